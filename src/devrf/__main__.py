@@ -1,0 +1,25 @@
+"""``python -m devrf``."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+from devrf.app import main
+from devrf.messages import mistakes_in_one_line
+
+
+def entry() -> None:
+    """Run the application; a mistake in the input ends it with one line and status 2."""
+    # Hydra would print a traceback of its own and exit with 1 if it were not told to raise.
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    try:
+        with mistakes_in_one_line():
+            main()
+    except KeyboardInterrupt:
+        print("devrf: interrupted", file=sys.stderr)
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    entry()

@@ -1,0 +1,24 @@
+"""The door: composes the config and runs the asked stage."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from devrf.config import config_folder, register_resolvers
+from devrf.messages import mistakes_in_one_line
+
+register_resolvers()
+
+
+@hydra.main(config_path=str(config_folder()), config_name="config", version_base="1.3")
+def main(config: DictConfig) -> None:
+    """Run ``stage=…`` in the folder that Hydra made for it."""
+    with mistakes_in_one_line():
+        # Imported here: --help and a misspelt key are answered before torch has loaded.
+        from devrf.run import Run
+
+        Run(config, Path(HydraConfig.get().runtime.output_dir))(config.stage)

@@ -1,0 +1,7 @@
+"""Callbacks: what watches a stage and acts on it from outside."""
+
+from devrf.callbacks.progress import Progress
+from devrf.callbacks.record import TrainingRecord
+from devrf.callbacks.schedule import GridUpscaling, LearningRateDecay
+
+__all__ = ["GridUpscaling", "LearningRateDecay", "Progress", "TrainingRecord"]

@@ -1,0 +1,95 @@
+"""A progress bar in the words of the field: iteration, PSNR, speed, resolution, frame."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from typing import Any
+
+from lightning import Callback, LightningModule, Trainer
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress as Bar,
+    TextColumn,
+    TimeRemainingColumn,
+)
+
+from devrf.stages.schedules import DeformationPhase
+from devrf.stages.stage import ScheduledStage
+
+log = logging.getLogger(__name__)
+
+
+class Progress(Callback):
+    """Shows how training goes: a bar on a terminal, else a line now and then."""
+
+    def __init__(self, every_seconds: float = 0.5, line_every_seconds: float = 15.0) -> None:
+        """Say how often to look.
+
+        Args:
+            every_seconds: between updates of the bar; each one reads one number from the device.
+            line_every_seconds: between lines where there is no terminal to draw on.
+        """
+        self.every_seconds = every_seconds
+        self.line_every_seconds = line_every_seconds
+        self._bar: Bar | None = None
+        self._shown = (0.0, 0)
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Open the bar."""
+        assert isinstance(pl_module, ScheduledStage)
+        self._shown = (time.perf_counter(), pl_module.iteration)
+        console = Console()
+        if console.is_terminal:
+            self._bar = Bar(
+                TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
+                TextColumn("{task.fields[state]}"), TimeRemainingColumn(), console=console,
+            )
+            self._bar.add_task(type(pl_module).__name__, total=pl_module.total_iterations, state="")
+            self._bar.start()
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Update the bar, or write a line, when it is time."""
+        assert isinstance(pl_module, ScheduledStage)
+        now = time.perf_counter()
+        since, done = now - self._shown[0], pl_module.iteration
+        if since < (self.line_every_seconds if self._bar is None else self.every_seconds):
+            return
+        state = describe(trainer, pl_module, (done - self._shown[1]) / since)
+        self._shown = (now, done)
+        if self._bar is None:
+            log.info("%s %d/%d  %s", pl_module.capture, done, pl_module.total_iterations, state)
+        else:
+            self._bar.update(self._bar.task_ids[0], completed=done, state=state)
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Close the bar."""
+        self._close()
+
+    def on_exception(
+        self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
+    ) -> None:
+        """Close the bar, so that what is said next stands on a line of its own."""
+        self._close()
+
+    def _close(self) -> None:
+        if self._bar is not None:
+            self._bar.update(self._bar.task_ids[0], completed=self._shown[1])
+            self._bar.stop()
+            self._bar = None
+
+
+def describe(trainer: Trainer, stage: ScheduledStage, speed: float) -> str:
+    """PSNR of the last batches, iterations a second, resolution, and the frame if there is one."""
+    means = trainer.callback_metrics
+    error = means.get(f"{stage.capture}/color", means.get(f"{stage.capture}/render"))
+    parts = [] if error is None else [f"{-10 * math.log10(max(float(error), 1e-12)):.1f} dB"]
+    parts += [f"{speed:.0f} it/s", "x".join(str(n) for n in stage.resolution)]
+    if isinstance(stage.phase, DeformationPhase):
+        parts.append(f"frame {stage.phase.frame}")
+    return "  ".join(parts)

@@ -1,0 +1,86 @@
+"""Pixels become a batch: rays with what the images say about them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from devrf.geometry.rays import Rays
+from devrf.scenes.scene import Views
+
+
+@dataclass(frozen=True)
+class RayBatch:
+    """R rays with the truth at their pixels.
+
+    Attributes:
+        rays: R rays in the fields' space.
+        color: (R, 3) RGB in [0, 1], composited on ``background``.
+        alpha: (R,) matte in [0, 1], or None for images without one.
+        background: (3,) or (R, 3) RGB behind the matte.
+        image: (R,) int64, the image of each ray among the views it was drawn from.
+        pixel: (R, 2) x, y of the pixels' centres.
+        flow: (R, 2) pixels, backward optical flow, or None.
+        flow_valid: (R,) bool, or None.
+    """
+
+    rays: Rays
+    color: Tensor
+    alpha: Tensor | None
+    background: Tensor
+    image: Tensor
+    pixel: Tensor
+    flow: Tensor | None
+    flow_valid: Tensor | None
+
+
+def pixel_positions(flat: Tensor, width: int) -> Tensor:
+    """Centres (R, 2), x then y, of pixels given by their row-major number (R,)."""
+    return torch.stack([flat % width, flat // width], dim=-1) + 0.5
+
+
+def gather_batch(views: Views, image: Tensor, flat: Tensor, background: Tensor) -> RayBatch:
+    """The batch of given pixels.
+
+    Args:
+        views: images and cameras, on the device of the indices.
+        image: (R,) int64, which image.
+        flat: (R,) int64, row-major pixel number within it.
+        background: (3,) or (R, 3) RGB in [0, 1] that mattes are composited on.
+
+    Returns:
+        Rays in world space with the truth at their pixels.
+    """
+    pixel = pixel_positions(flat, views.width)
+    row = image * (views.height * views.width) + flat
+    value = views.pixels.flatten(0, 2)[row].float() / 255
+    alpha = value[:, 3] if views.has_alpha else None
+    color = value[:, :3]
+    if alpha is not None:
+        color = background + alpha[:, None] * (color - background)
+    flow = flow_valid = None
+    if views.flow is not None:
+        flow = views.flow.vectors.flatten(0, 2)[row]
+        flow_valid = views.flow.valid.flatten()[row]
+    return RayBatch(
+        rays=views.cameras.rays(image, pixel),
+        color=color,
+        alpha=alpha,
+        background=background,
+        image=image,
+        pixel=pixel,
+        flow=flow,
+        flow_valid=flow_valid,
+    )
+
+
+def background_color(name: str, rays: int, device: torch.device, *, training: bool) -> Tensor:
+    """The background (3,), or (R, 3) when it is drawn at random for training.
+
+    A random background is white outside training, so that held-out views have one truth.
+    """
+    if name == "random" and training:
+        return torch.rand(rays, 3, device=device)
+    return torch.full((3,), 0.0 if name == "black" else 1.0, device=device)

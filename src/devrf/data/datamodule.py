@@ -1,0 +1,88 @@
+"""A scene as Lightning sees it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from lightning import LightningDataModule
+from torch.utils.data import DataLoader, Dataset, IterableDataset
+
+from devrf.scenes.scene import CaptureName, Scene, Views
+
+
+class SceneDataModule(LightningDataModule, ABC):
+    """Serves a scene to the stages.
+
+    A training batch is the whole set of training views of the capture that the stage asks for
+    (its attribute ``capture``: ``static`` or ``dynamic``), moved to the device once. The stage
+    draws its rays from it on the device, under its own schedule: no pixel crosses from the host
+    during training. A test batch is the position of one held-out image.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._scene: Scene | None = None
+        self._on_device: tuple[CaptureName, torch.device, Views] | None = None
+
+    @abstractmethod
+    def load(self) -> Scene:
+        """Read or make the scene; called once, when it is first needed."""
+
+    @property
+    def scene(self) -> Scene:
+        """The scene, on the host."""
+        if self._scene is None:
+            self._scene = self.load()
+        return self._scene
+
+    def setup(self, stage: str) -> None:
+        """Read the scene, in case nobody asked for it yet."""
+        _ = self.scene
+
+    def train_dataloader(self) -> DataLoader[Any]:
+        """An endless loader of the same batch: the training views of the stage's capture."""
+        return DataLoader(_Endless(), batch_size=None)
+
+    def test_dataloader(self) -> DataLoader[Any]:
+        """A loader of the positions of the held-out images, one at a time."""
+        return DataLoader(
+            _Positions(len(self.scene.capture(self._capture).test)), batch_size=None
+        )
+
+    def transfer_batch_to_device(
+        self, batch: Any, device: torch.device, dataloader_idx: int
+    ) -> Any:
+        """The training views on ``device``; the positions of a test batch pass through."""
+        return self.training_views(self._capture, device) if batch is None else batch
+
+    def training_views(self, capture: CaptureName, device: torch.device) -> Views:
+        """The training views of ``capture`` on ``device``, moved there at the first call."""
+        if self._on_device is None or self._on_device[:2] != (capture, device):
+            self._on_device = (capture, device, self.scene.capture(capture).train.to(device))
+        return self._on_device[2]
+
+    @property
+    def _capture(self) -> CaptureName:
+        assert self.trainer is not None
+        capture: CaptureName = self.trainer.lightning_module.capture  # type: ignore[assignment]
+        return capture
+
+
+class _Endless(IterableDataset[None]):
+    def __iter__(self) -> Iterator[None]:
+        while True:
+            yield None
+
+
+class _Positions(Dataset[int]):
+    def __init__(self, count: int) -> None:
+        self.count = count
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, index: int) -> int:
+        return index

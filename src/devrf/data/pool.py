@@ -1,0 +1,45 @@
+"""The pixels worth learning from, to draw batches from at random."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from devrf.scenes.scene import Views
+
+
+@dataclass(frozen=True)
+class PixelPool:
+    """P pixels of some images.
+
+    Attributes:
+        image: (P,) int32, the image of each pixel.
+        flat: (P,) int32, its row-major number in the image.
+    """
+
+    image: Tensor
+    flat: Tensor
+
+    def __len__(self) -> int:
+        return self.image.shape[0]
+
+    def draw(self, count: int) -> tuple[Tensor, Tensor]:
+        """``count`` pixels with replacement: image (count,) and number (count,), int64."""
+        pick = torch.randint(len(self), (count,), device=self.image.device)
+        return self.image[pick].long(), self.flat[pick].long()
+
+    def of_images(self, images: Tensor) -> PixelPool:
+        """The pixels that belong to ``images`` (K,)."""
+        kept = torch.isin(self.image, images.to(self.image.dtype))
+        return PixelPool(self.image[kept], self.flat[kept])
+
+
+def all_pixels(views: Views, images: Tensor) -> PixelPool:
+    """Every pixel of ``images`` (K,) int64."""
+    area = views.height * views.width
+    flat = torch.arange(area, dtype=torch.int32, device=images.device)
+    return PixelPool(
+        images.to(torch.int32).repeat_interleave(area), flat.repeat(len(images))
+    )

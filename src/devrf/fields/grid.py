@@ -1,0 +1,60 @@
+"""A dense voxel grid of values over a box: the one thing that every field is made of."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from devrf.geometry.box import Box
+from devrf.ops.trilinear import interpolate
+
+
+class VoxelGrid(nn.Module):
+    """Values (X, Y, Z, C) at the points of a grid whose corners sit on a box's corners.
+
+    Attributes:
+        values: (X, Y, Z, C) learned values, channels last so that a corner is one row of memory.
+    """
+
+    values: nn.Parameter
+
+    def __init__(self, shape: tuple[int, int, int], channels: int, fill: float = 0.0) -> None:
+        super().__init__()
+        self.values = nn.Parameter(torch.full((*shape, channels), fill))
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Grid points along x, y, z."""
+        x, y, z, _ = self.values.shape
+        return x, y, z
+
+    def forward(self, points: Tensor, box: Box) -> Tensor:
+        """Values (M, C) at ``points`` (M, 3) in the space of ``box``; outside, the border's."""
+        return interpolate(self.values, box.to_grid(points, self.shape))
+
+    @torch.no_grad()
+    def resize(self, shape: tuple[int, int, int]) -> None:
+        """Resample to another grid over the same box, trilinearly; a new parameter results."""
+        self.values = nn.Parameter(resample(self.values, shape))
+
+    def _load_from_state_dict(
+        self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
+    ) -> None:
+        """Take the shape of the stored grid: a run may have ended at any resolution."""
+        stored = state_dict.get(prefix + "values")
+        if stored is not None and stored.shape != self.values.shape:
+            self.values = nn.Parameter(self.values.new_empty(stored.shape))
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+
+
+def resample(values: Tensor, shape: tuple[int, int, int]) -> Tensor:
+    """A grid (X, Y, Z, C) at another resolution ``shape``, corners kept in place."""
+    if tuple(values.shape[:3]) == tuple(shape):
+        return values.detach().clone()
+    channels_first = values.permute(3, 0, 1, 2)[None]
+    resized = torch.nn.functional.interpolate(
+        channels_first, size=shape, mode="trilinear", align_corners=True
+    )
+    return resized[0].permute(1, 2, 3, 0).contiguous()

@@ -1,0 +1,119 @@
+"""Where something may be: a bit a cell, so that empty space is never sampled."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from devrf.geometry.box import Box
+
+
+class Occupancy(nn.Module):
+    """A mask (X, Y, Z) over a box; a point is looked up at its nearest grid point.
+
+    Attributes:
+        mask: (X, Y, Z) bool, True where something may be.
+        vicinity: the mask grown by ``REACH`` grid points, for stretches of a ray.
+        box: where the mask lives; outside it everything is empty.
+    """
+
+    mask: Tensor
+    vicinity: Tensor
+
+    # Grid points by which the vicinity exceeds the mask.
+    REACH = 2
+
+    def __init__(self, mask: Tensor, box: Box) -> None:
+        super().__init__()
+        self.box = box
+        self.register_buffer("mask", mask)
+        self.register_buffer("vicinity", dilate(mask, self.REACH), persistent=False)
+
+    @staticmethod
+    def full(shape: tuple[int, int, int], box: Box) -> Occupancy:
+        """A mask that excludes nothing inside the box."""
+        return Occupancy(torch.ones(shape, dtype=torch.bool), box)
+
+    @property
+    def reach(self) -> float:
+        """Shortest distance, in the box's units, that the vicinity surely grows the mask by."""
+        cells = zip(self.box.size, self.mask.shape, strict=True)
+        return (self.REACH - 0.5) * min(edge / (n - 1) for edge, n in cells)
+
+    @property
+    def share(self) -> float:
+        """Share of the cells that are occupied."""
+        return float(self.mask.float().mean())
+
+    def at(self, points: Tensor) -> Tensor:
+        """Mask (M,): may something be at ``points`` (M, 3)?"""
+        return self._look_up(self.mask, points)
+
+    def near(self, points: Tensor) -> Tensor:
+        """Mask (M,): may something be within :attr:`reach` of ``points`` (M, 3)?"""
+        return self._look_up(self.vicinity, points)
+
+    def _look_up(self, mask: Tensor, points: Tensor) -> Tensor:
+        x, y, z = mask.shape
+        cell = self.box.to_grid(points, (x, y, z)).round_().to(torch.int32)
+        i, j, k = cell.unbind(-1)
+        inside = (i >= 0) & (i < x) & (j >= 0) & (j < y) & (k >= 0) & (k < z)
+        row = torch.where(inside, (i * y + j) * z + k, 0)
+        return mask.view(-1)[row] & inside
+
+    def replace(self, mask: Tensor, box: Box | None = None) -> None:
+        """Take another mask, of any shape, over another box if one is given."""
+        self.mask = mask
+        self.vicinity = dilate(mask, self.REACH)
+        self.box = box or self.box
+
+    def _load_from_state_dict(
+        self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
+    ) -> None:
+        stored = state_dict.get(prefix + "mask")
+        if stored is not None:
+            self.replace(stored.to(self.mask.device))
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """The box, as plain numbers."""
+        return {"low": list(self.box.low), "high": list(self.box.high)}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`get_extra_state` gave."""
+        self.box = Box.of(state["low"], state["high"])
+
+
+def dilate(mask: Tensor, radius: int) -> Tensor:
+    """The mask (X, Y, Z) grown by ``radius`` grid points along every axis and diagonal."""
+    if radius == 0:
+        return mask
+    pooled = mask[None, None].float()
+    # A cube-shaped maximum is separable: three passes along the axes instead of one over r³.
+    for axis in range(3):
+        kernel, padding = [1, 1, 1], [0, 0, 0]
+        kernel[axis], padding[axis] = 2 * radius + 1, radius
+        pooled = torch.nn.functional.max_pool3d(pooled, kernel, stride=1, padding=padding)
+    return pooled[0, 0] > 0
+
+
+def bounding_box(mask: Tensor, box: Box) -> Box | None:
+    """The smallest box around the True grid points of ``mask`` over ``box``; None if empty.
+
+    It is at least one grid cell wide along each axis.
+    """
+    low, high = [], []
+    for axis in range(3):
+        others = [a for a in range(3) if a != axis]
+        used = mask.any(dim=others[1]).any(dim=others[0]).nonzero()[:, 0]
+        if len(used) == 0:
+            return None
+        cell = box.size[axis] / (mask.shape[axis] - 1)
+        first, last = int(used[0]), int(used[-1])
+        if first == last:
+            first, last = max(first - 1, 0), min(last + 1, mask.shape[axis] - 1)
+        low.append(box.low[axis] + first * cell)
+        high.append(box.low[axis] + last * cell)
+    return Box.of(low, high)

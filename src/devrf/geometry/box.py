@@ -1,0 +1,123 @@
+"""Axis-aligned boxes: where a field lives, how many voxels it holds, where rays cross it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from devrf.geometry.rays import Rays
+
+
+@dataclass(frozen=True)
+class Box:
+    """An axis-aligned box in the fields' space (world units, or NDC).
+
+    Attributes:
+        low: the corner (x, y, z) with the smallest coordinates.
+        high: the corner (x, y, z) with the largest coordinates.
+    """
+
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+
+    def __post_init__(self) -> None:
+        if not all(a < b for a, b in zip(self.low, self.high, strict=True)):
+            raise ValueError(f"a box needs low < high on every axis, not {self.low}, {self.high}")
+
+    @property
+    def size(self) -> tuple[float, float, float]:
+        """Edge lengths (x, y, z)."""
+        x, y, z = (b - a for a, b in zip(self.low, self.high, strict=True))
+        return x, y, z
+
+    @property
+    def longest(self) -> float:
+        """The longest edge."""
+        return max(self.size)
+
+    @property
+    def volume(self) -> float:
+        """Product of the edge lengths."""
+        x, y, z = self.size
+        return x * y * z
+
+    def voxel_size(self, voxels: int) -> float:
+        """s = (volume / N)^(1/3): the edge of each of ``voxels`` equal cubes (method §2)."""
+        return float((self.volume / voxels) ** (1 / 3))
+
+    def grid_shape(self, voxels: int) -> tuple[int, int, int]:
+        """Grid points along (x, y, z) for about ``voxels`` cubic voxels: floor(size / s).
+
+        At least two along each axis, since grid corners sit on the box's corners.
+        """
+        s = self.voxel_size(voxels)
+        # A hair is added so that a cube of 10^3 voxels has side 10 in spite of rounding.
+        x, y, z = (max(2, int(edge / s + 1e-6)) for edge in self.size)
+        return x, y, z
+
+    def scaled(self, factor: float) -> Box:
+        """The box grown about its centre by ``factor`` along every axis."""
+        mid = [(a + b) / 2 for a, b in zip(self.low, self.high, strict=True)]
+        half = [edge / 2 * factor for edge in self.size]
+        return Box.of([m - h for m, h in zip(mid, half, strict=True)],
+                      [m + h for m, h in zip(mid, half, strict=True)])
+
+    def union(self, other: Box) -> Box:
+        """The smallest box that holds both."""
+        return Box.of([min(a, b) for a, b in zip(self.low, other.low, strict=True)],
+                      [max(a, b) for a, b in zip(self.high, other.high, strict=True)])
+
+    def clipped(self, other: Box) -> Box:
+        """The part of this box inside ``other``."""
+        return Box.of([max(a, b) for a, b in zip(self.low, other.low, strict=True)],
+                      [min(a, b) for a, b in zip(self.high, other.high, strict=True)])
+
+    def contains(self, points: Tensor) -> Tensor:
+        """Mask (...,) of the points (..., 3) inside the box, faces included."""
+        low, high = self.corners(points)
+        return ((points >= low) & (points <= high)).all(dim=-1)
+
+    def nearest(self, points: Tensor) -> Tensor:
+        """The nearest points (..., 3) of the box, inside included."""
+        low, high = self.corners(points)
+        return torch.minimum(torch.maximum(points, low), high)
+
+    def corners(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        """The two corners (3,) as tensors with the dtype and device of ``like``."""
+        return like.new_tensor(self.low), like.new_tensor(self.high)
+
+    def to_grid(self, points: Tensor, shape: tuple[int, int, int]) -> Tensor:
+        """Grid coordinates (..., 3): 0 on the low faces, shape − 1 on the high ones."""
+        low, high = self.corners(points)
+        extent = points.new_tensor(shape) - 1
+        return (points - low) * (extent / (high - low))
+
+    def grid_points(self, shape: tuple[int, int, int], like: Tensor) -> Tensor:
+        """(X, Y, Z, 3) positions of a grid whose corners sit on the box's corners."""
+        axes = [
+            torch.linspace(a, b, n, dtype=like.dtype, device=like.device)
+            for a, b, n in zip(self.low, self.high, shape, strict=True)
+        ]
+        return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
+
+    def crossing(self, rays: Rays) -> tuple[Tensor, Tensor]:
+        """Distances (M,), (M,) at which rays enter and leave the box (slab method).
+
+        A ray that misses has entry > exit; entry is negative for a ray that starts inside.
+        """
+        low, high = self.corners(rays.origins)
+        d = rays.directions
+        d = torch.where(d.abs() < 1e-9, torch.full_like(d, 1e-9), d)
+        to_low, to_high = (low - rays.origins) / d, (high - rays.origins) / d
+        entry = torch.minimum(to_low, to_high).amax(dim=-1)
+        leave = torch.maximum(to_low, to_high).amin(dim=-1)
+        return entry, leave
+
+    @staticmethod
+    def of(low: Tensor | list[float], high: Tensor | list[float]) -> Box:
+        """A box from two sequences or tensors of three numbers."""
+        a, b, c = (float(v) for v in low)
+        d, e, f = (float(v) for v in high)
+        return Box((a, b, c), (d, e, f))

@@ -1,0 +1,173 @@
+"""Pinhole cameras: pixels become rays, points become pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from devrf.geometry.rays import Rays
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """N pinhole cameras that share one image size.
+
+    The camera looks along its negative z axis (OpenGL axes: x right, y up, z backwards). Pixel
+    coordinates are (x, y) with (0, 0) the outer corner of the top-left pixel, so the centre of
+    the pixel in column i and row j is (i + 0.5, j + 0.5).
+
+    Attributes:
+        camera_to_world: (N, 3, 4) rigid transforms, world units.
+        focal: (N, 2) focal lengths fx, fy in pixels.
+        center: (N, 2) principal points cx, cy in pixels.
+        width: image width in pixels.
+        height: image height in pixels.
+    """
+
+    camera_to_world: Tensor
+    focal: Tensor
+    center: Tensor
+    width: int
+    height: int
+
+    def __len__(self) -> int:
+        return self.camera_to_world.shape[0]
+
+    def __getitem__(self, index: Tensor | slice | list[int]) -> Cameras:
+        """The cameras at ``index``; always N of them, so an int is not an index."""
+        return Cameras(
+            self.camera_to_world[index],
+            self.focal[index],
+            self.center[index],
+            self.width,
+            self.height,
+        )
+
+    @property
+    def positions(self) -> Tensor:
+        """(N, 3) camera centres in world units."""
+        return self.camera_to_world[:, :, 3]
+
+    @property
+    def forwards(self) -> Tensor:
+        """(N, 3) unit viewing directions of the optical axes, in world space."""
+        return -self.camera_to_world[:, :, 2]
+
+    def rays(self, camera: Tensor, pixels: Tensor) -> Rays:
+        """World-space rays through pixels.
+
+        Args:
+            camera: (M,) which camera each ray belongs to.
+            pixels: (M, 2) x, y in pixels (a pixel's centre is at i + 0.5).
+
+        Returns:
+            M rays with unit directions that start at the camera centres.
+        """
+        x, y = ((pixels - self.center[camera]) / self.focal[camera]).unbind(-1)
+        local = torch.stack([x, -y, -torch.ones_like(x)], dim=-1)
+        pose = self.camera_to_world[camera]
+        directions = torch.einsum("mij,mj->mi", pose[:, :, :3], local)
+        directions = torch.nn.functional.normalize(directions, dim=-1)
+        return Rays(pose[:, :, 3], directions, directions)
+
+    def project(self, camera: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels on which world points fall: the inverse of :meth:`rays`.
+
+        Args:
+            camera: (M,) which camera looks at each point.
+            points: (M, 3) world units.
+
+        Returns:
+            pixels (M, 2) as x, y, and the depth (M,) along the optical axis in world units;
+            a point with depth ≤ 0 is behind the camera and its pixel means nothing.
+        """
+        pose = self.camera_to_world[camera]
+        local = torch.einsum("mji,mj->mi", pose[:, :, :3], points - pose[:, :, 3])
+        return _on_image(local, self.focal[camera], self.center[camera])
+
+    def project_into(self, camera: int, points: Tensor) -> tuple[Tensor, Tensor]:
+        """As :meth:`project`, of all ``points`` (M, 3) into one camera: a matrix product."""
+        pose = self.camera_to_world[camera]
+        local = (points - pose[:, 3]) @ pose[:, :3]
+        return _on_image(local, self.focal[camera], self.center[camera])
+
+    def pixel_grid(self) -> Tensor:
+        """(H·W, 2) pixel centres x, y in row-major order."""
+        device, dtype = self.focal.device, self.focal.dtype
+        y, x = torch.meshgrid(
+            torch.arange(self.height, device=device, dtype=dtype),
+            torch.arange(self.width, device=device, dtype=dtype),
+            indexing="ij",
+        )
+        return torch.stack([x, y], dim=-1).reshape(-1, 2) + 0.5
+
+    def image_rays(self, camera: int) -> Rays:
+        """All H·W rays of one camera, in row-major order."""
+        pixels = self.pixel_grid()
+        index = torch.full((len(pixels),), camera, device=pixels.device, dtype=torch.long)
+        return self.rays(index, pixels)
+
+    def resized(self, width: int, height: int) -> Cameras:
+        """The same cameras with images of another size (each axis scaled by its own factor)."""
+        scale = self.focal.new_tensor([width / self.width, height / self.height])
+        return Cameras(
+            self.camera_to_world, self.focal * scale, self.center * scale, width, height
+        )
+
+    def to(self, device: torch.device | str) -> Cameras:
+        """The same cameras on ``device``."""
+        return Cameras(
+            self.camera_to_world.to(device),
+            self.focal.to(device),
+            self.center.to(device),
+            self.width,
+            self.height,
+        )
+
+    @staticmethod
+    def looking_at(
+        positions: Tensor,
+        targets: Tensor,
+        *,
+        focal: float,
+        width: int,
+        height: int,
+        up: Tensor | None = None,
+    ) -> Cameras:
+        """Cameras at ``positions`` (N, 3) that look at ``targets`` (N, 3).
+
+        Args:
+            positions: camera centres, world units.
+            targets: what each looks at, world units.
+            focal: focal length in pixels; the principal point is the image's centre.
+            width: image width in pixels.
+            height: image height in pixels.
+            up: (3,) the direction that is up in the images; None: world z.
+        """
+        backward = torch.nn.functional.normalize(positions - targets, dim=-1)
+        up = positions.new_tensor([0.0, 0.0, 1.0]) if up is None else up
+        # A camera that looks straight up or down has no horizon: any other direction will do.
+        other = torch.eye(3).to(up)[int(up.abs().argmin())]
+        vertical = (backward @ up).abs()[:, None] > 0.999
+        up = torch.where(vertical, other, up)
+        right = torch.nn.functional.normalize(torch.linalg.cross(up, backward), dim=-1)
+        upward = torch.linalg.cross(backward, right)
+        pose = torch.stack([right, upward, backward, positions], dim=-1)
+        count = len(positions)
+        return Cameras(
+            pose,
+            positions.new_full((count, 2), focal),
+            positions.new_tensor([width / 2, height / 2]).repeat(count, 1),
+            width,
+            height,
+        )
+
+
+def _on_image(local: Tensor, focal: Tensor, center: Tensor) -> tuple[Tensor, Tensor]:
+    """Pixels (M, 2) and depths (M,) of points (M, 3) in a camera's own axes."""
+    x, y, z = local.unbind(-1)
+    depth = -z
+    safe = torch.where(depth.abs() < 1e-8, torch.full_like(depth, 1e-8), depth)
+    return torch.stack([x / safe, -y / safe], dim=-1) * focal + center, depth

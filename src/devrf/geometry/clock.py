@@ -1,0 +1,71 @@
+"""The frame clock: the only place where a time becomes frames and weights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Moment:
+    """A time between two frames.
+
+    Attributes:
+        before: index of the frame at or before the time.
+        after: index of the frame after it (``before`` itself on a frame).
+        weight: share of ``after``, in [0, 1); 0 exactly on a frame.
+    """
+
+    before: int
+    after: int
+    weight: float
+
+
+@dataclass(frozen=True)
+class FrameClock:
+    """The frames' times, in ascending order; frame 0 is at time 0, where nothing has moved.
+
+    Attributes:
+        times: T times in [0, 1].
+    """
+
+    times: tuple[float, ...]
+
+    # Times come from JSON text, float32 tensors and k / (T − 1): equal up to rounding only.
+    TOLERANCE = 1e-5
+
+    def __post_init__(self) -> None:
+        if len(self.times) < 2 or self.times[0] != 0.0:
+            raise ValueError("a frame clock needs time 0 and at least one later time")
+        if any(b - a <= self.TOLERANCE for a, b in zip(self.times, self.times[1:], strict=False)):
+            raise ValueError("a frame clock needs distinct ascending times")
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    @staticmethod
+    def from_times(times: Tensor) -> FrameClock:
+        """The clock of the distinct values in ``times`` (any shape), with 0 put before them."""
+        frames = [0.0]
+        for time in sorted(float(t) for t in times.flatten().tolist()):
+            if time - frames[-1] > FrameClock.TOLERANCE:
+                frames.append(time)
+        return FrameClock(tuple(frames))
+
+    def at(self, time: float) -> Moment:
+        """Where ``time`` lies; times outside the clock's range stay on the first or last frame."""
+        if time <= self.times[0] + self.TOLERANCE:
+            return Moment(0, 0, 0.0)
+        for k, (a, b) in enumerate(zip(self.times, self.times[1:], strict=False)):
+            if time < b - self.TOLERANCE:
+                on_frame = time <= a + self.TOLERANCE
+                return Moment(k, k, 0.0) if on_frame else Moment(k, k + 1, (time - a) / (b - a))
+        last = len(self) - 1
+        return Moment(last, last, 0.0)
+
+    def frames_of(self, times: Tensor) -> Tensor:
+        """The nearest frame of each time: int64, the shape of ``times``."""
+        clock = torch.tensor(self.times, dtype=torch.float64, device=times.device)
+        return (times.double()[..., None] - clock).abs().argmin(dim=-1)

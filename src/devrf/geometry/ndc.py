@@ -1,0 +1,63 @@
+"""Normalised device coordinates: an endless frustum becomes a box (forward-facing scenes).
+
+With a camera at the origin that looks along −z, focal length f, width W, height H and near
+plane n, a point (x, y, z) maps to (−f·x/(W/2·z), −f·y/(H/2·z), 1 + 2n/z), in [−1, 1]³: the
+near plane to z' = −1, infinity to z' = 1 (NeRF, appendix C).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from devrf.geometry.rays import Rays
+
+
+@dataclass(frozen=True)
+class NormalizedDevice:
+    """The mapping between world space and NDC of one reference camera.
+
+    Attributes:
+        width: image width in pixels.
+        height: image height in pixels.
+        focal: focal lengths (fx, fy) in pixels.
+        near: distance of the near plane in world units.
+    """
+
+    width: int
+    height: int
+    focal: tuple[float, float]
+    near: float = 1.0
+
+    @property
+    def _slopes(self) -> tuple[float, float]:
+        return 2 * self.focal[0] / self.width, 2 * self.focal[1] / self.height
+
+    def from_world(self, points: Tensor) -> Tensor:
+        """NDC (..., 3) of world points (..., 3) with z < 0."""
+        sx, sy = self._slopes
+        x, y, z = points.unbind(-1)
+        return torch.stack([-sx * x / z, -sy * y / z, 1 + 2 * self.near / z], dim=-1)
+
+    def to_world(self, points: Tensor) -> Tensor:
+        """World points (..., 3) of NDC (..., 3) with z' < 1: the inverse of :meth:`from_world`."""
+        sx, sy = self._slopes
+        x, y, z = points.unbind(-1)
+        depth = 2 * self.near / (z - 1)
+        return torch.stack([-x * depth / sx, -y * depth / sy, depth], dim=-1)
+
+    def rays(self, rays: Rays) -> Rays:
+        """World rays as NDC rays: origin on the near plane, origin + direction at infinity.
+
+        The view directions stay those of the world.
+        """
+        o, d = rays.origins, rays.directions
+        start = o + d * (-(self.near + o[:, 2:]) / d[:, 2:])
+        sx, sy = self._slopes
+        origin = self.from_world(start)
+        x = -sx * (d[:, 0] / d[:, 2] - start[:, 0] / start[:, 2])
+        y = -sy * (d[:, 1] / d[:, 2] - start[:, 1] / start[:, 2])
+        z = -2 * self.near / start[:, 2]
+        return Rays(origin, torch.stack([x, y, z], dim=-1), rays.viewdirs)

@@ -1,0 +1,95 @@
+"""Terms that tie the deformation field together (method §3, Losses)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from devrf.geometry.cameras import Cameras
+from devrf.losses.photometric import PHOTOMETRIC_TERMS, Prediction
+from devrf.rendering.render import Warp
+
+
+@dataclass(frozen=True)
+class MotionPrediction(Prediction):
+    """What was rendered through the warp of one frame, with what the motion terms need.
+
+    Attributes:
+        unwarp: canonical points (M, 3) → their positions at this frame, q + Δ_f(q, t).
+        unwarp_previous: the same for the frame before, frozen.
+        cameras: the cameras of the images that the batch was drawn from.
+        previous_image: (N,) int64, for each image the one that its flow leads to (the same view
+            one frame earlier), or the image itself where there is none.
+    """
+
+    unwarp: Warp
+    unwarp_previous: Warp
+    cameras: Cameras
+    previous_image: Tensor
+
+
+def cycle(prediction: MotionPrediction) -> Tensor:
+    """Mean over samples of ½ |x − (q + Δ_f(q, t))|²: there and back again."""
+    points = prediction.output.samples.points
+    if len(points) == 0:
+        return prediction.output.canonical.sum()
+    returned = prediction.unwarp(prediction.output.canonical)
+    return 0.5 * (points - returned).square().sum(dim=1).mean()
+
+
+def flow(prediction: MotionPrediction) -> Tensor:
+    """L1 between the induced and the observed backward flow, weighted by w_i and the mask.
+
+    Samples go back to canonical space, forward to the frame before, and onto that frame's
+    image; that pixel minus the sample's own is the induced flow. Pixels; the mean over the rays
+    whose flow is valid; zero without observed flow.
+    """
+    batch, output = prediction.batch, prediction.output
+    if batch.flow is None or batch.flow_valid is None:
+        return output.canonical.new_zeros(())
+    ray = output.samples.ray
+    kept = batch.flow_valid[ray].nonzero()[:, 0]
+    ray = ray[kept]
+    camera = prediction.previous_image[batch.image[ray]]
+    induced = induced_flow(
+        output.canonical[kept], prediction.unwarp_previous, prediction.cameras, camera,
+        batch.pixel[ray],
+    )
+    error = (induced - batch.flow[ray]).abs().sum(dim=1)
+    return (output.weight[kept] * error).sum() / batch.flow_valid.sum().clamp(min=1)
+
+
+def induced_flow(
+    canonical: Tensor, unwarp_previous: Warp, cameras: Cameras, camera: Tensor, pixel: Tensor
+) -> Tensor:
+    """The optical flow (M, 2) that the motion fields imply for canonical points.
+
+    Args:
+        canonical: (M, 3) canonical positions of what is seen at ``pixel``.
+        unwarp_previous: canonical points → their positions one frame earlier, world units.
+        cameras: all cameras.
+        camera: (M,) the camera that took the earlier frame.
+        pixel: (M, 2) where the points are seen now, x, y in pixels.
+    """
+    position, _ = cameras.project(camera, unwarp_previous(canonical))
+    return position - pixel
+
+
+MOTION_TERMS = {
+    **{("render" if name == "color" else name): term for name, term in PHOTOMETRIC_TERMS.items()},
+    "cycle": cycle,
+    "flow": flow,
+}
+
+
+def total_variation_weight(weight: float, side: int, rays: int) -> float:
+    """Factor of the Huber total variation's gradient: ω·(side/128)/R/6 (method §3, TV).
+
+    Args:
+        weight: ω, the term's weight.
+        side: the longest side of the motion grid.
+        rays: R, the rays of a batch.
+    """
+    return weight * (side / 128) / rays / 6
+

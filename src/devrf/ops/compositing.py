@@ -1,0 +1,73 @@
+"""Volume rendering along rays whose samples lie one after another in memory.
+
+Everything is written in optical depths τ = σ·δ, for which opacity is α = 1 − exp(−τ) and
+transmittance T_i = Π_{j<i} (1 − α_j) = exp(−Σ_{j<i} τ_j): no logarithm of a vanishing number.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+
+def composite(depth: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
+    """Weights of samples and what is left of each ray behind them (method §2, Compositing).
+
+    ``w_i = T_i α_i`` and ``T_end = exp(−Σ_i τ_i)``; for example τ = (ln 2, ln 2) on one ray
+    gives w = (1/2, 1/4) and T_end = 1/4.
+
+    Args:
+        depth: (S,) optical depths τ ≥ 0 of the samples, front to back within each ray.
+        ray: (S,) int64, ascending: the ray of each sample.
+        rays: how many rays there are; a ray may have no sample.
+
+    Returns:
+        weights (S,) and end transmittance (R,), differentiable once in ``depth``.
+    """
+    return _Composite.apply(depth, ray, rays)
+
+
+def sum_by_ray(values: Tensor, ray: Tensor, rays: int) -> Tensor:
+    """Sums (R, C) or (R,) of per-sample ``values`` (S, C) or (S,) over each ray."""
+    return values.new_zeros((rays, *values.shape[1:])).index_add(0, ray, values)
+
+
+class _Composite(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, depth: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
+        first, last = _segments(ray, rays)
+        reached = _running_sum(depth)
+        before = reached[:-1] - reached[first[ray]]
+        transmittance = torch.exp(-before).to(depth.dtype)
+        weights = transmittance * -torch.expm1(-depth)
+        end = torch.exp(reached[first] - reached[last]).to(depth.dtype)
+        ctx.save_for_backward(depth, ray, first, last, transmittance, weights, end)
+        return weights, end
+
+    @staticmethod
+    @once_differentiable
+    def backward(
+        ctx: Any, grad_weights: Tensor, grad_end: Tensor
+    ) -> tuple[Tensor, None, None]:
+        depth, ray, first, last, transmittance, weights, end = ctx.saved_tensors
+        shadowed = _running_sum(grad_weights * weights)
+        behind = (shadowed[last][ray] - shadowed[1:]).to(depth.dtype)
+        own = grad_weights * transmittance * torch.exp(-depth)
+        return own - behind - (grad_end * end)[ray], None, None
+
+
+def _segments(ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
+    """First sample and one past the last sample of every ray, (R,) each."""
+    edges = torch.searchsorted(ray, torch.arange(rays + 1, device=ray.device))
+    return edges[:-1], edges[1:]
+
+
+def _running_sum(values: Tensor) -> Tensor:
+    """Sums (S + 1,) of all values before each place, over all rays at once.
+
+    In double precision: a ray's own sum is the difference of two of these, which may be large.
+    """
+    return torch.nn.functional.pad(values.double().cumsum(dim=0), (1, 0))

@@ -1,0 +1,104 @@
+"""A whole scene that can be rendered: canonical field, its occupancy, and how it deforms."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from devrf.fields.canonical import CanonicalField
+from devrf.fields.deformation import DeformationField
+from devrf.fields.occupancy import Occupancy, dilate
+from devrf.geometry.rays import Rays
+from devrf.rendering.render import RenderSettings, Warp, render
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What R rays see, to be looked at.
+
+    Attributes:
+        color: (R, 3) RGB in [0, 1].
+        depth: (R,) mean distance of what is seen along the ray; 0 where nothing is.
+        opacity: (R,) in [0, 1], 1 − T_end.
+    """
+
+    color: Tensor
+    depth: Tensor
+    opacity: Tensor
+
+
+class SceneModel(nn.Module):
+    """What is needed to see a scene from any view at any time.
+
+    Attributes:
+        canonical: what the scene looks like at rest.
+        occupancy: where something is at rest.
+        deformation: how it moves; None shows the rest state at every time.
+        settings: how rays are sampled.
+    """
+
+    def __init__(
+        self,
+        canonical: CanonicalField,
+        occupancy: Occupancy,
+        settings: RenderSettings,
+        deformation: DeformationField | None = None,
+    ) -> None:
+        super().__init__()
+        self.canonical = canonical
+        self.occupancy = occupancy
+        self.settings = settings
+        self.deformation = deformation
+
+    def warp(self, time: float) -> Warp | None:
+        """The map from points (M, 3) at ``time`` into canonical space; None is the identity."""
+        deformation = self.deformation
+        if deformation is None or deformation.clock.at(time).after == 0:
+            return None
+        return lambda points: deformation.warp(points, time)
+
+    def occupancy_at(self, time: float) -> Occupancy:
+        """Where something is at ``time`` in [0, 1]."""
+        warp = self.warp(time)
+        return self.occupancy if warp is None else deformed_occupancy(self, warp)
+
+    @torch.no_grad()
+    def picture(
+        self, rays: Rays, time: float, background: Tensor, chunk: int = 16384
+    ) -> Picture:
+        """What rays see at ``time``.
+
+        Args:
+            rays: R rays.
+            time: in [0, 1].
+            background: (3,) RGB.
+            chunk: rays rendered at once.
+        """
+        warp, occupancy = self.warp(time), self.occupancy_at(time)
+        parts = [
+            render(rays[k : k + chunk], self.canonical, occupancy, self.settings, background, warp)
+            for k in range(0, len(rays), chunk)
+        ]
+        return Picture(
+            color=torch.cat([part.color for part in parts]),
+            depth=torch.cat([part.depth for part in parts]),
+            opacity=1 - torch.cat([part.transmittance for part in parts]),
+        )
+
+
+@torch.no_grad()
+def deformed_occupancy(model: SceneModel, warp: Warp, margin: int = 1) -> Occupancy:
+    """Where something is once it has moved: the grid points that the warp sends to matter.
+
+    Args:
+        model: gives the canonical occupancy and the box.
+        warp: maps points (M, 3) at the time in question into canonical space.
+        margin: grid points by which the result is grown, for what lies between them.
+    """
+    shape = tuple(model.occupancy.mask.shape)
+    box = model.canonical.box
+    points = box.grid_points((shape[0], shape[1], shape[2]), model.canonical.density.values)
+    found = model.occupancy.at(warp(points.reshape(-1, 3))).view(shape)
+    return Occupancy(dilate(found, margin), box)

@@ -1,0 +1,118 @@
+"""From rays to the sample points worth looking at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from devrf.fields.occupancy import Occupancy
+from devrf.geometry.box import Box
+from devrf.geometry.rays import Rays
+
+
+@dataclass(frozen=True)
+class Samples:
+    """S samples of R rays, one after another: ascending by ray, then front to back.
+
+    Attributes:
+        ray: (S,) int64, the ray of each sample.
+        distance: (S,) along the ray, in units of its direction.
+        points: (S, 3) positions in the fields' space.
+        rays: R, how many rays there are.
+    """
+
+    ray: Tensor
+    distance: Tensor
+    points: Tensor
+    rays: int
+
+    def __len__(self) -> int:
+        return self.ray.shape[0]
+
+    def __getitem__(self, index: Tensor) -> Samples:
+        """The samples at ascending positions ``index`` (K,)."""
+        return Samples(
+            self.ray.index_select(0, index),
+            self.distance.index_select(0, index),
+            self.points.index_select(0, index),
+            self.rays,
+        )
+
+
+@torch.no_grad()
+def march(
+    rays: Rays,
+    box: Box,
+    occupancy: Occupancy,
+    *,
+    step: float,
+    near: float,
+    far: float,
+) -> Samples:
+    """Samples every ``step`` along rays between their entry into the box and their exit.
+
+    Empty space is skipped in two strides: whole stretches of a ray with nothing near them,
+    then single samples.
+
+    Args:
+        rays: R rays.
+        box: where samples may be.
+        occupancy: where something may be.
+        step: distance between samples, in units of the rays' directions.
+        near: distance before which nothing is sampled.
+        far: distance behind which nothing is sampled.
+
+    Returns:
+        The samples in occupied cells; the k-th of a ray is at entry + k·step.
+    """
+    entry, leave = box.crossing(rays)
+    entry, leave = entry.clamp(min=near), leave.clamp(max=far)
+    per_stretch = max(1, int(2 * occupancy.reach / step))
+    stretch = per_stretch * step
+    stretches = ((leave - entry) / stretch).clamp(min=0).ceil().long()
+    ray = torch.repeat_interleave(stretches)
+    first = stretches.cumsum(0) - stretches
+    number = torch.arange(len(ray), device=ray.device) - first[ray]
+    start = entry[ray] + number * stretch
+    middle = start + (stretch - step) / 2
+    kept = occupancy.near(rays.at(ray, middle)).nonzero()[:, 0]
+    steps = step * torch.arange(per_stretch, device=ray.device, dtype=start.dtype)
+    distance = (start[kept, None] + steps).reshape(-1)
+    ray = ray[kept].repeat_interleave(per_stretch)
+    points = rays.at(ray, distance)
+    kept = (occupancy.at(points) & (distance < leave[ray])).nonzero()[:, 0]
+    return Samples(
+        ray.index_select(0, kept),
+        distance.index_select(0, kept),
+        points.index_select(0, kept),
+        len(rays),
+    )
+
+
+@torch.no_grad()
+def hits(
+    rays: Rays, box: Box, occupancy: Occupancy, *, near: float, far: float, chunk: int = 65536
+) -> Tensor:
+    """Mask (R,): which rays pass within reach of anything occupied."""
+    return torch.cat(
+        [
+            _hits(rays[k : k + chunk], box, occupancy, near, far)
+            for k in range(0, max(len(rays), 1), chunk)
+        ]
+    )
+
+
+def _hits(rays: Rays, box: Box, occupancy: Occupancy, near: float, far: float) -> Tensor:
+    entry, leave = box.crossing(rays)
+    entry, leave = entry.clamp(min=near), leave.clamp(max=far)
+    stride = occupancy.reach
+    strides = ((leave - entry) / stride).clamp(min=0).ceil().long()
+    ray = torch.repeat_interleave(strides)
+    first = strides.cumsum(0) - strides
+    number = torch.arange(len(ray), device=ray.device) - first[ray]
+    touched = occupancy.near(rays.at(ray, entry[ray] + (number + 0.5) * stride))
+    hit = torch.zeros(len(rays), dtype=torch.bool, device=ray.device)
+    hit[ray[touched]] = True
+    return hit

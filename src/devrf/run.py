@@ -1,0 +1,192 @@
+"""One run: its folder, its scene, and what each stage does there."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from statistics import mean
+from typing import Any
+
+import torch
+from hydra.utils import instantiate
+from lightning import Trainer, seed_everything
+from omegaconf import DictConfig
+
+from devrf.artifacts.contact_sheet import write_contact_sheet
+from devrf.artifacts.files import update_json
+from devrf.artifacts.film import FilmSettings, orbit, pictures, write_video
+from devrf.callbacks import TrainingRecord
+from devrf.data.datamodule import SceneDataModule
+from devrf.errors import DevrfError
+from devrf.scenes.export import export_blender
+from devrf.scenes.scene import CaptureName
+from devrf.stages.canonical import CanonicalStage
+from devrf.stages.checkpoint import Stored, load_checkpoint, save_checkpoint
+from devrf.stages.deformation import DeformationStage
+from devrf.stages.held_out import HeldOutView, background_value, score
+from devrf.stages.stage import ScheduledStage
+
+log = logging.getLogger(__name__)
+
+# What Lightning says of every run (accelerators it looked for, tips, how many workers a loader
+# might have) is of no use to someone who watches a scene being learned.
+for _name in ("lightning.pytorch", "lightning.fabric"):
+    logging.getLogger(_name).setLevel(logging.WARNING)
+for _message in (".*does not have many workers.*", ".*LeafSpec.*", ".*GPU available but not used.*"):
+    warnings.filterwarnings("ignore", message=_message)
+
+
+class Run:
+    """A configured run in a folder: ``run(stage)`` does what ``stage=…`` asks for.
+
+    In the folder: ``checkpoints/canonical.ckpt`` and ``deformation.ckpt``, ``metrics.json``,
+    ``images/`` and ``videos/``, next to the composed config and the log that Hydra writes.
+    """
+
+    def __init__(self, config: DictConfig, folder: Path) -> None:
+        """Take a composed config (``conf/config.yaml``) and the folder to work in."""
+        self.config = config
+        self.folder = folder
+        self.datamodule: SceneDataModule = instantiate(config.data)
+        self._logger: Any = None
+
+    def __call__(self, stage: str) -> None:
+        """Do what ``stage`` asks for.
+
+        Raises:
+            DevrfError: an unknown stage, or whatever is wrong with the input.
+        """
+        stages: dict[str, list[Callable[[], None]]] = {
+            "prepare": [self.prepare],
+            "canonical": [self.canonical],
+            "deformation": [self.deformation],
+            "evaluate": [self.evaluate],
+            "render": [self.render],
+            "pipeline": [self.canonical, self.deformation, self.evaluate, self.render],
+        }
+        if stage not in stages:
+            raise DevrfError(f"stage: expected one of {', '.join(stages)}, not {stage!r}")
+        for step in stages[stage]:
+            seed_everything(self.config.seed, verbose=False)
+            step()
+
+    def prepare(self) -> None:
+        """Write the scene to ``data.export`` in the published layout."""
+        folder = getattr(self.datamodule, "export", None)
+        if folder is None:
+            raise DevrfError("data.export: stage=prepare needs a folder; give data.export=PATH")
+        export_blender(self.datamodule.scene, folder)
+        log.info("scene written to %s", folder)
+
+    def canonical(self) -> None:
+        """Learn the scene at rest."""
+        self._fit(instantiate(self.config.canonical, _convert_="all"), "canonical")
+
+    def deformation(self) -> None:
+        """Learn how the scene moves, on top of a canonical checkpoint."""
+        rest = self._load("canonical")
+        if rest.model.deformation is not None:
+            raise DevrfError("ckpt: stage=deformation needs a canonical checkpoint, not a deformation's")
+        build = instantiate(self.config.deformation, _partial_=True, _convert_="all")
+        self._fit(build(rest=rest), "deformation")
+
+    def evaluate(self) -> None:
+        """Score what was learned on held-out views; write metrics and contact sheets."""
+        stored = self._load("deformation", "canonical")
+        records = stored.passport.records
+        rest = self._score(stored, "static")
+        sections: dict[str, Any] = {
+            "scene": self.datamodule.scene.name,
+            "canonical": {**_means(rest), **records.get("canonical", {})},
+        }
+        if stored.model.deformation is not None:
+            moving = self._score(stored, "dynamic")
+            checkpoint = self._checkpoint("deformation")
+            sections["deformation"] = {
+                **_means(moving),
+                "rest_pose_psnr": round(mean(v.rest_pose_psnr for v in moving), 4),
+                **records.get("deformation", {}),
+                "checkpoint_mb": round(checkpoint.stat().st_size / 1e6, 3),
+            }
+        update_json(self.folder / "metrics.json", sections)
+        for name, values in sections.items():
+            if isinstance(values, dict):
+                log.info("%s: %s", name, _line(values))
+
+    def render(self) -> None:
+        """Film the held-out view over time, and an orbit while time runs."""
+        stored, scene = self._load("deformation", "canonical"), self.datamodule.scene
+        film: FilmSettings = instantiate(self.config.video)
+        device = self._device()
+        model = stored.model.to(device)
+        held_out = scene.dynamic.test.cameras[[0] * film.frames]
+        paths = {
+            "held_out": held_out,
+            "orbit": orbit(scene.static.train.cameras, model.canonical.box, film),
+        }
+        for name, cameras in paths.items():
+            path = self.folder / "videos" / f"{name}.mp4"
+            shown = pictures(model, cameras, background_value(scene.background), device)
+            write_video(path, shown, film.fps)
+            log.info("video written to %s", path)
+
+    def _fit(self, stage: ScheduledStage, name: str) -> None:
+        callbacks = [*instantiate(self.config.callbacks).values(), TrainingRecord()]
+        trainer: Trainer = instantiate(
+            self.config.trainer, callbacks=callbacks, logger=self._shared_logger(),
+            default_root_dir=str(self.folder),
+        )
+        trainer.fit(stage, datamodule=self.datamodule)
+        if trainer.interrupted:
+            raise KeyboardInterrupt
+        path = self._own_checkpoint(name)
+        save_checkpoint(trainer, path)
+        log.info("%s: %s; written to %s", name, _line(stage.record), path)
+
+    def _shared_logger(self) -> Any:
+        if self._logger is None:
+            self._logger = instantiate(self.config.logger)
+        return self._logger
+
+    def _own_checkpoint(self, name: str) -> Path:
+        return self.folder / "checkpoints" / f"{name}.ckpt"
+
+    def _checkpoint(self, *names: str) -> Path:
+        """The checkpoint that was asked for, else the first of ``names`` that the run has."""
+        if self.config.ckpt is not None:
+            return Path(self.config.ckpt)
+        found = [path for path in map(self._own_checkpoint, names) if path.exists()]
+        if not found:
+            raise DevrfError(
+                f"{self._own_checkpoint(names[-1])}: no such checkpoint; run stage={names[-1]} "
+                "first, or give ckpt=PATH"
+            )
+        return found[0]
+
+    def _load(self, *names: str) -> Stored:
+        return load_checkpoint(self._checkpoint(*names), self.datamodule.scene)
+
+    def _device(self) -> torch.device:
+        trainer: Trainer = instantiate(self.config.trainer, logger=False)
+        device: torch.device = trainer.strategy.root_device
+        return device
+
+    def _score(self, stored: Stored, capture: CaptureName) -> list[HeldOutView]:
+        scene, device = self.datamodule.scene, self._device()
+        views, model = scene.capture(capture).test, stored.model.to(device)
+        scored = [score(model, views, k, scene.background, device) for k in range(len(views))]
+        write_contact_sheet(self.folder / "images" / f"{capture}.png", scored)
+        return scored
+
+
+def _means(views: list[HeldOutView]) -> dict[str, float]:
+    return {
+        "psnr": round(mean(view.psnr for view in views), 4),
+        "ssim": round(mean(view.ssim for view in views), 5),
+    }
+
+
+def _line(values: dict[str, Any]) -> str:
+    return ", ".join(f"{key} {value}" for key, value in values.items() if value is not None)

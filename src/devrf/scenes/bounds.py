@@ -1,0 +1,136 @@
+"""Where a scene is, found from the cameras that look at it (world units)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from devrf.geometry.box import Box
+from devrf.geometry.cameras import Cameras
+from devrf.scenes.scene import Bounds, Views
+from devrf.scenes.silhouettes import motion_box
+from devrf.scenes.validation import check_bound_scale, problem
+
+# Room for motion where nothing else is known: the published scenes use 1.05 to 2.
+FALLBACK_BOUND_SCALE = 1.5
+# Mean square sine of the angle between the axes and their common direction: about 2 degrees.
+NEARLY_PARALLEL = 1e-3
+# A near plane inside the box's sphere would be 0 or less: stay this share of the way out.
+NEAR_SHARE = 0.02
+
+
+def bound_scale_number(bound_scale: float | str) -> float:
+    """The factor that enlarges the tightened canonical box when there is no motion box.
+
+    Args:
+        bound_scale: "auto" or a number of at least 1; anything else is a DevrfError.
+    """
+    check_bound_scale(bound_scale)
+    return FALLBACK_BOUND_SCALE if bound_scale == "auto" else float(bound_scale)
+
+
+def axes_meet(cameras: Cameras) -> Tensor:
+    """The point (3,) nearest to all optical axes, by least squares.
+
+    Solves Σ (I − d dᵀ) p = Σ (I − d dᵀ) o for axes through o along d.
+
+    Raises:
+        DevrfError: the axes are nearly parallel, or meet behind the cameras.
+    """
+    origin, axis = cameras.positions.double(), cameras.forwards.double()
+    across = torch.eye(3, dtype=torch.float64) - axis[:, :, None] * axis[:, None, :]
+    normal = across.mean(dim=0)
+    if float(torch.linalg.eigvalsh(normal)[0]) < NEARLY_PARALLEL:
+        raise problem(
+            "data.box", "the static cameras look in nearly one direction, so their axes do not "
+            "say where the scene is; set data.box=[[x,y,z],[x,y,z]], data.near and data.far",
+        )
+    point: Tensor = torch.linalg.solve(normal, (across @ origin[:, :, None])[..., 0].mean(dim=0))
+    if float(((point - origin) * axis).sum(dim=1).median()) <= 0:
+        raise problem(
+            "data.box", "the static cameras look away from one another, expected cameras around "
+            "the scene; set data.box=[[x,y,z],[x,y,z]], data.near and data.far",
+        )
+    return point.float()
+
+
+def seen_radius(cameras: Cameras, center: Tensor) -> float:
+    """Radius of the sphere around ``center`` (3,) that the median camera sees whole.
+
+    distance · sin(half of the smaller field of view); a principal point off the middle counts
+    with its nearer edge.
+    """
+    size = cameras.center.new_tensor([cameras.width, cameras.height])
+    edge = torch.minimum(cameras.center, size - cameras.center) / cameras.focal
+    half_angle = torch.atan(edge.clamp(min=1e-3)).amin(dim=1)
+    distance = (cameras.positions - center).norm(dim=1)
+    return float((distance * half_angle.sin()).median())
+
+
+def box_from_cameras(cameras: Cameras) -> Box:
+    """The cube around the point all cameras look at whose half edge is what they see of it.
+
+    Raises:
+        DevrfError: what :func:`axes_meet` raises.
+    """
+    center = axes_meet(cameras)
+    radius = seen_radius(cameras, center)
+    return Box.of(center - radius, center + radius)
+
+
+def depth_range(cameras: Cameras, box: Box) -> tuple[float, float]:
+    """(near, far): distances from any of the cameras between which the box's sphere lies.
+
+    The sphere around the box: nearest camera − half diagonal, farthest camera + half diagonal.
+    """
+    low, high = box.corners(cameras.positions)
+    half_diagonal = float((high - low).norm()) / 2
+    distance = (cameras.positions - (low + high) / 2).norm(dim=1)
+    nearest, farthest = float(distance.min()), float(distance.max())
+    return max(NEAR_SHARE * farthest, nearest - half_diagonal), farthest + half_diagonal
+
+
+def inward_bounds(
+    static: Views,
+    dynamic: Views,
+    everyone: list[Views],
+    *,
+    bound_scale: float | str = "auto",
+    near: float | None = None,
+    far: float | None = None,
+    box: Box | None = None,
+) -> Bounds:
+    """Bounds of a scene that its cameras look in at.
+
+    Args:
+        static: training views at rest, whose cameras give the box.
+        dynamic: training views in motion, whose mattes give the motion box.
+        everyone: all views, test included; near and far hold for all their cameras.
+        bound_scale: "auto" (silhouettes where there are mattes) or a number ≥ 1.
+        near: distance in world units, or None for the cameras to say.
+        far: distance in world units, or None.
+        box: the scene's box, or None.
+
+    Raises:
+        DevrfError: the cameras do not say where the scene is, or near ≥ far.
+    """
+    scale = bound_scale_number(bound_scale)
+    box = box or box_from_cameras(static.cameras)
+    motion, source = None, f"canonical box x bound scale {scale:g}"
+    if bound_scale == "auto":
+        motion = motion_box(dynamic, box)
+        if motion is None:
+            source += " (no mattes from two cameras at every time)"
+        else:
+            views, frames = len(set(dynamic.view.tolist())), len(set(dynamic.times.tolist()))
+            source = f"silhouettes of {views} views x {frames} frames"
+    reach = box if motion is None else box.union(motion)
+    ranges = [depth_range(views.cameras, reach) for views in everyone]
+    near = min(r[0] for r in ranges) if near is None else float(near)
+    far = max(r[1] for r in ranges) if far is None else float(far)
+    if not 0 <= near < far:
+        raise problem(
+            "data.near, data.far", f"expected 0 <= near < far, not {near:g} and {far:g}; "
+            "set both, in world units, or leave them null",
+        )
+    return Bounds(box, near, far, motion, scale, source)

@@ -1,0 +1,125 @@
+"""Optical flow where a scene brings none: estimated once between the frames of each view."""
+
+from __future__ import annotations
+
+import logging
+import time
+from pathlib import Path
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from devrf.geometry.clock import FrameClock
+from devrf.scenes.flow_cache import content_key, load_flow, save_flow
+from devrf.scenes.flow_estimators import estimator
+from devrf.scenes.scene import OpticalFlow, Views
+from devrf.scenes.validation import check_choice, problem
+
+log = logging.getLogger(__name__)
+
+FlowMethod = Literal["dis", "raft"]
+
+# A vector is trusted when going there and back ends this near: 1 px, and 5 % of its length.
+CLOSED_PIXELS = 1.0
+CLOSED_SHARE = 0.05
+MATTE_THRESHOLD = 127
+
+
+def estimate_flow(views: Views, method: FlowMethod, cache: Path | None = None) -> OpticalFlow:
+    """Backward optical flow of each image to the one a frame earlier in its view.
+
+    A fixed camera's images follow one another by time; a moving camera's images (each its own
+    view) are taken as one sequence. Images are compared on white. A vector is valid where the
+    forward flow leads back, |b(x) + f(x + b(x))| < 1 px + 5 % · |b(x)|, where it stays in the
+    image, and on the matte where there is one.
+
+    Args:
+        views: N images of the scene in motion.
+        method: "dis" (OpenCV, on the CPU) or "raft" (torchvision, on the GPU if there is one).
+        cache: an npz to read the flow from, or to write it to; ignored and written again when
+            it belongs to other images or is damaged.
+
+    Raises:
+        DevrfError: an unknown method, its library or weights are missing, or the images have
+            no two distinct times.
+    """
+    check_choice("data.flow", method, get_args(FlowMethod))
+    pairs = frame_pairs(views)
+    if not pairs:
+        raise problem("data.flow", "no view has two consecutive frames to estimate flow between")
+    key = content_key(views, method)
+    if cache is not None:
+        stored = load_flow(cache, key, (len(views), views.height, views.width))
+        if stored is not None:
+            log.info("read estimated optical flow from %s", cache)
+            return stored
+    start = time.perf_counter()
+    between = estimator(method)
+    count = (len(views), views.height, views.width)
+    flow = OpticalFlow(torch.zeros((*count, 2)), torch.zeros(count, dtype=torch.bool))
+    for done, (image, earlier) in enumerate(pairs):
+        now, before = _on_white(views.pixels[image]), _on_white(views.pixels[earlier])
+        backward, forward = between(now, before), between(before, now)
+        valid = consistent(backward, forward)
+        if views.has_alpha:
+            valid &= views.pixels[image, ..., 3].cpu() > MATTE_THRESHOLD
+        flow.valid[image] = valid
+        flow.vectors[image] = backward * valid[..., None]
+        if (done + 1) % 100 == 0:
+            log.info("optical flow: %d of %d pairs", done + 1, len(pairs))
+    log.info(
+        "estimated optical flow (%s) of %d pairs in %.1f s", method, len(pairs),
+        time.perf_counter() - start,
+    )
+    if cache is not None:
+        save_flow(cache, key, flow)
+    return flow
+
+
+def frame_pairs(views: Views) -> list[tuple[int, int]]:
+    """(image, image one frame earlier in its view) for each image that has such a predecessor."""
+    if float(views.times.max()) == 0:
+        return []
+    frame = FrameClock.from_times(views.times).frames_of(views.times)
+    moving = len(set(views.view.tolist())) == len(views)
+    view = torch.zeros_like(views.view) if moving else views.view
+    at = {(v, f): i for i, (v, f) in enumerate(zip(view.tolist(), frame.tolist(), strict=True))}
+    return sorted((i, at[v, f - 1]) for (v, f), i in at.items() if (v, f - 1) in at)
+
+
+def consistent(backward: Tensor, forward: Tensor) -> Tensor:
+    """Where two flows agree.
+
+    Args:
+        backward: (H, W, 2) from an image to the earlier one, pixels, x then y.
+        forward: (H, W, 2) from the earlier image to this one.
+
+    Returns:
+        (H, W) bool: the end point is in the earlier image, and the way back leads to within
+        1 px + 5 % of the vector's length.
+    """
+    height, width = backward.shape[:2]
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    end = torch.stack([x, y], dim=-1) + backward
+    size = torch.tensor([width, height])
+    inside = ((end >= 0) & (end <= size - 1)).all(dim=-1)
+    grid = end / (size - 1) * 2 - 1
+    back: Tensor = grid_sample(
+        forward.permute(2, 0, 1)[None], grid[None], mode="bilinear", padding_mode="border",
+        align_corners=True,
+    )[0].permute(1, 2, 0)
+    miss: Tensor = torch.linalg.vector_norm(backward + back, dim=-1)
+    length: Tensor = torch.linalg.vector_norm(backward, dim=-1)
+    # NaN compares false: what is not a number is not trusted.
+    return inside & (miss < CLOSED_PIXELS + CLOSED_SHARE * length)
+
+
+def _on_white(image: Tensor) -> Tensor:
+    """(H, W, 3) uint8 on the CPU: an RGBA image over white; an RGB image as it is."""
+    image = image.cpu()
+    if image.shape[2] == 3:
+        return image
+    alpha = image[..., 3:].float() / 255
+    return (image[..., :3] * alpha + 255 * (1 - alpha)).round().to(torch.uint8)

@@ -1,0 +1,81 @@
+"""Solid textures: soft-edged patterns painted in a part's own rest coordinates."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+Rgb = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Paint:
+    """Two colours mixed by a product of cosines along the part's axes.
+
+    One period makes stripes, two a checkerboard, three a checkerboard in space; a threshold
+    above zero shrinks the accent from half of the surface to spots.
+
+    Attributes:
+        base: colour where the pattern is low.
+        accent: colour where the pattern is high, as at the part's origin.
+        periods: length of a full period along x, y, z in world units; 0: constant along it.
+        threshold: where, in −1 … 1, base turns into accent.
+        sharpness: steepness of the edges. They stay soft, so that an image of about 100 pixels
+            does not alias.
+    """
+
+    base: Rgb
+    accent: Rgb
+    periods: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    threshold: float = 0.0
+    sharpness: float = 6.0
+
+
+@dataclass(frozen=True)
+class PaintedParts:
+    """The paints of K parts and the frames they are painted in.
+
+    Attributes:
+        rotation: (K, 3, 3) axes of each part as columns, world ← part, at rest.
+        origin: (K, 3) origin of each part at rest, world units.
+        base: (K, 3) colours.
+        accent: (K, 3) colours.
+        wave: (K, 3) angular frequencies along the part's axes, radians per world unit.
+        edge: (K, 2) threshold and sharpness.
+    """
+
+    rotation: Tensor
+    origin: Tensor
+    base: Tensor
+    accent: Tensor
+    wave: Tensor
+    edge: Tensor
+
+    @staticmethod
+    def of(paints: Sequence[Paint], rotation: Tensor, origin: Tensor) -> PaintedParts:
+        """The table of ``paints`` (K of them) in frames (K, 3, 3), (K, 3)."""
+
+        def table(rows: list[tuple[float, ...]]) -> Tensor:
+            return torch.tensor(rows, dtype=torch.float64)
+
+        return PaintedParts(
+            rotation=rotation,
+            origin=origin,
+            base=table([p.base for p in paints]),
+            accent=table([p.accent for p in paints]),
+            wave=table([tuple(2 * math.pi / q if q else 0.0 for q in p.periods) for p in paints]),
+            edge=table([(p.threshold, p.sharpness) for p in paints]),
+        )
+
+    def color(self, rest: Tensor, part: Tensor) -> Tensor:
+        """Albedo (M, 3) of rest points (M, 3) of the parts (M,)."""
+        offset = rest - self.origin.to(rest)[part]
+        local = torch.einsum("mji,mj->mi", self.rotation.to(rest)[part], offset)
+        pattern = (local * self.wave.to(rest)[part]).cos().prod(dim=-1)
+        threshold, sharpness = self.edge.to(rest)[part].unbind(-1)
+        share = ((pattern - threshold) * sharpness).sigmoid()[:, None]
+        return torch.lerp(self.base.to(rest)[part], self.accent.to(rest)[part], share)

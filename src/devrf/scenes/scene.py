@@ -1,0 +1,179 @@
+"""What a scene is, whatever files it came from: frozen, typed, on the host, uint8."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from devrf.geometry.box import Box
+from devrf.geometry.cameras import Cameras
+from devrf.geometry.clock import FrameClock
+
+Background = Literal["white", "black", "random"]
+CaptureName = Literal["static", "dynamic"]
+
+
+@dataclass(frozen=True)
+class OpticalFlow:
+    """Backward optical flow of N images: where each pixel was one frame earlier in its own view.
+
+    Attributes:
+        vectors: (N, H, W, 2) float32, pixels, x then y: (pixel one frame earlier) − (this pixel).
+        valid: (N, H, W) bool; False where the flow is unknown or not to be trusted, and on all
+            of an image without an earlier frame.
+    """
+
+    vectors: Tensor
+    valid: Tensor
+
+
+@dataclass(frozen=True)
+class Views:
+    """N posed images of one size.
+
+    Attributes:
+        pixels: (N, H, W, 3 or 4) uint8, RGB or RGBA (alpha not premultiplied).
+        cameras: N cameras of the same width and height, world units.
+        times: (N,) float32 in [0, 1].
+        view: (N,) int64, which fixed camera took the image (0 … V−1); in a static set, or for a
+            moving camera, the image's own number.
+        names: N file names or labels, for messages and tables.
+        flow: backward optical flow, or None where there is none.
+        depth: (N, H, W) float32 distance along each pixel's ray in world units, +inf where the
+            ray hits nothing; None where it is unknown.
+    """
+
+    pixels: Tensor
+    cameras: Cameras
+    times: Tensor
+    view: Tensor
+    names: tuple[str, ...]
+    flow: OpticalFlow | None = None
+    depth: Tensor | None = None
+
+    def __len__(self) -> int:
+        return self.pixels.shape[0]
+
+    @property
+    def width(self) -> int:
+        """Image width in pixels."""
+        return self.pixels.shape[2]
+
+    @property
+    def height(self) -> int:
+        """Image height in pixels."""
+        return self.pixels.shape[1]
+
+    @property
+    def has_alpha(self) -> bool:
+        """Whether the images carry a matte."""
+        return self.pixels.shape[3] == 4
+
+    def __getitem__(self, index: Tensor) -> Views:
+        """The views at positions ``index`` (K,) int64."""
+        return Views(
+            self.pixels[index],
+            self.cameras[index],
+            self.times[index],
+            self.view[index],
+            tuple(self.names[i] for i in index.tolist()),
+            None
+            if self.flow is None
+            else OpticalFlow(self.flow.vectors[index], self.flow.valid[index]),
+            None if self.depth is None else self.depth[index],
+        )
+
+    def to(self, device: torch.device | str) -> Views:
+        """The same views on ``device``; images stay uint8."""
+        return replace(
+            self,
+            pixels=self.pixels.to(device),
+            cameras=self.cameras.to(device),
+            times=self.times.to(device),
+            view=self.view.to(device),
+            flow=None
+            if self.flow is None
+            else OpticalFlow(self.flow.vectors.to(device), self.flow.valid.to(device)),
+            depth=None if self.depth is None else self.depth.to(device),
+        )
+
+
+@dataclass(frozen=True)
+class Capture:
+    """One recording session: images to learn from and images held out.
+
+    Attributes:
+        train: what the fields are learned from.
+        test: held-out views, never seen in training.
+    """
+
+    train: Views
+    test: Views
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Where the scene is, in world units.
+
+    Attributes:
+        box: holds everything that can be seen of the static scene (before it is tightened).
+        near: distance from a camera under which nothing is.
+        far: distance from a camera beyond which nothing is.
+        motion: holds everything that moves at any time, or None where it is unknown and the
+            canonical box is enlarged by ``scale`` instead.
+        scale: how much larger than the tightened canonical box the fields' box is made, about
+            its centre, so that motion has room; not used when ``motion`` is known.
+        source: where the motion box came from, in words, for the log.
+    """
+
+    box: Box
+    near: float
+    far: float
+    motion: Box | None
+    scale: float
+    source: str
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A static → dynamic capture.
+
+    Attributes:
+        name: short name for folders and tables.
+        kind: ``inward`` (cameras around the scene) or ``forward`` (cameras before it, NDC).
+        static: many views of the scene at rest (t = 0).
+        dynamic: a few fixed views of the scene as it deforms.
+        bounds: where the scene is.
+        background: what is behind the matte.
+    """
+
+    name: str
+    kind: Literal["inward", "forward"]
+    static: Capture
+    dynamic: Capture
+    bounds: Bounds
+    background: Background
+
+    def capture(self, name: CaptureName) -> Capture:
+        """The capture called ``static`` or ``dynamic``."""
+        return self.static if name == "static" else self.dynamic
+
+    @property
+    def clock(self) -> FrameClock:
+        """The clock of the dynamic training views' times."""
+        return FrameClock.from_times(self.dynamic.train.times)
+
+    @property
+    def fingerprint(self) -> str:
+        """A short hash of cameras, times and image sizes: tells one scene from another."""
+        digest = hashlib.sha256(self.kind.encode())
+        for capture in (self.static, self.dynamic):
+            for views in (capture.train, capture.test):
+                digest.update(f"{tuple(views.pixels.shape)}".encode())
+                for part in (views.cameras.camera_to_world, views.cameras.focal, views.times):
+                    digest.update(part.float().cpu().numpy().tobytes())
+        return digest.hexdigest()[:16]

@@ -1,0 +1,140 @@
+"""The box of everything that moves, carved from the dynamic views' mattes (visual hulls).
+
+A hull from a few views holds the object and more: the box is an outer bound.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from devrf.geometry.box import Box
+from devrf.geometry.clock import FrameClock
+from devrf.scenes.scene import Views
+
+# NumPy for the carving: hundreds of small steps, which torch's threads only slow down.
+Array = npt.NDArray[Any]
+
+OUTSIDE, INSIDE, UNSEEN = 0, 1, 2
+# A pixel belongs to the silhouette when at least half of it is covered.
+MATTE_THRESHOLD = 127
+
+
+def motion_box(
+    views: Views, box: Box, *, resolution: int = 64, search: float = 1.5
+) -> Box | None:
+    """The box of the union over all frames of the visual hulls.
+
+    A point belongs to a frame's hull when at least two views see it inside their silhouettes
+    and none rules it out. A view rules out what it sees beside its silhouette, and what lies
+    beyond its image when the silhouette keeps clear of the image's border: then nothing is cut
+    off. (A second object that is out of one view while the first is whole in it goes unseen.)
+
+    Args:
+        views: the dynamic training views.
+        box: where the static scene is, world units.
+        resolution: grid points along each edge of the searched box.
+        search: size of the searched box as a multiple of ``box``.
+
+    Returns:
+        The box in world units, a grid cell wider than the hulls on each side and not larger
+        than the searched box; None without mattes, with fewer than two different cameras at
+        some time, or when all hulls are empty.
+    """
+    frames = _frames(views)
+    if frames is None:
+        return None
+    area = box.scaled(search)
+    cell = area.longest / (resolution - 1)
+    points = area.grid_points((resolution,) * 3, views.cameras.focal).reshape(-1, 3)
+    masks = _silhouettes(views, _reach(views, area, cell))
+    cached: dict[int, Array] = {}
+    hull = np.zeros(len(points), dtype=np.bool_)
+    for images in frames:
+        # Only points not yet in the union need a look; each view leaves fewer of them.
+        left = np.flatnonzero(~hull)
+        seen = np.zeros(len(left), dtype=np.int64)
+        for image in images:
+            number = int(views.view[image])
+            if number not in cached:
+                if len(cached) >= 16:  # moving cameras: no projection is asked for twice
+                    cached.clear()
+                cached[number] = _pixel_index(views, image, points)
+            verdict = masks[image][cached[number][left]]
+            keep = verdict != OUTSIDE
+            left, seen = left[keep], seen[keep] + (verdict[keep] == INSIDE)
+        hull[left[seen >= 2]] = True
+    if not hull.any():
+        return None
+    held = points[torch.from_numpy(hull).to(points.device)]
+    low, high = held.amin(dim=0) - cell, held.amax(dim=0) + cell
+    return Box.of(low, high).clipped(area)
+
+
+def _frames(views: Views) -> list[list[int]] | None:
+    """The images of each time, or None when mattes or a second camera are missing somewhere."""
+    if not views.has_alpha or len(views.times) == 0 or float(views.times.max()) == 0:
+        return None
+    clock = FrameClock.from_times(views.times)
+    frame_of = clock.frames_of(views.times)
+    frames = [(frame_of == k).nonzero()[:, 0].tolist() for k in sorted(set(frame_of.tolist()))]
+    if any(len({int(views.view[i]) for i in images}) < 2 for images in frames):
+        return None
+    return frames
+
+
+def _reach(views: Views, area: Box, cell: float) -> int:
+    """Pixels by which silhouettes are dilated: half a grid cell's diagonal at the box's centre.
+
+    With less, a part thinner than a cell could pass between the grid's points unseen.
+    """
+    low, high = area.corners(views.cameras.positions)
+    distance = float((views.cameras.positions - (low + high) / 2).norm(dim=1).median())
+    focal = float(views.cameras.focal.amax())
+    return max(1, math.ceil(math.sqrt(3) / 2 * cell * focal / max(distance, 1e-6)))
+
+
+def _silhouettes(views: Views, reach: int) -> Array:
+    """(N, H·W + 1) uint8: whether a pixel is INSIDE or OUTSIDE the dilated silhouette.
+
+    The last entry stands for all that is beyond the image: OUTSIDE, or UNSEEN where the image's
+    border cuts the silhouette or the whole object off.
+    """
+    matte = views.pixels[..., 3].cpu().numpy() > MATTE_THRESHOLD
+    count, height, width = matte.shape
+    at_border = matte[:, [0, -1]].any(axis=(1, 2)) | matte[:, :, [0, -1]].any(axis=(1, 2))
+    cut_off = at_border | ~matte.any(axis=(1, 2))
+    codes = np.empty((count, height * width + 1), dtype=np.uint8)
+    codes[:, :-1] = _dilated(matte, reach).reshape(count, -1)
+    codes[:, -1] = np.where(cut_off, UNSEEN, OUTSIDE)
+    return codes
+
+
+def _dilated(masks: Array, reach: int) -> Array:
+    """Masks (N, H, W) grown by ``reach`` pixels to each side, as a square."""
+    for axis in (1, 2):
+        done = 0
+        # A step of up to 2·done + 1 leaves no gap: doubling reaches far in a few passes.
+        while done < reach:
+            step = min(max(1, done), reach - done)
+            grown = masks.copy()
+            source, target = np.moveaxis(masks, axis, 0), np.moveaxis(grown, axis, 0)
+            target[step:] |= source[:-step]
+            target[:-step] |= source[step:]
+            masks, done = grown, done + step
+    return masks
+
+
+def _pixel_index(views: Views, image: int, points: Tensor) -> Array:
+    """(P,) where each point falls in the flattened image; H·W where the image does not hold it."""
+    camera = torch.full((len(points),), image, device=points.device)
+    pixels, depth = views.cameras.project(camera, points)
+    column, row = pixels.floor().unbind(-1)
+    held = (depth > 0) & (column >= 0) & (column < views.width) & (row >= 0) & (row < views.height)
+    index = row.long() * views.width + column.long()
+    return torch.where(held, index, views.width * views.height).cpu().numpy()

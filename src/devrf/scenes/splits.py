@@ -1,0 +1,167 @@
+"""Which camera and which time each image of a split belongs to, found from poses and times."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from devrf.geometry.cameras import Cameras
+from devrf.geometry.clock import FrameClock
+from devrf.scenes.images import load_images
+from devrf.scenes.scene import Views
+from devrf.scenes.transforms import Transforms, read_transforms
+from devrf.scenes.validation import problem
+
+log = logging.getLogger(__name__)
+
+# Two poses are one camera when no entry differs by more than this, relative to its distance.
+SAME_POSE = 1e-4
+
+
+@dataclass(frozen=True)
+class Split:
+    """A split that is ordered but not yet loaded.
+
+    Attributes:
+        transforms: what the file says, in the order of the file.
+        times: (N,) float32 in [0, 1].
+        view: (N,) int64: the fixed camera of each image, or the image's own number.
+        fixed: whether the cameras stand still while time passes.
+        index: (K,) int64 the positions in the file that are used, ascending.
+    """
+
+    transforms: Transforms
+    times: Tensor
+    view: Tensor
+    fixed: bool
+    index: Tensor
+
+    def where(self, keep: Tensor) -> Split:
+        """The same split, with only those used images for which the mask ``keep`` (N,) holds."""
+        return Split(
+            self.transforms, self.times, self.view, self.fixed, self.index[keep[self.index]]
+        )
+
+    @property
+    def used_times(self) -> Tensor:
+        """(K,) the times of the used images."""
+        return self.times[self.index]
+
+
+def distinct_poses(poses: Tensor) -> Tensor:
+    """(N,) int64: which of the distinct poses each of (N, 3, 4) is, in order of appearance."""
+    scale = 1 + float(poses[:, :, 3].norm(dim=1).median())
+    numbers, known = [], poses[:0]
+    for pose in poses:
+        same = ((known - pose).abs().amax(dim=(1, 2)) <= SAME_POSE * scale).nonzero()
+        if len(same) == 0:
+            numbers.append(len(known))
+            known = torch.cat([known, pose[None]])
+        else:
+            numbers.append(int(same[0]))
+    return torch.tensor(numbers, dtype=torch.int64)
+
+
+def static_split(file: Path, root: Path) -> Split:
+    """A split of a scene at rest: every image its own view, time 0 unless the file says more."""
+    transforms = read_transforms(file, root)
+    count = len(transforms.images)
+    times = torch.zeros(count) if transforms.times is None else torch.tensor(transforms.times)
+    return Split(transforms, times, torch.arange(count), False, torch.arange(count))
+
+
+def dynamic_split(file: Path, root: Path) -> Split:
+    """A split of a scene in motion.
+
+    Cameras are fixed when each distinct pose took two images or more on average; otherwise the
+    camera moves and each image is its own view. Without times in the file, the images of V
+    fixed views are time-major (frame = position // V) and those of a moving camera consecutive.
+
+    Raises:
+        DevrfError: what :func:`read_transforms` raises, or there are no times and the fixed
+            views do not take turns.
+    """
+    transforms = read_transforms(file, root)
+    order = torch.arange(len(transforms.images))
+    camera = distinct_poses(transforms.poses)
+    views = int(camera.max()) + 1
+    fixed = len(order) >= 2 * views
+    if transforms.times is not None:
+        times = torch.tensor(transforms.times)
+    else:
+        step = views if fixed else 1
+        if fixed and (len(order) % views or bool((camera != order % views).any())):
+            raise problem(
+                file, f"no times, and its {views} fixed views do not take turns; add a time to "
+                "every frame, or list all views of frame 0, then all of frame 1, and so on",
+            )
+        frames = order // step
+        times = frames / frames.max().clamp(min=1)
+    return Split(transforms, times.float(), camera if fixed else order, fixed, order)
+
+
+def first_views(split: Split, count: int | None) -> Split:
+    """The images of the first ``count`` fixed views (None: all); else DevrfError."""
+    if count is None:
+        return split
+    file = split.transforms.file
+    if not split.fixed:
+        raise problem(file, "data.train_views needs fixed cameras, and these move; leave it null")
+    views = int(split.view.max()) + 1
+    if count > views:
+        raise problem(
+            file, f"data.train_views={count}, but the set has {views} views; ask for fewer"
+        )
+    return split.where(split.view < count)
+
+
+def evenly_spread(times: Tensor, frames: int) -> Tensor | None:
+    """``frames`` of the distinct ``times`` (any shape), evenly spread, first and last included.
+
+    Returns:
+        (frames,) float32 ascending, or None when there are no more than ``frames`` distinct times.
+    """
+    distinct = distinct_times(times)
+    if len(distinct) <= frames:
+        return None
+    return distinct[torch.linspace(0, len(distinct) - 1, frames).round().long()]
+
+
+def distinct_times(times: Tensor) -> Tensor:
+    """The distinct values (T,) in ``times`` (any shape), ascending."""
+    ordered = times.flatten().sort().values
+    fresh = torch.ones(len(ordered), dtype=torch.bool)
+    fresh[1:] = ordered.diff() > FrameClock.TOLERANCE
+    return ordered[fresh]
+
+
+def at_times(split: Split, times: Tensor) -> Split:
+    """The images of ``split`` taken at one of ``times`` (T,)."""
+    gap = (split.times[:, None] - times).abs().amin(dim=1)
+    return split.where(gap <= FrameClock.TOLERANCE)
+
+
+def load_views(split: Split, root: Path, downscale: int) -> Views:
+    """Read the used images of a split; cameras are those of the smaller images.
+
+    Raises:
+        DevrfError: what :func:`devrf.scenes.images.load_images` raises.
+    """
+    used = split.index
+    files = [split.transforms.images[i] for i in used.tolist()]
+    loaded = load_images(files, downscale)
+    focal, center = split.transforms.intrinsics.in_pixels(loaded.width, loaded.height)
+    cameras = Cameras(
+        split.transforms.poses[used],
+        torch.tensor([focal]).repeat(len(used), 1),
+        torch.tensor([center]).repeat(len(used), 1),
+        loaded.width,
+        loaded.height,
+    ).resized(loaded.pixels.shape[2], loaded.pixels.shape[1])
+    base = root.resolve()
+    names = tuple(str(file.relative_to(base)) for file in files)
+    return Views(loaded.pixels, cameras, split.times[used], split.view[used], names)

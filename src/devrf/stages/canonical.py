@@ -1,0 +1,325 @@
+"""The canonical stage: static views → the scene at rest."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from devrf.data.batch import background_color, gather_batch
+from devrf.data.pool import PixelPool, all_pixels
+from devrf.errors import DevrfError
+from devrf.fields.architecture import Architecture
+from devrf.fields.occupancy import Occupancy, bounding_box, dilate
+from devrf.fields.canonical import CanonicalField
+from devrf.geometry.box import Box
+from devrf.geometry.cameras import Cameras
+from devrf.losses.composer import WeightedLoss
+from devrf.losses.photometric import PHOTOMETRIC_TERMS, Prediction
+from devrf.ops.adam import GridAdam
+from devrf.rendering.model import SceneModel
+from devrf.rendering.render import RenderSettings, render
+from devrf.rendering.sampling import hits
+from devrf.scenes.scene import CaptureName, Views
+from devrf.scenes.visual_hull import visual_hull
+from devrf.stages.checkpoint import Passport, Stored
+from devrf.stages.schedules import CanonicalPhase, CanonicalSchedule
+from devrf.stages.stage import Phase, ScheduledStage
+
+log = logging.getLogger(__name__)
+
+SEARCH_LOSS = {"color": 1.0, "per_sample_color": 0.1, "entropy": 0.01}
+FINE_LOSS = {"color": 1.0, "per_sample_color": 0.01, "entropy": 0.001}
+
+
+@dataclass(frozen=True)
+class CanonicalRates:
+    """Base learning rates of the canonical stage (method §2, Optimiser).
+
+    Attributes:
+        density: of the density grid.
+        color: of the feature grid.
+        decoder: of the colour decoder.
+    """
+
+    density: float = 0.1
+    color: float = 0.1
+    decoder: float = 1e-3
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How rays are sampled.
+
+    Attributes:
+        step: distance between samples in voxels.
+        alpha_threshold: opacity, and weight, under which a sample is not worth its colour.
+        search_alpha_threshold: the same during the coarse geometry search, which begins with
+            next to nothing everywhere.
+        occupancy_threshold: opacity of a step under which a cell counts as empty.
+    """
+
+    step: float = 0.5
+    alpha_threshold: float = 1e-4
+    search_alpha_threshold: float = 1e-7
+    occupancy_threshold: float = 1e-3
+
+
+class CanonicalStage(ScheduledStage):
+    """Learns the canonical field of an inward-facing scene (method §2).
+
+    First the coarse geometry is searched in the box of the scene's bounds; then the box is
+    tightened around it and enlarged so that motion has room, and the radiance field is learned
+    inside, on rays that meet the coarse geometry.
+    """
+
+    capture: ClassVar[CaptureName] = "static"
+
+    def __init__(
+        self,
+        schedule: CanonicalSchedule | None = None,
+        architecture: Architecture | None = None,
+        rates: CanonicalRates | None = None,
+        sampling: Sampling | None = None,
+        search_loss: Mapping[str, float] = SEARCH_LOSS,
+        fine_loss: Mapping[str, float] = FINE_LOSS,
+        iterations_per_step: int = 10,
+    ) -> None:
+        """Build the stage; the defaults are the paper's for inward-facing scenes.
+
+        Args:
+            schedule: resolutions and iterations.
+            architecture: sizes of the field.
+            rates: learning rates.
+            sampling: how rays are sampled.
+            search_loss: weights of the loss terms while the coarse geometry is searched.
+            fine_loss: their weights afterwards.
+            iterations_per_step: optimiser iterations in one Lightning step.
+        """
+        super().__init__(iterations_per_step)
+        self.schedule = schedule or CanonicalSchedule()
+        self.architecture = architecture or Architecture()
+        self.rates = rates or CanonicalRates()
+        self.sampling = sampling or Sampling()
+        self.losses = {
+            "search": WeightedLoss(PHOTOMETRIC_TERMS, search_loss),
+            "fine": WeightedLoss(PHOTOMETRIC_TERMS, fine_loss),
+        }
+        self._pool: PixelPool | None = None
+        self.scene_model: SceneModel | None = None
+        self._optimizer: GridAdam | None = None
+
+    @property
+    def resolution(self) -> tuple[int, int, int]:
+        """Present shape of the density and feature grids."""
+        return self.model.canonical.density.shape
+
+    @property
+    def model(self) -> SceneModel:
+        """The rest state learned so far."""
+        assert self.scene_model is not None, "the stage has not been set up"
+        return self.scene_model
+
+    @property
+    def optimizer(self) -> GridAdam:
+        """Adam over density, features and decoder, in that order of groups."""
+        assert self._optimizer is not None, "the stage has not been set up"
+        return self._optimizer
+
+    @property
+    def total_iterations(self) -> int:
+        """Iterations of search and fine stage together."""
+        return self.schedule.total
+
+    def phase_at(self, iteration: int) -> Phase:
+        """The schedule's phase."""
+        return self.schedule.phase(iteration)
+
+    def learning_rate_factor(self, iteration: int) -> float:
+        """The schedule's exponential decay."""
+        return self.schedule.learning_rate_factor(iteration)
+
+    def setup(self, stage: str) -> None:
+        """Build the field of the first phase in the scene's box."""
+        if self.scene_model is not None:
+            return
+        box, first = self.scene.bounds.box, self.schedule.phase(0)
+        side = self.schedule.search_side
+        occupancy = Occupancy(self._possible(box, box.grid_shape(side**3)), box)
+        if first.kind == "search":
+            canonical = self.architecture.search_field(box, first.voxels)
+        else:
+            canonical = self._radiance_field(occupancy, first)
+        self.scene_model = SceneModel(canonical, occupancy, self._settings(first))
+        rates = self.rates
+        self._optimizer = GridAdam(
+            [
+                {"params": list(canonical.density.parameters()), "lr": rates.density},
+                {"params": list(canonical.color.parameters()), "lr": rates.color},
+                {"params": list(canonical.decoder.parameters()), "lr": rates.decoder},
+            ]
+        )
+        for group in self._optimizer.param_groups:
+            group["base_lr"] = group["lr"]
+
+    def _settings(self, phase: CanonicalPhase) -> RenderSettings:
+        bounds, sampling = self.scene.bounds, self.sampling
+        searching = phase.kind == "search"
+        threshold = sampling.search_alpha_threshold if searching else sampling.alpha_threshold
+        return RenderSettings(sampling.step, threshold, bounds.near, bounds.far)
+
+    def _possible(self, box: Box, shape: tuple[int, int, int]) -> Tensor:
+        """Where matter can be before anything is learned (X, Y, Z).
+
+        Not nearer to a camera than its near plane: a cloud before a lens would explain its
+        picture perfectly. And inside the visual hull, if the schedule carves.
+        """
+        views = self.scene.static.train
+        points = box.grid_points(shape, views.cameras.focal)
+        possible = torch.ones(shape, dtype=torch.bool)
+        for position in views.cameras.positions:
+            lens = box.nearest(position) - position
+            if float(lens.norm()) < self.scene.bounds.near:
+                possible &= (points - position).norm(dim=-1) > self.scene.bounds.near
+        if self.schedule.carve and views.has_alpha:
+            possible &= visual_hull(views, box, shape)
+        return possible
+
+    def enter(self, phase: Phase) -> None:
+        """Make grids, occupancy, rays and optimiser ready for ``phase``."""
+        assert isinstance(phase, CanonicalPhase)
+        previous, self.phase = self.phase, phase
+        views = self.scene.static.train
+        self.model.settings = self._settings(phase)
+        if isinstance(previous, CanonicalPhase) and previous.kind != phase.kind:
+            self._begin_fine(phase)
+        elif previous is not None:
+            self.model.canonical.resize(phase.voxels)
+            self._refresh_occupancy()
+        self._pool = self._useful_pixels(views, everywhere=phase.kind == "search")
+        self._hand_over(views.cameras, skip_zero=phase.kind == "fine")
+
+    def _begin_fine(self, phase: CanonicalPhase) -> None:
+        """Tighten the box around what the search found, enlarge it, start the radiance field."""
+        search, occupancy = self.model.canonical, self.model.occupancy
+        found = search.voxel_alpha(self.sampling.step) > self.sampling.occupancy_threshold
+        occupancy.replace(dilate(found & occupancy.mask, 1))
+        self.model.canonical = self._radiance_field(occupancy, phase).to(self.device)
+
+    def _radiance_field(self, occupancy: Occupancy, phase: CanonicalPhase) -> CanonicalField:
+        """A new radiance field in the box around what is occupied, with room for motion."""
+        tight = bounding_box(occupancy.mask, occupancy.box)
+        if tight is None:
+            raise DevrfError(
+                "the geometry search found nothing opaque in the box "
+                f"{occupancy.box.low} to {occupancy.box.high}: check data.box, data.near and "
+                "data.background, or give it more schedule.canonical.search_iterations"
+            )
+        box = self._enlarged(tight)
+        share = 100 * occupancy.share
+        log.info("%.1f%% of the searched box may be occupied; fields live in %s", share, box)
+        return self.architecture.radiance_field(box, phase.voxels, self.schedule.side**3)
+
+    def _enlarged(self, box: Box) -> Box:
+        """The box with room for motion: the scene's motion box, or a multiple of the box."""
+        bounds = self.scene.bounds
+        if bounds.motion is None:
+            return box.scaled(bounds.scale)
+        return box.scaled(1.05).union(bounds.motion)
+
+    @torch.no_grad()
+    def _refresh_occupancy(self) -> None:
+        """Look again where something is, on the field's own grid, within what was occupied."""
+        field = self.model.canonical
+        found = dilate(
+            field.voxel_alpha(self.sampling.step) > self.sampling.occupancy_threshold, 1
+        )
+        points = field.box.grid_points(field.density.shape, field.density.values)
+        before = self.model.occupancy.at(points.view(-1, 3)).view(found.shape)
+        self.model.occupancy.replace(found & before, field.box)
+
+    def _useful_pixels(self, views: Views, *, everywhere: bool) -> PixelPool:
+        """The pixels whose rays meet something that may be occupied."""
+        device = self.device
+        pool = all_pixels(views, torch.arange(len(views), device=device))
+        if everywhere:
+            return pool
+        cameras, settings = views.cameras.to(device), self.model.settings
+        box = self.model.canonical.box
+        kept = torch.cat(
+            [
+                hits(cameras.image_rays(k), box, self.model.occupancy,
+                     near=settings.near, far=settings.far)
+                for k in range(len(views))
+            ]
+        )
+        return PixelPool(pool.image[kept], pool.flat[kept])
+
+    def _hand_over(self, cameras: Cameras, *, skip_zero: bool) -> None:
+        """Give the optimiser the present grids, each voxel paced by how many views see it."""
+        field = self.model.canonical
+        pace = None
+        if not skip_zero:
+            points = field.box.grid_points(field.density.shape, field.density.values)
+            pace = share_of_views(cameras.to(self.device), points)[..., None]
+        for group, grid in ((0, field.density), (1, field.color)):
+            self.optimizer.replace(group, list(grid.parameters()), pace)
+            self.optimizer.param_groups[group]["skip_zero"] = skip_zero
+        decoder = list(field.decoder.parameters())
+        if [id(p) for p in decoder] != [id(p) for p in self.optimizer.param_groups[2]["params"]]:
+            self.optimizer.replace(2, decoder)
+
+    def loss(self, views: Views) -> tuple[Tensor, dict[str, Tensor]]:
+        """Render a batch of random pixels and compare it with the images."""
+        assert isinstance(self.phase, CanonicalPhase) and self._pool is not None
+        image, flat = self._pool.draw(self.schedule.rays)
+        background = background_color(
+            self.scene.background, len(image), self.device, training=True
+        )
+        batch = gather_batch(views, image, flat, background)
+        model = self.model
+        output = render(
+            batch.rays, model.canonical, model.occupancy, model.settings, background
+        )
+        return self.losses[self.phase.kind](Prediction(output, batch))
+
+    @torch.no_grad()
+    def on_train_end(self) -> None:
+        """Empty what was never occupied, so that no deformed sample meets leftover fog."""
+        if self.iteration < self.total_iterations:
+            return
+        self._refresh_occupancy()
+        self.model.canonical.clear(~self.model.occupancy.mask, alpha=1e-6)
+
+    def passport(self) -> Passport:
+        """What the checkpoint is, and how to build its model."""
+        return Passport(
+            scene=self.scene.name,
+            fingerprint=self.scene.fingerprint,
+            architecture=self.architecture,
+            settings=self.model.settings,
+            records={"canonical": self.record},
+        )
+
+    def result(self) -> Stored:
+        """What the deformation stage builds on."""
+        return Stored(self.passport(), self.model)
+
+
+def share_of_views(cameras: Cameras, points: Tensor) -> Tensor:
+    """Share (X, Y, Z) in (0, 1] of the cameras that have each point (X, Y, Z, 3) in the picture.
+
+    Relative to the best-seen point; a point that no camera sees gets the share of one camera.
+    """
+    flat = points.view(-1, 3)
+    seen = torch.zeros(len(flat), device=flat.device)
+    for k in range(len(cameras)):
+        pixel, depth = cameras.project_into(k, flat)
+        x, y = pixel.unbind(-1)
+        seen += (depth > 0) & (x >= 0) & (x <= cameras.width) & (y >= 0) & (y <= cameras.height)
+    return (seen.clamp(min=1) / seen.max().clamp(min=1)).view(points.shape[:-1])
+

@@ -1,0 +1,292 @@
+"""The deformation stage: dynamic views + the canonical field → how the scene moves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import torch
+from torch import Tensor
+
+from devrf.data.batch import background_color, gather_batch
+from devrf.data.correspondence import previous_images
+from devrf.data.pool import PixelPool, all_pixels
+from devrf.errors import DevrfError
+from devrf.fields.deformation import DeformationField
+from devrf.fields.occupancy import Occupancy
+from devrf.losses.composer import WeightedLoss
+from devrf.losses.motion import MOTION_TERMS, MotionPrediction, total_variation_weight
+from devrf.ops.adam import GridAdam
+from devrf.ops.total_variation import add_total_variation_gradient
+from devrf.ops.trilinear import interpolate
+from devrf.rendering.model import SceneModel, deformed_occupancy
+from devrf.rendering.render import render
+from devrf.rendering.sampling import hits
+from devrf.scenes.scene import CaptureName, Views
+from devrf.stages.checkpoint import Passport, Stored
+from devrf.stages.schedules import DeformationPhase, DeformationSchedule
+from devrf.stages.stage import Phase, ScheduledStage
+
+DEFORMATION_LOSS = {
+    "render": 1.0,
+    "cycle": 100.0,
+    "flow": 0.005,
+    "tv": 1.0,
+    "per_sample_color": 0.1,
+    "entropy": 0.01,
+}
+
+
+@dataclass(frozen=True)
+class MotionSettings:
+    """How the deformation field is learned, beside its schedule.
+
+    Attributes:
+        learning_rate: base rate, in ``unit`` per step: how far a voxel moves at most.
+        unit: ``world`` for world units; ``box`` for the longest edge of the fields' box, so
+            that one value serves scenes of any scale.
+        views: ``one`` draws a batch from one view of the frame, the views taking turns;
+            ``all`` draws it from all of them.
+        pixels: ``all`` draws from whole images; ``useful`` from the pixels that show the matte
+            or whose rays meet what the present field has moved there.
+        occupancy_every: iterations after which the frame's occupancy is looked up anew.
+    """
+
+    learning_rate: float = 1e-3
+    unit: Literal["world", "box"] = "world"
+    views: Literal["one", "all"] = "one"
+    pixels: Literal["all", "useful"] = "all"
+    occupancy_every: int = 25
+
+
+@dataclass
+class Visit:
+    """What is at hand while one frame is visited; all of it can be made again.
+
+    Attributes:
+        backward: (X, Y, Z, 3) the frame's Δ_b, a leaf in the field's memory.
+        forward: (X, Y, Z, 3) the frame's Δ_f, likewise.
+        occupancy: where the frame's matter is.
+        pools: the pixels to learn from; batches are drawn from each in turn.
+    """
+
+    backward: Tensor
+    forward: Tensor
+    occupancy: Occupancy
+    pools: list[PixelPool]
+
+
+class DeformationStage(ScheduledStage):
+    """Learns the 4D deformation field of a scene whose canonical field is known (method §3).
+
+    Frames are visited one after another, coarse to fine. Only the visited frame's two slices
+    are trained; the canonical field and all other frames are frozen.
+    """
+
+    capture: ClassVar[CaptureName] = "dynamic"
+
+    def __init__(
+        self,
+        rest: Stored,
+        schedule: DeformationSchedule | None = None,
+        motion: MotionSettings | None = None,
+        loss: Mapping[str, float] = DEFORMATION_LOSS,
+        iterations_per_step: int = 10,
+    ) -> None:
+        """Build the stage; the defaults are the paper's for inward-facing scenes.
+
+        Args:
+            rest: what the canonical stage learned (``CanonicalStage.result()`` or
+                ``load_checkpoint``); its fields are frozen.
+            schedule: resolutions, iterations and frames.
+            motion: learning rate and how batches are drawn.
+            loss: weights of the loss terms; ``tv`` is the total variation of both fields.
+            iterations_per_step: optimiser iterations in one Lightning step.
+        """
+        super().__init__(iterations_per_step)
+        self.schedule = schedule or DeformationSchedule()
+        self.motion = motion or MotionSettings()
+        weights = dict(loss)
+        self.tv = weights.pop("tv", 0.0)
+        self.losses = WeightedLoss(MOTION_TERMS, weights)
+        self.scene_model = rest.model.requires_grad_(False)
+        self.architecture = rest.passport.architecture
+        self.records = rest.passport.records
+        placeholder = torch.zeros(2, 2, 2, 3, requires_grad=True)
+        self._optimizer = GridAdam([{"params": [placeholder], "lr": self.motion.learning_rate}])
+        self._visit: Visit | None = None
+        self._previous: Tensor | None = None
+
+    @property
+    def resolution(self) -> tuple[int, int, int]:
+        """Present shape of the motion grids."""
+        return self.field.shape
+
+    @property
+    def model(self) -> SceneModel:
+        """The moving scene learned so far."""
+        return self.scene_model
+
+    @property
+    def field(self) -> DeformationField:
+        """The deformation field."""
+        assert self.scene_model.deformation is not None, "the stage has not been set up"
+        return self.scene_model.deformation
+
+    @property
+    def optimizer(self) -> GridAdam:
+        """Adam over the visited frame's two slices."""
+        return self._optimizer
+
+    @property
+    def total_iterations(self) -> int:
+        """Iterations of all levels and frames."""
+        return self.schedule.total(len(self.field.clock))
+
+    def phase_at(self, iteration: int) -> Phase:
+        """The schedule's phase."""
+        return self.schedule.phase(iteration, len(self.field.clock))
+
+    def learning_rate_factor(self, iteration: int) -> float:
+        """The decay of the level that ``iteration`` belongs to."""
+        return self.schedule.phase(iteration, len(self.field.clock)).learning_rate_factor
+
+    def setup(self, stage: str) -> None:
+        """Build the field at rest, at the coarsest resolution, in the canonical field's box."""
+        if self.scene_model.deformation is None:
+            self.scene_model.deformation = DeformationField(
+                self.scene_model.canonical.box,
+                self.scene.clock,
+                voxels=self.schedule.sides[0] ** 3,
+            )
+        scale = self.scene_model.canonical.box.longest if self.motion.unit == "box" else 1.0
+        self._optimizer.param_groups[0]["base_lr"] = self.motion.learning_rate * scale
+
+    def enter(self, phase: Phase) -> None:
+        """Go to the phase's frame: grow the grids if a level begins, fresh Adam."""
+        assert isinstance(phase, DeformationPhase)
+        previous, self.phase = self.phase, phase
+        assert previous is None or isinstance(previous, DeformationPhase)
+        if previous is not None and previous.level != phase.level:
+            self.field.resize(phase.side**3)
+        if phase.carries:
+            self.field.carry(phase.frame)
+        backward, forward = self.field.slice(phase.frame)
+        self._visit = Visit(backward, forward, self.scene_model.occupancy, [])
+        self._optimizer.replace(0, [backward, forward])
+        self._optimizer.forget()
+        views = self._device_views()
+        if self._previous is None:
+            self._previous = previous_images(views, self.field.clock)
+        self._look_around()
+        self._visit.pools = self._frame_pools(views, phase.frame)
+
+    @property
+    def visit(self) -> Visit:
+        """The frame that is being visited."""
+        assert self._visit is not None, "no phase has been entered"
+        return self._visit
+
+    def _device_views(self) -> Views:
+        views: Views = self.trainer.datamodule.training_views(  # type: ignore[attr-defined]
+            self.capture, self.device
+        )
+        return views
+
+    def _warp(self, points: Tensor) -> Tensor:
+        """Points of the visited frame → canonical space."""
+        return points + interpolate(self.visit.backward, self._coords(points))
+
+    def _unwarp(self, points: Tensor) -> Tensor:
+        """Canonical points → the visited frame."""
+        return points + interpolate(self.visit.forward, self._coords(points))
+
+    def _unwarp_previous(self, points: Tensor) -> Tensor:
+        """Canonical points → the frame before; the identity where that is frame 0."""
+        assert isinstance(self.phase, DeformationPhase)
+        if self.phase.frame == 1:
+            return points
+        frozen = self.field.to_time[self.phase.frame - 1]
+        return points + interpolate(frozen, self._coords(points))
+
+    def _coords(self, points: Tensor) -> Tensor:
+        return self.field.box.to_grid(points, self.field.shape)
+
+    @torch.no_grad()
+    def _look_around(self) -> None:
+        """Find where the visited frame's matter is under the present field."""
+        self.visit.occupancy = deformed_occupancy(self.scene_model, self._warp, margin=2)
+
+    @torch.no_grad()
+    def _frame_pools(self, views: Views, frame: int) -> list[PixelPool]:
+        """The pixels to learn the frame from: a pool a batch can be drawn from, by turns."""
+        images = (self.field.clock.frames_of(views.times) == frame).nonzero()[:, 0]
+        if len(images) == 0:
+            raise DevrfError(f"dynamic training set: no image at frame {frame}")
+        pools = [all_pixels(views, image[None]) for image in images]
+        if self.motion.pixels == "useful":
+            pools = [self._useful(views, pool) for pool in pools]
+        if self.motion.views == "all":
+            pools = [
+                PixelPool(
+                    torch.cat([pool.image for pool in pools]),
+                    torch.cat([pool.flat for pool in pools]),
+                )
+            ]
+        return pools
+
+    def _useful(self, views: Views, pool: PixelPool) -> PixelPool:
+        """Pixels on the matte, or whose rays meet the frame's matter; all if there are none."""
+        image = int(pool.image[0])
+        settings = self.scene_model.settings
+        kept = hits(
+            views.cameras.image_rays(image), self.field.box, self.visit.occupancy,
+            near=settings.near, far=settings.far,
+        )
+        if views.has_alpha:
+            kept |= views.pixels[image, :, :, 3].flatten() > 0
+        return PixelPool(pool.image[kept], pool.flat[kept]) if bool(kept.any()) else pool
+
+    def loss(self, views: Views) -> tuple[Tensor, dict[str, Tensor]]:
+        """Render a batch of the visited frame through its warp; compare images and motion."""
+        assert isinstance(self.phase, DeformationPhase) and self._previous is not None
+        since = self.iteration - self.phase.start
+        if since and since % self.motion.occupancy_every == 0:
+            self._look_around()
+        pool = self.visit.pools[self.iteration % len(self.visit.pools)]
+        image, flat = pool.draw(self.schedule.rays)
+        background = background_color(
+            self.scene.background, len(image), self.device, training=True
+        )
+        batch = gather_batch(views, image, flat, background)
+        model = self.scene_model
+        output = render(
+            batch.rays, model.canonical, self.visit.occupancy, model.settings, background,
+            self._warp,
+        )
+        prediction = MotionPrediction(
+            output, batch, self._unwarp, self._unwarp_previous, views.cameras, self._previous
+        )
+        return self.losses(prediction)
+
+    @torch.no_grad()
+    def add_gradients(self) -> None:
+        """The total variation of the visited frame's slices, on all voxels."""
+        if not self.tv:
+            return
+        weight = total_variation_weight(self.tv, max(self.field.shape), self.schedule.rays)
+        for grid in (self.visit.backward, self.visit.forward):
+            if grid.grad is None:
+                grid.grad = torch.zeros_like(grid)
+            add_total_variation_gradient(grid, grid.grad, weight)
+
+    def passport(self) -> Passport:
+        """What the checkpoint is, and how to build its model."""
+        return Passport(
+            scene=self.scene.name,
+            fingerprint=self.scene.fingerprint,
+            architecture=self.architecture,
+            settings=self.scene_model.settings,
+            records={**self.records, "deformation": self.record},
+        )

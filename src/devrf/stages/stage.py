@@ -1,0 +1,142 @@
+"""What both stages share: a loop that follows a schedule, and held-out views that are scored."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import asdict
+from typing import Any, ClassVar
+
+from lightning import LightningModule
+from torch import Tensor
+
+from devrf.errors import DevrfError
+from devrf.ops.adam import GridAdam
+from devrf.rendering.model import SceneModel
+from devrf.scenes.scene import CaptureName, Scene, Views
+from devrf.stages.held_out import HeldOutView, score
+from devrf.stages.checkpoint import Passport
+from devrf.stages.schedules import CanonicalPhase, DeformationPhase
+
+Phase = CanonicalPhase | DeformationPhase
+
+
+class ScheduledStage(LightningModule, ABC):
+    """A stage whose schedule says what each iteration learns.
+
+    One Lightning step covers several optimiser iterations, so that the framework's own work
+    does not show. The stage never changes its grids by itself: the callback ``GridUpscaling``
+    calls :meth:`enter` where a phase begins, ``LearningRateDecay`` scales the learning rates
+    before every step.
+
+    Attributes:
+        capture: the part of the scene that is learned from.
+        iteration: optimiser iterations done.
+        phase: the stretch of the schedule that the grids are ready for; None before the first.
+        record: what training took, once a ``TrainingRecord`` callback has measured it.
+    """
+
+    capture: ClassVar[CaptureName]
+
+    def __init__(self, iterations_per_step: int) -> None:
+        super().__init__()
+        self.automatic_optimization = False
+        self.iterations_per_step = iterations_per_step
+        self.iteration = 0
+        self.phase: Phase | None = None
+        self.record: dict[str, float | None] = {}
+
+    @property
+    def scene(self) -> Scene:
+        """The scene of the trainer's datamodule."""
+        scene: Scene = self.trainer.datamodule.scene  # type: ignore[attr-defined]
+        return scene
+
+    @property
+    @abstractmethod
+    def total_iterations(self) -> int:
+        """Iterations of the whole schedule."""
+
+    @property
+    @abstractmethod
+    def resolution(self) -> tuple[int, int, int]:
+        """Present shape of the grid that is learned."""
+
+    @property
+    @abstractmethod
+    def model(self) -> SceneModel:
+        """What has been learned so far, ready to render."""
+
+    @abstractmethod
+    def phase_at(self, iteration: int) -> Phase:
+        """The phase of the schedule that ``iteration`` belongs to."""
+
+    @abstractmethod
+    def learning_rate_factor(self, iteration: int) -> float:
+        """What the base learning rates are multiplied by at ``iteration``."""
+
+    @abstractmethod
+    def enter(self, phase: Phase) -> None:
+        """Make grids and optimiser ready for ``phase``."""
+
+    @abstractmethod
+    def loss(self, views: Views) -> tuple[Tensor, dict[str, Tensor]]:
+        """The weighted loss of one batch drawn from ``views``, and its terms by name."""
+
+    def add_gradients(self) -> None:
+        """Add gradients that are known in closed form, after the backward pass."""
+
+    def training_step(self, views: Views, batch_idx: int) -> None:
+        """Run iterations up to ``iterations_per_step``, never beyond the present phase."""
+        if self.phase != self.phase_at(self.iteration):
+            raise DevrfError(
+                f"{type(self).__name__}: nobody prepared the phase of iteration "
+                f"{self.iteration}: add devrf.callbacks.GridUpscaling to the trainer's callbacks"
+            )
+        assert self.phase is not None
+        optimizer = self.optimizers()
+        left = min(self.phase.stop, self.total_iterations) - self.iteration
+        count = min(self.iterations_per_step, left)
+        if self.trainer.max_steps > 0:
+            count = min(count, self.trainer.max_steps - self.trainer.global_step)
+        sums: dict[str, Tensor] = {}
+        for _ in range(count):
+            optimizer.zero_grad()
+            total, terms = self.loss(views)
+            if total.requires_grad:
+                self.manual_backward(total)
+            self.add_gradients()
+            optimizer.step()
+            self.iteration += 1
+            for name, value in {"loss": total.detach(), **terms}.items():
+                sums[name] = sums[name] + value if name in sums else value
+        means = {f"{self.capture}/{name}": value / count for name, value in sums.items()}
+        self.log_dict({**means, "step": float(self.iteration)})
+        if self.iteration >= self.total_iterations:
+            self.trainer.should_stop = True
+
+    def test_step(self, index: int, batch_idx: int) -> HeldOutView:
+        """Render and score one held-out image; the means are logged."""
+        scene = self.scene
+        views = scene.capture(self.capture).test
+        view = score(self.model, views, index, scene.background, self.device)
+        self.log_dict({f"test/{self.capture}/psnr": view.psnr, f"test/{self.capture}/ssim": view.ssim},
+                      batch_size=1)
+        return view
+
+    def configure_optimizers(self) -> GridAdam:
+        """The optimiser that :meth:`enter` hands parameters to."""
+        return self.optimizer
+
+    @property
+    @abstractmethod
+    def optimizer(self) -> GridAdam:
+        """The stage's optimiser, the same object throughout."""
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Add what the tensors do not tell."""
+        checkpoint["devrf"] = asdict(self.passport())
+
+    @abstractmethod
+    def passport(self) -> Passport:
+        """What the checkpoint is and how to build its model."""
+

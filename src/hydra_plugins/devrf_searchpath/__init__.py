@@ -1,0 +1,15 @@
+"""Lets any Hydra application compose devrf's config groups. Imports neither torch nor lightning."""
+
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+
+from devrf.config import config_folder, register_resolvers
+
+
+class DevrfSearchPath(SearchPathPlugin):
+    """Puts devrf's ``conf/`` behind the application's own configs."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        """Append the folder and make devrf's resolvers known."""
+        register_resolvers()
+        search_path.append(provider="devrf", path=f"file://{config_folder()}")

@@ -1,0 +1,113 @@
+"""Flow files: read, checked, made smaller; numbers by hand, images that are not square."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from devrf.errors import DevrfError
+from devrf.scenes.flow_files import read_flow, read_flow_file
+from devrf.scenes.resampling import area_average, shrink_flow, shrink_pixels
+
+
+def write_flow(path: Path, vectors: np.ndarray, mask: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(path, flow=vectors, mask=mask)
+
+
+def test_shrinking_scales_each_axis_by_its_own_factor() -> None:
+    vectors = np.empty((6, 12, 2), dtype=np.float32)
+    vectors[...] = (6.0, 9.0)
+    shrunk, valid = shrink_flow(vectors, np.ones((6, 12), bool), width=4, height=3)
+    assert shrunk.shape == (3, 4, 2)
+    assert valid.all()
+    np.testing.assert_allclose(shrunk[..., 0], 6.0 * 4 / 12, rtol=1e-6)
+    np.testing.assert_allclose(shrunk[..., 1], 9.0 * 3 / 6, rtol=1e-6)
+
+
+def test_shrinking_averages_trusted_vectors_only_and_needs_half_of_them() -> None:
+    vectors = np.zeros((2, 4, 2), dtype=np.float32)
+    vectors[:, :, 0] = [[2, 4, 8, 8], [900, 900, 900, 900]]
+    valid = np.array([[True, True, True, False], [False] * 4])
+    shrunk, trusted = shrink_flow(vectors, valid, width=2, height=1)
+    np.testing.assert_array_equal(trusted, [[True, False]])  # 2 of 4, then 1 of 4
+    np.testing.assert_allclose(shrunk[0, :, 0], [(2 + 4) / 2 / 2, 0])
+
+
+def test_area_averages_count_fractions_of_cells() -> None:
+    row = np.array([[[0], [3], [6]]], dtype=np.float32)
+    # Two cells of 1.5 pixels each: (1·0 + 0.5·3) / 1.5 and (0.5·3 + 1·6) / 1.5.
+    np.testing.assert_allclose(area_average(row, width=2, height=1)[0, :, 0], [1, 5], rtol=1e-6)
+
+
+def test_colours_behind_a_clear_matte_do_not_bleed_in() -> None:
+    image = np.array([[[200, 0, 0, 255], [0, 255, 0, 0]]], dtype=np.uint8)
+    np.testing.assert_array_equal(shrink_pixels(image, 1, 1)[0, 0], [200, 0, 0, 128])
+
+
+def test_masked_nan_and_infinite_vectors_are_invalid_and_zero(tmp_path: Path) -> None:
+    vectors = np.ones((3, 5, 2), dtype=np.float32)
+    vectors[0, 0, 1], vectors[1, 2, 0] = np.nan, np.inf
+    mask = np.ones((3, 5), dtype=np.uint8)
+    mask[2, 4] = 0
+    write_flow(tmp_path / "f.npz", vectors, mask)
+    read, valid = read_flow_file(tmp_path / "f.npz", width=5, height=3)
+    assert {tuple(p) for p in np.argwhere(~valid)} == {(0, 0), (1, 2), (2, 4)}
+    assert (read[~valid] == 0).all() and (read[valid] == 1).all()
+
+
+def test_files_are_found_by_their_place_in_the_list(tmp_path: Path) -> None:
+    for index in (4, 5):
+        vectors = np.full((8, 12, 2), float(index), dtype=np.float32)
+        write_flow(tmp_path / f"{index:03d}_bwd.npz", vectors, np.ones((8, 12), bool))
+    flow = read_flow(tmp_path, [0, 4, 5], [False, True, True], (12, 8), (6, 2))
+    assert flow is not None
+    assert not flow.valid[0].any() and flow.valid[1:].all()
+    assert torch.equal(flow.vectors[:, 0, 0], torch.tensor([[0.0, 0], [2, 1], [2.5, 1.25]]))
+
+
+def test_no_file_at_all_means_no_flow(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO):
+        assert read_flow(tmp_path, [0, 1], [False, True], (9, 9), (9, 9)) is None
+    assert len(caplog.records) == 1 and str(tmp_path) in caplog.text
+
+
+def test_some_missing_files_leave_their_images_without_flow(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write_flow(tmp_path / "002_bwd.npz", np.ones((9, 9, 2)), np.ones((9, 9), bool))
+    flow = read_flow(tmp_path, [1, 2], [True, True], (9, 9), (9, 9))
+    assert flow is not None and not flow.valid[0].any() and flow.valid[1].all()
+    assert "1 of 2 flow files are missing" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("arrays", "said"),
+    [
+        ({"mask": np.ones((4, 6), bool)}, 'no array "flow"'),
+        ({"flow": np.ones((4, 6, 2))}, 'no array "mask"'),
+        ({"flow": np.ones((6, 4, 2)), "mask": np.ones((4, 6))}, "(6, 4, 2), expected (4, 6, 2)"),
+        ({"flow": np.ones((4, 6, 2)), "mask": np.ones((2, 3))}, "(2, 3), expected (4, 6)"),
+        ({"flow": np.full((4, 6, 2), None), "mask": np.ones((4, 6))}, "not a readable npz"),
+    ],
+)
+def test_wrong_arrays_are_named(
+    tmp_path: Path, arrays: dict[str, np.ndarray], said: str
+) -> None:
+    path = tmp_path / "001_bwd.npz"
+    np.savez(path, allow_pickle=True, **arrays)
+    with pytest.raises(DevrfError) as caught:
+        read_flow_file(path, width=6, height=4)
+    message = str(caught.value)
+    assert str(path) in message and said in message and "\n" not in message
+
+
+def test_a_file_that_is_no_npz_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "001_bwd.npz"
+    path.write_bytes(b"not a zip file")
+    with pytest.raises(DevrfError, match="001_bwd.npz: not a readable npz"):
+        read_flow_file(path, width=6, height=4)

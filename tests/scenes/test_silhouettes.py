@@ -1,0 +1,85 @@
+"""The motion box: what it must hold, and how much larger it may be."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from devrf.geometry.box import Box
+from devrf.scenes.scene import Views
+from devrf.scenes.silhouettes import _dilated, motion_box
+
+BallViews = Callable[..., Views]
+RADIUS = 0.35
+# The ball goes along x and up, and leaves the box from −1 to 1 on the way.
+PLACES = torch.stack(
+    [torch.linspace(-0.5, 0.9, 6), torch.zeros(6), torch.linspace(0, 0.4, 6)], dim=-1
+)
+
+
+def test_box_holds_the_moving_ball_and_little_more(ball_views: BallViews, unit_box: Box) -> None:
+    box = motion_box(ball_views(PLACES, RADIUS), unit_box)
+    assert box is not None
+    low, high = PLACES.amin(dim=0) - RADIUS, PLACES.amax(dim=0) + RADIUS
+    assert bool(box.contains(torch.stack([low, high])).all())
+    # A hull of four views that all look down a little: loose below, close elsewhere.
+    slack_low = low - torch.tensor(box.low)
+    slack_high = torch.tensor(box.high) - high
+    assert float(slack_low.max()) < 0.3 and float(slack_high.max()) < 0.25
+
+
+def test_a_ball_far_smaller_than_a_grid_cell_is_not_lost(
+    ball_views: BallViews, unit_box: Box
+) -> None:
+    place = torch.tensor([[0.31, 0.17, 0.23], [0.52, 0.17, 0.23]])
+    box = motion_box(ball_views(place, 0.05), unit_box, resolution=12)
+    assert box is not None and bool(box.contains(place).all())
+
+
+def test_a_ball_cut_off_by_one_image_is_kept_whole(ball_views: BallViews, unit_box: Box) -> None:
+    # Two of the cameras see as far as y = 1.93 only, the two others look along y.
+    places = torch.tensor([[0.0, 0.0, 0.0], [0.0, 1.9, 0.0]])
+    views = ball_views(places, RADIUS)
+    alpha = views.pixels[..., 3]
+    cut = alpha[:, :, [0, -1]].flatten(1).amax(dim=1) > 0
+    assert bool(cut.any()) and not bool(cut.all())
+    box = motion_box(views, unit_box.scaled(1.6))
+    assert box is not None and box.high[1] >= 1.9 + RADIUS
+
+
+def test_nothing_is_imagined_beyond_images_that_hold_the_ball_whole(
+    ball_views: BallViews, unit_box: Box
+) -> None:
+    # Opposite cameras both see the ball along x; the two others see no farther than 1.93.
+    views = ball_views(torch.tensor([[0.0, 0, 0], [0.05, 0, 0]]), 0.8)
+    box = motion_box(views, unit_box.scaled(2.0))
+    assert box is not None and max(box.high[:2]) < 1.3 and min(box.low[:2]) > -1.3
+
+
+def test_no_box_without_mattes_or_without_two_cameras_at_every_time(
+    ball_views: BallViews, unit_box: Box
+) -> None:
+    assert motion_box(ball_views(PLACES, RADIUS, channels=3), unit_box) is None
+    assert motion_box(ball_views(PLACES, RADIUS, count=1), unit_box) is None
+    whole = ball_views(PLACES, RADIUS)
+    missing = whole[torch.arange(len(whole) - 3)]  # the last time keeps one view of four
+    assert motion_box(missing, unit_box) is None
+
+
+def test_no_box_when_every_matte_is_empty(ball_views: BallViews, unit_box: Box) -> None:
+    views = ball_views(PLACES, RADIUS)
+    empty = replace(views, pixels=torch.zeros_like(views.pixels))
+    assert motion_box(empty, unit_box) is None
+
+
+@pytest.mark.parametrize("reach", [1, 2, 5, 6])
+def test_dilation_reaches_exactly_so_far(reach: int) -> None:
+    masks = torch.zeros((1, 15, 17), dtype=torch.bool)
+    masks[0, 7, 8] = True
+    expected = torch.zeros_like(masks)
+    expected[0, 7 - reach : 8 + reach, 8 - reach : 9 + reach] = True
+    np.testing.assert_array_equal(_dilated(masks.numpy(), reach), expected.numpy())
