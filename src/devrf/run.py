@@ -20,11 +20,11 @@ from devrf.artifacts.film import FilmSettings, orbit, pictures, write_video
 from devrf.callbacks import TrainingRecord
 from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
+from devrf.losses.composer import WeightedLoss
+from devrf.losses.motion import MOTION_TERMS
 from devrf.scenes.export import export_blender
 from devrf.scenes.scene import CaptureName
-from devrf.stages.canonical import CanonicalStage
 from devrf.stages.checkpoint import Stored, load_checkpoint, save_checkpoint
-from devrf.stages.deformation import DeformationStage
 from devrf.stages.held_out import HeldOutView, background_value, score
 from devrf.stages.stage import ScheduledStage
 
@@ -34,8 +34,11 @@ log = logging.getLogger(__name__)
 # might have) is of no use to someone who watches a scene being learned.
 for _name in ("lightning.pytorch", "lightning.fabric"):
     logging.getLogger(_name).setLevel(logging.WARNING)
-for _message in (".*does not have many workers.*", ".*LeafSpec.*", ".*GPU available but not used.*"):
-    warnings.filterwarnings("ignore", message=_message)
+for _words in (
+    "does not have many workers", "LeafSpec", "GPU available but not used",
+    "Experiment logs directory",
+):
+    warnings.filterwarnings("ignore", message=f".*{_words}.*")
 
 
 class Run:
@@ -68,9 +71,26 @@ class Run:
         }
         if stage not in stages:
             raise DevrfError(f"stage: expected one of {', '.join(stages)}, not {stage!r}")
+        self._check(stage)
         for step in stages[stage]:
             seed_everything(self.config.seed, verbose=False)
             step()
+
+    def _check(self, stage: str) -> None:
+        """Find what can be found wrong before the first stage has cost any time.
+
+        A mistake in the deformation's config would else show when the canonical stage is done.
+        """
+        if self.config.ckpt is not None and stage in ("prepare", "canonical", "pipeline"):
+            raise DevrfError(
+                f"ckpt: stage={stage} starts from nothing; with ckpt=PATH give stage=deformation, "
+                "stage=evaluate or stage=render"
+            )
+        instantiate(self.config.canonical, _convert_="all")
+        instantiate(self.config.deformation, _partial_=True, _convert_="all")
+        weights = {k: v for k, v in self.config.deformation.loss.items() if k != "tv"}
+        WeightedLoss(MOTION_TERMS, weights)
+        instantiate(self.config.video)
 
     def prepare(self) -> None:
         """Write the scene to ``data.export`` in the published layout."""
@@ -88,7 +108,9 @@ class Run:
         """Learn how the scene moves, on top of a canonical checkpoint."""
         rest = self._load("canonical")
         if rest.model.deformation is not None:
-            raise DevrfError("ckpt: stage=deformation needs a canonical checkpoint, not a deformation's")
+            raise DevrfError(
+                "ckpt: stage=deformation needs a canonical checkpoint, not a deformation's"
+            )
         build = instantiate(self.config.deformation, _partial_=True, _convert_="all")
         self._fit(build(rest=rest), "deformation")
 
@@ -133,6 +155,7 @@ class Run:
             log.info("video written to %s", path)
 
     def _fit(self, stage: ScheduledStage, name: str) -> None:
+        _ = self.datamodule.scene  # what is wrong with it is said before a logger writes files
         callbacks = [*instantiate(self.config.callbacks).values(), TrainingRecord()]
         trainer: Trainer = instantiate(
             self.config.trainer, callbacks=callbacks, logger=self._shared_logger(),
@@ -156,6 +179,8 @@ class Run:
     def _checkpoint(self, *names: str) -> Path:
         """The checkpoint that was asked for, else the first of ``names`` that the run has."""
         if self.config.ckpt is not None:
+            if not Path(self.config.ckpt).is_file():
+                raise DevrfError(f"{self.config.ckpt}: no such checkpoint; set ckpt to a file")
             return Path(self.config.ckpt)
         found = [path for path in map(self._own_checkpoint, names) if path.exists()]
         if not found:

@@ -98,7 +98,7 @@ def write_video(path: Path, images: Iterator[Tensor], fps: int) -> None:
             partial, format="FFMPEG", fps=fps, codec="libx264", quality=8, macro_block_size=2
         ) as writer:
             for image in images:
-                writer.append_data(_watchable(to_bytes(image).numpy()))
+                writer.append_data(_watchable(to_bytes(image).numpy()))  # type: ignore[attr-defined]
 
 
 def _watchable(image: np.ndarray) -> np.ndarray:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import importlib.util
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -65,7 +66,8 @@ class InwardFacingDataModule(SceneDataModule):
         check_choice("data.flow", flow, ("auto", "files", "dis", "raft", "none"))
         self.flow = flow
         self.flow_cache = None if flow_cache is None else Path(flow_cache)
-        self._read = lambda: read_blender(
+        self._read: Callable[[], Scene] = partial(
+            read_blender,
             root,
             name=name,
             dynamic=dynamic,
@@ -93,6 +95,6 @@ class InwardFacingDataModule(SceneDataModule):
             log.info("%s: no optical flow files; flow is %s", scene.name, how)
         if method not in ("dis", "raft"):
             return scene
-        flow = estimate_flow(train, method, self.flow_cache)  # type: ignore[arg-type]
+        flow = estimate_flow(train, method, self.flow_cache)
         dynamic = replace(scene.dynamic, train=replace(train, flow=flow))
         return replace(scene, dynamic=dynamic)

@@ -21,6 +21,8 @@ class ColorDecoder(nn.Module):
     once a sample.
     """
 
+    octaves: Tensor
+
     def __init__(self, channels: int, width: int, frequencies: int = 4) -> None:
         """Build the network.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import torch
@@ -30,7 +30,7 @@ class GridAdam(torch.optim.Optimizer):
         super().__init__(params, defaults)
 
     @torch.no_grad()
-    def step(self, closure: Callable[[], Any] | None = None) -> Any:  # type: ignore[override]
+    def step(self, closure: Callable[[], Any] | None = None) -> Any:
         """One step on every parameter that has a gradient."""
         result = None
         if closure is not None:
@@ -54,11 +54,11 @@ class GridAdam(torch.optim.Optimizer):
         """Drop all moments and step counts, as a fresh optimiser would start."""
         self.state.clear()
 
-    def replace(self, group: int, parameters: list[Tensor], pace: Tensor | None = None) -> None:
+    def replace(self, group: int, parameters: Sequence[Tensor], pace: Tensor | None = None) -> None:
         """Give a group other parameters (a resized grid, the next frame) with fresh moments."""
         for old in self.param_groups[group]["params"]:
             self.state.pop(old, None)
-        self.param_groups[group]["params"] = parameters
+        self.param_groups[group]["params"] = list(parameters)
         self.param_groups[group]["pace"] = pace
 
 

@@ -27,7 +27,15 @@ def composite(depth: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
     Returns:
         weights (S,) and end transmittance (R,), differentiable once in ``depth``.
     """
-    return _Composite.apply(depth, ray, rays)
+    weights, end = _Composite.apply(depth, ray, rays)  # type: ignore[no-untyped-call]
+    return weights, end
+
+
+def transmittances(depth: Tensor, ray: Tensor, rays: int) -> Tensor:
+    """T_i (S,): what is left of each sample's ray before it; arguments as :func:`composite`."""
+    first, _ = _segments(ray, rays)
+    reached = _running_sum(depth)
+    return torch.exp(reached[first[ray]] - reached[:-1]).to(depth.dtype)
 
 
 def sum_by_ray(values: Tensor, ray: Tensor, rays: int) -> Tensor:
@@ -40,8 +48,7 @@ class _Composite(torch.autograd.Function):
     def forward(ctx: Any, depth: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
         first, last = _segments(ray, rays)
         reached = _running_sum(depth)
-        before = reached[:-1] - reached[first[ray]]
-        transmittance = torch.exp(-before).to(depth.dtype)
+        transmittance = torch.exp(reached[first[ray]] - reached[:-1]).to(depth.dtype)
         weights = transmittance * -torch.expm1(-depth)
         end = torch.exp(reached[first] - reached[last]).to(depth.dtype)
         ctx.save_for_backward(depth, ray, first, last, transmittance, weights, end)

@@ -13,6 +13,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import embedding_bag
 
+Pair = tuple[Tensor, Tensor]
+
 
 def interpolate(grid: Tensor, coords: Tensor) -> Tensor:
     """Values of a grid between its points.
@@ -28,7 +30,8 @@ def interpolate(grid: Tensor, coords: Tensor) -> Tensor:
     Returns:
         (M, C), differentiable once in ``grid`` and ``coords``.
     """
-    return _Interpolate.apply(grid, coords)
+    values: Tensor = _Interpolate.apply(grid, coords)  # type: ignore[no-untyped-call]
+    return values
 
 
 class _Interpolate(torch.autograd.Function):
@@ -47,15 +50,13 @@ class _Interpolate(torch.autograd.Function):
         table = grid.reshape(-1, grid.shape[3])
         weights = _linear(fraction)
         if ctx.needs_input_grad[0]:
-            spread = _corner_weights(weights)[:, :, None] * grad[:, None, :]
-            grid_grad = torch.zeros_like(table)
-            grid_grad.index_add_(0, rows.reshape(-1), spread.reshape(-1, table.shape[1]))
+            grid_grad = _scatter(rows, _corner_weights(weights), grad, len(table))
             grid_grad = grid_grad.reshape(grid.shape)
         if ctx.needs_input_grad[1]:
             coords_grad = torch.empty_like(fraction)
-            slope = fraction.new_tensor([-1.0, 1.0]).expand(len(fraction), 2)
+            rise = torch.ones_like(fraction[:, 0])
             for axis in range(3):
-                sloped = [*weights[:axis], slope, *weights[axis + 1 :]]
+                sloped = [*weights[:axis], (-rise, rise), *weights[axis + 1 :]]
                 change = _bag(rows, table, _corner_weights(sloped))
                 coords_grad[:, axis] = (change * grad).sum(dim=1)
             coords_grad = coords_grad * inside
@@ -76,19 +77,37 @@ def _cell(coords: Tensor, shape: torch.Size) -> tuple[Tensor, Tensor, Tensor]:
     return rows, clamped - base, (coords >= 0) & (coords <= last)
 
 
-def _linear(fraction: Tensor) -> list[Tensor]:
-    """Per axis the weights (M, 2) of the lower and the upper corner."""
-    return [torch.stack([1 - f, f], dim=-1) for f in fraction.unbind(-1)]
+def _linear(fraction: Tensor) -> list[Pair]:
+    """Per axis the weights (M,), (M,) of the lower and the upper corner."""
+    return [(1 - f, f) for f in fraction.t().contiguous()]
 
 
-def _corner_weights(axes: list[Tensor]) -> Tensor:
+def _corner_weights(axes: list[Pair]) -> Tensor:
     """Products (M, 8) of the three axes' weights, in the order of the corners' rows."""
     x, y, z = axes
-    xy = x[:, :, None] * y[:, None, :]
-    return (xy[:, :, :, None] * z[:, None, None, :]).reshape(-1, 8)
+    # Whole vectors are multiplied and transposed at the end: broadcasting over pairs is slow.
+    weights = z[0].new_empty(8, len(z[0]))
+    for k, row in enumerate(weights):
+        torch.mul(x[k >> 2] * y[(k >> 1) & 1], z[k & 1], out=row)
+    return weights.t().contiguous()
 
 
 def _bag(rows: Tensor, table: Tensor, weights: Tensor) -> Tensor:
     if len(rows) == 0:
         return table.new_zeros(0, table.shape[1])
     return embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
+
+
+def _scatter(rows: Tensor, weights: Tensor, values: Tensor, count: int) -> Tensor:
+    """The transpose of :func:`_bag`: Σ weights · values (M, C) into (count, C)."""
+    channels = values.shape[1]
+    if values.is_cuda:
+        spread = weights[:, :, None] * values[:, None, :]
+        into = values.new_zeros(count, channels)
+        return into.index_add_(0, rows.reshape(-1), spread.reshape(-1, channels))
+    # On a CPU adding rows is ten times slower than adding numbers, channel by channel.
+    into = values.new_zeros(count * channels)
+    first = rows.reshape(-1).long() * channels
+    for channel, value in enumerate(values.t()):
+        into.scatter_add_(0, first + channel, (weights * value[:, None]).reshape(-1))
+    return into.view(count, channels)

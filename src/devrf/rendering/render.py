@@ -11,10 +11,13 @@ from torch import Tensor
 from devrf.fields.canonical import CanonicalField
 from devrf.fields.occupancy import Occupancy
 from devrf.geometry.rays import Rays
-from devrf.ops.compositing import composite, sum_by_ray
+from devrf.ops.compositing import composite, sum_by_ray, transmittances
 from devrf.rendering.sampling import Samples, march
 
 Warp = Callable[[Tensor], Tensor]
+
+# A ray ends where less than this of it is left: what is behind cannot be seen.
+STOP = 1e-4
 
 
 @dataclass(frozen=True)
@@ -88,10 +91,16 @@ def render(
         near=settings.near,
         far=settings.far,
     )
-    canonical = samples.points if warp is None else warp(samples.points)
+    # Most samples turn out to be empty or hidden. That is found out without a graph, so that
+    # gradients are computed for the others only.
+    with torch.no_grad():
+        tau = field.optical_depth(_warped(samples, warp), delta)
+        opaque = _at_least(-torch.expm1(-tau), settings.alpha_threshold)
+        samples, tau = samples[opaque], tau.index_select(0, opaque)
+        reached = _at_least(transmittances(tau, samples.ray, len(rays)), STOP)
+        samples = samples[reached]
+    canonical = _warped(samples, warp)
     tau = field.optical_depth(canonical, delta)
-    opaque = _at_least(-torch.expm1(-tau.detach()), settings.alpha_threshold)
-    samples, canonical, tau = samples[opaque], canonical.index_select(0, opaque), tau[opaque]
     weight, transmittance = composite(tau, samples.ray, len(rays))
     heavy = _at_least(weight.detach(), settings.alpha_threshold)
     samples, canonical = samples[heavy], canonical.index_select(0, heavy)
@@ -110,6 +119,10 @@ def render(
         weight=weight,
         sample_color=color,
     )
+
+
+def _warped(samples: Samples, warp: Warp | None) -> Tensor:
+    return samples.points if warp is None else warp(samples.points)
 
 
 def _at_least(values: Tensor, threshold: float) -> Tensor:

@@ -14,10 +14,11 @@ from devrf.data.batch import background_color, gather_batch
 from devrf.data.pool import PixelPool, all_pixels
 from devrf.errors import DevrfError
 from devrf.fields.architecture import Architecture
-from devrf.fields.occupancy import Occupancy, bounding_box, dilate
 from devrf.fields.canonical import CanonicalField
+from devrf.fields.occupancy import Occupancy, bounding_box, dilate
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
+from devrf.geometry.clock import FrameClock
 from devrf.losses.composer import WeightedLoss
 from devrf.losses.photometric import PHOTOMETRIC_TERMS, Prediction
 from devrf.ops.adam import GridAdam
@@ -185,7 +186,8 @@ class CanonicalStage(ScheduledStage):
             lens = box.nearest(position) - position
             if float(lens.norm()) < self.scene.bounds.near:
                 possible &= (points - position).norm(dim=-1) > self.scene.bounds.near
-        if self.schedule.carve and views.has_alpha:
+        at_rest = float(views.times.max() - views.times.min()) <= FrameClock.TOLERANCE
+        if self.schedule.carve and views.has_alpha and at_rest:
             possible &= visual_hull(views, box, shape)
         return possible
 

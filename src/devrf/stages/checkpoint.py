@@ -84,7 +84,9 @@ def load_checkpoint(path: Path, scene: Scene | None = None) -> Stored:
     try:
         data = torch.load(path, map_location="cpu", weights_only=True)
     except (RuntimeError, EOFError, OSError, ValueError, KeyError, pickle.UnpicklingError):
-        raise DevrfError(f"{path}: damaged, or not a checkpoint; expected one written by devrf") from None
+        raise DevrfError(
+            f"{path}: damaged, or not a checkpoint; expected one written by devrf"
+        ) from None
     if not isinstance(data, dict) or not isinstance(data.get("devrf"), dict):
         raise DevrfError(f"{path}: not a devrf checkpoint; set ckpt to one that devrf wrote")
     passport = _passport(path, data["devrf"])
@@ -111,7 +113,9 @@ def _passport(path: Path, stored: dict[str, Any]) -> Passport:
             records=stored["records"],
         )
     except (KeyError, TypeError) as error:
-        raise DevrfError(f"{path}: its description lacks or has an unknown entry ({error})") from None
+        raise DevrfError(
+            f"{path}: its description lacks or has an unknown entry ({error}); train again"
+        ) from None
 
 
 def _model(path: Path, passport: Passport, state: dict[str, Any]) -> SceneModel:

@@ -25,6 +25,7 @@ from devrf.rendering.render import render
 from devrf.rendering.sampling import hits
 from devrf.scenes.scene import CaptureName, Views
 from devrf.stages.checkpoint import Passport, Stored
+from devrf.stages.flow_start import follow, start_from_tracks
 from devrf.stages.schedules import DeformationPhase, DeformationSchedule
 from devrf.stages.stage import Phase, ScheduledStage
 
@@ -51,6 +52,9 @@ class MotionSettings:
         pixels: ``all`` draws from whole images; ``useful`` from the pixels that show the matte
             or whose rays meet what the present field has moved there.
         occupancy_every: iterations after which the frame's occupancy is looked up anew.
+        start: where a frame starts from at the coarsest level: ``previous`` is the result of
+            the frame before it; ``flow`` moves that along the observed optical flow, so that
+            parts that move far are not lost (without flow it is the same as ``previous``).
     """
 
     learning_rate: float = 1e-3
@@ -58,6 +62,7 @@ class MotionSettings:
     views: Literal["one", "all"] = "one"
     pixels: Literal["all", "useful"] = "all"
     occupancy_every: int = 25
+    start: Literal["previous", "flow"] = "previous"
 
 
 @dataclass
@@ -170,17 +175,27 @@ class DeformationStage(ScheduledStage):
         assert previous is None or isinstance(previous, DeformationPhase)
         if previous is not None and previous.level != phase.level:
             self.field.resize(phase.side**3)
+        views = self._device_views()
+        if self._previous is None:
+            self._previous = previous_images(views, self.field.clock)
         if phase.carries:
             self.field.carry(phase.frame)
+        if phase.level == 0 and self.motion.start == "flow" and views.flow is not None:
+            self._follow_flow(views, phase.frame)
         backward, forward = self.field.slice(phase.frame)
         self._visit = Visit(backward, forward, self.scene_model.occupancy, [])
         self._optimizer.replace(0, [backward, forward])
         self._optimizer.forget()
-        views = self._device_views()
-        if self._previous is None:
-            self._previous = previous_images(views, self.field.clock)
         self._look_around()
         self._visit.pools = self._frame_pools(views, phase.frame)
+
+    def _follow_flow(self, views: Views, frame: int) -> None:
+        """Move the frame's slices to where the flow says the frame before has gone."""
+        assert self._previous is not None
+        clock = self.field.clock
+        pool = all_pixels(views, (clock.frames_of(views.times) == frame).nonzero()[:, 0])
+        tracks = follow(self.scene_model, views, pool, self._previous, clock.times[frame - 1])
+        start_from_tracks(self.field, frame, tracks, views.cameras)
 
     @property
     def visit(self) -> Visit:

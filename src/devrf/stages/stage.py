@@ -7,14 +7,15 @@ from dataclasses import asdict
 from typing import Any, ClassVar
 
 from lightning import LightningModule
+from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
 
 from devrf.errors import DevrfError
 from devrf.ops.adam import GridAdam
 from devrf.rendering.model import SceneModel
 from devrf.scenes.scene import CaptureName, Scene, Views
-from devrf.stages.held_out import HeldOutView, score
 from devrf.stages.checkpoint import Passport
+from devrf.stages.held_out import score
 from devrf.stages.schedules import CanonicalPhase, DeformationPhase
 
 Phase = CanonicalPhase | DeformationPhase
@@ -94,6 +95,7 @@ class ScheduledStage(LightningModule, ABC):
             )
         assert self.phase is not None
         optimizer = self.optimizers()
+        assert isinstance(optimizer, LightningOptimizer)
         left = min(self.phase.stop, self.total_iterations) - self.iteration
         count = min(self.iterations_per_step, left)
         if self.trainer.max_steps > 0:
@@ -114,14 +116,18 @@ class ScheduledStage(LightningModule, ABC):
         if self.iteration >= self.total_iterations:
             self.trainer.should_stop = True
 
-    def test_step(self, index: int, batch_idx: int) -> HeldOutView:
-        """Render and score one held-out image; the means are logged."""
+    def test_step(self, index: int, batch_idx: int) -> dict[str, Any]:
+        """Render and score one held-out image; the means are logged.
+
+        Returns:
+            ``view``: the :class:`~devrf.stages.held_out.HeldOutView`, for callbacks.
+        """
         scene = self.scene
         views = scene.capture(self.capture).test
         view = score(self.model, views, index, scene.background, self.device)
-        self.log_dict({f"test/{self.capture}/psnr": view.psnr, f"test/{self.capture}/ssim": view.ssim},
-                      batch_size=1)
-        return view
+        scores = {"psnr": view.psnr, "ssim": view.ssim, "rest_pose_psnr": view.rest_pose_psnr}
+        self.log_dict({f"test/{self.capture}/{k}": v for k, v in scores.items()}, batch_size=1)
+        return {"view": view}
 
     def configure_optimizers(self) -> GridAdam:
         """The optimiser that :meth:`enter` hands parameters to."""

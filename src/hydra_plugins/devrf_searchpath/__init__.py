@@ -10,6 +10,8 @@ class DevrfSearchPath(SearchPathPlugin):
     """Puts devrf's ``conf/`` behind the application's own configs."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        """Append the folder and make devrf's resolvers known."""
+        """Append the folder, unless it is devrf itself that runs; make devrf's resolvers known."""
         register_resolvers()
-        search_path.append(provider="devrf", path=f"file://{config_folder()}")
+        path = f"file://{config_folder()}"
+        if all(element.path != path for element in search_path.get_path()):
+            search_path.append(provider="devrf", path=path)

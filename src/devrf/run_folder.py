@@ -1,0 +1,50 @@
+"""The folder of a run that came to nothing."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from devrf.messages import is_mistake
+
+# Hydra makes the folder and these before the program has had a look at its input.
+OF_HYDRA = {".hydra", "run.log"}
+
+
+@contextmanager
+def nothing_left_of_mistakes(folder: Path) -> Iterator[None]:
+    """Remove ``folder`` when the run ends in the user's mistake before it has made anything.
+
+    A folder that holds the results of an earlier run, or a first result of this one, stays.
+    Parents that are empty then go too, up to the working folder.
+    """
+    held_nothing = _holds_at_most(folder, {".hydra"})
+    try:
+        yield
+    except Exception as error:
+        if is_mistake(error) and held_nothing and _holds_at_most(folder, OF_HYDRA):
+            _remove(folder)
+        raise
+
+
+def _holds_at_most(folder: Path, names: set[str]) -> bool:
+    return folder.is_dir() and {path.name for path in folder.iterdir()} <= names
+
+
+def _remove(folder: Path) -> None:
+    for handler in list(logging.getLogger().handlers):
+        if isinstance(handler, logging.FileHandler):
+            logging.getLogger().removeHandler(handler)
+            handler.close()
+    shutil.rmtree(folder / ".hydra", ignore_errors=True)
+    (folder / "run.log").unlink(missing_ok=True)
+    here = Path.cwd()
+    for path in (folder.resolve(), *folder.resolve().parents):
+        # Nothing above a folder that lies elsewhere is ours, nor is the working folder.
+        elsewhere = path != folder.resolve() and here not in path.parents
+        if elsewhere or path == here or path in here.parents or any(path.iterdir()):
+            break
+        path.rmdir()

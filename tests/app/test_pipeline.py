@@ -1,0 +1,108 @@
+"""The main job, stage by stage and all at once, on a tiny embedded scene."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import imageio.v3 as iio
+import pytest
+
+CANONICAL_KEYS = {"psnr", "ssim", "seconds", "iterations", "peak_gpu_gb"}
+DEFORMATION_KEYS = CANONICAL_KEYS | {"rest_pose_psnr", "checkpoint_mb"}
+
+
+def metrics(folder: Path) -> dict:
+    return json.loads((folder / "metrics.json").read_text())
+
+
+def test_the_whole_run_succeeds_and_says_nothing_on_stderr(trained):
+    _, outcome = trained
+    assert outcome.status == 0
+    assert outcome.err == ""
+
+
+def test_metrics_have_the_documented_keys(trained):
+    folder, _ = trained
+    found = metrics(folder)
+    assert list(found) == ["scene", "canonical", "deformation"]
+    assert found["scene"] == "robot"
+    assert set(found["canonical"]) == CANONICAL_KEYS
+    assert set(found["deformation"]) == DEFORMATION_KEYS
+    assert found["canonical"]["iterations"] == 6
+    assert found["deformation"]["iterations"] == 12  # (2 + 2) for each of 3 frames
+    assert found["deformation"]["checkpoint_mb"] == pytest.approx(
+        (folder / "checkpoints" / "deformation.ckpt").stat().st_size / 1e6, abs=1e-3
+    )
+
+
+def test_everything_lies_in_the_run_folder(trained):
+    folder, _ = trained
+    made = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
+    assert {
+        ".hydra/config.yaml", "run.log", "metrics.json",
+        "checkpoints/canonical.ckpt", "checkpoints/deformation.ckpt",
+        "images/static.png", "images/dynamic.png",
+        "videos/held_out.mp4", "videos/orbit.mp4",
+    } <= made
+    assert not [name for name in made if "partial" in name]
+
+
+def test_pictures_and_videos_can_be_read(trained):
+    folder, _ = trained
+    sheet = iio.imread(folder / "images" / "dynamic.png")
+    assert sheet.ndim == 3 and sheet.shape[2] == 3
+    video = iio.imread(folder / "videos" / "held_out.mp4")
+    assert len(video) == 4
+    # Colour beside depth, 24 x 20 px each, enlarged alike.
+    assert video.shape[2] / video.shape[1] == pytest.approx(2 * 24 / 20, rel=0.02)
+
+
+def test_stages_one_by_one_find_the_checkpoints_and_come_to_the_same(
+    devrf, tmp_path, tiny, trained
+):
+    folder = tmp_path / "run"
+    for stage in ("canonical", "deformation", "evaluate", "render"):
+        outcome = devrf(*tiny, f"stage={stage}", f"hydra.run.dir={folder}")
+        assert (outcome.status, outcome.err) == (0, "")
+    assert (folder / "videos" / "orbit.mp4").is_file()
+    ours, whole = metrics(folder), metrics(trained[0])
+    for section in ("canonical", "deformation"):
+        assert ours[section]["psnr"] == pytest.approx(whole[section]["psnr"], abs=0.01)
+
+
+def test_the_canonical_stage_alone_can_be_scored(devrf, tmp_path, tiny):
+    for stage in ("canonical", "evaluate"):
+        outcome = devrf(*tiny, f"stage={stage}", "hydra.run.dir=run")
+        assert (outcome.status, outcome.err) == (0, "")
+    assert list(metrics(tmp_path / "run")) == ["scene", "canonical"]
+
+
+def test_a_checkpoint_from_elsewhere_is_taken_as_given(devrf, tmp_path, tiny, trained):
+    checkpoint = trained[0] / "checkpoints" / "deformation.ckpt"
+    outcome = devrf(*tiny, "stage=evaluate", f"ckpt={checkpoint}", "hydra.run.dir=scores")
+    assert (outcome.status, outcome.err) == (0, "")
+    assert metrics(tmp_path / "scores") == metrics(trained[0])
+
+
+def test_the_deformation_stage_starts_from_a_checkpoint_elsewhere(devrf, tmp_path, tiny, trained):
+    checkpoint = trained[0] / "checkpoints" / "canonical.ckpt"
+    outcome = devrf(*tiny, "stage=deformation", f"ckpt={checkpoint}", "hydra.run.dir=moved")
+    assert (outcome.status, outcome.err) == (0, "")
+    assert (tmp_path / "moved" / "checkpoints" / "deformation.ckpt").is_file()
+
+
+def test_the_folder_tells_scene_experiment_and_ablation(devrf, tmp_path, tiny):
+    outcome = devrf(
+        *tiny, "stage=canonical", "data.shape=flower", "experiment=quickstart", "ablation=c2f"
+    )
+    assert (outcome.status, outcome.err) == (0, "")
+    assert (tmp_path / "outputs/flower/quickstart-c2f/checkpoints/canonical.ckpt").is_file()
+
+
+def test_a_sweep_runs_every_combination(devrf, tmp_path, tiny):
+    outcome = devrf(
+        "--multirun", *tiny, "stage=canonical", "ablation=base,full", "hydra.sweep.dir=sweep"
+    )
+    assert (outcome.status, outcome.err) == (0, "")
+    assert len(list((tmp_path / "sweep").glob("*/checkpoints/canonical.ckpt"))) == 2

@@ -1,0 +1,46 @@
+"""Files that are written whole or not at all."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from devrf.artifacts.files import update_json, whole_file
+
+
+def test_a_finished_file_stands_under_its_name_alone(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "folder" / "picture.png"
+    with whole_file(path) as partial:
+        # Writers tell the format by the suffix.
+        assert partial.suffix == ".png" and partial != path
+        partial.write_text("whole")
+        assert not path.exists()
+    assert path.read_text() == "whole"
+    assert [p.name for p in path.parent.iterdir()] == ["picture.png"]
+
+
+def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.json"
+    path.write_text("old")
+    with pytest.raises(RuntimeError, match="disk"), whole_file(path) as partial:
+        partial.write_text("half")
+        raise RuntimeError("disk full")
+    assert path.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["metrics.json"]
+
+
+def test_json_is_updated_key_by_key(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.json"
+    assert update_json(path, {"a": 1, "b": {"c": 2}}) == {"a": 1, "b": {"c": 2}}
+    assert update_json(path, {"b": 3}) == {"a": 1, "b": 3}
+    assert json.loads(path.read_text()) == {"a": 1, "b": 3}
+
+
+@pytest.mark.parametrize("damaged", ["", "{", "[1, 2]"])
+def test_a_damaged_json_file_is_begun_anew(tmp_path: Path, damaged: str) -> None:
+    path = tmp_path / "metrics.json"
+    path.write_text(damaged)
+    update_json(path, {"a": 1})
+    assert json.loads(path.read_text()) == {"a": 1}

@@ -1,0 +1,145 @@
+"""Colour maps, contact sheets and films, read back from the files."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import imageio.v3 as iio
+import pytest
+import torch
+from torch import Tensor
+
+from devrf.artifacts.colors import depth_colors, error_colors, to_bytes
+from devrf.artifacts.contact_sheet import GAP, side_by_side, write_contact_sheet
+from devrf.artifacts.film import FilmSettings, orbit, pictures, write_video
+from devrf.fields.architecture import Architecture
+from devrf.fields.occupancy import Occupancy
+from devrf.geometry.box import Box
+from devrf.geometry.cameras import Cameras
+from devrf.rendering.model import SceneModel
+from devrf.rendering.render import RenderSettings
+from devrf.stages.held_out import HeldOutView
+
+
+def flat(height: int, width: int, color: tuple[float, float, float]) -> Tensor:
+    return torch.tensor(color).expand(height, width, 3)
+
+
+def test_bytes_are_rounded_and_clamped() -> None:
+    assert to_bytes(torch.tensor([-1.0, 0.0, 0.5, 1.0, 7.0, 0.9985])).tolist() == [
+        0, 0, 128, 255, 255, 255
+    ]
+
+
+def test_depth_is_bright_near_dark_far_and_white_where_nothing_is() -> None:
+    depth = torch.tensor([[1.0, 1.5, 2.0, 3.0, 0.0]])
+    opacity = torch.tensor([[1.0, 1.0, 1.0, 1.0, 0.0]])
+    colors = depth_colors(depth, opacity, near=1.0, far=2.0)
+    assert colors.shape == (1, 5, 3)
+    light = colors[0].mean(dim=1)
+    assert light[0] > light[1] > light[2]
+    torch.testing.assert_close(colors[0, 3], colors[0, 2])
+    assert torch.equal(colors[0, 4], torch.ones(3))
+
+
+def test_no_error_is_black_and_more_is_brighter_up_to_the_full_one() -> None:
+    truth = torch.zeros(1, 4, 3)
+    prediction = torch.tensor([0.0, 0.1, 0.25, 0.9])[None, :, None].expand(1, 4, 3)
+    light = error_colors(prediction, truth).sum(dim=-1)[0]
+    assert light[0] < 0.1
+    assert light[0] < light[1] < light[2] and light[2] == light[3]
+
+
+def view(number: int, height: int = 6, width: int = 9) -> HeldOutView:
+    truth = flat(height, width, (0.0, 0.0, 1.0))
+    prediction = flat(height, width, (number / 255, 0.0, 0.0))
+    return HeldOutView(f"{number}", 0.0, truth, prediction, 10.0, 0.5, 9.0)
+
+
+def test_a_contact_sheet_shows_prediction_truth_and_error_of_spread_views(tmp_path: Path) -> None:
+    path = tmp_path / "images" / "static.png"
+    write_contact_sheet(path, [view(10 * k) for k in range(11)], rows=3)
+    sheet = iio.imread(path)
+    assert sheet.shape == (3 * 6 + 2 * GAP, 3 * 9 + 2 * GAP, 3)
+    # The first, the middle and the last view.
+    assert [int(sheet[row * (6 + GAP), 0, 0]) for row in range(3)] == [0, 50, 100]
+    assert (sheet[:6, 9 : 9 + GAP] == 255).all()
+    assert (sheet[:6, 9 + GAP : 18 + GAP] == [0, 0, 255]).all()
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_contact_sheet_of_few_views_has_a_row_each(tmp_path: Path, count: int) -> None:
+    write_contact_sheet(tmp_path / "sheet.png", [view(k) for k in range(count)])
+    assert iio.imread(tmp_path / "sheet.png").shape[0] == count * 6 + (count - 1) * GAP
+
+
+def test_images_stand_side_by_side_with_white_between() -> None:
+    row = side_by_side([flat(2, 3, (0, 0, 0)), flat(2, 1, (0, 0, 0))], gap=2)
+    assert row.shape == (2, 6, 3)
+    assert row[0, :, 0].tolist() == [0, 0, 0, 1, 1, 0]
+
+
+@pytest.mark.parametrize(("height", "width"), [(48, 96), (241, 33), (15, 7), (301, 300)])
+def test_a_video_has_even_sides_a_watchable_size_and_all_its_pictures(
+    tmp_path: Path, height: int, width: int
+) -> None:
+    path = tmp_path / "videos" / "orbit.mp4"
+    shades = (0.0, 0.5, 1.0, 0.25)
+    write_video(path, iter([flat(height, width, (s, s, s)) for s in shades]), fps=10)
+    frames = iio.imread(path, plugin="FFMPEG")
+    factor = max(1, math.ceil(240 / height))
+    expected = (factor * height + factor * height % 2, factor * width + factor * width % 2)
+    assert frames.shape == (4, *expected, 3)
+    assert expected[0] >= 240
+    for frame, shade in zip(frames, shades, strict=True):
+        assert abs(float(frame.mean()) - 255 * shade) < 4
+    assert [p.name for p in path.parent.iterdir()] == ["orbit.mp4"]
+
+
+def test_a_film_that_fails_leaves_nothing_behind(tmp_path: Path) -> None:
+    def broken() -> Iterator[Tensor]:
+        yield flat(240, 240, (0, 0, 0))
+        raise RuntimeError("out of memory")
+
+    with pytest.raises(RuntimeError, match="out of memory"):
+        write_video(tmp_path / "film.mp4", broken(), fps=10)
+    assert list(tmp_path.iterdir()) == []
+
+
+def ring(count: int) -> Cameras:
+    angle = torch.arange(count) * (2 * math.pi / count)
+    positions = torch.stack([3 * angle.cos(), 3 * angle.sin(), 0 * angle + 1], dim=1)
+    return Cameras.looking_at(positions, torch.zeros(count, 3), focal=20.0, width=15, height=10)
+
+
+def test_an_orbit_circles_the_box_at_the_cameras_distance(cube: Box) -> None:
+    settings = FilmSettings(frames=8, orbit_turns=2.0, orbit_elevation=30.0)
+    cameras = orbit(ring(6), cube, settings)
+    assert len(cameras) == 8 and (cameras.width, cameras.height) == (15, 10)
+    torch.testing.assert_close(cameras.positions.norm(dim=1), torch.full((8,), math.sqrt(10)))
+    torch.testing.assert_close(cameras.positions[:, 2], torch.full((8,), math.sqrt(10) / 2))
+    # Two turns in eight pictures: a quarter turn each.
+    flat_steps = cameras.positions[:4, :2] * cameras.positions[1:5, :2]
+    torch.testing.assert_close(flat_steps.sum(dim=1), torch.zeros(4), atol=1e-5, rtol=0)
+    toward = torch.nn.functional.normalize(-cameras.positions, dim=1)
+    torch.testing.assert_close(cameras.forwards, toward)
+
+
+def test_pictures_show_colour_beside_depth_while_time_runs(cube: Box) -> None:
+    canonical = Architecture().search_field(cube, 5**3)
+    with torch.no_grad():
+        canonical.density.values[2, 2, 2] = 60.0
+        canonical.color.values.copy_(torch.tensor([9.0, -9.0, -9.0]).expand(5, 5, 5, 3))
+    settings = RenderSettings(0.5, 1e-4, 0.0, 9.0)
+    model = SceneModel(canonical, Occupancy.full((5, 5, 5), cube), settings)
+    shown = list(pictures(model, ring(3), 1.0, torch.device("cpu")))
+    assert len(shown) == 3
+    for image in shown:
+        assert image.shape == (10, 30, 3)
+        # A red thing in the middle, white around it; its depth is not white.
+        assert image[5, 7, 0] > 0.95 and image[5, 7, 1] < 0.05
+        torch.testing.assert_close(image[0, 0], torch.ones(3))
+        torch.testing.assert_close(image[0, 15], torch.ones(3))
+        assert image[5, 22].min() < 0.9

@@ -1,0 +1,129 @@
+"""What tests of every room share: one thread, seeded numbers, one tiny scene."""
+
+from __future__ import annotations
+
+import copy
+import logging
+import warnings
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import settings
+from lightning import Callback, Trainer
+
+from devrf.callbacks import GridUpscaling, LearningRateDecay
+from devrf.data.datamodule import SceneDataModule
+from devrf.fields.architecture import Architecture
+from devrf.geometry.box import Box
+from devrf.scenes.procedural import ProceduralScene
+from devrf.scenes.scene import Scene
+from devrf.stages.canonical import CanonicalStage
+from devrf.stages.checkpoint import Stored
+from devrf.stages.schedules import CanonicalSchedule
+
+logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
+
+# The same examples on every machine, however slow it is.
+settings.register_profile("house", derandomize=True, deadline=None, database=None)
+settings.load_profile("house")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def single_thread() -> Iterator[None]:
+    """Small tensors: on a busy machine threads cost more than they bring."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(autouse=True)
+def seeded() -> None:
+    """The global generator starts each test at the same place, whatever ran before."""
+    torch.manual_seed(0)
+
+
+@pytest.fixture
+def rng() -> torch.Generator:
+    """A generator of a test's own."""
+    return torch.Generator().manual_seed(1)
+
+
+@pytest.fixture
+def cube() -> Box:
+    """The cube from −1 to 1."""
+    return Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+
+
+@pytest.fixture(scope="session")
+def tiny_recipe() -> ProceduralScene:
+    """How the tiny scene is made; its ``model()`` knows every motion exactly."""
+    return ProceduralScene(
+        shape="robot", width=24, height=18, static_views=8, static_test_views=2,
+        train_views=2, frames=3, supersample=1,
+    )
+
+
+@pytest.fixture(scope="session")
+def tiny_scene(tiny_recipe: ProceduralScene) -> Scene:
+    """A robot in 24×18 pixels (not square): 8 static views, 2 moving views of 3 frames."""
+    return tiny_recipe()
+
+
+class GivenScene(SceneDataModule):
+    """Serves a scene that is there already."""
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__()
+        self.given = scene
+
+    def load(self) -> Scene:
+        """The scene."""
+        return self.given
+
+
+@pytest.fixture
+def datamodule(tiny_scene: Scene) -> SceneDataModule:
+    """Serves the tiny scene."""
+    return GivenScene(tiny_scene)
+
+
+def quiet_trainer(*callbacks: Callback, **options: Any) -> Trainer:
+    """A trainer on the CPU with the two callbacks that a schedule needs, and no files."""
+    warnings.filterwarnings("ignore", module="lightning")
+    return Trainer(
+        accelerator="cpu", devices=1, logger=False, enable_checkpointing=False,
+        enable_progress_bar=False, enable_model_summary=False,
+        callbacks=[GridUpscaling(), LearningRateDecay(), *callbacks], **options,
+    )
+
+
+@pytest.fixture
+def trainer() -> Callable[..., Trainer]:
+    """The function :func:`quiet_trainer`."""
+    return quiet_trainer
+
+
+SMALL = Architecture(channels=4, width=16, frequencies=2)
+
+
+@pytest.fixture(scope="session")
+def learned(tiny_scene: Scene) -> tuple[CanonicalStage, Trainer]:
+    """The tiny scene at rest, learned in under a second; not to be changed."""
+    torch.manual_seed(0)
+    schedule = CanonicalSchedule(
+        search_iterations=0, search_side=16, carve=True, iterations=120, side=20,
+        doublings=(40,), rays=256,
+    )
+    stage = CanonicalStage(schedule, SMALL)
+    fitted = quiet_trainer(max_epochs=1)
+    fitted.fit(stage, datamodule=GivenScene(tiny_scene))
+    return stage, fitted
+
+
+@pytest.fixture
+def rest(learned: tuple[CanonicalStage, Trainer]) -> Stored:
+    """A copy of the tiny scene at rest, for a deformation stage to build on."""
+    return copy.deepcopy(learned[0].result())

@@ -1,0 +1,106 @@
+"""Pixels become batches: rows and columns, backgrounds, flow, on images that are not square."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from devrf.data.batch import background_color, gather_batch, pixel_positions
+from devrf.data.pool import PixelPool, all_pixels
+from devrf.geometry.cameras import Cameras
+from devrf.scenes.scene import OpticalFlow, Views
+
+WIDTH, HEIGHT = 4, 3
+
+
+def views(channels: int = 4, flow: bool = True) -> Views:
+    """Two images; red is 100·image + 10·row + column, alpha half; flow is (x, −y) of a pixel."""
+    image, row, column = torch.meshgrid(
+        torch.arange(2), torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij"
+    )
+    red = 100 * image + 10 * row + column
+    pixels = torch.stack([red, 0 * red, 0 * red + 255, 0 * red + 51], dim=-1)[..., :channels]
+    cameras = Cameras(
+        torch.eye(3, 4)[None].repeat(2, 1, 1), torch.tensor([[5.0, 5.0], [7.0, 6.0]]),
+        torch.tensor([[2.0, 1.5]] * 2), WIDTH, HEIGHT,
+    )
+    vectors = torch.stack([column + 0.5, -(row + 0.5)], dim=-1)
+    return Views(
+        pixels.to(torch.uint8), cameras, torch.tensor([0.0, 1.0]), torch.tensor([0, 0]),
+        ("a", "b"), OpticalFlow(vectors, column > row) if flow else None,
+    )
+
+
+# Image 1, row 2, column 1; image 0, row 0, column 3.
+IMAGE, FLAT = torch.tensor([1, 0]), torch.tensor([9, 3])
+
+
+def test_pixel_positions_are_x_then_y() -> None:
+    assert pixel_positions(FLAT, WIDTH).tolist() == [[1.5, 2.5], [3.5, 0.5]]
+
+
+def test_a_batch_holds_the_right_pixels_with_their_flow() -> None:
+    batch = gather_batch(views(), IMAGE, FLAT, torch.zeros(3))
+    assert batch.pixel.tolist() == [[1.5, 2.5], [3.5, 0.5]]
+    assert batch.flow is not None and batch.flow_valid is not None
+    assert batch.flow.tolist() == [[1.5, -2.5], [3.5, -0.5]]
+    assert batch.flow_valid.tolist() == [False, True]
+    assert batch.image.tolist() == [1, 0]
+    # On black, colour times alpha 51/255.
+    torch.testing.assert_close(batch.color[:, 0], torch.tensor([121, 3]) / 255 * 0.2)
+
+
+def test_rays_belong_to_the_cameras_of_their_images() -> None:
+    data = views()
+    batch = gather_batch(data, IMAGE, FLAT, torch.zeros(3))
+    expected = data.cameras.rays(IMAGE, batch.pixel)
+    assert torch.equal(batch.rays.directions, expected.directions)
+    # ((1.5 − 2)/7, −(2.5 − 1.5)/6, −1) for image 1.
+    ray = torch.nn.functional.normalize(torch.tensor([-0.5 / 7, -1 / 6, -1.0]), dim=0)
+    torch.testing.assert_close(batch.rays.directions[0], ray)
+
+
+@pytest.mark.parametrize(
+    "background", [torch.tensor([1.0, 1.0, 1.0]), torch.tensor([[1.0, 0.0, 0.5], [0.2, 0.4, 0.6]])]
+)
+def test_mattes_are_composited_on_one_background_or_one_a_ray(background: Tensor) -> None:
+    batch = gather_batch(views(), IMAGE, FLAT, background)
+    rgb = torch.tensor([[121 / 255, 0.0, 1.0], [3 / 255, 0.0, 1.0]])
+    torch.testing.assert_close(batch.color, 0.2 * rgb + 0.8 * background)
+    assert batch.alpha is not None
+    torch.testing.assert_close(batch.alpha, torch.tensor([0.2, 0.2]))
+
+
+def test_images_without_matte_or_flow() -> None:
+    batch = gather_batch(views(channels=3, flow=False), IMAGE, FLAT, torch.zeros(3))
+    assert batch.alpha is None and batch.flow is None and batch.flow_valid is None
+    torch.testing.assert_close(batch.color[0], torch.tensor([121 / 255, 0.0, 1.0]))
+
+
+def test_backgrounds() -> None:
+    cpu = torch.device("cpu")
+    assert background_color("white", 5, cpu, training=True).tolist() == [1, 1, 1]
+    assert background_color("black", 5, cpu, training=True).tolist() == [0, 0, 0]
+    assert background_color("random", 5, cpu, training=False).tolist() == [1, 1, 1]
+    drawn = background_color("random", 5, cpu, training=True)
+    assert drawn.shape == (5, 3) and len(drawn.unique(dim=0)) == 5
+
+
+def test_all_pixels_of_some_images() -> None:
+    pool = all_pixels(views(), torch.tensor([1, 0]))
+    assert len(pool) == 2 * WIDTH * HEIGHT
+    assert pool.image.tolist() == [1] * 12 + [0] * 12
+    assert pool.flat.tolist() == list(range(12)) * 2
+    kept = pool.of_images(torch.tensor([0]))
+    assert kept.image.unique().tolist() == [0] and kept.flat.tolist() == list(range(12))
+
+
+def test_draws_come_from_the_pool_and_reach_all_of_it() -> None:
+    pool = PixelPool(
+        torch.tensor([0, 1, 1], dtype=torch.int32), torch.tensor([7, 2, 5], dtype=torch.int32)
+    )
+    image, flat = pool.draw(200)
+    assert image.dtype == flat.dtype == torch.int64
+    drawn = set(zip(image.tolist(), flat.tolist(), strict=True))
+    assert drawn == {(0, 7), (1, 2), (1, 5)}

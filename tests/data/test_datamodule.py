@@ -1,0 +1,66 @@
+"""Datamodules: the batch that a stage asks for."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+import torch
+
+from devrf.data.datamodule import SceneDataModule
+from devrf.data.inward import InwardFacingDataModule
+from devrf.data.procedural import ProceduralDataModule
+from devrf.errors import DevrfError
+from devrf.scenes.scene import Scene
+
+
+class Given(SceneDataModule):
+    """Serves a scene that is there already, and counts how often it was asked for."""
+
+    def __init__(self, scene: Scene) -> None:
+        super().__init__()
+        self.given, self.loads = scene, 0
+
+    def load(self) -> Scene:
+        self.loads += 1
+        return self.given
+
+
+def test_the_scene_is_loaded_once_and_only_when_needed(tiny_scene: Scene) -> None:
+    module = Given(tiny_scene)
+    assert module.loads == 0
+    module.setup("fit")
+    module.setup("test")
+    assert module.scene is tiny_scene and module.loads == 1
+
+
+def test_training_views_move_to_the_device_once_for_each_capture(tiny_scene: Scene) -> None:
+    module, cpu = Given(tiny_scene), torch.device("cpu")
+    static = module.training_views("static", cpu)
+    assert module.training_views("static", cpu) is static
+    assert torch.equal(static.pixels, tiny_scene.static.train.pixels)
+    dynamic = module.training_views("dynamic", cpu)
+    assert torch.equal(dynamic.times, tiny_scene.dynamic.train.times)
+    assert dynamic.flow is not None and len(dynamic) == 6
+
+
+def test_the_training_loader_never_ends(tiny_scene: Scene) -> None:
+    loader = Given(tiny_scene).train_dataloader()
+    assert list(itertools.islice(loader, 50)) == [None] * 50
+
+
+def test_the_procedural_module_renders_what_it_was_told() -> None:
+    module = ProceduralDataModule(
+        "flower", width=12, height=8, static_views=3, static_test_views=2, train_views=2,
+        frames=2, supersample=1,
+    )
+    scene = module.scene
+    assert scene.name == "flower"
+    assert scene.static.train.pixels.shape == (3, 8, 12, 4)
+    assert len(scene.static.test) == 2 and len(scene.dynamic.train) == 4
+    assert scene.clock.times == (0.0, 1.0)
+
+
+def test_an_unknown_source_of_flow_is_an_error_that_names_the_choices() -> None:
+    with pytest.raises(DevrfError, match="data.flow.*raft"):
+        InwardFacingDataModule("nowhere", flow="farneback")  # type: ignore[arg-type]

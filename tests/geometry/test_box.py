@@ -1,0 +1,135 @@
+"""Boxes: grids over them and rays across them."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from devrf.geometry.box import Box
+from devrf.geometry.rays import Rays
+
+
+def ray(origin: tuple[float, float, float], direction: tuple[float, float, float]) -> Rays:
+    d = torch.nn.functional.normalize(torch.tensor([direction]), dim=1)
+    return Rays(torch.tensor([origin]), d, d)
+
+
+@pytest.mark.parametrize("side", [2, 3, 10, 20, 40, 80, 100, 160, 161])
+def test_a_cube_of_side_cubed_voxels_has_that_side(side: int) -> None:
+    # The paper's grids: cube roots in floating point must not lose one.
+    for edge in (1.0, 2.26, 0.3):
+        assert Box((0.0, 0.0, 0.0), (edge, edge, edge)).grid_shape(side**3) == (side,) * 3
+
+
+def test_a_grid_follows_the_box_proportions() -> None:
+    box = Box((0.0, 0.0, 0.0), (4.0, 2.0, 1.0))
+    # s = (8 / 4096)^(1/3) = 1/8.
+    assert box.voxel_size(4096) == pytest.approx(0.125)
+    assert box.grid_shape(4096) == (32, 16, 8)
+    # floor: s = (8 / 1000)^(1/3) = 0.2 gives 20, 10, 5; a few voxels fewer give less.
+    assert box.grid_shape(1000) == (20, 10, 5)
+    assert box.grid_shape(990) == (19, 9, 4)
+
+
+def test_a_grid_has_two_points_along_every_axis_at_least() -> None:
+    assert Box((0.0, 0.0, 0.0), (100.0, 1.0, 1.0)).grid_shape(8) == (43, 2, 2)
+
+
+def test_derived_boxes_by_hand() -> None:
+    box, other = Box((0.0, 0.0, 0.0), (2.0, 4.0, 1.0)), Box((-1.0, 1.0, 0.5), (1.0, 5.0, 2.0))
+    assert box.size == (2.0, 4.0, 1.0) and box.longest == 4.0 and box.volume == 8.0
+    assert box.scaled(1.5) == Box((-0.5, -1.0, -0.25), (2.5, 5.0, 1.25))
+    assert box.union(other) == Box((-1.0, 0.0, 0.0), (2.0, 5.0, 2.0))
+    assert box.clipped(other) == Box((0.0, 1.0, 0.5), (1.0, 4.0, 1.0))
+
+
+@pytest.mark.parametrize("high", [(1.0, 1.0, 0.0), (1.0, -1.0, 1.0), (1.0, math.nan, 1.0)])
+def test_a_flat_or_inverted_box_is_an_error(high: tuple[float, float, float]) -> None:
+    with pytest.raises(ValueError, match="low < high"):
+        Box((0.0, 0.0, 0.0), high)
+
+
+def test_grid_points_sit_on_the_corners_and_to_grid_counts_them() -> None:
+    box, shape = Box((-1.0, 0.0, 2.0), (1.0, 3.0, 2.5)), (5, 4, 2)
+    points = box.grid_points(shape, torch.zeros(()))
+    assert points.shape == (5, 4, 2, 3)
+    torch.testing.assert_close(points[0, 0, 0], torch.tensor([-1.0, 0.0, 2.0]))
+    torch.testing.assert_close(points[4, 3, 1], torch.tensor([1.0, 3.0, 2.5]))
+    torch.testing.assert_close(points[1, 2, 0], torch.tensor([-0.5, 2.0, 2.0]))
+    counted = torch.cartesian_prod(*[torch.arange(float(n)) for n in shape])
+    torch.testing.assert_close(box.to_grid(points.reshape(-1, 3), shape), counted)
+
+
+def test_contains_its_faces_and_nearest_moves_only_what_is_outside() -> None:
+    box = Box((0.0, 0.0, 0.0), (1.0, 2.0, 3.0))
+    points = torch.tensor([[0.0, 2.0, 3.0], [0.5, 1.0, 1.0], [1.001, 1.0, 1.0], [-4.0, 9.0, 2.0]])
+    assert box.contains(points).tolist() == [True, True, False, False]
+    expected = torch.tensor([[0.0, 2.0, 3.0], [0.5, 1.0, 1.0], [1.0, 1.0, 1.0], [0.0, 2.0, 2.0]])
+    assert torch.equal(box.nearest(points), expected)
+
+
+@pytest.mark.parametrize(
+    ("origin", "direction", "entry", "leave"),
+    [
+        ((-3.0, 0.0, 0.0), (1.0, 0.0, 0.0), 2.0, 4.0),
+        ((3.0, 0.5, -0.5), (-1.0, 0.0, 0.0), 2.0, 4.0),
+        # From the inside the entry lies behind the origin.
+        ((0.5, 0.0, 0.0), (1.0, 0.0, 0.0), -1.5, 0.5),
+        # A diagonal through the middle.
+        ((-2.0, -2.0, -2.0), (1.0, 1.0, 1.0), math.sqrt(3), 3 * math.sqrt(3)),
+        # Away from the box: it is crossed behind the origin only.
+        ((3.0, 0.0, 0.0), (1.0, 0.0, 0.0), -4.0, -2.0),
+    ],
+)
+def test_crossing_by_hand(
+    cube: Box,
+    origin: tuple[float, float, float],
+    direction: tuple[float, float, float],
+    entry: float,
+    leave: float,
+) -> None:
+    got = cube.crossing(ray(origin, direction))
+    assert [float(v) for v in got] == pytest.approx([entry, leave], rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("origin", "direction"),
+    [
+        ((-3.0, 1.5, 0.0), (1.0, 0.0, 0.0)),  # parallel to two faces, beside the box
+        ((0.0, 0.0, 1.001), (0.6, 0.8, 0.0)),  # parallel above it
+        ((-3.0, 0.0, 0.0), (1.0, 1.0, 0.0)),  # slanted past a corner
+    ],
+)
+def test_a_miss_enters_after_it_leaves(
+    cube: Box, origin: tuple[float, float, float], direction: tuple[float, float, float]
+) -> None:
+    entry, leave = cube.crossing(ray(origin, direction))
+    assert float(entry) > float(leave)
+
+
+@given(
+    st.tuples(*[st.floats(-3, 3, width=32)] * 3), st.tuples(*[st.floats(-1, 1, width=32)] * 3)
+)
+def test_the_middle_of_a_crossing_is_inside_and_beyond_it_is_outside(
+    origin: tuple[float, float, float], direction: tuple[float, float, float]
+) -> None:
+    box = Box((-1.0, -0.5, -2.0), (1.0, 1.5, 0.25))
+    norm = math.dist(direction, (0, 0, 0))
+    if norm < 1e-2:
+        return
+    rays = ray(origin, direction)
+    entry, leave = (float(v) for v in box.crossing(rays))
+    if leave - entry > 1e-2:
+        at = torch.tensor([(entry + leave) / 2, entry - 0.02, leave + 0.02])
+        inside = box.contains(rays.at(torch.zeros(3, dtype=torch.long), at))
+        assert inside.tolist() == [True, False, False]
+
+
+def test_box_of_tensors_and_lists_agree() -> None:
+    low, high = [0.0, -1.0, 2.0], [1.0, 0.0, 3.0]
+    assert Box.of(torch.tensor(low), torch.tensor(high)) == Box.of(low, high)
+    assert Box.of(low, high).low == (0.0, -1.0, 2.0)

@@ -1,0 +1,143 @@
+"""Pinhole cameras: pixels to rays and back, on images that are not square."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from devrf.geometry.cameras import Cameras
+
+IDENTITY = torch.eye(3, 4)[None]
+
+
+def plain(width: int = 8, height: int = 6) -> Cameras:
+    """A camera at the origin that looks along −z, with unequal focal lengths."""
+    return Cameras(
+        IDENTITY, torch.tensor([[10.0, 5.0]]), torch.tensor([[4.0, 3.0]]), width, height
+    )
+
+
+@pytest.fixture
+def scattered(rng: torch.Generator) -> Cameras:
+    """Five cameras anywhere, each with its own lens; 30×20 pixels."""
+    looking = Cameras.looking_at(
+        torch.randn(5, 3, generator=rng) * 4, torch.randn(5, 3, generator=rng),
+        focal=1.0, width=30, height=20,
+    )
+    focal = 20 + 10 * torch.rand(5, 2, generator=rng)
+    center = torch.tensor([15.0, 10.0]) + torch.randn(5, 2, generator=rng)
+    return Cameras(looking.camera_to_world, focal, center, 30, 20)
+
+
+def test_a_ray_by_hand() -> None:
+    rays = plain().rays(torch.tensor([0]), torch.tensor([[14.0, 8.0]]))
+    # ((14 − 4)/10, −(8 − 3)/5, −1) = (1, −1, −1): right, down, ahead.
+    torch.testing.assert_close(rays.directions, torch.tensor([[1.0, -1.0, -1.0]]) / 3**0.5)
+    assert torch.equal(rays.viewdirs, rays.directions)
+    assert torch.equal(rays.origins, torch.zeros(1, 3))
+
+
+def test_a_pixel_by_hand() -> None:
+    points = torch.tensor([[1.0, 2.0, -4.0], [0.0, 0.0, -2.0], [1.0, 0.0, 3.0]])
+    pixel, depth = plain().project(torch.zeros(3, dtype=torch.long), points)
+    # x = 4 + 10·1/4, y = 3 − 5·2/4; then the principal point; then behind the camera.
+    torch.testing.assert_close(pixel[:2], torch.tensor([[6.5, 0.5], [4.0, 3.0]]))
+    assert depth.tolist() == [4.0, 2.0, -3.0]
+
+
+def test_a_moved_camera_sees_a_pixel_by_hand() -> None:
+    # At (0, 0, 5) turned a quarter about y: it looks along −x, its right is −z.
+    pose = torch.tensor([[[0.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 5.0]]])
+    camera = Cameras(pose, torch.tensor([[10.0, 5.0]]), torch.tensor([[4.0, 3.0]]), 8, 6)
+    assert torch.equal(camera.positions, torch.tensor([[0.0, 0.0, 5.0]]))
+    assert torch.equal(camera.forwards, torch.tensor([[-1.0, 0.0, 0.0]]))
+    pixel, depth = camera.project(torch.tensor([0]), torch.tensor([[-2.0, 1.0, 4.0]]))
+    # 2 ahead, 1 right, 1 up.
+    torch.testing.assert_close(pixel, torch.tensor([[9.0, 0.5]]))
+    assert depth.item() == 2.0
+
+
+def test_projection_undoes_rays(scattered: Cameras, rng: torch.Generator) -> None:
+    camera = torch.randint(5, (200,), generator=rng)
+    pixels = torch.rand(200, 2, generator=rng) * torch.tensor([30.0, 20.0])
+    rays = scattered.rays(camera, pixels)
+    distance = 0.5 + 9 * torch.rand(200, generator=rng)
+    again, depth = scattered.project(camera, rays.at(torch.arange(200), distance))
+    torch.testing.assert_close(again, pixels, atol=2e-4, rtol=0)
+    along = distance * (rays.directions * scattered.forwards[camera]).sum(dim=1)
+    torch.testing.assert_close(depth, along, atol=1e-5, rtol=1e-5)
+
+
+def test_project_into_is_project_with_one_camera(
+    scattered: Cameras, rng: torch.Generator
+) -> None:
+    points = torch.randn(50, 3, generator=rng)
+    for k in range(5):
+        one, many = scattered.project_into(k, points), scattered.project(
+            torch.full((50,), k), points
+        )
+        torch.testing.assert_close(one[0], many[0], atol=1e-3, rtol=1e-4)
+        torch.testing.assert_close(one[1], many[1], atol=1e-5, rtol=1e-5)
+
+
+def test_pixel_grid_is_row_major_with_x_first() -> None:
+    grid = plain(width=3, height=2).pixel_grid()
+    expected = [[0.5, 0.5], [1.5, 0.5], [2.5, 0.5], [0.5, 1.5], [1.5, 1.5], [2.5, 1.5]]
+    assert grid.tolist() == expected
+
+
+def test_image_rays_go_through_the_pixel_grid(scattered: Cameras) -> None:
+    rays = scattered.image_rays(3)
+    pixel, _ = scattered.project(torch.full((600,), 3), rays.origins + 2 * rays.directions)
+    torch.testing.assert_close(pixel, scattered.pixel_grid(), atol=1e-4, rtol=0)
+
+
+def test_resizing_scales_each_axis_by_its_own_factor(
+    scattered: Cameras, rng: torch.Generator
+) -> None:
+    small = scattered.resized(10, 4)
+    assert (small.width, small.height) == (10, 4)
+    camera = torch.randint(5, (40,), generator=rng)
+    pixels = torch.rand(40, 2, generator=rng) * torch.tensor([30.0, 20.0])
+    same = small.rays(camera, pixels / torch.tensor([3.0, 5.0]))
+    torch.testing.assert_close(same.directions, scattered.rays(camera, pixels).directions)
+
+
+def test_looking_at_puts_the_target_in_the_middle_and_up_above(rng: torch.Generator) -> None:
+    positions, targets = torch.randn(6, 3, generator=rng) * 3, torch.randn(6, 3, generator=rng)
+    cameras = Cameras.looking_at(positions, targets, focal=20.0, width=12, height=8)
+    every = torch.arange(6)
+    pixel, depth = cameras.project(every, targets)
+    torch.testing.assert_close(pixel, torch.tensor([[6.0, 4.0]]).expand(6, 2), atol=1e-4, rtol=0)
+    torch.testing.assert_close(depth, (targets - positions).norm(dim=1))
+    above, _ = cameras.project(every, targets + torch.tensor([0.0, 0.0, 0.05]))
+    torch.testing.assert_close(above[:, 0], torch.full((6,), 6.0), atol=1e-3, rtol=0)
+    assert (above[:, 1] < 4).all()
+
+
+def test_looking_at_gives_right_handed_rigid_poses_even_straight_down() -> None:
+    positions = torch.tensor([[0.0, 0.0, 3.0], [0.0, 0.0, -3.0], [2.0, 1.0, 1.0]])
+    cameras = Cameras.looking_at(
+        positions, torch.zeros(3, 3), focal=1.0, width=4, height=4
+    )
+    turn = cameras.camera_to_world[:, :, :3]
+    eye = torch.eye(3).expand(3, 3, 3)
+    torch.testing.assert_close(turn @ turn.transpose(1, 2), eye, atol=1e-6, rtol=0)
+    torch.testing.assert_close(torch.linalg.det(turn), torch.ones(3))
+
+
+def test_looking_at_takes_another_up() -> None:
+    camera = Cameras.looking_at(
+        torch.tensor([[0.0, 0.0, 4.0]]), torch.zeros(1, 3), focal=10.0, width=8, height=8,
+        up=torch.tensor([1.0, 0.0, 0.0]),
+    )
+    pixel, _ = camera.project(torch.tensor([0]), torch.tensor([[1.0, 0.0, 0.0]]))
+    torch.testing.assert_close(pixel, torch.tensor([[4.0, 1.5]]))
+
+
+def test_a_selection_keeps_each_camera_whole(scattered: Cameras) -> None:
+    chosen = scattered[[4, 1, 4]]
+    assert len(chosen) == 3
+    for name in ("camera_to_world", "focal", "center"):
+        assert torch.equal(getattr(chosen, name)[1], getattr(scattered, name)[1])
+        assert torch.equal(getattr(chosen, name)[2], getattr(scattered, name)[4])

@@ -1,0 +1,109 @@
+"""GridAdam against torch's Adam, and its two additions by hand."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from devrf.ops.adam import GridAdam
+
+SHAPE = (2, 3, 2, 2)
+
+
+def gradients(rng: torch.Generator, count: int) -> list[Tensor]:
+    """Gradients without any zero."""
+    return [torch.randn(SHAPE, generator=rng, dtype=torch.float64) + 0.01 for _ in range(count)]
+
+
+def run(optimizer: torch.optim.Optimizer, parameter: Tensor, grads: list[Tensor]) -> Tensor:
+    for grad in grads:
+        parameter.grad = grad.clone()
+        optimizer.step()
+    return parameter.detach()
+
+
+@pytest.mark.parametrize("skip_zero", [False, True])
+def test_is_adam_when_every_entry_has_a_gradient(rng: torch.Generator, skip_zero: bool) -> None:
+    start, grads = torch.randn(SHAPE, generator=rng, dtype=torch.float64), gradients(rng, 12)
+    ours, theirs = (start.clone().requires_grad_() for _ in range(2))
+    grid = GridAdam([{"params": [ours], "skip_zero": skip_zero}], lr=0.1)
+    adam = torch.optim.Adam([theirs], lr=0.1, betas=(0.9, 0.99), eps=1e-8)
+    torch.testing.assert_close(run(grid, ours, grads), run(adam, theirs, grads))
+
+
+def test_the_first_step_has_the_length_of_the_rate() -> None:
+    # With both corrections the first move is lr · g / |g|, whatever the gradient's size.
+    parameter = torch.zeros(1, 1, 1, 2, requires_grad=True)
+    optimizer = GridAdam([parameter], lr=0.25)
+    run(optimizer, parameter, [torch.tensor([1e-3, -40.0]).view(1, 1, 1, 2)])
+    torch.testing.assert_close(parameter.detach().flatten(), torch.tensor([-0.25, 0.25]))
+
+
+def test_an_entry_without_gradient_keeps_value_and_moments() -> None:
+    parameter = torch.zeros(1, 1, 2, 2, requires_grad=True)
+    optimizer = GridAdam([{"params": [parameter], "skip_zero": True}], lr=0.1)
+    # Entry (0, 1) shares its row with a touched one; the second row is not touched at all.
+    run(optimizer, parameter, [torch.full((1, 1, 2, 2), 2.0)])
+    before = {k: v.clone() for k, v in optimizer.state[parameter].items() if k != "step"}
+    value = parameter.detach().clone()
+    run(optimizer, parameter, [torch.tensor([[3.0, 0.0], [0.0, 0.0]]).view(1, 1, 2, 2)])
+    state = optimizer.state[parameter]
+    still = torch.tensor([[False, True], [True, True]]).view(1, 1, 2, 2)
+    assert torch.equal(parameter[still], value[still])
+    for name in ("mean", "square"):
+        assert torch.equal(state[name][still], before[name][still])
+    # The touched one by hand: m = 0.9·0.2 + 0.1·3, v = 0.99·0.04 + 0.01·9, second step.
+    assert state["mean"][0, 0, 0, 0].item() == pytest.approx(0.48)
+    assert state["square"][0, 0, 0, 0].item() == pytest.approx(0.1296)
+    move = 0.1 * (0.48 / (1 - 0.9**2)) / math.sqrt(0.1296 / (1 - 0.99**2))
+    assert parameter[0, 0, 0, 0].item() == pytest.approx(-0.1 - move, rel=1e-5)
+
+
+def test_without_skip_zero_momentum_moves_an_untouched_entry() -> None:
+    parameter = torch.zeros(1, 1, 1, 1, requires_grad=True)
+    optimizer = GridAdam([parameter], lr=0.1)
+    run(optimizer, parameter, [torch.ones(1, 1, 1, 1), torch.zeros(1, 1, 1, 1)])
+    move = 0.1 * (0.09 / (1 - 0.9**2)) / math.sqrt(0.0099 / (1 - 0.99**2))
+    assert parameter.item() == pytest.approx(-0.1 - move, rel=1e-5)
+
+
+@pytest.mark.parametrize("skip_zero", [False, True])
+def test_pace_scales_each_voxel(rng: torch.Generator, skip_zero: bool) -> None:
+    pace = torch.rand(*SHAPE[:3], 1, generator=rng, dtype=torch.float64)
+    grads = gradients(rng, 5)
+    paced, plain = (torch.zeros(SHAPE, dtype=torch.float64, requires_grad=True) for _ in range(2))
+    slow = GridAdam([{"params": [paced], "pace": pace, "skip_zero": skip_zero}], lr=0.1)
+    # The moments do not depend on the values, so each move is the plain one times the pace.
+    moved = run(slow, paced, grads)
+    torch.testing.assert_close(moved, pace * run(GridAdam([plain], lr=0.1), plain, grads))
+
+
+def test_replace_and_forget_start_afresh() -> None:
+    old, new = (torch.zeros(1, 1, 1, 1, requires_grad=True) for _ in range(2))
+    optimizer = GridAdam([old], lr=0.1)
+    run(optimizer, old, [torch.ones(1, 1, 1, 1)] * 3)
+    optimizer.replace(0, [new])
+    assert old not in optimizer.state
+    run(optimizer, new, [torch.full((1, 1, 1, 1), -5.0)])
+    assert new.item() == pytest.approx(0.1)
+    optimizer.forget()
+    run(optimizer, new, [torch.full((1, 1, 1, 1), 7.0)])
+    assert new.item() == pytest.approx(0.0, abs=1e-7)
+    assert old.item() == pytest.approx(-0.3)
+
+
+def test_a_parameter_without_gradient_stands_still_and_the_closure_is_asked() -> None:
+    parameter = torch.ones(1, 1, 1, 1, requires_grad=True)
+    other = torch.ones(1, 1, 1, 1, requires_grad=True)
+    optimizer = GridAdam([parameter, other], lr=0.1)
+
+    def closure() -> Tensor:
+        loss = 2 * parameter.sum()
+        loss.backward()
+        return loss
+
+    assert optimizer.step(closure).item() == 2.0
+    assert parameter.item() == pytest.approx(0.9) and other.item() == 1.0

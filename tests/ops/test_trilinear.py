@@ -1,0 +1,93 @@
+"""Trilinear interpolation against values computed by hand, and its gradients."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+from torch.autograd import gradcheck
+
+from devrf.ops.trilinear import interpolate
+
+
+def corner_grid() -> Tensor:
+    """2×2×2 grid whose value at (i, j, k) is 1 + i + 10·j + 100·k + 1000·i·j·k."""
+    i, j, k = torch.meshgrid(*[torch.arange(2.0)] * 3, indexing="ij")
+    return (1 + i + 10 * j + 100 * k + 1000 * i * j * k)[..., None]
+
+
+@pytest.mark.parametrize(
+    ("at", "value"),
+    [
+        ((0.0, 0.0, 0.0), 1.0),
+        ((1.0, 1.0, 1.0), 1112.0),
+        ((0.0, 1.0, 1.0), 111.0),
+        # All eight corners: 1 + 0.5 + 5 + 50 + 1000 / 8.
+        ((0.5, 0.5, 0.5), 181.5),
+        # 1 + 0.25 + 10·0.5 + 100·0.75 + 1000·0.25·0.5·0.75.
+        ((0.25, 0.5, 0.75), 175.0),
+    ],
+)
+def test_interpolates_between_eight_corners(
+    at: tuple[float, float, float], value: float
+) -> None:
+    assert interpolate(corner_grid(), torch.tensor([at])).item() == pytest.approx(value, rel=1e-6)
+
+
+def test_is_exact_at_every_grid_point_of_a_grid_with_unequal_sides(rng: torch.Generator) -> None:
+    grid = torch.randn(3, 4, 5, 2, generator=rng)
+    points = torch.cartesian_prod(torch.arange(3.0), torch.arange(4.0), torch.arange(5.0))
+    assert torch.equal(interpolate(grid, points), grid.reshape(-1, 2))
+
+
+def test_reproduces_a_linear_function_everywhere_inside(rng: torch.Generator) -> None:
+    axes = [torch.arange(n, dtype=torch.float64) for n in (4, 3, 6)]
+    points = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
+    slope = torch.tensor([[2.0, -1.0], [0.5, 3.0], [-4.0, 0.25]], dtype=torch.float64)
+    coords = torch.rand(200, 3, generator=rng, dtype=torch.float64) * torch.tensor([3.0, 2.0, 5.0])
+    torch.testing.assert_close(interpolate(points @ slope + 7, coords), coords @ slope + 7)
+
+
+def test_outside_the_border_goes_on(rng: torch.Generator) -> None:
+    grid = torch.randn(3, 3, 3, 1, generator=rng)
+    coords = torch.tensor([[-5.0, 1.0, 1.0], [9.0, 1.0, 1.0], [1.0, -0.01, 7.0]])
+    expected = torch.stack([grid[0, 1, 1], grid[2, 1, 1], grid[1, 0, 2]])
+    torch.testing.assert_close(interpolate(grid, coords), expected)
+
+
+def test_outside_the_position_has_no_gradient_along_the_axis_it_left(
+    rng: torch.Generator,
+) -> None:
+    grid = torch.randn(3, 3, 3, 1, generator=rng)
+    coords = torch.tensor([[-1.0, 0.5, 0.5], [0.5, 4.0, 0.5]], requires_grad=True)
+    interpolate(grid, coords).sum().backward()
+    assert coords.grad is not None
+    assert coords.grad[0, 0] == 0 and coords.grad[1, 1] == 0
+    assert (coords.grad[0, 1:] != 0).all() and (coords.grad[1, [0, 2]] != 0).all()
+
+
+def test_gradients_of_values_and_positions(rng: torch.Generator) -> None:
+    grid = torch.randn(3, 4, 3, 2, generator=rng, dtype=torch.float64, requires_grad=True)
+    # Off the grid planes, where the slope jumps; one point outside.
+    coords = torch.tensor(
+        [[0.3, 1.2, 0.7], [1.6, 2.9, 1.1], [0.2, 0.4, 1.9], [1.4, -0.5, 2.6]],
+        dtype=torch.float64, requires_grad=True,
+    )
+    assert gradcheck(interpolate, (grid, coords))
+
+
+def test_a_value_that_two_points_share_gets_both_gradients() -> None:
+    grid = torch.zeros(2, 2, 2, 1, requires_grad=True)
+    interpolate(grid, torch.tensor([[0.25, 0.0, 0.0], [0.5, 0.0, 0.0]])).sum().backward()
+    assert grid.grad is not None
+    assert grid.grad[0, 0, 0].item() == pytest.approx(0.75 + 0.5)
+    assert grid.grad[1, 0, 0].item() == pytest.approx(0.25 + 0.5)
+
+
+def test_no_points_is_no_values_and_no_gradient() -> None:
+    grid = torch.ones(2, 3, 2, 4, requires_grad=True)
+    coords = torch.zeros(0, 3, requires_grad=True)
+    out = interpolate(grid, coords)
+    assert out.shape == (0, 4)
+    out.sum().backward()
+    assert grid.grad is not None and not grid.grad.any()

@@ -1,0 +1,37 @@
+"""The real configs, composed as the command line composes them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, open_dict
+
+from devrf.config import config_folder, register_resolvers
+
+Composed = Callable[..., DictConfig]
+
+
+@pytest.fixture
+def composed(tmp_path: Path) -> Iterator[Composed]:
+    """``composed(*overrides)``: the config of a run in a folder of the test's own."""
+    register_resolvers()
+    hydra = HydraConfig.instance()
+    before = hydra.cfg
+
+    def config(*overrides: str) -> DictConfig:
+        with initialize_config_dir(str(config_folder()), version_base="1.3"):
+            whole = compose("config", overrides=list(overrides), return_hydra_config=True)
+        with open_dict(whole):
+            whole.hydra.runtime.output_dir = str(tmp_path)
+        hydra.set_config(whole)
+        task = whole.copy()
+        with open_dict(task):
+            del task["hydra"]
+        return task
+
+    yield config
+    hydra.cfg = before

@@ -1,0 +1,106 @@
+"""Every config file composes, fits the parts it names, and builds them."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import ConfigCompositionException
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+from devrf.config import config_folder
+from devrf.config_check import check_config
+from devrf.data.datamodule import SceneDataModule
+from devrf.stages.canonical import CanonicalStage
+from devrf.stages.deformation import DeformationStage
+from devrf.stages.schedules import DeformationSchedule
+
+GROUPS = sorted({path.name for path in config_folder().iterdir() if path.is_dir()} - {"hydra"})
+FILES = [
+    f"{group}={file.stem}"
+    for group in GROUPS
+    for file in sorted((config_folder() / group).glob("*.yaml"))
+]
+NEEDS = {"logger=tensorboard": "tensorboard"}
+
+
+def rooted(composed, *overrides):
+    """The composed config, with a folder for a scene from disk where one is asked for."""
+    config = composed(*overrides)
+    missing = OmegaConf.is_missing(config.data, "root")
+    return composed(*overrides, "data.root=scene") if missing else config
+
+
+def test_the_groups_are_the_documented_ones():
+    assert {
+        "ablation", "callbacks", "data", "experiment", "field", "logger", "loss", "sampling",
+        "schedule", "stages", "trainer", "video",
+    } <= set(GROUPS)
+
+
+@pytest.mark.parametrize("choice", FILES)
+def test_it_composes_and_builds(composed, choice):
+    needed = NEEDS.get(choice)
+    if needed and importlib.util.find_spec(needed) is None:
+        pytest.skip(f"{needed} is not installed")
+    config = rooted(composed, choice)
+    check_config(config)
+    assert isinstance(instantiate(config.data), SceneDataModule)
+    assert isinstance(instantiate(config.canonical, _convert_="all"), CanonicalStage)
+    build = instantiate(config.deformation, _partial_=True, _convert_="all")
+    assert build.func is DeformationStage
+    assert isinstance(build.keywords["schedule"], DeformationSchedule)
+    callbacks = list(instantiate(config.callbacks).values())
+    instantiate(config.trainer, logger=instantiate(config.logger), callbacks=callbacks)
+    assert instantiate(config.video).frames > 0
+
+
+@pytest.mark.parametrize("choice", FILES)
+def test_it_says_what_it_is_for(choice):
+    group, _, name = choice.partition("=")
+    lines = (config_folder() / group / f"{name}.yaml").read_text().splitlines()
+    comments = [line for line in lines[:2] if line.startswith("# ") and "@package" not in line]
+    assert comments, "the header says what the file is for"
+
+
+def test_building_writes_nothing(composed, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    config = composed("logger=wandb")
+    instantiate(config.logger)
+    assert not [path for path in Path().rglob("*") if path.is_file()]
+
+
+@pytest.mark.parametrize(
+    "key",
+    ["data.widht", "field.widht", "schedule.canonical.side_length", "loss.fine.colour", "trainr.x",
+     "sampling.steps", "video.speed", "motion.learning_rate", "canonical.schedul"],
+)
+def test_an_unknown_key_is_an_error_that_names_it(composed, key):
+    with pytest.raises(ConfigCompositionException, match=key):
+        composed(f"{key}=3")
+
+
+def test_the_command_line_overrides_the_ablation_and_that_the_experiment(composed):
+    assert composed("experiment=quickstart").loss.deformation.cycle == 100
+    assert composed("experiment=quickstart", "ablation=c2f_tv").loss.deformation.cycle == 0
+    config = composed("experiment=quickstart", "ablation=c2f_tv", "loss.deformation.cycle=7")
+    assert config.loss.deformation.cycle == 7
+
+
+@pytest.mark.parametrize(
+    ("overrides", "folder"),
+    [
+        ([], "outputs/robot/default"),
+        (["data.shape=flower", "experiment=quickstart"], "outputs/flower/quickstart"),
+        (["data=inward", "data.root=/scenes/my scene"], "outputs/my_scene/default"),
+        (["data=inward", "data.root=x", "data.name=y"], "outputs/y/default"),
+        (["ablation=base"], "outputs/robot/default-base"),
+        (["data=inward"], "outputs/scene/default"),
+    ],
+)
+def test_where_a_run_lives_is_told_from_scene_experiment_and_ablation(composed, overrides, folder):
+    composed(*overrides)
+    assert HydraConfig.get().run.dir == folder

@@ -1,0 +1,118 @@
+"""``experiment=paper_inward`` is the paper's schedule (supplementary, section A), to the number."""
+
+from __future__ import annotations
+
+import pytest
+from hydra.utils import instantiate
+
+ROOT = "data.root=scene"
+
+
+@pytest.fixture
+def paper(composed):
+    """The composed experiment."""
+    return composed("experiment=paper_inward", ROOT)
+
+
+def test_canonical_schedule(paper):
+    schedule = instantiate(paper.schedule.canonical, _convert_="all")
+    assert schedule.search_iterations == 5_000
+    assert schedule.search_side == 100
+    assert schedule.iterations == 20_000
+    assert schedule.side == 160
+    assert schedule.doublings == [1000, 2000, 3000, 4000]
+    assert schedule.rays == 8192
+    assert not schedule.carve
+
+
+def test_canonical_phases(paper):
+    schedule = instantiate(paper.schedule.canonical, _convert_="all")
+    search, *fine = schedule.phases
+    assert (search.kind, search.start, search.stop, search.voxels) == ("search", 0, 5000, 100**3)
+    assert [p.voxels for p in fine] == [160**3 // 2**k for k in (4, 3, 2, 1, 0)]
+    assert [p.start - 5000 for p in fine] == [0, 1000, 2000, 3000, 4000]
+    assert schedule.total == 25_000
+    # A tenth over every 20 000 iterations.
+    assert schedule.learning_rate_factor(5000) == 1.0
+    assert schedule.learning_rate_factor(25_000) == pytest.approx(0.1)
+
+
+def test_deformation_schedule(paper):
+    schedule = instantiate(paper.schedule.deformation, _convert_="all")
+    assert schedule.sides == [10, 20, 40, 80, 160]
+    assert schedule.iterations_per_frame == [200, 100, 100, 50, 50]
+    assert schedule.rays == 8192
+    assert schedule.total(frames=50) == 25_000
+    assert schedule.growths(frames=50) == [10_000, 15_000, 20_000, 22_500]
+
+
+def test_deformation_learning_rates(paper):
+    schedule = instantiate(paper.schedule.deformation, _convert_="all")
+    motion = instantiate(paper.schedule.motion)
+    assert (motion.learning_rate, motion.unit) == (1e-3, "world")
+    first, last = (schedule.phase(i, frames=50) for i in (0, 24_999))
+    assert motion.learning_rate * first.learning_rate_factor == pytest.approx(1e-3)
+    assert motion.learning_rate * last.learning_rate_factor == pytest.approx(1e-4)
+
+
+def test_a_batch_is_all_pixels_of_one_view(paper):
+    motion = instantiate(paper.schedule.motion)
+    assert (motion.views, motion.pixels) == ("one", "all")
+
+
+def test_canonical_learning_rates(paper):
+    rates = instantiate(paper.schedule.rates)
+    assert (rates.density, rates.color, rates.decoder) == (0.1, 0.1, 1e-3)
+
+
+def test_field(paper):
+    field = instantiate(paper.field)
+    assert (field.channels, field.width, field.frequencies) == (12, 128, 4)
+    assert (field.alpha_init, field.search_alpha_init) == (1e-2, 1e-6)
+
+
+def test_sampling(paper):
+    sampling = instantiate(paper.sampling)
+    assert sampling.step == 0.5
+    assert sampling.alpha_threshold == 1e-4
+    assert sampling.occupancy_threshold == 1e-3
+
+
+def test_loss_weights(paper):
+    assert dict(paper.loss.search) == {"color": 1.0, "per_sample_color": 0.1, "entropy": 0.01}
+    assert dict(paper.loss.fine) == {"color": 1.0, "per_sample_color": 0.01, "entropy": 0.001}
+    assert dict(paper.loss.deformation) == {
+        "render": 1.0, "cycle": 100.0, "flow": 0.005, "tv": 1.0,
+        "per_sample_color": 0.1, "entropy": 0.01,
+    }
+
+
+def test_the_config_says_what_the_code_defaults_to(paper):
+    """Plain Lightning code that states nothing gets the paper's stages too."""
+    from devrf.fields.architecture import Architecture
+    from devrf.stages.canonical import FINE_LOSS, SEARCH_LOSS, CanonicalRates, Sampling
+    from devrf.stages.deformation import DEFORMATION_LOSS, MotionSettings
+
+    assert instantiate(paper.field) == Architecture()
+    assert instantiate(paper.sampling) == Sampling()
+    assert instantiate(paper.schedule.rates) == CanonicalRates()
+    assert instantiate(paper.schedule.motion) == MotionSettings()
+    assert dict(paper.loss.search) == SEARCH_LOSS
+    assert dict(paper.loss.fine) == FINE_LOSS
+    assert dict(paper.loss.deformation) == DEFORMATION_LOSS
+
+
+@pytest.mark.parametrize(
+    ("ablation", "off", "coarse_to_fine"),
+    [
+        ("base", {"tv", "cycle", "flow"}, False),
+        ("c2f", {"tv", "cycle", "flow"}, True),
+        ("c2f_tv", {"cycle", "flow"}, True),
+        ("c2f_tv_cycle", {"flow"}, True),
+        ("full", set(), True),
+    ],
+)
+def test_the_rows_of_the_ablation_tables(composed, ablation, off, coarse_to_fine):
+    config = composed("experiment=paper_inward", ROOT, f"ablation={ablation}")
+    assert {name for name, weight in config.loss.deformation.items() if not weight} == off
+    assert config.schedule.deformation.coarse_to_fine is coarse_to_fine

@@ -1,0 +1,78 @@
+"""Another Hydra application composes devrf's groups, and pays for no torch until it builds."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import devrf
+
+APP = """
+import json
+import sys
+
+import hydra
+from omegaconf import OmegaConf
+
+
+@hydra.main(config_path="configs", config_name="app", version_base="1.3")
+def main(config):
+    assert not {"torch", "lightning"} & set(sys.modules), "composing is light"
+    print(json.dumps(OmegaConf.to_container(config, resolve=True)))
+
+
+main()
+"""
+CONFIG = """
+defaults:
+  - _self_
+  - data@scene: procedural
+  - schedule: paper_inward
+  - local: mine
+run: ${devrf.run_name:${local.name},base}
+label: ${devrf.scene_name:${scene}}
+hydra:
+  output_subdir: null
+  run:
+    dir: .
+"""
+
+
+@pytest.fixture
+def application(tmp_path: Path):
+    """``application(*arguments)``: the config that another application composes."""
+    (tmp_path / "configs" / "local").mkdir(parents=True)
+    (tmp_path / "app.py").write_text(APP)
+    (tmp_path / "configs" / "app.yaml").write_text(CONFIG)
+    (tmp_path / "configs" / "local" / "mine.yaml").write_text("name: theirs\n")
+    source = str(Path(devrf.__file__).parents[1])
+    path = os.pathsep.join(filter(None, [source, os.environ.get("PYTHONPATH")]))
+
+    def run(*arguments: str) -> dict:
+        done = subprocess.run(
+            [sys.executable, "app.py", *arguments], cwd=tmp_path, text=True, capture_output=True,
+            env={**os.environ, "PYTHONPATH": path}, timeout=60, check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout)
+
+    return run
+
+
+def test_groups_and_resolvers_are_there(application):
+    config = application()
+    assert config["scene"]["_target_"] == "devrf.data.procedural.ProceduralDataModule"
+    assert config["schedule"]["canonical"]["side"] == 160
+    assert (config["run"], config["label"]) == ("theirs-base", "robot")
+
+
+def test_options_are_chosen_on_its_command_line(application):
+    config = application("data@scene=inward", "scene.root=/scenes/suzanne", "schedule=quick")
+    assert config["scene"]["_target_"] == "devrf.data.inward.InwardFacingDataModule"
+    assert config["label"] == "suzanne"
+    assert config["schedule"]["canonical"]["side"] < 160

@@ -1,0 +1,124 @@
+"""A built wheel works from any folder, without the checkout."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tarfile
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from devrf.config import config_folder
+
+REPOSITORY = Path(__file__).parents[2]
+TINY = [
+    "data.width=24", "data.height=20", "data.static_views=6", "data.static_test_views=2",
+    "data.train_views=2", "data.frames=3", "data.supersample=1", "field.width=16",
+    "schedule.canonical.iterations=6", "schedule.canonical.side=16",
+    "schedule.canonical.search_side=16", "schedule.canonical.doublings=[2]",
+    "schedule.canonical.rays=64",
+]
+
+
+def run(*command: object, folder: Path) -> subprocess.CompletedProcess[str]:
+    hidden = {"PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV"}
+    environment = {key: value for key, value in os.environ.items() if key not in hidden}
+    done = subprocess.run(
+        [str(part) for part in command], cwd=folder, env=environment, text=True,
+        capture_output=True, timeout=180, check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory) -> Path:
+    """A folder with a source distribution and the wheel that was built from it."""
+    folder = tmp_path_factory.mktemp("dist")
+    run(sys.executable, "-m", "build", "--no-isolation", "--outdir", folder, folder=REPOSITORY)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def wheel(built) -> Path:
+    """The wheel."""
+    (path,) = built.glob("*.whl")
+    return path
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory, wheel) -> Path:
+    """A fresh environment with the wheel, which sees this one's packages but not the checkout."""
+    folder = tmp_path_factory.mktemp("fresh") / "venv"
+    venv.create(folder, with_pip=False, symlinks=True)
+    (site,) = folder.glob("lib/python*/site-packages")
+    # A path that is added by a .pth file is no site folder: the .pth files in it, which an
+    # editable install of the checkout leaves there, are not read.
+    theirs = {Path(path).resolve() for path in sys.path if path.endswith("site-packages")}
+    (site / "dependencies.pth").write_text("".join(f"{path}\n" for path in sorted(theirs)))
+    run(
+        sys.executable, "-m", "pip", "--python", folder / "bin" / "python", "install",
+        "--no-deps", "--no-index", "--quiet", wheel, folder=folder,
+    )
+    return folder
+
+
+def test_the_wheel_has_code_configs_plugin_and_licence(wheel):
+    names = set(zipfile.ZipFile(wheel).namelist())
+    configs = {p.relative_to(config_folder()) for p in config_folder().rglob("*.yaml")}
+    assert {f"devrf/conf/{path.as_posix()}" for path in configs} <= names
+    assert "devrf/__main__.py" in names and "devrf/py.typed" in names
+    assert "hydra_plugins/devrf_searchpath/__init__.py" in names
+    # Other packages share the namespace.
+    assert "hydra_plugins/__init__.py" not in names
+    assert [name for name in names if name.endswith("licenses/LICENSE")]
+
+
+def test_the_wheel_has_nothing_else(wheel):
+    roots = {name.split("/")[0].split("-")[0] for name in zipfile.ZipFile(wheel).namelist()}
+    assert roots == {"devrf", "hydra_plugins"}
+
+
+def test_the_source_distribution_has_what_a_build_needs(built):
+    (path,) = built.glob("*.tar.gz")
+    with tarfile.open(path) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    assert {"pyproject.toml", "conf/config.yaml", "src/devrf/app.py", "LICENSE"} <= names
+
+
+def test_an_installed_devrf_learns_a_scene_from_any_folder(environment, tmp_path):
+    python = environment / "bin" / "python"
+    where = run(
+        python, "-c", "import devrf, devrf.config as c; print(devrf.__file__, c.config_folder())",
+        folder=tmp_path,
+    ).stdout
+    assert str(REPOSITORY) not in where
+    assert all(part.startswith(str(environment)) for part in where.split())
+    arguments = ["stage=canonical", "hydra.run.dir=run", *TINY]
+    done = run(python, "-m", "devrf", *arguments, folder=tmp_path)
+    assert done.stderr == ""
+    assert (tmp_path / "run" / "checkpoints" / "canonical.ckpt").is_file()
+
+
+def test_the_command_is_installed(environment, tmp_path):
+    assert shutil.which("devrf", path=environment / "bin")
+    done = run(environment / "bin" / "devrf", "--help", folder=tmp_path)
+    assert "stage=deformation" in done.stdout
+
+
+def test_another_application_finds_the_installed_configs(environment, tmp_path):
+    (tmp_path / "configs").mkdir()
+    (tmp_path / "configs" / "app.yaml").write_text("defaults: [_self_, data@scene: procedural]\n")
+    (tmp_path / "app.py").write_text(
+        "import hydra\n"
+        "@hydra.main(config_path='configs', config_name='app', version_base='1.3')\n"
+        "def main(config): print(config)\n"
+        "main()\n"
+    )
+    done = run(environment / "bin" / "python", "app.py", "hydra.run.dir=.", folder=tmp_path)
+    assert "devrf.data.procedural.ProceduralDataModule" in done.stdout

@@ -1,0 +1,113 @@
+"""Marching along rays against a slow twin that looks at every sample."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from devrf.fields.occupancy import Occupancy
+from devrf.geometry.box import Box
+from devrf.geometry.rays import Rays
+from devrf.rendering.sampling import hits, march
+
+BOX = Box((-1.0, -0.5, 0.0), (1.0, 1.5, 1.0))
+
+
+def scattered_rays(count: int, rng: torch.Generator) -> Rays:
+    """Float64 rays from all around, some from inside, towards the box or past it."""
+    origins = 2.5 * torch.randn(count, 3, generator=rng, dtype=torch.float64)
+    targets = 1.3 * torch.randn(count, 3, generator=rng, dtype=torch.float64)
+    d = torch.nn.functional.normalize(targets - origins, dim=1)
+    return Rays(origins, d, d)
+
+
+def slowly(
+    rays: Rays, occupancy: Occupancy, step: float, near: float, far: float
+) -> tuple[Tensor, Tensor]:
+    """Ray and distance of every sample entry + k·step that is in an occupied cell."""
+    entry, leave = BOX.crossing(rays)
+    entry, leave = entry.clamp(min=near), leave.clamp(max=far)
+    distance = entry[:, None] + step * torch.arange(500, dtype=entry.dtype)
+    ray = torch.arange(len(rays))[:, None].expand_as(distance)
+    kept = distance < leave[:, None]
+    ray, distance = ray[kept], distance[kept]
+    kept = occupancy.at(rays.at(ray, distance))
+    return ray[kept], distance[kept]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.3, 1.0])
+@pytest.mark.parametrize("step", [0.02, 0.11, 0.5])
+def test_finds_exactly_the_samples_in_occupied_cells(
+    share: float, step: float, rng: torch.Generator
+) -> None:
+    rays = scattered_rays(300, rng)
+    occupancy = Occupancy(torch.rand(9, 12, 5, generator=rng) < share, BOX)
+    samples = march(rays, BOX, occupancy, step=step, near=0.3, far=6.0)
+    ray, distance = slowly(rays, occupancy, step, 0.3, 6.0)
+    assert torch.equal(samples.ray, ray)
+    torch.testing.assert_close(samples.distance, distance, atol=1e-6, rtol=0)
+    torch.testing.assert_close(samples.points, rays.at(ray, distance), atol=1e-6, rtol=0)
+    assert samples.rays == len(rays)
+
+
+def test_sample_places_by_hand(cube: Box) -> None:
+    d = torch.tensor([[1.0, 0.0, 0.0]])
+    rays = Rays(torch.tensor([[-3.0, 0.0, 0.0]]), d, d)
+    samples = march(rays, cube, Occupancy.full((5, 5, 5), cube), step=0.5, near=0.0, far=9.0)
+    # Entry at distance 2, exit at 4: the exit itself is no sample.
+    assert samples.distance.tolist() == [2.0, 2.5, 3.0, 3.5]
+    near = march(rays, cube, Occupancy.full((5, 5, 5), cube), step=0.5, near=2.25, far=3.0)
+    assert near.distance.tolist() == [2.25, 2.75]
+
+
+def test_the_last_cells_before_the_exit_are_not_skipped(cube: Box) -> None:
+    mask = torch.zeros(9, 9, 9, dtype=torch.bool)
+    mask[-1] = True
+    occupancy = Occupancy(mask, cube)
+    d = torch.tensor([[1.0, 0.0, 0.0]])
+    for start in torch.linspace(-0.9, 0.8, 18).tolist():
+        rays = Rays(torch.tensor([[start, 0.0, 0.0]]), d, d)
+        # The last cell reaches from 0.875 to the face at 1.
+        samples = march(rays, cube, occupancy, step=0.01, near=0.0, far=9.0)
+        assert len(samples) in (12, 13), f"from x = {start}"
+
+
+def test_a_ray_that_march_samples_is_never_left_out(rng: torch.Generator) -> None:
+    rays = scattered_rays(3000, rng)
+    for share in (0.01, 0.1):
+        occupancy = Occupancy(torch.rand(6, 7, 4, generator=rng) < share, BOX)
+        ray, _ = slowly(rays, occupancy, 0.003, 0.3, 4.0)
+        hit = hits(rays, BOX, occupancy, near=0.3, far=4.0)
+        assert hit[ray].all()
+        assert not hit.all()
+
+
+def test_rays_that_clip_a_corner_are_hit(cube: Box) -> None:
+    # 1e-3 to 0.1 of a chord through the corner (1, 1, ·) of a full box.
+    d = torch.nn.functional.normalize(torch.tensor([[1.0, -1.0, 0.0]]), dim=1)
+    inset = torch.tensor([0.001, 0.01, 0.03, 0.1])
+    origins = torch.stack([0 * inset, 2 - inset, 0 * inset], dim=1)
+    rays = Rays(origins, d.expand(4, 3), d.expand(4, 3))
+    full = Occupancy.full((9, 9, 9), cube)
+    assert len(march(rays, cube, full, step=0.05, near=0.0, far=9.0).ray.unique()) == 4
+    assert hits(rays, cube, full, near=0.0, far=9.0).all()
+
+
+def test_rays_are_hit_in_chunks_as_in_one_go(rng: torch.Generator) -> None:
+    rays = scattered_rays(101, rng)
+    occupancy = Occupancy(torch.rand(9, 12, 5, generator=rng) < 0.02, BOX)
+    whole = hits(rays, BOX, occupancy, near=0.0, far=9.0)
+    assert torch.equal(hits(rays, BOX, occupancy, near=0.0, far=9.0, chunk=10), whole)
+    assert whole.any() and not whole.all()
+
+
+def test_no_rays_and_missing_rays_give_no_samples(cube: Box) -> None:
+    full = Occupancy.full((3, 3, 3), cube)
+    none = Rays(*[torch.zeros(0, 3)] * 3)
+    assert len(march(none, cube, full, step=0.1, near=0.0, far=9.0)) == 0
+    assert hits(none, cube, full, near=0.0, far=9.0).shape == (0,)
+    d = torch.tensor([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
+    past = Rays(torch.tensor([[-3.0, 2.0, 0.0], [-3.0, 0.0, 0.0]]), d, d)
+    assert len(march(past, cube, full, step=0.1, near=0.0, far=9.0)) == 0
+    assert hits(past, cube, full, near=0.0, far=9.0).tolist() == [False, False]

@@ -1,0 +1,195 @@
+"""Checkpoints: whole, bit-equal, and honest about what they are."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from lightning import Trainer
+
+from devrf.data.datamodule import SceneDataModule
+from devrf.errors import DevrfError
+from devrf.rendering.model import SceneModel
+from devrf.scenes.scene import Scene
+from devrf.stages.canonical import CanonicalStage
+from devrf.stages.checkpoint import FORMAT, Stored, load_checkpoint, save_checkpoint
+from devrf.stages.deformation import DeformationStage
+from devrf.stages.schedules import CanonicalSchedule, DeformationSchedule
+
+
+@pytest.fixture
+def canonical(learned: tuple[CanonicalStage, Trainer], tmp_path: Path) -> Path:
+    """A checkpoint of the canonical stage."""
+    path = tmp_path / "run" / "canonical.ckpt"
+    save_checkpoint(learned[1], path)
+    return path
+
+
+def assert_same_pictures(one: SceneModel, other: SceneModel, scene: Scene) -> None:
+    rays = scene.dynamic.test.cameras.image_rays(0)
+    for time in (0.0, 0.3, 0.5, 1.0):
+        a, b = (model.picture(rays, time, torch.ones(3)) for model in (one, other))
+        for name in ("color", "depth", "opacity"):
+            assert torch.equal(getattr(a, name), getattr(b, name)), f"{name} at {time}"
+
+
+def refusal(path: Path, scene: Scene | None = None) -> str:
+    """The message of the error that loading ``path`` raises: one line that names the file."""
+    with pytest.raises(DevrfError) as caught:
+        load_checkpoint(path, scene)
+    message = str(caught.value)
+    assert message.startswith(str(path)) and "\n" not in message
+    return message
+
+
+def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> Path:
+    data = torch.load(path, weights_only=True)
+    change(data)
+    torch.save(data, path)
+    return path
+
+
+def test_the_canonical_stage_comes_back_bit_equal(
+    canonical: Path, learned: tuple[CanonicalStage, Trainer], tiny_scene: Scene
+) -> None:
+    stored = load_checkpoint(canonical, tiny_scene)
+    assert_same_pictures(stored.model, learned[0].model, tiny_scene)
+    assert stored.passport == learned[0].passport()
+    assert stored.model.deformation is None
+    assert [p.name for p in canonical.parent.iterdir()] == ["canonical.ckpt"]
+
+
+def test_the_deformation_stage_comes_back_bit_equal_and_alone_suffices(
+    rest: Stored, datamodule: SceneDataModule, tiny_scene: Scene, tmp_path: Path,
+    trainer: Callable[..., Trainer],
+) -> None:
+    schedule = DeformationSchedule(sides=(4, 6), iterations_per_frame=(4, 2), rays=128)
+    stage, fit = DeformationStage(rest, schedule), trainer(max_epochs=1)
+    fit.fit(stage, datamodule=datamodule)
+    save_checkpoint(fit, tmp_path / "deformation.ckpt")
+    stored = load_checkpoint(tmp_path / "deformation.ckpt", tiny_scene)
+    assert_same_pictures(stored.model, stage.model, tiny_scene)
+    assert stored.model.deformation is not None
+    assert stored.model.deformation.clock == tiny_scene.clock
+    assert set(stored.passport.records) == {"canonical", "deformation"}
+    # It moves: otherwise equal pictures would say nothing of the deformation.
+    rays = tiny_scene.dynamic.test.cameras.image_rays(0)
+    black = torch.zeros(3)
+    still = stored.model.picture(rays, 0.0, black).color
+    assert not torch.equal(stored.model.picture(rays, 1.0, black).color, still)
+
+
+def test_a_deformation_can_be_learned_on_a_loaded_checkpoint(
+    canonical: Path, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
+) -> None:
+    schedule = DeformationSchedule(sides=(4,), iterations_per_frame=(2,), rays=64)
+    stage = DeformationStage(load_checkpoint(canonical), schedule)
+    trainer(max_epochs=1).fit(stage, datamodule=datamodule)
+    assert stage.iteration == 6
+
+
+def test_another_scene_is_refused(canonical: Path, tiny_scene: Scene) -> None:
+    views = tiny_scene.static.train
+    fewer = replace(views[torch.arange(7)])
+    other = replace(tiny_scene, name="cat", static=replace(tiny_scene.static, train=fewer))
+    message = refusal(canonical, other)
+    assert "another scene" in message and "robot" in message and "cat" in message
+    assert load_checkpoint(canonical, None).passport.scene == "robot"
+
+
+def test_a_missing_file_says_which_stage_to_run(tmp_path: Path) -> None:
+    assert "no such checkpoint" in refusal(tmp_path / "nothing.ckpt")
+    assert "no such checkpoint" in refusal(tmp_path)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 0.999])
+def test_a_truncated_file_is_refused(canonical: Path, share: float) -> None:
+    content = canonical.read_bytes()
+    canonical.write_bytes(content[: int(share * len(content))])
+    assert "damaged" in refusal(canonical)
+
+
+def test_files_of_noise_or_text_are_refused(tmp_path: Path) -> None:
+    noise = random.Random(0)
+    path = tmp_path / "some.ckpt"
+    for _ in range(100):
+        path.write_bytes(noise.randbytes(noise.randrange(60)))
+        assert "not a checkpoint" in refusal(path)
+    path.write_text("scene: robot\n" * 20)
+    assert "not a checkpoint" in refusal(path)
+
+
+@pytest.mark.parametrize(
+    "foreign", [{"state_dict": {}}, {"devrf": "yes", "state_dict": {}}, [1, 2], torch.zeros(3)],
+    ids=["other project", "other type", "list", "tensor"],
+)
+def test_checkpoints_of_others_are_refused(tmp_path: Path, foreign: object) -> None:
+    path = tmp_path / "foreign.ckpt"
+    torch.save(foreign, path)
+    assert "not a devrf checkpoint" in refusal(path)
+
+
+def test_nothing_in_a_file_is_run(tmp_path: Path) -> None:
+    class Bomb:
+        def __reduce__(self) -> tuple[Any, ...]:
+            return (Path(tmp_path / "exploded").touch, ())
+
+    path = tmp_path / "bomb.ckpt"
+    torch.save({"devrf": {}, "state_dict": Bomb()}, path)
+    refusal(path)
+    assert not (tmp_path / "exploded").exists()
+
+
+def test_a_newer_format_is_named(canonical: Path) -> None:
+    edit(canonical, lambda data: data["devrf"].update(format=FORMAT + 1))
+    message = refusal(canonical)
+    assert f"format {FORMAT + 1}" in message and f"reads {FORMAT}" in message
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda data: data["devrf"].pop("scene"),
+        lambda data: data["devrf"]["architecture"].update(depth=3),
+        lambda data: data["devrf"]["architecture"].update(channels=5),
+        lambda data: data.pop("state_dict"),
+        lambda data: data["state_dict"].pop("scene_model.occupancy.mask"),
+        lambda data: data["state_dict"]["scene_model.canonical._extra_state"].pop("voxels"),
+        lambda data: data["state_dict"]["scene_model.canonical._extra_state"].update(low=[9, 9, 9]),
+    ],
+    ids=["no scene", "unknown size", "other size", "no state", "no mask", "no voxels", "no box"],
+)
+def test_a_checkpoint_that_contradicts_itself_is_refused(
+    canonical: Path, change: Callable[[dict[str, Any]], object]
+) -> None:
+    refusal(edit(canonical, change))
+
+
+def test_a_failed_save_leaves_the_old_file_alone(canonical: Path) -> None:
+    class FullDisk:
+        def save_checkpoint(self, path: Path, weights_only: bool) -> None:
+            path.write_bytes(b"half a check")
+            raise OSError("No space left on device")
+
+    before = canonical.read_bytes()
+    with pytest.raises(OSError, match="No space"):
+        save_checkpoint(FullDisk(), canonical)  # type: ignore[arg-type]
+    assert canonical.read_bytes() == before
+    assert [p.name for p in canonical.parent.iterdir()] == ["canonical.ckpt"]
+
+
+def test_a_stage_stopped_in_its_search_comes_back(
+    datamodule: SceneDataModule, tiny_scene: Scene, tmp_path: Path,
+    trainer: Callable[..., Trainer],
+) -> None:
+    schedule = CanonicalSchedule(10, 8, False, 10, 8, (), rays=64)
+    stage, fit = CanonicalStage(schedule), trainer(max_steps=2)
+    fit.fit(stage, datamodule=datamodule)
+    save_checkpoint(fit, tmp_path / "search.ckpt")
+    stored = load_checkpoint(tmp_path / "search.ckpt", tiny_scene)
+    assert_same_pictures(stored.model, stage.model, tiny_scene)

@@ -1,0 +1,177 @@
+"""Schedules: the paper's tables, and what holds for every schedule."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from devrf.errors import DevrfError
+from devrf.stages.schedules import (
+    CanonicalPhase,
+    CanonicalSchedule,
+    DeformationPhase,
+    DeformationSchedule,
+)
+
+
+def canonical_phases(schedule: CanonicalSchedule) -> list[CanonicalPhase]:
+    """The phases in order, found as a stage finds them: each at the end of the one before."""
+    phases, at = [], 0
+    while at < schedule.total:
+        phases.append(schedule.phase(at))
+        assert phases[-1].stop > at
+        at = phases[-1].stop
+    return phases
+
+
+def deformation_phases(schedule: DeformationSchedule, frames: int) -> list[DeformationPhase]:
+    phases, at = [], 0
+    while at < schedule.total(frames):
+        phases.append(schedule.phase(at, frames))
+        assert phases[-1].stop > at
+        at = phases[-1].stop
+    return phases
+
+
+def test_canonical_defaults_are_the_papers() -> None:
+    schedule = CanonicalSchedule()
+    assert schedule.total == 25000
+    found = [(p.kind, p.start, p.stop, p.voxels) for p in canonical_phases(schedule)]
+    full = 160**3
+    assert found == [
+        ("search", 0, 5000, 100**3),
+        ("fine", 5000, 6000, full // 16),
+        ("fine", 6000, 7000, full // 8),
+        ("fine", 7000, 8000, full // 4),
+        ("fine", 8000, 9000, full // 2),
+        ("fine", 9000, 25000, full),
+    ]
+    assert schedule.rays == 8192
+
+
+def test_canonical_rates_fall_to_a_tenth_in_each_part() -> None:
+    factor = CanonicalSchedule().learning_rate_factor
+    assert factor(0) == factor(5000) == 1.0
+    assert factor(4999) == pytest.approx(0.1 ** (4999 / 20000))
+    assert factor(15000) == pytest.approx(0.1**0.5)
+    assert factor(25000) == pytest.approx(0.1)
+
+
+def test_deformation_defaults_are_the_papers_inward() -> None:
+    schedule, frames = DeformationSchedule(), 50
+    assert schedule.total(frames) == 25000
+    assert schedule.growths(frames) == [10000, 15000, 20000, 22500]
+    phases = deformation_phases(schedule, frames)
+    assert len(phases) == 5 * 49
+    assert [p.side for p in phases[::49]] == [10, 20, 40, 80, 160]
+    for level, share in enumerate((200, 100, 100, 50, 50)):
+        of_level = phases[49 * level : 49 * (level + 1)]
+        # Frame 0 is the identity: its share goes to frame 1.
+        assert [p.stop - p.start for p in of_level] == [2 * share] + [share] * 48
+        for phase in of_level:
+            assert phase.learning_rate_factor == pytest.approx(10 ** (-level / 4))
+    assert 1e-3 * phases[-1].learning_rate_factor == pytest.approx(1e-4)
+    assert schedule.rays == 8192
+
+
+def test_deformation_forward_facing_is_the_papers() -> None:
+    schedule = DeformationSchedule(iterations_per_frame=(200, 200, 100, 50, 50), rays=4096)
+    assert schedule.total(40) == 24000
+    assert schedule.growths(40) == [8000, 16000, 20000, 22000]
+
+
+def test_frames_are_carried_at_the_coarsest_level_only() -> None:
+    for phase in deformation_phases(DeformationSchedule(), 6):
+        assert phase.carries == (phase.level == 0 and phase.frame >= 2)
+
+
+def test_without_coarse_to_fine_every_share_goes_to_the_finest_grid() -> None:
+    schedule = DeformationSchedule(coarse_to_fine=False)
+    phases = deformation_phases(schedule, 50)
+    assert schedule.total(50) == 25000 and schedule.growths(50) == []
+    assert {(p.side, p.level, p.learning_rate_factor) for p in phases} == {(160, 0, 1.0)}
+    assert [p.frame for p in phases] == list(range(1, 50))
+
+
+@given(
+    st.integers(0, 50),
+    st.lists(st.integers(1, 199), max_size=5, unique=True).map(sorted),
+    st.integers(7, 60),
+)
+def test_canonical_phases_tile_every_schedule(
+    search: int, doublings: list[int], side: int
+) -> None:
+    schedule = CanonicalSchedule(search, 10, False, 200, side, doublings)
+    phases = canonical_phases(schedule)
+    edges = [0, *([search] if search else []), *(search + d for d in doublings), search + 200]
+    assert [(p.start, p.stop) for p in phases] == list(zip(edges, edges[1:], strict=False))
+    for phase in phases:
+        for at in (phase.start, phase.stop - 1):
+            assert schedule.phase(at) == phase
+    assert phases[-1].voxels == side**3
+    assert schedule.phase(schedule.total + 7) == phases[-1]
+
+
+@given(
+    st.lists(st.tuples(st.integers(2, 99), st.integers(1, 9)), min_size=1, max_size=5),
+    st.integers(2, 12),
+    st.booleans(),
+)
+def test_deformation_phases_tile_every_schedule(
+    levels: list[tuple[int, int]], frames: int, coarse_to_fine: bool
+) -> None:
+    sides, shares = zip(*levels, strict=True)
+    schedule = DeformationSchedule(sorted(sides), shares, coarse_to_fine)
+    phases = deformation_phases(schedule, frames)
+    assert phases[0].start == 0 and phases[-1].stop == schedule.total(frames)
+    for phase, after in zip(phases, phases[1:], strict=False):
+        assert phase.stop == after.start
+    for phase in phases:
+        assert {schedule.phase(k, frames) for k in range(phase.start, phase.stop)} == {phase}
+    depth = len(levels) if coarse_to_fine else 1
+    visits = [(level, frame) for level in range(depth) for frame in range(1, frames)]
+    assert [(p.level, p.frame) for p in phases] == visits
+    begun = [p.start for p in phases if p.frame == 1]
+    assert begun == [0, *schedule.growths(frames)]
+    assert schedule.phase(schedule.total(frames) + 3, frames) == phases[-1]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"doublings": (1000, 1000)},
+        {"doublings": (2000, 1000)},
+        {"doublings": (0, 1000)},
+        {"doublings": (1000, 30000)},
+        {"iterations": 0, "doublings": ()},
+        {"search_iterations": -1},
+        {"side": 2},  # 8 voxels cannot be halved four times
+        {"decay_iterations": 0},
+        {"rays": 0},
+    ],
+    ids=str,
+)
+def test_a_wrong_canonical_schedule_is_an_error(wrong: dict[str, Any]) -> None:
+    with pytest.raises(DevrfError, match="schedule.canonical"):
+        CanonicalSchedule(**wrong)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"sides": (10, 20)},
+        {"sides": (), "iterations_per_frame": ()},
+        {"iterations_per_frame": (200, 100, 100, 50, 0)},
+        {"iterations_per_frame": (200, 100, -100, 50, 50)},
+        {"sides": (10, 20, 40, 80, 1)},
+        {"decay": 0.0},
+        {"rays": 0},
+    ],
+    ids=str,
+)
+def test_a_wrong_deformation_schedule_is_an_error(wrong: dict[str, Any]) -> None:
+    with pytest.raises(DevrfError, match="schedule.deformation"):
+        DeformationSchedule(**wrong)

@@ -1,0 +1,103 @@
+"""The deformation stage, trained for moments from plain Lightning code, without Hydra."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from lightning import Trainer
+
+from devrf.data.datamodule import SceneDataModule
+from devrf.errors import DevrfError
+from devrf.ops.total_variation import total_variation
+from devrf.scenes.scene import Scene
+from devrf.stages.checkpoint import Stored
+from devrf.stages.deformation import DEFORMATION_LOSS, DeformationStage, MotionSettings
+from devrf.stages.held_out import score
+from devrf.stages.schedules import DeformationSchedule
+
+SHORT = DeformationSchedule(sides=(4, 8), iterations_per_frame=(20, 10), rays=256)
+FAST = MotionSettings(learning_rate=5e-3, views="all", pixels="useful")
+
+
+def test_two_steps_move_the_first_frame_only(
+    rest: Stored, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
+) -> None:
+    before = {k: v.clone() for k, v in rest.model.canonical.named_parameters()}
+    stage, fit = DeformationStage(rest, SHORT), trainer(max_steps=2)
+    fit.fit(stage, datamodule=datamodule)
+    assert stage.iteration == fit.global_step == 2
+    assert stage.field.to_canonical[1].abs().max() > 0
+    # Two steps of Adam move no voxel further than twice the rate, or little more.
+    assert stage.field.to_canonical[1].abs().max() < 2.5e-3
+    for frames in (stage.field.to_canonical, stage.field.to_time):
+        assert not frames[0].any() and not frames[2].any()
+    for name, value in stage.model.canonical.named_parameters():
+        assert torch.equal(value, before[name])
+
+
+def test_a_whole_schedule_sees_the_motion_better_than_the_rest_pose(
+    rest: Stored, datamodule: SceneDataModule, tiny_scene: Scene,
+    trainer: Callable[..., Trainer],
+) -> None:
+    schedule = DeformationSchedule(sides=(4, 8), iterations_per_frame=(40, 20), rays=256)
+    stage = DeformationStage(rest, schedule, FAST)
+    fit = trainer(max_epochs=1)
+    fit.fit(stage, datamodule=datamodule)
+    assert stage.iteration == stage.total_iterations == 180
+    assert stage.resolution == stage.model.canonical.box.grid_shape(8**3)
+    for frames in (stage.field.to_canonical, stage.field.to_time):
+        assert not frames[0].any()
+        assert (frames[1:].abs().amax(dim=(1, 2, 3, 4)) > 1e-3).all()
+    # Two views of three frames: at rest there is nothing to win.
+    cpu, train = torch.device("cpu"), tiny_scene.dynamic.train
+    views = [score(stage.model, train, k, "white", cpu) for k in range(6)]
+    gains = [view.psnr - view.rest_pose_psnr for view in views]
+    assert gains[:2] == [0.0, 0.0]
+    assert min(gains[2:]) > 0.5 and sum(gains[2:]) / 4 > 1
+
+
+def test_total_variation_alone_smooths_both_directions(
+    rest: Stored, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
+) -> None:
+    # With "render" at a vanishing weight only the closed-form gradient moves Δ_f.
+    stage = DeformationStage(rest, SHORT, loss={"render": 1e-20, "tv": 1.0})
+    fit = trainer(max_steps=1)
+    fit.fit(stage, datamodule=datamodule)
+    forward = stage.field.to_time[1]
+    assert not forward.any()
+    forward[1, 1, 1] = 0.5
+    stage.visit.forward.grad = None
+    stage.add_gradients()
+    grad = stage.visit.forward.grad
+    assert grad is not None and grad[1, 1, 1, 0] > 0 and grad[0, 1, 1, 0] < 0
+    copied = forward.detach().clone().requires_grad_()
+    (slope,) = torch.autograd.grad(total_variation(copied), copied)
+    torch.testing.assert_close(grad, slope * (max(stage.field.shape) / 128 / 256 / 6))
+
+
+def test_stages_built_on_one_rest_do_not_meet(
+    rest: Stored, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
+) -> None:
+    # An ablation in a notebook: the same canonical scene, two deformations.
+    first = DeformationStage(rest, SHORT)
+    trainer(max_steps=2).fit(first, datamodule=datamodule)
+    second = DeformationStage(rest, SHORT)
+    trainer(max_steps=1).fit(second, datamodule=datamodule)
+    assert first.field is not second.field
+    assert not second.field.to_time[2].any()
+    assert first.field.to_canonical[1].abs().max() > 1e-3
+
+
+def test_defaults_are_the_papers(rest: Stored) -> None:
+    stage = DeformationStage(rest)
+    assert stage.motion.learning_rate == 1e-3 and stage.motion.unit == "world"
+    assert stage.tv == 1.0
+    weights = {"render": 1.0, "cycle": 100.0, "flow": 0.005, "tv": 1.0}
+    assert {name: DEFORMATION_LOSS[name] for name in weights} == weights
+
+
+def test_an_unknown_loss_term_is_named(rest: Stored) -> None:
+    with pytest.raises(DevrfError, match="unknown term 'floww'"):
+        DeformationStage(rest, loss={"floww": 1.0})
