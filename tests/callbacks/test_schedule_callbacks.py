@@ -111,9 +111,15 @@ def test_progress_writes_lines_where_there_is_no_terminal(
 def test_phases_are_entered_once(
     datamodule: SceneDataModule, trainer: Callable[..., Trainer], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    stage, entered = CanonicalStage(CANONICAL, SMALL, iterations_per_step=1), []
+    stage = CanonicalStage(CANONICAL, SMALL, iterations_per_step=1)
+    entered: list[Any] = []
     enter = stage.enter
-    monkeypatch.setattr(stage, "enter", lambda phase: (entered.append(phase), enter(phase)))
+
+    def noted(phase: Any) -> None:
+        entered.append(phase)
+        enter(phase)
+
+    monkeypatch.setattr(stage, "enter", noted)
     fit = trainer(max_epochs=1)
     assert any(isinstance(c, GridUpscaling) for c in fit.callbacks)  # type: ignore[attr-defined]
     fit.fit(stage, datamodule=datamodule)

@@ -38,12 +38,13 @@ def seen(batch: RayBatch, ray: Tensor, points: Tensor, canonical: Tensor, weight
 
 @pytest.fixture
 def by_hand() -> MotionPrediction:
-    """Two rays of a camera at the origin that looks along −z; three samples at depth 2.
+    """Two rays of image 1, whose flow leads into image 0; three samples before them.
 
-    The motion: at t everything has moved by (0.3, 0, 0), one frame earlier by (0.1, 0, 0).
+    Both cameras are at the origin and look along −z; image 0 has another lens. The motion: at t
+    everything has moved by (0.3, 0, 0), one frame earlier by (0.1, 0, 0).
     """
     cameras = Cameras(
-        torch.eye(3, 4)[None].repeat(2, 1, 1), torch.tensor([[10.0, 20.0]] * 2),
+        torch.eye(3, 4)[None].repeat(2, 1, 1), torch.tensor([[10.0, 20.0], [3.0, 4.0]]),
         torch.tensor([[8.0, 6.0]] * 2), 16, 12,
     )
     pixel = torch.tensor([[8.5, 6.5], [10.5, 4.5]])
@@ -74,8 +75,8 @@ def test_cycle_of_an_exact_motion_is_zero_and_of_another_by_hand(
 
 
 def test_flow_by_hand(by_hand: MotionPrediction) -> None:
-    # Both samples of ray 0 lie on its pixel. Moved back by 0.2 along x they shift by
-    # −10·0.2/2 = −1 and −10·0.2/4 = −0.5 pixels, with none along y.
+    # Through image 0's lens both samples of ray 0 lie on its pixel. Moved back by 0.2 along x
+    # they shift by −10·0.2/2 = −1 and −10·0.2/4 = −0.5 pixels, with none along y.
     # Against (−1, 0.5): 0.5 and 1.0, weighted by 0.5 and 0.25; one valid ray; ray 1 is masked.
     assert flow(by_hand).item() == pytest.approx(0.5 * 0.5 + 0.25 * 1.0, abs=1e-5)
 

@@ -116,7 +116,12 @@ def test_composer_does_not_compute_what_does_not_count() -> None:
     def expensive(_: Tensor) -> Tensor:
         raise AssertionError("computed")
 
-    loss = WeightedLoss({"cheap": torch.sum, "expensive": expensive}, {"cheap": 1, "expensive": 0})
+    def cheap(values: Tensor) -> Tensor:
+        return values.sum()
+
+    loss: WeightedLoss[Tensor] = WeightedLoss(
+        {"cheap": cheap, "expensive": expensive}, {"cheap": 1.0, "expensive": 0.0}
+    )
     total, terms = loss(torch.ones(4))
     assert total.item() == 4 and set(terms) == {"cheap"}
 

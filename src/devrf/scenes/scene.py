@@ -12,6 +12,7 @@ from torch import Tensor
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
+from devrf.geometry.space import Space, WorldSpace
 
 Background = Literal["white", "black", "random"]
 CaptureName = Literal["static", "dynamic"]
@@ -117,7 +118,7 @@ class Capture:
 
 @dataclass(frozen=True)
 class Bounds:
-    """Where the scene is, in world units.
+    """Where the scene is, in the space that its fields live in (world units, or NDC).
 
     Attributes:
         box: holds everything that can be seen of the static scene (before it is tightened).
@@ -149,6 +150,7 @@ class Scene:
         dynamic: a few fixed views of the scene as it deforms.
         bounds: where the scene is.
         background: what is behind the matte.
+        space: the space that the fields live in, and in which ``bounds`` are given.
     """
 
     name: str
@@ -157,6 +159,7 @@ class Scene:
     dynamic: Capture
     bounds: Bounds
     background: Background
+    space: Space = WorldSpace()
 
     def capture(self, name: CaptureName) -> Capture:
         """The capture called ``static`` or ``dynamic``."""
