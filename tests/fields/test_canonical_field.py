@@ -28,7 +28,7 @@ def test_an_untrained_field_has_its_initial_opacity_a_base_voxel(cube: Box, alph
 def test_the_same_length_has_the_same_opacity_at_every_resolution(cube: Box) -> None:
     # 512 voxels at full size, 64 now: a voxel is twice a base voxel, half a voxel is one.
     field = SMALL.radiance_field(cube, 64, 512)
-    assert field.voxel_size == pytest.approx(0.5)
+    assert field.step_length(1.0) == pytest.approx(0.5)
     assert field.step_in_base_voxels(0.5) == pytest.approx(1.0)
     assert field.voxel_alpha(0.5).max().item() == pytest.approx(1e-2, rel=1e-4)
     field.resize(512)

@@ -30,7 +30,8 @@ def slowly(
     entry, leave = entry.clamp(min=near), leave.clamp(max=far)
     distance = entry[:, None] + step * torch.arange(500, dtype=entry.dtype)
     ray = torch.arange(len(rays))[:, None].expand_as(distance)
-    kept = distance < leave[:, None]
+    # The exit itself counts, up to rounding.
+    kept = distance <= leave[:, None] + 1e-3 * step
     ray, distance = ray[kept], distance[kept]
     kept = occupancy.at(rays.at(ray, distance))
     return ray[kept], distance[kept]
@@ -55,8 +56,8 @@ def test_sample_places_by_hand(cube: Box) -> None:
     d = torch.tensor([[1.0, 0.0, 0.0]])
     rays = Rays(torch.tensor([[-3.0, 0.0, 0.0]]), d, d)
     samples = march(rays, cube, Occupancy.full((5, 5, 5), cube), step=0.5, near=0.0, far=9.0)
-    # Entry at distance 2, exit at 4: the exit itself is no sample.
-    assert samples.distance.tolist() == [2.0, 2.5, 3.0, 3.5]
+    # Entry at distance 2, exit at 4: both are samples.
+    assert samples.distance.tolist() == [2.0, 2.5, 3.0, 3.5, 4.0]
     near = march(rays, cube, Occupancy.full((5, 5, 5), cube), step=0.5, near=2.25, far=3.0)
     assert near.distance.tolist() == [2.25, 2.75]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -94,9 +95,11 @@ def pictures(
 def write_video(path: Path, images: Iterator[Tensor], fps: int) -> None:
     """Write images (H, W, 3) in [0, 1] of one size as an mp4 (H.264)."""
     with whole_file(path) as partial:
-        with imageio.get_writer(
+        writer = imageio.get_writer(
             partial, format="FFMPEG", fps=fps, codec="libx264", quality=8, macro_block_size=2
-        ) as writer:
+        )
+        # As a context manager of its own it would leave ffmpeg running, and writing, on an error.
+        with closing(writer):
             for image in images:
                 writer.append_data(_watchable(to_bytes(image).numpy()))  # type: ignore[attr-defined]
 

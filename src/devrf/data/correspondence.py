@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from devrf.geometry.clock import FrameClock
+from devrf.scenes.optical_flow import frame_pairs
 from devrf.scenes.scene import Views
 
 
@@ -19,10 +20,7 @@ def previous_images(views: Views, clock: FrameClock) -> Tensor:
     Returns:
         (N,) int64 on the device of the views.
     """
-    frame = clock.frames_of(views.times)
-    own = torch.arange(len(views), device=frame.device)
-    earlier = frame[None, :] == frame[:, None] - 1
-    same_view = earlier & (views.view[None, :] == views.view[:, None])
-    alone = earlier & (earlier.sum(dim=1, keepdim=True) == 1)
-    match = torch.where(same_view.any(dim=1, keepdim=True), same_view, alone)
-    return torch.where(match.any(dim=1), match.int().argmax(dim=1), own)
+    previous = torch.arange(len(views), device=views.times.device)
+    for image, earlier in frame_pairs(views):
+        previous[image] = earlier
+    return previous

@@ -20,6 +20,7 @@ class Architecture:
             direction alone.
         alpha_init: opacity of a voxel of the radiance field before anything is learned.
         search_alpha_init: the same in the coarse geometry search.
+        planes: planes of an NDC grid, one behind another; None for cubic voxels.
     """
 
     channels: int = 12
@@ -27,6 +28,7 @@ class Architecture:
     frequencies: int = 4
     alpha_init: float = 1e-2
     search_alpha_init: float = 1e-6
+    planes: int | None = None
 
     def search_field(self, box: Box, voxels: int) -> CanonicalField:
         """The field of the coarse geometry search: colours straight from three channels."""
@@ -43,4 +45,5 @@ class Architecture:
             voxels=voxels,
             base_voxels=base_voxels,
             alpha_init=self.alpha_init,
+            planes=self.planes,
         )

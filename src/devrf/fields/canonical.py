@@ -31,6 +31,7 @@ class CanonicalField(nn.Module):
         voxels: int,
         base_voxels: int | None = None,
         alpha_init: float,
+        planes: int | None = None,
     ) -> None:
         """Build an empty field.
 
@@ -42,21 +43,48 @@ class CanonicalField(nn.Module):
             base_voxels: how many there are at full resolution; step lengths are measured in
                 voxels of that size. None: ``voxels``.
             alpha_init: opacity of one base voxel before anything is learned.
+            planes: in NDC, how many planes stand one behind another at every resolution;
+                then each plane starts with an equal share of every ray, the last one opaque.
+                None for cubic voxels.
         """
         super().__init__()
         self.box = box
         self.base_voxels = base_voxels or voxels
         self.alpha_init = alpha_init
-        shape = box.grid_shape(voxels)
         self.voxels = voxels
+        self.planes = planes
+        shape = self.grid_shape(voxels)
         self.density = VoxelGrid(shape, 1)
         self.color = VoxelGrid(shape, channels)
         self.decoder = decoder
+        if planes is not None:
+            self._share_out(planes)
 
-    @property
-    def voxel_size(self) -> float:
-        """Edge of a voxel at the present resolution, in the box's units."""
-        return self.box.voxel_size(self.voxels)
+    @torch.no_grad()
+    def _share_out(self, planes: int) -> None:
+        """Give each of P planes the weight 1/P of every ray: α_k = 1 / (P − k), the last ≈ 1."""
+        alpha = 1 / torch.arange(planes, 0, -1, dtype=torch.float64)
+        tau = -torch.log1p(-alpha.clamp(max=1 - 1e-6))
+        raw = torch.log(torch.expm1(tau / self.step_in_base_voxels(1.0))) - self.shift
+        self.density.values[..., 0] = raw.float()
+
+    def grid_shape(self, voxels: int) -> tuple[int, int, int]:
+        """Grid points along (x, y, z) for about ``voxels`` voxels."""
+        if self.planes is None:
+            return self.box.grid_shape(voxels)
+        width, height, _ = self.box.size
+        edge = (width * height * self.planes / voxels) ** 0.5
+        return max(2, int(width / edge + 1e-6)), max(2, int(height / edge + 1e-6)), self.planes
+
+    def step_length(self, step: float) -> float:
+        """Length of ``step`` voxels along a ray, in units of the ray's direction.
+
+        In NDC a direction leads from the first plane to the last, so that samples are evenly
+        spaced in NDC depth.
+        """
+        if self.planes is None:
+            return step * self.box.voxel_size(self.voxels)
+        return step / (self.planes - 1)
 
     @property
     def shift(self) -> float:
@@ -64,8 +92,13 @@ class CanonicalField(nn.Module):
         return math.log(1 / (1 - self.alpha_init) - 1)
 
     def step_in_base_voxels(self, step: float) -> float:
-        """δ of a step of ``step`` voxels: its length in voxels of the full resolution."""
-        return step * self.voxel_size / self.box.voxel_size(self.base_voxels)
+        """δ of a step of ``step`` voxels: its length in voxels of the full resolution.
+
+        In NDC, where the planes stay as they are, in units of 1/256 of the depth.
+        """
+        if self.planes is None:
+            return step * self.box.voxel_size(self.voxels) / self.box.voxel_size(self.base_voxels)
+        return step * 256 / self.planes
 
     def optical_depth(self, points: Tensor, delta: float) -> Tensor:
         """τ = softplus(v(x) + b)·δ (M,) at ``points`` (M, 3), for steps of δ base voxels."""
@@ -87,7 +120,7 @@ class CanonicalField(nn.Module):
     def resize(self, voxels: int) -> None:
         """Resample both grids to about ``voxels`` voxels; new parameters result."""
         self.voxels = voxels
-        shape = self.box.grid_shape(voxels)
+        shape = self.grid_shape(voxels)
         self.density.resize(shape)
         self.color.resize(shape)
 
@@ -114,6 +147,7 @@ class CanonicalField(nn.Module):
             "voxels": self.voxels,
             "base_voxels": self.base_voxels,
             "alpha_init": self.alpha_init,
+            "planes": self.planes,
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
@@ -122,3 +156,4 @@ class CanonicalField(nn.Module):
         self.voxels = state["voxels"]
         self.base_voxels = state["base_voxels"]
         self.alpha_init = state["alpha_init"]
+        self.planes = state["planes"]

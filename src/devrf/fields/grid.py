@@ -57,4 +57,5 @@ def resample(values: Tensor, shape: tuple[int, int, int]) -> Tensor:
     resized = torch.nn.functional.interpolate(
         channels_first, size=shape, mode="trilinear", align_corners=True
     )
-    return resized[0].permute(1, 2, 3, 0).contiguous()
+    # Not contiguous(): of a single channel it keeps a stray stride, and look-ups become slow.
+    return resized[0].permute(1, 2, 3, 0).clone(memory_format=torch.contiguous_format)

@@ -53,7 +53,7 @@ class Occupancy(nn.Module):
 
     def near(self, points: Tensor) -> Tensor:
         """Mask (M,): may something be within :attr:`reach` of ``points`` (M, 3)?"""
-        return self._look_up(self.vicinity, points)
+        return self._look_up(self.vicinity, self.box.nearest(points))
 
     def _look_up(self, mask: Tensor, points: Tensor) -> Tensor:
         x, y, z = mask.shape

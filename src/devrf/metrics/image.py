@@ -20,5 +20,5 @@ def ssim(prediction: Tensor, truth: Tensor) -> float:
     the image is large enough to have any.
     """
     a, b = (x.permute(2, 0, 1)[None].float() for x in (prediction, truth))
-    padding = "valid" if min(a.shape[-2:]) > 11 else "same"
+    padding = "valid" if min(a.shape[-2:]) >= 11 else "same"
     return float(ssim_map(a, b, window_size=11, max_val=1.0, padding=padding).mean())

@@ -87,7 +87,7 @@ def render(
         rays,
         field.box,
         occupancy,
-        step=settings.step * field.voxel_size,
+        step=field.step_length(settings.step),
         near=settings.near,
         far=settings.far,
     )

@@ -69,26 +69,33 @@ def march(
     """
     entry, leave = box.crossing(rays)
     entry, leave = entry.clamp(min=near), leave.clamp(max=far)
-    per_stretch = max(1, int(2 * occupancy.reach / step))
-    stretch = per_stretch * step
-    stretches = ((leave - entry) / stretch).clamp(min=0).ceil().long()
+    # The sample on the way out counts: in NDC it is the last plane, which closes the scene.
+    count = torch.where(leave >= entry, ((leave - entry) / step + 1e-3).floor() + 1, 0.0).long()
+    per_stretch = max(1, int(2 * _reach(rays, occupancy) / step))
+    stretches = (count + per_stretch - 1) // per_stretch
     ray = torch.repeat_interleave(stretches)
     first = stretches.cumsum(0) - stretches
-    number = torch.arange(len(ray), device=ray.device) - first[ray]
-    start = entry[ray] + number * stretch
-    middle = start + (stretch - step) / 2
+    start = (torch.arange(len(ray), device=ray.device) - first[ray]) * per_stretch
+    middle = entry[ray] + step * (start + (per_stretch - 1) / 2)
     kept = occupancy.near(rays.at(ray, middle)).nonzero()[:, 0]
-    steps = step * torch.arange(per_stretch, device=ray.device, dtype=start.dtype)
-    distance = (start[kept, None] + steps).reshape(-1)
+    number = start[kept, None] + torch.arange(per_stretch, device=ray.device)
     ray = ray[kept].repeat_interleave(per_stretch)
+    number = number.reshape(-1)
+    distance = entry[ray] + step * number
     points = rays.at(ray, distance)
-    kept = (occupancy.at(points) & (distance < leave[ray])).nonzero()[:, 0]
+    kept = (occupancy.at(points) & (number < count[ray])).nonzero()[:, 0]
     return Samples(
         ray.index_select(0, kept),
         distance.index_select(0, kept),
         points.index_select(0, kept),
         len(rays),
     )
+
+
+def _reach(rays: Rays, occupancy: Occupancy) -> float:
+    """The vicinity's reach in units of the rays' directions, which in NDC are no unit vectors."""
+    lengths = rays.directions.norm(dim=1)
+    return occupancy.reach / max(float(lengths.amax()), 1e-9) if len(rays) else occupancy.reach
 
 
 @torch.no_grad()
@@ -107,7 +114,7 @@ def hits(
 def _hits(rays: Rays, box: Box, occupancy: Occupancy, near: float, far: float) -> Tensor:
     entry, leave = box.crossing(rays)
     entry, leave = entry.clamp(min=near), leave.clamp(max=far)
-    stride = occupancy.reach
+    stride = _reach(rays, occupancy)
     strides = ((leave - entry) / stride).clamp(min=0).ceil().long()
     ray = torch.repeat_interleave(strides)
     first = strides.cumsum(0) - strides

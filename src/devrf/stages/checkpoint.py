@@ -83,7 +83,7 @@ def load_checkpoint(path: Path, scene: Scene | None = None) -> Stored:
         raise DevrfError(f"{path}: no such checkpoint; run the stage that makes it, or set ckpt")
     try:
         data = torch.load(path, map_location="cpu", weights_only=True)
-    except (RuntimeError, EOFError, OSError, ValueError, KeyError, pickle.UnpicklingError):
+    except Exception:  # noise in a file makes the unpickler raise whatever it likes
         raise DevrfError(
             f"{path}: damaged, or not a checkpoint; expected one written by devrf"
         ) from None
@@ -95,7 +95,7 @@ def load_checkpoint(path: Path, scene: Scene | None = None) -> Stored:
             f"{path}: belongs to another scene ({passport.scene}: other cameras, times or image "
             f"sizes than {scene.name}); train this scene, or set ckpt to its own checkpoint"
         )
-    return Stored(passport, _model(path, passport, data["state_dict"]))
+    return Stored(passport, _model(path, passport, data.get("state_dict") or {}))
 
 
 def _passport(path: Path, stored: dict[str, Any]) -> Passport:
@@ -121,16 +121,19 @@ def _passport(path: Path, stored: dict[str, Any]) -> Passport:
 def _model(path: Path, passport: Passport, state: dict[str, Any]) -> SceneModel:
     """Build a model of any size and let the stored state give it its shapes."""
     box = Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+    own = {k.removeprefix("scene_model."): v for k, v in state.items()}
+    build = passport.architecture
+    # A stage that was stopped in its search has no decoder yet.
+    searched = not any(key.startswith("canonical.decoder.") for key in own)
     model = SceneModel(
-        passport.architecture.radiance_field(box, 8, 8),
+        build.search_field(box, 8) if searched else build.radiance_field(box, 8, 8),
         Occupancy.full((2, 2, 2), box),
         passport.settings,
     )
-    own = {k.removeprefix("scene_model."): v for k, v in state.items()}
     if any(key.startswith("deformation.") for key in own):
         model.deformation = DeformationField(box, FrameClock((0.0, 1.0)), voxels=8)
     try:
         model.load_state_dict(own)
-    except RuntimeError:
+    except (RuntimeError, KeyError, ValueError, TypeError):
         raise DevrfError(f"{path}: its fields do not fit its description; train again") from None
     return model

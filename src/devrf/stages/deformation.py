@@ -115,7 +115,9 @@ class DeformationStage(ScheduledStage):
         weights = dict(loss)
         self.tv = weights.pop("tv", 0.0)
         self.losses = WeightedLoss(MOTION_TERMS, weights)
-        self.scene_model = rest.model.requires_grad_(False)
+        canonical, occupancy = rest.model.canonical, rest.model.occupancy
+        model = SceneModel(canonical, occupancy, rest.model.settings)
+        self.scene_model = model.requires_grad_(False)
         self.architecture = rest.passport.architecture
         self.records = rest.passport.records
         placeholder = torch.zeros(2, 2, 2, 3, requires_grad=True)

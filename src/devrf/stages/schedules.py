@@ -54,6 +54,19 @@ class CanonicalSchedule:
     phases: tuple[CanonicalPhase, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
+        least = {"search_iterations": 0, "search_side": 2, "iterations": 1, "side": 2,
+                 "decay_iterations": 1, "rays": 1}
+        for name, bound in least.items():
+            if getattr(self, name) < bound:
+                raise DevrfError(
+                    f"schedule.canonical.{name}: expected at least {bound}, "
+                    f"not {getattr(self, name)}"
+                )
+        if self.side**3 < 8 * 2 ** len(self.doublings):
+            raise DevrfError(
+                f"schedule.canonical.doublings: {len(self.doublings)} of them are too many for "
+                f"side {self.side}; start from 8 voxels or more"
+            )
         edges = [0, *self.doublings, self.iterations]
         if any(a >= b for a, b in zip(edges, edges[1:], strict=False)):
             raise DevrfError(
@@ -136,6 +149,17 @@ class DeformationSchedule:
                 "schedule.deformation.sides and .iterations_per_frame must be of one length, "
                 f"not {len(self.sides)} and {len(self.iterations_per_frame)}"
             )
+        for name, values, bound in (
+            ("sides", self.sides, 2),
+            ("iterations_per_frame", self.iterations_per_frame, 1),
+            ("rays", (self.rays,), 1),
+        ):
+            if min(values) < bound:
+                raise DevrfError(
+                    f"schedule.deformation.{name}: expected at least {bound}, not {min(values)}"
+                )
+        if not self.decay > 0:
+            raise DevrfError(f"schedule.deformation.decay: expected more than 0, not {self.decay}")
         if not self.coarse_to_fine:
             object.__setattr__(self, "sides", (self.sides[-1],))
             object.__setattr__(self, "iterations_per_frame", (sum(self.iterations_per_frame),))
