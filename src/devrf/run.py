@@ -14,9 +14,10 @@ from hydra.utils import instantiate
 from lightning import Trainer, seed_everything
 from omegaconf import DictConfig
 
+from devrf.artifacts.camera_paths import focus_distance, orbit, spiral
 from devrf.artifacts.contact_sheet import write_contact_sheet
 from devrf.artifacts.files import update_json
-from devrf.artifacts.film import FilmSettings, orbit, pictures, write_video
+from devrf.artifacts.film import FilmSettings, pictures, write_video
 from devrf.callbacks import TrainingRecord
 from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
@@ -138,16 +139,18 @@ class Run:
                 log.info("%s: %s", name, _line(values))
 
     def render(self) -> None:
-        """Film the held-out view over time, and an orbit while time runs."""
+        """Film the held-out view over time, and an orbit (or a spiral) while time runs."""
         stored, scene = self._load("deformation", "canonical"), self.datamodule.scene
         film: FilmSettings = instantiate(self.config.video)
         device = self._device()
         model = stored.model.to(device)
         held_out = scene.dynamic.test.cameras[[0] * film.frames]
-        paths = {
-            "held_out": held_out,
-            "orbit": orbit(scene.static.train.cameras, model.canonical.box, film),
-        }
+        captured = scene.static.train.cameras
+        paths = {"held_out": held_out}
+        if scene.kind == "forward":
+            paths["spiral"] = spiral(captured, focus_distance(model, captured, device), film)
+        else:
+            paths["orbit"] = orbit(captured, model.canonical.box, film)
         for name, cameras in paths.items():
             path = self.folder / "videos" / f"{name}.mp4"
             shown = pictures(model, cameras, background_value(scene.background), device)

@@ -11,9 +11,10 @@ import pytest
 import torch
 from torch import Tensor
 
+from devrf.artifacts.camera_paths import orbit
 from devrf.artifacts.colors import depth_colors, error_colors, to_bytes
 from devrf.artifacts.contact_sheet import GAP, side_by_side, write_contact_sheet
-from devrf.artifacts.film import FilmSettings, orbit, pictures, write_video
+from devrf.artifacts.film import FilmSettings, pictures, write_video
 from devrf.fields.architecture import Architecture
 from devrf.fields.occupancy import Occupancy
 from devrf.geometry.box import Box

@@ -7,7 +7,6 @@ import torch
 
 from devrf.data.correspondence import previous_images
 from devrf.geometry.cameras import Cameras
-from devrf.geometry.clock import FrameClock
 from devrf.scenes.optical_flow import frame_pairs
 from devrf.scenes.scene import Views
 
@@ -24,7 +23,7 @@ def views(times: list[float], view: list[int]) -> Views:
 
 
 def previous(data: Views) -> list[int]:
-    found: list[int] = previous_images(data, FrameClock.from_times(data.times)).tolist()
+    found: list[int] = previous_images(data).tolist()
     return found
 
 

@@ -119,7 +119,7 @@ def exact(scene: Scene, recipe: ProceduralScene, frame: int) -> MotionPrediction
     return MotionPrediction(
         seen(batch, every, points, material.rest, torch.ones(len(flat))), batch,
         lambda q: at(times[frame], q), lambda q: at(times[frame - 1], q), views.cameras,
-        previous_images(views, scene.clock),
+        previous_images(views),
     )
 
 

@@ -1,4 +1,4 @@
-"""Videos of a learned scene: the held-out view over time, and an orbit while time runs."""
+"""Videos of a learned scene, colour beside depth, while time runs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from torch import Tensor
 
 from devrf.artifacts.colors import depth_colors, to_bytes
 from devrf.artifacts.files import whole_file
-from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.rendering.model import SceneModel
 
@@ -41,55 +40,29 @@ class FilmSettings:
     orbit_elevation: float = 25.0
 
 
-def orbit(cameras: Cameras, box: Box, settings: FilmSettings) -> Cameras:
-    """Cameras on a circle around a box, looking at its middle.
-
-    Args:
-        cameras: the captured cameras: the orbit has their mean distance, their lens, and the
-            direction that is up for them.
-        box: what to look at.
-        settings: how many, how high, how often round.
-    """
-    middle = torch.tensor([(a + b) / 2 for a, b in zip(box.low, box.high, strict=True)])
-    radius = float((cameras.positions - middle).norm(dim=1).mean())
-    up = torch.nn.functional.normalize(cameras.camera_to_world[:, :, 1].mean(dim=0), dim=0)
-    away = torch.eye(3)[int(up.abs().argmin())]
-    east = torch.nn.functional.normalize(torch.linalg.cross(away, up), dim=0)
-    north = torch.linalg.cross(up, east)
-    angle = torch.arange(settings.frames) * (2 * math.pi * settings.orbit_turns / settings.frames)
-    height = math.radians(settings.orbit_elevation)
-    ring = angle.cos()[:, None] * east + angle.sin()[:, None] * north
-    positions = middle + radius * (math.cos(height) * ring + math.sin(height) * up)
-    return Cameras.looking_at(
-        positions,
-        middle.expand_as(positions),
-        focal=float(cameras.focal.mean()),
-        width=cameras.width,
-        height=cameras.height,
-        up=up,
-    )
-
-
 def pictures(
     model: SceneModel, cameras: Cameras, background: float, device: torch.device
 ) -> Iterator[Tensor]:
     """Colour beside depth (H, 2W, 3) from each of N cameras, while time runs from 0 to 1."""
-    box = model.canonical.box
-    half_diagonal = math.dist(box.low, box.high) / 2
-    middle = torch.tensor([(a + b) / 2 for a, b in zip(box.low, box.high, strict=True)])
     behind = torch.full((3,), background, device=device)
     for k in range(len(cameras)):
         time = k / max(len(cameras) - 1, 1)
         picture = model.picture(cameras.image_rays(k).to(device), time, behind)
-        distance = float((cameras.positions[k] - middle).norm())
+        near, far = _depth_range(model, cameras.positions[k])
         shape = (cameras.height, cameras.width)
         depth = depth_colors(
-            picture.depth.view(shape).cpu(),
-            picture.opacity.view(shape).cpu(),
-            near=max(distance - half_diagonal / 1.5, 0.0),
-            far=distance + half_diagonal / 1.5,
+            picture.depth.view(shape).cpu(), picture.opacity.view(shape).cpu(), near, far
         )
         yield torch.cat([picture.color.view(*shape, 3).cpu(), depth], dim=1)
+
+
+def _depth_range(model: SceneModel, position: Tensor) -> tuple[float, float]:
+    """Depths shown brightest and darkest: about where the scene is, seen from ``position``."""
+    if model.canonical.planes is not None:
+        return model.settings.near, model.settings.far
+    box = model.canonical.box
+    distance, reach = math.dist(position.tolist(), box.middle), math.dist(box.low, box.high) / 3
+    return max(distance - reach, 0.0), distance + reach
 
 
 def write_video(path: Path, images: Iterator[Tensor], fps: int) -> None:
@@ -101,7 +74,7 @@ def write_video(path: Path, images: Iterator[Tensor], fps: int) -> None:
         # As a context manager of its own it would leave ffmpeg running, and writing, on an error.
         with closing(writer):
             for image in images:
-                writer.append_data(_watchable(to_bytes(image).numpy()))  # type: ignore[attr-defined]
+                writer.append_data(_watchable(to_bytes(image).numpy()))
 
 
 def _watchable(image: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from devrf.geometry.rays import Rays
+from devrf.geometry.space import WORLD, Space
 from devrf.scenes.scene import Views
 
 
@@ -41,7 +42,13 @@ def pixel_positions(flat: Tensor, width: int) -> Tensor:
     return torch.stack([flat % width, flat // width], dim=-1) + 0.5
 
 
-def gather_batch(views: Views, image: Tensor, flat: Tensor, background: Tensor) -> RayBatch:
+def gather_batch(
+    views: Views,
+    image: Tensor,
+    flat: Tensor,
+    background: Tensor,
+    space: Space = WORLD,
+) -> RayBatch:
     """The batch of given pixels.
 
     Args:
@@ -49,9 +56,10 @@ def gather_batch(views: Views, image: Tensor, flat: Tensor, background: Tensor) 
         image: (R,) int64, which image.
         flat: (R,) int64, row-major pixel number within it.
         background: (3,) or (R, 3) RGB in [0, 1] that mattes are composited on.
+        space: the space that the fields live in.
 
     Returns:
-        Rays in world space with the truth at their pixels.
+        Rays in the fields' space with the truth at their pixels.
     """
     pixel = pixel_positions(flat, views.width)
     row = image * (views.height * views.width) + flat
@@ -65,7 +73,7 @@ def gather_batch(views: Views, image: Tensor, flat: Tensor, background: Tensor) 
         flow = views.flow.vectors.flatten(0, 2)[row]
         flow_valid = views.flow.valid.flatten()[row]
     return RayBatch(
-        rays=views.cameras.rays(image, pixel),
+        rays=space.rays(views.cameras.rays(image, pixel)),
         color=color,
         alpha=alpha,
         background=background,

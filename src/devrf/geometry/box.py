@@ -33,6 +33,12 @@ class Box:
         return x, y, z
 
     @property
+    def middle(self) -> tuple[float, float, float]:
+        """The centre (x, y, z)."""
+        x, y, z = ((a + b) / 2 for a, b in zip(self.low, self.high, strict=True))
+        return x, y, z
+
+    @property
     def longest(self) -> float:
         """The longest edge."""
         return max(self.size)

@@ -45,3 +45,6 @@ class WorldSpace:
     def rays(self, rays: Rays) -> Rays:
         """The rays themselves."""
         return rays
+
+
+WORLD = WorldSpace()

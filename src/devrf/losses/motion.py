@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from devrf.geometry.cameras import Cameras
+from devrf.geometry.space import WORLD, Space
 from devrf.losses.photometric import PHOTOMETRIC_TERMS, Prediction
 from devrf.rendering.render import Warp
 
@@ -21,12 +22,14 @@ class MotionPrediction(Prediction):
         cameras: the cameras of the images that the batch was drawn from.
         previous_image: (N,) int64, for each image the one that its flow leads to (the same view
             one frame earlier), or the image itself where there is none.
+        space: the space that points are in.
     """
 
     unwarp: Warp
     unwarp_previous: Warp
     cameras: Cameras
     previous_image: Tensor
+    space: Space = WORLD
 
 
 def cycle(prediction: MotionPrediction) -> Tensor:
@@ -54,25 +57,31 @@ def flow(prediction: MotionPrediction) -> Tensor:
     camera = prediction.previous_image[batch.image[ray]]
     induced = induced_flow(
         output.canonical[kept], prediction.unwarp_previous, prediction.cameras, camera,
-        batch.pixel[ray],
+        batch.pixel[ray], prediction.space,
     )
     error = (induced - batch.flow[ray]).abs().sum(dim=1)
     return (output.weight[kept] * error).sum() / batch.flow_valid.sum().clamp(min=1)
 
 
 def induced_flow(
-    canonical: Tensor, unwarp_previous: Warp, cameras: Cameras, camera: Tensor, pixel: Tensor
+    canonical: Tensor,
+    unwarp_previous: Warp,
+    cameras: Cameras,
+    camera: Tensor,
+    pixel: Tensor,
+    space: Space = WORLD,
 ) -> Tensor:
     """The optical flow (M, 2) that the motion fields imply for canonical points.
 
     Args:
         canonical: (M, 3) canonical positions of what is seen at ``pixel``.
-        unwarp_previous: canonical points → their positions one frame earlier, world units.
+        unwarp_previous: canonical points → their positions one frame earlier.
         cameras: all cameras.
         camera: (M,) the camera that took the earlier frame.
         pixel: (M, 2) where the points are seen now, x, y in pixels.
+        space: the space that the points are in; they are projected from the world.
     """
-    position, _ = cameras.project(camera, unwarp_previous(canonical))
+    position, _ = cameras.project(camera, space.to_world(unwarp_previous(canonical)))
     return position - pixel
 
 

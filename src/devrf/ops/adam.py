@@ -50,10 +50,6 @@ class GridAdam(torch.optim.Optimizer):
                 update(parameter, parameter.grad, state, group)
         return result
 
-    def forget(self) -> None:
-        """Drop all moments and step counts, as a fresh optimiser would start."""
-        self.state.clear()
-
     def replace(self, group: int, parameters: Sequence[Tensor], pace: Tensor | None = None) -> None:
         """Give a group other parameters (a resized grid, the next frame) with fresh moments."""
         for old in self.param_groups[group]["params"]:

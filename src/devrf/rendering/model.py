@@ -11,6 +11,7 @@ from devrf.fields.canonical import CanonicalField
 from devrf.fields.deformation import DeformationField
 from devrf.fields.occupancy import Occupancy, dilate
 from devrf.geometry.rays import Rays
+from devrf.geometry.space import WORLD, Space
 from devrf.rendering.render import RenderSettings, Warp, render
 
 
@@ -37,6 +38,7 @@ class SceneModel(nn.Module):
         occupancy: where something is at rest.
         deformation: how it moves; None shows the rest state at every time.
         settings: how rays are sampled.
+        space: the space that the fields live in.
     """
 
     def __init__(
@@ -45,12 +47,14 @@ class SceneModel(nn.Module):
         occupancy: Occupancy,
         settings: RenderSettings,
         deformation: DeformationField | None = None,
+        space: Space = WORLD,
     ) -> None:
         super().__init__()
         self.canonical = canonical
         self.occupancy = occupancy
         self.settings = settings
         self.deformation = deformation
+        self.space = space
 
     def warp(self, time: float) -> Warp | None:
         """The map from points (M, 3) at ``time`` into canonical space; None is the identity."""
@@ -71,11 +75,12 @@ class SceneModel(nn.Module):
         """What rays see at ``time``.
 
         Args:
-            rays: R rays.
+            rays: R rays in world space.
             time: in [0, 1].
             background: (3,) RGB.
             chunk: rays rendered at once.
         """
+        rays = self.space.rays(rays)
         warp, occupancy = self.warp(time), self.occupancy_at(time)
         parts = [
             render(rays[k : k + chunk], self.canonical, occupancy, self.settings, background, warp)

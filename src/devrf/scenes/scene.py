@@ -12,7 +12,7 @@ from torch import Tensor
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
-from devrf.geometry.space import Space, WorldSpace
+from devrf.geometry.space import WORLD, Space
 
 Background = Literal["white", "black", "random"]
 CaptureName = Literal["static", "dynamic"]
@@ -159,7 +159,7 @@ class Scene:
     dynamic: Capture
     bounds: Bounds
     background: Background
-    space: Space = WorldSpace()
+    space: Space = WORLD
 
     def capture(self, name: CaptureName) -> Capture:
         """The capture called ``static`` or ``dynamic``."""

@@ -20,8 +20,10 @@ from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
 from devrf.losses.composer import WeightedLoss
+from devrf.losses.motion import total_variation_weight
 from devrf.losses.photometric import PHOTOMETRIC_TERMS, Prediction
 from devrf.ops.adam import GridAdam
+from devrf.ops.total_variation import add_total_variation_gradient
 from devrf.rendering.model import SceneModel
 from devrf.rendering.render import RenderSettings, render
 from devrf.rendering.sampling import hits
@@ -97,7 +99,8 @@ class CanonicalStage(ScheduledStage):
             architecture: sizes of the field.
             rates: learning rates.
             sampling: how rays are sampled.
-            search_loss: weights of the loss terms while the coarse geometry is searched.
+            search_loss: weights of the loss terms while the coarse geometry is searched;
+                ``tv`` is the total variation of both grids.
             fine_loss: their weights afterwards.
             iterations_per_step: optimiser iterations in one Lightning step.
         """
@@ -106,10 +109,11 @@ class CanonicalStage(ScheduledStage):
         self.architecture = architecture or Architecture()
         self.rates = rates or CanonicalRates()
         self.sampling = sampling or Sampling()
-        self.losses = {
-            "search": WeightedLoss(PHOTOMETRIC_TERMS, search_loss),
-            "fine": WeightedLoss(PHOTOMETRIC_TERMS, fine_loss),
-        }
+        self.losses, self.tv = {}, {}
+        for kind, given in (("search", search_loss), ("fine", fine_loss)):
+            weights = dict(given)
+            self.tv[kind] = weights.pop("tv", 0.0)
+            self.losses[kind] = WeightedLoss(PHOTOMETRIC_TERMS, weights)
         self._pool: PixelPool | None = None
         self.scene_model: SceneModel | None = None
         self._optimizer: GridAdam | None = None
@@ -155,7 +159,9 @@ class CanonicalStage(ScheduledStage):
             canonical = self.architecture.search_field(box, first.voxels)
         else:
             canonical = self._radiance_field(occupancy, first)
-        self.scene_model = SceneModel(canonical, occupancy, self._settings(first))
+        self.scene_model = SceneModel(
+            canonical, occupancy, self._settings(first), space=self.scene.space
+        )
         rates = self.rates
         self._optimizer = GridAdam(
             [
@@ -224,7 +230,7 @@ class CanonicalStage(ScheduledStage):
         box = self._enlarged(tight)
         share = 100 * occupancy.share
         log.info("%.1f%% of the searched box may be occupied; fields live in %s", share, box)
-        return self.architecture.radiance_field(box, phase.voxels, self.schedule.side**3)
+        return self.architecture.radiance_field(box, phase.voxels, round(self.schedule.side**3))
 
     def _enlarged(self, box: Box) -> Box:
         """The box with room for motion: the scene's motion box, or a multiple of the box."""
@@ -251,10 +257,10 @@ class CanonicalStage(ScheduledStage):
         if everywhere:
             return pool
         cameras, settings = views.cameras.to(device), self.model.settings
-        box = self.model.canonical.box
+        box, space = self.model.canonical.box, self.scene.space
         kept = torch.cat(
             [
-                hits(cameras.image_rays(k), box, self.model.occupancy,
+                hits(space.rays(cameras.image_rays(k)), box, self.model.occupancy,
                      near=settings.near, far=settings.far)
                 for k in range(len(views))
             ]
@@ -267,6 +273,7 @@ class CanonicalStage(ScheduledStage):
         pace = None
         if not skip_zero:
             points = field.box.grid_points(field.density.shape, field.density.values)
+            points = self.scene.space.to_world(points)
             pace = share_of_views(cameras.to(self.device), points)[..., None]
         for group, grid in ((0, field.density), (1, field.color)):
             self.optimizer.replace(group, list(grid.parameters()), pace)
@@ -282,12 +289,27 @@ class CanonicalStage(ScheduledStage):
         background = background_color(
             self.scene.background, len(image), self.device, training=True
         )
-        batch = gather_batch(views, image, flat, background)
+        batch = gather_batch(views, image, flat, background, self.scene.space)
         model = self.model
         output = render(
             batch.rays, model.canonical, model.occupancy, model.settings, background
         )
         return self.losses[self.phase.kind](Prediction(output, batch))
+
+    @torch.no_grad()
+    def add_gradients(self) -> None:
+        """The total variation of both grids, at the voxels that this batch has touched."""
+        assert isinstance(self.phase, CanonicalPhase)
+        if not self.tv[self.phase.kind]:
+            return
+        field = self.model.canonical
+        side = max(field.density.shape)
+        weight = total_variation_weight(self.tv[self.phase.kind], side, self.schedule.rays)
+        for grid in (field.density.values, field.color.values):
+            if grid.grad is not None:
+                smooth = torch.zeros_like(grid)
+                add_total_variation_gradient(grid, smooth, weight)
+                grid.grad += smooth * (grid.grad != 0)
 
     @torch.no_grad()
     def on_train_end(self) -> None:
@@ -304,6 +326,7 @@ class CanonicalStage(ScheduledStage):
             fingerprint=self.scene.fingerprint,
             architecture=self.architecture,
             settings=self.model.settings,
+            space=self.model.space,
             records={"canonical": self.record},
         )
 

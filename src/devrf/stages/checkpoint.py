@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import pickle
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,8 @@ from devrf.fields.deformation import DeformationField
 from devrf.fields.occupancy import Occupancy
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
+from devrf.geometry.ndc import NormalizedDevice
+from devrf.geometry.space import WORLD, Space
 from devrf.rendering.model import SceneModel
 from devrf.rendering.render import RenderSettings
 from devrf.scenes.scene import Scene
@@ -33,6 +34,7 @@ class Passport:
         fingerprint: the scene's cameras, times and image sizes, hashed.
         architecture: sizes of the canonical field.
         settings: how rays are sampled.
+        space: the space that the fields live in.
         records: what training took, by stage.
         format: version of this layout.
     """
@@ -41,6 +43,7 @@ class Passport:
     fingerprint: str
     architecture: Architecture
     settings: RenderSettings
+    space: Space = WORLD
     records: dict[str, dict[str, float | None]] = field(default_factory=dict)
     format: int = FORMAT
 
@@ -110,6 +113,7 @@ def _passport(path: Path, stored: dict[str, Any]) -> Passport:
             fingerprint=stored["fingerprint"],
             architecture=Architecture(**stored["architecture"]),
             settings=RenderSettings(**stored["settings"]),
+            space=NormalizedDevice(**stored["space"]) if stored["space"] else WORLD,
             records=stored["records"],
         )
     except (KeyError, TypeError) as error:
@@ -129,6 +133,7 @@ def _model(path: Path, passport: Passport, state: dict[str, Any]) -> SceneModel:
         build.search_field(box, 8) if searched else build.radiance_field(box, 8, 8),
         Occupancy.full((2, 2, 2), box),
         passport.settings,
+        space=passport.space,
     )
     if any(key.startswith("deformation.") for key in own):
         model.deformation = DeformationField(box, FrameClock((0.0, 1.0)), voxels=8)

@@ -116,7 +116,9 @@ class DeformationStage(ScheduledStage):
         self.tv = weights.pop("tv", 0.0)
         self.losses = WeightedLoss(MOTION_TERMS, weights)
         canonical, occupancy = rest.model.canonical, rest.model.occupancy
-        model = SceneModel(canonical, occupancy, rest.model.settings)
+        model = SceneModel(
+            canonical, occupancy, rest.model.settings, space=rest.model.space
+        )
         self.scene_model = model.requires_grad_(False)
         self.architecture = rest.passport.architecture
         self.records = rest.passport.records
@@ -179,7 +181,7 @@ class DeformationStage(ScheduledStage):
             self.field.resize(phase.side**3)
         views = self._device_views()
         if self._previous is None:
-            self._previous = previous_images(views, self.field.clock)
+            self._previous = previous_images(views)
         if phase.carries:
             self.field.carry(phase.frame)
         if phase.level == 0 and self.motion.start == "flow" and views.flow is not None:
@@ -187,7 +189,6 @@ class DeformationStage(ScheduledStage):
         backward, forward = self.field.slice(phase.frame)
         self._visit = Visit(backward, forward, self.scene_model.occupancy, [])
         self._optimizer.replace(0, [backward, forward])
-        self._optimizer.forget()
         self._look_around()
         self._visit.pools = self._frame_pools(views, phase.frame)
 
@@ -197,7 +198,8 @@ class DeformationStage(ScheduledStage):
         clock = self.field.clock
         pool = all_pixels(views, (clock.frames_of(views.times) == frame).nonzero()[:, 0])
         tracks = follow(self.scene_model, views, pool, self._previous, clock.times[frame - 1])
-        start_from_tracks(self.field, frame, tracks, views.cameras)
+        space = self.scene_model.space
+        start_from_tracks(self.field, frame, tracks, views.cameras, space)
 
     @property
     def visit(self) -> Visit:
@@ -257,9 +259,9 @@ class DeformationStage(ScheduledStage):
         """Pixels on the matte, or whose rays meet the frame's matter; all if there are none."""
         image = int(pool.image[0])
         settings = self.scene_model.settings
+        rays = self.scene_model.space.rays(views.cameras.image_rays(image))
         kept = hits(
-            views.cameras.image_rays(image), self.field.box, self.visit.occupancy,
-            near=settings.near, far=settings.far,
+            rays, self.field.box, self.visit.occupancy, near=settings.near, far=settings.far
         )
         if views.has_alpha:
             kept |= views.pixels[image, :, :, 3].flatten() > 0
@@ -276,14 +278,16 @@ class DeformationStage(ScheduledStage):
         background = background_color(
             self.scene.background, len(image), self.device, training=True
         )
-        batch = gather_batch(views, image, flat, background)
+        space = self.scene_model.space
+        batch = gather_batch(views, image, flat, background, space)
         model = self.scene_model
         output = render(
             batch.rays, model.canonical, self.visit.occupancy, model.settings, background,
             self._warp,
         )
         prediction = MotionPrediction(
-            output, batch, self._unwarp, self._unwarp_previous, views.cameras, self._previous
+            output, batch, self._unwarp, self._unwarp_previous, views.cameras, self._previous,
+            space,
         )
         return self.losses(prediction)
 
@@ -305,5 +309,6 @@ class DeformationStage(ScheduledStage):
             fingerprint=self.scene.fingerprint,
             architecture=self.architecture,
             settings=self.scene_model.settings,
+            space=self.scene_model.space,
             records={**self.records, "deformation": self.record},
         )

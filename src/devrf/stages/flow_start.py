@@ -20,6 +20,7 @@ from devrf.data.batch import gather_batch
 from devrf.data.pool import PixelPool
 from devrf.fields.deformation import DeformationField
 from devrf.geometry.cameras import Cameras
+from devrf.geometry.space import WORLD, Space
 from devrf.ops.trilinear import interpolate
 from devrf.rendering.model import SceneModel
 from devrf.rendering.render import render
@@ -31,7 +32,7 @@ class Tracks:
     """N canonical points that were seen one frame earlier and are seen again.
 
     Attributes:
-        canonical: (N, 3) the points in canonical space, world units.
+        canonical: (N, 3) the points in canonical space.
         camera: (N,) int64, the camera that sees each point now.
         pixel: (N, 2) x, y where it sees it, in pixels.
     """
@@ -67,7 +68,7 @@ def follow(
     image, flat = pool.image[kept].long(), pool.flat[kept].long()
     now = gather_batch(views, image, flat, torch.ones(3, device=image.device))
     assert now.flow is not None
-    rays = views.cameras.rays(previous[image], now.pixel + now.flow)
+    rays = model.space.rays(views.cameras.rays(previous[image], now.pixel + now.flow))
     seen = render(
         rays, model.canonical, model.occupancy_at(time_before), model.settings,
         torch.ones(3, device=image.device), model.warp(time_before),
@@ -81,8 +82,13 @@ def follow(
 
 
 def start_from_tracks(
-    field: DeformationField, frame: int, tracks: Tracks, cameras: Cameras,
-    smoothness: float = 0.01, steps: int = 60,
+    field: DeformationField,
+    frame: int,
+    tracks: Tracks,
+    cameras: Cameras,
+    space: Space = WORLD,
+    smoothness: float = 0.01,
+    steps: int = 60,
 ) -> None:
     """Move a frame's two slices, carried from the frame before, along the tracks.
 
@@ -95,19 +101,19 @@ def start_from_tracks(
         frame: the frame to start.
         tracks: where canonical points are seen at that frame.
         cameras: the cameras that the tracks name.
+        space: the space that the field lives in.
         smoothness: weight of differences between neighbouring voxels' changes.
         steps: optimiser steps of each fit.
     """
     if len(tracks) == 0:
         return
-    depth = (tracks.canonical - cameras.positions[tracks.camera]).norm(dim=1).mean()
-    scale = float(cameras.focal.mean() / depth)
+    scale = _pixels_per_unit(tracks, cameras, space, 1e-3 * field.box.longest)
     _, forward = field.slice(frame)
     coords = field.box.to_grid(tracks.canonical, field.shape)
 
     def misses(change: Tensor) -> Tensor:
         points = tracks.canonical + interpolate(forward.detach() + change, coords)
-        pixel, _ = cameras.project(tracks.camera, points)
+        pixel, _ = cameras.project(tracks.camera, space.to_world(points))
         return pixel - tracks.pixel
 
     with torch.no_grad():
@@ -122,6 +128,17 @@ def start_from_tracks(
 
     with torch.no_grad():
         field.to_canonical[frame] += _fit(errs, back, scale, smoothness, steps)
+
+
+def _pixels_per_unit(tracks: Tracks, cameras: Cameras, space: Space, small: float) -> float:
+    """By how many pixels the tracked points move in their images for a unit of the space."""
+    first, _ = cameras.project(tracks.camera, space.to_world(tracks.canonical))
+    moves = []
+    for axis in torch.eye(3).to(first):
+        there = space.to_world(tracks.canonical + small * axis)
+        moved, _ = cameras.project(tracks.camera, there)
+        moves.append((moved - first).norm(dim=1).mean() / small)
+    return float(torch.stack(moves).amax())
 
 
 @torch.enable_grad()
@@ -143,9 +160,7 @@ def _fit(
     for _ in range(steps):
         optimizer.zero_grad()
         missed = residual(change)
-        error = torch.nn.functional.huber_loss(
-            missed, torch.zeros_like(missed), delta=1.0
-        )
+        error = torch.nn.functional.huber_loss(missed, torch.zeros_like(missed), delta=1.0)
         rough = sum(change.diff(dim=axis).square().sum() for axis in range(3)) * scale**2
         total: Tensor = error + smoothness * rough / like.shape[:3].numel()
         total.backward()  # type: ignore[no-untyped-call]

@@ -47,7 +47,7 @@ class CanonicalSchedule:
     search_side: int = 100
     carve: bool = False
     iterations: int = 20000
-    side: int = 160
+    side: float = 160
     doublings: Sequence[int] = (1000, 2000, 3000, 4000)
     decay_iterations: int = 20000
     rays: int = 8192
@@ -77,7 +77,7 @@ class CanonicalSchedule:
         if offset:
             phases.append(CanonicalPhase("search", 0, offset, self.search_side**3))
         for k, (start, stop) in enumerate(zip(edges, edges[1:], strict=False)):
-            voxels = self.side**3 // 2 ** (len(self.doublings) - k)
+            voxels = round(self.side**3) // 2 ** (len(self.doublings) - k)
             phases.append(CanonicalPhase("fine", offset + start, offset + stop, voxels))
         object.__setattr__(self, "phases", tuple(phases))
 
