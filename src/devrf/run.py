@@ -23,7 +23,7 @@ from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
 from devrf.losses.composer import WeightedLoss
 from devrf.losses.motion import MOTION_TERMS
-from devrf.scenes.export import export_blender
+from devrf.scenes.export import export
 from devrf.scenes.scene import CaptureName
 from devrf.stages.checkpoint import Stored, load_checkpoint, save_checkpoint
 from devrf.stages.held_out import HeldOutView, background_value, score
@@ -98,7 +98,7 @@ class Run:
         folder = getattr(self.datamodule, "export", None)
         if folder is None:
             raise DevrfError("data.export: stage=prepare needs a folder; give data.export=PATH")
-        export_blender(self.datamodule.scene, folder)
+        export(self.datamodule.scene, folder)
         log.info("scene written to %s", folder)
 
     def canonical(self) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,8 @@ import torch
 
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
+from devrf.scenes.lens import Lens
+from devrf.scenes.resampling import shrink_pixels
 from devrf.scenes.scene import Views
 
 # Not square, so that a swap of the axes cannot hide: 32 columns, 24 rows.
@@ -150,3 +153,138 @@ def unit_box() -> Box:
 def ring_cameras() -> Callable[..., Cameras]:
     """The function :func:`ring`."""
     return ring
+
+
+# A red, a green and a blue ball, none in the middle: a mirrored or turned axis shows.
+BALLS = torch.tensor([[1.2, 0.1, 0.45], [-0.6, 1.0, 0.0], [0.1, -1.1, -0.45]])
+
+
+def balls_picture(pose: torch.Tensor, lens: Lens, width: int, height: int) -> np.ndarray:
+    """What a camera with distortion sees of the balls: RGBA, 3 × 3 exact samples a pixel.
+
+    ``pose`` (3, 4) is camera-to-world in OpenGL axes, ``lens`` in pixels of the picture.
+    """
+    key = tuple(pose.flatten().tolist())
+    return shrink_pixels(_balls(key, lens.scaled(3, 3), width * 3, height * 3), width, height)
+
+
+@cache
+def _balls(numbers: tuple[float, ...], lens: Lens, width: int, height: int) -> np.ndarray:
+    pose = torch.tensor(numbers, dtype=torch.float64).reshape(3, 4)
+    seen = _directions(lens, width, height)
+    local = torch.cat([seen * torch.tensor([1, -1]), -torch.ones(height, width, 1)], dim=-1)
+    rays = torch.nn.functional.normalize(local @ pose[:, :3].T, dim=-1)
+    image = np.zeros((height, width, 4), dtype=np.uint8)
+    for ball, center in enumerate(BALLS.double() - pose[:, 3]):
+        along = (rays * center).sum(dim=-1, keepdim=True)
+        hit = ((center - along * rays).norm(dim=-1) < 0.12).numpy()
+        image[hit, ball] = 255
+        image[hit, 3] = 255
+    return image
+
+
+@cache
+def _directions(lens: Lens, width: int, height: int) -> torch.Tensor:
+    """(H, W, 2) where the lens looks in each pixel: x/z and y/z, y down."""
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    py = (y.double() + 0.5 - lens.center[1]) / lens.focal[1]
+    px = (x.double() + 0.5 - lens.center[0] - lens.skew * py) / lens.focal[0]
+    return lens.distortion.undistort(torch.stack([px, py], dim=-1))
+
+
+def ball_centers(pixels: torch.Tensor) -> torch.Tensor:
+    """(3, 2) the centres of mass x, y of the balls in a picture (H, W, 4) uint8."""
+    height, width = pixels.shape[:2]
+    weight = pixels[..., :3].float() * pixels[..., 3:]
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    place = torch.stack([x, y], dim=-1) + 0.5
+    mass = weight.sum(dim=(0, 1))
+    return torch.einsum("hwb,hwc->bc", weight, place) / mass[:, None]
+
+
+@pytest.fixture
+def picture() -> Callable[..., np.ndarray]:
+    """The function :func:`balls_picture`."""
+    return balls_picture
+
+
+@pytest.fixture
+def balls_are_where_they_project() -> Callable[[Views], None]:
+    """A function that compares each image with where its camera projects the balls."""
+
+    def check(views: Views) -> None:
+        for image, pixels in enumerate(views.pixels):
+            expected, depth = views.cameras.project_into(image, BALLS)
+            assert (depth > 0).all()
+            torch.testing.assert_close(ball_centers(pixels), expected, atol=0.15, rtol=0)
+
+    return check
+
+
+class LlffFolder:
+    """A valid forward-facing scene, written by hand, that a test then breaks in one place.
+
+    9 static cameras that look along world −x, 4.5 world units apart along world y; world z is
+    up. The least depth is 6, so the reader's unit is 4.5. Then 3 fixed views of 3 frames, in
+    the reader's own frame. Images are 24×16; static poses speak of 96×64, the others of 48×32.
+    """
+
+    WIDTH, HEIGHT = 24, 16
+
+    def __init__(self, root: Path) -> None:
+        """Write it under ``root``."""
+        self.root = root
+        self.static, self.dynamic = root / "static", root / "dynamic_3views"
+        self.images(self.static / "images_4", 9)
+        self.save("static/poses_bounds.npy", self.static_rows())
+        for view in range(3):
+            self.images(self.dynamic / f"view{view + 1}" / "images_4", 3, first=10 * view)
+        poses = np.zeros((5, 3, 5))
+        poses[:, :, :3] = np.eye(3)
+        # Two of the static cameras come first; the last three are the fixed ones.
+        poses[:, 0, 3] = [7, 8, -0.5, 0, 0.5]
+        poses[:, :, 4] = [32, 48, 40]
+        self.save("dynamic_3views/poses.npy", poses)
+        self.save("dynamic_3views/bds.npy", np.tile([1.2, 9.0], (5, 1)))
+
+    @staticmethod
+    def static_rows() -> np.ndarray:
+        """(9, 17): axes [down, right, back], position, [H, W, focal], near, far."""
+        matrix = np.zeros((9, 3, 5))
+        matrix[:, :, 0] = [0, 0, -1]
+        matrix[:, :, 1] = [0, 1, 0]
+        matrix[:, :, 2] = [1, 0, 0]
+        matrix[:, :, 3] = [10, 20, 30]
+        matrix[:, 1, 3] += 4.5 * np.arange(9)
+        matrix[:, :, 4] = [64, 96, 80]
+        depths = np.tile([6.0, 50.0], (9, 1))
+        depths[1:, 0] = 7
+        return np.concatenate([matrix.reshape(9, 15), depths], axis=1)
+
+    def save(self, file: str, values: np.ndarray) -> Path:
+        """Write an array; its path."""
+        np.save(self.root / file, values)
+        return self.root / file
+
+    def images(self, folder: Path, count: int, first: int = 0, times: int = 1) -> None:
+        """Images 000.png, …, ``times`` as large, whose red tells the number."""
+        folder.mkdir(parents=True, exist_ok=True)
+        for k in range(count):
+            image = np.full((self.HEIGHT * times, self.WIDTH * times, 3), 50, dtype=np.uint8)
+            image[..., 0] = first + k
+            iio.imwrite(folder / f"{k:03d}.png", image)
+
+    def flow(self, view: int, name: str, value: float) -> None:
+        """A flow file of ``view`` whose vectors are all (value, −value)."""
+        folder = self.dynamic / f"view{view}" / "images_4_flow"
+        folder.mkdir(exist_ok=True)
+        vectors = np.full((self.HEIGHT, self.WIDTH, 2), value, dtype=np.float32)
+        vectors[..., 1] *= -1
+        mask = np.ones((self.HEIGHT, self.WIDTH), dtype=bool)
+        np.savez(folder / f"{name}_bwd.npz", flow=vectors, mask=mask)
+
+
+@pytest.fixture
+def llff_folder(tmp_path: Path) -> LlffFolder:
+    """A valid forward-facing scene on disk."""
+    return LlffFolder(tmp_path / "toy")

@@ -73,6 +73,22 @@ def test_intrinsics_in_pixels_are_honoured(scene_folder: Any) -> None:
     assert cameras.focal[0].tolist() == [20, 22] and cameras.center[0].tolist() == [7.5, 6.5]
 
 
+def test_a_lens_is_undistorted_and_its_flow_files_are_left_out(
+    scene_folder: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    flow = scene_folder.dynamic / "train_flow"
+    flow.mkdir()
+    for index in range(2, 6):
+        np.savez(flow / f"{index:03d}_bwd.npz", flow=np.zeros((24, 32, 2)), mask=np.ones((24, 32)))
+    assert read_blender(scene_folder.root).dynamic.train.flow is not None
+    file = scene_folder.dynamic / "transforms_train.json"
+    # Pincushion: the pinhole needs a longer focal length to see no empty border.
+    scene_folder.edit(file, lambda content: content.update(k1=0.3))
+    train = read_blender(scene_folder.root).dynamic.train
+    assert train.flow is None and "left out: they are of images before undistortion" in caplog.text
+    assert float(train.cameras.focal[0, 0]) > 16 / math.tan(0.4) + 0.5
+
+
 def test_times_come_from_the_order_where_the_file_gives_none(scene_folder: Any) -> None:
     scene_folder.edit(scene_folder.dynamic / "transforms_train.json", drop_times)
     scene_folder.edit(scene_folder.dynamic / "transforms_test.json", drop_times)

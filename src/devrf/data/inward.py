@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import importlib.util
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import get_args
 
 from devrf.data.datamodule import SceneDataModule
+from devrf.data.flow_source import FlowSource, files_or_none, with_flow
 from devrf.scenes.blender import read_blender
-from devrf.scenes.optical_flow import estimate_flow
 from devrf.scenes.scene import Background, Scene
 from devrf.scenes.validation import check_choice
 
 log = logging.getLogger(__name__)
-
-FlowSource = Literal["auto", "files", "dis", "raft", "none"]
 
 
 class InwardFacingDataModule(SceneDataModule):
@@ -63,7 +59,7 @@ class InwardFacingDataModule(SceneDataModule):
             static_until: without a static set, the latest time that counts as static.
         """
         super().__init__()
-        check_choice("data.flow", flow, ("auto", "files", "dis", "raft", "none"))
+        check_choice("data.flow", flow, get_args(FlowSource))
         self.flow = flow
         self.flow_cache = None if flow_cache is None else Path(flow_cache)
         self._read: Callable[[], Scene] = partial(
@@ -77,7 +73,7 @@ class InwardFacingDataModule(SceneDataModule):
             near=near,
             far=far,
             box=None if box is None else [list(corner) for corner in box],
-            flow="files" if flow in ("auto", "files") else "none",
+            flow=files_or_none(flow),
             train_views=train_views,
             frames=frames,
             static_until=static_until,
@@ -87,14 +83,4 @@ class InwardFacingDataModule(SceneDataModule):
         """Read the scene, and estimate its optical flow if that is asked for."""
         scene = self._read()
         log.info("%s: box for motion from %s", scene.name, scene.bounds.source)
-        train = scene.dynamic.train
-        method = self.flow
-        if method == "auto" and train.flow is None:
-            method = "dis" if importlib.util.find_spec("cv2") else "none"
-            how = "estimated with DIS" if method == "dis" else "left out (OpenCV is not installed)"
-            log.info("%s: no optical flow files; flow is %s", scene.name, how)
-        if method not in ("dis", "raft"):
-            return scene
-        flow = estimate_flow(train, method, self.flow_cache)
-        dynamic = replace(scene.dynamic, train=replace(train, flow=flow))
-        return replace(scene, dynamic=dynamic)
+        return with_flow(scene, self.flow, self.flow_cache)

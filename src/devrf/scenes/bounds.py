@@ -78,6 +78,18 @@ def box_from_cameras(cameras: Cameras) -> Box:
     return Box.of(center - radius, center + radius)
 
 
+def box_of_frusta(cameras: Cameras, near: float, far: float) -> Box:
+    """The box of all that the cameras see between two distances (world units) along their rays."""
+    # Ends of rays lie on a sphere, which bulges between its corners: so fine a grid sees it.
+    steps = torch.linspace(0, 1, 17).to(cameras.center)
+    share = torch.cartesian_prod(steps, steps)
+    pixels = share * share.new_tensor([cameras.width, cameras.height])
+    camera = torch.arange(len(cameras)).repeat_interleave(len(pixels))
+    rays = cameras.rays(camera, pixels.repeat(len(cameras), 1))
+    ends = torch.cat([rays.origins + rays.directions * distance for distance in (near, far)])
+    return Box.of(ends.amin(dim=0), ends.amax(dim=0))
+
+
 def depth_range(cameras: Cameras, box: Box) -> tuple[float, float]:
     """(near, far): distances from any of the cameras between which the box's sphere lies.
 

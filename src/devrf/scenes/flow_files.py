@@ -6,7 +6,7 @@ import logging
 import time
 import zipfile
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -103,7 +103,6 @@ def read_flow(
     Raises:
         DevrfError: what :func:`read_flow_file` raises.
     """
-    start = time.perf_counter()
     files = {
         row: folder / f"{number:03d}_bwd.npz"
         for row, (number, wanted) in enumerate(zip(index, expected, strict=True))
@@ -118,20 +117,42 @@ def read_flow(
             "%d of %d flow files are missing in %s; those images go without flow",
             len(files) - len(present), len(files), folder,
         )
+    return stacked_flow(present, len(index), source_size, size)
+
+
+def stacked_flow(
+    files: Mapping[int, Path], count: int, source_size: tuple[int, int], size: tuple[int, int]
+) -> OpticalFlow:
+    """The backward flow of ``count`` images; those without a file have none.
+
+    Args:
+        files: which image's flow is in which file; at least one.
+        count: how many images there are.
+        source_size: (width, height) of the images before downscaling.
+        size: (width, height) after downscaling.
+
+    Returns:
+        Flow in pixels of the smaller images.
+
+    Raises:
+        DevrfError: what :func:`read_flow_file` raises.
+    """
+    start = time.perf_counter()
     width, height = size
-    vectors = np.zeros((len(index), height, width, 2), dtype=np.float32)
-    valid = np.zeros((len(index), height, width), dtype=np.bool_)
+    vectors = np.zeros((count, height, width, 2), dtype=np.float32)
+    valid = np.zeros((count, height, width), dtype=np.bool_)
 
     def fill(row: int) -> None:
-        flow, mask = read_flow_file(present[row], *source_size)
+        flow, mask = read_flow_file(files[row], *source_size)
         if size != source_size:
             flow, mask = shrink_flow(flow, mask, width, height)
         vectors[row], valid[row] = flow, mask
 
     with ThreadPoolExecutor(workers()) as pool:
-        for _ in pool.map(fill, present):
+        for _ in pool.map(fill, files):
             pass
     log.info(
-        "read %d flow files from %s in %.1f s", len(present), folder, time.perf_counter() - start
+        "read %d flow files from %s in %.1f s",
+        len(files), next(iter(files.values())).parent, time.perf_counter() - start,
     )
     return OpticalFlow(torch.from_numpy(vectors), torch.from_numpy(valid))

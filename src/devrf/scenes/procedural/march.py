@@ -21,7 +21,9 @@ CHUNK = 65536
 BLOCK = 4
 
 
-def trace(shape: Shape, rays: Rays, time: float, start: Tensor, reach: float) -> Tensor:
+def trace(
+    shape: Shape, rays: Rays, time: float, start: Tensor, reach: float, steps: int = MAX_STEPS
+) -> Tensor:
     """Distance (M,) along each ray to the surface at ``time``, +inf where it meets none.
 
     Args:
@@ -30,6 +32,8 @@ def trace(shape: Shape, rays: Rays, time: float, start: Tensor, reach: float) ->
         time: in [0, 1].
         start: (M,) distances before which nothing is; +inf for a ray known to miss.
         reach: radius of a ball about the origin that holds the shape at ``time``.
+        steps: a ray that has met nothing after so many counts as a miss; where everything is
+            in front of something else, only many make sure that none does.
     """
     result = torch.full_like(start, math.inf)
     entry, leave = _ball_crossing(rays, reach)
@@ -37,7 +41,7 @@ def trace(shape: Shape, rays: Rays, time: float, start: Tensor, reach: float) ->
     active = (distance < leave).nonzero().squeeze(-1)
     origins, directions = rays.origins[active], rays.directions[active]
     distance, leave = distance[active], leave[active]
-    for _ in range(MAX_STEPS):
+    for _ in range(steps):
         if len(active) == 0:
             break
         step = shape.distance(torch.addcmul(origins, directions, distance[:, None]), time)

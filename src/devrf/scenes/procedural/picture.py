@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from devrf.geometry.cameras import Cameras
-from devrf.scenes.procedural.march import CHUNK, block_starts, trace
+from devrf.scenes.procedural.march import CHUNK, MAX_STEPS, block_starts, trace
 from devrf.scenes.procedural.shape import Shape
 
 # Towards the lamp, world space: fixed, so that shading changes as the shape turns.
@@ -39,6 +39,7 @@ def render(
     reach: float,
     supersample: int = 2,
     light: float = 0.2,
+    steps: int = MAX_STEPS,
 ) -> Pictures:
     """The shape at ``time`` as N ``cameras`` see it.
 
@@ -49,6 +50,7 @@ def render(
         reach: radius of a ball about the origin that holds the shape at ``time``.
         supersample: n: colour and alpha are the mean of n × n rays a pixel.
         light: share of the lamp in the lighting, 0 (albedo alone) … 1.
+        steps: after how many steps a ray counts as a miss.
     """
     start = block_starts(shape, cameras, time, reach)
     size = start.shape
@@ -59,11 +61,12 @@ def render(
     live = start.isfinite().nonzero().squeeze(-1)
     for pixel in torch.split(live, max(CHUNK // count, 1)):
         camera, center = pixel // len(grid), grid[pixel % len(grid)]
-        depth[pixel] = trace(shape, cameras.rays(camera, center), time, start[pixel], reach)
+        depth[pixel] = trace(shape, cameras.rays(camera, center), time, start[pixel], reach, steps)
         rays = cameras.rays(
             camera.repeat_interleave(count), (center[:, None] + offsets).reshape(-1, 2)
         )
-        distance = trace(shape, rays, time, start[pixel].repeat_interleave(count), reach)
+        onset = start[pixel].repeat_interleave(count)
+        distance = trace(shape, rays, time, onset, reach, steps)
         hit = distance.isfinite().nonzero().squeeze(-1)
         # Colour times alpha, and alpha: only these may be averaged.
         samples = start.new_zeros(len(rays), 4)

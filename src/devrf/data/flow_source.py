@@ -1,0 +1,49 @@
+"""Where a scene's optical flow comes from: its files, an estimate, or nowhere."""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal, get_args
+
+from devrf.scenes.optical_flow import estimate_flow
+from devrf.scenes.scene import Scene
+
+log = logging.getLogger(__name__)
+
+FlowSource = Literal["auto", "files", "dis", "raft", "none"]
+# Of layouts that have no place for flow files.
+EstimatedFlow = Literal["auto", "dis", "raft", "none"]
+ESTIMATED = get_args(EstimatedFlow)
+
+
+def files_or_none(source: FlowSource) -> Literal["files", "none"]:
+    """Whether a reader is to read flow files."""
+    return "files" if source in ("auto", "files") else "none"
+
+
+def with_flow(scene: Scene, source: FlowSource, cache: Path | None) -> Scene:
+    """The scene with estimated flow of its moving training views, if that is asked for.
+
+    Args:
+        scene: as its reader gave it, with flow from files or without.
+        source: ``dis`` and ``raft`` estimate; ``auto`` keeps what was read from files, else
+            estimates with DIS where OpenCV is installed; the others change nothing.
+        cache: an ``.npz`` that keeps the estimate, or None.
+
+    Raises:
+        DevrfError: what :func:`devrf.scenes.optical_flow.estimate_flow` raises.
+    """
+    train = scene.dynamic.train
+    method = source
+    if method == "auto" and train.flow is None:
+        method = "dis" if importlib.util.find_spec("cv2") else "none"
+        how = "estimated with DIS" if method == "dis" else "left out (OpenCV is not installed)"
+        log.info("%s: no optical flow files; flow is %s", scene.name, how)
+    if method not in ("dis", "raft"):
+        return scene
+    flow = estimate_flow(train, method, cache)
+    dynamic = replace(scene.dynamic, train=replace(train, flow=flow))
+    return replace(scene, dynamic=dynamic)

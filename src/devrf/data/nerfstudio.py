@@ -1,0 +1,84 @@
+"""Inward-facing scenes from nerfstudio's ``transforms.json``, with a time on each image."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+
+from devrf.data.datamodule import SceneDataModule
+from devrf.data.flow_source import ESTIMATED, EstimatedFlow, with_flow
+from devrf.scenes.nerfstudio import read_nerfstudio
+from devrf.scenes.scene import Background, Scene
+from devrf.scenes.validation import check_choice
+
+log = logging.getLogger(__name__)
+
+
+class NerfstudioDataModule(SceneDataModule):
+    """A scene in nerfstudio's layout, one file or ``static/`` and ``dynamic/``."""
+
+    def __init__(
+        self,
+        root: str | Path,
+        *,
+        name: str | None = None,
+        downscale: int = 1,
+        background: Background = "white",
+        bound_scale: float | str = "auto",
+        near: float | None = None,
+        far: float | None = None,
+        box: Sequence[Sequence[float]] | None = None,
+        flow: EstimatedFlow = "auto",
+        flow_cache: str | Path | None = None,
+        train_views: int | None = None,
+        frames: int | None = None,
+        holdout: int = 8,
+        static_until: float | None = None,
+    ) -> None:
+        """Say where the scene is and how to read it; it is read when first needed.
+
+        Args:
+            root: the scene's folder.
+            name: short name; None takes the folder's.
+            downscale: integer factor by which images are made smaller.
+            background: ``white``, ``black`` or ``random``: what is behind the mattes.
+            bound_scale: ``auto`` (room for motion from the silhouettes), or a number ≥ 1.
+            near: world units; None: from the cameras.
+            far: world units; None: from the cameras.
+            box: [[x, y, z], [x, y, z]] in world units; None: from the cameras.
+            flow: ``dis`` and ``raft`` estimate it, ``none`` does without; ``auto`` estimates
+                with DIS where OpenCV is installed, else does without.
+            flow_cache: an ``.npz`` that keeps estimated flow; None estimates it every time.
+            train_views: train on the first so many dynamic views; None: all.
+            frames: keep so many times, evenly spread; None: all.
+            holdout: without lists in the file, one of so many images is held out.
+            static_until: the latest time that counts as static; None: 0 where several images
+                are of time 0, else 1.
+        """
+        super().__init__()
+        check_choice("data.flow", flow, ESTIMATED)
+        self.flow = flow
+        self.flow_cache = None if flow_cache is None else Path(flow_cache)
+        self._read: Callable[[], Scene] = partial(
+            read_nerfstudio,
+            root,
+            name=name,
+            downscale=downscale,
+            background=background,
+            bound_scale=bound_scale,
+            near=near,
+            far=far,
+            box=None if box is None else [list(corner) for corner in box],
+            train_views=train_views,
+            frames=frames,
+            holdout=holdout,
+            static_until=static_until,
+        )
+
+    def load(self) -> Scene:
+        """Read the scene, and estimate its optical flow if that is asked for."""
+        scene = self._read()
+        log.info("%s: box for motion from %s", scene.name, scene.bounds.source)
+        return with_flow(scene, self.flow, self.flow_cache)

@@ -1,0 +1,180 @@
+"""A scene written to disk in the published forward-facing layout (LLFF's and fixed views)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import torch
+from torch import Tensor
+
+from devrf.geometry.cameras import Cameras
+from devrf.scenes.array_files import Numbers
+from devrf.scenes.llff_poses import BOUND_FACTOR
+from devrf.scenes.new_folder import time_major, whole_folder
+from devrf.scenes.scene import Capture, Scene, Views
+from devrf.scenes.validation import problem
+
+# The published scenes are read at this factor, from folders images_4; larger images need not
+# be there, and are not.
+FACTOR = 4
+# Readers hold out every so manieth static image, the first one included.
+HOLDOUT = 8
+# Times are not written, but counted: k / (T − 1).
+_TIME_TOLERANCE = 1e-5
+# How far nothing is known to be, in multiples of the least depth.
+_FAR = 100.0
+
+
+def export_llff(scene: Scene, folder: Path) -> None:
+    """Write ``scene`` as ``folder/static`` and ``folder/dynamic_<V>views``.
+
+    ``static/poses_bounds.npy`` (N, 17) speaks of images four times as large as those in
+    ``static/images_4``, as LLFF's does. The moving capture has V − 1 views to learn from and,
+    the last one, the held-out view; flow goes to ``view<k>/images_4_flow/<frame>_bwd.npz``.
+    Least depths are written as 1/0.75, so a reader scales by one; a scene whose static cameras
+    have the identity as their average pose reads back as it is.
+
+    Args:
+        scene: a forward-facing scene.
+        folder: a new or an empty folder.
+
+    Raises:
+        DevrfError: the folder is in use or cannot be written, or the layout cannot hold the
+            scene.
+    """
+    if scene.kind != "forward":
+        raise problem(scene.name, "only forward-facing scenes fit LLFF's layout")
+    static = _interleaved(scene.static)
+    views = [*_by_camera(scene.dynamic.train), *_by_camera(scene.dynamic.test)]
+    _check_moving(scene.dynamic, views)
+    far = _farthest([static, *views])
+    bounds = np.array([1 / BOUND_FACTOR, far])
+    with whole_folder(folder) as partial:
+        _write_static(static, bounds, partial / "static")
+        _write_moving(views, bounds, partial / f"dynamic_{len(views)}views")
+
+
+def _interleaved(static: Capture) -> Views:
+    """All static views in an order in which every eighth one is a held-out one."""
+    count = len(static.train) + len(static.test)
+    held_out = torch.arange(count) % HOLDOUT == 0
+    if int(held_out.sum()) != len(static.test):
+        raise problem(
+            "static", f"the layout holds out every {HOLDOUT}th image, {int(held_out.sum())} of "
+            f"{count}, but {len(static.test)} are held out here",
+        )
+    if static.train.pixels.shape[1:] != static.test.pixels.shape[1:]:
+        raise problem("static", "the layout needs static images of one size and channel count")
+    order = torch.empty(count, dtype=torch.int64)
+    order[~held_out] = torch.arange(len(static.train))
+    order[held_out] = len(static.train) + torch.arange(len(static.test))
+    both = Views(
+        torch.cat([static.train.pixels, static.test.pixels]),
+        _joined(static),
+        torch.zeros(count),
+        torch.arange(count),
+        static.train.names + static.test.names,
+        depth=None if static.train.depth is None or static.test.depth is None
+        else torch.cat([static.train.depth, static.test.depth]),
+    )
+    return both[order]
+
+
+def _joined(static: Capture) -> Cameras:
+    a, b = static.train.cameras, static.test.cameras
+    return Cameras(
+        torch.cat([a.camera_to_world, b.camera_to_world]), torch.cat([a.focal, b.focal]),
+        torch.cat([a.center, b.center]), a.width, a.height,
+    )
+
+
+def _by_camera(views: Views) -> list[Views]:
+    """The views of each fixed camera, in order of time."""
+    ordered = time_major(views)
+    return [
+        ordered[(ordered.view == camera).nonzero().flatten()]
+        for camera in sorted(set(views.view.tolist()))
+    ]
+
+
+def _check_moving(capture: Capture, views: list[Views]) -> None:
+    held_out = len(set(capture.test.view.tolist()))
+    if held_out != 1:
+        raise problem("dynamic", f"the layout holds one held-out view, but there are {held_out}")
+    frames = len(views[0])
+    expected = torch.arange(frames) / max(frames - 1, 1)
+    for view in views:
+        if len(view) != frames or bool(((view.times - expected).abs() > _TIME_TOLERANCE).any()):
+            raise problem(
+                "dynamic", "the layout has no times: each view needs the same frames, evenly "
+                "spread over [0, 1]",
+            )
+        poses = view.cameras.camera_to_world
+        if not torch.equal(poses, poses[:1].expand_as(poses)):
+            raise problem("dynamic", "the layout needs cameras that stand still")
+
+
+def _farthest(everyone: list[Views]) -> float:
+    """The largest distance that is known, or as good as infinity."""
+    known = [views.depth[views.depth.isfinite()] for views in everyone if views.depth is not None]
+    return max([_FAR / BOUND_FACTOR if not known else 0.0, *(float(k.max()) for k in known)])
+
+
+def _intrinsics(views: Views, factor: int) -> Numbers:
+    """[H, W, focal] (N, 3) of images larger by ``factor``; else DevrfError."""
+    cameras = views.cameras
+    middle = cameras.center.new_tensor([cameras.width / 2, cameras.height / 2])
+    if not torch.allclose(cameras.focal[:, 0], cameras.focal[:, 1], rtol=1e-6, atol=0.0):
+        raise problem("cameras", "the layout has one focal length for both axes")
+    if not torch.allclose(cameras.center, middle.expand_as(cameras.center), rtol=0.0, atol=1e-4):
+        raise problem("cameras", "the layout needs principal points in the images' middle")
+    sides = np.tile([cameras.height, cameras.width], (len(views), 1))
+    focal = cameras.focal[:, :1].double().cpu().numpy()
+    return np.concatenate([sides, focal], axis=1) * factor
+
+
+def _write_static(views: Views, bounds: Numbers, folder: Path) -> None:
+    right, up, back, position = _double(views.cameras.camera_to_world).transpose(2, 0, 1)
+    matrix = np.stack([-up, right, back, position, _intrinsics(views, FACTOR)], axis=2)
+    rows = np.concatenate([matrix.reshape(-1, 15), np.tile(bounds, (len(views), 1))], axis=1)
+    _write_images(views, folder / f"images_{FACTOR}")
+    np.save(folder / "poses_bounds.npy", rows)
+
+
+def _write_moving(views: list[Views], bounds: Numbers, folder: Path) -> None:
+    matrices = []
+    for number, view in enumerate(views, start=1):
+        images = folder / f"view{number}" / f"images_{FACTOR}"
+        _write_images(view, images)
+        if view.flow is not None and number < len(views):
+            _write_flow(view, images.with_name(f"{images.name}_flow"))
+        pose = _double(view.cameras.camera_to_world[0])
+        matrices.append(np.concatenate([pose, _intrinsics(view, 1)[:1].T], axis=1))
+    np.save(folder / "poses.npy", np.stack(matrices))
+    np.save(folder / "bds.npy", np.tile(bounds, (len(views), 1)))
+
+
+def _double(poses: Tensor) -> Numbers:
+    """Poses in double precision: what was exact in single precision stays so."""
+    array: Numbers = poses.double().cpu().numpy()
+    return array
+
+
+def _write_images(views: Views, folder: Path) -> None:
+    folder.mkdir(parents=True)
+    for k, pixels in enumerate(views.pixels):
+        iio.imwrite(folder / f"{k:03d}.png", pixels.cpu().numpy())
+
+
+def _write_flow(views: Views, folder: Path) -> None:
+    """``<frame>_bwd.npz`` for each image but the first; the frame is the image's name."""
+    assert views.flow is not None  # its caller looked
+    folder.mkdir()
+    for k in range(1, len(views)):
+        np.savez_compressed(
+            folder / f"{k:03d}_bwd.npz",
+            flow=views.flow.vectors[k].float().cpu().numpy(),
+            mask=views.flow.valid[k].cpu().numpy(),
+        )

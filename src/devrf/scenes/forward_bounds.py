@@ -1,0 +1,65 @@
+"""Where a forward-facing scene is: the box in normalised device coordinates."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from devrf.geometry.box import Box
+from devrf.geometry.cameras import Cameras
+from devrf.geometry.ndc import NormalizedDevice
+from devrf.scenes.scene import Bounds, Views
+from devrf.scenes.validation import problem
+
+# Cosine of the steepest angle, about 84 degrees, to −z: beyond it the box gets out of hand.
+LEAST_COSINE = 0.1
+
+
+def reference_space(cameras: Cameras, near: float) -> NormalizedDevice:
+    """NDC of a camera at the origin with the mean focal lengths of ``cameras``.
+
+    Args:
+        cameras: the static cameras, whose average pose is the identity.
+        near: distance of the near plane, world units.
+    """
+    fx, fy = cameras.focal.double().mean(dim=0).tolist()
+    return NormalizedDevice(cameras.width, cameras.height, (fx, fy), near)
+
+
+def forward_bounds(everyone: list[Views], space: NormalizedDevice, source: str) -> Bounds:
+    """The box that holds all that cameras see from the near plane to infinity, in NDC.
+
+    Rays are straight in NDC too, so it is enough to follow the rays through the images'
+    corners: ``origin`` on the near plane (z' = −1), ``origin + direction`` at infinity (z' = 1).
+    Hence near = 0 and far = 1, in multiples of an NDC ray's direction.
+
+    Args:
+        everyone: the views whose cameras count.
+        space: the scene's NDC.
+        source: where the room for motion comes from, for the log.
+
+    Raises:
+        DevrfError: a camera sees something that is not before the reference camera.
+    """
+    ends = torch.cat([_seen(views, space) for views in everyone])
+    low, high = ends.amin(dim=0).tolist(), ends.amax(dim=0).tolist()
+    box = Box.of([low[0], low[1], -1.0], [high[0], high[1], 1.0])
+    return Bounds(box, near=0.0, far=1.0, motion=None, scale=1.0, source=source)
+
+
+def _seen(views: Views, space: NormalizedDevice) -> Tensor:
+    """NDC (8 · N, 3) where the rays through the corners of N images start and end."""
+    cameras = views.cameras
+    edge = [(0, 0), (cameras.width, 0), (0, cameras.height), (cameras.width, cameras.height)]
+    corners = torch.tensor(edge, dtype=cameras.focal.dtype).repeat(len(cameras), 1)
+    image = torch.arange(len(cameras)).repeat_interleave(len(edge))
+    rays = cameras.rays(image, corners)
+    steep = (-rays.directions[:, 2] < LEAST_COSINE).nonzero().flatten()
+    if len(steep):
+        raise problem(
+            views.names[int(image[steep[0]])], "its camera does not look along the common viewing "
+            "direction, so normalised device coordinates cannot hold what it sees; leave the "
+            "image out, or use data=inward for cameras around a scene",
+        )
+    device = space.rays(rays)
+    return torch.cat([device.origins, device.origins + device.directions])

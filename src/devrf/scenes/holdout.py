@@ -1,0 +1,13 @@
+"""Which images of a capture are held out where no list says so."""
+
+from __future__ import annotations
+
+
+def every_nth(count: int, holdout: int) -> tuple[list[int], list[int]]:
+    """The positions to learn from and those to hold out, of ``count`` ≥ 2 images.
+
+    Every ``holdout``-th (≥ 2) is held out: the last of each such run, since the first image of a
+    sequence shows the scene at rest. Of fewer images the last one is held out.
+    """
+    held_out = list(range(holdout - 1, count, holdout)) or [count - 1]
+    return [i for i in range(count) if i not in set(held_out)], held_out

@@ -1,0 +1,114 @@
+"""The four splits that make a scene, whichever format lists them."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from devrf.scenes.scene import Capture, Views
+from devrf.scenes.splits import (
+    Split,
+    at_times,
+    distinct_times,
+    evenly_spread,
+    first_views,
+    load_views,
+)
+from devrf.scenes.validation import problem
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A scene's splits, ordered but not yet loaded.
+
+    Attributes:
+        static_train: images of the scene at rest.
+        static_test: held-out images of the scene at rest.
+        dynamic_train: images of the scene in motion.
+        dynamic_test: held-out images of the scene in motion.
+    """
+
+    static_train: Split
+    static_test: Split
+    dynamic_train: Split
+    dynamic_test: Split
+
+
+def without_static_set(train: Split, test: Split, static_until: float) -> Layout:
+    """The layout of one capture in motion, whose early images count as static.
+
+    Args:
+        train: the images to learn from.
+        test: the held-out images.
+        static_until: the latest time of an image that counts as static.
+
+    Raises:
+        DevrfError: no image to learn from is that early.
+    """
+    early = train.where(train.times <= static_until + 1e-6)
+    if len(early.index) == 0:
+        raise problem(
+            train.transforms.file, f"no image at a time of data.static_until={static_until:g} or "
+            "before to learn the static scene from; set it higher",
+        )
+    early_test = test.where(test.times <= static_until + 1e-6)
+    if len(early_test.index) == 0:
+        early_test = test
+    log.warning(
+        "no static set: the canonical field is learned from %d of the %d training images "
+        "(times up to %g), and tested on %d of %d",
+        len(early.index), len(train.index), static_until, len(early_test.index), len(test.index),
+    )
+    return Layout(early, early_test, train, test)
+
+
+def fewer(layout: Layout, train_views: int | None, frames: int | None) -> tuple[Layout, bool]:
+    """The layout with fewer dynamic views and times, and whether times were left out.
+
+    Args:
+        layout: the whole.
+        train_views: train on the first so many dynamic views; None: all.
+        frames: keep so many times, evenly spread, first and last included; None: all.
+
+    Raises:
+        DevrfError: the dynamic images have one time only, or fewer views.
+    """
+    train, test = first_views(layout.dynamic_train, train_views), layout.dynamic_test
+    if len(distinct_times(train.used_times)) < 2:
+        raise problem(
+            train.transforms.file, "all dynamic images have one time, expected at least 2 "
+            "distinct times; give each frame its own",
+        )
+    kept = None if frames is None else evenly_spread(train.used_times, frames)
+    if kept is not None:
+        train, same = at_times(train, kept), at_times(test, kept)
+        # Held-out times of their own (D-NeRF) need not meet the kept ones: then all stay.
+        test = same if len(same.index) else test
+    return replace(layout, dynamic_train=train, dynamic_test=test), kept is not None
+
+
+def load_layout(layout: Layout, root: Path, downscale: int) -> tuple[Capture, Capture]:
+    """The static and the dynamic capture, images read.
+
+    Raises:
+        DevrfError: what :func:`devrf.scenes.splits.load_views` raises.
+    """
+    splits = (
+        layout.static_train, layout.static_test, layout.dynamic_train, layout.dynamic_test
+    )
+    loaded: list[tuple[Split, Views]] = []
+    for split in splits:
+        # Without a static set the captures share files: read them once.
+        twin = next((v for s, v in loaded if _same_images(s, split)), None)
+        loaded.append((split, load_views(split, root, downscale) if twin is None else twin))
+    a, b, c, d = (views for _, views in loaded)
+    return Capture(a, b), Capture(c, d)
+
+
+def _same_images(a: Split, b: Split) -> bool:
+    return a.transforms is b.transforms and torch.equal(a.index, b.index)

@@ -1,0 +1,98 @@
+"""A shape on a pedestal before a painted wall and floor, which fill every image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from devrf.scenes.procedural.sdf import rounded_box
+from devrf.scenes.procedural.shape import Material, Shape
+
+# The wall is the plane z = WALL, the floor the plane y = FLOOR; world units, y up.
+WALL = -4.6
+FLOOR = -1.15
+# The pedestal's centre, outer half edges and rounding.
+_PEDESTAL = (0.0, (FLOOR - 0.72) / 2, -2.6)
+_HALF = (0.56, (-0.72 - FLOOR) / 2, 0.44)
+_ROUNDING = 0.04
+
+_WALL, _FLOOR, _BOX = 0, 1, 2
+_FIRST = 3  # the shape's own parts come after these
+
+# Waves of the paint: direction (x, y, z) times angular frequency in radians per world unit, a
+# phase, and how much of it goes into red, green and blue. No two wavelengths have a common
+# multiple within the picture, so that no place looks like another.
+_WAVES = (
+    ((1.1, 0.7, 0.9), 0.3, (0.7, 0.3, -0.1)),
+    ((-1.2, 2.3, -1.7), 1.1, (-0.1, 0.5, 0.4)),
+    ((3.9, -1.9, 1.3), 2.0, (0.6, 0.5, 0.7)),
+    ((1.3, 4.7, 3.3), 0.7, (0.5, 0.6, 0.3)),
+    ((-5.3, -3.9, 4.1), 2.9, (0.6, 0.6, 0.6)),
+    ((6.7, 4.1, -2.9), 4.2, (0.5, 0.4, 0.5)),
+)
+# Paler than what stands before it.
+_DARKEST, _LIGHTEST = (0.42, 0.45, 0.52), (0.86, 0.88, 0.90)
+
+
+@dataclass(frozen=True)
+class OnStage:
+    """A :class:`~devrf.scenes.procedural.shape.Shape` with something behind it everywhere.
+
+    Parts 0, 1 and 2 are wall, floor and pedestal, which stand still; the shape's own follow.
+
+    Attributes:
+        shape: what stands on the pedestal, and moves.
+    """
+
+    shape: Shape
+
+    def distance(self, points: Tensor, time: float) -> Tensor:
+        """The smaller of the shape's distance bound and the stage's distance (M,)."""
+        return torch.minimum(self.shape.distance(points, time), _still(points).amin(dim=0))
+
+    def material(self, points: Tensor, time: float) -> Material:
+        """The nearest thing's material; that of the stage is where it is."""
+        still, part = _still(points).min(dim=0)
+        own = self.shape.material(points, time)
+        nearer = self.shape.distance(points, time) < still
+        return Material(
+            torch.where(nearer[:, None], own.rest, points),
+            torch.where(nearer, own.part + _FIRST, part),
+        )
+
+    def forward(self, material: Material, time: float) -> Tensor:
+        """Where the shape goes; the stage stays."""
+        own = Material(material.rest, (material.part - _FIRST).clamp_min(0))
+        moved = self.shape.forward(own, time)
+        return torch.where((material.part >= _FIRST)[:, None], moved, material.rest)
+
+    def color(self, material: Material) -> Tensor:
+        """The shape's paint, or the stage's."""
+        own = Material(material.rest, (material.part - _FIRST).clamp_min(0))
+        painted = _mural(material.rest)
+        # The pedestal stands out from the floor.
+        painted = torch.where((material.part == _BOX)[:, None], 0.5 * painted, painted)
+        return torch.where((material.part >= _FIRST)[:, None], self.shape.color(own), painted)
+
+    def outline(self) -> Material:
+        """The points around the shape's parts: the stage has no end."""
+        own = self.shape.outline()
+        return Material(own.rest, own.part + _FIRST)
+
+
+def _still(points: Tensor) -> Tensor:
+    """Distances (3, M) to wall, floor and pedestal."""
+    x, y, z = points.unbind(-1)
+    a, b, c = _PEDESTAL
+    return torch.stack([z - WALL, y - FLOOR, rounded_box(x - a, y - b, z - c, _HALF, _ROUNDING)])
+
+
+def _mural(points: Tensor) -> Tensor:
+    """Clouds of colour (M, 3), painted in space."""
+    wave = points.new_tensor([w for w, _, _ in _WAVES])
+    phase = points.new_tensor([p for _, p, _ in _WAVES])
+    mixed = (points @ wave.T + phase).cos() @ points.new_tensor([c for _, _, c in _WAVES])
+    dark, light = points.new_tensor(_DARKEST), points.new_tensor(_LIGHTEST)
+    return torch.lerp(dark, light, torch.sigmoid(1.5 * mixed))

@@ -1,0 +1,138 @@
+"""Images taken through a lens become images of a pinhole camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from devrf.scenes.lens import Lens
+from devrf.scenes.validation import problem
+
+# A lens that needs a longer focal length than this to fill its image is no such lens.
+_LONGEST = 2.0
+_HALVINGS = 24
+
+
+def as_pinhole(
+    pixels: Tensor, lenses: Sequence[Lens], names: Sequence[object]
+) -> tuple[Tensor, tuple[Lens, ...]]:
+    """Undistort the images that need it, bilinearly.
+
+    The principal point stays and the focal lengths grow just enough that every pixel has been
+    seen by the lens: there are no empty borders to learn from.
+
+    Args:
+        pixels: (N, H, W, 3 or 4) uint8, alpha not premultiplied; changed in place.
+        lenses: N, in pixels of these images.
+        names: N, for messages.
+
+    Returns:
+        The pixels, and N lenses without distortion and skew.
+
+    Raises:
+        DevrfError: a distortion is so strong that the image folds over.
+    """
+    height, width = pixels.shape[1:3]
+    plain = list(lenses)
+    for row, lens in enumerate(lenses):
+        if lens.pinhole:
+            continue
+        view = _pinhole_view(lens, width, height)
+        if view is None:
+            raise problem(
+                names[row], "the distortion (k1, k2, k3, p1, p2) is so strong that the image "
+                "folds over; correct it, or undistort the images first",
+            )
+        plain[row], source = view
+        pixels[row] = resample(pixels[row], source)
+    return pixels, tuple(plain)
+
+
+def resample(image: Tensor, source: Tensor) -> Tensor:
+    """An image looked up elsewhere, bilinearly; colours count by their alpha.
+
+    Args:
+        image: (H, W, 3 or 4) uint8, alpha not premultiplied.
+        source: (H', W', 2) x, y in pixels of ``image``, where a pixel's centre is at i + 0.5.
+
+    Returns:
+        (H', W', 3 or 4) uint8, alpha not premultiplied; black where alpha is 0. Places outside
+        take the nearest pixel of the border.
+    """
+    height, width, channels = image.shape
+    values = image.float()
+    if channels == 4:
+        # Colours behind a zero alpha are arbitrary: premultiplied, they cannot bleed in.
+        values[..., :3] *= values[..., 3:]
+    grid = source * (2 / source.new_tensor([width, height])) - 1
+    taken = grid_sample(
+        values.permute(2, 0, 1)[None], grid.float()[None], mode="bilinear",
+        padding_mode="border", align_corners=False,
+    )[0].permute(1, 2, 0)
+    if channels == 4:
+        alpha = taken[..., 3:]
+        color = torch.where(alpha > 0, taken[..., :3] / alpha, torch.zeros_like(alpha))
+        taken = torch.cat([color, alpha], dim=-1)
+    return (taken + 0.5).clamp(0, 255).to(torch.uint8)
+
+
+# One lens for all images is the rule; several take turns at most.
+@lru_cache(maxsize=4)
+def _pinhole_view(lens: Lens, width: int, height: int) -> tuple[Lens, Tensor] | None:
+    """The pinhole and, for each of its pixels, where the lens has it (H, W, 2); None: folded."""
+    zoom = _zoom(lens, width, height)
+    if zoom is None:
+        return None
+    (fx, fy), center = lens.focal, lens.center
+    plain = Lens((fx * zoom, fy * zoom), center)
+    x, y = torch.arange(width) + 0.5, torch.arange(height) + 0.5
+    pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).double()
+    directions = _directions(plain, pixels)
+    if not bool(lens.distortion.upright(directions).all()):
+        return None
+    return plain, _on_lens(lens, directions).float()
+
+
+def _zoom(lens: Lens, width: int, height: int) -> float | None:
+    """The least factor ≥ 1 of the focal lengths at which the lens saw the whole border."""
+    x, y = torch.arange(width) + 0.5, torch.arange(height) + 0.5
+    border = torch.cat([
+        torch.stack([x, torch.full_like(x, 0.5)], dim=-1),
+        torch.stack([x, torch.full_like(x, height - 0.5)], dim=-1),
+        torch.stack([torch.full_like(y, 0.5), y], dim=-1),
+        torch.stack([torch.full_like(y, width - 0.5), y], dim=-1),
+    ]).double()
+    directions = _directions(Lens(lens.focal, lens.center), border)
+    size = border.new_tensor([width, height])
+
+    def seen(zoom: float) -> bool:
+        source = _on_lens(lens, directions / zoom)
+        upright = lens.distortion.upright(directions / zoom)
+        return bool((((source >= 0) & (source <= size)).all(dim=-1) & upright).all())
+
+    if seen(1.0):
+        return 1.0
+    low, high = 1.0, _LONGEST
+    if not seen(high):
+        return None
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        low, high = (low, middle) if seen(middle) else (middle, high)
+    return high
+
+
+def _directions(pinhole: Lens, pixels: Tensor) -> Tensor:
+    """(..., 2) x/z and y/z of a pinhole's ``pixels`` (..., 2)."""
+    focal, center = pixels.new_tensor(pinhole.focal), pixels.new_tensor(pinhole.center)
+    return (pixels - center) / focal
+
+
+def _on_lens(lens: Lens, directions: Tensor) -> Tensor:
+    """Pixels (..., 2) on which ``directions`` (..., 2) fall."""
+    x, y = lens.distortion.distort(directions).unbind(-1)
+    (fx, fy), (cx, cy) = lens.focal, lens.center
+    return torch.stack([fx * x + lens.skew * y + cx, fy * y + cy], dim=-1)

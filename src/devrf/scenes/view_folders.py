@@ -1,0 +1,114 @@
+"""The fixed cameras' folders ``view1`` … ``viewV`` of a moving capture, and their flow files."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from devrf.scenes.image_folders import image_folder, listed_images
+from devrf.scenes.validation import problem
+
+log = logging.getLogger(__name__)
+
+_VIEW = re.compile(r"view([1-9]\d{0,5})")
+_DIGITS = re.compile(r"\d+")
+_SUFFIX = "_bwd.npz"
+
+
+@dataclass(frozen=True)
+class ViewFolder:
+    """What one fixed camera recorded.
+
+    Attributes:
+        images: T files in order of time.
+        downscale: integer factor by which they are yet to be made smaller.
+        flow: the folder where backward flow of these files would lie.
+    """
+
+    images: list[Path]
+    downscale: int
+    flow: Path
+
+
+def view_folders(folder: Path, downscale: int) -> list[ViewFolder]:
+    """The folders of V fixed cameras, in order of their numbers.
+
+    Raises:
+        DevrfError: there are none, a number is left out, or they hold different numbers of
+            images or fewer than two.
+    """
+    numbered = {}
+    for path in folder.iterdir():
+        match = _VIEW.fullmatch(path.name)
+        if match and path.is_dir():
+            numbered[int(match[1])] = path
+    if not numbered:
+        raise problem(folder, "no folders view1, view2, …; add one for each fixed camera")
+    for number in range(1, len(numbered) + 1):
+        if number not in numbered:
+            raise problem(
+                folder, f"no folder view{number} although there is view{max(numbered)}; number "
+                "the fixed cameras' folders from 1 on",
+            )
+    views: list[ViewFolder] = []
+    for _, path in sorted(numbered.items()):
+        source = image_folder(path, downscale)
+        images = listed_images(source.path, by_number=True)
+        if views and len(images) != len(views[0].images):
+            raise problem(
+                source.path, f"has {len(images)} images, but {views[0].images[0].parent} has "
+                f"{len(views[0].images)}; each fixed camera needs one image a frame",
+            )
+        if views and source.downscale != views[0].downscale:
+            raise problem(
+                path, f"no folder {views[0].images[0].parent.name} as the other views have; add it"
+            )
+        views.append(ViewFolder(images, source.downscale, source.flow))
+    if len(views[0].images) < 2:
+        raise problem(folder, "its views have one image each, expected at least 2 frames")
+    return views
+
+
+def flow_files(views: list[ViewFolder]) -> dict[tuple[int, int], Path]:
+    """Which file holds the backward flow of (view, frame); frame 0 has none.
+
+    ``<frame>_bwd.npz`` may name a frame in three ways: by its image's name (``0007`` for
+    ``0007.png``), by the last number in it (``7`` for ``img_0007.png``), or by its position,
+    counted from 0. The way that finds the most files holds for all views; in doubt the first.
+    """
+    ways: tuple[Callable[[int, Path], str | int | None], ...] = (
+        lambda position, image: image.stem,
+        lambda position, image: _last_number(image.stem),
+        lambda position, image: position,
+    )
+    best: dict[tuple[int, int], Path] = {}
+    for way in ways:
+        found: dict[tuple[int, int], Path] = {}
+        for v, view in enumerate(views):
+            named: dict[str | int | None, Path] = {}
+            for path in sorted(view.flow.glob(f"*{_SUFFIX}")):
+                name = path.name.removesuffix(_SUFFIX)
+                named[name] = path
+                if name.isdecimal():
+                    named[int(name)] = path
+            for k, image in enumerate(view.images):
+                path_of = named.get(way(k, image))
+                if k > 0 and path_of is not None:
+                    found[v, k] = path_of
+        if len(found) > len(best):
+            best = found
+    expected = len(views) * (len(views[0].images) - 1) if views else 0
+    if 0 < len(best) < expected:
+        log.warning(
+            "%d of %d flow files are missing in %s and its like; those images go without flow",
+            expected - len(best), expected, views[0].flow,
+        )
+    return best
+
+
+def _last_number(stem: str) -> int | None:
+    numbers = _DIGITS.findall(stem)
+    return int(numbers[-1]) if numbers else None

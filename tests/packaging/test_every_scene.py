@@ -1,0 +1,197 @@
+"""Every config of a scene reads its layout and trains two steps of both stages on a CPU."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import pytest
+import torch
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+from devrf.config import config_folder
+from devrf.data.datamodule import SceneDataModule
+from devrf.scenes.export import export
+from devrf.scenes.procedural.forward import ProceduralForwardScene
+from devrf.scenes.scene import Scene, Views
+from devrf.stages.deformation import DeformationStage
+
+PUBLISHED_INWARD = ["lego", "floating_robot", "daisy", "glove", "kuka", "flower_360"]
+PUBLISHED_FORWARD = ["plant", "rabbit", "pig_toy"]
+FILES = sorted(path.stem for path in (config_folder() / "data").glob("*.yaml"))
+TINY = [
+    "field.width=8", "field.channels=4", "video=default",
+    "schedule.canonical.search_iterations=0", "schedule.canonical.search_side=12",
+    "schedule.canonical.iterations=2", "schedule.canonical.side=12",
+    "schedule.canonical.doublings=[]", "schedule.canonical.rays=128",
+    "schedule.deformation.sides=[4]", "schedule.deformation.iterations_per_frame=[2]",
+    "schedule.deformation.rays=128", "canonical.iterations_per_step=1",
+    "deformation.iterations_per_step=1", "trainer=cpu",
+]
+OF_KIND = {
+    "inward": [],
+    "forward": [
+        "field=forward", "loss=forward", "field.planes=8", "schedule.canonical.carve=false",
+    ],
+}
+# The embedded scenes in sizes that take no time.
+EMBEDDED = {
+    "procedural": ["data.static_views=8", "data.static_test_views=2"],
+    "procedural_forward": ["data.static_views=7"],
+}
+
+
+@pytest.fixture(scope="session")
+def forward_scene() -> Scene:
+    """The tiny forward-facing scene: three views of three frames, one more held out."""
+    return ProceduralForwardScene(
+        width=24, height=18, static_views=7, train_views=3, frames=3, supersample=1
+    )()
+
+
+def in_one_list(scene: Scene) -> list[tuple[Views, int, str]]:
+    """Every image of an inward-facing scene, dynamic test views last: views, position, name."""
+    parts = [("static", scene.static.train), ("rest", scene.static.test),
+             ("dynamic", scene.dynamic.train), ("held_out", scene.dynamic.test)]
+    return [(views, i, f"{name}_{i:03d}") for name, views in parts for i in range(len(views))]
+
+
+def write_nerfstudio(scene: Scene, root: Path) -> None:
+    """The scene as nerfstudio lists it: all images in one file, at rest at time 0."""
+    (root / "images").mkdir(parents=True)
+    frames: list[dict[str, Any]] = []
+    for views, i, name in in_one_list(scene):
+        iio.imwrite(root / f"images/{name}.png", views.pixels[i].numpy())
+        pose = views.cameras.camera_to_world[i].tolist()
+        frames.append({
+            "file_path": f"images/{name}.png", "time": float(views.times[i]),
+            "transform_matrix": [*pose, [0, 0, 0, 1]],
+        })
+    cameras = scene.static.train.cameras
+    (root / "transforms.json").write_text(json.dumps({
+        "camera_model": "OPENCV", "fl_x": float(cameras.focal[0, 0]),
+        "fl_y": float(cameras.focal[0, 1]), "cx": float(cameras.center[0, 0]),
+        "cy": float(cameras.center[0, 1]), "w": cameras.width, "h": cameras.height,
+        "frames": frames,
+        "test_filenames": [
+            f["file_path"] for f in frames if "rest" in f["file_path"] or "held" in f["file_path"]
+        ],
+    }))
+
+
+def write_nerfies(scene: Scene, root: Path) -> None:
+    """The scene as Nerfies lists it, its images already made smaller by four."""
+    for folder in ("camera", "rgb/4x"):
+        (root / folder).mkdir(parents=True)
+    ids, metadata = [], {}
+    for views, i, name in in_one_list(scene):
+        ids.append(name)
+        iio.imwrite(root / f"rgb/4x/{name}.png", views.pixels[i].numpy())
+        metadata[name] = {"warp_id": round(float(views.times[i]) * 2), "appearance_id": 0}
+        pose, focal = views.cameras.camera_to_world[i], views.cameras.focal[i] * 4
+        (root / f"camera/{name}.json").write_text(json.dumps({
+            "orientation": (pose[:, :3] * torch.tensor([1.0, -1.0, -1.0])).T.tolist(),
+            "position": pose[:, 3].tolist(), "focal_length": float(focal[0]),
+            "principal_point": (views.cameras.center[i] * 4).tolist(),
+            "image_size": [views.width * 4, views.height * 4], "skew": 0.0,
+            "pixel_aspect_ratio": float(focal[1] / focal[0]),
+            "radial_distortion": [0.0] * 3, "tangential_distortion": [0.0] * 2,
+        }))
+    val = [name for name in ids if name.startswith(("rest", "held"))]
+    train = [name for name in ids if name not in val]
+    world = {
+        "center": [0, 0, 0], "scale": 1, "near": scene.bounds.near, "far": scene.bounds.far,
+    }
+    for file, content in (
+        ("dataset", {"count": len(ids), "ids": ids, "train_ids": train, "val_ids": val}),
+        ("metadata", metadata), ("scene", world),
+    ):
+        (root / f"{file}.json").write_text(json.dumps(content))
+
+
+def write_scene(target: str, root: Path, inward: Scene, forward: Scene) -> None:
+    """A tiny scene in the layout that the datamodule ``target`` reads."""
+    if target.endswith("NerfstudioDataModule"):
+        write_nerfstudio(inward, root)
+    elif target.endswith("NerfiesDataModule"):
+        write_nerfies(inward, root)
+    else:
+        export(forward if target.endswith("ForwardFacingDataModule") else inward, root)
+
+
+def scene_config(
+    composed: Callable[..., Any], name: str, tmp_path: Path, inward: Scene, forward: Scene
+) -> Any:
+    """The whole config of ``data=<name>`` with a tiny scene and tiny fields."""
+    choice = [f"data={name}"]
+    target = composed(*choice).data["_target_"]
+    kind = "forward" if "Forward" in target else "inward"
+    if name in EMBEDDED:
+        choice += [*EMBEDDED[name], "data.width=24", "data.height=18", "data.frames=3",
+                   "data.train_views=2", "data.supersample=1"]
+    else:
+        write_scene(target, tmp_path / "scene", inward, forward)
+        choice.append(f"data.root={tmp_path}/scene")
+    return composed(*choice, *OF_KIND[kind], *TINY)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_two_steps_of_both_stages(
+    name: str,
+    composed: Callable[..., Any],
+    trainer: Callable[..., Any],
+    tmp_path: Path,
+    tiny_scene: Scene,
+    forward_scene: Scene,
+) -> None:
+    config = scene_config(composed, name, tmp_path, tiny_scene, forward_scene)
+    module = instantiate(config.data)
+    assert isinstance(module, SceneDataModule)
+    canonical = instantiate(config.canonical, _convert_="all")
+    trainer(max_steps=2).fit(canonical, datamodule=module)
+    assert canonical.iteration == 2
+    assert canonical.model.canonical.color.values.abs().max() > 0
+    build = instantiate(config.deformation, _partial_=True, _convert_="all")
+    deformation: DeformationStage = build(canonical.result())
+    trainer(max_steps=2).fit(deformation, datamodule=module)
+    assert deformation.iteration == 2
+    assert module.scene.dynamic.train.flow is not None
+    assert torch.isfinite(deformation.field.to_canonical).all()
+
+
+@pytest.mark.parametrize("name", PUBLISHED_INWARD + PUBLISHED_FORWARD)
+def test_a_published_scene_leaves_only_its_folder_to_give(
+    composed: Callable[..., Any], name: str
+) -> None:
+    data = composed(f"data={name}").data
+    assert [key for key in data if OmegaConf.is_missing(data, key)] == ["root"]
+    forward = name in PUBLISHED_FORWARD
+    assert data.name == name and data.background == "white"
+    assert data.downscale == (4 if forward else 2)
+    assert ("Forward" in data["_target_"]) is forward
+
+
+def test_the_layouts_say_the_same(
+    composed: Callable[..., Any], tmp_path: Path, tiny_scene: Scene, forward_scene: Scene
+) -> None:
+    """One scene through three layouts: the same rays, times and pixels."""
+    scenes = {}
+    for name in ("inward", "nerfstudio", "nerfies"):
+        folder = tmp_path / name
+        config = scene_config(composed, name, folder, tiny_scene, forward_scene)
+        scenes[name] = instantiate(config.data).scene
+    given = tiny_scene.dynamic.train
+    for name, scene in scenes.items():
+        train = scene.dynamic.train
+        kept = torch.tensor([k for k, n in enumerate(train.names) if "static" not in Path(n).stem])
+        views = train[kept] if name == "nerfies" else train
+        torch.testing.assert_close(views.times, given.times)
+        assert torch.equal(views.pixels, given.pixels)
+        for image in range(len(given)):
+            expected, found = given.cameras.image_rays(image), views.cameras.image_rays(image)
+            torch.testing.assert_close(found.origins, expected.origins, atol=1e-5, rtol=0)
+            torch.testing.assert_close(found.directions, expected.directions, atol=1e-5, rtol=0)

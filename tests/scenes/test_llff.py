@@ -1,0 +1,220 @@
+"""Forward-facing scenes on disk: what is read, in which frame, with which numbers."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from devrf.geometry.ndc import NormalizedDevice
+from devrf.scenes.llff import read_llff
+from devrf.scenes.scene import Views
+
+
+def reds(views: Views) -> list[int]:
+    """The number that each image carries."""
+    return views.pixels[:, 0, 0, 0].tolist()
+
+
+def test_the_published_layout(llff_folder: Any) -> None:
+    scene = read_llff(llff_folder.root)
+    assert (scene.name, scene.kind, scene.background) == ("toy", "forward", "white")
+    assert scene.static.train.pixels.shape == (7, 16, 24, 3)
+    # Every eighth image is held out: 0 and 8.
+    assert reds(scene.static.train) == [1, 2, 3, 4, 5, 6, 7]
+    assert reds(scene.static.test) == [0, 8]
+    assert scene.static.train.times.tolist() == [0] * 7
+    assert scene.static.train.view.tolist() == list(range(7))
+    assert scene.static.test.names == ("static/images_4/000.png", "static/images_4/008.png")
+    train, test = scene.dynamic.train, scene.dynamic.test
+    assert reds(train) == [0, 10, 1, 11, 2, 12] and reds(test) == [20, 21, 22]
+    assert train.view.tolist() == [0, 1] * 3 and test.view.tolist() == [0] * 3
+    assert train.times.tolist() == [0, 0, 0.5, 0.5, 1, 1]
+    assert test.times.tolist() == [0, 0.5, 1]
+    assert train.names[3] == "dynamic_3views/view2/images_4/001.png"
+    assert train.flow is None and scene.clock.times == (0.0, 0.5, 1.0)
+
+
+def test_static_poses_by_hand(llff_folder: Any) -> None:
+    cameras = read_llff(llff_folder.root).static.train.cameras
+    # 4.5 world units apart are one unit of 0.75 · 6; the middle one of nine is the origin. What
+    # was [down, right, back] along (−z, y, x) is right, up, back along (x, y, z) when centred.
+    expected = torch.eye(3, 4).repeat(7, 1, 1)
+    expected[:, 0, 3] = torch.arange(1, 8) - 4.0
+    torch.testing.assert_close(cameras.camera_to_world, expected)
+    # A focal length of 80 px in images of 96×64 is 20 px in these of 24×16.
+    assert cameras.focal.tolist() == [[20, 20]] * 7
+    assert cameras.center.tolist() == [[12, 8]] * 7
+    assert (cameras.width, cameras.height) == (24, 16)
+
+
+def test_a_world_point_falls_on_the_pixel_computed_by_hand(llff_folder: Any) -> None:
+    scene = read_llff(llff_folder.root)
+    # The world point 9 before the middle camera (at y = 20 + 4 · 4.5), 1.8 right, 0.9 up of it:
+    # (0.4, 0.2, −2) in the reader's frame.
+    point = torch.tensor([[0.4, 0.2, -2.0]])
+    pixel, depth = scene.static.train.cameras.project(torch.tensor([3]), point)
+    assert pixel[0].tolist() == pytest.approx([12 + 20 * 0.2, 8 - 20 * 0.1])
+    assert float(depth) == 2
+    # The fixed view 2 is at the origin too, view 1 half a unit to its left.
+    pixel, _ = scene.dynamic.train.cameras.project(torch.tensor([0, 1]), point.repeat(2, 1))
+    assert pixel[0].tolist() == pytest.approx([12 + 20 * 0.45, 6])
+    assert pixel[1].tolist() == pytest.approx([16, 6])
+
+
+def test_dynamic_poses_are_taken_as_they_are(llff_folder: Any) -> None:
+    scene = read_llff(llff_folder.root)
+    # The last three of five; 40 px in images of 48×32 are 20 px here.
+    assert scene.dynamic.train.cameras.positions[:2, 0].tolist() == [-0.5, 0]
+    assert scene.dynamic.test.cameras.positions[0].tolist() == [0.5, 0, 0]
+    assert scene.dynamic.train.cameras.focal[0].tolist() == [20, 20]
+    assert torch.equal(scene.dynamic.train.cameras.camera_to_world[0, :, :3], torch.eye(3))
+
+
+def test_a_tilted_world_is_turned_back(llff_folder: Any) -> None:
+    angle = 0.7
+    turn = np.array([
+        [np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]
+    ])
+    rows = llff_folder.static_rows()
+    matrix = rows[:, :15].reshape(9, 3, 5)
+    matrix[:, :, :4] = turn @ matrix[:, :, :4]
+    rows[:, :15] = matrix.reshape(9, 15)
+    straight = read_llff(llff_folder.root).static.train.cameras
+    llff_folder.save("static/poses_bounds.npy", rows)
+    tilted = read_llff(llff_folder.root).static.train.cameras
+    torch.testing.assert_close(tilted.camera_to_world, straight.camera_to_world)
+
+
+@pytest.mark.parametrize(
+    ("inner", "focal", "center"),
+    [
+        ([64, 96, 80], (20, 20), (12, 8)),
+        ([64, 96, 80, 44, 36], (20, 20), (11, 9)),
+        ([[64], [96], [80], [72], [44], [36]], (20, 18), (11, 9)),
+    ],
+)
+def test_poses_without_intrinsics_take_them_from_their_own_file(
+    llff_folder: Any, inner: Any, focal: tuple[float, ...], center: tuple[float, ...]
+) -> None:
+    rows = llff_folder.static_rows()
+    matrix = rows[:, :15].reshape(9, 3, 5)[:, :, :4].reshape(9, 12)
+    llff_folder.save("static/poses_bounds.npy", np.concatenate([matrix, rows[:, 15:]], axis=1))
+    llff_folder.save("static/hwf_cxcy.npy", np.array(inner, dtype=float))
+    cameras = read_llff(llff_folder.root).static.train.cameras
+    assert tuple(cameras.focal[0].tolist()) == focal
+    assert tuple(cameras.center[0].tolist()) == center
+    assert cameras.positions[:, 0].tolist() == pytest.approx([k - 4 for k in range(1, 8)])
+
+
+def test_full_size_images_are_made_smaller_where_the_factor_is_missing(llff_folder: Any) -> None:
+    for folder in (llff_folder.static, *llff_folder.dynamic.glob("view*")):
+        count = len(list((folder / "images_4").iterdir()))
+        shutil.rmtree(folder / "images_4")
+        llff_folder.images(folder / "images", count, times=4)
+    scene = read_llff(llff_folder.root)
+    assert scene.static.train.pixels.shape == (7, 16, 24, 3)
+    assert scene.static.train.cameras.focal[0].tolist() == [20, 20]
+    assert scene.dynamic.train.cameras.focal[0].tolist() == [20, 20]
+    assert read_llff(llff_folder.root, downscale=2).static.train.width == 48
+
+
+def test_images_of_a_lesser_factor_go_the_rest_of_the_way(llff_folder: Any) -> None:
+    llff_folder.flow(1, "001", 3.0)
+    scene = read_llff(llff_folder.root, downscale=8)
+    assert scene.static.train.width == 12
+    assert scene.static.train.cameras.focal[0].tolist() == [10, 10]
+    flow = scene.dynamic.train.flow
+    assert flow is not None and flow.vectors[2, 0, 0].tolist() == [1.5, -1.5]
+
+
+@pytest.mark.parametrize(
+    ("names", "found"),
+    [
+        # By the images' names, by the numbers in them, by position.
+        (("a_010.png", "a_020.png", "a_030.png"), {"a_020": 1, "a_030": 2}),
+        (("a_010.png", "a_020.png", "a_030.png"), {"020": 1, "030": 2}),
+        (("a_010.png", "a_020.png", "a_030.png"), {"001": 1, "002": 2}),
+        # Counted from 1: 002 may be the second image, or the third; all files decide together.
+        (("001.png", "002.png", "003.png"), {"002": 1, "003": 2}),
+        (("001.png", "002.png", "003.png"), {"001": 1, "002": 2}),
+        # Time passes by numbers, not by letters.
+        (("8.png", "9.png", "10.png"), {"9": 1, "10": 2}),
+    ],
+)
+def test_flow_finds_its_frame(
+    llff_folder: Any, names: tuple[str, ...], found: dict[str, int]
+) -> None:
+    for view in (1, 2, 3):
+        folder = llff_folder.dynamic / f"view{view}" / "images_4"
+        for k, name in enumerate(names):
+            (folder / f"{k:03d}.png").rename(folder / f"moving_{name}")
+        for name in names:
+            (folder / f"moving_{name}").rename(folder / name)
+        for name, frame in found.items():
+            llff_folder.flow(view, name, 10 * view + frame)
+    train = read_llff(llff_folder.root).dynamic.train
+    assert reds(train) == [0, 10, 1, 11, 2, 12]
+    assert train.flow is not None
+    assert train.flow.vectors[:, 3, 5, 0].tolist() == [0, 0, 11, 21, 12, 22]
+    assert train.flow.vectors[:, 3, 5, 1].tolist() == [0, 0, -11, -21, -12, -22]
+    assert train.flow.valid.flatten(1).any(dim=1).tolist() == [False] * 2 + [True] * 4
+
+
+def test_missing_flow_files_leave_images_without_flow(llff_folder: Any, caplog: Any) -> None:
+    llff_folder.flow(2, "002", 5.0)
+    with caplog.at_level(logging.WARNING):
+        train = read_llff(llff_folder.root).dynamic.train
+    assert "3 of 4 flow files are missing" in caplog.text
+    assert train.flow is not None
+    assert train.flow.valid.flatten(1).any(dim=1).tolist() == [False] * 5 + [True]
+    assert read_llff(llff_folder.root, flow="none").dynamic.train.flow is None
+
+
+@pytest.mark.parametrize(("test_view", "held_out"), [(1, 0), (2, 10), (-3, 0), (3, 20)])
+def test_another_view_is_held_out(llff_folder: Any, test_view: int, held_out: int) -> None:
+    llff_folder.flow(3, "001", 3.0)
+    dynamic = read_llff(llff_folder.root, test_view=test_view).dynamic
+    assert reds(dynamic.test) == [held_out, held_out + 1, held_out + 2]
+    assert set(reds(dynamic.train)) == {0, 1, 2, 10, 11, 12, 20, 21, 22} - set(reds(dynamic.test))
+    assert dynamic.train.view.tolist() == [0, 1] * 3
+    # Cameras and flow stay with their own views.
+    place = {0: -0.5, 1: 0.0, 2: 0.5}
+    for red, camera in zip(reds(dynamic.train), dynamic.train.cameras.positions, strict=True):
+        assert float(camera[0]) == place[red // 10]
+    if dynamic.train.flow is not None:
+        valid = dynamic.train.flow.valid.flatten(1).any(dim=1)
+        assert [r for r, v in zip(reds(dynamic.train), valid, strict=True) if v] == [21]
+    else:
+        assert held_out == 20
+
+
+def test_fewer_views_and_frames(llff_folder: Any) -> None:
+    llff_folder.flow(1, "001", 3.0)
+    scene = read_llff(llff_folder.root, train_views=1, frames=2, holdout=3)
+    assert reds(scene.dynamic.train) == [0, 2] and reds(scene.dynamic.test) == [20, 22]
+    assert scene.dynamic.train.times.tolist() == [0, 1]
+    assert scene.dynamic.train.flow is None
+    assert reds(scene.static.test) == [0, 3, 6]
+
+
+def test_the_number_of_views_is_that_of_the_folders(llff_folder: Any) -> None:
+    llff_folder.dynamic.rename(llff_folder.root / "dynamic_12views")
+    scene = read_llff(llff_folder.root)
+    assert len(scene.dynamic.train) == 6
+
+
+def test_space_and_box_by_hand(llff_folder: Any) -> None:
+    scene = read_llff(llff_folder.root)
+    assert scene.space == NormalizedDevice(24, 16, (20.0, 20.0), 1.0)
+    bounds = scene.bounds
+    # All cameras look straight ahead: at infinity they see [−1, 1]; on the near plane a camera
+    # moved by 3 sees as far as 1 + 3 · 20 / 12.
+    assert bounds.box.low == pytest.approx((-6.0, -1.0, -1.0))
+    assert bounds.box.high == pytest.approx((6.0, 1.0, 1.0))
+    assert (bounds.near, bounds.far, bounds.motion, bounds.scale) == (0.0, 1.0, None, 1.0)
+    assert read_llff(llff_folder.root, near=0.5).bounds.box.high[0] == pytest.approx(11.0)

@@ -1,0 +1,89 @@
+"""Images through a lens become images of a pinhole camera: geometry, mattes, borders."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+
+from devrf.errors import DevrfError
+from devrf.geometry.distortion import Distortion
+from devrf.scenes.lens import Lens
+from devrf.scenes.undistortion import as_pinhole, resample
+
+BARREL = Distortion((-0.2, 0.05, 0.0, 0.0), (0.004, -0.006))
+PINCUSHION = Distortion((0.15, 0.02, 0.01, 0.0), (-0.004, 0.003))
+WIDTH, HEIGHT = 96, 64
+
+
+@pytest.mark.parametrize("distortion", [BARREL, PINCUSHION, Distortion()])
+@pytest.mark.parametrize("skew", [0.0, 4.0])
+def test_straight_lines_come_out_straight(distortion: Distortion, skew: float) -> None:
+    """Each pixel shows its own direction: an image of x/z and y/z becomes one linear in them."""
+    lens = Lens((70.0, 60.0), (50.0, 30.0), distortion, skew)
+    y, x = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
+    py = (y.double() + 0.5 - 30) / 60
+    px = (x.double() + 0.5 - 50 - skew * py) / 70
+    direction = distortion.undistort(torch.stack([px, py], dim=-1))
+    coded = ((direction + 1.5) * 80).round().clamp(0, 255).to(torch.uint8)
+    image = torch.cat([coded, coded[..., :1]], dim=-1)
+    pixels, (plain,) = as_pinhole(image[None], [lens], ["image"])
+    assert plain.pinhole and plain.center == lens.center
+    zoom = plain.focal[0] / 70
+    assert zoom == pytest.approx(plain.focal[1] / 60) and zoom >= 1
+    expected = torch.stack(
+        [(x + 0.5 - 50) / plain.focal[0], (y + 0.5 - 30) / plain.focal[1]], dim=-1
+    )
+    found = pixels[0, ..., :2].float() / 80 - 1.5
+    # One of 80 steps a unit; the border clamps half a pixel.
+    assert (found - expected).abs()[2:-2, 2:-2].max() < 1.1 / 80
+
+
+def test_a_pincushion_is_zoomed_until_nothing_is_missing() -> None:
+    _, (plain,) = as_pinhole(
+        torch.zeros(1, HEIGHT, WIDTH, 3, dtype=torch.uint8),
+        [Lens((70.0, 70.0), (48.0, 32.0), PINCUSHION)], ["image"],
+    )
+    corner = torch.tensor([47.5, 31.5]) / plain.focal[0]
+    reached = PINCUSHION.distort(corner) * 70
+    assert plain.focal[0] > 70 and (reached <= torch.tensor([48.0, 32.0])).all()
+
+
+def test_a_plain_lens_leaves_every_pixel() -> None:
+    image = torch.randint(256, (2, HEIGHT, WIDTH, 4), dtype=torch.uint8)
+    lens = Lens((70.0, 60.0), (50.0, 30.0))
+    pixels, lenses = as_pinhole(image.clone(), [lens, lens], ["a", "b"])
+    assert torch.equal(pixels, image) and lenses == (lens, lens)
+
+
+def test_colours_behind_the_matte_do_not_bleed_in() -> None:
+    image = torch.zeros(1, 2, 4, dtype=torch.uint8)
+    image[0, 0] = torch.tensor([200, 100, 50, 255])
+    image[0, 1] = torch.tensor([0, 255, 0, 0])
+    between = resample(image, torch.tensor([[[1.0, 0.5], [1.5, 0.5], [0.5, 0.5]]]))
+    assert between[0].tolist() == [[200, 100, 50, 128], [0, 0, 0, 0], [200, 100, 50, 255]]
+
+
+@pytest.mark.parametrize("k1", [-3.0, 60.0])
+def test_a_lens_that_folds_is_an_error_that_names_the_image(k1: float) -> None:
+    lens = Lens((50.0, 50.0), (48.0, 32.0), Distortion((k1, 0.0, 0.0, 0.0)))
+    folded = Lens((12.0, 12.0), (48.0, 32.0), Distortion((-3.0, 0.0, 0.0, 0.0)))
+    chosen = lens if k1 > 0 else folded
+    image = torch.zeros(1, HEIGHT, WIDTH, 3, dtype=torch.uint8)
+    with pytest.raises(DevrfError, match=r"view_7\.png: the distortion .* folds over"):
+        as_pinhole(image, [chosen], ["view_7.png"])
+
+
+def test_the_balls_are_where_the_pinhole_projects_them(
+    ring_cameras: Callable[..., Any], picture: Callable[..., Any]
+) -> None:
+    cameras = ring_cameras(1, width=WIDTH, height=HEIGHT, angle=0.7)
+    lens = Lens((110.0, 105.0), (50.0, 30.0), BARREL)
+    pose = cameras.camera_to_world[0]
+    image = torch.from_numpy(picture(pose, lens, WIDTH, HEIGHT))
+    pixels, (plain,) = as_pinhole(image[None].clone(), [lens], ["image"])
+    straight = torch.from_numpy(picture(pose, plain, WIDTH, HEIGHT))
+    differing = (pixels[0, ..., 3].float() - straight[..., 3].float()).abs() > 200
+    assert straight[..., 3].any() and differing.float().mean() < 0.002
