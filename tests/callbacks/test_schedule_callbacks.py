@@ -16,8 +16,9 @@ from devrf.errors import DevrfError
 from devrf.fields.architecture import Architecture
 from devrf.stages.canonical import CanonicalStage
 from devrf.stages.checkpoint import Stored
-from devrf.stages.deformation import DeformationStage, MotionSettings
+from devrf.stages.deformation import DeformationStage
 from devrf.stages.schedules import CanonicalSchedule, DeformationSchedule
+from devrf.stages.settings import MotionSettings
 
 SMALL = Architecture(channels=4, width=8, frequencies=1)
 CANONICAL = CanonicalSchedule(

@@ -90,8 +90,14 @@ def test_loss_weights(paper):
 def test_the_config_says_what_the_code_defaults_to(paper):
     """Plain Lightning code that states nothing gets the paper's stages too."""
     from devrf.fields.architecture import Architecture
-    from devrf.stages.canonical import FINE_LOSS, SEARCH_LOSS, CanonicalRates, Sampling
-    from devrf.stages.deformation import DEFORMATION_LOSS, MotionSettings
+    from devrf.stages.settings import (
+        DEFORMATION_LOSS,
+        FINE_LOSS,
+        SEARCH_LOSS,
+        CanonicalRates,
+        MotionSettings,
+        Sampling,
+    )
 
     assert instantiate(paper.field) == Architecture()
     assert instantiate(paper.sampling) == Sampling()

@@ -17,8 +17,9 @@ from devrf.fields.decoder import ColorDecoder, SigmoidColor
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.scene import Scene
-from devrf.stages.canonical import CanonicalStage, share_of_views
+from devrf.stages.canonical import CanonicalStage
 from devrf.stages.schedules import CanonicalSchedule
+from devrf.stages.visibility import share_of_views
 
 SMALL = Architecture(channels=4, width=16, frequencies=2)
 CARVED = CanonicalSchedule(

@@ -13,9 +13,10 @@ from devrf.errors import DevrfError
 from devrf.ops.total_variation import total_variation
 from devrf.scenes.scene import Scene
 from devrf.stages.checkpoint import Stored
-from devrf.stages.deformation import DEFORMATION_LOSS, DeformationStage, MotionSettings
+from devrf.stages.deformation import DeformationStage
 from devrf.stages.held_out import score
 from devrf.stages.schedules import DeformationSchedule
+from devrf.stages.settings import DEFORMATION_LOSS, MotionSettings
 
 SHORT = DeformationSchedule(sides=(4, 8), iterations_per_frame=(20, 10), rays=256)
 FAST = MotionSettings(learning_rate=5e-3, views="all", pixels="useful")

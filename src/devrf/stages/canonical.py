@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
@@ -18,7 +17,6 @@ from devrf.fields.canonical import CanonicalField
 from devrf.fields.occupancy import Occupancy, bounding_box, dilate
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
-from devrf.geometry.clock import FrameClock
 from devrf.losses.composer import WeightedLoss
 from devrf.losses.motion import total_variation_weight
 from devrf.losses.photometric import PHOTOMETRIC_TERMS, Prediction
@@ -28,49 +26,13 @@ from devrf.rendering.model import SceneModel
 from devrf.rendering.render import RenderSettings, render
 from devrf.rendering.sampling import hits
 from devrf.scenes.scene import CaptureName, Views
-from devrf.scenes.visual_hull import visual_hull
 from devrf.stages.checkpoint import Passport, Stored
 from devrf.stages.schedules import CanonicalPhase, CanonicalSchedule
+from devrf.stages.settings import FINE_LOSS, SEARCH_LOSS, CanonicalRates, Sampling
 from devrf.stages.stage import Phase, ScheduledStage
+from devrf.stages.visibility import possible_space, share_of_views
 
 log = logging.getLogger(__name__)
-
-SEARCH_LOSS = {"color": 1.0, "per_sample_color": 0.1, "entropy": 0.01}
-FINE_LOSS = {"color": 1.0, "per_sample_color": 0.01, "entropy": 0.001}
-
-
-@dataclass(frozen=True)
-class CanonicalRates:
-    """Base learning rates of the canonical stage (method §2, Optimiser).
-
-    Attributes:
-        density: of the density grid.
-        color: of the feature grid.
-        decoder: of the colour decoder.
-    """
-
-    density: float = 0.1
-    color: float = 0.1
-    decoder: float = 1e-3
-
-
-@dataclass(frozen=True)
-class Sampling:
-    """How rays are sampled.
-
-    Attributes:
-        step: distance between samples in voxels.
-        alpha_threshold: opacity, and weight, under which a sample is not worth its colour.
-        search_alpha_threshold: the same during the coarse geometry search, which begins with
-            next to nothing everywhere.
-        occupancy_threshold: opacity of a step under which a cell counts as empty.
-    """
-
-    step: float = 0.5
-    alpha_threshold: float = 1e-4
-    search_alpha_threshold: float = 1e-7
-    occupancy_threshold: float = 1e-3
-
 
 class CanonicalStage(ScheduledStage):
     """Learns the canonical field of an inward-facing scene (method §2).
@@ -154,7 +116,9 @@ class CanonicalStage(ScheduledStage):
             return
         box, first = self.scene.bounds.box, self.schedule.phase(0)
         side = self.schedule.search_side
-        occupancy = Occupancy(self._possible(box, box.grid_shape(side**3)), box)
+        occupancy = Occupancy(
+            possible_space(self.scene, box.grid_shape(side**3), carve=self.schedule.carve), box
+        )
         if first.kind == "search":
             canonical = self.architecture.search_field(box, first.voxels)
         else:
@@ -178,24 +142,6 @@ class CanonicalStage(ScheduledStage):
         searching = phase.kind == "search"
         threshold = sampling.search_alpha_threshold if searching else sampling.alpha_threshold
         return RenderSettings(sampling.step, threshold, bounds.near, bounds.far)
-
-    def _possible(self, box: Box, shape: tuple[int, int, int]) -> Tensor:
-        """Where matter can be before anything is learned (X, Y, Z).
-
-        Not nearer to a camera than its near plane: a cloud before a lens would explain its
-        picture perfectly. And inside the visual hull, if the schedule carves.
-        """
-        views = self.scene.static.train
-        points = box.grid_points(shape, views.cameras.focal)
-        possible = torch.ones(shape, dtype=torch.bool)
-        for position in views.cameras.positions:
-            lens = box.nearest(position) - position
-            if float(lens.norm()) < self.scene.bounds.near:
-                possible &= (points - position).norm(dim=-1) > self.scene.bounds.near
-        at_rest = float(views.times.max() - views.times.min()) <= FrameClock.TOLERANCE
-        if self.schedule.carve and views.has_alpha and at_rest:
-            possible &= visual_hull(views, box, shape)
-        return possible
 
     def enter(self, phase: Phase) -> None:
         """Make grids, occupancy, rays and optimiser ready for ``phase``."""
@@ -333,18 +279,3 @@ class CanonicalStage(ScheduledStage):
     def result(self) -> Stored:
         """What the deformation stage builds on."""
         return Stored(self.passport(), self.model)
-
-
-def share_of_views(cameras: Cameras, points: Tensor) -> Tensor:
-    """Share (X, Y, Z) in (0, 1] of the cameras that have each point (X, Y, Z, 3) in the picture.
-
-    Relative to the best-seen point; a point that no camera sees gets the share of one camera.
-    """
-    flat = points.view(-1, 3)
-    seen = torch.zeros(len(flat), device=flat.device)
-    for k in range(len(cameras)):
-        pixel, depth = cameras.project_into(k, flat)
-        x, y = pixel.unbind(-1)
-        seen += (depth > 0) & (x >= 0) & (x <= cameras.width) & (y >= 0) & (y <= cameras.height)
-    return (seen.clamp(min=1) / seen.max().clamp(min=1)).view(points.shape[:-1])
-

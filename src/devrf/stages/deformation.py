@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -27,42 +27,8 @@ from devrf.scenes.scene import CaptureName, Views
 from devrf.stages.checkpoint import Passport, Stored
 from devrf.stages.flow_start import follow, start_from_tracks
 from devrf.stages.schedules import DeformationPhase, DeformationSchedule
+from devrf.stages.settings import DEFORMATION_LOSS, MotionSettings
 from devrf.stages.stage import Phase, ScheduledStage
-
-DEFORMATION_LOSS = {
-    "render": 1.0,
-    "cycle": 100.0,
-    "flow": 0.005,
-    "tv": 1.0,
-    "per_sample_color": 0.1,
-    "entropy": 0.01,
-}
-
-
-@dataclass(frozen=True)
-class MotionSettings:
-    """How the deformation field is learned, beside its schedule.
-
-    Attributes:
-        learning_rate: base rate, in ``unit`` per step: how far a voxel moves at most.
-        unit: ``world`` for world units; ``box`` for the longest edge of the fields' box, so
-            that one value serves scenes of any scale.
-        views: ``one`` draws a batch from one view of the frame, the views taking turns;
-            ``all`` draws it from all of them.
-        pixels: ``all`` draws from whole images; ``useful`` from the pixels that show the matte
-            or whose rays meet what the present field has moved there.
-        occupancy_every: iterations after which the frame's occupancy is looked up anew.
-        start: where a frame starts from at the coarsest level: ``previous`` is the result of
-            the frame before it; ``flow`` moves that along the observed optical flow, so that
-            parts that move far are not lost (without flow it is the same as ``previous``).
-    """
-
-    learning_rate: float = 1e-3
-    unit: Literal["world", "box"] = "world"
-    views: Literal["one", "all"] = "one"
-    pixels: Literal["all", "useful"] = "all"
-    occupancy_every: int = 25
-    start: Literal["previous", "flow"] = "previous"
 
 
 @dataclass
