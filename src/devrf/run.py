@@ -13,11 +13,15 @@ import torch
 from hydra.utils import instantiate
 from lightning import Trainer, seed_everything
 from omegaconf import DictConfig
+from rich.console import Console
 
 from devrf.artifacts.camera_paths import focus_distance, orbit, spiral
 from devrf.artifacts.contact_sheet import write_contact_sheet
 from devrf.artifacts.files import update_json
 from devrf.artifacts.film import FilmSettings, pictures, write_video
+from devrf.artifacts.inspection import inspect_scene
+from devrf.artifacts.inspection_picture import write_inspection_picture
+from devrf.artifacts.inspection_text import plain, tables
 from devrf.callbacks import TrainingRecord
 from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
@@ -27,9 +31,13 @@ from devrf.scenes.export import export
 from devrf.scenes.scene import CaptureName
 from devrf.stages.checkpoint import Stored, load_checkpoint, save_checkpoint
 from devrf.stages.held_out import HeldOutView, background_value, score
+from devrf.stages.memory import estimate
 from devrf.stages.stage import ScheduledStage
 
 log = logging.getLogger(__name__)
+
+# Stages that no checkpoint is of use to.
+FROM_NOTHING = ("prepare", "inspect", "canonical", "pipeline")
 
 # What Lightning says of every run (accelerators it looked for, tips, how many workers a loader
 # might have) is of no use to someone who watches a scene being learned.
@@ -68,6 +76,7 @@ class Run:
             "deformation": [self.deformation],
             "evaluate": [self.evaluate],
             "render": [self.render],
+            "inspect": [self.inspect],
             "pipeline": [self.canonical, self.deformation, self.evaluate, self.render],
         }
         if stage not in stages:
@@ -82,7 +91,7 @@ class Run:
 
         A mistake in the deformation's config would else show when the canonical stage is done.
         """
-        if self.config.ckpt is not None and stage in ("prepare", "canonical", "pipeline"):
+        if self.config.ckpt is not None and stage in FROM_NOTHING:
             raise DevrfError(
                 f"ckpt: stage={stage} starts from nothing; with ckpt=PATH give stage=deformation, "
                 "stage=evaluate or stage=render"
@@ -100,6 +109,24 @@ class Run:
             raise DevrfError("data.export: stage=prepare needs a folder; give data.export=PATH")
         export(self.datamodule.scene, folder)
         log.info("scene written to %s", folder)
+
+    def inspect(self) -> None:
+        """Say and draw what the scene holds and what may be wrong with it; learn nothing."""
+        scene = self.datamodule.scene
+        canonical = instantiate(self.config.canonical, _convert_="all")
+        moving = instantiate(self.config.deformation.schedule, _convert_="all")
+        budget = estimate(
+            scene, canonical.schedule, moving, canonical.architecture, canonical.sampling.step
+        )
+        found = inspect_scene(scene)
+        console = Console()
+        if console.is_terminal:
+            console.print(tables(found, budget))
+        else:
+            log.info("%s", plain(found, budget))
+        path = self.folder / "images" / "inspect.png"
+        write_inspection_picture(path, scene)
+        log.info("picture written to %s", path)
 
     def canonical(self) -> None:
         """Learn the scene at rest."""

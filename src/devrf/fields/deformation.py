@@ -93,8 +93,8 @@ class DeformationField(nn.Module):
     def resize(self, voxels: int) -> None:
         """Resample every frame to about ``voxels`` voxels, trilinearly."""
         shape = self.box.grid_shape(voxels)
-        self.to_canonical = torch.stack([resample(frame, shape) for frame in self.to_canonical])
-        self.to_time = torch.stack([resample(frame, shape) for frame in self.to_time])
+        self.to_canonical = _resampled(self.to_canonical, shape)
+        self.to_time = _resampled(self.to_time, shape)
 
     def _load_from_state_dict(
         self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
@@ -117,3 +117,11 @@ class DeformationField(nn.Module):
         """Restore what :meth:`get_extra_state` gave."""
         self.box = Box.of(state["low"], state["high"])
         self.clock = FrameClock(tuple(state["times"]))
+
+
+def _resampled(frames: Tensor, shape: tuple[int, int, int]) -> Tensor:
+    """Frames (T, X, Y, Z, 3) at another resolution, each written to its place: no copy of all."""
+    resized = frames.new_empty(len(frames), *shape, 3)
+    for into, frame in zip(resized, frames, strict=True):
+        into.copy_(resample(frame, shape))
+    return resized

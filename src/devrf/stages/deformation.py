@@ -144,6 +144,9 @@ class DeformationStage(ScheduledStage):
         previous, self.phase = self.phase, phase
         assert previous is None or isinstance(previous, DeformationPhase)
         if previous is not None and previous.level != phase.level:
+            # What was visited shares the old grids' memory: let go of it first.
+            self._visit = None
+            self._optimizer.replace(0, [])
             self.field.resize(phase.side**3)
         views = self._device_views()
         if self._previous is None:

@@ -1,0 +1,169 @@
+"""An inspection in words: rich tables for a terminal, plain text for a log."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from rich import box as borders
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from devrf.artifacts.inspection import FlowFacts, Inspection, ViewsFacts
+from devrf.geometry.box import Box
+from devrf.scenes.scene import Bounds
+from devrf.stages.memory import Budget, StageMemory
+
+
+@dataclass(frozen=True)
+class Section:
+    """A titled table.
+
+    Attributes:
+        title: what it is about.
+        rows: cells of text, of one number in all rows; the first row is the heading if
+            ``heading`` is set.
+        heading: whether the first row names the columns.
+    """
+
+    title: str
+    rows: tuple[tuple[str, ...], ...]
+    heading: bool = False
+
+
+def sections(found: Inspection, budget: Budget) -> list[Section]:
+    """The whole report: the scene, its images, where it is, and what a run will need."""
+    return [
+        _scene(found),
+        Section(
+            "images",
+            (("set", "images", "views x times", "size", "mattes", "focal length", "distance"),
+             *(_images(facts) for facts in found.sets)),
+            heading=True,
+        ),
+        _memory(budget),
+    ]
+
+
+def plain(found: Inspection, budget: Budget) -> str:
+    """The report as plain text, columns aligned."""
+    lines: list[str] = []
+    for section in sections(found, budget):
+        widths = [max(map(len, column)) for column in zip(*section.rows, strict=True)]
+        lines.append(section.title)
+        for row in section.rows:
+            cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
+            lines.append(("  " + "  ".join(cells)).rstrip())
+    lines.append(_verdict(found))
+    lines += [f"  {advice}" for advice in found.advice]
+    return "\n".join(lines)
+
+
+def tables(found: Inspection, budget: Budget) -> RenderableType:
+    """The report as tables for a terminal."""
+    parts: list[RenderableType] = []
+    for section in sections(found, budget):
+        table = Table(
+            title=section.title, title_justify="left", title_style="bold",
+            box=borders.SIMPLE_HEAD if section.heading else None, show_header=section.heading,
+        )
+        rows = section.rows
+        for name in rows[0] if section.heading else [""] * len(rows[0]):
+            table.add_column(name, style="" if table.columns else "cyan")
+        for row in rows[1:] if section.heading else rows:
+            table.add_row(*map(Text, row))  # Text: a name may hold [brackets]
+        parts += [table, Text()]
+    parts.append(Text(_verdict(found), style="bold yellow" if found.advice else "bold green"))
+    for advice in found.advice:
+        parts.append(Text.assemble(
+            ("  " + advice.where, "yellow"), f": {advice.what}; ", (advice.remedy, "italic")
+        ))
+    return Group(*parts)
+
+
+def size(count: float) -> str:
+    """Bytes in the unit that reads best: 1.6 GB, 12 MB, 3 kB (powers of ten)."""
+    for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if count >= factor:
+            value = count / factor
+            return f"{value:.1f} {unit}" if value < 10 else f"{value:.0f} {unit}"
+    return f"{count:.0f} B"
+
+
+def _verdict(found: Inspection) -> str:
+    count = len(found.advice)
+    return "no problems found" if count == 0 else f"problems found: {count}"
+
+
+def _scene(found: Inspection) -> Section:
+    bounds, times = found.bounds, found.times
+    unit = "NDC" if found.kind == "forward" else "world units"
+    spacing = "evenly spaced" if times.even else "unevenly spaced"
+    rows = [
+        ("scene", f"{found.name}, {found.kind}-facing, {found.background} background"),
+        ("times", f"{times.count} from {times.first:g} to {times.last:g}, {spacing}"),
+        ("near, far", f"{bounds.near:.4g}, {bounds.far:.4g} ({unit})"),
+        ("box", _box(bounds.box)),
+        ("room for motion", _room(bounds)),
+        ("optical flow", _flow(found.flow)),
+    ]
+    if found.gap is not None:
+        rows.insert(2, ("static views", f"widest sector without one: {found.gap:.0f} degrees"))
+    return Section("what was found", tuple(rows))
+
+
+def _room(bounds: Bounds) -> str:
+    if bounds.motion is None:
+        return bounds.source
+    return f"{_box(bounds.motion)}, {bounds.source}"
+
+
+def _box(box: Box) -> str:
+    low, high = (" ".join(f"{v:.3g}" for v in corner) for corner in (box.low, box.high))
+    return f"[{low}] to [{high}]"
+
+
+def _flow(flow: FlowFacts | None) -> str:
+    if flow is None:
+        return "none"
+    on_matte = ""
+    if flow.valid_on_matte is not None:
+        on_matte = f" ({100 * flow.valid_on_matte:.0f} % of the mattes)"
+    return (
+        f"{flow.images} images, valid on {100 * flow.valid:.0f} % of the pixels{on_matte}, "
+        f"mean {flow.mean:.1f} px, longest {flow.longest:.1f} px"
+    )
+
+
+def _images(facts: ViewsFacts) -> tuple[str, ...]:
+    least, most = facts.focal
+    focal = f"{least:.0f} px" if most - least < 0.5 else f"{least:.0f} to {most:.0f} px"
+    near, mean, far = facts.distance
+    distance = f"{mean:.3g}" if far - near < 0.01 * mean else f"{near:.3g} to {far:.3g}"
+    return (
+        facts.name, str(facts.images), f"{facts.views} x {facts.frames}",
+        f"{facts.width} x {facts.height}", "yes" if facts.mattes else "no", focal, distance,
+    )
+
+
+def _memory(budget: Budget) -> Section:
+    rows = [
+        ("GPU, canonical stage", size(budget.canonical.peak), _largest(budget.canonical)),
+        ("GPU, deformation stage", size(budget.deformation.peak), _largest(budget.deformation)),
+        ("host, beside a GPU", size(budget.host), "the scene: " + _parts(budget.scene)),
+        ("host, without a GPU", size(budget.host_alone), "the scene and the larger stage"),
+        ("checkpoint", size(sum(budget.checkpoint.values())), _parts(budget.checkpoint, 2)),
+    ]
+    return Section("what a run will need, estimated", tuple(rows))
+
+
+def _largest(stage: StageMemory) -> str:
+    worst = max(stage.passing, key=lambda name: stage.passing[name])
+    return _parts({**stage.held, worst: stage.passing[worst]}, 3)
+
+
+def _parts(parts: Mapping[str, int], most: int = 3) -> str:
+    """The largest parts, by name."""
+    ordered = sorted(parts.items(), key=lambda part: -part[1])
+    return ", ".join(f"{name} {size(count)}" for name, count in ordered[:most])

@@ -1,0 +1,127 @@
+"""What a run will need, counted by hand."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from devrf.fields.architecture import Architecture
+from devrf.geometry.box import Box
+from devrf.scenes.scene import Scene
+from devrf.stages.memory import (
+    PROGRAM,
+    StageMemory,
+    batch_bytes,
+    estimate,
+    samples_per_ray,
+    view_bytes,
+)
+from devrf.stages.schedules import CanonicalSchedule, DeformationSchedule
+
+SMALL = Architecture(channels=4, width=16, frequencies=2)
+CANONICAL = CanonicalSchedule(
+    search_iterations=0, search_side=8, iterations=10, side=10, doublings=(5,), rays=64
+)
+DEFORMATION = DeformationSchedule(sides=(4, 8), iterations_per_frame=(2, 2), rays=64)
+
+
+@pytest.fixture
+def cubic(tiny_scene: Scene, cube: Box) -> Scene:
+    """The tiny scene (24×18 px; 8 static views, 2 views × 3 frames) in a cube."""
+    return replace(tiny_scene, bounds=replace(tiny_scene.bounds, box=cube, motion=None))
+
+
+def test_fields_gradients_and_moments_by_hand(cubic: Scene) -> None:
+    budget = estimate(cubic, CANONICAL, DEFORMATION, SMALL)
+    grids = 10**3 * (1 + 4) * 4
+    # 4→16 with bias, direction (3 + 6·2)→16, 16→16 and 16→3 with bias.
+    decoder = 4 * (4 * 16 + 16 + 15 * 16 + 16 * 16 + 16 + 3 * 16 + 3)
+    canonical = budget.canonical.held
+    assert canonical["density and features"] == grids == canonical["their gradients"]
+    assert canonical["their Adam moments"] == 2 * grids
+    assert canonical["decoder, with gradients and moments"] == 4 * decoder
+    assert canonical["occupancy"] == 2 * 10**3
+    assert canonical["pixels to draw from"] == 8 * 24 * 18 * 8
+    moving = budget.deformation.held
+    displacements = 2 * 3 * 8**3 * 3 * 4  # both ways, 3 frames
+    assert moving["displacements of 3 frames, both ways"] == displacements
+    assert moving["gradients of one frame"] == displacements // 3
+    assert moving["Adam moments of one frame"] == 2 * displacements // 3
+    assert moving["pixels to draw from"] == 2 * 24 * 18 * 8
+    # The old grids of one direction.
+    grown = 3 * 4**3 * 12
+    assert budget.deformation.passing["growing the grids"] == grown
+    assert sum(budget.checkpoint.values()) == grids + decoder + 10**3 + displacements
+
+
+def test_images_flow_and_depth_by_hand(tiny_scene: Scene) -> None:
+    moving = tiny_scene.dynamic.train
+    assert len(moving) == 6 and moving.flow is not None
+    parts = view_bytes(replace(moving, depth=torch.zeros(6, 18, 24)))
+    pixels = 6 * 24 * 18
+    channels = moving.pixels.shape[3]
+    assert parts == {
+        "images": channels * pixels, "optical flow": (2 * 4 + 1) * pixels, "depth": 4 * pixels
+    }
+    assert set(view_bytes(replace(moving, flow=None, depth=None))) == {"images"}
+
+
+def test_the_host_holds_all_views_and_twice_the_fields(cubic: Scene) -> None:
+    budget = estimate(cubic, CANONICAL, DEFORMATION, SMALL)
+    everything = [v for c in (cubic.static, cubic.dynamic) for v in (c.train, c.test)]
+    assert budget.scene["images"] == sum(v.pixels.numel() for v in everything)
+    scene = sum(budget.scene.values())
+    assert budget.host == PROGRAM + scene + 2 * sum(budget.checkpoint.values())
+    assert budget.host_alone >= budget.host
+
+
+def test_a_peak_is_what_is_held_and_the_largest_of_what_passes() -> None:
+    assert StageMemory({"a": 3, "b": 4}, {"c": 10, "d": 2}).peak == 17
+    assert StageMemory({"a": 3}, {}).peak == 3
+
+
+def test_the_checkpoint_of_a_learned_scene(tiny_scene: Scene, rest) -> None:
+    # As the fixture was learned: side 20; the box that it found is another than the bounds'.
+    schedule = CanonicalSchedule(search_iterations=0, iterations=120, side=20, doublings=(40,))
+    parts = estimate(tiny_scene, schedule, DEFORMATION, SMALL).checkpoint
+    said = sum(size for name, size in parts.items() if "frames" not in name)
+    kept = [v for v in rest.model.state_dict().values() if isinstance(v, torch.Tensor)]
+    assert said == pytest.approx(sum(v.numel() * v.element_size() for v in kept), rel=0.1)
+
+
+def test_samples_of_a_ray(cube: Box) -> None:
+    # The mean chord of a cube is 2/3 of its edge: of 30 voxels 20, sampled twice each.
+    assert samples_per_ray(cube, 30**3, None, 0.5) == pytest.approx(40)
+    assert samples_per_ray(cube, 30**3, 128, 0.5) == 255
+
+
+def test_fog_costs_most(cube: Box) -> None:
+    schedule = CanonicalSchedule()
+    sizes = [batch_bytes(schedule, k, Architecture(), cube, 0.5) for k in range(6)]
+    # The first fine phase decodes every sample of its fog; later ones a tenth of them.
+    assert sizes[1] > 4 * sizes[2] > 0
+    assert sizes[2] < sizes[3] < sizes[4] < sizes[5]
+    assert sizes[0] > 0
+
+
+def test_the_papers_sizes(cubic: Scene) -> None:
+    """50 × 160³ displacements of 12 bytes each way: 2.46 GB per direction (method §3)."""
+    times = torch.linspace(0, 1, 50)
+    moving = cubic.dynamic.train[torch.zeros(50, dtype=torch.long)]
+    dynamic = replace(cubic.dynamic, train=replace(moving, times=times))
+    budget = estimate(
+        replace(cubic, dynamic=dynamic), CanonicalSchedule(), DeformationSchedule(), Architecture()
+    )
+    both = budget.checkpoint["displacements of 50 frames, both ways"]
+    assert both == pytest.approx(2 * 2.46e9, rel=0.01)
+    assert 5e9 < budget.gpu < 12e9
+    assert math.isfinite(budget.host)
+
+
+def test_nothing_is_drawn_at_random(cubic: Scene) -> None:
+    before = torch.get_rng_state()
+    estimate(cubic, CANONICAL, DEFORMATION, SMALL)
+    assert torch.equal(before, torch.get_rng_state())
