@@ -131,8 +131,8 @@ class DeformationSchedule:
     Attributes:
         sides: sides of the motion grids, coarse to fine.
         iterations_per_frame: share of a frame at each level.
-        coarse_to_fine: False spends all shares at the finest resolution, at the base rate (the
-            ``base`` row of the ablation tables).
+        coarse_to_fine: False spends all shares at the finest resolution, at the base rate, each
+            frame starting from rest (the ``base`` row of the ablation tables).
         decay: factor of the learning rate from a level to the next.
         rays: rays a batch.
     """
@@ -194,5 +194,5 @@ class DeformationSchedule:
             stop=start + (frame + 1) * share,
             side=self.sides[level],
             learning_rate_factor=self.decay**level,
-            carries=level == 0 and frame > 1,
+            carries=self.coarse_to_fine and level == 0 and frame > 1,
         )
