@@ -231,6 +231,8 @@ class Run:
     def _score(self, stored: Stored, capture: CaptureName) -> list[HeldOutView]:
         scene, device = self.datamodule.scene, self._device()
         views, model = scene.capture(capture).test, stored.model.to(device)
+        if capture == "static":
+            model = model.at_rest()
         scored = [score(model, views, k, scene.background, device) for k in range(len(views))]
         write_contact_sheet(self.folder / "images" / f"{capture}.png", scored)
         return scored

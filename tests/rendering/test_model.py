@@ -95,3 +95,10 @@ def test_depth_is_the_distance_of_the_face_and_zero_beside_it(model: SceneModel)
     assert picture.depth[1].item() == 0
     torch.testing.assert_close(picture.color[1], torch.ones(3))
     assert picture.color[0, 0] > 0.99 and picture.color[0, 1] < 0.01
+
+
+def test_the_rest_state_is_the_same_at_every_time(model: SceneModel) -> None:
+    rest = model.at_rest()
+    assert middle(rest, 1.0) == middle(model, 0.0)
+    # It shares the fields: what is learned later shows in both.
+    assert rest.canonical is model.canonical and model.deformation is not None

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal, get_args
 
-from devrf.scenes.optical_flow import estimate_flow
+from devrf.scenes.optical_flow import camera_turn, estimate_flow
 from devrf.scenes.scene import Scene
 
 log = logging.getLogger(__name__)
@@ -17,6 +17,9 @@ FlowSource = Literal["auto", "files", "dis", "raft", "none"]
 # Of layouts that have no place for flow files.
 EstimatedFlow = Literal["auto", "dis", "raft", "none"]
 ESTIMATED = get_args(EstimatedFlow)
+
+# Images taken in directions that differ by more show too little in common for optical flow.
+JUMP_DEGREES = 10.0
 
 
 def files_or_none(source: FlowSource) -> Literal["files", "none"]:
@@ -30,7 +33,8 @@ def with_flow(scene: Scene, source: FlowSource, cache: Path | None) -> Scene:
     Args:
         scene: as its reader gave it, with flow from files or without.
         source: ``dis`` and ``raft`` estimate; ``auto`` keeps what was read from files, else
-            estimates with DIS where OpenCV is installed; the others change nothing.
+            estimates with DIS where OpenCV is installed and the cameras do not jump from a
+            frame to the next; the others change nothing.
         cache: an ``.npz`` that keeps the estimate, or None.
 
     Raises:
@@ -39,8 +43,11 @@ def with_flow(scene: Scene, source: FlowSource, cache: Path | None) -> Scene:
     train = scene.dynamic.train
     method = source
     if method == "auto" and train.flow is None:
-        method = "dis" if importlib.util.find_spec("cv2") else "none"
-        how = "estimated with DIS" if method == "dis" else "left out (OpenCV is not installed)"
+        method, how = "dis", "estimated with DIS"
+        if not importlib.util.find_spec("cv2"):
+            method, how = "none", "left out (OpenCV is not installed)"
+        elif camera_turn(train) > JUMP_DEGREES:
+            method, how = "none", "left out (the cameras jump from frame to frame)"
         log.info("%s: no optical flow files; flow is %s", scene.name, how)
     if method not in ("dis", "raft"):
         return scene

@@ -56,6 +56,10 @@ class SceneModel(nn.Module):
         self.deformation = deformation
         self.space = space
 
+    def at_rest(self) -> SceneModel:
+        """The canonical field alone, sharing its memory: the rest state at every time."""
+        return SceneModel(self.canonical, self.occupancy, self.settings, space=self.space)
+
     def warp(self, time: float) -> Warp | None:
         """The map from points (M, 3) at ``time`` into canonical space; None is the identity."""
         deformation = self.deformation
