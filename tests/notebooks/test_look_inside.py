@@ -1,0 +1,61 @@
+"""The notebook is committed as it was written, and all of it runs."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+import devrf
+
+REASON = "needs devrf[notebooks]"
+nbformat = pytest.importorskip("nbformat", reason=REASON)
+nbclient = pytest.importorskip("nbclient", reason=REASON)
+pytest.importorskip("ipykernel", reason=REASON)
+pytest.importorskip("matplotlib", reason=REASON)
+
+PATH = Path(__file__).parents[2] / "notebooks" / "look_inside.ipynb"
+
+
+@pytest.fixture
+def notebook():
+    return nbformat.read(PATH, as_version=4)
+
+
+def code_cells(notebook):
+    return [cell for cell in notebook.cells if cell.cell_type == "code"]
+
+
+def test_it_is_committed_clean(notebook):
+    nbformat.validate(notebook)
+    assert (notebook.nbformat, notebook.nbformat_minor) == (4, 5)
+    assert notebook.metadata.kernelspec.name == "python3"
+    assert all(not cell.outputs for cell in code_cells(notebook))
+    assert all(cell.execution_count is None for cell in code_cells(notebook))
+
+
+def test_its_short_form_runs(notebook, monkeypatch, tmp_path):
+    # The kernel is a process of its own: it finds the devrf that is tested here.
+    source = str(Path(devrf.__file__).parents[1])
+    before = [path for path in (os.environ.get("PYTHONPATH"),) if path]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([source, *before]))
+    monkeypatch.setenv("DEVRF_NOTEBOOK_SCALE", "0.05")
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    # Whatever kernels this machine knows, it is this interpreter that runs the cells.
+    command = [sys.executable, "-m", "ipykernel_launcher", "-f", "{connection_file}"]
+    client = nbclient.NotebookClient(
+        notebook, timeout=120, kernel_name="python3",
+        resources={"metadata": {"path": str(tmp_path)}},
+    )
+    client.create_kernel_manager().kernel_spec.argv = command
+    client.execute()  # an error in a cell is raised
+
+    cells = code_cells(notebook)
+    assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1))
+    outputs = [output for cell in cells for output in cell.outputs]
+    assert not [o for o in outputs if o.output_type == "error" or o.get("name") == "stderr"]
+    figures = [cell for cell in cells if "plt.show()" in cell.source]
+    assert figures
+    assert all(any("image/png" in o.get("data", {}) for o in cell.outputs) for cell in figures)
