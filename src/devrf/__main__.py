@@ -7,15 +7,14 @@ import sys
 
 from devrf.app import main
 from devrf.messages import mistakes_in_one_line
+from devrf.process import tune_for_cpu
 
 
 def entry() -> None:
     """Run the application; a mistake in the input ends it with one line and status 2."""
     # Hydra would print a traceback of its own and exit with 1 if it were not told to raise.
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    # Threads that wait for one another by spinning cost a busy machine a hundredfold; OpenMP
-    # reads this when torch is loaded, which is later.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    tune_for_cpu()
     try:
         with mistakes_in_one_line():
             main()
