@@ -22,6 +22,7 @@ from devrf.artifacts.film import FilmSettings, pictures, write_video
 from devrf.artifacts.inspection import inspect_scene
 from devrf.artifacts.inspection_picture import write_inspection_picture
 from devrf.artifacts.inspection_text import plain, tables
+from devrf.artifacts.records import mean_scores, provenance, write_frames
 from devrf.callbacks import TrainingRecord
 from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
@@ -30,6 +31,7 @@ from devrf.losses.motion import MOTION_TERMS
 from devrf.scenes.export import export
 from devrf.scenes.scene import CaptureName
 from devrf.stages.checkpoint import Stored, load_checkpoint, save_checkpoint
+from devrf.stages.evaluation import Evaluation, Judge
 from devrf.stages.held_out import HeldOutView, background_value, score
 from devrf.stages.memory import estimate
 from devrf.stages.stage import ScheduledStage
@@ -100,6 +102,7 @@ class Run:
         instantiate(self.config.deformation, _partial_=True, _convert_="all")
         weights = {k: v for k, v in self.config.deformation.loss.items() if k != "tv"}
         WeightedLoss(MOTION_TERMS, weights)
+        self._evaluation().check()
         instantiate(self.config.video)
 
     def prepare(self) -> None:
@@ -146,21 +149,25 @@ class Run:
         """Score what was learned on held-out views; write metrics and contact sheets."""
         stored = self._load("deformation", "canonical")
         records = stored.passport.records
-        rest = self._score(stored, "static")
+        judge = self._evaluation().judge(self._device())
+        rest = self._score(stored, "static", judge)
+        frames = {"static": rest}
         sections: dict[str, Any] = {
             "scene": self.datamodule.scene.name,
-            "canonical": {**_means(rest), **records.get("canonical", {})},
+            "canonical": {**mean_scores(rest), **records.get("canonical", {})},
         }
         if stored.model.deformation is not None:
-            moving = self._score(stored, "dynamic")
+            moving = frames["dynamic"] = self._score(stored, "dynamic", judge)
             checkpoint = self._checkpoint("deformation")
             sections["deformation"] = {
-                **_means(moving),
+                **mean_scores(moving),
                 "rest_pose_psnr": round(mean(v.rest_pose_psnr for v in moving), 4),
                 **records.get("deformation", {}),
                 "checkpoint_mb": round(checkpoint.stat().st_size / 1e6, 3),
             }
-        update_json(self.folder / "metrics.json", sections)
+        write_frames(self.folder / "frames.csv", frames)
+        ran = provenance(stored.model, self._device())
+        update_json(self.folder / "metrics.json", {**sections, "run": ran})
         for name, values in sections.items():
             if isinstance(values, dict):
                 log.info("%s: %s", name, _line(values))
@@ -228,21 +235,20 @@ class Run:
         device: torch.device = trainer.strategy.root_device
         return device
 
-    def _score(self, stored: Stored, capture: CaptureName) -> list[HeldOutView]:
+    def _evaluation(self) -> Evaluation:
+        chosen: Evaluation = instantiate(self.config.evaluation, _convert_="all")
+        return chosen
+
+    def _score(self, stored: Stored, capture: CaptureName, judge: Judge) -> list[HeldOutView]:
         scene, device = self.datamodule.scene, self._device()
         views, model = scene.capture(capture).test, stored.model.to(device)
         if capture == "static":
             model = model.at_rest()
-        scored = [score(model, views, k, scene.background, device) for k in range(len(views))]
+        scored = [
+            score(model, views, k, scene.background, device, judge) for k in range(len(views))
+        ]
         write_contact_sheet(self.folder / "images" / f"{capture}.png", scored)
         return scored
-
-
-def _means(views: list[HeldOutView]) -> dict[str, float]:
-    return {
-        "psnr": round(mean(view.psnr for view in views), 4),
-        "ssim": round(mean(view.ssim for view in views), 5),
-    }
 
 
 def _line(values: dict[str, Any]) -> str:

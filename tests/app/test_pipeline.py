@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from pathlib import Path
 
 import imageio.v3 as iio
 import pytest
 
-CANONICAL_KEYS = {"psnr", "ssim", "seconds", "iterations", "peak_gpu_gb"}
+FURTHER = {
+    "ms_ssim", "lpips", "psnr_masked", "ssim_masked", "lpips_masked", "depth_error", "flow_error",
+}
+CANONICAL_KEYS = {"psnr", "ssim", "seconds", "iterations", "peak_gpu_gb"} | FURTHER
 DEFORMATION_KEYS = CANONICAL_KEYS | {"rest_pose_psnr", "checkpoint_mb"}
 
 
@@ -25,7 +29,7 @@ def test_the_whole_run_succeeds_and_says_nothing_on_stderr(trained):
 def test_metrics_have_the_documented_keys(trained):
     folder, _ = trained
     found = metrics(folder)
-    assert list(found) == ["scene", "canonical", "deformation"]
+    assert list(found) == ["scene", "canonical", "deformation", "run"]
     assert found["scene"] == "robot"
     assert set(found["canonical"]) == CANONICAL_KEYS
     assert set(found["deformation"]) == DEFORMATION_KEYS
@@ -36,11 +40,65 @@ def test_metrics_have_the_documented_keys(trained):
     )
 
 
+def test_what_is_known_of_an_embedded_scene_is_measured(trained):
+    found = metrics(trained[0])
+    for section in (found["canonical"], found["deformation"]):
+        # 24 x 20 pixels are too few for MS-SSIM's scales.
+        assert section["ms_ssim"] is None
+        assert section["psnr_masked"] > 0 and section["ssim_masked"] < 1
+        assert section["depth_error"] is None or section["depth_error"] > 0
+    assert found["canonical"]["flow_error"] is None
+    assert found["deformation"]["flow_error"] > 0
+
+
+def test_a_run_says_how_it_came_about(trained):
+    ran = metrics(trained[0])["run"]
+    assert ran["parameters"] > 1000 and ran["device"] and ran["torch"]
+
+
+def test_every_frame_has_a_row(trained):
+    with (trained[0] / "frames.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["capture"] for row in rows] == ["static"] * 2 + ["dynamic"] * 3
+    assert [float(row["time"]) for row in rows[2:]] == [0, 0.5, 1]
+    found = metrics(trained[0])["deformation"]
+    for name in ("psnr", "ssim", "psnr_masked", "rest_pose_psnr"):
+        mean = sum(float(row[name]) for row in rows[2:]) / 3
+        assert mean == pytest.approx(found[name], rel=1e-4)
+    assert rows[2]["flow_error"] == ""  # nothing comes before the first frame
+
+
+def test_fewer_metrics_may_be_asked_for(devrf, tmp_path, tiny, trained):
+    checkpoint = trained[0] / "checkpoints" / "deformation.ckpt"
+    outcome = devrf(
+        *tiny, "stage=evaluate", f"ckpt={checkpoint}", "hydra.run.dir=few",
+        "evaluation.metrics=[psnr_masked]",
+    )
+    assert (outcome.status, outcome.err) == (0, "")
+    assert "LPIPS" not in outcome.out
+    found = metrics(tmp_path / "few")["canonical"]
+    assert set(found) == CANONICAL_KEYS - FURTHER | {"psnr_masked"}
+
+
+@pytest.mark.parametrize(
+    ("argument", "expected"),
+    [
+        ("evaluation.metrics=[lpisp]", "evaluation.metrics: no metric 'lpisp'"),
+        ("evaluation.lpips_weights=no.pth", "evaluation.lpips_weights: no file no.pth"),
+    ],
+)
+def test_a_metric_that_cannot_be_is_a_mistake(devrf, tmp_path, tiny, argument, expected):
+    outcome = devrf(*tiny, argument)
+    assert outcome.status == 2
+    assert expected in outcome.err
+    assert not list(tmp_path.iterdir())
+
+
 def test_everything_lies_in_the_run_folder(trained):
     folder, _ = trained
     made = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
     assert {
-        ".hydra/config.yaml", "run.log", "metrics.json",
+        ".hydra/config.yaml", "run.log", "metrics.json", "frames.csv",
         "checkpoints/canonical.ckpt", "checkpoints/deformation.ckpt",
         "images/static.png", "images/dynamic.png",
         "videos/held_out.mp4", "videos/orbit.mp4",
@@ -75,14 +133,15 @@ def test_the_canonical_stage_alone_can_be_scored(devrf, tmp_path, tiny):
     for stage in ("canonical", "evaluate"):
         outcome = devrf(*tiny, f"stage={stage}", "hydra.run.dir=run")
         assert (outcome.status, outcome.err) == (0, "")
-    assert list(metrics(tmp_path / "run")) == ["scene", "canonical"]
+    assert list(metrics(tmp_path / "run")) == ["scene", "canonical", "run"]
 
 
 def test_a_checkpoint_from_elsewhere_is_taken_as_given(devrf, tmp_path, tiny, trained):
     checkpoint = trained[0] / "checkpoints" / "deformation.ckpt"
     outcome = devrf(*tiny, "stage=evaluate", f"ckpt={checkpoint}", "hydra.run.dir=scores")
     assert (outcome.status, outcome.err) == (0, "")
-    assert metrics(tmp_path / "scores") == metrics(trained[0])
+    scores, whole = metrics(tmp_path / "scores"), metrics(trained[0])
+    assert {**scores, "run": None} == {**whole, "run": None}
 
 
 def test_the_deformation_stage_starts_from_a_checkpoint_elsewhere(devrf, tmp_path, tiny, trained):

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import torch
-from kornia.metrics import ssim as ssim_map
+from kornia.metrics import ssim as kornia_ssim
 from torch import Tensor
+from torchmetrics.functional.image import multiscale_structural_similarity_index_measure
+
+WINDOW = 11
+# The coarsest of MS-SSIM's five scales, 1/16 of the image, must hold a whole window.
+MS_SSIM_SMALLEST = 16 * WINDOW
 
 
 def psnr(prediction: Tensor, truth: Tensor) -> float:
@@ -19,6 +24,31 @@ def ssim(prediction: Tensor, truth: Tensor) -> float:
     Gaussian window of 11×11, σ 1.5; only pixels whose window lies inside the image count where
     the image is large enough to have any.
     """
-    a, b = (x.permute(2, 0, 1)[None].float() for x in (prediction, truth))
-    padding = "valid" if min(a.shape[-2:]) >= 11 else "same"
-    return float(ssim_map(a, b, window_size=11, max_val=1.0, padding=padding).mean())
+    return float(ssim_map(prediction, truth).mean())
+
+
+def ssim_map(prediction: Tensor, truth: Tensor) -> Tensor:
+    """Structural similarity at each pixel that :func:`ssim` counts: (H − 10, W − 10, 3).
+
+    Of images smaller than a window (H, W, 3), with what is missing mirrored.
+    """
+    a, b = (_batched(image) for image in (prediction, truth))
+    padding = "valid" if min(a.shape[-2:]) >= WINDOW else "same"
+    found: Tensor = kornia_ssim(a, b, window_size=WINDOW, max_val=1.0, padding=padding)
+    return found[0].permute(1, 2, 0)
+
+
+def ms_ssim(prediction: Tensor, truth: Tensor) -> float | None:
+    """Multi-scale structural similarity of two (H, W, 3) images in [0, 1] (Wang et al. 2003).
+
+    Five scales with the paper's exponents; each is the mean over all windows inside the image
+    and all channels, negative ones counting as 0. None where a side is under 176 pixels.
+    """
+    a, b = (_batched(image) for image in (prediction, truth))
+    if min(a.shape[-2:]) < MS_SSIM_SMALLEST:
+        return None
+    return float(multiscale_structural_similarity_index_measure(a, b, data_range=1.0))
+
+
+def _batched(image: Tensor) -> Tensor:
+    return image.permute(2, 0, 1)[None].float()

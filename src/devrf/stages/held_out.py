@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -10,6 +10,7 @@ from torch import Tensor
 from devrf.metrics.image import psnr, ssim
 from devrf.rendering.model import Picture, SceneModel
 from devrf.scenes.scene import Background, Views
+from devrf.stages.evaluation import Judge, Sight
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,7 @@ class HeldOutView:
         psnr: dB.
         ssim: in [−1, 1].
         rest_pose_psnr: dB that the canonical field alone reaches there.
+        further: what else was measured, by name; None where there is nothing to compare with.
     """
 
     name: str
@@ -33,18 +35,50 @@ class HeldOutView:
     psnr: float
     ssim: float
     rest_pose_psnr: float
+    further: dict[str, float | None] = field(default_factory=dict)
+
+    @property
+    def scores(self) -> dict[str, float | None]:
+        """Every metric by name."""
+        own = {"psnr": self.psnr, "ssim": self.ssim, "rest_pose_psnr": self.rest_pose_psnr}
+        return {**own, **self.further}
 
 
 def score(
-    model: SceneModel, views: Views, index: int, background: Background, device: torch.device
+    model: SceneModel,
+    views: Views,
+    index: int,
+    background: Background,
+    device: torch.device,
+    judge: Judge | None = None,
 ) -> HeldOutView:
-    """Render image ``index`` of held-out ``views`` and compare it with the truth."""
+    """Render image ``index`` of held-out ``views`` and compare it with the truth.
+
+    Args:
+        model: what was learned, on ``device``.
+        views: the held-out views, on the host.
+        index: which of them.
+        background: what is behind the matte.
+        device: where to render.
+        judge: measures more than PSNR and SSIM.
+    """
     time = float(views.times[index])
     truth = truth_image(views, index, background)
-    prediction = _see(model, views, index, time, background, device)
+    seen = _see(model, views, index, time, background, device)
+    prediction = _image(seen, views)
     rest = prediction
     if model.warp(time) is not None:
-        rest = _see(model, views, index, 0.0, background, device)
+        rest = _image(_see(model, views, index, 0.0, background, device), views)
+    further: dict[str, float | None] = {}
+    if judge is not None and judge.metrics:
+        shape = (views.height, views.width)
+        distance = _world_distance(model, views, index, seen)
+        further = judge.scores(
+            Sight(
+                model, views, index, prediction, truth, distance.view(shape),
+                seen.opacity.cpu().view(shape), judge.lpips,
+            )
+        )
     return HeldOutView(
         name=views.names[index],
         time=time,
@@ -53,6 +87,7 @@ def score(
         psnr=psnr(prediction, truth),
         ssim=ssim(prediction, truth),
         rest_pose_psnr=psnr(rest, truth),
+        further=further,
     )
 
 
@@ -77,8 +112,20 @@ def _see(
     time: float,
     background: Background,
     device: torch.device,
-) -> Tensor:
+) -> Picture:
     rays = views.cameras.image_rays(index).to(device)
     behind = torch.full((3,), background_value(background), device=device)
-    picture: Picture = model.picture(rays, time, behind)
-    return picture.color.view(views.height, views.width, 3).clamp(0, 1).cpu()
+    return model.picture(rays, time, behind)
+
+
+def _image(seen: Picture, views: Views) -> Tensor:
+    return seen.color.view(views.height, views.width, 3).clamp(0, 1).cpu()
+
+
+def _world_distance(model: SceneModel, views: Views, index: int, seen: Picture) -> Tensor:
+    """Depths (H·W,) of a picture as distances from the camera in world units."""
+    rays = views.cameras.image_rays(index)
+    own = model.space.rays(rays)
+    points = model.space.to_world(own.at(torch.arange(len(own)), seen.depth.cpu()))
+    distance: Tensor = torch.linalg.vector_norm(points - rays.origins, dim=1)
+    return distance

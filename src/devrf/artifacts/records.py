@@ -1,0 +1,123 @@
+"""What a run leaves in numbers: means, a row per held-out image, and what it takes to repeat it."""
+
+from __future__ import annotations
+
+import csv
+import platform
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from statistics import mean
+from typing import Any
+
+import lightning
+import torch
+
+import devrf
+from devrf.artifacts.files import whole_file
+from devrf.rendering.model import SceneModel
+from devrf.stages.held_out import HeldOutView
+
+
+def mean_scores(views: Sequence[HeldOutView]) -> dict[str, float | None]:
+    """Means of each metric over held-out images, as the paper's tables have them.
+
+    Over the images that have a value, of which there may be none (None); rounded to five
+    digits after the point. ``rest_pose_psnr`` is not among them: at rest it says nothing.
+    """
+    names = [name for name in views[0].scores if name != "rest_pose_psnr"]
+    means: dict[str, float | None] = {}
+    for name in names:
+        known = [value for view in views if (value := view.scores[name]) is not None]
+        means[name] = round(mean(known), 5) if known else None
+    return means
+
+
+def write_frames(path: Path, captures: Mapping[str, Sequence[HeldOutView]]) -> None:
+    """Write a CSV table with a row for each held-out image: capture, name, time, every metric.
+
+    Args:
+        path: the file.
+        captures: images that were scored alike, by the capture they belong to.
+    """
+    views = [view for group in captures.values() for view in group]
+    names = list(dict.fromkeys(name for view in views for name in view.scores))
+    with whole_file(path) as partial, partial.open("w", newline="") as file:
+        table = csv.writer(file)
+        table.writerow(["capture", "name", "time", *names])
+        for capture, group in captures.items():
+            for view in group:
+                values = [view.scores.get(name) for name in names]
+                cells = ["" if value is None else f"{value:.6g}" for value in values]
+                table.writerow([capture, view.name, f"{view.time:.6g}", *cells])
+
+
+def provenance(model: SceneModel, device: torch.device) -> dict[str, Any]:
+    """What it takes, beside the composed config, to tell how numbers came about.
+
+    Returns:
+        Plain data: versions, device, git revision (None outside a checkout; ``-dirty`` where
+        files were changed), learned values, peak memory of this process in GiB, UTC date.
+    """
+    return {
+        "devrf": devrf.__version__,
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "lightning": lightning.__version__,
+        "device": device_name(device),
+        "git": git_revision(),
+        "parameters": parameter_count(model),
+        "peak_host_gb": peak_host_memory(),
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+
+
+def parameter_count(model: SceneModel) -> int:
+    """How many numbers were learned: canonical field and, where there is one, deformation."""
+    learned: list[torch.Tensor] = list(model.parameters())
+    if model.deformation is not None:
+        learned += [model.deformation.to_canonical, model.deformation.to_time]
+    return sum(tensor.numel() for tensor in learned)
+
+
+def device_name(device: torch.device) -> str:
+    """The GPU's name, or the processor's."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.partition(":")[2].strip() for line in lines if "model name" in line)
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
+
+
+def git_revision(root: Path | None = None) -> str | None:
+    """The commit that the package runs from, if its folder is a checkout of devrf.
+
+    Args:
+        root: the checkout; None: the folder that holds ``src/devrf``.
+    """
+    root = Path(devrf.__file__).resolve().parents[2] if root is None else root
+    if not (root / ".git").exists():
+        return None
+    command = ["git", "describe", "--always", "--dirty", "--exclude=*", "--abbrev=40"]
+    try:
+        done = subprocess.run(
+            command, cwd=root, capture_output=True, text=True, timeout=10, check=True
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip() or None
+
+
+def peak_host_memory() -> float | None:
+    """The most memory this process has held so far, GiB; None where the system does not say."""
+    if sys.platform == "win32":
+        return None
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    unit = 1 if sys.platform == "darwin" else 2**10
+    return round(peak * unit / 2**30, 3)

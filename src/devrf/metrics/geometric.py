@@ -1,0 +1,33 @@
+"""How far rendered geometry and motion are from the truth."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+# A pixel shows a surface where at least this much of its ray is stopped.
+SOLID = 0.5
+
+
+def depth_error(depth: Tensor, opacity: Tensor, truth: Tensor) -> float | None:
+    """Mean absolute error of depths (H, W), in their unit.
+
+    Over the pixels where both are finite and more than half of the ray is stopped: how far what
+    is seen is from where it should be, not how much is missing. None without such pixels.
+
+    Args:
+        depth: rendered distance along each pixel's ray.
+        opacity: in [0, 1], how much of each ray is stopped.
+        truth: true distance, +inf where the ray hits nothing.
+    """
+    counted = truth.isfinite() & depth.isfinite() & (opacity > SOLID)
+    if not bool(counted.any()):
+        return None
+    return float((depth[counted] - truth[counted]).abs().mean())
+
+
+def end_point_error(flow: Tensor, truth: Tensor) -> float | None:
+    """Mean Euclidean length of the differences of two flows (P, 2), in their unit.
+
+    None of no vectors at all.
+    """
+    return float((flow - truth).norm(dim=-1).mean()) if len(truth) else None

@@ -1,0 +1,27 @@
+"""How alike two images are where a mask says so: inside the matte, without the background."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from devrf.metrics.image import psnr, ssim_map
+
+
+def psnr_masked(prediction: Tensor, truth: Tensor, mask: Tensor) -> float | None:
+    """PSNR in dB of the pixels of two (H, W, 3) images in [0, 1] where ``mask`` (H, W) is True.
+
+    None where it is nowhere True.
+    """
+    return psnr(prediction[mask], truth[mask]) if bool(mask.any()) else None
+
+
+def ssim_masked(prediction: Tensor, truth: Tensor, mask: Tensor) -> float | None:
+    """Mean SSIM of the windows of two (H, W, 3) images whose centres ``mask`` (H, W) holds.
+
+    The windows reach beyond the mask, as SSIM compares neighbourhoods. None where no window
+    that counts has its centre there.
+    """
+    values = ssim_map(prediction, truth)
+    edge = (mask.shape[0] - values.shape[0]) // 2
+    inner = mask[edge : edge + values.shape[0], edge : edge + values.shape[1]]
+    return float(values[inner].mean()) if bool(inner.any()) else None

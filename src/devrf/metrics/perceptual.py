@@ -1,0 +1,148 @@
+"""LPIPS: distance of two images in the features of a network that was trained to see.
+
+Zhang et al. 2018, version 0.1: images in [−1, 1] are shifted and scaled by fixed constants;
+after five of the trunk's layers the features are normalised to unit length over channels; the
+squared differences, weighted by channel (the linear heads), are averaged over the image and
+summed over the five layers. The trunks are VGG16's and AlexNet's convolutional parts with
+torchvision's layer numbers, built here so that torchvision need not be installed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import interpolate, normalize
+
+SHIFT = (-0.030, -0.088, -0.188)
+SCALE = (0.458, 0.448, 0.450)
+
+
+@dataclass(frozen=True)
+class Trunk:
+    """The convolutional part of a network.
+
+    Attributes:
+        layers: (channels, kernel, stride, padding) of a convolution, which a ReLU follows, or
+            (kernel, stride) of a max pooling.
+        taps: numbers of the layers after which features are compared.
+        smallest: the least image side, in pixels, that leaves features after every tap.
+        file: name of torchvision's published weights.
+    """
+
+    layers: tuple[tuple[int, ...], ...]
+    taps: tuple[int, ...]
+    smallest: int
+    file: str
+
+    def build(self) -> nn.Sequential:
+        """The layers, with weights yet to be loaded, numbered as torchvision's."""
+        channels, built = 3, nn.Sequential()
+        for layer in self.layers:
+            if len(layer) == 2:
+                kernel, stride = layer
+                built.append(nn.MaxPool2d(kernel, stride))
+            else:
+                width, kernel, stride, padding = layer
+                built.append(nn.Conv2d(channels, width, kernel, stride, padding))
+                built.append(nn.ReLU())
+                channels = width
+        return built
+
+
+def _vgg_layers(*blocks: tuple[int, int]) -> Iterable[tuple[int, ...]]:
+    for number, (channels, count) in enumerate(blocks):
+        if number:
+            yield (2, 2)
+        yield from [(channels, 3, 1, 1)] * count
+
+
+TRUNKS = {
+    "vgg": Trunk(
+        layers=tuple(_vgg_layers((64, 2), (128, 2), (256, 3), (512, 3), (512, 3))),
+        taps=(3, 8, 15, 22, 29),
+        smallest=16,
+        file="vgg16-397923af.pth",
+    ),
+    "alex": Trunk(
+        layers=(
+            (64, 11, 4, 2), (3, 2), (192, 5, 1, 2), (3, 2),
+            (384, 3, 1, 1), (256, 3, 1, 1), (256, 3, 1, 1),
+        ),
+        taps=(1, 4, 7, 9, 11),
+        smallest=31,
+        file="alexnet-owt-7be5be79.pth",
+    ),
+}
+
+
+class Lpips(nn.Module):
+    """Perceptual distance of two images; frozen."""
+
+    shift: Tensor
+    scale: Tensor
+
+    def __init__(
+        self, trunk: Trunk, features: Mapping[str, Tensor], heads: Iterable[Tensor]
+    ) -> None:
+        """Put a network and its heads together.
+
+        Args:
+            trunk: the network.
+            features: its weights, ``0.weight``, ``0.bias``, …, of any floating type.
+            heads: weight of each channel, (1, C, 1, 1), for each tap.
+
+        Raises:
+            RuntimeError: the weights are not those of the trunk.
+        """
+        super().__init__()
+        self.trunk = trunk
+        self.layers = trunk.build()
+        self.layers.load_state_dict(dict(features))
+        self.heads = nn.ParameterList(head.float() for head in heads)
+        self.register_buffer("shift", torch.tensor(SHIFT)[:, None, None])
+        self.register_buffer("scale", torch.tensor(SCALE)[:, None, None])
+        self.eval().requires_grad_(False)
+
+    def forward(self, prediction: Tensor, truth: Tensor) -> float | None:
+        """LPIPS of two (H, W, 3) images in [0, 1]; None where they are too small."""
+        maps = self.maps(prediction, truth)
+        return None if maps is None else float(sum(layer.mean() for layer in maps))
+
+    def inside(self, prediction: Tensor, truth: Tensor, mask: Tensor) -> float | None:
+        """LPIPS of two (H, W, 3) images in [0, 1] where ``mask`` (H, W) is True.
+
+        Outside the mask the prediction is taken to be right; the layers' differences,
+        interpolated to the image's size, are averaged inside it. None where that is nowhere.
+        """
+        if not bool(mask.any()):
+            return None
+        maps = self.maps(torch.where(mask[..., None], prediction, truth), truth)
+        if maps is None:
+            return None
+        shape = mask.shape
+        full = [interpolate(layer, shape, mode="bilinear")[0, 0].cpu() for layer in maps]
+        return float(sum(layer[mask].mean() for layer in full))
+
+    @torch.no_grad()
+    def maps(self, prediction: Tensor, truth: Tensor) -> list[Tensor] | None:
+        """Differences (1, 1, h, w) after each tap, or None of images that are too small."""
+        if min(truth.shape[:2]) < self.trunk.smallest:
+            return None
+        features = zip(self._features(prediction), self._features(truth), strict=True)
+        return [
+            (head * (a - b).square()).sum(dim=1, keepdim=True)
+            for head, (a, b) in zip(self.heads, features, strict=True)
+        ]
+
+    def _features(self, image: Tensor) -> list[Tensor]:
+        value = image.to(self.shift).permute(2, 0, 1)
+        value = ((2 * value - 1 - self.shift) / self.scale)[None]
+        found = []
+        for number, layer in enumerate(self.layers):
+            value = layer(value)
+            if number in self.trunk.taps:
+                found.append(normalize(value, dim=1, eps=1e-8))
+        return found

@@ -1,0 +1,115 @@
+"""Means, rows and provenance: read back as a user would."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+from pathlib import Path
+
+import pytest
+import torch
+
+import devrf
+from devrf.artifacts.records import (
+    git_revision,
+    mean_scores,
+    parameter_count,
+    peak_host_memory,
+    provenance,
+    write_frames,
+)
+from devrf.fields.deformation import DeformationField
+from devrf.geometry.clock import FrameClock
+from devrf.stages.checkpoint import Stored
+from devrf.stages.held_out import HeldOutView
+
+HOST = torch.device("cpu")
+
+
+def view(name: str, time: float, psnr: float, **further: float | None) -> HeldOutView:
+    image = torch.zeros(2, 2, 3)
+    return HeldOutView(name, time, image, image, psnr, 0.5, 9.0, further)
+
+
+def test_means_are_over_what_is_known() -> None:
+    views = [
+        view("a", 0.0, 20.0, depth_error=0.5, flow_error=None, lpips=None),
+        view("b", 1.0, 31.0, depth_error=0.25, flow_error=3.0, lpips=None),
+    ]
+    assert mean_scores(views) == {
+        "psnr": 25.5, "ssim": 0.5, "depth_error": 0.375, "flow_error": 3.0, "lpips": None,
+    }
+
+
+def test_frames_read_back(tmp_path: Path) -> None:
+    path = tmp_path / "run" / "frames.csv"
+    rest = [view("r, 0", 0.0, 20.0, depth_error=0.5, flow_error=None)]
+    moving = [view(f"m{k}", k / 2, 20.0 + k, depth_error=None, flow_error=1.5) for k in range(3)]
+    write_frames(path, {"static": rest, "dynamic": moving})
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["capture"] for row in rows] == ["static"] + ["dynamic"] * 3
+    assert rows[0] == {
+        "capture": "static", "name": "r, 0", "time": "0", "psnr": "20", "ssim": "0.5",
+        "rest_pose_psnr": "9", "depth_error": "0.5", "flow_error": "",
+    }
+    assert [float(row["time"]) for row in rows[1:]] == [0.0, 0.5, 1.0]
+    assert [float(row["psnr"]) for row in rows[1:]] == [20.0, 21.0, 22.0]
+    assert {(row["depth_error"], row["flow_error"]) for row in rows[1:]} == {("", "1.5")}
+
+
+def test_provenance_is_plain_and_whole(rest: Stored) -> None:
+    found = provenance(rest.model, HOST)
+    assert json.loads(json.dumps(found)) == found
+    assert set(found) == {
+        "devrf", "python", "torch", "lightning", "device", "git", "parameters", "peak_host_gb",
+        "date",
+    }
+    assert found["devrf"] == devrf.__version__ and found["torch"] == torch.__version__
+    assert found["device"]
+    assert found["date"].endswith("+00:00")
+
+
+def test_learned_values_are_counted_by_hand(rest: Stored) -> None:
+    model = rest.model
+    grids = [model.canonical.density.values, model.canonical.color.values]
+    decoder = sum(p.numel() for p in model.canonical.decoder.parameters())
+    at_rest = sum(grid.numel() for grid in grids) + decoder
+    assert parameter_count(model) == at_rest
+    field = DeformationField(model.canonical.box, FrameClock((0.0, 0.5, 1.0)), voxels=27)
+    model.deformation = field
+    # Three frames, to canonical space and back, three coordinates a voxel.
+    voxels = field.shape[0] * field.shape[1] * field.shape[2]
+    assert parameter_count(model) == at_rest + 3 * 2 * 3 * voxels
+
+
+def test_peak_memory_is_that_of_a_process_with_torch() -> None:
+    peak = peak_host_memory()
+    assert peak is None or 0.05 < peak < 100
+
+
+def test_the_revision_is_that_of_a_checkout(tmp_path: Path) -> None:
+    assert git_revision(tmp_path) is None
+
+    def git(*arguments: str) -> str:
+        identity = ["-c", "user.name=a", "-c", "user.email=a@b.c", "-c", "commit.gpgsign=false"]
+        done = subprocess.run(
+            ["git", *identity, *arguments], cwd=tmp_path, capture_output=True, text=True,
+            check=True,
+        )
+        return done.stdout.strip()
+
+    try:
+        git("init")
+    except FileNotFoundError:
+        pytest.skip("git is not installed")
+    assert git_revision(tmp_path) is None  # nothing committed yet
+    (tmp_path / "file").write_text("one")
+    git("add", "file")
+    git("commit", "-m", "one")
+    git("tag", "v1")
+    head = git("rev-parse", "HEAD")
+    assert git_revision(tmp_path) == head
+    (tmp_path / "file").write_text("two")
+    assert git_revision(tmp_path) == f"{head}-dirty"

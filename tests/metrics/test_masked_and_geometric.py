@@ -1,0 +1,62 @@
+"""Metrics inside a mask, and errors of depth and motion, by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from devrf.metrics.geometric import depth_error, end_point_error
+from devrf.metrics.image import ssim, ssim_map
+from devrf.metrics.masked import psnr_masked, ssim_masked
+
+
+def test_masked_psnr_counts_the_masked_pixels_alone() -> None:
+    truth = torch.zeros(2, 2, 3)
+    seen = torch.tensor([[0.1, 0.9], [0.3, 0.9]])[..., None].expand(2, 2, 3)
+    mask = torch.tensor([[True, False], [True, False]])
+    # Mean square of 0.1 and 0.3.
+    assert psnr_masked(seen, truth, mask) == pytest.approx(-10 * np.log10(0.05), abs=1e-4)
+    assert psnr_masked(seen, truth, ~mask) == pytest.approx(-10 * np.log10(0.81), abs=1e-4)
+    assert psnr_masked(seen, truth, torch.zeros(2, 2, dtype=torch.bool)) is None
+
+
+def test_masked_ssim_is_the_mean_over_windows_centred_in_the_mask(rng: torch.Generator) -> None:
+    a, b = torch.rand(16, 14, 3, generator=rng), torch.rand(16, 14, 3, generator=rng)
+    mask = torch.zeros(16, 14, dtype=torch.bool)
+    mask[7, 8] = True
+    # The window around (7, 8) is rows 2 to 12 and columns 3 to 13.
+    alone = ssim(a[2:13, 3:14], b[2:13, 3:14])
+    assert ssim_masked(a, b, mask) == pytest.approx(alone, abs=1e-5)
+    everywhere = torch.ones(16, 14, dtype=torch.bool)
+    assert ssim_masked(a, b, everywhere) == pytest.approx(ssim(a, b), abs=1e-6)
+    mask[:] = False
+    mask[0, 0] = True  # no whole window lies around a corner
+    assert ssim_masked(a, b, mask) is None
+
+
+def test_masked_ssim_of_an_image_smaller_than_a_window(rng: torch.Generator) -> None:
+    a, b = torch.rand(8, 9, 3, generator=rng), torch.rand(8, 9, 3, generator=rng)
+    mask = torch.zeros(8, 9, dtype=torch.bool)
+    mask[2, 3] = True
+    assert ssim_masked(a, b, mask) == pytest.approx(float(ssim_map(a, b)[2, 3].mean()))
+
+
+def test_depth_error_by_hand() -> None:
+    inf = math.inf
+    truth = torch.tensor([[2.0, inf, 3.0], [4.0, 5.0, 6.0]])
+    depth = torch.tensor([[2.5, 1.0, 2.0], [9.0, inf, 6.0]])
+    opacity = torch.tensor([[0.9, 1.0, 0.6], [0.5, 1.0, 1.0]])
+    # Off by 0.5, 1 and 0; not counted: nothing there, half transparent, seen at infinity.
+    assert depth_error(depth, opacity, truth) == pytest.approx(0.5)
+    assert depth_error(depth, 0 * opacity, truth) is None
+    assert depth_error(depth, opacity, torch.full((2, 3), inf)) is None
+
+
+def test_end_point_error_by_hand() -> None:
+    truth = torch.tensor([[1.0, 1.0], [0.0, -2.0]])
+    assert end_point_error(truth, truth) == 0
+    assert end_point_error(torch.zeros(2, 2), truth) == pytest.approx((2**0.5 + 2) / 2)
+    assert end_point_error(truth[:0], truth[:0]) is None

@@ -1,0 +1,150 @@
+"""LPIPS: two checked distances, torchmetrics' own put together from our trunks, and no weights."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from urllib.error import URLError
+
+import imageio.v3 as iio
+import pytest
+import torch
+from torch import Tensor, nn
+from torchmetrics.functional.image import lpips as theirs
+
+from devrf.errors import DevrfError
+from devrf.metrics.perceptual import TRUNKS, Lpips
+from devrf.metrics.pretrained import Network, load_lpips, read_lpips
+
+SHARED = Path(__file__).parents[3] / "shared" / "weights"
+
+
+def random_weights(network: Network, folder: Path) -> Path:
+    """A file with weights of a network, as torchvision names them, and a classifier's."""
+    torch.manual_seed(3)
+    state = TRUNKS[network].build().state_dict()
+    stored = {f"features.{name}": value for name, value in state.items()}
+    path = folder / TRUNKS[network].file
+    torch.save({**stored, "classifier.0.weight": torch.zeros(2)}, path)
+    return path
+
+
+@pytest.fixture
+def pair(rng: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Two images of 40×48 pixels."""
+    return torch.rand(40, 48, 3, generator=rng), torch.rand(40, 48, 3, generator=rng)
+
+
+@pytest.fixture
+def empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A torch cache without any weights: its folder of checkpoints."""
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path / "hub"))
+    checkpoints = tmp_path / "hub" / "checkpoints"
+    checkpoints.mkdir(parents=True)
+    return checkpoints
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="the weights are not beside this checkout")
+def test_checked_distances() -> None:
+    lpips = read_lpips("vgg", SHARED / "vgg16_features_fp16.pth")
+
+    def image(name: str) -> Tensor:
+        pixels = iio.imread(SHARED / "lpips_fixture" / f"{name}.png")
+        return torch.from_numpy(pixels).float() / 255
+
+    truth = image("ex_ref")
+    for name, distance in (("ex_p0", 0.5686), ("ex_p1", 0.4217)):
+        assert lpips(image(name), truth) == pytest.approx(distance, abs=2e-3)
+        everywhere = torch.ones(64, 64, dtype=torch.bool)
+        assert lpips.inside(image(name), truth, everywhere) == pytest.approx(distance, abs=2e-3)
+
+
+@pytest.mark.parametrize("network", ["vgg", "alex"])
+def test_agrees_with_torchmetrics_on_the_same_layers(
+    network: Network, pair: tuple[Tensor, Tensor], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ours = read_lpips(network, random_weights(network, tmp_path))
+
+    def features(net: str, pretrained: bool = False) -> nn.Sequential:
+        return ours.layers
+
+    # Which layers are compared, the constants, the heads: all but the layers is theirs.
+    monkeypatch.setattr(theirs, "_get_tv_model_features", features)
+    net = theirs._LPIPS(net=network)
+    a, b = (image.permute(2, 0, 1)[None] for image in pair)
+    expected = float(net(a, b, normalize=True))
+    assert expected > 1e-3
+    assert ours(*pair) == pytest.approx(expected, rel=1e-4)
+    assert ours(pair[0], pair[0]) == 0
+
+
+def test_only_what_lies_inside_the_mask_counts(
+    pair: tuple[Tensor, Tensor], tmp_path: Path
+) -> None:
+    lpips = read_lpips("vgg", random_weights("vgg", tmp_path))
+    truth, other = pair
+    mask = torch.zeros(40, 48, dtype=torch.bool)
+    mask[8:20, 10:30] = True
+    outside = torch.where(mask[..., None], truth, other)
+    assert lpips.inside(outside, truth, mask) == 0
+    inside = lpips.inside(other, truth, mask)
+    assert inside is not None and inside > 0
+    assert lpips.inside(other, truth, torch.zeros_like(mask)) is None
+
+
+@pytest.mark.parametrize("network", ["vgg", "alex"])
+def test_images_that_are_too_small_have_none(network: Network, tmp_path: Path) -> None:
+    lpips = read_lpips(network, random_weights(network, tmp_path))
+    side = TRUNKS[network].smallest
+    enough, less = torch.rand(side, side, 3), torch.rand(side - 1, side + 9, 3)
+    assert lpips(enough, enough) == 0
+    assert lpips(less, less) is None
+    assert lpips.inside(less, less, torch.ones(less.shape[:2], dtype=torch.bool)) is None
+
+
+def test_weights_in_torchs_cache_are_found(empty_cache: Path) -> None:
+    random_weights("alex", empty_cache)
+    assert isinstance(load_lpips("alex"), Lpips)
+
+
+def test_without_weights_one_line_says_why(
+    empty_cache: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.INFO):
+        assert load_lpips() is None
+    assert len(caplog.messages) == 1
+    assert "LPIPS is null" in caplog.text and str(empty_cache) in caplog.text
+    assert not list(empty_cache.iterdir())
+
+
+def test_a_download_that_fails_says_why(
+    empty_cache: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def fails(url: str, **_: object) -> None:
+        asked.append(url)
+        raise URLError("no network")
+
+    monkeypatch.setattr(torch.hub, "load_state_dict_from_url", fails)
+    with caplog.at_level(logging.INFO):
+        assert load_lpips(download=True) is None
+    assert asked == ["https://download.pytorch.org/models/vgg16-397923af.pth"]
+    assert len(caplog.messages) == 1 and "no network" in caplog.text
+
+
+def test_a_download_fills_the_cache(empty_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        torch.hub, "load_state_dict_from_url", lambda *_, **__: random_weights("alex", empty_cache)
+    )
+    assert isinstance(load_lpips("alex", download=True), Lpips)
+
+
+def test_weights_that_are_given_must_be_there_and_fit(tmp_path: Path) -> None:
+    with pytest.raises(DevrfError, match=r"no\.pth: no such file"):
+        load_lpips("vgg", tmp_path / "no.pth")
+    noise = tmp_path / "noise.pth"
+    noise.write_bytes(b"not weights")
+    for path in (noise, random_weights("alex", tmp_path)):
+        with pytest.raises(DevrfError, match="not the weights of vgg"):
+            load_lpips("vgg", path)
