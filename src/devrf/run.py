@@ -17,7 +17,7 @@ from rich.console import Console
 
 from devrf.artifacts.camera_paths import focus_distance, orbit, spiral
 from devrf.artifacts.contact_sheet import write_contact_sheet
-from devrf.artifacts.files import update_json
+from devrf.artifacts.files import write_json
 from devrf.artifacts.film import FilmSettings, pictures, write_video
 from devrf.artifacts.inspection import inspect_scene
 from devrf.artifacts.inspection_picture import write_inspection_picture
@@ -167,7 +167,7 @@ class Run:
             }
         write_frames(self.folder / "frames.csv", frames)
         ran = provenance(stored.model, self._device())
-        update_json(self.folder / "metrics.json", {**sections, "run": ran})
+        write_json(self.folder / "metrics.json", {**sections, "run": ran})
         for name, values in sections.items():
             if isinstance(values, dict):
                 log.info("%s: %s", name, _line(values))
@@ -214,7 +214,10 @@ class Run:
         return self.folder / "checkpoints" / f"{name}.ckpt"
 
     def _checkpoint(self, *names: str) -> Path:
-        """The checkpoint that was asked for, else the first of ``names`` that the run has."""
+        """The checkpoint that was asked for, else the one of ``names`` that was written last.
+
+        A deformation that is older than the run's canonical field belongs to another.
+        """
         if self.config.ckpt is not None:
             if not Path(self.config.ckpt).is_file():
                 raise DevrfError(f"{self.config.ckpt}: no such checkpoint; set ckpt to a file")
@@ -225,7 +228,7 @@ class Run:
                 f"{self._own_checkpoint(names[-1])}: no such checkpoint; run stage={names[-1]} "
                 "first, or give ckpt=PATH"
             )
-        return found[0]
+        return max(found, key=lambda path: path.stat().st_mtime)
 
     def _load(self, *names: str) -> Stored:
         return load_checkpoint(self._checkpoint(*names), self.datamodule.scene)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
+import os
+import shutil
 from pathlib import Path
 
 import imageio.v3 as iio
@@ -165,3 +167,14 @@ def test_a_sweep_runs_every_combination(devrf, tmp_path, tiny):
     )
     assert (outcome.status, outcome.err) == (0, "")
     assert len(list((tmp_path / "sweep").glob("*/checkpoints/canonical.ckpt"))) == 2
+
+
+def test_a_deformation_older_than_the_canonical_field_is_not_passed_off_as_its_own(
+    devrf, tmp_path, tiny, trained
+):
+    folder = tmp_path / "retrained"
+    shutil.copytree(trained[0], folder)
+    canonical, moving = (folder / "checkpoints" / f"{n}.ckpt" for n in ("canonical", "deformation"))
+    os.utime(canonical, ns=(0, moving.stat().st_mtime_ns + 10**9))
+    assert devrf(*tiny, "stage=evaluate", f"hydra.run.dir={folder}").status == 0
+    assert "deformation" not in metrics(folder)

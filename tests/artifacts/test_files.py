@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from devrf.artifacts.files import update_json, whole_file
+from devrf.artifacts.files import whole_file, write_json
 
 
 def test_a_finished_file_stands_under_its_name_alone(tmp_path: Path) -> None:
@@ -31,16 +31,8 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["metrics.json"]
 
 
-def test_json_is_updated_key_by_key(tmp_path: Path) -> None:
+def test_json_takes_the_place_of_what_was_there(tmp_path: Path) -> None:
     path = tmp_path / "metrics.json"
-    assert update_json(path, {"a": 1, "b": {"c": 2}}) == {"a": 1, "b": {"c": 2}}
-    assert update_json(path, {"b": 3}) == {"a": 1, "b": 3}
-    assert json.loads(path.read_text()) == {"a": 1, "b": 3}
-
-
-@pytest.mark.parametrize("damaged", ["", "{", "[1, 2]"])
-def test_a_damaged_json_file_is_begun_anew(tmp_path: Path, damaged: str) -> None:
-    path = tmp_path / "metrics.json"
-    path.write_text(damaged)
-    update_json(path, {"a": 1})
-    assert json.loads(path.read_text()) == {"a": 1}
+    path.write_text("{ damaged")
+    write_json(path, {"a": 1, "b": {"c": None}})
+    assert json.loads(path.read_text()) == {"a": 1, "b": {"c": None}}

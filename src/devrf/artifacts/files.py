@@ -23,13 +23,7 @@ def whole_file(path: Path) -> Iterator[Path]:
         partial.unlink(missing_ok=True)
 
 
-def update_json(path: Path, values: dict[str, Any]) -> dict[str, Any]:
-    """Put ``values`` over what the JSON object in ``path`` holds, key by key; what results."""
-    try:
-        held = json.loads(path.read_text())
-    except (OSError, ValueError):
-        held = {}
-    merged = {**(held if isinstance(held, dict) else {}), **values}
+def write_json(path: Path, values: dict[str, Any]) -> None:
+    """Write ``values`` as an indented JSON object."""
     with whole_file(path) as partial:
-        partial.write_text(json.dumps(merged, indent=2) + "\n")
-    return merged
+        partial.write_text(json.dumps(values, indent=2) + "\n")
