@@ -105,7 +105,7 @@ class Views:
 
 @dataclass(frozen=True)
 class Capture:
-    """One recording session: images to learn from and images held out.
+    """One recording: images to learn from and images held out.
 
     Attributes:
         train: what the fields are learned from.
