@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import get_args
 
-from devrf.data.datamodule import SceneDataModule
-from devrf.data.flow_source import FlowSource, files_or_none, with_flow
+from devrf.data.flow_source import FlowSource, files_or_none
+from devrf.data.recorded import RecordedDataModule
 from devrf.scenes.llff import read_llff
-from devrf.scenes.scene import Background, Scene
-from devrf.scenes.validation import check_choice
+from devrf.scenes.scene import Background
 
 
-class ForwardFacingDataModule(SceneDataModule):
+class ForwardFacingDataModule(RecordedDataModule):
     """A scene in DeVRF's published forward-facing layout: LLFF's, and fixed views (method §4)."""
 
     def __init__(
@@ -51,11 +48,7 @@ class ForwardFacingDataModule(SceneDataModule):
             train_views: train on the first so many of the other fixed views; None: all.
             frames: keep so many times, evenly spread; None: all.
         """
-        super().__init__()
-        check_choice("data.flow", flow, get_args(FlowSource))
-        self.flow = flow
-        self.flow_cache = None if flow_cache is None else Path(flow_cache)
-        self._read: Callable[[], Scene] = partial(
+        read = partial(
             read_llff,
             root,
             name=name,
@@ -69,7 +62,4 @@ class ForwardFacingDataModule(SceneDataModule):
             train_views=train_views,
             frames=frames,
         )
-
-    def load(self) -> Scene:
-        """Read the scene, and estimate its optical flow if that is asked for."""
-        return with_flow(self._read(), self.flow, self.flow_cache)
+        super().__init__(read, flow, flow_cache)

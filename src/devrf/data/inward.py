@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import get_args
 
-from devrf.data.datamodule import SceneDataModule
-from devrf.data.flow_source import FlowSource, files_or_none, with_flow
+from devrf.data.flow_source import FlowSource, files_or_none
+from devrf.data.recorded import RecordedDataModule
 from devrf.scenes.blender import read_blender
-from devrf.scenes.scene import Background, Scene
-from devrf.scenes.validation import check_choice
-
-log = logging.getLogger(__name__)
+from devrf.scenes.scene import Background
 
 
-class InwardFacingDataModule(SceneDataModule):
+class InwardFacingDataModule(RecordedDataModule):
     """A scene in DeVRF's published Blender layout, or D-NeRF's (method §4)."""
 
     def __init__(
@@ -58,11 +53,7 @@ class InwardFacingDataModule(SceneDataModule):
             frames: keep so many times, evenly spread; None: all.
             static_until: without a static set, the latest time that counts as static.
         """
-        super().__init__()
-        check_choice("data.flow", flow, get_args(FlowSource))
-        self.flow = flow
-        self.flow_cache = None if flow_cache is None else Path(flow_cache)
-        self._read: Callable[[], Scene] = partial(
+        read = partial(
             read_blender,
             root,
             name=name,
@@ -78,9 +69,4 @@ class InwardFacingDataModule(SceneDataModule):
             frames=frames,
             static_until=static_until,
         )
-
-    def load(self) -> Scene:
-        """Read the scene, and estimate its optical flow if that is asked for."""
-        scene = self._read()
-        log.info("%s: box for motion from %s", scene.name, scene.bounds.source)
-        return with_flow(scene, self.flow, self.flow_cache)
+        super().__init__(read, flow, flow_cache)

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from devrf.data.datamodule import SceneDataModule
-from devrf.data.flow_source import ESTIMATED, EstimatedFlow, with_flow
+from devrf.data.flow_source import ESTIMATED, EstimatedFlow
+from devrf.data.recorded import RecordedDataModule
 from devrf.scenes.nerfies import read_nerfies
-from devrf.scenes.scene import Background, Scene
-from devrf.scenes.validation import check_choice
-
-log = logging.getLogger(__name__)
+from devrf.scenes.scene import Background
 
 
-class NerfiesDataModule(SceneDataModule):
+class NerfiesDataModule(RecordedDataModule):
     """A scene in the layout of Nerfies and HyperNeRF."""
 
     def __init__(
@@ -54,11 +50,7 @@ class NerfiesDataModule(SceneDataModule):
             holdout: without ``val_ids``, one of so many images is held out.
             static_until: the latest time in [0, 1] that counts as static.
         """
-        super().__init__()
-        check_choice("data.flow", flow, ESTIMATED)
-        self.flow = flow
-        self.flow_cache = None if flow_cache is None else Path(flow_cache)
-        self._read: Callable[[], Scene] = partial(
+        read = partial(
             read_nerfies,
             root,
             name=name,
@@ -72,9 +64,4 @@ class NerfiesDataModule(SceneDataModule):
             holdout=holdout,
             static_until=static_until,
         )
-
-    def load(self) -> Scene:
-        """Read the scene, and estimate its optical flow if that is asked for."""
-        scene = self._read()
-        log.info("%s: box for motion from %s", scene.name, scene.bounds.source)
-        return with_flow(scene, self.flow, self.flow_cache)
+        super().__init__(read, flow, flow_cache, flows=ESTIMATED)
