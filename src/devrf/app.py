@@ -23,6 +23,6 @@ def main(config: DictConfig) -> None:
     with mistakes_in_one_line(), nothing_left_of_mistakes(folder):
         check_config(config)
         # Imported here: --help and a misspelt key are answered before torch has loaded.
-        from devrf.run import Run
+        from devrf.run.steps import run_stage
 
-        Run(config, folder)(config.stage)
+        run_stage(config, folder)

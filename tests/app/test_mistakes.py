@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import devrf as package
+from devrf.run.steps import STEPS
 
 # Arguments, and what the one line must name.
 MISTAKES = {
@@ -23,7 +24,7 @@ MISTAKES = {
     "unreadable override": (["data.box=[[1"], "data.box=[[1: not understood"),
     "missing root": (["data=inward"], "data.root: required; give data.root=PATH"),
     "missing folder": (["data=inward", "data.root=nowhere"], "nowhere: no such folder"),
-    "unknown stage": (["stage=train"], "stage: expected one of prepare, canonical"),
+    "unknown stage": (["stage=train"], "stage: expected one of prepare, inspect"),
     "too few frames": (["data.frames=1"], "data.frames"),
     "word for a number": (["data.width=abc"], "data.width: expected a whole number, not 'abc'"),
     "fraction for a count": (["seed=1.5"], "seed: expected a whole number, not 1.5"),
@@ -90,10 +91,10 @@ def test_results_of_an_earlier_run_survive_a_mistake(devrf, tmp_path, tiny):
 
 
 def test_a_fault_of_the_program_keeps_its_traceback(devrf, tiny, monkeypatch):
-    def boom(self: object) -> None:
+    def boom(run: object) -> None:
         raise RuntimeError("ours")
 
-    monkeypatch.setattr("devrf.run.Run.canonical", boom)
+    monkeypatch.setitem(STEPS, "canonical", (boom,))
     with pytest.raises(RuntimeError, match="ours"):
         devrf(*tiny, "stage=canonical")
 
@@ -124,8 +125,8 @@ def test_as_a_process_of_its_own(tmp_path):
 
 def test_a_fault_as_a_process_of_its_own(tmp_path):
     script = (
-        "import devrf.run, devrf.__main__\n"
-        "devrf.run.Run.prepare = lambda self: 1 / 0\n"
+        "import devrf.run.steps, devrf.__main__\n"
+        "devrf.run.steps.STEPS['prepare'] = (lambda run: 1 / 0,)\n"
         "devrf.__main__.entry()\n"
     )
     done = command("-c", script, "stage=prepare", folder=tmp_path)

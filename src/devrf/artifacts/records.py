@@ -121,3 +121,8 @@ def peak_host_memory() -> float | None:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     unit = 1 if sys.platform == "darwin" else 2**10
     return round(peak * unit / 2**30, 3)
+
+
+def in_words(values: Mapping[str, Any]) -> str:
+    """``name value, name value, …`` on one line, without what is not known."""
+    return ", ".join(f"{key} {value}" for key, value in values.items() if value is not None)
