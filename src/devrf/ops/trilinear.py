@@ -37,59 +37,74 @@ def interpolate(grid: Tensor, coords: Tensor) -> Tensor:
 class _Interpolate(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, grid: Tensor, coords: Tensor) -> Tensor:
-        rows, fraction, inside = _cell(coords, grid.shape[:3])
-        ctx.save_for_backward(grid, rows, fraction, inside)
+        first, fraction = _cell(coords, grid.shape[:3])
+        ctx.save_for_backward(grid, coords, first, fraction)
+        rows = _corner_rows(first, grid.shape[:3])
         table = grid.reshape(-1, grid.shape[3])
         return _bag(rows, table, _corner_weights(_linear(fraction)))
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        grid, rows, fraction, inside = ctx.saved_tensors
+        grid, coords, first, fraction = ctx.saved_tensors
         grid_grad = coords_grad = None
+        rows = _corner_rows(first, grid.shape[:3])
         table = grid.reshape(-1, grid.shape[3])
         weights = _linear(fraction)
         if ctx.needs_input_grad[0]:
             grid_grad = _scatter(rows, _corner_weights(weights), grad, len(table))
             grid_grad = grid_grad.reshape(grid.shape)
         if ctx.needs_input_grad[1]:
-            coords_grad = torch.empty_like(fraction)
-            rise = torch.ones_like(fraction[:, 0])
-            for axis in range(3):
+            slopes = torch.empty_like(fraction)
+            rise = torch.ones_like(fraction[0])
+            for axis, points in enumerate(grid.shape[:3]):
                 sloped = [*weights[:axis], (-rise, rise), *weights[axis + 1 :]]
                 change = _bag(rows, table, _corner_weights(sloped))
-                coords_grad[:, axis] = (change * grad).sum(dim=1)
-            coords_grad = coords_grad * inside
+                inside = (coords[:, axis] >= 0) & (coords[:, axis] <= points - 1)
+                torch.mul((change * grad).sum(dim=1), inside, out=slopes[axis])
+            coords_grad = slopes.t()
         return grid_grad, coords_grad
 
 
-def _cell(coords: Tensor, shape: torch.Size) -> tuple[Tensor, Tensor, Tensor]:
-    """Rows (M, 8) of each point's corners, fractions (M, 3) in the cell, inside mask (M, 3)."""
-    last = coords.new_tensor(shape) - 1
-    clamped = torch.minimum(coords.clamp(min=0), last)
-    base = torch.minimum(clamped.floor(), last - 1)
-    i, j, k = base.to(torch.int32).unbind(-1)
-    first = (i * shape[1] + j) * shape[2] + k
+def _cell(coords: Tensor, shape: torch.Size) -> tuple[Tensor, Tensor]:
+    """Row (M,) of each point's lowest corner, and fractions (3, M) within the cell.
+
+    Axis by axis: whole vectors are several times faster than rows of three.
+    """
+    along = coords.t().contiguous()
+    fraction = torch.empty_like(along)
+    first = torch.zeros_like(along[0], dtype=torch.int32)
+    for axis, points in enumerate(shape):
+        clamped = along[axis].clamp(0, points - 1)
+        base = clamped.floor().clamp_(max=points - 2)
+        torch.sub(clamped, base, out=fraction[axis])
+        first.mul_(points).add_(base.to(torch.int32))
+    return first, fraction
+
+
+def _corner_rows(first: Tensor, shape: torch.Size) -> Tensor:
+    """Rows (M, 8) of the corners of cells whose lowest corners are in rows ``first`` (M,)."""
     steps = [
         (a * shape[1] + b) * shape[2] + c for a in (0, 1) for b in (0, 1) for c in (0, 1)
     ]
-    rows = first[:, None] + torch.tensor(steps, dtype=torch.int32, device=coords.device)
-    return rows, clamped - base, (coords >= 0) & (coords <= last)
+    return first[:, None] + torch.tensor(steps, dtype=torch.int32, device=first.device)
 
 
 def _linear(fraction: Tensor) -> list[Pair]:
     """Per axis the weights (M,), (M,) of the lower and the upper corner."""
-    return [(1 - f, f) for f in fraction.t().contiguous()]
+    return [(1 - f, f) for f in fraction]
 
 
 def _corner_weights(axes: list[Pair]) -> Tensor:
     """Products (M, 8) of the three axes' weights, in the order of the corners' rows."""
     x, y, z = axes
-    # Whole vectors are multiplied and transposed at the end: broadcasting over pairs is slow.
-    weights = z[0].new_empty(8, len(z[0]))
-    for k, row in enumerate(weights):
-        torch.mul(x[k >> 2] * y[(k >> 1) & 1], z[k & 1], out=row)
-    return weights.t().contiguous()
+    weights = z[0].new_empty(len(z[0]), 8)
+    for pair in range(4):
+        side = x[pair >> 1] * y[pair & 1]
+        # Column by column: broadcasting over pairs, or one transposition at the end, is slower.
+        weights[:, 2 * pair] = side * z[0]
+        weights[:, 2 * pair + 1] = side * z[1]
+    return weights
 
 
 def _bag(rows: Tensor, table: Tensor, weights: Tensor) -> Tensor:

@@ -24,12 +24,12 @@ from devrf.ops.adam import GridAdam
 from devrf.ops.total_variation import add_total_variation_gradient
 from devrf.rendering.model import SceneModel
 from devrf.rendering.render import RenderSettings, render
-from devrf.rendering.sampling import hits
 from devrf.scenes.scene import CaptureName, Views
 from devrf.stages.checkpoint import Passport, Stored
 from devrf.stages.schedules import CanonicalPhase, CanonicalSchedule
 from devrf.stages.settings import FINE_LOSS, SEARCH_LOSS, CanonicalRates, Sampling
 from devrf.stages.stage import Phase, ScheduledStage
+from devrf.stages.useful import meets_matter
 from devrf.stages.visibility import possible_space, share_of_views
 
 log = logging.getLogger(__name__)
@@ -202,13 +202,11 @@ class CanonicalStage(ScheduledStage):
         pool = all_pixels(views, torch.arange(len(views), device=device))
         if everywhere:
             return pool
-        cameras, settings = views.cameras.to(device), self.model.settings
-        box, space = self.model.canonical.box, self.scene.space
+        cameras = views.cameras.to(device)
         kept = torch.cat(
             [
-                hits(space.rays(cameras.image_rays(k)), box, self.model.occupancy,
-                     near=settings.near, far=settings.far)
-                for k in range(len(views))
+                meets_matter(cameras, image, self.model, self.model.occupancy)
+                for image in range(len(views))
             ]
         )
         return PixelPool(pool.image[kept], pool.flat[kept])

@@ -22,13 +22,13 @@ from devrf.ops.total_variation import add_total_variation_gradient
 from devrf.ops.trilinear import interpolate
 from devrf.rendering.model import SceneModel, deformed_occupancy
 from devrf.rendering.render import render
-from devrf.rendering.sampling import hits
 from devrf.scenes.scene import CaptureName, Views
 from devrf.stages.checkpoint import Passport, Stored
 from devrf.stages.flow_start import follow, start_from_tracks
 from devrf.stages.schedules import DeformationPhase, DeformationSchedule
 from devrf.stages.settings import DEFORMATION_LOSS, MotionSettings
 from devrf.stages.stage import Phase, ScheduledStage
+from devrf.stages.useful import meets_matter
 
 
 @dataclass
@@ -204,7 +204,7 @@ class DeformationStage(ScheduledStage):
     @torch.no_grad()
     def _look_around(self) -> None:
         """Find where the visited frame's matter is under the present field."""
-        self.visit.occupancy = deformed_occupancy(self.scene_model, self._warp, margin=2)
+        self.visit.occupancy = deformed_occupancy(self.scene_model, self._warp)
 
     @torch.no_grad()
     def _frame_pools(self, views: Views, frame: int) -> list[PixelPool]:
@@ -227,11 +227,7 @@ class DeformationStage(ScheduledStage):
     def _useful(self, views: Views, pool: PixelPool) -> PixelPool:
         """Pixels on the matte, or whose rays meet the frame's matter; all if there are none."""
         image = int(pool.image[0])
-        settings = self.scene_model.settings
-        rays = self.scene_model.space.rays(views.cameras.image_rays(image))
-        kept = hits(
-            rays, self.field.box, self.visit.occupancy, near=settings.near, far=settings.far
-        )
+        kept = meets_matter(views.cameras, image, self.scene_model, self.visit.occupancy)
         if views.has_alpha:
             kept |= views.pixels[image, :, :, 3].flatten() > 0
         return PixelPool(pool.image[kept], pool.flat[kept]) if bool(kept.any()) else pool
