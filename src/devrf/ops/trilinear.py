@@ -6,6 +6,7 @@ of eight rows: exactly what an embedding bag does, in one pass and without inter
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -13,10 +14,13 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import embedding_bag
 
+from devrf.ops.choice import triton_runs
+from devrf.ops.corners import Shape, shape_of
+
 Pair = tuple[Tensor, Tensor]
 
 
-def interpolate(grid: Tensor, coords: Tensor) -> Tensor:
+def interpolate(grid: Tensor, coords: Tensor, *, gradient: Tensor | None = None) -> Tensor:
     """Values of a grid between its points.
 
     ``out[m] = Σ_{i,j,k ∈ {0,1}} Π_axis w_axis(i,j,k) · grid[⌊c⌋ + (i,j,k)]`` with linear weights;
@@ -26,47 +30,59 @@ def interpolate(grid: Tensor, coords: Tensor) -> Tensor:
     Args:
         grid: (X, Y, Z, C), at least two points along each axis.
         coords: (M, 3) in grid units: 0 … X − 1, 0 … Y − 1, 0 … Z − 1.
+        gradient: None, or a contiguous tensor (X, Y, Z, C) that the grid's gradient is added to
+            in the backward pass, instead of being returned to autograd as a tensor of its own.
+            For a grid that requires gradients and of which few points are touched.
 
     Returns:
         (M, C), differentiable once in ``grid`` and ``coords``.
     """
-    values: Tensor = _Interpolate.apply(grid, coords)  # type: ignore[no-untyped-call]
+    if triton_runs(grid, coords):
+        from devrf.ops.kernels.trilinear import Interpolate
+
+        grid, coords = grid.contiguous(), coords.contiguous()
+        values: Tensor = Interpolate.apply(grid, coords, gradient)  # type: ignore[no-untyped-call]
+        return values
+    values = _Interpolate.apply(grid, coords, gradient)  # type: ignore[no-untyped-call]
     return values
 
 
 class _Interpolate(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, grid: Tensor, coords: Tensor) -> Tensor:
-        first, fraction = _cell(coords, grid.shape[:3])
+    def forward(ctx: Any, grid: Tensor, coords: Tensor, gradient: Tensor | None) -> Tensor:
+        first, fraction = _cell(coords, shape_of(grid))
         ctx.save_for_backward(grid, coords, first, fraction)
-        rows = _corner_rows(first, grid.shape[:3])
+        ctx.gradient = gradient
         table = grid.reshape(-1, grid.shape[3])
+        rows = _corner_rows(first, shape_of(grid))
         return _bag(rows, table, _corner_weights(_linear(fraction)))
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None]:
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
         grid, coords, first, fraction = ctx.saved_tensors
         grid_grad = coords_grad = None
-        rows = _corner_rows(first, grid.shape[:3])
+        rows = _corner_rows(first, shape_of(grid))
         table = grid.reshape(-1, grid.shape[3])
         weights = _linear(fraction)
-        if ctx.needs_input_grad[0]:
-            grid_grad = _scatter(rows, _corner_weights(weights), grad, len(table))
-            grid_grad = grid_grad.reshape(grid.shape)
+        if ctx.gradient is not None:
+            _scatter(rows, _corner_weights(weights), grad, ctx.gradient.view(table.shape))
+        elif ctx.needs_input_grad[0]:
+            grid_grad = torch.zeros_like(grid, memory_format=torch.contiguous_format)
+            _scatter(rows, _corner_weights(weights), grad, grid_grad.view(table.shape))
         if ctx.needs_input_grad[1]:
             slopes = torch.empty_like(fraction)
             rise = torch.ones_like(fraction[0])
-            for axis, points in enumerate(grid.shape[:3]):
+            for axis, points in enumerate(shape_of(grid)):
                 sloped = [*weights[:axis], (-rise, rise), *weights[axis + 1 :]]
                 change = _bag(rows, table, _corner_weights(sloped))
                 inside = (coords[:, axis] >= 0) & (coords[:, axis] <= points - 1)
                 torch.mul((change * grad).sum(dim=1), inside, out=slopes[axis])
             coords_grad = slopes.t()
-        return grid_grad, coords_grad
+        return grid_grad, coords_grad, None
 
 
-def _cell(coords: Tensor, shape: torch.Size) -> tuple[Tensor, Tensor]:
+def _cell(coords: Tensor, shape: Shape) -> tuple[Tensor, Tensor]:
     """Row (M,) of each point's lowest corner, and fractions (3, M) within the cell.
 
     Axis by axis: whole vectors are several times faster than rows of three.
@@ -82,12 +98,23 @@ def _cell(coords: Tensor, shape: torch.Size) -> tuple[Tensor, Tensor]:
     return first, fraction
 
 
-def _corner_rows(first: Tensor, shape: torch.Size) -> Tensor:
+def _corner_rows(first: Tensor, shape: Shape) -> Tensor:
     """Rows (M, 8) of the corners of cells whose lowest corners are in rows ``first`` (M,)."""
+    return first[:, None] + _steps(shape, first.device)
+
+
+@lru_cache(maxsize=256)
+def _steps(shape: Shape, device: torch.device) -> Tensor:
+    """Rows (8,) of a cell's corners from its first one.
+
+    Kept on the device: made anew at every step, they would make the device wait for the host.
+    """
     steps = [
         (a * shape[1] + b) * shape[2] + c for a in (0, 1) for b in (0, 1) for c in (0, 1)
     ]
-    return first[:, None] + torch.tensor(steps, dtype=torch.int32, device=first.device)
+    # A tensor made in inference mode could not be used for training later.
+    with torch.inference_mode(False):
+        return torch.tensor(steps, dtype=torch.int32).to(device)
 
 
 def _linear(fraction: Tensor) -> list[Pair]:
@@ -113,16 +140,14 @@ def _bag(rows: Tensor, table: Tensor, weights: Tensor) -> Tensor:
     return embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
 
 
-def _scatter(rows: Tensor, weights: Tensor, values: Tensor, count: int) -> Tensor:
-    """The transpose of :func:`_bag`: Σ weights · values (M, C) into (count, C)."""
+def _scatter(rows: Tensor, weights: Tensor, values: Tensor, into: Tensor) -> None:
+    """The transpose of :func:`_bag`: adds Σ weights · values (M, C) to rows of ``into``."""
     channels = values.shape[1]
     if values.is_cuda:
         spread = weights[:, :, None] * values[:, None, :]
-        into = values.new_zeros(count, channels)
-        return into.index_add_(0, rows.reshape(-1), spread.reshape(-1, channels))
+        into.index_add_(0, rows.reshape(-1), spread.reshape(-1, channels))
+        return
     # On a CPU adding rows is ten times slower than adding numbers, channel by channel.
-    into = values.new_zeros(count * channels)
-    first = rows.reshape(-1).long() * channels
+    flat, first = into.view(-1), rows.reshape(-1).long() * channels
     for channel, value in enumerate(values.t()):
-        into.scatter_add_(0, first + channel, (weights * value[:, None]).reshape(-1))
-    return into.view(count, channels)
+        flat.scatter_add_(0, first + channel, (weights * value[:, None]).reshape(-1))
