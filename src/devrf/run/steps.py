@@ -17,6 +17,7 @@ from devrf.losses.motion import MOTION_TERMS
 from devrf.run.context import RunContext
 from devrf.run.film import render
 from devrf.run.look import inspect, prepare
+from devrf.run.report import report
 from devrf.run.score import evaluate
 from devrf.run.train import canonical, deformation
 
@@ -28,10 +29,13 @@ STEPS: dict[str, tuple[Callable[[RunContext], None], ...]] = {
     "evaluate": (evaluate,),
     "render": (render,),
     "pipeline": (canonical, deformation, evaluate, render),
+    "report": (report,),
 }
 
 # Stages that no checkpoint is of use to.
-FROM_NOTHING = ("prepare", "inspect", "canonical", "pipeline")
+FROM_NOTHING = ("prepare", "inspect", "canonical", "pipeline", "report")
+# Stages that look at runs, not at a scene.
+OF_NO_SCENE = ("report",)
 
 # What Lightning says of every run (accelerators it looked for, tips, how many workers a loader
 # might have) is of no use to someone who watches a scene being learned.
@@ -75,6 +79,8 @@ def _check(run: RunContext, stage: str) -> None:
             f"ckpt: stage={stage} starts from nothing; with ckpt=PATH give stage=deformation, "
             "stage=evaluate or stage=render"
         )
+    if stage in OF_NO_SCENE:
+        return
     _ = run.datamodule
     instantiate(config.canonical, _convert_="all")
     instantiate(config.deformation, _partial_=True, _convert_="all")
