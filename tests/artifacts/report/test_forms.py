@@ -81,6 +81,14 @@ def test_failures_are_listed_with_their_reason(table, failed, runs):
     assert f"% failed: {first}\n% failed: {second}\n" in latex(found)
 
 
+def test_a_failure_is_told_by_what_it_does_not_share_with_the_others(runs, ran, failed):
+    failed("1", "lost", overrides=["data.width=24", "seed=1"])
+    alone = markdown(tabulate(collect(runs)), {})
+    assert "- 1 (robot data.width=24 seed=1): lost\n" in alone
+    ran("0", overrides=["data.width=24", "seed=0"])
+    assert "- 1 (robot seed=1): lost\n" in markdown(tabulate(collect(runs)), {})
+
+
 def test_plain_text_is_aligned_and_marked(table):
     lines = plain(table()).splitlines()
     assert lines[0].split() == "pig_toy PSNR ↑ SSIM ↑ LPIPS ↓ GPU (GB) ↓ Time ↓".split()

@@ -13,7 +13,7 @@ from devrf.artifacts.report.words import (
     credit,
     headings,
     published_heading,
-    reason,
+    reasons,
 )
 
 SIDE_BY_SIDE = 3
@@ -47,7 +47,7 @@ def latex(table: Table, remarks: Sequence[str] = ()) -> str:
     for start in range(0, len(table.blocks), SIDE_BY_SIDE):
         parts.append(_tabular(table.blocks[start : start + SIDE_BY_SIDE], escaped(words)))
         words = "Continued."
-    lines = [*table.notes, *remarks, *(f"failed: {reason(f)}" for f in table.found.failures)]
+    lines = [*table.notes, *remarks, *(f"failed: {why}" for why in reasons(table.found))]
     parts.append("".join(f"% {' '.join(line.split())}\n" for line in lines))
     return "\n".join(part for part in parts if part)
 

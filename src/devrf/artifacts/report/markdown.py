@@ -14,7 +14,7 @@ from devrf.artifacts.report.words import (
     credit,
     headings,
     published_heading,
-    reason,
+    reasons,
 )
 
 MARKS = {1: "**{}**", 2: "<ins>{}</ins>", 3: "*{}*", None: "{}"}
@@ -44,7 +44,7 @@ def markdown(table: Table, figures: Mapping[str, str], remarks: Sequence[str] = 
     if notes:
         parts.append("\n".join(f"- {escaped(note)}" for note in notes))
     if found.failures:
-        parts += ["## Failed", "\n".join(f"- {escaped(reason(f))}" for f in found.failures)]
+        parts += ["## Failed", "\n".join(f"- {escaped(line)}" for line in reasons(found))]
     if found.skipped:
         parts += ["## Skipped", "\n".join(f"- {escaped(line)}" for line in found.skipped)]
     if figures:
@@ -68,7 +68,7 @@ def plain(table: Table, remarks: Sequence[str] = ()) -> str:
             rows += [[published_heading(), *[""] * len(headings())]]
             rows += [_cells(row, PLAIN_MARKS, "† {}".format) for row in block.published]
         lines += ["  ".join(row).rstrip() for row in aligned(rows)] + [""]
-    lines += [*table.notes, *remarks, *(f"failed: {reason(f)}" for f in table.found.failures)]
+    lines += [*table.notes, *remarks, *(f"failed: {why}" for why in reasons(table.found))]
     return "\n".join([*lines, *table.found.skipped]).rstrip()
 
 

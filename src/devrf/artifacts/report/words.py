@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 
 from devrf.artifacts.report.cells import COLUMNS, Column
 from devrf.artifacts.report.published import published
-from devrf.artifacts.report.runs import Failure
+from devrf.artifacts.report.runs import Collection
 from devrf.artifacts.report.table import Table
 
 
@@ -56,11 +56,18 @@ def published_heading() -> str:
     return f"† published, on an {published().hardware}"
 
 
-def reason(failure: Failure) -> str:
-    """Which run failed, and why, in one line."""
-    told = [failure.scene or "unknown scene", *failure.setup.overrides]
-    fault = " (a fault of the program: see its run.log)" if failure.mistake is False else ""
-    return f"{failure.name} ({' '.join(told)}): {failure.error}{fault}"
+def reasons(found: Collection) -> list[str]:
+    """Which runs failed, and why, a line each; overrides that all runs share are left out."""
+    setups = [run.setup for run in found.runs] + [lost.setup for lost in found.failures]
+    told = [set(setup.overrides) for setup in setups]
+    shared = set.intersection(*told) if len(told) > 1 else set()
+    lines: list[str] = []
+    for failure in found.failures:
+        own = [text for text in failure.setup.overrides if text not in shared]
+        what = " ".join([failure.scene or "unknown scene", *own])
+        fault = " (a fault of the program: see its run.log)" if failure.mistake is False else ""
+        lines.append(f"{failure.name} ({what}): {failure.error}{fault}")
+    return lines
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> list[list[str]]:
