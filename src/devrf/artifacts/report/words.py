@@ -46,8 +46,8 @@ def credit() -> str:
     paper = published()
     return (
         f"As published in {paper.authors}: {paper.title}. {paper.venue}; measured by its authors "
-        f"on an {paper.hardware}, other hardware than ours, and not marked. DeVRF is what they "
-        'call "Ours".'
+        f"on an {paper.hardware}, other hardware than ours, and not marked. What they call Ours "
+        "is DeVRF here."
     )
 
 
