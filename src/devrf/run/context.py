@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from hydra.utils import instantiate
 from lightning import Trainer
+from lightning.pytorch.strategies import Strategy
 from omegaconf import DictConfig
 
 from devrf.data.datamodule import SceneDataModule
@@ -16,6 +17,7 @@ from devrf.errors import DevrfError
 from devrf.scenes.scene import Scene
 from devrf.stages.checkpoint import Stored, load_checkpoint
 from devrf.stages.evaluation import Evaluation
+from devrf.stages.ranks import RaysByRank
 
 
 class RunContext:
@@ -47,14 +49,32 @@ class RunContext:
 
     @cached_property
     def logger(self) -> Any:
-        """The tracker of the whole run, one for both stages."""
-        return instantiate(self.config.logger)
+        """The tracker of the whole run, one for both stages; of several processes, rank 0's."""
+        return instantiate(self.config.logger) if self.leads else False
 
     @cached_property
+    def strategy(self) -> Strategy:
+        """How the configured trainer would work: on which device, in which process of how many.
+
+        Raises:
+            DevrfError: in several processes, but not as the stages need it.
+        """
+        trainer: Trainer = instantiate(self.config.trainer, logger=False)
+        if trainer.world_size > 1 and not isinstance(trainer.strategy, RaysByRank):
+            raise DevrfError(
+                f"trainer.devices: {trainer.world_size} processes need trainer=ddp; give both"
+            )
+        return trainer.strategy
+
+    @property
+    def leads(self) -> bool:
+        """Whether this process writes files and says what happens: rank 0, or the only one."""
+        return bool(self.strategy.is_global_zero)
+
+    @property
     def device(self) -> torch.device:
         """Where the configured trainer would work."""
-        trainer: Trainer = instantiate(self.config.trainer, logger=False)
-        device: torch.device = trainer.strategy.root_device
+        device: torch.device = self.strategy.root_device
         return device
 
     @cached_property
