@@ -184,10 +184,28 @@ def _start(run: RunContext, work: Work, count: int) -> Iterator[Child]:
         process = spawn.Process(
             target=_take_part, args=(work, config, run.folder, there), daemon=True
         )
-        process.start()
+        with _deaf():
+            process.start()
         there.close()
         yield Child(rank, process, here)
     os.environ["LOCAL_RANK"] = "0"
+
+
+@contextmanager
+def _deaf() -> Iterator[None]:
+    """A process started now hears no Ctrl-C and no request to end.
+
+    They may go to all processes at once, but are for rank 0, which ends the others.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    # What is blocked is inherited.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _first_failure(children: Sequence[Child]) -> Failure | None:
@@ -210,7 +228,6 @@ def _watch(child: Child, over: threading.Event) -> None:
 
 def _take_part(work: Work, config: Any, folder: Path, reports: Connection) -> None:
     """The whole life of another process."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for rank 0, which ends this one
     threading.Thread(target=_end_with_parent, daemon=True).start()
     _fall_silent()
     tune_for_cpu()

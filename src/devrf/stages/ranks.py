@@ -5,6 +5,7 @@ With one process everything here gives back what it is given.
 
 from __future__ import annotations
 
+import signal
 import zlib
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -31,6 +32,21 @@ class RaysByRank(DDPStrategy):
             process_group_backend: None: ``nccl`` between GPUs, ``gloo`` between CPUs.
         """
         super().__init__(process_group_backend=process_group_backend)
+        self._on_terminate: Any = signal.SIG_DFL
+
+    def setup_environment(self) -> None:
+        """Begin to talk with the other processes."""
+        super().setup_environment()
+        self._on_terminate = signal.getsignal(signal.SIGTERM)
+
+    def on_train_start(self) -> None:
+        """Answer SIGTERM as before the trainer ran.
+
+        Lightning's own answer is to talk with the other processes at once, whatever they are
+        doing; after that all may wait for one another for good.
+        """
+        if type(signal.getsignal(signal.SIGTERM)).__module__.startswith("lightning."):
+            signal.signal(signal.SIGTERM, self._on_terminate)
 
     def configure_ddp(self) -> None:
         """Leave the stage as it is."""
