@@ -165,6 +165,7 @@ def _others(run: RunContext, work: Work, count: int) -> Iterator[None]:
     finally:
         for child in children:
             child.process.kill()
+            child.process.join()
         over.set()
 
 

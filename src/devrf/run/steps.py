@@ -19,3 +19,97 @@ from devrf.run.film import render
 from devrf.run.look import inspect, prepare
 from devrf.run.processes import together
 from devrf.run.report import report
+from devrf.run.score import evaluate
+from devrf.run.train import canonical, deformation
+
+STEPS: dict[str, tuple[Callable[[RunContext], None], ...]] = {
+    "prepare": (prepare,),
+    "inspect": (inspect,),
+    "canonical": (canonical,),
+    "deformation": (deformation,),
+    "evaluate": (evaluate,),
+    "render": (render,),
+    "pipeline": (canonical, deformation, evaluate, render),
+    "report": (report,),
+}
+
+# Steps that several processes take together; what follows them is for one.
+LEARNING = (canonical, deformation)
+
+# Stages that no checkpoint is of use to.
+FROM_NOTHING = ("prepare", "inspect", "canonical", "pipeline", "report")
+# Stages that look at runs, not at a scene.
+OF_NO_SCENE = ("report",)
+
+# What Lightning says of every run (accelerators it looked for, tips, how many workers a loader
+# might have) is of no use to someone who watches a scene being learned.
+for _name in ("lightning.pytorch", "lightning.fabric"):
+    logging.getLogger(_name).setLevel(logging.WARNING)
+for _words in (
+    "does not have many workers", "LeafSpec", "GPU available but not used",
+    "Experiment logs directory",
+):
+    warnings.filterwarnings("ignore", message=f".*{_words}.*")
+
+
+def run_stage(config: DictConfig, folder: Path) -> None:
+    """Do what ``stage=…`` asks for, in the run's folder.
+
+    Args:
+        config: a composed config (``conf/config.yaml``).
+        folder: where to work.
+
+    Raises:
+        DevrfError: an unknown stage, or whatever is wrong with the input.
+    """
+    stage = config.stage
+    if stage not in STEPS:
+        raise DevrfError(f"stage: expected one of {', '.join(STEPS)}, not {stage!r}")
+    run = RunContext(config, folder)
+    _check(run, stage)
+    learning = [step for step in STEPS[stage] if step in LEARNING]
+    if learning:
+        with together(run, learn):
+            _take(learning, run)
+    if not learning or run.leads:
+        _take([step for step in STEPS[stage] if step not in LEARNING], run)
+
+
+def learn(config: DictConfig, folder: Path) -> None:
+    """Take the steps of ``stage=…`` that learn, as one of several processes.
+
+    Args:
+        config: a composed config that has been checked.
+        folder: the run's folder; rank 0 writes into it.
+    """
+    run = RunContext(config, folder)
+    with together(run, learn):
+        _take([step for step in STEPS[config.stage] if step in LEARNING], run)
+
+
+def _take(steps: Sequence[Callable[[RunContext], None]], run: RunContext) -> None:
+    for step in steps:
+        seed_everything(run.config.seed, verbose=False)
+        step(run)
+
+
+def _check(run: RunContext, stage: str) -> None:
+    """Find what can be found wrong before the first step has cost any time.
+
+    A mistake in the deformation's config would else show when the canonical stage is done.
+    """
+    config = run.config
+    if config.ckpt is not None and stage in FROM_NOTHING:
+        raise DevrfError(
+            f"ckpt: stage={stage} starts from nothing; with ckpt=PATH give stage=deformation, "
+            "stage=evaluate or stage=render"
+        )
+    if stage in OF_NO_SCENE:
+        return
+    _ = run.datamodule
+    instantiate(config.canonical, _convert_="all")
+    instantiate(config.deformation, _partial_=True, _convert_="all")
+    weights = {k: v for k, v in config.deformation.loss.items() if k != "tv"}
+    WeightedLoss(MOTION_TERMS, weights)
+    run.evaluation.check()
+    instantiate(config.video)

@@ -22,7 +22,10 @@ class RaysByRank(DDPStrategy):
 
     torch's wrapper for distributed modules ties itself to the parameters that it finds first;
     here grids grow, and the frame that is learned is a slice of a buffer. So nothing is wrapped:
-    the stage averages the gradients itself, with :func:`average_gradients`.
+    the stage averages the gradients itself, with :func:`average_gradients`. A term that is a
+    mean over what its rays have met (cycle, flow) becomes a mean of the processes' means.
+
+    With a trainer of your own, ``Trainer(strategy=RaysByRank(), devices=4)``.
     """
 
     def __init__(self, process_group_backend: str | None = None) -> None:
