@@ -2,7 +2,7 @@
 
 Rank 0 is the process that the user started. It alone composes the config, writes files and says
 anything; the others get the composed config, take part in the steps that learn, and end. Where
-a launcher (torchrun, SLURM) has started all of them, none is started here.
+a launcher such as torchrun has started all of them, none is started here.
 """
 
 from __future__ import annotations

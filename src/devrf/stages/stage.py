@@ -175,7 +175,8 @@ class ScheduledStage(LightningModule, ABC):
         views = scene.capture(self.capture).test
         view = score(self.model, views, index, scene.background, self.device)
         scores = {"psnr": view.psnr, "ssim": view.ssim, "rest_pose_psnr": view.rest_pose_psnr}
-        self.log_dict({f"test/{self.capture}/{k}": v for k, v in scores.items()}, batch_size=1)
+        means = {f"test/{self.capture}/{k}": v for k, v in scores.items()}
+        self.log_dict(means, batch_size=1, sync_dist=True)
         return {"view": view}
 
     def configure_optimizers(self) -> GridAdam:
