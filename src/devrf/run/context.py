@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,16 @@ class RunContext:
     def __init__(self, config: DictConfig, folder: Path) -> None:
         self.config = config
         self.folder = folder
+        self._began = time.perf_counter()
+
+    def begin_step(self) -> None:
+        """Start the clock of a step."""
+        self._began = time.perf_counter()
+
+    @property
+    def step_seconds(self) -> float:
+        """Wall clock since the present step began: reading, learning, scoring, writing."""
+        return round(time.perf_counter() - self._began, 2)
 
     @cached_property
     def datamodule(self) -> SceneDataModule:

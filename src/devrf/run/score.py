@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from statistics import mean
 from typing import Any
 
+from devrf import job
 from devrf.artifacts.contact_sheet import write_contact_sheet
 from devrf.artifacts.files import write_json
 from devrf.artifacts.records import in_words, mean_scores, provenance, write_frames
@@ -17,6 +19,9 @@ from devrf.stages.held_out import HeldOutView, score
 
 log = logging.getLogger(__name__)
 
+# What a checkpoint knows of its training that stands beside the scores.
+TRAINING = ("seconds", "iterations", "iterations_per_second", "peak_gpu_gb")
+
 
 def evaluate(run: RunContext) -> None:
     """Score what was learned on held-out views; write metrics and contact sheets."""
@@ -27,7 +32,7 @@ def evaluate(run: RunContext) -> None:
     frames = {"static": rest}
     sections: dict[str, Any] = {
         "scene": run.scene.name,
-        "canonical": {**mean_scores(rest), **records.get("canonical", {})},
+        "canonical": {**mean_scores(rest), **_training(records, "canonical")},
     }
     if stored.model.deformation is not None:
         moving = frames["dynamic"] = _score(run, stored, "dynamic", judge)
@@ -35,15 +40,42 @@ def evaluate(run: RunContext) -> None:
         sections["deformation"] = {
             **mean_scores(moving),
             "rest_pose_psnr": round(mean(v.rest_pose_psnr for v in moving), 4),
-            **records.get("deformation", {}),
+            **_training(records, "deformation"),
             "checkpoint_mb": round(checkpoint.stat().st_size / 1e6, 3),
         }
     write_frames(run.folder / "frames.csv", frames)
-    ran = provenance(stored.model, run.device)
+    ran = {**provenance(stored.model, run.device), **_origin(run, records)}
     write_json(run.folder / "metrics.json", {**sections, "run": ran})
     for name, values in sections.items():
         if isinstance(values, dict):
             log.info("%s: %s", name, in_words(values))
+
+
+Records = Mapping[str, Mapping[str, float | None]]
+
+
+def _training(records: Records, stage: str) -> dict[str, float | None]:
+    return {name: records.get(stage, {}).get(name) for name in TRAINING}
+
+
+def _origin(run: RunContext, records: Records) -> dict[str, Any]:
+    """What was asked for, on how much data, and how long each step took from end to end.
+
+    The steps that learn may have run in other processes: their checkpoints tell (None if they
+    do not), measured up to the writing of the checkpoint.
+    """
+    scene = run.scene
+    frames = scene.clock.frames_of(scene.dynamic.train.times)
+    learned = {k: records.get(k, {}).get("wall_seconds") for k in ("canonical", "deformation")}
+    return {
+        "choices": job.choices(),
+        "overrides": job.overrides(),
+        "seed": run.config.seed,
+        # A camera that moves is one view, however many images it took.
+        "train_views": int(frames.bincount().max()),
+        "test_frames": len(scene.dynamic.test),
+        "wall_seconds": {**learned, "evaluate": run.step_seconds},
+    }
 
 
 def _score(

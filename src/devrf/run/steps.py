@@ -61,6 +61,7 @@ def run_stage(config: DictConfig, folder: Path) -> None:
     _check(run, stage)
     for step in STEPS[stage]:
         seed_everything(config.seed, verbose=False)
+        run.begin_step()
         step(run)
 
 
