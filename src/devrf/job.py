@@ -24,9 +24,6 @@ def in_sweep() -> bool:
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
 
 
-def sweeper_counts_failures() -> bool:
-    """Whether the sweeper has a rule of its own for jobs that fail, as a search has.
-
-    Such a sweeper is told of a failure by an exception; the basic one would end the sweep.
-    """
-    return "max_failure_rate" in HydraConfig.get().sweeper
+def in_search() -> bool:
+    """Whether the sweeper looks for the best, and so needs a number from each job."""
+    return in_sweep() and "direction" in HydraConfig.get().sweeper

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import warnings
 from collections.abc import Callable
@@ -11,12 +12,14 @@ from hydra.utils import instantiate
 from lightning import seed_everything
 from omegaconf import DictConfig
 
+from devrf import job
 from devrf.errors import DevrfError
 from devrf.losses.composer import WeightedLoss
 from devrf.losses.motion import MOTION_TERMS
 from devrf.run.context import RunContext
 from devrf.run.film import render
 from devrf.run.look import inspect, prepare
+from devrf.run.objective import check_objective, objective
 from devrf.run.score import evaluate
 from devrf.run.train import canonical, deformation
 
@@ -44,12 +47,15 @@ for _words in (
     warnings.filterwarnings("ignore", message=f".*{_words}.*")
 
 
-def run_stage(config: DictConfig, folder: Path) -> None:
+def run_stage(config: DictConfig, folder: Path) -> float | None:
     """Do what ``stage=…`` asks for, in the run's folder.
 
     Args:
         config: a composed config (``conf/config.yaml``).
         folder: where to work.
+
+    Returns:
+        What ``objective`` names; None where nothing was scored.
 
     Raises:
         DevrfError: an unknown stage, or whatever is wrong with the input.
@@ -63,6 +69,9 @@ def run_stage(config: DictConfig, folder: Path) -> None:
         seed_everything(config.seed, verbose=False)
         run.begin_step()
         step(run)
+    if evaluate not in STEPS[stage]:
+        return None
+    return objective(config.objective, json.loads((folder / "metrics.json").read_text()))
 
 
 def _check(run: RunContext, stage: str) -> None:
@@ -82,4 +91,7 @@ def _check(run: RunContext, stage: str) -> None:
     weights = {k: v for k, v in config.deformation.loss.items() if k != "tv"}
     WeightedLoss(MOTION_TERMS, weights)
     run.evaluation.check()
+    check_objective(config.objective, run.evaluation.metrics)
+    if job.in_search() and evaluate not in STEPS[stage]:
+        raise DevrfError(f"stage: a search needs the objective, which stage={stage} does not score")
     instantiate(config.video)
