@@ -34,9 +34,25 @@ def run_name(experiment: str | None, ablation: str | None) -> str:
     return "-".join(parts)
 
 
+def tracked_name(scene: str, mode: Any, overrides: str) -> str:
+    """What a tracker calls a run: the scene; in a sweep, what was asked of the job."""
+    return overrides or scene if _of_sweep(mode) else scene
+
+
+def tracked_group(mode: Any, folder: str) -> str | None:
+    """The group that a tracker puts a run into: the sweep's folder's name, None outside one."""
+    return Path(folder).name if _of_sweep(mode) else None
+
+
+def _of_sweep(mode: Any) -> bool:
+    return str(getattr(mode, "name", mode)) == "MULTIRUN"
+
+
 def register_resolvers() -> None:
-    """Make ``${devrf.scene_name:…}`` and ``${devrf.run_name:…}`` known to OmegaConf."""
+    """Make ``${devrf.scene_name:…}`` and the others above known to OmegaConf."""
     from omegaconf import OmegaConf
 
+    for word in (tracked_name, tracked_group):
+        OmegaConf.register_new_resolver(f"devrf.{word.__name__}", word, replace=True)
     OmegaConf.register_new_resolver("devrf.scene_name", scene_name, replace=True)
     OmegaConf.register_new_resolver("devrf.run_name", run_name, replace=True)

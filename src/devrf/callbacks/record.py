@@ -7,6 +7,7 @@ import time
 import torch
 from lightning import Callback, LightningModule, Trainer
 
+from devrf.callbacks.previews import Previews
 from devrf.stages.stage import ScheduledStage
 
 
@@ -26,16 +27,19 @@ class TrainingRecord(Callback):
         self._started = time.perf_counter()
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Write down wall-clock seconds, iterations, iterations a second, peak GPU memory.
+        """Write down seconds, iterations, iterations a second, peak GPU memory.
 
-        Memory in GiB; None on a CPU.
+        Seconds are wall clock, without what previews took: they teach the fields nothing. Memory
+        is in GiB; None on a CPU.
         """
         assert isinstance(pl_module, ScheduledStage)
         peak = None
         if pl_module.device.type == "cuda":
             torch.cuda.synchronize(pl_module.device)
             peak = round(torch.cuda.max_memory_allocated(pl_module.device) / 2**30, 3)
-        seconds = time.perf_counter() - self._started
+        callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
+        looking = sum(c.seconds for c in callbacks if isinstance(c, Previews))
+        seconds = time.perf_counter() - self._started - looking
         pl_module.record = {
             "seconds": round(seconds, 2),
             "iterations": pl_module.iteration,

@@ -10,13 +10,17 @@ from typing import Any
 import torch
 from hydra.utils import instantiate
 from lightning import Trainer
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
+from devrf.artifacts.tracking import Tracker, trackers
 from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
 from devrf.scenes.scene import Scene
 from devrf.stages.checkpoint import Stored, load_checkpoint
 from devrf.stages.evaluation import Evaluation
+
+# Stages that no checkpoint is of use to, and that begin a run of their own.
+FROM_NOTHING = ("prepare", "inspect", "canonical", "pipeline")
 
 
 class RunContext:
@@ -58,8 +62,29 @@ class RunContext:
 
     @cached_property
     def logger(self) -> Any:
-        """The tracker of the whole run, one for both stages."""
-        return instantiate(self.config.logger)
+        """What logs the whole run, one for all its steps.
+
+        A tracker is told the config, which begins its run: nothing should be wrong any more.
+        """
+        logger = instantiate(self.config.logger)
+        for tracker in trackers([logger]):
+            if self.config.stage not in FROM_NOTHING:
+                tracker.go_on()
+            settings = OmegaConf.to_container(self.config, resolve=True)
+            assert isinstance(settings, dict)
+            tracker.log_hyperparams({str(key): value for key, value in settings.items()})
+        return logger
+
+    @property
+    def trackers(self) -> list[Tracker]:
+        """The logger, if it takes pictures, videos and tables."""
+        return trackers([self.logger])
+
+    def close(self, *, failed: bool) -> None:
+        """End the tracking of the run, if it began."""
+        if "logger" in self.__dict__:
+            for tracker in self.trackers:
+                tracker.close(failed=failed)
 
     @cached_property
     def device(self) -> torch.device:

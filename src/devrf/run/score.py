@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from statistics import mean
 from typing import Any
 
 from devrf import job
 from devrf.artifacts.contact_sheet import write_contact_sheet
 from devrf.artifacts.files import write_json
-from devrf.artifacts.records import in_words, mean_scores, provenance, write_frames
+from devrf.artifacts.records import (
+    frame_rows,
+    in_words,
+    mean_scores,
+    provenance,
+    write_frames,
+)
 from devrf.run.context import RunContext
 from devrf.scenes.scene import CaptureName
 from devrf.stages.checkpoint import Stored
@@ -46,9 +52,29 @@ def evaluate(run: RunContext) -> None:
     write_frames(run.folder / "frames.csv", frames)
     ran = {**provenance(stored.model, run.device), **_origin(run, records)}
     write_json(run.folder / "metrics.json", {**sections, "run": ran})
-    for name, values in sections.items():
-        if isinstance(values, dict):
-            log.info("%s: %s", name, in_words(values))
+    scores = {name: values for name, values in sections.items() if isinstance(values, dict)}
+    for name, values in scores.items():
+        log.info("%s: %s", name, in_words(values))
+    _track(run, scores, frames)
+
+
+def _track(
+    run: RunContext,
+    scores: Mapping[str, Mapping[str, float | None]],
+    frames: Mapping[str, Sequence[HeldOutView]],
+) -> None:
+    """Show where the run is tracked what it has come to."""
+    for tracker in run.trackers:
+        tracker.conclude(
+            {
+                f"{section}/{name}": value
+                for section, values in scores.items()
+                for name, value in values.items()
+                if value is not None
+            }
+        )
+        tracker.show_table("metrics", [{"stage": name, **row} for name, row in scores.items()])
+        tracker.show_table("frames", frame_rows(frames))
 
 
 Records = Mapping[str, Mapping[str, float | None]]
@@ -87,5 +113,7 @@ def _score(
     scored = [
         score(model, views, k, run.scene.background, run.device, judge) for k in range(len(views))
     ]
-    write_contact_sheet(run.folder / "images" / f"{capture}.png", scored)
+    sheet = write_contact_sheet(run.folder / "images" / f"{capture}.png", scored)
+    for tracker in run.trackers:
+        tracker.show_image(f"held_out/{capture}", sheet)
     return scored

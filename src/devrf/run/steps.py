@@ -16,7 +16,7 @@ from devrf import job
 from devrf.errors import DevrfError
 from devrf.losses.composer import WeightedLoss
 from devrf.losses.motion import MOTION_TERMS
-from devrf.run.context import RunContext
+from devrf.run.context import FROM_NOTHING, RunContext
 from devrf.run.film import render
 from devrf.run.look import inspect, prepare
 from devrf.run.objective import check_objective, objective
@@ -32,9 +32,6 @@ STEPS: dict[str, tuple[Callable[[RunContext], None], ...]] = {
     "render": (render,),
     "pipeline": (canonical, deformation, evaluate, render),
 }
-
-# Stages that no checkpoint is of use to.
-FROM_NOTHING = ("prepare", "inspect", "canonical", "pipeline")
 
 # What Lightning says of every run (accelerators it looked for, tips, how many workers a loader
 # might have) is of no use to someone who watches a scene being learned.
@@ -65,10 +62,15 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
         raise DevrfError(f"stage: expected one of {', '.join(STEPS)}, not {stage!r}")
     run = RunContext(config, folder)
     _check(run, stage)
-    for step in STEPS[stage]:
-        seed_everything(config.seed, verbose=False)
-        run.begin_step()
-        step(run)
+    ended = False
+    try:
+        for step in STEPS[stage]:
+            seed_everything(config.seed, verbose=False)
+            run.begin_step()
+            step(run)
+        ended = True
+    finally:
+        run.close(failed=not ended)
     if evaluate not in STEPS[stage]:
         return None
     return objective(config.objective, json.loads((folder / "metrics.json").read_text()))
