@@ -13,7 +13,7 @@ from lightning.pytorch.loggers import CSVLogger, Logger
 from torch import Tensor
 
 from devrf.artifacts.tracking import Row, Tracker, trackers
-from devrf.callbacks import Curves, GridUpscaling, LearningRateDecay, Previews, TrainingRecord
+from devrf.callbacks import GridUpscaling, LearningRateDecay, Meter, Previews, TrainingRecord
 from devrf.data.datamodule import SceneDataModule
 from devrf.fields.architecture import Architecture
 from devrf.stages.canonical import CanonicalStage
@@ -93,7 +93,7 @@ def test_previews_come_as_often_as_asked_for_and_look_right(datamodule: SceneDat
 
 
 def test_watching_changes_nothing_of_what_is_learned(datamodule: SceneDataModule) -> None:
-    watched = learn(datamodule, Album(), Curves(), Previews(times=4)).model
+    watched = learn(datamodule, Album(), Meter(), Previews(times=4)).model
     alone = learn(datamodule, Album()).model
     assert torch.equal(watched.canonical.density.values, alone.canonical.density.values)
     assert torch.equal(watched.canonical.color.values, alone.canonical.color.values)
@@ -128,7 +128,7 @@ def test_without_a_tracker_no_picture_is_made(
 
 def test_curves_stand_in_the_rows_of_the_losses(datamodule: SceneDataModule) -> None:
     album = Album()
-    stage = learn(datamodule, album, Curves())
+    stage = learn(datamodule, album, Meter())
     assert [row["step"] for row in album.rows] == [4, 8, 12]
     x, y, z = stage.resolution
     for row in album.rows:

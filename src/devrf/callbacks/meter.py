@@ -13,7 +13,7 @@ from devrf.stages.schedules import DeformationPhase
 from devrf.stages.stage import ScheduledStage
 
 
-class Curves(Callback):
+class Meter(Callback):
     """Adds what a stage is doing to the rows that its losses are logged in."""
 
     def __init__(self) -> None:
