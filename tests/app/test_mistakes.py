@@ -44,6 +44,7 @@ MISTAKES = {
         ["trainer.devices=2"], "trainer.devices: 2 processes need trainer=ddp",
     ),
     "part that is not there": (["data._target_=devrf.nothing"], "data._target_: cannot load"),
+    "unknown objective": (["objective=deformation.pnsr"], "objective: deformation has no 'pnsr'"),
     "scoring before training": (["stage=evaluate"], "canonical.ckpt: no such checkpoint"),
     "moving before the rest state": (["stage=deformation"], "canonical.ckpt: no such checkpoint"),
     "missing checkpoint": (["stage=render", "ckpt=no.ckpt"], "no.ckpt: no such checkpoint"),

@@ -44,6 +44,8 @@ def _fit(run: RunContext, stage: ScheduledStage, name: str) -> None:
     trainer.fit(stage, datamodule=run.datamodule)
     if trainer.interrupted:
         raise KeyboardInterrupt
+    # The checkpoint carries it to whoever scores the run, hence without its own writing.
+    stage.record["wall_seconds"] = run.step_seconds
     path = run.own_checkpoint(name)
     if run.leads:
         save_checkpoint(trainer, path)

@@ -136,8 +136,9 @@ class CanonicalStage(ScheduledStage):
                 {"params": list(canonical.decoder.parameters()), "lr": rates.decoder},
             ]
         )
-        for group in self._optimizer.param_groups:
-            group["base_lr"] = group["lr"]
+        names = ("density", "color", "decoder")
+        for name, group in zip(names, self._optimizer.param_groups, strict=True):
+            group.update(name=name, base_lr=group["lr"])
 
     def _settings(self, phase: CanonicalPhase) -> RenderSettings:
         bounds, sampling = self.scene.bounds, self.sampling

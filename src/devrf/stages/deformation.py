@@ -90,7 +90,9 @@ class DeformationStage(ScheduledStage):
         self.architecture = rest.passport.architecture
         self.records = rest.passport.records
         placeholder = torch.zeros(2, 2, 2, 3, requires_grad=True)
-        self._optimizer = GridAdam([{"params": [placeholder], "lr": self.motion.learning_rate}])
+        self._optimizer = GridAdam(
+            [{"params": [placeholder], "lr": self.motion.learning_rate, "name": "motion"}]
+        )
         self._visit: Visit | None = None
         self._previous: Tensor | None = None
 
