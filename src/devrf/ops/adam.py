@@ -50,6 +50,13 @@ class GridAdam(torch.optim.Optimizer):
                 update(parameter, parameter.grad, state, group)
         return result
 
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take up the state of a run that was left, on the device of the parameters."""
+        super().load_state_dict(state_dict)
+        for group in self.param_groups:
+            if group["pace"] is not None:
+                group["pace"] = group["pace"].to(group["params"][0].device)
+
     def replace(self, group: int, parameters: Sequence[Tensor], pace: Tensor | None = None) -> None:
         """Give a group other parameters (a resized grid, the next frame) with fresh moments."""
         for old in self.param_groups[group]["params"]:
