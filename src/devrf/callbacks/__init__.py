@@ -2,6 +2,10 @@
 
 from devrf.callbacks.progress import Progress
 from devrf.callbacks.record import TrainingRecord
+from devrf.callbacks.saving import Saving
 from devrf.callbacks.schedule import GridUpscaling, LearningRateDecay
+from devrf.callbacks.stopping import StopOnSignal
 
-__all__ = ["GridUpscaling", "LearningRateDecay", "Progress", "TrainingRecord"]
+__all__ = [
+    "GridUpscaling", "LearningRateDecay", "Progress", "Saving", "StopOnSignal", "TrainingRecord",
+]

@@ -17,6 +17,7 @@ from devrf.losses.motion import MOTION_TERMS
 from devrf.run.context import RunContext
 from devrf.run.film import render
 from devrf.run.look import inspect, prepare
+from devrf.run.resume import set_aside
 from devrf.run.score import evaluate
 from devrf.run.train import canonical, deformation
 
@@ -59,6 +60,9 @@ def run_stage(config: DictConfig, folder: Path) -> None:
         raise DevrfError(f"stage: expected one of {', '.join(STEPS)}, not {stage!r}")
     run = RunContext(config, folder)
     _check(run, stage)
+    if not config.resume and not {canonical, deformation}.isdisjoint(STEPS[stage]):
+        needed = () if canonical in STEPS[stage] else (run.own_checkpoint("canonical"),)
+        set_aside(folder, *needed)
     for step in STEPS[stage]:
         seed_everything(config.seed, verbose=False)
         step(run)
