@@ -102,3 +102,15 @@ def test_draws_come_from_the_pool_and_reach_all_of_it(rng: torch.Generator) -> N
     assert image.dtype == flat.dtype == torch.int64
     drawn = set(zip(image.tolist(), flat.tolist(), strict=True))
     assert drawn == {(0, 7), (1, 2), (1, 5)}
+
+
+def test_a_pool_is_told_by_its_mask() -> None:
+    whole = all_pixels(views(), torch.arange(2))
+    some = PixelPool(whole.image[1::3], whole.flat[1::3])
+    of_second = some.of_images(torch.tensor([1]))
+    for pool, images in ((some, torch.arange(2)), (of_second, torch.tensor([1]))):
+        mask = pool.mask(images, WIDTH * HEIGHT)
+        assert mask.sum() == len(pool)
+        again = PixelPool.of_mask(images, mask)
+        assert torch.equal(again.image, pool.image) and again.image.dtype == torch.int32
+        assert torch.equal(again.flat, pool.flat) and again.flat.dtype == torch.int32

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -17,9 +16,10 @@ from devrf.errors import DevrfError
 from devrf.rendering.model import SceneModel
 from devrf.scenes.scene import Scene
 from devrf.stages.canonical import CanonicalStage
-from devrf.stages.checkpoint import FORMAT, Stored, load_checkpoint, save_checkpoint
+from devrf.stages.checkpoint import Stored, load_checkpoint, save_checkpoint
 from devrf.stages.deformation import DeformationStage
 from devrf.stages.schedules import CanonicalSchedule, DeformationSchedule
+from devrf.stages.sealed_file import read_sealed, write_sealed
 
 
 @pytest.fixture
@@ -48,9 +48,10 @@ def refusal(path: Path, scene: Scene | None = None) -> str:
 
 
 def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> Path:
-    data = torch.load(path, weights_only=True)
+    """The same file with other content, well sealed."""
+    data = read_sealed(path)
     change(data)
-    torch.save(data, path)
+    write_sealed(path, data)
     return path
 
 
@@ -107,48 +108,14 @@ def test_a_missing_file_says_which_stage_to_run(tmp_path: Path) -> None:
     assert "no such checkpoint" in refusal(tmp_path)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 0.999])
-def test_a_truncated_file_is_refused(canonical: Path, share: float) -> None:
-    content = canonical.read_bytes()
-    canonical.write_bytes(content[: int(share * len(content))])
-    assert "damaged" in refusal(canonical)
-
-
-def test_files_of_noise_or_text_are_refused(tmp_path: Path) -> None:
-    noise = random.Random(0)
-    path = tmp_path / "some.ckpt"
-    for _ in range(100):
-        path.write_bytes(noise.randbytes(noise.randrange(60)))
-        assert "not a checkpoint" in refusal(path)
-    path.write_text("scene: robot\n" * 20)
-    assert "not a checkpoint" in refusal(path)
-
-
 @pytest.mark.parametrize(
-    "foreign", [{"state_dict": {}}, {"devrf": "yes", "state_dict": {}}, [1, 2], torch.zeros(3)],
-    ids=["other project", "other type", "list", "tensor"],
+    "foreign", [{"state_dict": {}}, {"devrf": "yes", "state_dict": {}}],
+    ids=["other project", "other type"],
 )
-def test_checkpoints_of_others_are_refused(tmp_path: Path, foreign: object) -> None:
+def test_checkpoints_of_others_are_refused(tmp_path: Path, foreign: dict[str, Any]) -> None:
     path = tmp_path / "foreign.ckpt"
-    torch.save(foreign, path)
+    write_sealed(path, foreign)
     assert "not a devrf checkpoint" in refusal(path)
-
-
-def test_nothing_in_a_file_is_run(tmp_path: Path) -> None:
-    class Bomb:
-        def __reduce__(self) -> tuple[Any, ...]:
-            return (Path(tmp_path / "exploded").touch, ())
-
-    path = tmp_path / "bomb.ckpt"
-    torch.save({"devrf": {}, "state_dict": Bomb()}, path)
-    refusal(path)
-    assert not (tmp_path / "exploded").exists()
-
-
-def test_a_newer_format_is_named(canonical: Path) -> None:
-    edit(canonical, lambda data: data["devrf"].update(format=FORMAT + 1))
-    message = refusal(canonical)
-    assert f"format {FORMAT + 1}" in message and f"reads {FORMAT}" in message
 
 
 @pytest.mark.parametrize(
@@ -158,29 +125,21 @@ def test_a_newer_format_is_named(canonical: Path) -> None:
         lambda data: data["devrf"]["architecture"].update(depth=3),
         lambda data: data["devrf"]["architecture"].update(channels=5),
         lambda data: data.pop("state_dict"),
+        lambda data: data.update(state_dict=[1]),
+        lambda data: data["state_dict"].update({"scene_model.occupancy.mask": "all"}),
         lambda data: data["state_dict"].pop("scene_model.occupancy.mask"),
         lambda data: data["state_dict"]["scene_model.canonical._extra_state"].pop("voxels"),
         lambda data: data["state_dict"]["scene_model.canonical._extra_state"].update(low=[9, 9, 9]),
     ],
-    ids=["no scene", "unknown size", "other size", "no state", "no mask", "no voxels", "no box"],
+    ids=[
+        "no scene", "unknown size", "other size", "no state", "list for state", "text for mask",
+        "no mask", "no voxels", "no box",
+    ],
 )
 def test_a_checkpoint_that_contradicts_itself_is_refused(
     canonical: Path, change: Callable[[dict[str, Any]], object]
 ) -> None:
     refusal(edit(canonical, change))
-
-
-def test_a_failed_save_leaves_the_old_file_alone(canonical: Path) -> None:
-    class FullDisk:
-        def save_checkpoint(self, path: Path, weights_only: bool) -> None:
-            path.write_bytes(b"half a check")
-            raise OSError("No space left on device")
-
-    before = canonical.read_bytes()
-    with pytest.raises(OSError, match="No space"):
-        save_checkpoint(FullDisk(), canonical)  # type: ignore[arg-type]
-    assert canonical.read_bytes() == before
-    assert [p.name for p in canonical.parent.iterdir()] == ["canonical.ckpt"]
 
 
 def test_a_stage_stopped_in_its_search_comes_back(

@@ -4,8 +4,11 @@ from devrf.callbacks.meter import Meter
 from devrf.callbacks.previews import Previews
 from devrf.callbacks.progress import Progress
 from devrf.callbacks.record import TrainingRecord
+from devrf.callbacks.saving import Saving
 from devrf.callbacks.schedule import GridUpscaling, LearningRateDecay
+from devrf.callbacks.stopping import StopOnSignal
 
 __all__ = [
-    "GridUpscaling", "LearningRateDecay", "Meter", "Previews", "Progress", "TrainingRecord",
+    "GridUpscaling", "LearningRateDecay", "Meter", "Previews", "Progress", "Saving",
+    "StopOnSignal", "TrainingRecord",
 ]

@@ -52,7 +52,10 @@ class Progress(Callback):
                 TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
                 TextColumn("{task.fields[state]}"), TimeRemainingColumn(), console=console,
             )
-            self._bar.add_task(type(pl_module).__name__, total=pl_module.total_iterations, state="")
+            self._bar.add_task(
+                type(pl_module).__name__, total=pl_module.total_iterations,
+                completed=pl_module.iteration, state="",
+            )
             self._bar.start()
 
     def on_train_batch_end(

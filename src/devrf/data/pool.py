@@ -42,6 +42,19 @@ class PixelPool:
         kept = torch.isin(self.image, images.to(self.image.dtype))
         return PixelPool(self.image[kept], self.flat[kept])
 
+    def mask(self, images: Tensor, area: int) -> Tensor:
+        """Which pixels of ``images`` (K,), ascending, are here: (K, ``area``) bool."""
+        mask = torch.zeros(len(images), area, dtype=torch.bool, device=self.image.device)
+        row = torch.searchsorted(images.to(self.image.dtype), self.image)
+        mask[row, self.flat.long()] = True
+        return mask
+
+    @staticmethod
+    def of_mask(images: Tensor, mask: Tensor) -> PixelPool:
+        """The pool that :meth:`mask` describes, its pixels in ascending order."""
+        row, flat = mask.nonzero().unbind(1)
+        return PixelPool(images[row].to(torch.int32), flat.to(torch.int32))
+
 
 def all_pixels(views: Views, images: Tensor) -> PixelPool:
     """Every pixel of ``images`` (K,) int64."""

@@ -65,6 +65,16 @@ class GridAdam(torch.optim.Optimizer):
             state["square"] = torch.zeros_like(parameter)
         return state
 
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take up the state of a run that was left, on the device of the parameters."""
+        super().load_state_dict(state_dict)
+        for state in self.state.values():
+            # torch makes every number of a state one of its parameter's type.
+            state["steps"] = state["steps"].double()
+        for group in self.param_groups:
+            if group["pace"] is not None:
+                group["pace"] = group["pace"].to(group["params"][0].device)
+
     def replace(self, group: int, parameters: Sequence[Tensor], pace: Tensor | None = None) -> None:
         """Give a group other parameters (a resized grid, the next frame) with fresh moments."""
         for old in self.param_groups[group]["params"]:

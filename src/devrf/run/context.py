@@ -72,8 +72,7 @@ class RunContext:
             return False
         logger = instantiate(self.config.logger)
         for tracker in trackers([logger]):
-            if self.config.stage not in FROM_NOTHING:
-                tracker.go_on()
+            tracker.go_on()
             settings = OmegaConf.to_container(self.config, resolve=True)
             assert isinstance(settings, dict)
             tracker.log_hyperparams({str(key): value for key, value in settings.items()})

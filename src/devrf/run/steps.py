@@ -22,6 +22,7 @@ from devrf.run.look import inspect, prepare
 from devrf.run.objective import check_objective, objective
 from devrf.run.processes import together
 from devrf.run.report import report
+from devrf.run.resume import set_aside
 from devrf.run.score import evaluate
 from devrf.run.train import canonical, deformation
 
@@ -70,6 +71,9 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
         raise DevrfError(f"stage: expected one of {', '.join(STEPS)}, not {stage!r}")
     run = RunContext(config, folder)
     _check(run, stage)
+    if not config.resume and not {canonical, deformation}.isdisjoint(STEPS[stage]):
+        needed = () if canonical in STEPS[stage] else (run.own_checkpoint("canonical"),)
+        set_aside(folder, *needed)
     learning = [step for step in STEPS[stage] if step in LEARNING]
     others = [step for step in STEPS[stage] if step not in LEARNING]
     ended = False

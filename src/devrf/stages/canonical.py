@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -26,6 +26,7 @@ from devrf.rendering.model import SceneModel
 from devrf.rendering.render import RenderSettings, render
 from devrf.scenes.scene import CaptureName, Views
 from devrf.stages.checkpoint import Passport, Stored
+from devrf.stages.progress import pack, unpack
 from devrf.stages.ranks import share
 from devrf.stages.schedules import CanonicalPhase, CanonicalSchedule
 from devrf.stages.settings import FINE_LOSS, SEARCH_LOSS, CanonicalRates, Sampling
@@ -43,6 +44,7 @@ class CanonicalStage(ScheduledStage):
     inside, on rays that meet the coarse geometry.
     """
 
+    name: ClassVar[str] = "canonical"
     capture: ClassVar[CaptureName] = "static"
 
     def __init__(
@@ -264,6 +266,30 @@ class CanonicalStage(ScheduledStage):
         self._refresh_occupancy()
         self.model.canonical.clear(~self.model.occupancy.mask, alpha=1e-6)
 
+    def make_room(self, state: dict[str, Tensor]) -> None:
+        """Take a radiance field in place of the search's, if that is what was stored."""
+        fine = any(key.startswith("scene_model.canonical.decoder.") for key in state)
+        if fine and self.schedule.search_iterations:
+            box = self.model.canonical.box
+            self.model.canonical = self.architecture.radiance_field(box, 8, 8)
+
+    def at_hand(self) -> dict[str, Any]:
+        """The pixels that batches are drawn from."""
+        assert self._pool is not None
+        views = self.scene.static.train
+        images = torch.arange(len(views), device=self.device)
+        return {"pixels": pack(self._pool.mask(images, views.height * views.width))}
+
+    def take_up(self, phase: Phase, kept: dict[str, Any]) -> None:
+        """Go on with ``phase``, the field being loaded."""
+        assert isinstance(phase, CanonicalPhase)
+        views = self.scene.static.train
+        self.model.settings = self._settings(phase)
+        shape = (len(views), views.height * views.width)
+        images = torch.arange(len(views), device=self.device)
+        self._pool = PixelPool.of_mask(images, unpack(kept["pixels"], shape, self.device))
+        self._hand_over(views.cameras, skip_zero=phase.kind == "fine")
+
     def passport(self) -> Passport:
         """What the checkpoint is, and how to build its model."""
         return Passport(
@@ -273,6 +299,8 @@ class CanonicalStage(ScheduledStage):
             settings=self.model.settings,
             space=self.model.space,
             records={"canonical": self.record},
+            made_with=self.made_with,
+            complete=self.iteration >= self.total_iterations,
         )
 
     def result(self) -> Stored:

@@ -1,14 +1,13 @@
-"""Checkpoints that know what they are: written whole or not at all, read without running code."""
+"""Checkpoints that know what they are: sealed, and read without running code."""
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import torch
 from lightning import Trainer
+from lightning.fabric.plugins import CheckpointIO
 
 from devrf.errors import DevrfError
 from devrf.fields.architecture import Architecture
@@ -21,8 +20,7 @@ from devrf.geometry.space import WORLD, Space
 from devrf.rendering.model import SceneModel
 from devrf.rendering.render import RenderSettings
 from devrf.scenes.scene import Scene
-
-FORMAT = 1
+from devrf.stages.sealed_file import read_sealed, write_sealed
 
 
 @dataclass(frozen=True)
@@ -36,7 +34,9 @@ class Passport:
         settings: how rays are sampled.
         space: the space that the fields live in.
         records: what training took, by stage.
-        format: version of this layout.
+        made_with: the settings that decided what was learned, by config key; empty where nobody
+            told (a stage that was not trained from a config).
+        complete: whether the stage's schedule has come to its end.
     """
 
     scene: str
@@ -45,7 +45,8 @@ class Passport:
     settings: RenderSettings
     space: Space = WORLD
     records: dict[str, dict[str, float | None]] = field(default_factory=dict)
-    format: int = FORMAT
+    made_with: dict[str, Any] = field(default_factory=dict)
+    complete: bool = True
 
 
 @dataclass(frozen=True)
@@ -61,15 +62,43 @@ class Stored:
     model: SceneModel
 
 
-def save_checkpoint(trainer: Trainer, path: Path) -> None:
-    """Write what the trainer's stage has learned; an earlier file stays until the new is whole."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".partial-{path.name}")
+class SealedFiles(CheckpointIO):
+    """How Lightning writes and reads checkpoints here: sealed files."""
+
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None
+    ) -> None:
+        """Write ``checkpoint`` to ``path``, whole or not at all."""
+        write_sealed(Path(path), checkpoint)
+
+    def load_checkpoint(
+        self, path: str | Path, map_location: Any = None, weights_only: bool | None = None
+    ) -> dict[str, Any]:
+        """Read a sealed file onto the host; whatever the other arguments ask, no code is run."""
+        return read_sealed(Path(path))
+
+    def remove_checkpoint(self, path: str | Path) -> None:
+        """Remove the file."""
+        Path(path).unlink(missing_ok=True)
+
+
+def save_checkpoint(trainer: Trainer, path: Path, *, weights_only: bool = True) -> None:
+    """Write what the trainer's stage has learned; an earlier file stays until the new is whole.
+
+    Args:
+        trainer: has the stage.
+        path: the file.
+        weights_only: False adds all that it takes to go on learning from there.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    strategy = trainer.strategy
+    usual, strategy.checkpoint_io = strategy.checkpoint_io, SealedFiles()
     try:
-        trainer.save_checkpoint(partial, weights_only=True)
-        os.replace(partial, path)
+        trainer.save_checkpoint(path, weights_only=weights_only)
     finally:
-        partial.unlink(missing_ok=True)
+        strategy.checkpoint_io = usual
 
 
 def load_checkpoint(path: Path, scene: Scene | None = None) -> Stored:
@@ -80,33 +109,41 @@ def load_checkpoint(path: Path, scene: Scene | None = None) -> Stored:
         scene: the scene it must belong to; None takes any.
 
     Raises:
-        DevrfError: no such file, not a devrf checkpoint, a newer one, or of another scene.
+        DevrfError: no such file, a damaged one, not a devrf checkpoint, one of another format, or
+            of another scene.
     """
     if not path.is_file():
         raise DevrfError(f"{path}: no such checkpoint; run the stage that makes it, or set ckpt")
-    try:
-        data = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception:  # noise in a file makes the unpickler raise whatever it likes
-        raise DevrfError(
-            f"{path}: damaged, or not a checkpoint; expected one written by devrf"
-        ) from None
-    if not isinstance(data, dict) or not isinstance(data.get("devrf"), dict):
-        raise DevrfError(f"{path}: not a devrf checkpoint; set ckpt to one that devrf wrote")
-    passport = _passport(path, data["devrf"])
-    if scene is not None and passport.fingerprint != scene.fingerprint:
+    data = read_sealed(path)
+    passport = passport_in(path, data)
+    if scene is not None:
+        check_scene(path, passport, scene)
+    state = data.get("state_dict")
+    return Stored(passport, _model(path, passport, state if isinstance(state, dict) else {}))
+
+
+def check_scene(path: Path, passport: Passport, scene: Scene) -> None:
+    """Check that a checkpoint belongs to ``scene``.
+
+    Raises:
+        DevrfError: it does not.
+    """
+    if passport.fingerprint != scene.fingerprint:
         raise DevrfError(
             f"{path}: belongs to another scene ({passport.scene}: other cameras, times or image "
             f"sizes than {scene.name}); train this scene, or set ckpt to its own checkpoint"
         )
-    return Stored(passport, _model(path, passport, data.get("state_dict") or {}))
 
 
-def _passport(path: Path, stored: dict[str, Any]) -> Passport:
-    if stored.get("format") != FORMAT:
-        raise DevrfError(
-            f"{path}: has format {stored.get('format')!r}, this version reads {FORMAT}; use the "
-            "version of devrf that wrote it, or train again"
-        )
+def passport_in(path: Path, data: dict[str, Any]) -> Passport:
+    """The passport in the content of a checkpoint.
+
+    Raises:
+        DevrfError: there is none that is understood here.
+    """
+    if not isinstance(data, dict) or not isinstance(data.get("devrf"), dict):
+        raise DevrfError(f"{path}: not a devrf checkpoint; set ckpt to one that devrf wrote")
+    stored = data["devrf"]
     try:
         return Passport(
             scene=stored["scene"],
@@ -115,6 +152,8 @@ def _passport(path: Path, stored: dict[str, Any]) -> Passport:
             settings=RenderSettings(**stored["settings"]),
             space=NormalizedDevice(**stored["space"]) if stored["space"] else WORLD,
             records=stored["records"],
+            made_with=stored["made_with"],
+            complete=stored["complete"],
         )
     except (KeyError, TypeError) as error:
         raise DevrfError(
@@ -125,7 +164,7 @@ def _passport(path: Path, stored: dict[str, Any]) -> Passport:
 def _model(path: Path, passport: Passport, state: dict[str, Any]) -> SceneModel:
     """Build a model of any size and let the stored state give it its shapes."""
     box = Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
-    own = {k.removeprefix("scene_model."): v for k, v in state.items()}
+    own = {str(k).removeprefix("scene_model."): v for k, v in state.items()}
     build = passport.architecture
     # A stage that was stopped in its search has no decoder yet.
     searched = not any(key.startswith("canonical.decoder.") for key in own)
@@ -139,6 +178,6 @@ def _model(path: Path, passport: Passport, state: dict[str, Any]) -> SceneModel:
         model.deformation = DeformationField(box, FrameClock((0.0, 1.0)), voxels=8)
     try:
         model.load_state_dict(own)
-    except (RuntimeError, KeyError, ValueError, TypeError):
+    except (RuntimeError, KeyError, ValueError, TypeError, AttributeError):
         raise DevrfError(f"{path}: its fields do not fit its description; train again") from None
     return model

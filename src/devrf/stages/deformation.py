@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -25,6 +25,7 @@ from devrf.rendering.render import render
 from devrf.scenes.scene import CaptureName, Views
 from devrf.stages.checkpoint import Passport, Stored
 from devrf.stages.flow_start import follow, start_from_tracks
+from devrf.stages.progress import pack, unpack
 from devrf.stages.ranks import share, take_from_first
 from devrf.stages.schedules import DeformationPhase, DeformationSchedule
 from devrf.stages.settings import DEFORMATION_LOSS, MotionSettings
@@ -34,7 +35,7 @@ from devrf.stages.useful import meets_matter
 
 @dataclass
 class Visit:
-    """What is at hand while one frame is visited; all of it can be made again.
+    """What is at hand while one frame is visited.
 
     Attributes:
         backward: (X, Y, Z, 3) the frame's Δ_b, a leaf in the field's memory.
@@ -56,6 +57,7 @@ class DeformationStage(ScheduledStage):
     are trained; the canonical field and all other frames are frozen.
     """
 
+    name: ClassVar[str] = "deformation"
     capture: ClassVar[CaptureName] = "dynamic"
 
     def __init__(
@@ -169,7 +171,7 @@ class DeformationStage(ScheduledStage):
         """Move the frame's slices to where the flow says the frame before has gone."""
         assert self._previous is not None
         clock = self.field.clock
-        pool = all_pixels(views, (clock.frames_of(views.times) == frame).nonzero()[:, 0])
+        pool = all_pixels(views, self._images(views, frame))
         tracks = follow(
             self.scene_model, views, pool, self._previous, clock.times[frame - 1], self.generator
         )
@@ -217,7 +219,7 @@ class DeformationStage(ScheduledStage):
     @torch.no_grad()
     def _frame_pools(self, views: Views, frame: int) -> list[PixelPool]:
         """The pixels to learn the frame from: a pool a batch can be drawn from, by turns."""
-        images = (self.field.clock.frames_of(views.times) == frame).nonzero()[:, 0]
+        images = self._images(views, frame)
         if len(images) == 0:
             raise DevrfError(f"dynamic training set: no image at frame {frame}")
         pools = [all_pixels(views, image[None]) for image in images]
@@ -231,6 +233,10 @@ class DeformationStage(ScheduledStage):
                 )
             ]
         return pools
+
+    def _images(self, views: Views, frame: int) -> Tensor:
+        """The images (K,) of a frame, ascending."""
+        return (self.field.clock.frames_of(views.times) == frame).nonzero()[:, 0]
 
     def _useful(self, views: Views, pool: PixelPool) -> PixelPool:
         """Pixels on the matte, or whose rays meet the frame's matter; all if there are none."""
@@ -273,6 +279,34 @@ class DeformationStage(ScheduledStage):
                 grid.grad = torch.zeros_like(grid)
             add_total_variation_gradient(grid, grid.grad, weight)
 
+    def at_hand(self) -> dict[str, Any]:
+        """Where the visited frame's matter was last seen, and the pixels to learn from."""
+        assert isinstance(self.phase, DeformationPhase)
+        views, mask = self._device_views(), self.visit.occupancy.mask
+        images, area = self._images(views, self.phase.frame), views.height * views.width
+        return {
+            "occupancy": pack(mask),
+            "shape": list(mask.shape),
+            "pixels": [pack(pool.mask(images, area)) for pool in self.visit.pools],
+        }
+
+    def take_up(self, phase: Phase, kept: dict[str, Any]) -> None:
+        """Go on with the visit of ``phase``, the field being loaded."""
+        assert isinstance(phase, DeformationPhase)
+        views = self._device_views()
+        self._previous = previous_images(views)
+        images, area = self._images(views, phase.frame), views.height * views.width
+        mask = unpack(kept["occupancy"], kept["shape"], self.device)
+        self._visit = Visit(
+            *self.field.slice(phase.frame),
+            Occupancy(mask, self.scene_model.canonical.box),
+            [
+                PixelPool.of_mask(images, unpack(bits, (len(images), area), self.device))
+                for bits in kept["pixels"]
+            ],
+        )
+        self._optimizer.replace(0, [self.visit.backward, self.visit.forward])
+
     def passport(self) -> Passport:
         """What the checkpoint is, and how to build its model."""
         return Passport(
@@ -282,4 +316,6 @@ class DeformationStage(ScheduledStage):
             settings=self.scene_model.settings,
             space=self.scene_model.space,
             records={**self.records, "deformation": self.record},
+            made_with=self.made_with,
+            complete=self.iteration >= self.total_iterations,
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -16,8 +17,9 @@ from devrf.errors import DevrfError
 from devrf.ops.adam import GridAdam
 from devrf.rendering.model import SceneModel
 from devrf.scenes.scene import CaptureName, Scene, Views
-from devrf.stages.checkpoint import Passport
+from devrf.stages.checkpoint import Passport, check_scene, passport_in
 from devrf.stages.held_out import score
+from devrf.stages.progress import random_states, set_random_states
 from devrf.stages.ranks import (
     RaysByRank,
     average,
@@ -39,15 +41,22 @@ class ScheduledStage(LightningModule, ABC):
     calls :meth:`enter` where a phase begins, ``LearningRateDecay`` scales the learning rates
     before every step.
 
+    A checkpoint with the optimiser's state in it (any of Lightning's that is not ``weights_only``)
+    holds all that it takes to go on: ``Trainer.fit(ckpt_path=…)`` continues as if the run had
+    never stopped. ``stages.progress`` says how.
+
     Attributes:
+        name: what the stage is called in files and messages.
         capture: the part of the scene that is learned from.
         iteration: optimiser iterations done.
         phase: the stretch of the schedule that the grids are ready for; None before the first.
         record: what training took, once a ``TrainingRecord`` callback has measured it.
         generator: what pixels are drawn with, on the stage's device. At the beginning of each
             Lightning step it depends on the seed, the process and the iteration alone.
+        made_with: the settings that decide what is learned, by config key, if somebody told.
     """
 
+    name: ClassVar[str]
     capture: ClassVar[CaptureName]
 
     def __init__(self, iterations_per_step: int) -> None:
@@ -59,6 +68,8 @@ class ScheduledStage(LightningModule, ABC):
         self.record: dict[str, float | None] = {}
         self.generator = torch.Generator()
         self._seed = 0
+        self.made_with: dict[str, Any] = {}
+        self._left_off: dict[str, Any] | None = None
 
     @property
     def scene(self) -> Scene:
@@ -117,10 +128,6 @@ class ScheduledStage(LightningModule, ABC):
     def on_fit_start(self) -> None:
         """Begin with the same fields in every process."""
         take_from_first([*self.parameters(), *self.buffers()])
-
-    def on_train_start(self) -> None:
-        """Make the generator ready."""
-        self._draw_anew()
 
     def on_fit_end(self) -> None:
         """See that every process has come to the same fields."""
@@ -181,6 +188,8 @@ class ScheduledStage(LightningModule, ABC):
 
     def configure_optimizers(self) -> GridAdam:
         """The optimiser that :meth:`enter` hands parameters to."""
+        if self._left_off is not None and self.phase is not None:
+            self.take_up(self.phase, self._left_off["at_hand"])
         return self.optimizer
 
     @property
@@ -191,6 +200,57 @@ class ScheduledStage(LightningModule, ABC):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add what the tensors do not tell."""
         checkpoint["devrf"] = asdict(self.passport())
+        # Without the optimiser's state it is there to be rendered, not to be gone on from.
+        if "optimizer_states" in checkpoint:
+            checkpoint["progress"] = {
+                "stage": self.name,
+                "iteration": self.iteration,
+                "total": self.total_iterations,
+                "phase": None if self.phase is None else self.phase.start,
+                "at_hand": {} if self.phase is None else self.at_hand(),
+                "seed": self._seed,
+                "random": random_states(self.device),
+            }
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Make room for the tensors, which come next, and note where the run was left.
+
+        Raises:
+            DevrfError: the checkpoint is of another scene, stage or schedule.
+        """
+        path = Path(str(self.trainer.ckpt_path))
+        check_scene(path, passport_in(path, checkpoint), self.scene)
+        self.make_room(checkpoint["state_dict"])
+        kept = checkpoint.get("progress")
+        if kept is None:
+            return
+        course, ours = (kept["stage"], kept["total"]), (self.name, self.total_iterations)
+        if course != ours:
+            raise DevrfError(
+                f"{path}: left by the {course[0]} stage on a schedule of {course[1]} iterations, "
+                f"this is the {ours[0]} stage on one of {ours[1]}; give it its own schedule"
+            )
+        self.iteration, self._seed = kept["iteration"], kept["seed"]
+        self.phase = None if kept["phase"] is None else self.phase_at(kept["phase"])
+        self._left_off = kept
+
+    def on_train_start(self) -> None:
+        """Draw random numbers from where the run was left: all else is in place by now."""
+        if self._left_off is not None:
+            set_random_states(self._left_off["random"], self.device)
+            self._left_off = None
+        self._draw_anew()
+
+    @abstractmethod
+    def at_hand(self) -> dict[str, Any]:
+        """What the present phase works with that its schedule does not tell, as plain data."""
+
+    @abstractmethod
+    def take_up(self, phase: Phase, kept: dict[str, Any]) -> None:
+        """Go on with ``phase``, in which :meth:`at_hand` gave ``kept``; the fields are loaded."""
+
+    def make_room(self, state: dict[str, Tensor]) -> None:
+        """Make modules for the stored ``state``, where the present ones would not take it."""
 
     @abstractmethod
     def passport(self) -> Passport:

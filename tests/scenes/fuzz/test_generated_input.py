@@ -9,7 +9,9 @@ from __future__ import annotations
 import io
 import json
 import os
+import resource
 import shutil
+import sys
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -417,6 +419,12 @@ PARSERS = (
 )
 
 
+def most_memory() -> int:
+    """The most bytes that this process ever held."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
 @pytest.mark.parametrize("parser", PARSERS, ids=lambda parser: parser.name)
 @pytest.mark.filterwarnings("ignore")
 def test_damaged_input_is_read_or_refused(
@@ -429,7 +437,9 @@ def test_damaged_input_is_read_or_refused(
     def each(drawn: Any) -> None:
         verdicts.of(lambda: read(drawn))
 
+    before = most_memory()
     each()
+    assert most_memory() - before < 2**30
     assert verdicts.refused >= parser.refused, (verdicts.refused, verdicts.read)
 
 
