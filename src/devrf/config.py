@@ -51,9 +51,9 @@ def config_record(stage: str) -> str | None:
     return None if stage == "report" else ".hydra"
 
 
-def tracked_name(scene: str, mode: Any, overrides: str) -> str:
-    """What a tracker calls a run: the scene; in a sweep, what was asked of the job."""
-    return overrides or scene if _of_sweep(mode) else scene
+def tracked_name(scene: str, mode: Any, folder: str, overrides: str) -> str:
+    """What a tracker calls a run: the scene; a sweep's job by its folder and what was asked."""
+    return f"{Path(folder).name} {overrides}" if _of_sweep(mode) else scene
 
 
 def tracked_group(mode: Any, folder: str) -> str | None:

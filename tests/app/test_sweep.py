@@ -148,7 +148,7 @@ def test_jobs_in_processes_of_their_own(tmp_path, tiny):
 
 
 @installed("hydra_optuna_sweeper")
-def test_a_search_maximises_the_objective(devrf, tmp_path, tiny, steps):
+def test_a_search_maximises_the_objective(devrf, tmp_path, tiny):
     outcome = devrf(
         "-m", *tiny, "hparams_search=loss_weights", "hydra.sweeper.n_trials=2",
         "hydra.sweep.dir=sweep", "video.frames=1",

@@ -181,14 +181,16 @@ def test_jobs_of_a_sweep_are_grouped_and_named(devrf, tmp_path, tiny, monkeypatc
     pytest.importorskip("wandb")
     monkeypatch.delenv("WANDB_MODE", raising=False)
     outcome = devrf(
-        "-m", *tiny, "stage=canonical", "logger=wandb", "hydra.sweep.dir=mine", "seed=0,1",
-        "hydra.job.config.override_dirname.exclude_keys=[stage,logger,field]",
+        "-m", *tiny, "stage=canonical", "logger=wandb", "hydra.sweep.dir=mine", "seed=0,1"
     )
     assert outcome.status == 0
-    runs = [Tracked(offline_runs(tmp_path / "mine" / job)[0]).run for job in ("0_robot", "1_robot")]
+    jobs = ("0_robot", "1_robot")
+    runs = [Tracked(offline_runs(tmp_path / "mine" / job)[0]).run for job in jobs]
     assert {run.run_group for run in runs} == {"mine"}
     assert len({run.run_id for run in runs}) == 2
-    assert all(len(run.display_name) <= 128 and "data.frames=3" in run.display_name for run in runs)
+    for job, run in zip(jobs, runs, strict=True):
+        assert len(run.display_name) <= 128
+        assert run.display_name.startswith(f"{job} data.frames=3,data.height=20")
 
 
 def test_a_run_that_begins_anew_is_another_run(devrf, tmp_path, tiny):
