@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.autograd import gradcheck
 
-from devrf.ops.compositing import composite, sum_by_ray, transmittances
+from devrf.ops.compositing import composite, sum_by_doubling, sum_by_ray, transmittances
 
 # Three rays: three samples, none, two.
 RAY = torch.tensor([0, 0, 0, 2, 2])
@@ -98,3 +98,13 @@ def test_transmittance_before_each_sample_by_hand() -> None:
     alpha = torch.tensor([0.5, 0.2, 0.1, 0.25, 0.6])
     before = transmittances(-torch.log1p(-alpha), RAY, 3)
     torch.testing.assert_close(before, torch.tensor([1.0, 0.5, 0.4, 1.0, 0.75]))
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 7, 8, 1000])
+def test_running_sums_by_doubling(rng: torch.Generator, count: int) -> None:
+    values = torch.rand(count, generator=rng, dtype=torch.float64)
+    torch.testing.assert_close(sum_by_doubling(values), values.cumsum(0), rtol=1e-14, atol=0)
+
+
+def test_running_sums_by_doubling_in_full() -> None:
+    assert sum_by_doubling(torch.tensor([1.0, 2.0, 4.0, 8.0, 16.0])).tolist() == [1, 3, 7, 15, 31]
