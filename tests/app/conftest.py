@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import logging
 import os
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -13,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+import devrf as package
 from devrf.__main__ import entry
 
 # A scene of 24 x 20 pixels and schedules of a few iterations: seconds, and no quality.
@@ -97,3 +100,50 @@ def trained(
     folder = tmp_path_factory.mktemp("trained")
     outcome = call(folder, *tiny)
     yield folder / "outputs" / "robot" / "default", outcome
+
+
+class Warm:
+    """Runs commands in processes of their own, without waiting for their imports."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self._process = process
+
+    def __call__(
+        self,
+        folder: Path,
+        *arguments: str,
+        after: tuple[str, int] | None = None,
+        delay: float = 0.0,
+        signals: tuple[int, ...] = (),
+        most_bytes: int = 0,
+    ) -> Outcome:
+        """``devrf ARGUMENTS`` in ``folder``; ``warm_process.py`` says what the others do."""
+        assert self._process.stdin is not None and self._process.stdout is not None
+        said = folder / "said.txt"
+        before = said.stat().st_size if said.exists() else 0
+        asked = {
+            "folder": str(folder), "arguments": arguments, "after": after, "delay": delay,
+            "signals": signals, "most_bytes": most_bytes,
+        }
+        self._process.stdin.write(json.dumps(asked) + "\n")
+        self._process.stdin.flush()
+        status = int(json.loads(self._process.stdout.readline()))
+        return Outcome(status, said.read_text()[before:], "")
+
+
+@pytest.fixture(scope="session")
+def warm() -> Iterator[Warm]:
+    """Runs commands in processes of their own, at the cost of a fork each."""
+    if not hasattr(os, "fork"):
+        pytest.skip("needs fork")
+    source = str(Path(package.__file__).parents[1])
+    environment = {**os.environ, "PYTHONPATH": source, "OMP_NUM_THREADS": "1"}
+    environment.pop("HYDRA_FULL_ERROR", None)
+    with subprocess.Popen(
+        [sys.executable, str(Path(__file__).with_name("warm_process.py"))], env=environment,
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    ) as process:
+        assert process.stdin is not None and process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        yield Warm(process)
+        process.stdin.close()

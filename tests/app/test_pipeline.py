@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import shutil
 from pathlib import Path
 
@@ -185,12 +184,15 @@ def test_a_sweep_runs_every_combination(devrf, tmp_path, tiny):
     assert len(list((tmp_path / "sweep").glob("*/checkpoints/canonical.ckpt"))) == 2
 
 
-def test_a_deformation_older_than_the_canonical_field_is_not_passed_off_as_its_own(
+def test_a_deformation_of_another_canonical_field_is_not_passed_off_as_its_own(
     devrf, tmp_path, tiny, trained
 ):
     folder = tmp_path / "retrained"
     shutil.copytree(trained[0], folder)
-    canonical, moving = (folder / "checkpoints" / f"{n}.ckpt" for n in ("canonical", "deformation"))
-    os.utime(canonical, ns=(0, moving.stat().st_mtime_ns + 10**9))
-    assert devrf(*tiny, "stage=evaluate", f"hydra.run.dir={folder}").status == 0
+    assert devrf(*tiny, "stage=canonical", "seed=1", "hydra.run.dir=other").status == 0
+    other = tmp_path / "other" / "checkpoints" / "canonical.ckpt"
+    other.replace(folder / "checkpoints" / "canonical.ckpt")
+    outcome = devrf(*tiny, "stage=evaluate", f"hydra.run.dir={folder}")
+    assert outcome.status == 0
+    assert "deformation.ckpt: left out, it belongs to another canonical field" in outcome.out
     assert "deformation" not in metrics(folder)

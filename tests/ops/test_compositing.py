@@ -12,6 +12,7 @@ from torch.autograd import gradcheck
 from devrf.ops.compositing import (
     composite,
     composite_segments,
+    sum_by_doubling,
     sum_by_ray,
     sum_segments,
     transmittances,
@@ -128,3 +129,13 @@ def test_sums_of_segments_by_hand() -> None:
     values = torch.tensor([[1.0, 0.0], [1.0, 1.0], [0.0, 1.0], [2.0, 0.0], [0.0, 1.0], [9.0, 9.0]])
     sums = sum_segments(weights, values, FIRST)
     assert torch.equal(sums, torch.tensor([[3.0, 5.0], [0.0, 0.0], [8.0, 5.0]]))
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 7, 8, 1000])
+def test_running_sums_by_doubling(rng: torch.Generator, count: int) -> None:
+    values = torch.rand(count, generator=rng, dtype=torch.float64)
+    torch.testing.assert_close(sum_by_doubling(values), values.cumsum(0), rtol=1e-14, atol=0)
+
+
+def test_running_sums_by_doubling_in_full() -> None:
+    assert sum_by_doubling(torch.tensor([1.0, 2.0, 4.0, 8.0, 16.0])).tolist() == [1, 3, 7, 15, 31]

@@ -45,7 +45,7 @@ class PixelPool:
     def mask(self, images: Tensor, area: int) -> Tensor:
         """Which pixels of ``images`` (K,), ascending, are here: (K, ``area``) bool."""
         mask = torch.zeros(len(images), area, dtype=torch.bool, device=self.image.device)
-        row = torch.searchsorted(images.to(self.image.dtype), self.image)
+        row = torch.searchsorted(images.to(self.image.dtype), self.image.contiguous())
         mask[row, self.flat.long()] = True
         return mask
 

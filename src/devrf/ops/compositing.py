@@ -149,4 +149,21 @@ def _running_sum(values: Tensor) -> Tensor:
 
     In double precision: a ray's own sum is the difference of two of these, which may be large.
     """
-    return torch.nn.functional.pad(values.double().cumsum(dim=0), (1, 0))
+    values = values.double()
+    if values.is_cuda and torch.are_deterministic_algorithms_enabled():
+        sums = sum_by_doubling(values)
+    else:
+        sums = values.cumsum(dim=0)
+    return torch.nn.functional.pad(sums, (1, 0))
+
+
+def sum_by_doubling(values: Tensor) -> Tensor:
+    """Running sums (S,) in ⌈log₂ S⌉ passes, whose additions always come in the same order.
+
+    On a GPU ``cumsum`` adds in the order in which its blocks happen to finish.
+    """
+    reach = 1
+    while reach < len(values):
+        values = torch.cat([values[:reach], values[reach:] + values[:-reach]])
+        reach *= 2
+    return values

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from functools import cached_property
 from pathlib import Path
@@ -20,6 +21,13 @@ from devrf.scenes.scene import Scene
 from devrf.stages.checkpoint import Stored, load_checkpoint
 from devrf.stages.evaluation import Evaluation
 from devrf.stages.ranks import RaysByRank
+from devrf.stages.sealed_file import digest_of
+
+log = logging.getLogger(__name__)
+
+# What a deformation was learned on, among the settings it was made with: the digest of the run's
+# own canonical field, or of one that was given.
+OWN_REST, GIVEN_REST = "checkpoints/canonical.ckpt", "ckpt"
 
 # Stages that no checkpoint is of use to, and that begin a run of their own.
 FROM_NOTHING = ("prepare", "inspect", "canonical", "pipeline", "report")
@@ -125,9 +133,7 @@ class RunContext:
         return self.folder / "checkpoints" / f"{name}.ckpt"
 
     def checkpoint(self, *names: str) -> Path:
-        """The checkpoint that was asked for, else the one of ``names`` that was written last.
-
-        A deformation that is older than the run's canonical field belongs to another.
+        """The checkpoint that was asked for, else the first of ``names`` that the run has.
 
         Raises:
             DevrfError: there is none.
@@ -142,8 +148,18 @@ class RunContext:
                 f"{self.own_checkpoint(names[-1])}: no such checkpoint; run stage={names[-1]} "
                 "first, or give ckpt=PATH"
             )
-        return max(found, key=lambda path: path.stat().st_mtime)
+        return found[0]
 
     def load(self, *names: str) -> Stored:
-        """What a stage learned of this run's scene; ``names`` as for :meth:`checkpoint`."""
-        return load_checkpoint(self.checkpoint(*names), self.scene)
+        """What a stage learned of this run's scene; ``names`` as for :meth:`checkpoint`.
+
+        A deformation of another canonical field than the run's is passed over.
+        """
+        path = self.checkpoint(*names)
+        stored = load_checkpoint(path, self.scene)
+        own = self.own_checkpoint("canonical")
+        rest = stored.passport.made_with.get(OWN_REST)
+        if self.config.ckpt is None and rest and own.is_file() and digest_of(own) != rest:
+            log.info("%s: left out, it belongs to another canonical field than the run's", path)
+            return load_checkpoint(own, self.scene)
+        return stored

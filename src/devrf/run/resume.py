@@ -27,7 +27,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from devrf.config_check import REFERENCE
 from devrf.errors import DevrfError
-from devrf.run.context import RunContext
+from devrf.run.context import GIVEN_REST, OWN_REST, RunContext
 from devrf.stages.checkpoint import Passport, passport_in
 from devrf.stages.progress import progress_files
 from devrf.stages.sealed_file import digest_of, read_sealed
@@ -36,10 +36,6 @@ log = logging.getLogger(__name__)
 
 # Settings of a datamodule or a stage that change nothing that is learned.
 ELSEWHERE = {"root", "name", "flow_cache", "export", "iterations_per_step"}
-
-# What a deformation is learned on: the run's own canonical field, or one that was given.
-OWN_REST, GIVEN_REST = "checkpoints/canonical.ckpt", "ckpt"
-
 
 @dataclass(frozen=True)
 class Beginning:
