@@ -13,6 +13,31 @@ from devrf.scenes.scene import Views
 
 
 @dataclass(frozen=True)
+class Pixels:
+    """R pixels to make a batch of.
+
+    Attributes:
+        image: (R,) int64, the image of each among the views.
+        flat: (R,) int64, its row-major number in the image.
+        background: (3,) or (R, 3) RGB in [0, 1] that mattes are composited on.
+    """
+
+    image: Tensor
+    flat: Tensor
+    background: Tensor
+
+    def take(self, others: Pixels) -> None:
+        """Become as many others, in the same memory."""
+        self.image.copy_(others.image)
+        self.flat.copy_(others.flat)
+        self.background.copy_(others.background)
+
+    def clone(self) -> Pixels:
+        """The same pixels in other memory."""
+        return Pixels(self.image.clone(), self.flat.clone(), self.background.clone())
+
+
+@dataclass(frozen=True)
 class RayBatch:
     """R rays with the truth at their pixels.
 

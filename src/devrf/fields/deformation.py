@@ -129,6 +129,11 @@ class DeformationField(nn.Module):
             tensor.copy_(value, non_blocking=True)
 
     @torch.no_grad()
+    def read_forward(self, frame: int, into: Tensor) -> None:
+        """As :meth:`read`, of the forward displacements alone."""
+        into.copy_(self.to_time[frame], non_blocking=True)
+
+    @torch.no_grad()
     def write(self, frame: int, displacements: Directions) -> None:
         """Copy a frame back: backward and forward ``displacements`` (X, Y, Z, 3).
 
