@@ -32,7 +32,6 @@ from devrf.stages.stage import Phase, ScheduledStage
 from devrf.stages.useful import meets_matter
 from devrf.stages.visit import Visit
 
-
 log = logging.getLogger(__name__)
 
 
@@ -301,9 +300,9 @@ class DeformationStage(ScheduledStage):
         visit, space = self.visit, self.scene_model.space
         batch = gather_batch(views, pixels.image, pixels.flat, pixels.background, space)
         output = self.see(batch.rays, visit.occupancy, batch.background, visit.warp)
+        before = visit.unwarp_previous(looked_up=self.room is not None)
         prediction = MotionPrediction(
-            output, batch, visit.unwarp, visit.unwarp_previous, views.cameras, self._previous,
-            space,
+            output, batch, visit.unwarp, before, views.cameras, self._previous, space
         )
         return self.losses(prediction)
 
