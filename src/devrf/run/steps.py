@@ -16,6 +16,7 @@ from devrf import job
 from devrf.errors import DevrfError
 from devrf.losses.composer import WeightedLoss
 from devrf.losses.motion import MOTION_TERMS
+from devrf.ops.choice import using
 from devrf.run.context import FROM_NOTHING, RunContext
 from devrf.run.film import render
 from devrf.run.look import inspect, prepare
@@ -107,7 +108,8 @@ def _take(steps: Sequence[Callable[[RunContext], None]], run: RunContext) -> Non
     for step in steps:
         seed_everything(run.config.seed, verbose=False)
         run.begin_step()
-        step(run)
+        with using(run.config.kernels):
+            step(run)
 
 
 def _check(run: RunContext, stage: str) -> None:
