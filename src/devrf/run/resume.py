@@ -37,6 +37,7 @@ log = logging.getLogger(__name__)
 # Settings of a datamodule or a stage that change nothing that is learned.
 ELSEWHERE = {"root", "name", "flow_cache", "export", "iterations_per_step"}
 
+
 @dataclass(frozen=True)
 class Beginning:
     """Where a stage begins.
