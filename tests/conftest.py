@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import copy
 import logging
+import os
 import warnings
 from collections.abc import Callable, Iterator
 from typing import Any
+
+# Before torch, which loads Triton: Triton decides then whether its interpreter runs kernels.
+# TRITON_INTERPRET=0 in the environment runs the tests of the kernels on a GPU instead.
+os.environ.setdefault("TRITON_INTERPRET", "1")
 
 import pytest
 import torch

@@ -9,19 +9,21 @@ from devrf.app import main
 from devrf.messages import mistakes_in_one_line
 from devrf.process import tune_for_cpu
 from devrf.signals import Interrupted, answered_by, end_at_once
+from devrf.sweep import failures_at_the_end
 
 
 def entry() -> None:
     """Run the application.
 
-    A mistake in the input ends it with one line and status 2, a signal with one line and 128
-    plus its number: 130 for Ctrl-C, 143 for SIGTERM.
+    A mistake in the input ends it with one line and status 2, a sweep of which jobs failed with
+    their names and status 3, a signal with one line and 128 plus its number: 130 for Ctrl-C,
+    143 for SIGTERM.
     """
     # Hydra would print a traceback of its own and exit with 1 if it were not told to raise.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     tune_for_cpu()
     try:
-        with answered_by(end_at_once), mistakes_in_one_line():
+        with answered_by(end_at_once), mistakes_in_one_line(), failures_at_the_end():
             main()
     except Interrupted as stop:
         print(f"devrf: {stop.said}", file=sys.stderr)

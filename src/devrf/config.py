@@ -6,6 +6,8 @@ import re
 from pathlib import Path
 from typing import Any
 
+from devrf.artifacts.report.write import ReportSettings
+
 
 def config_folder() -> Path:
     """The folder ``conf/``: inside an installed package, else beside ``src/`` in a checkout."""
@@ -34,9 +36,39 @@ def run_name(experiment: str | None, ablation: str | None) -> str:
     return "-".join(parts)
 
 
+def run_folder(stage: str, report: Any, scene: str, name: str) -> str:
+    """Where a run lives: told from scene and experiment; a report lives where it is written."""
+    if stage != "report":
+        return f"outputs/{scene}/{name}"
+    settings = ReportSettings(report.runs, report.into)
+    # A folder that was misspelt is not made: the step says that there is none.
+    there = Path(settings.runs).is_dir() or report.into is not None
+    return str(settings.folder) if there else "outputs/report"
+
+
+def config_record(stage: str) -> str | None:
+    """The folder in a run's own for its composed config; a report may lie beside another's."""
+    return None if stage == "report" else ".hydra"
+
+
+def tracked_name(scene: str, mode: Any, folder: str, overrides: str) -> str:
+    """What a tracker calls a run: the scene; a sweep's job by its folder and what was asked."""
+    return f"{Path(folder).name} {overrides}" if _of_sweep(mode) else scene
+
+
+def tracked_group(mode: Any, folder: str) -> str | None:
+    """The group that a tracker puts a run into: the sweep's folder's name, None outside one."""
+    return Path(folder).name if _of_sweep(mode) else None
+
+
+def _of_sweep(mode: Any) -> bool:
+    return str(getattr(mode, "name", mode)) == "MULTIRUN"
+
+
 def register_resolvers() -> None:
-    """Make ``${devrf.scene_name:…}`` and ``${devrf.run_name:…}`` known to OmegaConf."""
+    """Make ``${devrf.scene_name:…}`` and the other words known to OmegaConf."""
     from omegaconf import OmegaConf
 
-    OmegaConf.register_new_resolver("devrf.scene_name", scene_name, replace=True)
-    OmegaConf.register_new_resolver("devrf.run_name", run_name, replace=True)
+    words = (scene_name, run_name, run_folder, config_record, tracked_name, tracked_group)
+    for word in words:
+        OmegaConf.register_new_resolver(f"devrf.{word.__name__}", word, replace=True)

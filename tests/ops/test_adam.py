@@ -47,7 +47,7 @@ def test_an_entry_without_gradient_keeps_value_and_moments() -> None:
     optimizer = GridAdam([{"params": [parameter], "skip_zero": True}], lr=0.1)
     # Entry (0, 1) shares its row with a touched one; the second row is not touched at all.
     run(optimizer, parameter, [torch.full((1, 1, 2, 2), 2.0)])
-    before = {k: v.clone() for k, v in optimizer.state[parameter].items() if k != "step"}
+    before = {k: v.clone() for k, v in optimizer.state[parameter].items() if k != "steps"}
     value = parameter.detach().clone()
     run(optimizer, parameter, [torch.tensor([[3.0, 0.0], [0.0, 0.0]]).view(1, 1, 2, 2)])
     state = optimizer.state[parameter]
@@ -90,6 +90,26 @@ def test_replaced_parameters_start_afresh() -> None:
     run(optimizer, new, [torch.full((1, 1, 1, 1), -5.0)])
     assert new.item() == pytest.approx(0.1)
     assert old.item() == pytest.approx(-0.3)
+
+
+def test_the_rate_may_be_a_tensor_that_changes() -> None:
+    parameter, rate = torch.zeros(1, 1, 1, 1, requires_grad=True), torch.tensor(0.5)
+    optimizer = GridAdam([parameter], lr=rate)
+    run(optimizer, parameter, [torch.ones(1, 1, 1, 1)])
+    assert parameter.item() == pytest.approx(-0.5)
+    rate.fill_(0.25)
+    run(optimizer, parameter, [torch.ones(1, 1, 1, 1)])
+    assert parameter.item() == pytest.approx(-0.75)
+
+
+def test_a_restored_optimizer_goes_on_where_it_stopped(rng: torch.Generator) -> None:
+    grads = gradients(rng, 6)
+    whole, resumed = (torch.zeros(SHAPE, dtype=torch.float64, requires_grad=True) for _ in range(2))
+    run(GridAdam([whole], lr=0.1), whole, grads)
+    first, second = GridAdam([resumed], lr=0.1), GridAdam([resumed], lr=0.1)
+    run(first, resumed, grads[:3])
+    second.load_state_dict(first.state_dict())
+    torch.testing.assert_close(run(second, resumed, grads[3:]), whole.detach())
 
 
 def test_a_parameter_without_gradient_stands_still_and_the_closure_is_asked() -> None:

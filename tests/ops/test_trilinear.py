@@ -91,3 +91,20 @@ def test_no_points_is_no_values_and_no_gradient() -> None:
     assert out.shape == (0, 4)
     out.sum().backward()
     assert grid.grad is not None and not grid.grad.any()
+
+
+def test_the_gradient_of_a_grid_may_be_added_to_a_buffer() -> None:
+    grid, into = torch.zeros(2, 2, 2, 1, requires_grad=True), torch.ones(2, 2, 2, 1)
+    interpolate(grid, torch.tensor([[0.25, 0.0, 0.0]]), gradient=into).sum().backward()
+    assert grid.grad is None
+    assert into[0, 0, 0].item() == pytest.approx(1.75)
+    assert into[1, 0, 0].item() == pytest.approx(1.25)
+    assert into[:, 1].eq(1).all()
+
+
+def test_a_shape_first_met_in_inference_mode_can_be_trained() -> None:
+    with torch.inference_mode():
+        interpolate(torch.zeros(2, 3, 9, 1), torch.ones(1, 3))
+    coords = torch.ones(1, 3, requires_grad=True)
+    interpolate(torch.zeros(2, 3, 9, 1), coords).sum().backward()
+    assert coords.grad is not None

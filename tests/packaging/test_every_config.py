@@ -24,7 +24,10 @@ FILES = [
     for group in GROUPS
     for file in sorted((config_folder() / group).glob("*.yaml"))
 ]
-NEEDS = {"logger=tensorboard": "tensorboard"}
+NEEDS = {
+    "logger=tensorboard": "tensorboard",
+    "hparams_search=loss_weights": "hydra_plugins.hydra_optuna_sweeper",
+}
 
 
 def rooted(composed, *overrides):
@@ -36,8 +39,8 @@ def rooted(composed, *overrides):
 
 def test_the_groups_are_the_documented_ones():
     assert {
-        "ablation", "callbacks", "data", "experiment", "field", "logger", "loss", "sampling",
-        "schedule", "stages", "trainer", "video",
+        "ablation", "callbacks", "data", "experiment", "field", "logger", "loss", "report",
+        "sampling", "schedule", "stages", "trainer", "video",
     } <= set(GROUPS)
 
 
@@ -99,8 +102,19 @@ def test_the_command_line_overrides_the_ablation_and_that_the_experiment(compose
         (["data=inward", "data.root=x", "data.name=y"], "outputs/y/default"),
         (["ablation=base"], "outputs/robot/default-base"),
         (["data=inward"], "outputs/scene/default"),
+        (["stage=report", "report.into=there"], "there"),
+        (["stage=report", "report.runs=no such folder"], "outputs/report"),
     ],
 )
 def test_where_a_run_lives_is_told_from_scene_experiment_and_ablation(composed, overrides, folder):
     composed(*overrides)
     assert HydraConfig.get().run.dir == folder
+
+
+def test_the_ablation_table_is_every_ablation_on_both_embedded_scenes(composed):
+    composed("experiment=ablation_table")
+    hydra = HydraConfig.get()
+    ablations = {path.stem for path in (config_folder() / "ablation").glob("*.yaml")}
+    assert hydra.mode.name == "MULTIRUN"
+    assert set(hydra.sweeper.params["ablation"].split(",")) == ablations
+    assert hydra.sweeper.params["data.shape"] == "robot,flower"

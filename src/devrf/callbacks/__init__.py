@@ -1,5 +1,7 @@
 """Callbacks: what watches a stage and acts on it from outside."""
 
+from devrf.callbacks.meter import Meter
+from devrf.callbacks.previews import Previews
 from devrf.callbacks.progress import Progress
 from devrf.callbacks.record import TrainingRecord
 from devrf.callbacks.saving import Saving
@@ -7,5 +9,6 @@ from devrf.callbacks.schedule import GridUpscaling, LearningRateDecay
 from devrf.callbacks.stopping import StopOnSignal
 
 __all__ = [
-    "GridUpscaling", "LearningRateDecay", "Progress", "Saving", "StopOnSignal", "TrainingRecord",
+    "GridUpscaling", "LearningRateDecay", "Meter", "Previews", "Progress", "Saving",
+    "StopOnSignal", "TrainingRecord",
 ]

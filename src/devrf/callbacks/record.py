@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from lightning import Callback, LightningModule, Trainer
 
+from devrf.callbacks.previews import Previews
 from devrf.stages.stage import ScheduledStage
 
 
@@ -22,9 +23,12 @@ class TrainingRecord(Callback):
         self._seconds_before = 0.0
         self._peak_before: float | None = None
         self._device: torch.device | None = None
+        self._previews: list[Previews] = []
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start the clock and the memory's high-water mark."""
+        callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
+        self._previews = [one for one in callbacks if isinstance(one, Previews)]
         self._device = pl_module.device
         if self._device.type == "cuda":
             torch.cuda.reset_peak_memory_stats(self._device)
@@ -40,18 +44,25 @@ class TrainingRecord(Callback):
         self._peak_before = state_dict["peak_gpu_gb"]
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Write down wall-clock seconds, iterations and peak GPU memory (GiB; None on a CPU)."""
+        """Write down seconds, iterations, iterations a second, peak GPU memory.
+
+        Seconds are wall clock, without what previews took: they teach the fields nothing. Memory
+        is in GiB; None on a CPU.
+        """
         assert isinstance(pl_module, ScheduledStage)
         if pl_module.device.type == "cuda":
             torch.cuda.synchronize(pl_module.device)
+        seconds = self._seconds()
         pl_module.record = {
-            "seconds": round(self._seconds(), 2),
+            "seconds": round(seconds, 2),
             "iterations": pl_module.iteration,
+            "iterations_per_second": round(pl_module.iteration / seconds, 2),
             "peak_gpu_gb": self._peak(),
         }
 
     def _seconds(self) -> float:
-        return self._seconds_before + time.perf_counter() - self._started
+        looking = sum(previews.seconds for previews in self._previews)
+        return self._seconds_before + time.perf_counter() - self._started - looking
 
     def _peak(self) -> float | None:
         if self._device is None or self._device.type != "cuda":

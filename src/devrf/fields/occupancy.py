@@ -57,11 +57,14 @@ class Occupancy(nn.Module):
 
     def _look_up(self, mask: Tensor, points: Tensor) -> Tensor:
         x, y, z = mask.shape
-        cell = self.box.to_grid(points, (x, y, z)).round_().to(torch.int32)
-        i, j, k = cell.unbind(-1)
-        inside = (i >= 0) & (i < x) & (j >= 0) & (j < y) & (k >= 0) & (k < z)
-        row = torch.where(inside, (i * y + j) * z + k, 0)
-        return mask.view(-1)[row] & inside
+        # Axis by axis: whole vectors are several times faster than rows of three.
+        along = self.box.to_grid(points, (x, y, z)).round_().to(torch.int32).t().contiguous()
+        inside = torch.ones_like(along[0], dtype=torch.bool)
+        row = torch.zeros_like(along[0])
+        for cell, count in zip(along, mask.shape, strict=True):
+            inside &= (cell >= 0) & (cell < count)
+            row.mul_(count).add_(cell)
+        return mask.view(-1).index_select(0, row.mul_(inside)) & inside
 
     def replace(self, mask: Tensor, box: Box | None = None) -> None:
         """Take another mask, of any shape, over another box if one is given."""
@@ -88,15 +91,16 @@ class Occupancy(nn.Module):
 
 def dilate(mask: Tensor, radius: int) -> Tensor:
     """The mask (X, Y, Z) grown by ``radius`` grid points along every axis and diagonal."""
-    if radius == 0:
-        return mask
-    pooled = mask[None, None].float()
-    # A cube-shaped maximum is separable: three passes along the axes instead of one over r³.
+    grown = mask
+    # A cube grows along one axis after another; bits shifted onto each other are quicker than
+    # any pooling.
     for axis in range(3):
-        kernel, padding = [1, 1, 1], [0, 0, 0]
-        kernel[axis], padding[axis] = 2 * radius + 1, radius
-        pooled = torch.nn.functional.max_pool3d(pooled, kernel, stride=1, padding=padding)
-    return pooled[0, 0] > 0
+        before, grown = grown, grown.clone()
+        for shift in range(1, min(radius, mask.shape[axis] - 1) + 1):
+            length = mask.shape[axis] - shift
+            grown.narrow(axis, shift, length).logical_or_(before.narrow(axis, 0, length))
+            grown.narrow(axis, 0, length).logical_or_(before.narrow(axis, shift, length))
+    return grown
 
 
 def bounding_box(mask: Tensor, box: Box) -> Box | None:

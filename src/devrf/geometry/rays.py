@@ -30,8 +30,14 @@ class Rays:
         return Rays(self.origins[index], self.directions[index], self.viewdirs[index])
 
     def at(self, ray: Tensor, distance: Tensor) -> Tensor:
-        """Points (S, 3) at ``distance`` (S,) along the rays numbered ``ray`` (S,)."""
-        return torch.addcmul(self.origins[ray], self.directions[ray], distance[:, None])
+        """Points (S, 3) at ``distance`` (S,) along the rays numbered ``ray`` (S,).
+
+        They lie in memory axis by axis: what is done to millions of points is several times
+        faster on whole vectors than on rows of three.
+        """
+        origins = self.origins.t().contiguous().index_select(1, ray)
+        directions = self.directions.t().contiguous().index_select(1, ray)
+        return origins.addcmul_(directions, distance).t()
 
     def to(self, device: torch.device | str) -> Rays:
         """The same rays on ``device``."""

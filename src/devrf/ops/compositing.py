@@ -2,6 +2,9 @@
 
 Everything is written in optical depths τ = σ·δ, for which opacity is α = 1 − exp(−τ) and
 transmittance T_i = Π_{j<i} (1 − α_j) = exp(−Σ_{j<i} τ_j): no logarithm of a vanishing number.
+
+A ray's samples are given either by the ray of each sample, or by where each ray begins in a list
+that may end in padding (devrf.ops.search).
 """
 
 from __future__ import annotations
@@ -11,6 +14,8 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+
+from devrf.ops.choice import triton_runs
 
 
 def composite(depth: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
@@ -27,19 +32,80 @@ def composite(depth: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
     Returns:
         weights (S,) and end transmittance (R,), differentiable once in ``depth``.
     """
+    if triton_runs(depth):
+        from devrf.ops.kernels.compositing import Composite
+
+        first = torch.searchsorted(ray, torch.arange(rays + 1, device=ray.device))
+        weights, end = Composite.apply(depth.contiguous(), first)  # type: ignore[no-untyped-call]
+        return weights, end
     weights, end = _Composite.apply(depth, ray, rays)  # type: ignore[no-untyped-call]
     return weights, end
 
 
+def composite_segments(depth: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
+    """As :func:`composite`, for rays given by where they begin.
+
+    Args:
+        depth: (S,) optical depths, front to back within each ray; padding at the end.
+        first: (R + 1,) int64, ascending: ray r has the samples first[r] … first[r + 1] − 1.
+            Places from first[R] on are padding.
+
+    Returns:
+        weights (S,), zero in the padding, and end transmittance (R,), differentiable once in
+        ``depth``.
+    """
+    if triton_runs(depth):
+        from devrf.ops.kernels.compositing import Composite
+
+        weights, end = Composite.apply(  # type: ignore[no-untyped-call]
+            depth.contiguous(), first.contiguous()
+        )
+        return weights, end
+    rays = len(first) - 1
+    ray = _rays_of(first, len(depth))
+    # The padding makes one ray more, on which there is nothing.
+    tau = torch.where(ray < rays, depth, torch.zeros_like(depth))
+    weights, end = _Composite.apply(tau, ray, rays + 1)  # type: ignore[no-untyped-call]
+    return weights, end[:-1]
+
+
+def sum_segments(weights: Tensor, values: Tensor, first: Tensor) -> Tensor:
+    """Sums (R, C) of ``w_i · c_i`` over each ray's samples; padding counts for nothing.
+
+    Args:
+        weights: (S,) w.
+        values: (S, C) c, finite in the padding too.
+        first: (R + 1,) as for :func:`composite_segments`.
+
+    Returns:
+        (R, C), differentiable once in ``weights`` and ``values``.
+    """
+    if triton_runs(weights, values):
+        from devrf.ops.kernels.compositing import SumSegments
+
+        sums: Tensor = SumSegments.apply(  # type: ignore[no-untyped-call]
+            weights.contiguous(), values.contiguous(), first.contiguous()
+        )
+        return sums
+    ray = _rays_of(first, len(weights))
+    return sum_by_ray(weights[:, None] * values, ray, len(first))[:-1]
+
+
 def transmittances(depth: Tensor, ray: Tensor, rays: int) -> Tensor:
-    """T_i (S,): what is left of each sample's ray before it; arguments as :func:`composite`."""
+    """T_i (S,): what is left of each sample's ray before it; arguments as :func:`composite`.
+
+    Plain PyTorch everywhere: a search with devrf.ops.search does not need it.
+    """
     first, _ = _segments(ray, rays)
     reached = _running_sum(depth)
     return torch.exp(reached[first[ray]] - reached[:-1]).to(depth.dtype)
 
 
 def sum_by_ray(values: Tensor, ray: Tensor, rays: int) -> Tensor:
-    """Sums (R, C) or (R,) of per-sample ``values`` (S, C) or (S,) over each ray."""
+    """Sums (R, C) or (R,) of per-sample ``values`` (S, C) or (S,) over each ray.
+
+    Plain PyTorch everywhere: it is one kernel already, and ``ray`` need not ascend.
+    """
     return values.new_zeros((rays, *values.shape[1:])).index_add(0, ray, values)
 
 
@@ -70,6 +136,12 @@ def _segments(ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
     """First sample and one past the last sample of every ray, (R,) each."""
     edges = torch.searchsorted(ray, torch.arange(rays + 1, device=ray.device))
     return edges[:-1], edges[1:]
+
+
+def _rays_of(first: Tensor, samples: int) -> Tensor:
+    """The ray (S,) of each sample; R in the padding."""
+    place = torch.arange(samples, device=first.device)
+    return torch.searchsorted(first[1:].contiguous(), place, right=True)
 
 
 def _running_sum(values: Tensor) -> Tensor:

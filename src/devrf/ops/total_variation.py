@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from devrf.ops.choice import triton_runs
+
 
 def total_variation(grid: Tensor) -> Tensor:
     """Σ over pairs of neighbours of h(v − v'), h(d) = d²/2 for |d| ≤ 1 and |d| − 1/2 beyond.
@@ -34,6 +36,11 @@ def add_total_variation_gradient(grid: Tensor, gradient: Tensor, weight: float) 
         gradient: the same shape.
         weight: factor of the penalty.
     """
+    if grid.is_contiguous() and gradient.is_contiguous() and triton_runs(grid, gradient):
+        from devrf.ops.kernels.adam import add_gradient_in_one_pass
+
+        add_gradient_in_one_pass(grid, gradient, weight)
+        return
     for axis in range(3):
         after, before = _neighbours(grid, axis)
         slope = (after - before).clamp_(-1, 1)

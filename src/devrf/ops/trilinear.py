@@ -6,6 +6,7 @@ of eight rows: exactly what an embedding bag does, in one pass and without inter
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -13,10 +14,13 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import embedding_bag
 
+from devrf.ops.choice import triton_runs
+from devrf.ops.corners import Shape, shape_of
+
 Pair = tuple[Tensor, Tensor]
 
 
-def interpolate(grid: Tensor, coords: Tensor) -> Tensor:
+def interpolate(grid: Tensor, coords: Tensor, *, gradient: Tensor | None = None) -> Tensor:
     """Values of a grid between its points.
 
     ``out[m] = Σ_{i,j,k ∈ {0,1}} Π_axis w_axis(i,j,k) · grid[⌊c⌋ + (i,j,k)]`` with linear weights;
@@ -26,70 +30,108 @@ def interpolate(grid: Tensor, coords: Tensor) -> Tensor:
     Args:
         grid: (X, Y, Z, C), at least two points along each axis.
         coords: (M, 3) in grid units: 0 … X − 1, 0 … Y − 1, 0 … Z − 1.
+        gradient: None, or a contiguous tensor (X, Y, Z, C) that the grid's gradient is added to
+            in the backward pass, instead of being returned to autograd as a tensor of its own.
+            For a grid that requires gradients and of which few points are touched.
 
     Returns:
         (M, C), differentiable once in ``grid`` and ``coords``.
     """
-    values: Tensor = _Interpolate.apply(grid, coords)  # type: ignore[no-untyped-call]
+    if triton_runs(grid, coords):
+        from devrf.ops.kernels.trilinear import Interpolate
+
+        grid, coords = grid.contiguous(), coords.contiguous()
+        values: Tensor = Interpolate.apply(grid, coords, gradient)  # type: ignore[no-untyped-call]
+        return values
+    values = _Interpolate.apply(grid, coords, gradient)  # type: ignore[no-untyped-call]
     return values
 
 
 class _Interpolate(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, grid: Tensor, coords: Tensor) -> Tensor:
-        rows, fraction, inside = _cell(coords, grid.shape[:3])
-        ctx.save_for_backward(grid, rows, fraction, inside)
+    def forward(ctx: Any, grid: Tensor, coords: Tensor, gradient: Tensor | None) -> Tensor:
+        first, fraction = _cell(coords, shape_of(grid))
+        ctx.save_for_backward(grid, coords, first, fraction)
+        ctx.gradient = gradient
         table = grid.reshape(-1, grid.shape[3])
+        rows = _corner_rows(first, shape_of(grid))
         return _bag(rows, table, _corner_weights(_linear(fraction)))
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        grid, rows, fraction, inside = ctx.saved_tensors
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
+        grid, coords, first, fraction = ctx.saved_tensors
         grid_grad = coords_grad = None
+        rows = _corner_rows(first, shape_of(grid))
         table = grid.reshape(-1, grid.shape[3])
         weights = _linear(fraction)
-        if ctx.needs_input_grad[0]:
-            grid_grad = _scatter(rows, _corner_weights(weights), grad, len(table))
-            grid_grad = grid_grad.reshape(grid.shape)
+        if ctx.gradient is not None:
+            _scatter(rows, _corner_weights(weights), grad, ctx.gradient.view(table.shape))
+        elif ctx.needs_input_grad[0]:
+            grid_grad = torch.zeros_like(grid, memory_format=torch.contiguous_format)
+            _scatter(rows, _corner_weights(weights), grad, grid_grad.view(table.shape))
         if ctx.needs_input_grad[1]:
-            coords_grad = torch.empty_like(fraction)
-            rise = torch.ones_like(fraction[:, 0])
-            for axis in range(3):
+            slopes = torch.empty_like(fraction)
+            rise = torch.ones_like(fraction[0])
+            for axis, points in enumerate(shape_of(grid)):
                 sloped = [*weights[:axis], (-rise, rise), *weights[axis + 1 :]]
                 change = _bag(rows, table, _corner_weights(sloped))
-                coords_grad[:, axis] = (change * grad).sum(dim=1)
-            coords_grad = coords_grad * inside
-        return grid_grad, coords_grad
+                inside = (coords[:, axis] >= 0) & (coords[:, axis] <= points - 1)
+                torch.mul((change * grad).sum(dim=1), inside, out=slopes[axis])
+            coords_grad = slopes.t()
+        return grid_grad, coords_grad, None
 
 
-def _cell(coords: Tensor, shape: torch.Size) -> tuple[Tensor, Tensor, Tensor]:
-    """Rows (M, 8) of each point's corners, fractions (M, 3) in the cell, inside mask (M, 3)."""
-    last = coords.new_tensor(shape) - 1
-    clamped = torch.minimum(coords.clamp(min=0), last)
-    base = torch.minimum(clamped.floor(), last - 1)
-    i, j, k = base.to(torch.int32).unbind(-1)
-    first = (i * shape[1] + j) * shape[2] + k
+def _cell(coords: Tensor, shape: Shape) -> tuple[Tensor, Tensor]:
+    """Row (M,) of each point's lowest corner, and fractions (3, M) within the cell.
+
+    Axis by axis: whole vectors are several times faster than rows of three.
+    """
+    along = coords.t().contiguous()
+    fraction = torch.empty_like(along)
+    first = torch.zeros_like(along[0], dtype=torch.int32)
+    for axis, points in enumerate(shape):
+        clamped = along[axis].clamp(0, points - 1)
+        base = clamped.floor().clamp_(max=points - 2)
+        torch.sub(clamped, base, out=fraction[axis])
+        first.mul_(points).add_(base.to(torch.int32))
+    return first, fraction
+
+
+def _corner_rows(first: Tensor, shape: Shape) -> Tensor:
+    """Rows (M, 8) of the corners of cells whose lowest corners are in rows ``first`` (M,)."""
+    return first[:, None] + _steps(shape, first.device)
+
+
+@lru_cache(maxsize=256)
+def _steps(shape: Shape, device: torch.device) -> Tensor:
+    """Rows (8,) of a cell's corners from its first one.
+
+    Kept on the device: made anew at every step, they would make the device wait for the host.
+    """
     steps = [
         (a * shape[1] + b) * shape[2] + c for a in (0, 1) for b in (0, 1) for c in (0, 1)
     ]
-    rows = first[:, None] + torch.tensor(steps, dtype=torch.int32, device=coords.device)
-    return rows, clamped - base, (coords >= 0) & (coords <= last)
+    # A tensor made in inference mode could not be used for training later.
+    with torch.inference_mode(False):
+        return torch.tensor(steps, dtype=torch.int32).to(device)
 
 
 def _linear(fraction: Tensor) -> list[Pair]:
     """Per axis the weights (M,), (M,) of the lower and the upper corner."""
-    return [(1 - f, f) for f in fraction.t().contiguous()]
+    return [(1 - f, f) for f in fraction]
 
 
 def _corner_weights(axes: list[Pair]) -> Tensor:
     """Products (M, 8) of the three axes' weights, in the order of the corners' rows."""
     x, y, z = axes
-    # Whole vectors are multiplied and transposed at the end: broadcasting over pairs is slow.
-    weights = z[0].new_empty(8, len(z[0]))
-    for k, row in enumerate(weights):
-        torch.mul(x[k >> 2] * y[(k >> 1) & 1], z[k & 1], out=row)
-    return weights.t().contiguous()
+    weights = z[0].new_empty(len(z[0]), 8)
+    for pair in range(4):
+        side = x[pair >> 1] * y[pair & 1]
+        # Column by column: broadcasting over pairs, or one transposition at the end, is slower.
+        weights[:, 2 * pair] = side * z[0]
+        weights[:, 2 * pair + 1] = side * z[1]
+    return weights
 
 
 def _bag(rows: Tensor, table: Tensor, weights: Tensor) -> Tensor:
@@ -98,16 +140,14 @@ def _bag(rows: Tensor, table: Tensor, weights: Tensor) -> Tensor:
     return embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
 
 
-def _scatter(rows: Tensor, weights: Tensor, values: Tensor, count: int) -> Tensor:
-    """The transpose of :func:`_bag`: Σ weights · values (M, C) into (count, C)."""
+def _scatter(rows: Tensor, weights: Tensor, values: Tensor, into: Tensor) -> None:
+    """The transpose of :func:`_bag`: adds Σ weights · values (M, C) to rows of ``into``."""
     channels = values.shape[1]
     if values.is_cuda:
         spread = weights[:, :, None] * values[:, None, :]
-        into = values.new_zeros(count, channels)
-        return into.index_add_(0, rows.reshape(-1), spread.reshape(-1, channels))
+        into.index_add_(0, rows.reshape(-1), spread.reshape(-1, channels))
+        return
     # On a CPU adding rows is ten times slower than adding numbers, channel by channel.
-    into = values.new_zeros(count * channels)
-    first = rows.reshape(-1).long() * channels
+    flat, first = into.view(-1), rows.reshape(-1).long() * channels
     for channel, value in enumerate(values.t()):
-        into.scatter_add_(0, first + channel, (weights * value[:, None]).reshape(-1))
-    return into.view(count, channels)
+        flat.scatter_add_(0, first + channel, (weights * value[:, None]).reshape(-1))

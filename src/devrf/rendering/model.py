@@ -98,16 +98,18 @@ class SceneModel(nn.Module):
 
 
 @torch.no_grad()
-def deformed_occupancy(model: SceneModel, warp: Warp, margin: int = 1) -> Occupancy:
+def deformed_occupancy(model: SceneModel, warp: Warp) -> Occupancy:
     """Where something is once it has moved: the grid points that the warp sends to matter.
+
+    The canonical occupancy has a rim of one grid point, for what a stretching warp would step
+    over; so has the result, for what lies between its own grid points.
 
     Args:
         model: gives the canonical occupancy and the box.
         warp: maps points (M, 3) at the time in question into canonical space.
-        margin: grid points by which the result is grown, for what lies between them.
     """
-    shape = tuple(model.occupancy.mask.shape)
+    x, y, z = model.occupancy.mask.shape
     box = model.canonical.box
-    points = box.grid_points((shape[0], shape[1], shape[2]), model.canonical.density.values)
-    found = model.occupancy.at(warp(points.reshape(-1, 3))).view(shape)
-    return Occupancy(dilate(found, margin), box)
+    points = box.grid_points((x, y, z), model.canonical.density.values).view(-1, 3)
+    found = model.occupancy.at(warp(points)).view(x, y, z)
+    return Occupancy(dilate(found, 1), box)

@@ -36,7 +36,7 @@ class Samples:
         return Samples(
             self.ray.index_select(0, index),
             self.distance.index_select(0, index),
-            self.points.index_select(0, index),
+            self.points.t().index_select(1, index).t(),
             self.rays,
         )
 
@@ -75,19 +75,21 @@ def march(
     stretches = (count + per_stretch - 1) // per_stretch
     ray = torch.repeat_interleave(stretches)
     first = stretches.cumsum(0) - stretches
-    start = (torch.arange(len(ray), device=ray.device) - first[ray]) * per_stretch
-    middle = entry[ray] + step * (start + (per_stretch - 1) / 2)
+    start = torch.arange(len(ray), device=ray.device).sub_(first.index_select(0, ray))
+    start *= per_stretch
+    middle = entry.index_select(0, ray) + step * (start + (per_stretch - 1) / 2)
     kept = occupancy.near(rays.at(ray, middle)).nonzero()[:, 0]
-    number = start[kept, None] + torch.arange(per_stretch, device=ray.device)
-    ray = ray[kept].repeat_interleave(per_stretch)
-    number = number.reshape(-1)
-    distance = entry[ray] + step * number
+    ray, start = ray.index_select(0, kept), start.index_select(0, kept)
+    number = (start[:, None] + torch.arange(per_stretch, device=ray.device)).reshape(-1)
+    ray = ray.repeat_interleave(per_stretch)
+    distance = entry.index_select(0, ray).add_(number, alpha=step)
     points = rays.at(ray, distance)
-    kept = (occupancy.at(points) & (number < count[ray])).nonzero()[:, 0]
+    met = occupancy.at(points) & (number < count.index_select(0, ray))
+    kept = met.nonzero()[:, 0]
     return Samples(
         ray.index_select(0, kept),
         distance.index_select(0, kept),
-        points.index_select(0, kept),
+        points.t().index_select(1, kept).t(),
         len(rays),
     )
 

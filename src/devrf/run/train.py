@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import signal
 
 from hydra.utils import instantiate
 from lightning import Trainer
@@ -46,7 +47,8 @@ def deformation(run: RunContext) -> None:
 
 
 def _fit(run: RunContext, stage: ScheduledStage, begin: Beginning) -> None:
-    _ = run.scene  # what is wrong with it is said before a logger writes files
+    if run.leads:
+        _ = run.scene  # what is wrong with it is said before a logger writes files
     stage.made_with = begin.made_with
     callbacks = [*instantiate(run.config.callbacks).values(), TrainingRecord()]
     saving = next((one for one in callbacks if isinstance(one, Saving)), None)
@@ -63,16 +65,20 @@ def _fit(run: RunContext, stage: ScheduledStage, begin: Beginning) -> None:
             run.logger.go_on(stage.capture, begin.iteration)
         path = begin.progress and str(begin.progress)
         trainer.fit(stage, datamodule=run.datamodule, ckpt_path=path)
-        complete = stage.iteration >= stage.total_iterations
-        if stop.number is None or complete:
+        strategy = trainer.strategy
+        asked = strategy.reduce_boolean_decision(stop.number is not None, all=False)
+        if run.leads and (not asked or stage.iteration >= stage.total_iterations):
             _keep(run, trainer, stage)
-    if stop.number is not None:
-        raise Interrupted(stop.number, _where(stage, saving))
+        strategy.barrier("the checkpoint is written")
+    if asked:  # of several processes the first is, and ends for all
+        raise Interrupted(stop.number or signal.SIGTERM, _where(stage, saving))
 
 
 def _keep(run: RunContext, trainer: Trainer, stage: ScheduledStage) -> None:
     """Write what the stage has learned, and the config that it was learned with."""
     path = run.own_checkpoint(stage.name)
+    # The checkpoint carries it to whoever scores the run, hence without its own writing.
+    stage.record["wall_seconds"] = run.step_seconds
     try:
         save_checkpoint(trainer, path)
         with whole_file(path.with_name("config.yaml")) as partial:

@@ -24,13 +24,14 @@ from devrf.ops.adam import GridAdam
 from devrf.ops.total_variation import add_total_variation_gradient
 from devrf.rendering.model import SceneModel
 from devrf.rendering.render import RenderSettings, render
-from devrf.rendering.sampling import hits
 from devrf.scenes.scene import CaptureName, Views
 from devrf.stages.checkpoint import Passport, Stored
 from devrf.stages.progress import pack, unpack
+from devrf.stages.ranks import share
 from devrf.stages.schedules import CanonicalPhase, CanonicalSchedule
 from devrf.stages.settings import FINE_LOSS, SEARCH_LOSS, CanonicalRates, Sampling
 from devrf.stages.stage import Phase, ScheduledStage
+from devrf.stages.useful import meets_matter
 from devrf.stages.visibility import possible_space, share_of_views
 
 log = logging.getLogger(__name__)
@@ -114,6 +115,7 @@ class CanonicalStage(ScheduledStage):
 
     def setup(self, stage: str) -> None:
         """Build the field of the first phase in the scene's box."""
+        super().setup(stage)
         if self.scene_model is not None:
             return
         box, first = self.scene.bounds.box, self.schedule.phase(0)
@@ -136,8 +138,9 @@ class CanonicalStage(ScheduledStage):
                 {"params": list(canonical.decoder.parameters()), "lr": rates.decoder},
             ]
         )
-        for group in self._optimizer.param_groups:
-            group["base_lr"] = group["lr"]
+        names = ("density", "color", "decoder")
+        for name, group in zip(names, self._optimizer.param_groups, strict=True):
+            group.update(name=name, base_lr=group["lr"])
 
     def _settings(self, phase: CanonicalPhase) -> RenderSettings:
         bounds, sampling = self.scene.bounds, self.sampling
@@ -204,13 +207,11 @@ class CanonicalStage(ScheduledStage):
         pool = all_pixels(views, torch.arange(len(views), device=device))
         if everywhere:
             return pool
-        cameras, settings = views.cameras.to(device), self.model.settings
-        box, space = self.model.canonical.box, self.scene.space
+        cameras = views.cameras.to(device)
         kept = torch.cat(
             [
-                hits(space.rays(cameras.image_rays(k)), box, self.model.occupancy,
-                     near=settings.near, far=settings.far)
-                for k in range(len(views))
+                meets_matter(cameras, image, self.model, self.model.occupancy)
+                for image in range(len(views))
             ]
         )
         return PixelPool(pool.image[kept], pool.flat[kept])
@@ -233,10 +234,8 @@ class CanonicalStage(ScheduledStage):
     def loss(self, views: Views) -> tuple[Tensor, dict[str, Tensor]]:
         """Render a batch of random pixels and compare it with the images."""
         assert isinstance(self.phase, CanonicalPhase) and self._pool is not None
-        image, flat = self._pool.draw(self.schedule.rays)
-        background = background_color(
-            self.scene.background, len(image), self.device, training=True
-        )
+        image, flat = self._pool.draw(share(self.schedule.rays), self.generator)
+        background = background_color(self.scene.background, len(image), self.generator)
         batch = gather_batch(views, image, flat, background, self.scene.space)
         model = self.model
         output = render(

@@ -22,14 +22,15 @@ from devrf.ops.total_variation import add_total_variation_gradient
 from devrf.ops.trilinear import interpolate
 from devrf.rendering.model import SceneModel, deformed_occupancy
 from devrf.rendering.render import render
-from devrf.rendering.sampling import hits
 from devrf.scenes.scene import CaptureName, Views
 from devrf.stages.checkpoint import Passport, Stored
 from devrf.stages.flow_start import follow, start_from_tracks
 from devrf.stages.progress import pack, unpack
+from devrf.stages.ranks import share, take_from_first
 from devrf.stages.schedules import DeformationPhase, DeformationSchedule
 from devrf.stages.settings import DEFORMATION_LOSS, MotionSettings
 from devrf.stages.stage import Phase, ScheduledStage
+from devrf.stages.useful import meets_matter
 
 
 @dataclass
@@ -91,7 +92,9 @@ class DeformationStage(ScheduledStage):
         self.architecture = rest.passport.architecture
         self.records = rest.passport.records
         placeholder = torch.zeros(2, 2, 2, 3, requires_grad=True)
-        self._optimizer = GridAdam([{"params": [placeholder], "lr": self.motion.learning_rate}])
+        self._optimizer = GridAdam(
+            [{"params": [placeholder], "lr": self.motion.learning_rate, "name": "motion"}]
+        )
         self._visit: Visit | None = None
         self._previous: Tensor | None = None
 
@@ -131,6 +134,7 @@ class DeformationStage(ScheduledStage):
 
     def setup(self, stage: str) -> None:
         """Build the field at rest, at the coarsest resolution, in the canonical field's box."""
+        super().setup(stage)
         if self.scene_model.deformation is None:
             self.scene_model.deformation = DeformationField(
                 self.scene_model.canonical.box,
@@ -168,9 +172,13 @@ class DeformationStage(ScheduledStage):
         assert self._previous is not None
         clock = self.field.clock
         pool = all_pixels(views, self._images(views, frame))
-        tracks = follow(self.scene_model, views, pool, self._previous, clock.times[frame - 1])
+        tracks = follow(
+            self.scene_model, views, pool, self._previous, clock.times[frame - 1], self.generator
+        )
         space = self.scene_model.space
         start_from_tracks(self.field, frame, tracks, views.cameras, space)
+        # Each process has followed pixels of its own.
+        take_from_first([self.field.to_canonical[frame], self.field.to_time[frame]])
 
     @property
     def visit(self) -> Visit:
@@ -206,7 +214,7 @@ class DeformationStage(ScheduledStage):
     @torch.no_grad()
     def _look_around(self) -> None:
         """Find where the visited frame's matter is under the present field."""
-        self.visit.occupancy = deformed_occupancy(self.scene_model, self._warp, margin=2)
+        self.visit.occupancy = deformed_occupancy(self.scene_model, self._warp)
 
     @torch.no_grad()
     def _frame_pools(self, views: Views, frame: int) -> list[PixelPool]:
@@ -233,11 +241,7 @@ class DeformationStage(ScheduledStage):
     def _useful(self, views: Views, pool: PixelPool) -> PixelPool:
         """Pixels on the matte, or whose rays meet the frame's matter; all if there are none."""
         image = int(pool.image[0])
-        settings = self.scene_model.settings
-        rays = self.scene_model.space.rays(views.cameras.image_rays(image))
-        kept = hits(
-            rays, self.field.box, self.visit.occupancy, near=settings.near, far=settings.far
-        )
+        kept = meets_matter(views.cameras, image, self.scene_model, self.visit.occupancy)
         if views.has_alpha:
             kept |= views.pixels[image, :, :, 3].flatten() > 0
         return PixelPool(pool.image[kept], pool.flat[kept]) if bool(kept.any()) else pool
@@ -249,10 +253,8 @@ class DeformationStage(ScheduledStage):
         if since and since % self.motion.occupancy_every == 0:
             self._look_around()
         pool = self.visit.pools[self.iteration % len(self.visit.pools)]
-        image, flat = pool.draw(self.schedule.rays)
-        background = background_color(
-            self.scene.background, len(image), self.device, training=True
-        )
+        image, flat = pool.draw(share(self.schedule.rays), self.generator)
+        background = background_color(self.scene.background, len(image), self.generator)
         space = self.scene_model.space
         batch = gather_batch(views, image, flat, background, space)
         model = self.scene_model

@@ -7,6 +7,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
+import torch
 from lightning import LightningModule
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
@@ -18,6 +20,14 @@ from devrf.scenes.scene import CaptureName, Scene, Views
 from devrf.stages.checkpoint import Passport, check_scene, passport_in
 from devrf.stages.held_out import score
 from devrf.stages.progress import random_states, set_random_states
+from devrf.stages.ranks import (
+    RaysByRank,
+    average,
+    average_gradients,
+    check_alike,
+    rank,
+    take_from_first,
+)
 from devrf.stages.schedules import CanonicalPhase, DeformationPhase
 
 Phase = CanonicalPhase | DeformationPhase
@@ -41,6 +51,8 @@ class ScheduledStage(LightningModule, ABC):
         iteration: optimiser iterations done.
         phase: the stretch of the schedule that the grids are ready for; None before the first.
         record: what training took, once a ``TrainingRecord`` callback has measured it.
+        generator: what pixels are drawn with, on the stage's device. At the beginning of each
+            Lightning step it depends on the seed, the process and the iteration alone.
         made_with: the settings that decide what is learned, by config key, if somebody told.
     """
 
@@ -54,6 +66,8 @@ class ScheduledStage(LightningModule, ABC):
         self.iteration = 0
         self.phase: Phase | None = None
         self.record: dict[str, float | None] = {}
+        self.generator = torch.Generator()
+        self._seed = 0
         self.made_with: dict[str, Any] = {}
         self._left_off: dict[str, Any] | None = None
 
@@ -97,6 +111,35 @@ class ScheduledStage(LightningModule, ABC):
     def add_gradients(self) -> None:
         """Add gradients that are known in closed form, after the backward pass."""
 
+    def setup(self, stage: str) -> None:
+        """Make the generator.
+
+        Raises:
+            DevrfError: several processes, and a strategy that cannot follow growing grids.
+        """
+        if self.trainer.world_size > 1 and not isinstance(self.trainer.strategy, RaysByRank):
+            raise DevrfError(
+                f"trainer: {self.trainer.world_size} processes need trainer=ddp (the strategy "
+                "devrf.stages.ranks.RaysByRank)"
+            )
+        self._seed = torch.initial_seed()
+        self.generator = torch.Generator(self.device)
+
+    def on_fit_start(self) -> None:
+        """Begin with the same fields in every process."""
+        take_from_first([*self.parameters(), *self.buffers()])
+
+    def on_fit_end(self) -> None:
+        """See that every process has come to the same fields."""
+        if self.iteration >= self.total_iterations:
+            state = self.state_dict().items()
+            check_alike({name: t for name, t in state if isinstance(t, Tensor)})
+
+    def _draw_anew(self) -> None:
+        """Seed the generator for the coming iterations, in each process differently."""
+        mixed = np.random.SeedSequence([self._seed, rank(), self.iteration])
+        self.generator.manual_seed(int(mixed.generate_state(1, np.uint64)[0]))
+
     def training_step(self, views: Views, batch_idx: int) -> None:
         """Run iterations up to ``iterations_per_step``, never beyond the present phase."""
         if self.phase != self.phase_at(self.iteration):
@@ -117,12 +160,14 @@ class ScheduledStage(LightningModule, ABC):
             total, terms = self.loss(views)
             if total.requires_grad:
                 self.manual_backward(total)
+            average_gradients(p for group in optimizer.param_groups for p in group["params"])
             self.add_gradients()
             optimizer.step()
             self.iteration += 1
             for name, value in {"loss": total.detach(), **terms}.items():
                 sums[name] = sums[name] + value if name in sums else value
-        means = {f"{self.capture}/{name}": value / count for name, value in sums.items()}
+        self._draw_anew()
+        means = {f"{self.capture}/{k}": value / count for k, value in average(sums).items()}
         self.log_dict({**means, "step": float(self.iteration)})
         if self.iteration >= self.total_iterations:
             self.trainer.should_stop = True
@@ -137,7 +182,8 @@ class ScheduledStage(LightningModule, ABC):
         views = scene.capture(self.capture).test
         view = score(self.model, views, index, scene.background, self.device)
         scores = {"psnr": view.psnr, "ssim": view.ssim, "rest_pose_psnr": view.rest_pose_psnr}
-        self.log_dict({f"test/{self.capture}/{k}": v for k, v in scores.items()}, batch_size=1)
+        means = {f"test/{self.capture}/{k}": v for k, v in scores.items()}
+        self.log_dict(means, batch_size=1, sync_dist=True)
         return {"view": view}
 
     def configure_optimizers(self) -> GridAdam:
@@ -162,6 +208,7 @@ class ScheduledStage(LightningModule, ABC):
                 "total": self.total_iterations,
                 "phase": None if self.phase is None else self.phase.start,
                 "at_hand": {} if self.phase is None else self.at_hand(),
+                "seed": self._seed,
                 "random": random_states(self.device),
             }
 
@@ -183,7 +230,7 @@ class ScheduledStage(LightningModule, ABC):
                 f"{path}: left by the {course[0]} stage on a schedule of {course[1]} iterations, "
                 f"this is the {ours[0]} stage on one of {ours[1]}; give it its own schedule"
             )
-        self.iteration = kept["iteration"]
+        self.iteration, self._seed = kept["iteration"], kept["seed"]
         self.phase = None if kept["phase"] is None else self.phase_at(kept["phase"])
         self._left_off = kept
 
@@ -192,6 +239,7 @@ class ScheduledStage(LightningModule, ABC):
         if self._left_off is not None:
             set_random_states(self._left_off["random"], self.device)
             self._left_off = None
+        self._draw_anew()
 
     @abstractmethod
     def at_hand(self) -> dict[str, Any]:

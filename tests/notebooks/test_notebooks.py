@@ -1,4 +1,4 @@
-"""The notebook is committed as it was written, and all of it runs."""
+"""Every notebook is committed as it was written, and all of it runs."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ nbclient = pytest.importorskip("nbclient", reason=REASON)
 pytest.importorskip("ipykernel", reason=REASON)
 pytest.importorskip("matplotlib", reason=REASON)
 
-PATH = Path(__file__).parents[2] / "notebooks" / "look_inside.ipynb"
+PATHS = sorted((Path(__file__).parents[2] / "notebooks").glob("*.ipynb"))
 
 
-@pytest.fixture
-def notebook():
-    return nbformat.read(PATH, as_version=4)
+@pytest.fixture(params=PATHS, ids=lambda path: path.stem)
+def notebook(request):
+    return nbformat.read(request.param, as_version=4)
 
 
 def code_cells(notebook):
@@ -56,6 +56,11 @@ def test_its_short_form_runs(notebook, monkeypatch, tmp_path):
     assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1))
     outputs = [output for cell in cells for output in cell.outputs]
     assert not [o for o in outputs if o.output_type == "error" or o.get("name") == "stderr"]
-    figures = [cell for cell in cells if "plt.show()" in cell.source]
-    assert figures
-    assert all(any("image/png" in o.get("data", {}) for o in cell.outputs) for cell in figures)
+    showing = [cell for cell in cells if "plt.show()" in cell.source or "display(" in cell.source]
+    assert showing
+    shown = {"image/png", "text/markdown"}
+    assert all(any(shown & set(o.get("data", {})) for o in cell.outputs) for cell in showing)
+
+
+def test_there_are_the_documented_ones():
+    assert [path.stem for path in PATHS] == ["compare_runs", "look_inside"]

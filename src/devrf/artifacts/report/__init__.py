@@ -1,0 +1,1 @@
+"""Tables and plots of finished runs, beside the paper's own. Needs no torch."""

@@ -1,0 +1,161 @@
+"""One step of Adam on one tensor, with the total variation of a grid in the same pass.
+
+The learning rate and the number of the step are tensors on the device, so that a captured CUDA
+graph steps on as they change.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from devrf.ops.choice import triton_runs
+from devrf.ops.total_variation import add_total_variation_gradient
+
+
+@dataclass(frozen=True)
+class AdamRule:
+    """How Adam steps (Kingma & Ba 2015), with what voxel grids need (method §2, Optimiser).
+
+    Attributes:
+        rate: () learning rate, on the device.
+        step: () number of this step, 1 for the first one, on the device.
+        betas: decay of the mean and of the square.
+        eps: what is added to the square's root.
+        skip_zero: an entry whose gradient is exactly zero keeps its value *and its moments*.
+        pace: None, or (X, Y, Z, 1) that multiplies the learning rate voxel by voxel.
+    """
+
+    rate: Tensor
+    step: Tensor
+    betas: tuple[float, float] = (0.9, 0.99)
+    eps: float = 1e-8
+    skip_zero: bool = False
+    pace: Tensor | None = None
+
+
+def adam_step(
+    values: Tensor,
+    gradient: Tensor,
+    mean: Tensor,
+    square: Tensor,
+    rule: AdamRule,
+    *,
+    clear: bool = True,
+) -> None:
+    """Step in place; with ``clear`` the gradient is zero afterwards, ready to be added to.
+
+    ``m ← β₁m + (1 − β₁)g``, ``s ← β₂s + (1 − β₂)g²``,
+    ``v ← v − rate·pace · (m / (1 − β₁ᵗ)) / (√(s / (1 − β₂ᵗ)) + ε)``.
+
+    Args:
+        values: of any shape, contiguous; (X, Y, Z, C) if there is a pace.
+        gradient: the same shape.
+        mean: first moments, the same shape, changed in place.
+        square: second moments, likewise.
+        rule: how to step.
+        clear: whether to zero the gradient.
+    """
+    tensors = (values, gradient, mean, square)
+    if all(tensor.is_contiguous() for tensor in tensors) and triton_runs(*tensors):
+        from devrf.ops.kernels.adam import step_in_one_pass
+
+        step_in_one_pass(values, values, gradient, mean, square, rule, clear=clear)
+        return
+    _step(values, gradient, mean, square, rule)
+    if clear:
+        gradient.zero_()
+
+
+def smooth_adam_step(
+    values: Tensor,
+    into: Tensor,
+    gradient: Tensor,
+    mean: Tensor,
+    square: Tensor,
+    rule: AdamRule,
+    *,
+    smoothing: float,
+    touched_only: bool = False,
+) -> None:
+    """As :func:`adam_step`, the gradient of the total variation added in the same pass.
+
+    That gradient needs the neighbours' old values, and the neighbours are stepped by others at
+    the same time: the new values go to a second buffer, which takes its turn as ``values`` in the
+    next step. This moves fewer bytes than a pass of its own for the total variation would.
+
+    Args:
+        values: (X, Y, Z, C), contiguous; read only.
+        into: the new values, another tensor of the same shape, written everywhere.
+        gradient: the same shape; zero afterwards.
+        mean: first moments, the same shape, changed in place.
+        square: second moments, likewise.
+        rule: how to step. With ``skip_zero``, what counts is the gradient as it was given.
+        smoothing: weight of the total variation, as for
+            :func:`~devrf.ops.total_variation.add_total_variation_gradient`.
+        touched_only: smooth only entries whose given gradient is not zero.
+    """
+    tensors = (values, into, gradient, mean, square)
+    if all(tensor.is_contiguous() for tensor in tensors) and triton_runs(*tensors):
+        from devrf.ops.kernels.adam import step_in_one_pass
+
+        step_in_one_pass(
+            values, into, gradient, mean, square, rule,
+            smoothing=smoothing, touched_only=touched_only,
+        )
+        return
+    smooth = torch.zeros_like(gradient)
+    add_total_variation_gradient(values, smooth, smoothing)
+    if touched_only or rule.skip_zero:
+        smooth *= gradient != 0
+    into.copy_(values)
+    _step(into, gradient + smooth, mean, square, rule)
+    gradient.zero_()
+
+
+def _step(values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, rule: AdamRule) -> None:
+    step = _step_touched if rule.skip_zero else _step_all
+    step(values, grad, mean, square, rule)
+
+
+def _step_all(values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, rule: AdamRule) -> None:
+    beta1, beta2 = rule.betas
+    mean.lerp_(grad, 1 - beta1)
+    square.mul_(beta2).addcmul_(grad, grad, value=1 - beta2)
+    size, correction = _step_size(rule)
+    move = mean / (square / correction).sqrt_().add_(rule.eps)
+    if rule.pace is not None:
+        move *= rule.pace
+    values.addcmul_(move, size.to(values.dtype), value=-1)
+
+
+def _step_touched(
+    values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, rule: AdamRule
+) -> None:
+    """As :func:`_step_all` on the rows with a gradient: most of a grid is not touched."""
+    beta1, beta2 = rule.betas
+    channels = values.shape[-1]
+    flat_grad = grad.reshape(-1, channels)
+    rows = (flat_grad != 0).any(dim=1).nonzero()[:, 0]
+    g = flat_grad[rows]
+    touched = g != 0
+    means, squares = mean.view(-1, channels), square.view(-1, channels)
+    m, s = means[rows], squares[rows]
+    m = torch.where(touched, m + (1 - beta1) * (g - m), m)
+    s = torch.where(touched, s + (1 - beta2) * (g * g - s), s)
+    means[rows], squares[rows] = m, s
+    size, correction = _step_size(rule)
+    move = m / (s / correction).sqrt_().add_(rule.eps)
+    if rule.pace is not None:
+        move *= rule.pace.view(-1, 1)[rows]
+    table = values.view(-1, channels)
+    table[rows] = table[rows] - size * torch.where(touched, move, torch.zeros_like(move))
+
+
+def _step_size(rule: AdamRule) -> tuple[Tensor, Tensor]:
+    """Learning rate with the mean's bias correction, and the square's correction."""
+    first, second = (-torch.expm1(rule.step * math.log(beta)) for beta in rule.betas)
+    return rule.rate / first, second

@@ -1,0 +1,67 @@
+"""Grids whose corners sit on a box's corners: from positions to grid coordinates.
+
+Numbers that depend on the box alone are made once and kept on the device: a tensor made from
+Python's numbers at every step would make the device wait for the host.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+Triple = tuple[float, float, float]
+Shape = tuple[int, int, int]
+
+
+class Corners(Protocol):
+    """An axis-aligned box: anything that has a low and a high corner."""
+
+    @property
+    def low(self) -> Triple:
+        """The corner (x, y, z) with the smallest coordinates."""
+
+    @property
+    def high(self) -> Triple:
+        """The corner (x, y, z) with the largest coordinates."""
+
+
+def to_grid(points: Tensor, box: Corners, shape: Shape) -> Tensor:
+    """Grid coordinates (M, 3) of ``points`` (M, 3): 0 on the low faces, shape − 1 on the high.
+
+    Differentiable in ``points``. Makes no tensor from Python's numbers after the first call with
+    the same box and shape.
+    """
+    low, scale = _on_device(box.low, box.high, shape, points.dtype, points.device)
+    return (points - low) * scale
+
+
+def scales(box: Corners, shape: Shape) -> Triple:
+    """Grid points per unit of length along each axis, rounded to float32."""
+    x, y, z = _scale(box.low, box.high, shape, torch.float32).tolist()
+    return x, y, z
+
+
+def shape_of(grid: Tensor) -> Shape:
+    """Grid points along x, y, z of a grid (X, Y, Z) or (X, Y, Z, C)."""
+    x, y, z = grid.shape[:3]
+    return x, y, z
+
+
+@lru_cache(maxsize=256)
+def _scale(low: Triple, high: Triple, shape: Shape, dtype: torch.dtype) -> Tensor:
+    # Tensors made in inference mode could not be used for training later.
+    with torch.inference_mode(False):
+        extent = torch.tensor(shape, dtype=dtype) - 1
+        return extent / (torch.tensor(high, dtype=dtype) - torch.tensor(low, dtype=dtype))
+
+
+@lru_cache(maxsize=256)
+def _on_device(
+    low: Triple, high: Triple, shape: Shape, dtype: torch.dtype, device: torch.device
+) -> tuple[Tensor, Tensor]:
+    with torch.inference_mode(False):
+        corner = torch.tensor(low, dtype=dtype).to(device)
+        return corner, _scale(low, high, shape, dtype).to(device)

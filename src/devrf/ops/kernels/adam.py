@@ -1,0 +1,159 @@
+"""Adam in one pass over a tensor, the total variation of a grid included; and that alone.
+
+Each number is read and written once: value, gradient and two moments in, value and two moments
+out. A zero is only written where there was a gradient, and with ``SKIP_ZERO`` in place nothing
+else is read or written but there.
+"""
+
+from __future__ import annotations
+
+import math
+
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from devrf.ops.adam_step import AdamRule
+from devrf.ops.kernels.launch import launch
+from devrf.ops.kernels.numbers import opacity
+
+THREADS = 128
+# Most numbers of a program: 8 for each of its 128 threads.
+LARGEST = 1024
+
+
+def step_in_one_pass(
+    values: Tensor, into: Tensor, gradient: Tensor, mean: Tensor, square: Tensor, rule: AdamRule,
+    *, clear: bool = True, smoothing: float = 0.0, touched_only: bool = False,
+) -> None:
+    """As devrf.ops.adam_step: adam_step if ``into`` is ``values``, else smooth_adam_step."""
+    smooth = into is not values
+    length = _row(values) if smooth else values.numel()
+    beta1, beta2 = rule.betas
+    launch(
+        adam_kernel, _programs(values, length), values,
+        values, into, gradient, mean, square,
+        values if rule.pace is None else rule.pace.contiguous(), rule.rate, rule.step, length,
+        *(values.shape[:2] if smooth else (1, 1)),
+        1 - beta1, 1 - beta2, -math.log(beta1), -math.log(beta2), rule.eps, smoothing,
+        PACED=rule.pace is not None, SKIP_ZERO=rule.skip_zero, CLEAR=clear, SMOOTH=smooth,
+        TOUCHED_ONLY=touched_only or rule.skip_zero,
+        CHANNELS=values.shape[-1] if smooth or rule.pace is not None else 1,
+        WIDE=_is_wide(values), BLOCK=_block(length),
+    )
+
+
+def add_gradient_in_one_pass(grid: Tensor, gradient: Tensor, weight: float) -> None:
+    """As devrf.ops.total_variation.add_total_variation_gradient."""
+    length = _row(grid)
+    launch(
+        total_variation_kernel, _programs(grid, length), grid,
+        grid, gradient, length, *grid.shape[:2], weight,
+        CHANNELS=grid.shape[3], WIDE=_is_wide(grid), BLOCK=_block(length),
+    )
+
+
+def _row(grid: Tensor) -> int:
+    """Numbers in a row of a grid (X, Y, Z, C) along z."""
+    return grid.shape[2] * grid.shape[3]
+
+
+def _block(length: int) -> int:
+    """Numbers of a program, for rows of that length."""
+    return min(LARGEST, max(THREADS, int(triton.next_power_of_2(length))))
+
+
+def _programs(values: Tensor, length: int) -> int:
+    """How many programs go over all rows, each over a piece of one."""
+    return values.numel() // max(length, 1) * int(triton.cdiv(length, _block(length)))
+
+
+def _is_wide(values: Tensor) -> bool:
+    """Do places in the tensor need 64 bits?"""
+    return values.numel() >= 2**31 - LARGEST
+
+
+@triton.jit
+def piece(length, WIDE: tl.constexpr, BLOCK: tl.constexpr):
+    """This program's row, and its numbers within the row.
+
+    A program stays in one row, so that nothing is divided number by number but by constants.
+    """
+    program = tl.program_id(0).to(tl.int64) if WIDE else tl.program_id(0)
+    pieces = tl.cdiv(length, BLOCK)
+    return program // pieces, (program % pieces) * BLOCK + tl.arange(0, BLOCK)
+
+
+@triton.jit
+def pull(values, at, own, stride, there):
+    """clamp(v − v', −1, 1) for the neighbour ``stride`` further on, 0 where there is none."""
+    other = tl.load(values + at + stride, mask=there, other=0.0)
+    return tl.where(there, tl.minimum(tl.maximum(own - other, -1.0), 1.0), 0.0)
+
+
+@triton.jit
+def slope_of_variation(values, at, own, here, row, number, length, x, y, CHANNELS: tl.constexpr):
+    """Σ over the six neighbours of clamp(v − v', −1, 1)."""
+    # Spread over the block here, since Triton's interpreter cannot spread a truth value.
+    i = row // y + number * 0
+    j = row % y + number * 0
+    total = pull(values, at, own, CHANNELS, here & (number + CHANNELS < length))
+    total += pull(values, at, own, -CHANNELS, here & (number >= CHANNELS))
+    total += pull(values, at, own, length, here & (j < y - 1))
+    total += pull(values, at, own, -length, here & (j > 0))
+    total += pull(values, at, own, y * length, here & (i < x - 1))
+    total += pull(values, at, own, -y * length, here & (i > 0))
+    return total
+
+
+@triton.jit(do_not_specialize=["x", "y"])
+def total_variation_kernel(
+    values, gradient, length, x, y, weight,
+    CHANNELS: tl.constexpr, WIDE: tl.constexpr, BLOCK: tl.constexpr,
+):
+    """gradient += weight · Σ clamp(v − v', −1, 1)."""
+    row, number = piece(length, WIDE, BLOCK)
+    here = number < length
+    at = row * length + number
+    own = tl.load(values + at, mask=here, other=0.0)
+    slope = slope_of_variation(values, at, own, here, row, number, length, x, y, CHANNELS)
+    before = tl.load(gradient + at, mask=here, other=0.0)
+    tl.store(gradient + at, before + weight * slope, mask=here)
+
+
+@triton.jit(do_not_specialize=["x", "y"])
+def adam_kernel(
+    values, into, gradient, mean, square, pace, rate, step, length, x, y,
+    share1, share2, decay1, decay2, eps, smoothing,
+    PACED: tl.constexpr, SKIP_ZERO: tl.constexpr, CLEAR: tl.constexpr, SMOOTH: tl.constexpr,
+    TOUCHED_ONLY: tl.constexpr, CHANNELS: tl.constexpr, WIDE: tl.constexpr, BLOCK: tl.constexpr,
+):
+    """One step; share = 1 − β, decay = −log β, so that 1 − βᵗ = opacity(t·decay)."""
+    row, number = piece(length, WIDE, BLOCK)
+    here = number < length
+    at = row * length + number
+    g = tl.load(gradient + at, mask=here, other=0.0)
+    touched = here & (g != 0.0)
+    active = touched if SKIP_ZERO else here
+    # Smoothed values go to another tensor, and there everywhere.
+    written = here if SMOOTH else active
+    own = tl.load(values + at, mask=written, other=0.0)
+    if CLEAR:
+        tl.store(gradient + at, tl.zeros((BLOCK,), dtype=tl.float32), mask=touched)
+    if SMOOTH:
+        smoothed = touched if TOUCHED_ONLY else here
+        g += smoothing * slope_of_variation(
+            values, at, own, smoothed, row, number, length, x, y, CHANNELS
+        )
+    m = tl.load(mean + at, mask=active, other=0.0)
+    s = tl.load(square + at, mask=active, other=0.0)
+    m += share1 * (g - m)
+    s += share2 * (g * g - s)
+    tl.store(mean + at, m, mask=active)
+    tl.store(square + at, s, mask=active)
+    time = tl.load(step).to(tl.float32)
+    size = tl.load(rate).to(tl.float32) / opacity(time * decay1)
+    move = size * m / (tl.sqrt(s / opacity(time * decay2)) + eps)
+    if PACED:
+        move *= tl.load(pace + at // CHANNELS, mask=active, other=0.0)
+    tl.store(into + at, tl.where(active, own - move, own), mask=written)

@@ -1,0 +1,72 @@
+"""Where a point lies in a grid: its cell, the cell's eight corners, and their weights.
+
+Corner number c lies at ``(c >> 2, (c >> 1) & 1, c & 1)`` in the cell: bit 4 for x, 2 for y, 1
+for z.
+"""
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+
+@triton.jit
+def cell(coordinate, points):
+    """Lower corner (int32) and fraction in the cell, along an axis of ``points`` grid points.
+
+    A coordinate outside is clamped to the grid; one that is no number counts as 0.
+    """
+    last = points - 1.0
+    clamped = tl.where(coordinate > 0.0, tl.minimum(coordinate, last), 0.0)
+    base = tl.minimum(tl.floor(clamped), last - 1.0)
+    return base.to(tl.int32), clamped - base
+
+
+@triton.jit
+def inside(coordinate, points):
+    """1.0 where the coordinate lies on the grid, 0.0 where it was clamped."""
+    return ((coordinate >= 0.0) & (coordinate <= points - 1.0)).to(tl.float32)
+
+
+@triton.jit
+def corner_row(i, j, k, y, z, CORNER: tl.constexpr):
+    """Row of a cell's corner in a grid (X, y, z, C) seen as a table of rows; int64."""
+    row = ((i + (CORNER >> 2)) * y + j + ((CORNER >> 1) & 1)) * z + k + (CORNER & 1)
+    return row.to(tl.int64)
+
+
+@triton.jit
+def share(fraction, UPPER: tl.constexpr):
+    """Linear weight of the lower or the upper end along one axis."""
+    return fraction if UPPER else 1.0 - fraction
+
+
+@triton.jit
+def scalar_at(grid, i, j, k, fx, fy, fz, y, z, here):
+    """Trilinear value of a grid (X, y, z, 1) in the cell (i, j, k)."""
+    value = fx * 0.0
+    for corner in tl.static_range(8):
+        row = corner_row(i, j, k, y, z, corner)
+        weight = share(fx, corner & 4) * share(fy, corner & 2) * share(fz, corner & 1)
+        value += weight * tl.load(grid + row, mask=here, other=0.0)
+    return value
+
+
+@triton.jit
+def scalar_slope(grid, i, j, k, fx, fy, fz, y, z, here):
+    """Value of a grid (X, y, z, 1) in the cell, and its slopes per grid unit along x, y, z."""
+    value = fx * 0.0
+    along_x = fx * 0.0
+    along_y = fx * 0.0
+    along_z = fx * 0.0
+    for corner in tl.static_range(8):
+        row = corner_row(i, j, k, y, z, corner)
+        at = tl.load(grid + row, mask=here, other=0.0)
+        wx = share(fx, corner & 4)
+        wy = share(fy, corner & 2)
+        wz = share(fz, corner & 1)
+        value += wx * wy * wz * at
+        along_x += wy * wz * (at if corner & 4 else -at)
+        along_y += wx * wz * (at if corner & 2 else -at)
+        along_z += wx * wy * (at if corner & 1 else -at)
+    return value, along_x, along_y, along_z

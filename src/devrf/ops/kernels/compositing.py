@@ -1,0 +1,178 @@
+"""Compositing and its backward pass: one program goes along one ray.
+
+Sums stay within a ray, so that float32 is enough. A sum over what lies before a sample is a sum
+over its neighbour and on, never a sum less the sample itself, which would cancel behind an opaque
+one.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from devrf.ops.kernels.launch import launch
+from devrf.ops.kernels.numbers import opacity
+
+# Samples that a program looks at together: one for each thread of its only warp.
+BLOCK = 32
+
+
+class Composite(torch.autograd.Function):
+    """As devrf.ops.compositing.composite_segments."""
+
+    @staticmethod
+    def forward(ctx: Any, depth: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
+        rays = len(first) - 1
+        weights, transmittance = torch.zeros_like(depth), torch.zeros_like(depth)
+        end = torch.empty(rays, dtype=depth.dtype, device=depth.device)
+        launch(
+            composite_kernel, rays, depth,
+            depth, first, weights, transmittance, end, BLOCK=BLOCK, num_warps=1,
+        )
+        ctx.save_for_backward(first, weights, transmittance, end)
+        return weights, end
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, weights_gradient: Tensor, end_gradient: Tensor) -> tuple[Tensor, None]:
+        first, weights, transmittance, end = ctx.saved_tensors
+        into = torch.zeros_like(weights)
+        launch(
+            composite_backward_kernel, len(end), into,
+            first, weights, transmittance, end, weights_gradient.contiguous(),
+            end_gradient.contiguous(), into, BLOCK=BLOCK, num_warps=1,
+        )
+        return into, None
+
+
+class SumSegments(torch.autograd.Function):
+    """As devrf.ops.compositing.sum_segments."""
+
+    @staticmethod
+    def forward(ctx: Any, weights: Tensor, values: Tensor, first: Tensor) -> Tensor:
+        rays, channels = len(first) - 1, values.shape[1]
+        ctx.save_for_backward(weights, values, first)
+        sums = torch.empty(rays, channels, dtype=values.dtype, device=values.device)
+        launch(
+            sum_kernel, rays, values,
+            weights, values, first, sums, CHANNELS=channels,
+            PADDED=triton.next_power_of_2(channels), BLOCK=BLOCK, num_warps=1,
+        )
+        return sums
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, Tensor, None]:
+        weights, values, first = ctx.saved_tensors
+        into_weights, into_values = torch.zeros_like(weights), torch.zeros_like(values)
+        rays, channels = len(first) - 1, values.shape[1]
+        launch(
+            sum_backward_kernel, rays, values,
+            weights, values, first, upstream.contiguous(), into_weights, into_values,
+            CHANNELS=channels, PADDED=triton.next_power_of_2(channels), BLOCK=BLOCK, num_warps=1,
+        )
+        return into_weights, into_values, None
+
+
+@triton.jit
+def composite_kernel(depth, first, weights, transmittance, ends, BLOCK: tl.constexpr):
+    """w_i = T_i·α_i with T_i = exp(−Σ_{j<i} τ_j), and T_end."""
+    ray = tl.program_id(0)
+    begin = tl.load(first + ray)
+    stop = tl.load(first + ray + 1)
+    lane = tl.arange(0, BLOCK)
+    gone = 0.0
+    start = begin
+    while start < stop:
+        at = start + lane
+        here = at < stop
+        tau = tl.load(depth + at, mask=here, other=0.0)
+        previous = tl.load(depth + at - 1, mask=here & (lane > 0), other=0.0)
+        left = tl.exp(-(gone + tl.cumsum(previous, 0)))
+        tl.store(transmittance + at, left, mask=here)
+        tl.store(weights + at, left * opacity(tau), mask=here)
+        gone += tl.sum(tau, 0)
+        start += BLOCK
+    tl.store(ends + ray, tl.exp(-gone))
+
+
+@triton.jit
+def composite_backward_kernel(
+    first, weights, transmittance, ends, weights_gradient, end_gradient, into, BLOCK: tl.constexpr
+):
+    """∂/∂τ_i = g_i·T_{i+1} − Σ_{j>i} g_j·w_j − g_end·T_end, from the back to the front."""
+    ray = tl.program_id(0)
+    begin = tl.load(first + ray)
+    stop = tl.load(first + ray + 1)
+    lane = tl.arange(0, BLOCK)
+    last = tl.load(end_gradient + ray) * tl.load(ends + ray)
+    start = begin + (tl.cdiv(stop - begin, BLOCK) - 1) * BLOCK
+    while start >= begin:
+        at = start + lane
+        here = at < stop
+        gradient = tl.load(weights_gradient + at, mask=here, other=0.0)
+        weight = tl.load(weights + at, mask=here, other=0.0)
+        left = tl.load(transmittance + at, mask=here, other=0.0) - weight
+        beyond = here & (at + 1 < stop) & (lane < BLOCK - 1)
+        follower = tl.load(weights_gradient + at + 1, mask=beyond, other=0.0)
+        follower *= tl.load(weights + at + 1, mask=beyond, other=0.0)
+        behind = last + tl.cumsum(follower, 0, reverse=True)
+        tl.store(into + at, gradient * left - behind, mask=here)
+        last += tl.sum(gradient * weight, 0)
+        start -= BLOCK
+
+
+@triton.jit
+def sum_kernel(
+    weights, values, first, sums,
+    CHANNELS: tl.constexpr, PADDED: tl.constexpr, BLOCK: tl.constexpr,
+):
+    """Σ w_i·c_i along a ray."""
+    ray = tl.program_id(0).to(tl.int64)
+    begin = tl.load(first + ray)
+    stop = tl.load(first + ray + 1)
+    lane = tl.arange(0, BLOCK)
+    channel = tl.arange(0, PADDED)
+    total = tl.zeros((PADDED,), dtype=tl.float32)
+    start = begin
+    while start < stop:
+        at = start + lane
+        here = at < stop
+        wanted = here[:, None] & (channel < CHANNELS)[None, :]
+        value = tl.load(
+            values + at[:, None] * CHANNELS + channel[None, :], mask=wanted, other=0.0
+        )
+        weight = tl.load(weights + at, mask=here, other=0.0)
+        total += tl.sum(weight[:, None] * value, axis=0)
+        start += BLOCK
+    tl.store(sums + ray * CHANNELS + channel, total, mask=channel < CHANNELS)
+
+
+@triton.jit
+def sum_backward_kernel(
+    weights, values, first, upstream, into_weights, into_values,
+    CHANNELS: tl.constexpr, PADDED: tl.constexpr, BLOCK: tl.constexpr,
+):
+    """g·c to the weights, g·w to the values."""
+    ray = tl.program_id(0).to(tl.int64)
+    begin = tl.load(first + ray)
+    stop = tl.load(first + ray + 1)
+    lane = tl.arange(0, BLOCK)
+    channel = tl.arange(0, PADDED)
+    gradient = tl.load(upstream + ray * CHANNELS + channel, mask=channel < CHANNELS, other=0.0)
+    start = begin
+    while start < stop:
+        at = start + lane
+        here = at < stop
+        wanted = here[:, None] & (channel < CHANNELS)[None, :]
+        place = at[:, None] * CHANNELS + channel[None, :]
+        value = tl.load(values + place, mask=wanted, other=0.0)
+        weight = tl.load(weights + at, mask=here, other=0.0)
+        tl.store(into_weights + at, tl.sum(value * gradient[None, :], axis=1), mask=here)
+        tl.store(into_values + place, weight[:, None] * gradient[None, :], mask=wanted)
+        start += BLOCK

@@ -1,0 +1,220 @@
+"""Warp, density and optical depth of points in one pass; their gradients in another.
+
+A thread does a point: the three components of a displacement lie in one sector of memory, and the
+grids' rows that neighbours along a ray share come from the cache.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from devrf.ops.corners import Corners, scales, shape_of
+from devrf.ops.kernels.cells import cell, corner_row, inside, scalar_at, scalar_slope, share
+from devrf.ops.kernels.launch import launch
+from devrf.ops.kernels.numbers import sigmoid, softplus
+
+BLOCK = 128
+
+
+def warped_depth_in_one_pass(
+    points: Tensor, density: Tensor, slices: Sequence[Tensor], weight: float, box: Corners,
+    shift: float, delta: float, density_gradient: Tensor | None,
+    slice_gradients: Sequence[Tensor | None],
+) -> tuple[Tensor, Tensor]:
+    """As devrf.ops.warped_depth.warped_depth; a gradient buffer for each slice, or None."""
+    density = density.contiguous()
+    # What is not there is stood in for by what is: the kernel does not look at it.
+    before, after = (frame.contiguous() for frame in ([*slices, density, density])[:2])
+    buffers = (density_gradient, *([*slice_gradients, None, None])[:2])
+    numbers = (
+        weight, shift, delta, *box.low,
+        *scales(box, shape_of(before)), *scales(box, shape_of(density)),
+        *shape_of(before), *shape_of(density),
+    )
+    q, tau = WarpedDepth.apply(
+        points.detach().contiguous(), density, before, after, len(slices), numbers, buffers
+    )
+    return q, tau
+
+
+class WarpedDepth(torch.autograd.Function):
+    """As devrf.ops.warped_depth.warped_depth."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, points: Tensor, density: Tensor, before: Tensor, after: Tensor, slices: int,
+        numbers: tuple[float, ...], buffers: tuple[Tensor | None, ...],
+    ) -> tuple[Tensor, Tensor]:
+        count = len(points)
+        warped = torch.empty_like(points)
+        tau = torch.empty(count, dtype=points.dtype, device=points.device)
+        launch(
+            warped_depth_kernel, triton.cdiv(count, BLOCK), points,
+            points, density, before, after, warped, tau, count, *numbers,
+            SLICES=slices, BLOCK=BLOCK,
+        )
+        ctx.save_for_backward(points, density, before, after, warped)
+        ctx.slices, ctx.numbers, ctx.buffers = slices, numbers, buffers
+        return warped, tau
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, warped_gradient: Tensor, tau_gradient: Tensor) -> tuple[Any, ...]:
+        points, density, before, after, warped = ctx.saved_tensors
+        grids = (density, before, after)
+        used = (True, ctx.slices > 0, ctx.slices > 1)
+        needs = [
+            there and (asked or buffer is not None)
+            for there, asked, buffer in zip(
+                used, ctx.needs_input_grad[1:4], ctx.buffers, strict=True
+            )
+        ]
+        own = [
+            torch.zeros_like(grid) if need and buffer is None else None
+            for grid, need, buffer in zip(grids, needs, ctx.buffers, strict=True)
+        ]
+        into = [
+            grid if not need else buffer if buffer is not None else fresh
+            for grid, need, buffer, fresh in zip(grids, needs, ctx.buffers, own, strict=True)
+        ]
+        launch(
+            warped_depth_backward_kernel, triton.cdiv(len(points), BLOCK), points,
+            points, density, warped, warped_gradient.contiguous(), tau_gradient.contiguous(),
+            *into, len(points), *ctx.numbers,
+            NEEDS_DENSITY=needs[0], NEEDS_BEFORE=needs[1], NEEDS_AFTER=needs[2],
+            TWO=ctx.slices > 1, BLOCK=BLOCK,
+        )
+        return None, *own, None, None, None
+
+
+@triton.jit
+def displaced(before, after, weight, px, py, pz, cx, cy, cz, x, y, z, here, SLICES: tl.constexpr):
+    """Points moved by one slice, or by two that are blended; coordinates in the slices' grid."""
+    i, fx = cell(cx, x)
+    j, fy = cell(cy, y)
+    k, fz = cell(cz, z)
+    for corner in tl.static_range(8):
+        place = corner_row(i, j, k, y, z, corner) * 3
+        part = share(fx, corner & 4) * share(fy, corner & 2) * share(fz, corner & 1)
+        dx = tl.load(before + place, mask=here, other=0.0)
+        dy = tl.load(before + place + 1, mask=here, other=0.0)
+        dz = tl.load(before + place + 2, mask=here, other=0.0)
+        if SLICES == 2:
+            dx += weight * (tl.load(after + place, mask=here, other=0.0) - dx)
+            dy += weight * (tl.load(after + place + 1, mask=here, other=0.0) - dy)
+            dz += weight * (tl.load(after + place + 2, mask=here, other=0.0) - dz)
+        px += part * dx
+        py += part * dy
+        pz += part * dz
+    return px, py, pz
+
+
+_SIZES = ["count", "slice_x", "slice_y", "slice_z", "density_x", "density_y", "density_z"]
+
+
+@triton.jit(do_not_specialize=_SIZES)
+def warped_depth_kernel(
+    points, density, before, after, warped, tau, count, weight, shift, delta,
+    low_x, low_y, low_z, slice_scale_x, slice_scale_y, slice_scale_z,
+    density_scale_x, density_scale_y, density_scale_z,
+    slice_x, slice_y, slice_z, density_x, density_y, density_z,
+    SLICES: tl.constexpr, BLOCK: tl.constexpr,
+):
+    """q = x + Δ(x), τ = softplus(v(q) + b)·δ."""
+    point = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    here = point < count
+    at = point.to(tl.int64) * 3
+    qx = tl.load(points + at, mask=here, other=0.0)
+    qy = tl.load(points + at + 1, mask=here, other=0.0)
+    qz = tl.load(points + at + 2, mask=here, other=0.0)
+    if SLICES > 0:
+        qx, qy, qz = displaced(
+            before, after, weight, qx, qy, qz,
+            (qx - low_x) * slice_scale_x, (qy - low_y) * slice_scale_y,
+            (qz - low_z) * slice_scale_z, slice_x, slice_y, slice_z, here, SLICES,
+        )
+    tl.store(warped + at, qx, mask=here)
+    tl.store(warped + at + 1, qy, mask=here)
+    tl.store(warped + at + 2, qz, mask=here)
+    i, fx = cell((qx - low_x) * density_scale_x, density_x)
+    j, fy = cell((qy - low_y) * density_scale_y, density_y)
+    k, fz = cell((qz - low_z) * density_scale_z, density_z)
+    raw = scalar_at(density, i, j, k, fx, fy, fz, density_y, density_z, here)
+    tl.store(tau + point, softplus(raw + shift) * delta, mask=here)
+
+
+@triton.jit(do_not_specialize=_SIZES)
+def warped_depth_backward_kernel(
+    points, density, warped, warped_gradient, tau_gradient,
+    density_into, before_into, after_into, count, weight, shift, delta,
+    low_x, low_y, low_z, slice_scale_x, slice_scale_y, slice_scale_z,
+    density_scale_x, density_scale_y, density_scale_z,
+    slice_x, slice_y, slice_z, density_x, density_y, density_z,
+    NEEDS_DENSITY: tl.constexpr, NEEDS_BEFORE: tl.constexpr, NEEDS_AFTER: tl.constexpr,
+    TWO: tl.constexpr, BLOCK: tl.constexpr,
+):
+    """Gradients of q and τ, scattered to the density grid and to the slices."""
+    point = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    here = point < count
+    at = point.to(tl.int64) * 3
+    cx = (tl.load(warped + at, mask=here, other=0.0) - low_x) * density_scale_x
+    cy = (tl.load(warped + at + 1, mask=here, other=0.0) - low_y) * density_scale_y
+    cz = (tl.load(warped + at + 2, mask=here, other=0.0) - low_z) * density_scale_z
+    i, fx = cell(cx, density_x)
+    j, fy = cell(cy, density_y)
+    k, fz = cell(cz, density_z)
+    raw, along_x, along_y, along_z = scalar_slope(
+        density, i, j, k, fx, fy, fz, density_y, density_z, here
+    )
+    change = tl.load(tau_gradient + point, mask=here, other=0.0) * sigmoid(raw + shift) * delta
+    if NEEDS_DENSITY:
+        for corner in tl.static_range(8):
+            row = corner_row(i, j, k, density_y, density_z, corner)
+            part = share(fx, corner & 4) * share(fy, corner & 2) * share(fz, corner & 1)
+            # Padding has no gradient: adding its zeros to one place would make a queue there.
+            tl.atomic_add(
+                density_into + row, part * change, mask=here & (change != 0.0), sem="relaxed"
+            )
+    if NEEDS_BEFORE or NEEDS_AFTER:
+        gx = tl.load(warped_gradient + at, mask=here, other=0.0)
+        gy = tl.load(warped_gradient + at + 1, mask=here, other=0.0)
+        gz = tl.load(warped_gradient + at + 2, mask=here, other=0.0)
+        gx += change * along_x * inside(cx, density_x) * density_scale_x
+        gy += change * along_y * inside(cy, density_y) * density_scale_y
+        gz += change * along_z * inside(cz, density_z) * density_scale_z
+        px = (tl.load(points + at, mask=here, other=0.0) - low_x) * slice_scale_x
+        py = (tl.load(points + at + 1, mask=here, other=0.0) - low_y) * slice_scale_y
+        pz = (tl.load(points + at + 2, mask=here, other=0.0) - low_z) * slice_scale_z
+        if NEEDS_BEFORE:
+            own = 1.0 - weight if TWO else 1.0
+            scatter_displacement(
+                before_into, px, py, pz, gx * own, gy * own, gz * own,
+                slice_x, slice_y, slice_z, here,
+            )
+        if NEEDS_AFTER:
+            scatter_displacement(
+                after_into, px, py, pz, gx * weight, gy * weight, gz * weight,
+                slice_x, slice_y, slice_z, here,
+            )
+
+
+@triton.jit
+def scatter_displacement(into, cx, cy, cz, gx, gy, gz, x, y, z, here):
+    """Add the gradients (gx, gy, gz) of a displacement at grid coordinates to eight rows."""
+    i, fx = cell(cx, x)
+    j, fy = cell(cy, y)
+    k, fz = cell(cz, z)
+    here = here & ((gx != 0.0) | (gy != 0.0) | (gz != 0.0))
+    for corner in tl.static_range(8):
+        place = corner_row(i, j, k, y, z, corner) * 3
+        part = share(fx, corner & 4) * share(fy, corner & 2) * share(fz, corner & 1)
+        tl.atomic_add(into + place, part * gx, mask=here, sem="relaxed")
+        tl.atomic_add(into + place + 1, part * gy, mask=here, sem="relaxed")
+        tl.atomic_add(into + place + 2, part * gz, mask=here, sem="relaxed")

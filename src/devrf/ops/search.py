@@ -1,0 +1,198 @@
+"""Which samples of which rays can be seen: the search that comes before every gradient.
+
+Lists have a fixed length, and how much of them is used is known to the device alone: a loop
+built on them never waits for the device, and can be captured in a CUDA graph.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from devrf.ops.choice import triton_runs
+from devrf.ops.compositing import transmittances
+from devrf.ops.corners import Corners, shape_of, to_grid
+from devrf.ops.warped_depth import warped_depth
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """What is too faint to be seen.
+
+    Attributes:
+        alpha: a sample of lower opacity is dropped.
+        stop: a sample is dropped if less than this of its ray is left before it.
+        weight: a sample of lower weight T·α is not heavy.
+    """
+
+    alpha: float
+    stop: float
+    weight: float
+
+
+@dataclass(frozen=True)
+class Found:
+    """Samples of R rays in lists of length C: ascending by ray, front to back, then padding.
+
+    Attributes:
+        ray: (C,) int64, the ray of each sample; R in the padding.
+        distance: (C,) along the ray, in units of its direction; 0 in the padding.
+        points: (C, 3) positions; 0 in the padding.
+        heavy: (C,) bool, whether the sample weighs enough for its colour to matter.
+        first: (R + 1,) int64, where each ray's samples begin; the last entry is how many of the
+            C places are used.
+        total: () int64, how many samples there were to find; more than C if some were dropped.
+        overflow: () bool, whether any were dropped.
+    """
+
+    ray: Tensor
+    distance: Tensor
+    points: Tensor
+    heavy: Tensor
+    first: Tensor
+    total: Tensor
+    overflow: Tensor
+
+
+@dataclass(frozen=True)
+class Selected:
+    """Some of the samples of a list, in a list of length K.
+
+    Attributes:
+        index: (K,) int64, their places in the list they come from; in the padding any place.
+        first: (R + 1,) int64, where each ray's samples begin among them; the last entry is how
+            many of the K places are used.
+        total: () int64, how many there were; more than K if some were dropped.
+        overflow: () bool, whether any were dropped.
+    """
+
+    index: Tensor
+    first: Tensor
+    total: Tensor
+    overflow: Tensor
+
+
+@torch.no_grad()
+def find_samples(
+    origins: Tensor,
+    directions: Tensor,
+    entry: Tensor,
+    count: Tensor,
+    mask: Tensor,
+    density: Tensor,
+    slices: Sequence[Tensor] = (),
+    weight: float = 0.0,
+    *,
+    step: float,
+    longest: int,
+    capacity: int,
+    mask_box: Corners,
+    box: Corners,
+    shift: float,
+    delta: float,
+    thresholds: Thresholds,
+) -> Found:
+    """Samples that can be seen (method §2, Rays), at ``entry + k·step``, k = 0 … count − 1.
+
+    A sample is kept if the grid point nearest to it is occupied, its opacity is no less than
+    ``thresholds.alpha``, and the transmittance before it, over the samples in front of it that
+    pass both tests, is no less than ``thresholds.stop``. It is heavy if its weight is no less than
+    ``thresholds.weight`` too. No gradient, and with Triton no waiting for the device.
+
+    Args:
+        origins: (R, 3) of rays in the box's units.
+        directions: (R, 3) of rays.
+        entry: (R,) distance of each ray's first sample, in units of its direction.
+        count: (R,) how many samples each ray has; int64 or int32.
+        mask: (X, Y, Z) bool, True where something may be at the time of the rays.
+        density: raw densities; as ``slices``, ``weight``, ``box``, ``shift`` and ``delta`` for
+            :func:`~devrf.ops.warped_depth.warped_depth`.
+        slices: displacements: none, one, or two.
+        weight: of the second slice.
+        step: distance between samples, in units of the rays' directions.
+        longest: an upper bound of ``count``; a ray with more is cut there.
+        capacity: C, the length of the lists. What does not fit is dropped from their end.
+        mask_box: where the mask lives; outside it everything is empty.
+        box: where density and displacements live.
+        shift: what is added to a raw density.
+        delta: the length of a step in base voxels.
+        thresholds: what is too faint.
+
+    Returns:
+        The samples; ``overflow`` tells whether ``capacity`` or ``longest`` was too small.
+    """
+    if triton_runs(origins, directions, entry, density, *slices):
+        from devrf.ops.kernels.search import find_samples_on_device
+
+        return find_samples_on_device(
+            origins, directions, entry, count, mask, density, slices, weight, step, longest,
+            capacity, mask_box, box, shift, delta, thresholds,
+        )
+    rays = len(origins)
+    samples = count.clamp(max=longest)
+    ray = torch.repeat_interleave(samples)
+    number = torch.arange(len(ray), device=ray.device) - (samples.cumsum(0) - samples)[ray]
+    distance = entry[ray] + step * number
+    points = torch.addcmul(origins[ray], directions[ray], distance[:, None])
+    kept = _occupied(mask, to_grid(points, mask_box, shape_of(mask))).nonzero()[:, 0]
+    ray, distance, points = ray[kept], distance[kept], points[kept]
+    _, tau = warped_depth(
+        points, density, slices, weight, box=box, shift=shift, delta=delta
+    )
+    alpha = -torch.expm1(-tau)
+    kept = (alpha >= thresholds.alpha).nonzero()[:, 0]
+    ray, distance, points = ray[kept], distance[kept], points[kept]
+    before = transmittances(tau[kept], ray, rays)
+    heavy = before * alpha[kept] >= thresholds.weight
+    kept = (before >= thresholds.stop).nonzero()[:, 0]
+    first = torch.searchsorted(ray[kept], torch.arange(rays + 1, device=ray.device))
+    total = first[-1]
+    kept = kept[:capacity]
+    room = capacity - len(kept)
+    return Found(
+        pad(ray[kept], (0, room), value=rays),
+        pad(distance[kept], (0, room)),
+        pad(points[kept], (0, 0, 0, room)),
+        pad(heavy[kept], (0, room)),
+        first.clamp(max=capacity),
+        total,
+        (total > capacity) | (count > longest).any(),
+    )
+
+
+def _occupied(mask: Tensor, coords: Tensor) -> Tensor:
+    """Mask (M,): is the grid point nearest to each coordinate (M, 3) on the grid and True?"""
+    x, y, z = mask.shape
+    i, j, k = coords.round().to(torch.int32).unbind(-1)
+    inside = (i >= 0) & (i < x) & (j >= 0) & (j < y) & (k >= 0) & (k < z)
+    row = torch.where(inside, (i * y + j) * z + k, 0)
+    return mask.reshape(-1)[row] & inside
+
+
+@torch.no_grad()
+def select(flags: Tensor, first: Tensor, capacity: int) -> Selected:
+    """The samples with a flag, without waiting for the device; the same on any device.
+
+    Padding repeats places of the list, each another one, so that a gradient that is gathered
+    from there does not queue up at one of them. It belongs to no ray.
+
+    Args:
+        flags: (C,) bool, none in the padding.
+        first: (R + 1,) where each ray's samples begin.
+        capacity: K ≤ C, the length of the new list. What does not fit is dropped from its end.
+    """
+    if capacity > len(flags):
+        raise ValueError(f"{capacity} of {len(flags)} samples cannot be selected")
+    place = torch.arange(len(flags), device=flags.device)
+    running = pad(flags.cumsum(0), (1, 0))
+    total = running[-1]
+    # One place more takes all that is not wanted.
+    target = torch.where(flags, running[:-1], capacity).clamp_(max=capacity)
+    index = torch.arange(capacity + 1, device=flags.device).scatter_(0, target, place)
+    return Selected(
+        index[:capacity], running[first].clamp_(max=capacity), total, total > capacity
+    )

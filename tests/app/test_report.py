@@ -1,0 +1,107 @@
+"""``stage=report``, and the report that a sweep ends with."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+
+import pytest
+
+
+def everything_in(folder):
+    return {str(path.relative_to(folder)) for path in folder.rglob("*")}
+
+
+@pytest.fixture
+def finished(trained, tmp_path):
+    """A folder with two finished runs."""
+    for name in ("one", "two"):
+        (tmp_path / "mine" / name).mkdir(parents=True)
+        for file in ("metrics.json", "frames.csv"):
+            shutil.copy(trained[0] / file, tmp_path / "mine" / name / file)
+    return tmp_path / "mine"
+
+
+def test_finished_runs_become_a_report_and_nothing_else_is_left(devrf, tmp_path, finished):
+    before = everything_in(tmp_path)
+    outcome = devrf("stage=report", "report.runs=mine")
+    assert (outcome.status, outcome.err) == (0, "")
+    assert outcome.out.splitlines()[-1] == "report written to mine/report/report.md"
+    psnr = json.loads((finished / "one" / "metrics.json").read_text())["deformation"]["psnr"]
+    assert outcome.out.count(f"{psnr:.2f}") == 2
+    made = everything_in(tmp_path) - before
+    assert {"mine/report", *(f"mine/report/report.{s}" for s in ("md", "csv", "tex"))} <= made
+    assert all(name.startswith("mine/report") for name in made)
+    assert not (finished / "report" / ".hydra").exists()
+    with (finished / "report" / "report.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["folder"] for row in rows] == ["one", "two"]
+    assert all(float(row["deformation.psnr"]) == psnr for row in rows)
+
+
+def test_it_needs_no_scene_from_disk(devrf, finished):
+    assert devrf("stage=report", "report.runs=mine", "data=lego", "data.root=nowhere").status == 0
+
+
+def test_outputs_are_what_is_reported_by_default(devrf, tmp_path, finished):
+    finished.rename(tmp_path / "outputs")
+    assert devrf("stage=report").out.endswith("report written to outputs/report/report.md\n")
+
+
+def test_a_report_among_the_files_of_a_run_leaves_the_runs_record_alone(devrf, finished):
+    record = finished / "one" / ".hydra" / "config.yaml"
+    record.parent.mkdir()
+    record.write_text("seed: 7\n")
+    outcome = devrf("stage=report", "report.runs=mine", "report.into=mine/one")
+    assert outcome.status == 0 and (finished / "one" / "report.md").is_file()
+    assert record.read_text() == "seed: 7\n"
+    assert {path.name for path in record.parent.iterdir()} == {"config.yaml"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["report.runs=nowhere"], "report.runs: no folder nowhere"),
+        (["report.runs=empty"], "report.runs: no finished run below empty"),
+        (["report.runs=empty", "report.into=there"], "report.runs: no finished run below empty"),
+        (["report.published=some"], "report.published: expected one of matching, all, none"),
+        (["report.folder=x"], "report.folder: no such key"),
+        (["ckpt=x"], "ckpt: stage=report starts from nothing"),
+    ],
+)
+def test_a_mistake_is_one_line_and_leaves_nothing(devrf, tmp_path, arguments, expected):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "empty" / "note").write_text("mine")
+    outcome = devrf("stage=report", *arguments)
+    assert outcome.status == 2
+    assert outcome.err.startswith(f"devrf: {expected}") and outcome.err.count("\n") == 1
+    assert everything_in(tmp_path) == {"empty", "empty/note"}
+
+
+def test_a_damaged_run_is_named_and_the_others_are_reported(devrf, finished):
+    (finished / "two" / "metrics.json").write_text('{"scene": "rob')
+    outcome = devrf("stage=report", "report.runs=mine")
+    assert (outcome.status, outcome.err) == (0, "")
+    assert outcome.out.count("mine/two/metrics.json: skipped; damaged") == 1
+    assert "1 finished run below" in (finished / "report" / "report.md").read_text("utf-8")
+
+
+def test_one_command_makes_the_ablation_table(devrf, tmp_path, tiny):
+    outcome = devrf(
+        "experiment=ablation_table", *tiny, "ablation=base,full", "hydra.sweep.dir=sweep"
+    )
+    assert (outcome.status, outcome.err) == (0, "")
+    assert outcome.out.splitlines()[-1] == "report written to sweep/report/report.md"
+    jobs = {path.parent.name for path in (tmp_path / "sweep").glob("*/metrics.json")}
+    assert jobs == {"0_robot", "1_robot", "2_flower", "3_flower"}
+    text = (tmp_path / "sweep" / "report" / "report.md").read_text("utf-8")
+    assert "4 finished runs below `sweep`" in text
+    assert "## robot" in text and "## flower" in text
+    assert not (tmp_path / "outputs").exists()
+
+
+def test_a_sweep_without_scores_ends_without_a_report(devrf, tmp_path, tiny):
+    outcome = devrf("-m", *tiny, "stage=canonical", "seed=0", "hydra.sweep.dir=sweep")
+    assert (outcome.status, outcome.err) == (0, "")
+    assert "report" not in outcome.out and not (tmp_path / "sweep" / "report").exists()

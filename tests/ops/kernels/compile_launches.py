@@ -1,0 +1,99 @@
+"""Compiles every launch of the check of the kernels for GPUs that need not be there.
+
+Run by test_compilation.py in a process of its own, without Triton's interpreter. The functions are
+called on CPU tensors; their launches are recorded instead of run, then each is compiled to PTX and
+on to a cubin by the assembler in Triton's wheel. Prints one JSON list.
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+import sys
+from importlib import import_module
+from pkgutil import iter_modules
+from typing import Any
+
+import torch
+import triton
+from triton.backends.compiler import GPUTarget
+from triton.compiler import ASTSource
+from triton.runtime.jit import JITFunction
+
+import devrf.ops.kernels
+from devrf.ops import choice
+from devrf.ops.selfcheck import CASES, Draw, interpolation, sample_search, warped_depths
+
+POINTERS = {
+    torch.float32: "*fp32", torch.float64: "*fp64", torch.int32: "*i32", torch.int64: "*i64",
+    torch.uint8: "*u8",
+}
+recorded: dict[tuple[Any, ...], tuple[ASTSource, dict[str, Any]]] = {}
+
+
+def record(kernel: JITFunction, *args: Any, grid: Any, warmup: bool, **kwargs: Any) -> None:
+    """Keep a kernel with the types and constants that it is launched with."""
+    known = ("num_warps", "enable_fp_fusion")
+    options = {name: kwargs.pop(name) for name in known if name in kwargs}
+    given = inspect.signature(kernel.fn).bind(*args, **kwargs).arguments
+    signature, constants = {}, {}
+    for parameter in kernel.params:
+        value = given[parameter.name]
+        if parameter.is_constexpr:
+            constants[parameter.name] = value
+        else:
+            signature[parameter.name] = type_of(value)
+    key = (kernel.fn.__name__, *signature.items(), *constants.items())
+    if "constexprs" in inspect.signature(ASTSource).parameters:
+        # From Triton 3.3 on constants have their place in the signature.
+        order = [parameter.name for parameter in kernel.params]
+        signature = {name: signature.get(name, "constexpr") for name in order}
+    recorded[key] = (ASTSource(kernel, signature, constants), options)
+
+
+def type_of(value: Any) -> str:
+    if isinstance(value, torch.Tensor):
+        assert value.is_contiguous()
+        return POINTERS[value.dtype]
+    return "fp32" if isinstance(value, float) else "i32"
+
+
+def kernel_names() -> set[str]:
+    """Every kernel of the package, as opposed to the functions that kernels call."""
+    modules = [import_module(m.name) for m in iter_modules(
+        devrf.ops.kernels.__path__, "devrf.ops.kernels."
+    )]
+    return {
+        name for module in modules for name, value in vars(module).items()
+        if isinstance(value, JITFunction) and name.endswith("_kernel")
+    }
+
+
+def main(capabilities: list[int]) -> None:
+    names = kernel_names()
+    JITFunction.run = record
+    choice.reaches = lambda device: True
+    draw = Draw(torch.device("cpu"))
+    with choice.using("triton"):
+        for case in CASES:
+            case(draw)
+        # What the check leaves out: other rows of channels, and no displacement.
+        interpolation(draw, (1, 9))
+        warped_depths(draw, (0,))
+        sample_search(draw, (0,))
+    found = []
+    done: set[str] = set()
+    for (name, *_), (source, options) in recorded.items():
+        # The last capability for every set of constants, the others once for each kernel.
+        for capability in capabilities[-1:] if name in done else capabilities:
+            done.add(name)
+            compiled = triton.compile(source, GPUTarget("cuda", capability, 32), options)
+            ptx, cubin = compiled.asm["ptx"], compiled.asm["cubin"]
+            found.append({
+                "kernel": name, "capability": capability,
+                "ptx": f".target sm_{capability}" in ptx, "cubin": cubin[:4] == b"\x7fELF",
+            })
+    print(json.dumps({"kernels": sorted(names), "compiled": found}))
+
+
+main([int(argument) for argument in sys.argv[1:]])

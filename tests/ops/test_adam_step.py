@@ -1,0 +1,81 @@
+"""One step of Adam: what it leaves behind, and the total variation within it, by hand."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from devrf.ops.adam_step import AdamRule, adam_step, smooth_adam_step
+from devrf.ops.total_variation import add_total_variation_gradient
+
+
+def rule(step: int = 1, **options: Any) -> AdamRule:
+    return AdamRule(torch.tensor(0.1), torch.tensor(float(step)), **options)
+
+
+def peak() -> Tensor:
+    """Zero everywhere but at one voxel, which exceeds its neighbours by 5."""
+    grid = torch.zeros(2, 2, 2, 1)
+    grid[1, 1, 1] = 5.0
+    return grid
+
+
+def test_a_step_clears_the_gradient_unless_told_otherwise() -> None:
+    for clear in (True, False):
+        values, gradient = torch.zeros(3), torch.tensor([1.0, -2.0, 0.0])
+        adam_step(values, gradient, torch.zeros(3), torch.zeros(3), rule(), clear=clear)
+        torch.testing.assert_close(values, torch.tensor([-0.1, 0.1, 0.0]))
+        assert gradient.any() != clear
+
+
+def test_second_step_by_hand() -> None:
+    values, mean, square = torch.zeros(1), torch.tensor([0.2]), torch.tensor([0.04])
+    adam_step(values, torch.tensor([3.0]), mean, square, rule(2))
+    # m = 0.9·0.2 + 0.1·3, s = 0.99·0.04 + 0.01·9.
+    assert mean.item() == pytest.approx(0.48) and square.item() == pytest.approx(0.1296)
+    move = 0.1 * (0.48 / (1 - 0.81)) / (0.1296 / (1 - 0.9801)) ** 0.5
+    assert values.item() == pytest.approx(-move, rel=1e-5)
+
+
+def test_smoothing_pulls_at_a_peak_and_its_neighbours_by_their_old_values() -> None:
+    values, into, gradient = peak(), torch.empty(2, 2, 2, 1), torch.zeros(2, 2, 2, 1)
+    mean, square = torch.zeros_like(values), torch.zeros_like(values)
+    smooth_adam_step(values, into, gradient, mean, square, rule(), smoothing=0.5)
+    assert torch.equal(values, peak())
+    # At the peak 0.5·3, at each of its three neighbours −0.5; a tenth of it is the mean.
+    assert mean[1, 1, 1].item() == pytest.approx(0.15)
+    assert mean[0, 1, 1].item() == mean[1, 0, 1].item() == pytest.approx(-0.05)
+    assert mean[0, 0, 0].item() == 0
+    assert into[1, 1, 1].item() == pytest.approx(4.9)
+    assert into[0, 1, 1].item() == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("skip_zero", [False, True])
+def test_smoothing_of_what_is_touched_leaves_the_rest(skip_zero: bool) -> None:
+    values, into, gradient = peak(), torch.empty(2, 2, 2, 1), torch.zeros(2, 2, 2, 1)
+    gradient[1, 1, 1] = 1.0
+    mean, square = torch.zeros_like(values), torch.zeros_like(values)
+    smooth_adam_step(
+        values, into, gradient, mean, square, rule(skip_zero=skip_zero), smoothing=0.5,
+        touched_only=True,
+    )
+    assert mean[1, 1, 1].item() == pytest.approx(0.25)
+    assert mean.count_nonzero() == 1 and not gradient.any()
+    expected = peak()
+    expected[1, 1, 1] = 4.9
+    torch.testing.assert_close(into, expected)
+
+
+def test_is_the_two_steps_it_stands_for(rng: torch.Generator) -> None:
+    values, gradient, mean = (torch.randn(3, 4, 2, 3, generator=rng) for _ in range(3))
+    square, pace = torch.rand(3, 4, 2, 3, generator=rng), torch.rand(3, 4, 2, 1, generator=rng)
+    into, how = torch.empty_like(values), rule(4, pace=pace)
+    expected = [t.clone() for t in (values, gradient, mean, square)]
+    add_total_variation_gradient(expected[0].clone(), expected[1], 0.3)
+    adam_step(expected[0], expected[1], expected[2], expected[3], how)
+    smooth_adam_step(values, into, gradient, mean, square, how, smoothing=0.3)
+    for ours, truth in zip((into, gradient, mean, square), expected, strict=True):
+        torch.testing.assert_close(ours, truth)

@@ -1,0 +1,114 @@
+"""Which implementation runs, and what happens where Triton cannot."""
+
+from __future__ import annotations
+
+import ast
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+
+from devrf.errors import DevrfError
+from devrf.ops import choice, selfcheck
+from devrf.ops.choice import passes_check, triton_runs, using
+
+CPU = torch.zeros(1)
+
+
+@pytest.fixture(autouse=True)
+def unchecked(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """No device has been looked at, and Triton's interpreter is off."""
+    monkeypatch.delenv("TRITON_INTERPRET")
+    passes_check.cache_clear()
+    yield
+    passes_check.cache_clear()
+
+
+class OnGpu:
+    """What the choice looks at in a tensor on a GPU."""
+
+    is_cuda = True
+    device = torch.device("cuda", 0)
+
+    def __init__(self, dtype: torch.dtype = torch.float32) -> None:
+        self.dtype = dtype
+
+
+def test_on_a_cpu_it_is_pytorch() -> None:
+    assert not triton_runs(CPU)
+
+
+def test_on_a_gpu_it_is_triton_where_the_check_passes(monkeypatch: pytest.MonkeyPatch) -> None:
+    looked: list[torch.device] = []
+    monkeypatch.setattr(selfcheck, "check_kernels", looked.append)
+    gpu = OnGpu()
+    assert triton_runs(gpu) and triton_runs(gpu)  # type: ignore[arg-type]
+    assert looked == [gpu.device]
+    assert not triton_runs(OnGpu(torch.float64))  # type: ignore[arg-type]
+
+
+def test_a_failed_check_is_said_once(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def broken(device: torch.device) -> None:
+        raise RuntimeError("no compiler\nmany lines")
+
+    monkeypatch.setattr(selfcheck, "check_kernels", broken)
+    with caplog.at_level(logging.WARNING):
+        assert not any(triton_runs(OnGpu()) for _ in range(3))  # type: ignore[arg-type]
+    (record,) = caplog.records
+    assert record.getMessage() == (
+        "kernels: plain PyTorch runs on cuda:0, since the Triton kernels failed their check there "
+        "(RuntimeError: no compiler)"
+    )
+
+
+def test_what_was_asked_for_holds_inside_and_not_after(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(choice, "reaches", lambda device: True)
+    monkeypatch.setattr(choice, "find_spec", lambda name: True)
+    with using("triton"):
+        assert triton_runs(CPU)
+        with using("torch"):
+            assert not triton_runs(OnGpu())  # type: ignore[arg-type]
+        assert triton_runs(CPU)
+    assert not triton_runs(CPU)
+
+
+def test_triton_on_a_cpu_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(choice, "find_spec", lambda name: True)
+    with using("triton"), pytest.raises(DevrfError) as refusal:
+        triton_runs(CPU)
+    assert str(refusal.value) == (
+        "kernels: triton needs a CUDA device, and these tensors are on the cpu: choose kernels=auto"
+    )
+
+
+def test_triton_refuses_other_numbers_than_float32(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(choice, "find_spec", lambda name: True)
+    with using("triton"), pytest.raises(DevrfError, match="float32, not on torch.float64"):
+        triton_runs(OnGpu(torch.float64))  # type: ignore[arg-type]
+
+
+def test_triton_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(choice, "find_spec", lambda name: None)
+    with using("triton"), pytest.raises(DevrfError, match="pip install triton"):
+        triton_runs(CPU)
+
+
+def test_nothing_loads_triton_before_it_is_needed() -> None:
+    modules = sorted(Path(choice.__file__).parent.glob("*.py"))
+    assert len(modules) > 5
+    for module in modules:
+        for statement in ast.parse(module.read_text()).body:
+            if isinstance(statement, ast.Import):
+                assert not any("triton" in name.name for name in statement.names), module
+            if isinstance(statement, ast.ImportFrom):
+                assert "kernels" not in str(statement.module), module
+
+
+def test_another_kind_is_refused() -> None:
+    with pytest.raises(DevrfError, match="kernels: expected auto, torch or triton, not 'cuda'"):
+        with using("cuda"):  # type: ignore[arg-type]
+            pass

@@ -1,0 +1,38 @@
+"""Grid coordinates, to the bit those of geometry's boxes."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from devrf.geometry.box import Box
+from devrf.ops.corners import scales, to_grid
+
+BOX = Box((-1.1, 0.3, -0.7), (0.9, 2.2, 1.3))
+SHAPE = (7, 160, 33)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_is_what_the_box_says_to_the_bit(rng: torch.Generator, dtype: torch.dtype) -> None:
+    points = torch.randn(500, 3, generator=rng, dtype=dtype)
+    assert torch.equal(to_grid(points, BOX, SHAPE), BOX.to_grid(points, SHAPE))
+    # The kernels are given these numbers, and work in float32.
+    single = points.float()
+    low, scale = torch.tensor(BOX.low), torch.tensor(scales(BOX, SHAPE))
+    assert torch.equal((single - low) * scale, BOX.to_grid(single, SHAPE))
+
+
+def test_corners_by_hand() -> None:
+    points = torch.tensor([BOX.low, BOX.middle, BOX.high])
+    expected = torch.tensor([[0.0, 0.0, 0.0], [3.0, 79.5, 16.0], [6.0, 159.0, 32.0]])
+    torch.testing.assert_close(to_grid(points, BOX, SHAPE), expected)
+
+
+def test_first_met_in_inference_mode_then_trained() -> None:
+    box = Box((0.0, 0.0, 0.0), (3.0, 3.0, 3.0))
+    with torch.inference_mode():
+        to_grid(torch.ones(1, 3), box, (4, 4, 7))
+    points = torch.ones(1, 3, requires_grad=True)
+    to_grid(points, box, (4, 4, 7)).sum().backward()
+    assert points.grad is not None
+    assert points.grad.tolist() == [[1.0, 1.0, 2.0]]

@@ -1,0 +1,129 @@
+"""The search for visible samples: by hand, and as the renderer finds them."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+import torch
+
+from devrf.fields.architecture import Architecture
+from devrf.fields.occupancy import Occupancy
+from devrf.geometry.box import Box
+from devrf.geometry.rays import Rays
+from devrf.ops.search import Found, Thresholds, find_samples, select
+from devrf.rendering.render import STOP, RenderSettings, render
+
+LINE = Box((0.0, 0.0, 0.0), (4.0, 1.0, 1.0))
+# Opacities of five grid points along x: empty, half, half, opaque, half.
+ALPHA = torch.tensor([0.0, 0.5, 0.5, 1 - 1e-6, 0.5])
+
+
+def along_x(**changed: Any) -> Found:
+    """Two rays along x, the second of which has no samples; one sample at each grid point."""
+    tau = (-torch.log1p(-ALPHA.double())).clamp(min=1e-9)
+    raw = torch.log(torch.expm1(tau)).float().view(5, 1, 1, 1).expand(5, 2, 2, 1)
+    arguments: dict[str, Any] = {
+        "origins": torch.zeros(2, 3), "directions": torch.tensor([[1.0, 0, 0], [0, 1.0, 0]]),
+        "entry": torch.zeros(2), "count": torch.tensor([5, 0]),
+        "mask": torch.ones(5, 2, 2, dtype=torch.bool), "density": raw.contiguous(),
+        "step": 1.0, "longest": 5, "capacity": 6, "mask_box": LINE, "box": LINE,
+        "shift": 0.0, "delta": 1.0, "thresholds": Thresholds(alpha=0.01, stop=1e-4, weight=0.2),
+    }
+    return find_samples(**(arguments | changed))
+
+
+def test_by_hand() -> None:
+    found = along_x()
+    # The empty one is dropped, and so is what stands behind the opaque one.
+    assert found.ray.tolist() == [0, 0, 0, 2, 2, 2]
+    assert found.distance.tolist() == [1, 2, 3, 0, 0, 0]
+    assert found.points[:3].tolist() == [[1, 0, 0], [2, 0, 0], [3, 0, 0]]
+    # Weights 0.5, 0.25, 0.25.
+    assert found.heavy.tolist() == [True, True, True, False, False, False]
+    assert found.first.tolist() == [0, 3, 3]
+    assert found.total == 3 and not found.overflow
+
+
+def test_weight_decides_what_is_heavy() -> None:
+    found = along_x(thresholds=Thresholds(alpha=0.01, stop=1e-4, weight=0.3))
+    assert found.heavy.tolist() == [True, False, False, False, False, False]
+
+
+def test_what_was_dropped_hides_nothing() -> None:
+    # Without the opaque cell the last one is seen, with a quarter of the ray left before it.
+    mask = torch.ones(5, 2, 2, dtype=torch.bool)
+    mask[3] = False
+    found = along_x(mask=mask, thresholds=Thresholds(alpha=0.01, stop=0.25, weight=0.125))
+    assert found.distance[:3].tolist() == [1, 2, 4]
+    assert found.heavy[:3].all()
+
+
+def test_a_displacement_leads_elsewhere() -> None:
+    # Every point sees what lies one further on.
+    ahead = torch.tensor([1.0, 0.0, 0.0]).expand(2, 2, 2, 3).contiguous()
+    assert along_x(slices=[ahead]).distance[:3].tolist() == [0, 1, 2]
+    halves = [torch.zeros(2, 2, 2, 3), 2 * ahead]
+    assert along_x(slices=halves, weight=0.5).distance[:3].tolist() == [0, 1, 2]
+
+
+@pytest.mark.parametrize("capacity", [0, 1, 2])
+def test_the_tail_that_does_not_fit_is_dropped(capacity: int) -> None:
+    found = along_x(capacity=capacity)
+    assert found.distance.tolist() == [1, 2, 3][:capacity]
+    assert found.first.tolist() == [0, capacity, capacity]
+    assert found.total == 3 and found.overflow
+
+
+def test_a_ray_longer_than_promised_is_cut_and_it_is_said() -> None:
+    found = along_x(longest=2)
+    assert found.total == 1 and found.overflow
+
+
+def test_finds_what_the_renderer_finds(rng: torch.Generator, cube: Box) -> None:
+    field = Architecture(channels=3, width=8, frequencies=1).radiance_field(cube, 12**3, 12**3)
+    with torch.no_grad():
+        field.density.values.copy_(8 * torch.rand(12, 12, 12, 1, generator=rng) - 3)
+    occupancy = Occupancy(torch.rand(9, 9, 9, generator=rng) > 0.5, cube)
+    directions = torch.nn.functional.normalize(torch.randn(40, 3, generator=rng), dim=1)
+    rays = Rays(-2 * directions + 0.3 * torch.randn(40, 3, generator=rng), directions, directions)
+    settings = RenderSettings(step=0.5, alpha_threshold=0.02, near=0.5, far=3.0)
+    truth = render(rays, field, occupancy, settings, torch.ones(3)).samples
+    entry, leave = cube.crossing(rays)
+    entry, leave = entry.clamp(min=settings.near), leave.clamp(max=settings.far)
+    step = field.step_length(settings.step)
+    count = torch.where(leave >= entry, ((leave - entry) / step + 1e-3).floor() + 1, 0.0).long()
+    found = find_samples(
+        rays.origins, rays.directions, entry, count, occupancy.mask, field.density.values,
+        step=step, longest=math.ceil(12**0.5 / step) + 1, capacity=2000, mask_box=cube, box=cube,
+        shift=field.shift, delta=field.step_in_base_voxels(settings.step),
+        thresholds=Thresholds(0.02, STOP, 0.02),
+    )
+    heavy = select(found.heavy, found.first, 1000)
+    used = int(heavy.total)
+    assert len(truth) == used > 100 and not found.overflow
+    index = heavy.index[:used]
+    assert torch.equal(found.ray[index], truth.ray)
+    torch.testing.assert_close(found.distance[index], truth.distance)
+    torch.testing.assert_close(found.points[index], truth.points)
+
+
+def test_selection_by_hand() -> None:
+    flags = torch.tensor([True, False, True, True, False, True, False, False])
+    first = torch.tensor([0, 2, 2, 4, 6])
+    chosen = select(flags, first, 6)
+    assert chosen.index[:4].tolist() == [0, 2, 3, 5]
+    # Padding: each another place of the list.
+    assert chosen.index[4:].tolist() == [4, 5]
+    assert chosen.first.tolist() == [0, 1, 1, 3, 4]
+    assert chosen.total == 4 and not chosen.overflow
+
+
+def test_a_selection_that_does_not_fit() -> None:
+    chosen = select(torch.ones(5, dtype=torch.bool), torch.tensor([0, 2, 5]), 3)
+    assert chosen.index.tolist() == [0, 1, 2]
+    assert chosen.first.tolist() == [0, 2, 3]
+    assert chosen.total == 5 and chosen.overflow
+    with pytest.raises(ValueError, match="6 of 5"):
+        select(torch.ones(5, dtype=torch.bool), torch.tensor([0, 2, 5]), 6)
