@@ -18,6 +18,7 @@ from devrf.ops.adam import GridAdam
 from devrf.rendering.model import SceneModel
 from devrf.scenes.scene import CaptureName, Scene, Views
 from devrf.stages.checkpoint import Passport, check_scene, passport_in
+from devrf.stages.compact_state import compact_state
 from devrf.stages.held_out import score
 from devrf.stages.progress import random_states, set_random_states
 from devrf.stages.ranks import (
@@ -201,7 +202,11 @@ class ScheduledStage(LightningModule, ABC):
         """Add what the tensors do not tell."""
         checkpoint["devrf"] = asdict(self.passport())
         # Without the optimiser's state it is there to be rendered, not to be gone on from.
-        if "optimizer_states" in checkpoint:
+        if "optimizer_states" not in checkpoint:
+            if self.iteration >= self.total_iterations:
+                small = compact_state(self.model)
+                checkpoint["state_dict"] = {f"scene_model.{k}": v for k, v in small.items()}
+        else:
             checkpoint["progress"] = {
                 "stage": self.name,
                 "iteration": self.iteration,
