@@ -12,6 +12,7 @@ from torch import Tensor
 
 from devrf.errors import DevrfError
 from devrf.ops.adam import GridAdam
+from devrf.ops.spans import span
 from devrf.rendering.model import SceneModel
 from devrf.scenes.scene import CaptureName, Scene, Views
 from devrf.stages.checkpoint import Passport
@@ -105,9 +106,11 @@ class ScheduledStage(LightningModule, ABC):
             optimizer.zero_grad()
             total, terms = self.loss(views)
             if total.requires_grad:
-                self.manual_backward(total)
-            self.add_gradients()
-            optimizer.step()
+                with span("backward"):
+                    self.manual_backward(total)
+            with span("optimiser"):
+                self.add_gradients()
+                optimizer.step()
             self.iteration += 1
             for name, value in {"loss": total.detach(), **terms}.items():
                 sums[name] = sums[name] + value if name in sums else value
