@@ -8,15 +8,20 @@ import sys
 from devrf.app import main
 from devrf.messages import mistakes_in_one_line
 from devrf.process import tune_for_cpu
+from devrf.sweep import failures_at_the_end
 
 
 def entry() -> None:
-    """Run the application; a mistake in the input ends it with one line and status 2."""
+    """Run the application.
+
+    A mistake in the input ends it with one line and status 2, a sweep of which jobs failed with
+    their names and status 3.
+    """
     # Hydra would print a traceback of its own and exit with 1 if it were not told to raise.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     tune_for_cpu()
     try:
-        with mistakes_in_one_line():
+        with mistakes_in_one_line(), failures_at_the_end():
             main()
     except KeyboardInterrupt:
         print("devrf: interrupted", file=sys.stderr)

@@ -8,21 +8,34 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from devrf import job
 from devrf.config import config_folder, register_resolvers
 from devrf.config_check import check_config
 from devrf.messages import mistakes_in_one_line
 from devrf.run_folder import nothing_left_of_mistakes
+from devrf.sweep import forget_failure, one_of_many
 
 register_resolvers()
 
 
-@hydra.main(config_path=str(config_folder()), config_name="config", version_base="1.3")
-def main(config: DictConfig) -> None:
-    """Run ``stage=…`` in the folder that Hydra made for it."""
+def run(config: DictConfig) -> float | None:
+    """Run ``stage=…`` in the folder that Hydra made for it; return the objective, if measured."""
     folder = Path(HydraConfig.get().runtime.output_dir)
+    if job.in_sweep():
+        return one_of_many(lambda: _checked(config, folder), config, folder)
     with mistakes_in_one_line(), nothing_left_of_mistakes(folder):
-        check_config(config)
-        # Imported here: --help and a misspelt key are answered before torch has loaded.
-        from devrf.run.steps import run_stage
+        value = _checked(config, folder)
+    forget_failure(folder)
+    return value
 
-        run_stage(config, folder)
+
+def _checked(config: DictConfig, folder: Path) -> float | None:
+    check_config(config)
+    # Imported here: --help and a misspelt key are answered before torch has loaded.
+    from devrf.run.steps import run_stage
+
+    return run_stage(config, folder)
+
+
+# Kept apart from `run`, which other processes find by its name.
+main = hydra.main(config_path=str(config_folder()), config_name="config", version_base="1.3")(run)

@@ -51,9 +51,24 @@ def config_record(stage: str) -> str | None:
     return None if stage == "report" else ".hydra"
 
 
+def tracked_name(scene: str, mode: Any, overrides: str) -> str:
+    """What a tracker calls a run: the scene; in a sweep, what was asked of the job."""
+    return overrides or scene if _of_sweep(mode) else scene
+
+
+def tracked_group(mode: Any, folder: str) -> str | None:
+    """The group that a tracker puts a run into: the sweep's folder's name, None outside one."""
+    return Path(folder).name if _of_sweep(mode) else None
+
+
+def _of_sweep(mode: Any) -> bool:
+    return str(getattr(mode, "name", mode)) == "MULTIRUN"
+
+
 def register_resolvers() -> None:
     """Make ``${devrf.scene_name:…}`` and the other words known to OmegaConf."""
     from omegaconf import OmegaConf
 
-    for word in (scene_name, run_name, run_folder, config_record):
+    words = (scene_name, run_name, run_folder, config_record, tracked_name, tracked_group)
+    for word in words:
         OmegaConf.register_new_resolver(f"devrf.{word.__name__}", word, replace=True)

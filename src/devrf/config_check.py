@@ -20,7 +20,9 @@ from devrf.errors import DevrfError
 from devrf.value_types import described, fits, held
 
 # What the run itself reads, beside the parts.
-ROOT: dict[str, Any] = {"stage": str, "seed": int, "ckpt": str | Path | None, "scene": str}
+ROOT: dict[str, Any] = {
+    "stage": str, "seed": int, "ckpt": str | Path | None, "objective": str, "scene": str,
+}
 # Hydra's own keys in a part's config.
 RESERVED = {"_target_", "_partial_", "_convert_", "_recursive_", "_args_"}
 REFERENCE = re.compile(r"\$\{([\w.]+)\}")

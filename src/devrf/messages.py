@@ -23,6 +23,13 @@ REFUSED = {
     errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.ENOTDIR, errno.EEXIST,
 }
 
+# What Hydra's plugins for sweeps add to its groups.
+PLUGINS = {
+    "hydra/launcher": ("joblib", "submitit_local", "submitit_slurm"),
+    "hydra/sweeper": ("optuna",),
+    "hydra/sweeper/sampler": ("tpe",),
+}
+
 
 @contextmanager
 def mistakes_in_one_line() -> Iterator[None]:
@@ -64,6 +71,8 @@ def one_line(error: BaseException) -> str:
     own = own_error(error)
     if own is not None:
         text = str(own)
+    elif isinstance(error, MissingConfigException) and _plugin(error):
+        text = f'{_plugin(error)}: not installed; pip install "devrf[sweeps]"'
     elif isinstance(error, MissingConfigException) and error.options:
         group, _, option = str(error.missing_cfg_file).rpartition("/")
         text = f"{group}={option}: no such option; choose one of {', '.join(error.options)}"
@@ -74,6 +83,12 @@ def one_line(error: BaseException) -> str:
     else:
         text = _of_hydra(error)
     return " ".join(text.split())
+
+
+def _plugin(error: MissingConfigException) -> str | None:
+    """``group=option`` where what is missing would come with a plugin."""
+    group, _, option = str(error.missing_cfg_file).rpartition("/")
+    return f"{group}={option}" if option in PLUGINS.get(group, ()) else None
 
 
 def _of_hydra(error: BaseException) -> str:

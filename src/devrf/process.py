@@ -1,10 +1,11 @@
-"""What a process that trains on a CPU asks of the system before torch is loaded."""
+"""What a process that trains asks of the system."""
 
 from __future__ import annotations
 
 import ctypes
 import os
 import sys
+from pathlib import Path
 
 # glibc's malloc.h
 M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD = -1, -2, -3
@@ -32,3 +33,11 @@ def tune_for_cpu() -> None:
     mallopt(M_MMAP_THRESHOLD, 32 * 2**20)  # the most that glibc accepts
     mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
     mallopt(M_TOP_PAD, 64 * 2**20)
+
+
+def forget_peak_memory() -> None:
+    """Let the system measure this process's peak memory anew, where it can (Linux)."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:
+        return

@@ -25,22 +25,31 @@ def nothing_left_of_mistakes(folder: Path) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        if is_mistake(error) and held_nothing and _holds_at_most(folder, OF_HYDRA):
-            _remove(folder)
+        if is_mistake(error) and held_nothing:
+            remove_if_only(folder, OF_HYDRA)
         raise
+
+
+def remove_if_only(folder: Path, names: set[str]) -> None:
+    """Remove ``folder`` if it holds nothing but ``names``, and parents that are empty then."""
+    if _holds_at_most(folder, names):
+        _remove(folder, names)
 
 
 def _holds_at_most(folder: Path, names: set[str]) -> bool:
     return folder.is_dir() and {path.name for path in folder.iterdir()} <= names
 
 
-def _remove(folder: Path) -> None:
+def _remove(folder: Path, names: set[str]) -> None:
     for handler in list(logging.getLogger().handlers):
         if isinstance(handler, logging.FileHandler):
             logging.getLogger().removeHandler(handler)
             handler.close()
-    shutil.rmtree(folder / ".hydra", ignore_errors=True)
-    (folder / "run.log").unlink(missing_ok=True)
+    for path in map(folder.joinpath, names):
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
     here = Path.cwd()
     for path in (folder.resolve(), *folder.resolve().parents):
         # Nothing above a folder that lies elsewhere is ours, nor is the working folder.

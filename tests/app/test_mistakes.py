@@ -40,7 +40,11 @@ MISTAKES = {
     "word for a weight": (["loss.fine.color=high"], "loss.fine.color: expected a number"),
     "unknown trainer setting": (["+trainer.max_step=3"], "did you mean trainer.max_steps?"),
     "unknown accelerator": (["trainer.accelerator=abacus"], "trainer: "),
+    "several devices, each for itself": (
+        ["trainer.devices=2"], "trainer.devices: 2 processes need trainer=ddp",
+    ),
     "part that is not there": (["data._target_=devrf.nothing"], "data._target_: cannot load"),
+    "unknown objective": (["objective=deformation.pnsr"], "objective: deformation has no 'pnsr'"),
     "scoring before training": (["stage=evaluate"], "canonical.ckpt: no such checkpoint"),
     "moving before the rest state": (["stage=deformation"], "canonical.ckpt: no such checkpoint"),
     "missing checkpoint": (["stage=render", "ckpt=no.ckpt"], "no.ckpt: no such checkpoint"),

@@ -14,7 +14,9 @@ import pytest
 FURTHER = {
     "ms_ssim", "lpips", "psnr_masked", "ssim_masked", "lpips_masked", "depth_error", "flow_error",
 }
-CANONICAL_KEYS = {"psnr", "ssim", "seconds", "iterations", "peak_gpu_gb"} | FURTHER
+CANONICAL_KEYS = {
+    "psnr", "ssim", "seconds", "iterations", "iterations_per_second", "peak_gpu_gb",
+} | FURTHER
 DEFORMATION_KEYS = CANONICAL_KEYS | {"rest_pose_psnr", "checkpoint_mb"}
 
 
@@ -56,6 +58,16 @@ def test_what_is_known_of_an_embedded_scene_is_measured(trained):
 def test_a_run_says_how_it_came_about(trained):
     ran = metrics(trained[0])["run"]
     assert ran["parameters"] > 1000 and ran["device"] and ran["torch"]
+    assert ran["choices"]["data"] == "procedural" and ran["choices"]["ablation"] == "full"
+    assert ran["choices"]["experiment"] is None and "hydra/launcher" not in ran["choices"]
+    assert "data.frames=3" in ran["overrides"]
+    assert (ran["seed"], ran["train_views"], ran["test_frames"]) == (0, 2, 3)
+    found = metrics(trained[0])
+    for stage in ("canonical", "deformation"):
+        assert ran["wall_seconds"][stage] >= found[stage]["seconds"] > 0
+        took = found[stage]["iterations"] / found[stage]["iterations_per_second"]
+        assert took == pytest.approx(found[stage]["seconds"], abs=0.01)
+    assert ran["wall_seconds"]["evaluate"] > 0
 
 
 def test_every_frame_has_a_row(trained):
@@ -127,6 +139,8 @@ def test_stages_one_by_one_find_the_checkpoints_and_come_to_the_same(
         assert (outcome.status, outcome.err) == (0, "")
     assert (folder / "videos" / "orbit.mp4").is_file()
     ours, whole = metrics(folder), metrics(trained[0])
+    # Each step ran by itself; the checkpoints say how long the earlier ones took.
+    assert all(seconds > 0 for seconds in ours["run"]["wall_seconds"].values())
     for section in ("canonical", "deformation"):
         assert ours[section]["psnr"] == pytest.approx(whole[section]["psnr"], abs=0.01)
 
@@ -135,7 +149,9 @@ def test_the_canonical_stage_alone_can_be_scored(devrf, tmp_path, tiny):
     for stage in ("canonical", "evaluate"):
         outcome = devrf(*tiny, f"stage={stage}", "hydra.run.dir=run")
         assert (outcome.status, outcome.err) == (0, "")
-    assert list(metrics(tmp_path / "run")) == ["scene", "canonical", "run"]
+    found = metrics(tmp_path / "run")
+    assert list(found) == ["scene", "canonical", "run"]
+    assert found["run"]["wall_seconds"]["deformation"] is None
 
 
 def test_a_checkpoint_from_elsewhere_is_taken_as_given(devrf, tmp_path, tiny, trained):

@@ -90,6 +90,8 @@ def test_the_record_says_what_training_took(
     assert stage.record["peak_gpu_gb"] is None
     seconds = stage.record["seconds"]
     assert seconds is not None and 0 < seconds < 60
+    speed = stage.record["iterations_per_second"]
+    assert speed is not None and 12 / speed == pytest.approx(seconds, abs=0.01)
     assert stage.passport().records["canonical"] == stage.record
 
 

@@ -78,12 +78,10 @@ def test_images_without_matte_or_flow() -> None:
     torch.testing.assert_close(batch.color[0], torch.tensor([121 / 255, 0.0, 1.0]))
 
 
-def test_backgrounds() -> None:
-    cpu = torch.device("cpu")
-    assert background_color("white", 5, cpu, training=True).tolist() == [1, 1, 1]
-    assert background_color("black", 5, cpu, training=True).tolist() == [0, 0, 0]
-    assert background_color("random", 5, cpu, training=False).tolist() == [1, 1, 1]
-    drawn = background_color("random", 5, cpu, training=True)
+def test_backgrounds(rng: torch.Generator) -> None:
+    assert background_color("white", 5, rng).tolist() == [1, 1, 1]
+    assert background_color("black", 5, rng).tolist() == [0, 0, 0]
+    drawn = background_color("random", 5, rng)
     assert drawn.shape == (5, 3) and len(drawn.unique(dim=0)) == 5
 
 
@@ -96,11 +94,11 @@ def test_all_pixels_of_some_images() -> None:
     assert kept.image.unique().tolist() == [0] and kept.flat.tolist() == list(range(12))
 
 
-def test_draws_come_from_the_pool_and_reach_all_of_it() -> None:
+def test_draws_come_from_the_pool_and_reach_all_of_it(rng: torch.Generator) -> None:
     pool = PixelPool(
         torch.tensor([0, 1, 1], dtype=torch.int32), torch.tensor([7, 2, 5], dtype=torch.int32)
     )
-    image, flat = pool.draw(200)
+    image, flat = pool.draw(200, rng)
     assert image.dtype == flat.dtype == torch.int64
     drawn = set(zip(image.tolist(), flat.tolist(), strict=True))
     assert drawn == {(0, 7), (1, 2), (1, 5)}

@@ -57,6 +57,12 @@ def test_frames_of_gives_the_nearest_frame_in_any_shape() -> None:
     times = torch.tensor([[0.04, 0.06, 0.29], [0.31, 0.9, 0.7]])
     assert UNEVEN.frames_of(times).tolist() == [[0, 1, 1], [2, 3, 2]]
     assert UNEVEN.frames_of(times).dtype == torch.int64
+    assert UNEVEN.frames_of(torch.tensor([-0.1, 1.7])).tolist() == [0, len(UNEVEN) - 1]
+
+
+def test_frames_of_many_frames_takes_no_memory_of_their_square() -> None:
+    times = torch.linspace(0, 1, 90_000, dtype=torch.float64)
+    assert FrameClock(tuple(times.tolist())).frames_of(times).tolist() == list(range(90_000))
 
 
 @pytest.mark.parametrize("times", [(0.0,), (0.1, 0.2), (0.0, 0.5, 0.5), (0.0, 0.6, 0.5), ()])

@@ -24,7 +24,10 @@ FILES = [
     for group in GROUPS
     for file in sorted((config_folder() / group).glob("*.yaml"))
 ]
-NEEDS = {"logger=tensorboard": "tensorboard"}
+NEEDS = {
+    "logger=tensorboard": "tensorboard",
+    "hparams_search=loss_weights": "hydra_plugins.hydra_optuna_sweeper",
+}
 
 
 def rooted(composed, *overrides):

@@ -121,11 +121,33 @@ def test_image_paths_stay_inside_the_scene(scene_folder: Any, escape: str) -> No
     assert str(path) in message and "outside the scene's folder" in message
 
 
-def test_a_link_does_not_lead_outside_either(scene_folder: Any, tmp_path: Path) -> None:
-    image = scene_folder.static / "train/r_000.png"
-    image.rename(tmp_path / "outside.png")
-    image.symlink_to(tmp_path / "outside.png")
-    assert "outside the scene's folder" in message_of(scene_folder.root)
+def test_links_that_lie_in_the_scene_are_followed(scene_folder: Any, tmp_path: Path) -> None:
+    (scene_folder.static / "train").rename(tmp_path / "elsewhere")
+    (scene_folder.static / "train").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "scene").rename(tmp_path / "moved")
+    (tmp_path / "link").symlink_to(tmp_path / "moved")
+    assert read_blender(tmp_path / "link").static.train.names[0] == "static/train/r_000.png"
+
+
+def test_text_does_not_leave_through_a_link(scene_folder: Any, tmp_path: Path) -> None:
+    """For the system ``link/..`` is where the link leads; here it is the scene's folder."""
+    (tmp_path / "elsewhere" / "images").mkdir(parents=True)
+    (scene_folder.static / "train/r_000.png").rename(tmp_path / "elsewhere/secret.png")
+    (scene_folder.static / "link").symlink_to(tmp_path / "elsewhere/images")
+    path = scene_folder.root / TRAIN
+    scene_folder.edit(path, in_first_frame("file_path", "link/../secret.png"))
+    message = message_of(scene_folder.root)
+    assert f"{scene_folder.static}/secret.png: no such image" in message
+
+
+def test_a_scene_beside_the_current_folder(
+    scene_folder: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(scene_folder.static)
+    assert read_blender("..").static.train.names[0] == "static/train/r_000.png"
+    inner = str(scene_folder.static / "train/r_001.png")
+    scene_folder.edit(scene_folder.root / TRAIN, in_first_frame("file_path", inner))
+    assert read_blender(Path("..")).static.train.names[0] == "static/train/r_001.png"
 
 
 def test_a_missing_image(scene_folder: Any) -> None:

@@ -16,8 +16,12 @@ from devrf.stages.held_out import HeldOutView
 GAP = 4
 
 
-def write_contact_sheet(path: Path, views: Sequence[HeldOutView], rows: int = 6) -> None:
-    """Write a PNG with ``rows`` of the views, evenly spread: prediction | truth | error."""
+def write_contact_sheet(path: Path, views: Sequence[HeldOutView], rows: int = 6) -> Tensor:
+    """Write a PNG with ``rows`` of the views, evenly spread: prediction | truth | error.
+
+    Returns:
+        The sheet (H, W, 3) in [0, 1].
+    """
     count = min(rows, len(views))
     chosen = [views[round(k * (len(views) - 1) / max(count - 1, 1))] for k in range(count)]
     strips = [
@@ -26,6 +30,7 @@ def write_contact_sheet(path: Path, views: Sequence[HeldOutView], rows: int = 6)
     sheet = side_by_side([strip.transpose(0, 1) for strip in strips]).transpose(0, 1)
     with whole_file(path) as partial:
         iio.imwrite(partial, to_bytes(sheet).numpy(), extension=".png")
+    return sheet
 
 
 def side_by_side(images: Sequence[Tensor], gap: int = GAP) -> Tensor:

@@ -16,7 +16,7 @@ from torch import Tensor
 from devrf.artifacts.colors import depth_colors, to_bytes
 from devrf.artifacts.files import whole_file
 from devrf.geometry.cameras import Cameras
-from devrf.rendering.model import SceneModel
+from devrf.rendering.model import Picture, SceneModel
 
 # Small pictures are shown enlarged: a video of 100 pixels is too small to watch.
 WATCHABLE = 240
@@ -48,12 +48,15 @@ def pictures(
     for k in range(len(cameras)):
         time = k / max(len(cameras) - 1, 1)
         picture = model.picture(cameras.image_rays(k).to(device), time, behind)
-        near, far = _depth_range(model, cameras.positions[k])
-        shape = (cameras.height, cameras.width)
-        depth = depth_colors(
-            picture.depth.view(shape).cpu(), picture.opacity.view(shape).cpu(), near, far
-        )
-        yield torch.cat([picture.color.view(*shape, 3).cpu(), depth], dim=1)
+        depth = depth_picture(model, picture, cameras.positions[k], cameras.height)
+        yield torch.cat([picture.color.view(depth.shape).cpu(), depth], dim=1)
+
+
+def depth_picture(model: SceneModel, picture: Picture, position: Tensor, height: int) -> Tensor:
+    """How far away things are (H, W, 3), of a whole image that a camera at ``position`` sees."""
+    near, far = _depth_range(model, position)
+    depth, opacity = picture.depth.view(height, -1), picture.opacity.view(height, -1)
+    return depth_colors(depth.cpu(), opacity.cpu(), near, far)
 
 
 def _depth_range(model: SceneModel, position: Tensor) -> tuple[float, float]:

@@ -42,16 +42,23 @@ def write_frames(path: Path, captures: Mapping[str, Sequence[HeldOutView]]) -> N
         path: the file.
         captures: images that were scored alike, by the capture they belong to.
     """
-    views = [view for group in captures.values() for view in group]
-    names = list(dict.fromkeys(name for view in views for name in view.scores))
+    rows = frame_rows(captures)
     with whole_file(path) as partial, partial.open("w", newline="") as file:
-        table = csv.writer(file)
-        table.writerow(["capture", "name", "time", *names])
-        for capture, group in captures.items():
-            for view in group:
-                values = [view.scores.get(name) for name in names]
-                cells = ["" if value is None else f"{value:.6g}" for value in values]
-                table.writerow([capture, view.name, f"{view.time:.6g}", *cells])
+        table = csv.DictWriter(file, list(dict.fromkeys(name for row in rows for name in row)))
+        table.writeheader()
+        for row in rows:
+            table.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
+
+
+def frame_rows(
+    captures: Mapping[str, Sequence[HeldOutView]]
+) -> list[dict[str, str | float | None]]:
+    """A row for each held-out image: capture, name, time, every metric."""
+    return [
+        {"capture": capture, "name": view.name, "time": view.time, **view.scores}
+        for capture, group in captures.items()
+        for view in group
+    ]
 
 
 def provenance(model: SceneModel, device: torch.device) -> dict[str, Any]:

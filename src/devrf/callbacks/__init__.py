@@ -1,7 +1,11 @@
 """Callbacks: what watches a stage and acts on it from outside."""
 
+from devrf.callbacks.meter import Meter
+from devrf.callbacks.previews import Previews
 from devrf.callbacks.progress import Progress
 from devrf.callbacks.record import TrainingRecord
 from devrf.callbacks.schedule import GridUpscaling, LearningRateDecay
 
-__all__ = ["GridUpscaling", "LearningRateDecay", "Progress", "TrainingRecord"]
+__all__ = [
+    "GridUpscaling", "LearningRateDecay", "Meter", "Previews", "Progress", "TrainingRecord",
+]

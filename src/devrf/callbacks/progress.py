@@ -43,6 +43,8 @@ class Progress(Callback):
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Open the bar."""
         assert isinstance(pl_module, ScheduledStage)
+        if not trainer.is_global_zero:
+            return
         self._shown = (time.perf_counter(), pl_module.iteration)
         console = Console()
         if console.is_terminal:

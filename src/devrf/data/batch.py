@@ -84,11 +84,15 @@ def gather_batch(
     )
 
 
-def background_color(name: str, rays: int, device: torch.device, *, training: bool) -> Tensor:
-    """The background (3,), or (R, 3) when it is drawn at random for training.
+def background_color(name: str, rays: int, generator: torch.Generator) -> Tensor:
+    """The background (3,) to learn on, or (R, 3) where it is random.
 
-    A random background is white outside training, so that held-out views have one truth.
+    Args:
+        name: ``white``, ``black`` or ``random``.
+        rays: R, the rays of the batch.
+        generator: of the random colours; the background is on its device.
     """
-    if name == "random" and training:
-        return torch.rand(rays, 3, device=device)
+    device = generator.device
+    if name == "random":
+        return torch.rand(rays, 3, device=device, generator=generator)
     return torch.full((3,), 0.0 if name == "black" else 1.0, device=device)

@@ -38,6 +38,10 @@ class SceneDataModule(LightningDataModule, ABC):
             self._scene = self.load()
         return self._scene
 
+    def prepare_data(self) -> None:
+        """Read the scene in one process of several, before the others find what it has kept."""
+        _ = self.scene
+
     def setup(self, stage: str) -> None:
         """Read the scene, in case nobody asked for it yet."""
         _ = self.scene

@@ -25,9 +25,16 @@ class PixelPool:
     def __len__(self) -> int:
         return self.image.shape[0]
 
-    def draw(self, count: int) -> tuple[Tensor, Tensor]:
-        """``count`` pixels with replacement: image (count,) and number (count,), int64."""
-        pick = torch.randint(len(self), (count,), device=self.image.device)
+    def draw(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """``count`` pixels with replacement: image (count,) and number (count,), int64.
+
+        Args:
+            count: how many.
+            generator: of the random choice, on the pool's device.
+        """
+        pick = torch.randint(
+            len(self), (count,), device=self.image.device, generator=generator
+        )
         return self.image[pick].long(), self.flat[pick].long()
 
     def of_images(self, images: Tensor) -> PixelPool:

@@ -68,4 +68,5 @@ class FrameClock:
     def frames_of(self, times: Tensor) -> Tensor:
         """The nearest frame of each time: int64, the shape of ``times``."""
         clock = torch.tensor(self.times, dtype=torch.float64, device=times.device)
-        return (times.double()[..., None] - clock).abs().argmin(dim=-1)
+        middles = (clock[1:] + clock[:-1]) / 2
+        return torch.searchsorted(middles, times.double().contiguous())

@@ -6,7 +6,7 @@ the compiler of the machine that a run is on.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -69,23 +69,23 @@ def _run(case: Callable[[Draw], Results], kind: Kind, device: torch.device) -> l
         return [result.detach().float() for result in case(Draw(device))]
 
 
-def interpolation(draw: Draw) -> Results:
-    """Values and both gradients, for every number of channels that a field may have."""
+def interpolation(draw: Draw, channels: Sequence[int] = (3, 12)) -> Results:
+    """Values and both gradients, of rows that cannot and that can be loaded in fours."""
     results: list[Tensor] = []
-    for channels in (1, 3, 9, 12):
-        grid, coords = draw.leaf(4, 3, 5, channels), (2 + 3 * draw(50, 3)).requires_grad_()
+    for width in channels:
+        grid, coords = draw.leaf(4, 3, 5, width), (2 + 3 * draw(50, 3)).requires_grad_()
         values = interpolate(grid, coords)
-        upstream = draw(50, channels)
+        upstream = draw(50, width)
         results += [values, *torch.autograd.grad(values, (grid, coords), upstream)]
     return tuple(results)
 
 
-def warped_depths(draw: Draw) -> Results:
-    """At rest, at a frame, and between two."""
+def warped_depths(draw: Draw, frames: Sequence[int] = (1, 2)) -> Results:
+    """At a frame, and between two."""
     results: list[Tensor] = []
-    for frames in (0, 1, 2):
+    for count in frames:
         density, points = draw.leaf(4, 3, 5, 1), draw(50, 3)
-        slices = [draw.leaf(3, 4, 3, 3) for _ in range(frames)]
+        slices = [draw.leaf(3, 4, 3, 3) for _ in range(count)]
         q, tau = warped_depth(points, density, slices, 0.3, box=_Box(), shift=-1.0, delta=0.5)
         results += [q, tau]
         leaves = [density, *slices]
@@ -95,13 +95,13 @@ def warped_depths(draw: Draw) -> Results:
     return tuple(results)
 
 
-def sample_search(draw: Draw) -> Results:
-    """Rays through a box that is partly occupied, at rest, at a frame, and between two."""
+def sample_search(draw: Draw, frames: Sequence[int] = (1, 2)) -> Results:
+    """Rays through a box that is partly occupied, at a frame, and between two."""
     results: list[Tensor] = []
-    for frames in (0, 1, 2):
+    for moments in frames:
         origins, directions = 0.5 * draw(9, 3), torch.nn.functional.normalize(draw(9, 3), dim=1)
         count = (20 * draw(9)).clamp(min=0).long() * 2
-        slices = [0.2 * draw(3, 4, 3, 3) for _ in range(frames)]
+        slices = [0.2 * draw(3, 4, 3, 3) for _ in range(moments)]
         found = find_samples(
             origins, directions, -1 + 0.1 * draw(9), count, draw(5, 4, 6) > -0.3,
             3 * draw(4, 3, 5, 1), slices, 0.3, step=0.05, longest=40, capacity=40,

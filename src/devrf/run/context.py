@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -9,13 +10,19 @@ from typing import Any
 import torch
 from hydra.utils import instantiate
 from lightning import Trainer
-from omegaconf import DictConfig
+from lightning.pytorch.strategies import Strategy
+from omegaconf import DictConfig, OmegaConf
 
+from devrf.artifacts.tracking import Tracker, trackers
 from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
 from devrf.scenes.scene import Scene
 from devrf.stages.checkpoint import Stored, load_checkpoint
 from devrf.stages.evaluation import Evaluation
+from devrf.stages.ranks import RaysByRank
+
+# Stages that no checkpoint is of use to, and that begin a run of their own.
+FROM_NOTHING = ("prepare", "inspect", "canonical", "pipeline", "report")
 
 
 class RunContext:
@@ -33,6 +40,16 @@ class RunContext:
     def __init__(self, config: DictConfig, folder: Path) -> None:
         self.config = config
         self.folder = folder
+        self._began = time.perf_counter()
+
+    def begin_step(self) -> None:
+        """Start the clock of a step."""
+        self._began = time.perf_counter()
+
+    @property
+    def step_seconds(self) -> float:
+        """Wall clock since the present step began: reading, learning, scoring, writing."""
+        return round(time.perf_counter() - self._began, 2)
 
     @cached_property
     def datamodule(self) -> SceneDataModule:
@@ -47,14 +64,55 @@ class RunContext:
 
     @cached_property
     def logger(self) -> Any:
-        """The tracker of the whole run, one for both stages."""
-        return instantiate(self.config.logger)
+        """What logs the whole run, one for all its steps; of several processes, rank 0's.
+
+        A tracker is told the config, which begins its run: nothing should be wrong any more.
+        """
+        if not self.leads:
+            return False
+        logger = instantiate(self.config.logger)
+        for tracker in trackers([logger]):
+            if self.config.stage not in FROM_NOTHING:
+                tracker.go_on()
+            settings = OmegaConf.to_container(self.config, resolve=True)
+            assert isinstance(settings, dict)
+            tracker.log_hyperparams({str(key): value for key, value in settings.items()})
+        return logger
+
+    @property
+    def trackers(self) -> list[Tracker]:
+        """The logger, if it takes pictures, videos and tables."""
+        return trackers([self.logger])
+
+    def close(self, *, failed: bool) -> None:
+        """End the tracking of the run, if it began."""
+        if "logger" in self.__dict__:
+            for tracker in self.trackers:
+                tracker.close(failed=failed)
 
     @cached_property
+    def strategy(self) -> Strategy:
+        """How the configured trainer would work: on which device, in which process of how many.
+
+        Raises:
+            DevrfError: in several processes, but not as the stages need it.
+        """
+        trainer: Trainer = instantiate(self.config.trainer, logger=False)
+        if trainer.world_size > 1 and not isinstance(trainer.strategy, RaysByRank):
+            raise DevrfError(
+                f"trainer.devices: {trainer.world_size} processes need trainer=ddp; give both"
+            )
+        return trainer.strategy
+
+    @property
+    def leads(self) -> bool:
+        """Whether this process writes files and says what happens: rank 0, or the only one."""
+        return bool(self.strategy.is_global_zero)
+
+    @property
     def device(self) -> torch.device:
         """Where the configured trainer would work."""
-        trainer: Trainer = instantiate(self.config.trainer, logger=False)
-        device: torch.device = trainer.strategy.root_device
+        device: torch.device = self.strategy.root_device
         return device
 
     @cached_property

@@ -31,3 +31,5 @@ def render(run: RunContext) -> None:
         shown = pictures(model, cameras, background_value(scene.background), run.device)
         write_video(path, shown, film.fps)
         log.info("video written to %s", path)
+        for tracker in run.trackers:
+            tracker.show_video(f"videos/{name}", path)

@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping, Sequence
 from statistics import mean
 from typing import Any
 
+from devrf import job
 from devrf.artifacts.contact_sheet import write_contact_sheet
 from devrf.artifacts.files import write_json
-from devrf.artifacts.records import in_words, mean_scores, provenance, write_frames
+from devrf.artifacts.records import (
+    frame_rows,
+    in_words,
+    mean_scores,
+    provenance,
+    write_frames,
+)
 from devrf.run.context import RunContext
 from devrf.scenes.scene import CaptureName
 from devrf.stages.checkpoint import Stored
@@ -16,6 +24,9 @@ from devrf.stages.evaluation import Judge
 from devrf.stages.held_out import HeldOutView, score
 
 log = logging.getLogger(__name__)
+
+# What a checkpoint knows of its training that stands beside the scores.
+TRAINING = ("seconds", "iterations", "iterations_per_second", "peak_gpu_gb")
 
 
 def evaluate(run: RunContext) -> None:
@@ -27,7 +38,7 @@ def evaluate(run: RunContext) -> None:
     frames = {"static": rest}
     sections: dict[str, Any] = {
         "scene": run.scene.name,
-        "canonical": {**mean_scores(rest), **records.get("canonical", {})},
+        "canonical": {**mean_scores(rest), **_training(records, "canonical")},
     }
     if stored.model.deformation is not None:
         moving = frames["dynamic"] = _score(run, stored, "dynamic", judge)
@@ -35,15 +46,62 @@ def evaluate(run: RunContext) -> None:
         sections["deformation"] = {
             **mean_scores(moving),
             "rest_pose_psnr": round(mean(v.rest_pose_psnr for v in moving), 4),
-            **records.get("deformation", {}),
+            **_training(records, "deformation"),
             "checkpoint_mb": round(checkpoint.stat().st_size / 1e6, 3),
         }
     write_frames(run.folder / "frames.csv", frames)
-    ran = provenance(stored.model, run.device)
+    ran = {**provenance(stored.model, run.device), **_origin(run, records)}
     write_json(run.folder / "metrics.json", {**sections, "run": ran})
-    for name, values in sections.items():
-        if isinstance(values, dict):
-            log.info("%s: %s", name, in_words(values))
+    scores = {name: values for name, values in sections.items() if isinstance(values, dict)}
+    for name, values in scores.items():
+        log.info("%s: %s", name, in_words(values))
+    _track(run, scores, frames)
+
+
+def _track(
+    run: RunContext,
+    scores: Mapping[str, Mapping[str, float | None]],
+    frames: Mapping[str, Sequence[HeldOutView]],
+) -> None:
+    """Show where the run is tracked what it has come to."""
+    for tracker in run.trackers:
+        tracker.conclude(
+            {
+                f"{section}/{name}": value
+                for section, values in scores.items()
+                for name, value in values.items()
+                if value is not None
+            }
+        )
+        tracker.show_table("metrics", [{"stage": name, **row} for name, row in scores.items()])
+        tracker.show_table("frames", frame_rows(frames))
+
+
+Records = Mapping[str, Mapping[str, float | None]]
+
+
+def _training(records: Records, stage: str) -> dict[str, float | None]:
+    return {name: records.get(stage, {}).get(name) for name in TRAINING}
+
+
+def _origin(run: RunContext, records: Records) -> dict[str, Any]:
+    """What was asked for, on how much data, and how long each step took from end to end.
+
+    The steps that learn may have run in other processes: their checkpoints tell (None if they
+    do not), measured up to the writing of the checkpoint.
+    """
+    scene = run.scene
+    frames = scene.clock.frames_of(scene.dynamic.train.times)
+    learned = {k: records.get(k, {}).get("wall_seconds") for k in ("canonical", "deformation")}
+    return {
+        "choices": job.choices(),
+        "overrides": job.overrides(),
+        "seed": run.config.seed,
+        # A camera that moves is one view, however many images it took.
+        "train_views": int(frames.bincount().max()),
+        "test_frames": len(scene.dynamic.test),
+        "wall_seconds": {**learned, "evaluate": run.step_seconds},
+    }
 
 
 def _score(
@@ -55,5 +113,7 @@ def _score(
     scored = [
         score(model, views, k, run.scene.background, run.device, judge) for k in range(len(views))
     ]
-    write_contact_sheet(run.folder / "images" / f"{capture}.png", scored)
+    sheet = write_contact_sheet(run.folder / "images" / f"{capture}.png", scored)
+    for tracker in run.trackers:
+        tracker.show_image(f"held_out/{capture}", sheet)
     return scored

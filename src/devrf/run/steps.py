@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from hydra.utils import instantiate
 from lightning import seed_everything
 from omegaconf import DictConfig
 
+from devrf import job
 from devrf.errors import DevrfError
 from devrf.losses.composer import WeightedLoss
 from devrf.losses.motion import MOTION_TERMS
-from devrf.run.context import RunContext
+from devrf.run.context import FROM_NOTHING, RunContext
 from devrf.run.film import render
 from devrf.run.look import inspect, prepare
+from devrf.run.objective import check_objective, objective
+from devrf.run.processes import together
 from devrf.run.report import report
 from devrf.run.score import evaluate
 from devrf.run.train import canonical, deformation
@@ -32,8 +36,8 @@ STEPS: dict[str, tuple[Callable[[RunContext], None], ...]] = {
     "report": (report,),
 }
 
-# Stages that no checkpoint is of use to.
-FROM_NOTHING = ("prepare", "inspect", "canonical", "pipeline", "report")
+# Steps that several processes take together; what follows them is for one.
+LEARNING = (canonical, deformation)
 # Stages that look at runs, not at a scene.
 OF_NO_SCENE = ("report",)
 
@@ -48,12 +52,15 @@ for _words in (
     warnings.filterwarnings("ignore", message=f".*{_words}.*")
 
 
-def run_stage(config: DictConfig, folder: Path) -> None:
+def run_stage(config: DictConfig, folder: Path) -> float | None:
     """Do what ``stage=…`` asks for, in the run's folder.
 
     Args:
         config: a composed config (``conf/config.yaml``).
         folder: where to work.
+
+    Returns:
+        What ``objective`` names; None where nothing was scored.
 
     Raises:
         DevrfError: an unknown stage, or whatever is wrong with the input.
@@ -63,8 +70,39 @@ def run_stage(config: DictConfig, folder: Path) -> None:
         raise DevrfError(f"stage: expected one of {', '.join(STEPS)}, not {stage!r}")
     run = RunContext(config, folder)
     _check(run, stage)
-    for step in STEPS[stage]:
-        seed_everything(config.seed, verbose=False)
+    learning = [step for step in STEPS[stage] if step in LEARNING]
+    others = [step for step in STEPS[stage] if step not in LEARNING]
+    ended = False
+    try:
+        if learning:
+            with together(run, learn):
+                _take(learning, run)
+        if not learning or run.leads:
+            _take(others, run)
+        ended = True
+    finally:
+        run.close(failed=not ended)
+    if evaluate not in others or not run.leads:
+        return None
+    return objective(config.objective, json.loads((folder / "metrics.json").read_text()))
+
+
+def learn(config: DictConfig, folder: Path) -> None:
+    """Take the steps of ``stage=…`` that learn, as one of several processes.
+
+    Args:
+        config: a composed config that has been checked.
+        folder: the run's folder; rank 0 writes into it.
+    """
+    run = RunContext(config, folder)
+    with together(run, learn):
+        _take([step for step in STEPS[config.stage] if step in LEARNING], run)
+
+
+def _take(steps: Sequence[Callable[[RunContext], None]], run: RunContext) -> None:
+    for step in steps:
+        seed_everything(run.config.seed, verbose=False)
+        run.begin_step()
         step(run)
 
 
@@ -87,4 +125,7 @@ def _check(run: RunContext, stage: str) -> None:
     weights = {k: v for k, v in config.deformation.loss.items() if k != "tv"}
     WeightedLoss(MOTION_TERMS, weights)
     run.evaluation.check()
+    check_objective(config.objective, run.evaluation.metrics)
+    if job.in_search() and evaluate not in STEPS[stage]:
+        raise DevrfError(f"stage: a search needs the objective, which stage={stage} does not score")
     instantiate(config.video)

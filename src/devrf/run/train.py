@@ -34,7 +34,8 @@ def deformation(run: RunContext) -> None:
 
 
 def _fit(run: RunContext, stage: ScheduledStage, name: str) -> None:
-    _ = run.scene  # what is wrong with it is said before a logger writes files
+    if run.leads:
+        _ = run.scene  # what is wrong with it is said before a logger writes files
     callbacks = [*instantiate(run.config.callbacks).values(), TrainingRecord()]
     trainer: Trainer = instantiate(
         run.config.trainer, callbacks=callbacks, logger=run.logger,
@@ -43,6 +44,10 @@ def _fit(run: RunContext, stage: ScheduledStage, name: str) -> None:
     trainer.fit(stage, datamodule=run.datamodule)
     if trainer.interrupted:
         raise KeyboardInterrupt
+    # The checkpoint carries it to whoever scores the run, hence without its own writing.
+    stage.record["wall_seconds"] = run.step_seconds
     path = run.own_checkpoint(name)
-    save_checkpoint(trainer, path)
-    log.info("%s: %s; written to %s", name, in_words(stage.record), path)
+    if run.leads:
+        save_checkpoint(trainer, path)
+        log.info("%s: %s; written to %s", name, in_words(stage.record), path)
+    trainer.strategy.barrier("the checkpoint is written")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal, get_args
@@ -13,9 +14,10 @@ from devrf.scenes.flow_files import read_flow
 from devrf.scenes.images import image_size
 from devrf.scenes.layout import Layout, fewer, load_layout, without_static_set
 from devrf.scenes.options import check_options
+from devrf.scenes.paths import existing_folder, scene_folder
 from devrf.scenes.scene import Background, Scene, Views
 from devrf.scenes.splits import Split, dynamic_split, static_split
-from devrf.scenes.validation import check_choice, existing_folder, problem
+from devrf.scenes.validation import check_choice, problem
 
 log = logging.getLogger(__name__)
 
@@ -67,7 +69,7 @@ def read_blender(
         downscale=downscale, background=background, bound_scale=bound_scale, near=near, far=far,
         box=box, frames=frames, static_until=static_until, train_views=train_views,
     )
-    folder = existing_folder(Path(root).expanduser())
+    folder = scene_folder(root)
 
     layout, flow_folder = _layout(folder, dynamic, static_until)
     layout, thinned = fewer(layout, train_views, frames)
@@ -89,8 +91,8 @@ def read_blender(
 def _layout(root: Path, dynamic: str | None, static_until: float) -> tuple[Layout, Path]:
     """The splits, and the folder where flow files would lie."""
     static = root / "static"
-    if not static.is_dir() and not dynamic_folders(root):
-        if not (root / "transforms_train.json").is_file():
+    if not os.path.isdir(static) and not dynamic_folders(root):
+        if not os.path.isfile(root / "transforms_train.json"):
             raise problem(
                 root, "expected static/ and dynamic_<V>views/, or transforms_train.json; "
                 "set data.root to the scene's folder",

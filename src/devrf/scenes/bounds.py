@@ -7,6 +7,7 @@ from torch import Tensor
 
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
+from devrf.scenes.poses import FARTHEST
 from devrf.scenes.scene import Bounds, Views
 from devrf.scenes.silhouettes import motion_box
 from devrf.scenes.validation import check_bound_scale, problem
@@ -17,6 +18,9 @@ FALLBACK_BOUND_SCALE = 1.5
 NEARLY_PARALLEL = 1e-3
 # A near plane inside the box's sphere would be 0 or less: stay this share of the way out.
 NEAR_SHARE = 0.02
+# Shortest edge of a box, as a share of its distance from the origin: in a float32 a thousand
+# steps along it are still a thousand places.
+LEAST_EDGE = 1e-4
 
 
 def bound_scale_number(bound_scale: float | str) -> float:
@@ -75,7 +79,25 @@ def box_from_cameras(cameras: Cameras) -> Box:
     """
     center = axes_meet(cameras)
     radius = seen_radius(cameras, center)
-    return Box.of(center - radius, center + radius)
+    return resolved_box(center - radius, center + radius)
+
+
+def resolved_box(low: Tensor, high: Tensor) -> Box:
+    """The box between two corners (3,), world units, that a float32 can tell apart.
+
+    Raises:
+        DevrfError: it is too small for its distance from the origin, or too large.
+    """
+    reach = float(torch.maximum(low.abs(), high.abs()).max())
+    least = max(LEAST_EDGE * reach, 1 / FARTHEST)
+    # NaN compares false.
+    if not (float((high - low).min()) > least and reach <= FARTHEST):
+        raise problem(
+            "data.box", f"the cameras say that the scene lies between {low.tolist()} and "
+            f"{high.tolist()}, which single precision cannot hold; bring the scene nearer to the "
+            "origin, correct its unit, or set data.box=[[x,y,z],[x,y,z]]",
+        )
+    return Box.of(low, high)
 
 
 def box_of_frusta(cameras: Cameras, near: float, far: float) -> Box:
@@ -87,7 +109,7 @@ def box_of_frusta(cameras: Cameras, near: float, far: float) -> Box:
     camera = torch.arange(len(cameras)).repeat_interleave(len(pixels))
     rays = cameras.rays(camera, pixels.repeat(len(cameras), 1))
     ends = torch.cat([rays.origins + rays.directions * distance for distance in (near, far)])
-    return Box.of(ends.amin(dim=0), ends.amax(dim=0))
+    return resolved_box(ends.amin(dim=0), ends.amax(dim=0))
 
 
 def depth_range(cameras: Cameras, box: Box) -> tuple[float, float]:
@@ -140,7 +162,7 @@ def inward_bounds(
     ranges = [depth_range(views.cameras, reach) for views in everyone]
     near = min(r[0] for r in ranges) if near is None else float(near)
     far = max(r[1] for r in ranges) if far is None else float(far)
-    if not 0 <= near < far:
+    if not 0 <= near < far <= 4 * FARTHEST:
         raise problem(
             "data.near, data.far", f"expected 0 <= near < far, not {near:g} and {far:g}; "
             "set both, in world units, or leave them null",

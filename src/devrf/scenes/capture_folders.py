@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import fnmatch
+import os
 from pathlib import Path
 
+from devrf.scenes.paths import entries
 from devrf.scenes.validation import problem
 
 
 def dynamic_folders(root: Path) -> list[Path]:
     """The folders ``dynamic_<V>views`` of ``root``, in order of their names."""
-    return sorted(folder for folder in root.glob("dynamic_*views") if folder.is_dir())
+    return [
+        path for path in entries(root)
+        if fnmatch.fnmatch(path.name, "dynamic_*views") and os.path.isdir(path)
+    ]
 
 
 def chosen_dynamic(root: Path, chosen: str | None) -> Path:

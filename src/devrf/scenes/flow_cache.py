@@ -6,13 +6,13 @@ import hashlib
 import logging
 import os
 import tempfile
-import zipfile
-import zlib
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from devrf.errors import DevrfError
+from devrf.scenes.array_files import Form, read_archive
 from devrf.scenes.scene import OpticalFlow, Views
 from devrf.scenes.validation import problem
 
@@ -20,10 +20,6 @@ log = logging.getLogger(__name__)
 
 # Part of the key: a change of the estimate makes earlier files foreign.
 VERSION = "1"
-UNREADABLE = (
-    OSError, ValueError, TypeError, KeyError, EOFError, RuntimeError, zipfile.BadZipFile,
-    zlib.error,
-)
 
 
 def content_key(views: Views, method: str) -> str:
@@ -42,23 +38,22 @@ def load_flow(path: Path, key: str, shape: tuple[int, int, int]) -> OpticalFlow 
         key: the :func:`content_key` that it must carry.
         shape: (N, H, W) that it must have.
     """
-    if not path.is_file():
+    if not os.path.isfile(path):
         return None
+    forms = {"key": Form((), "U"), "vectors": Form((*shape, 2), "f"), "valid": Form(shape, "b")}
     try:
-        # Opened here: given a path, np.load leaves a damaged file open.
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            if str(stored["key"]) != key:
-                log.info("%s holds the flow of other images or of another method", path)
-                return None
-            vectors = torch.from_numpy(stored["vectors"])
-            valid = torch.from_numpy(stored["valid"])
-    except UNREADABLE as error:
-        log.warning("%s is damaged (%s): the flow is estimated again", path, error)
+        stored = read_archive(path, forms, "the images explain", "it is written again")
+    except DevrfError as error:
+        log.warning("the flow is estimated again: %s", error)
         return None
-    if vectors.shape != (*shape, 2) or valid.shape != shape or valid.dtype != torch.bool:
-        log.warning("%s is damaged (wrong shapes): the flow is estimated again", path)
+    if str(stored["key"]) != key:
+        log.info("%s holds the flow of other images or of another method", path)
         return None
-    return OpticalFlow(vectors.float(), valid)
+    vectors = torch.from_numpy(stored["vectors"].astype(np.float32))
+    if not bool(vectors.isfinite().all()):
+        log.warning("the flow is estimated again: %s holds NaN or infinity", path)
+        return None
+    return OpticalFlow(vectors, torch.from_numpy(stored["valid"]))
 
 
 def save_flow(path: Path, key: str, flow: OpticalFlow) -> None:

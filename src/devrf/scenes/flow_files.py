@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import logging
+import os
 import time
-import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -14,33 +13,17 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from devrf.scenes.array_files import Form, read_archive
 from devrf.scenes.images import workers
+from devrf.scenes.memory import check_memory
 from devrf.scenes.resampling import shrink_flow
 from devrf.scenes.scene import OpticalFlow
-from devrf.scenes.validation import problem
 
 log = logging.getLogger(__name__)
 
-UNREADABLE = (
-    OSError, ValueError, TypeError, EOFError, zipfile.BadZipFile, zlib.error, RuntimeError
-)
-
-
-def _declared(path: Path) -> dict[str, tuple[int, ...]]:
-    """The shapes of the arrays in an npz as their headers give them: nothing is unpacked."""
-    shapes = {}
-    with zipfile.ZipFile(path) as archive:
-        for name in ("flow", "mask"):
-            if f"{name}.npy" not in archive.namelist():
-                continue
-            with archive.open(f"{name}.npy") as member:
-                version = np.lib.format.read_magic(member)
-                old = version == (1, 0)
-                read = np.lib.format.read_array_header_1_0 if old else (
-                    np.lib.format.read_array_header_2_0
-                )
-                shapes[name] = read(member)[0]
-    return shapes
+REMEDY = "compute the flow again, or set data.flow=none"
+# Bytes a pixel of vectors and mask once they are read.
+_BYTES = 9
 
 
 def read_flow_file(
@@ -54,30 +37,20 @@ def read_flow_file(
         height: rows of that image.
 
     Returns:
-        vectors (H, W, 2) and valid (H, W); false where masked out, NaN or infinite, where the
-        vectors are 0.
+        vectors (H, W, 2) and valid (H, W); false where masked out, NaN, infinite or longer than
+        the image's sides together, where the vectors are 0.
 
     Raises:
         DevrfError: not an npz, an array is missing, or an array is of another size.
     """
-    try:
-        shapes = _declared(path)
-        for name, expected in (("flow", (height, width, 2)), ("mask", (height, width))):
-            if name not in shapes:
-                raise problem(path, f'has no array "{name}"; expected "flow" and "mask"')
-            if shapes[name] != expected:
-                raise problem(
-                    path, f'"{name}" has shape {shapes[name]}, expected {expected} as the image '
-                    "has before downscaling; compute the flow again, or set data.flow=none",
-                )
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-            vectors = np.asarray(arrays["flow"]).astype(np.float32)
-            valid = np.asarray(arrays["mask"]) > 0.5
-    except UNREADABLE as error:
-        raise problem(
-            path, f"not a readable npz ({error}); compute the flow again, or set data.flow=none"
-        ) from None
-    valid = valid & np.isfinite(vectors).all(axis=-1)
+    arrays = read_archive(
+        path, {"flow": Form((height, width, 2)), "mask": Form((height, width), "bfiu")},
+        "the image has before downscaling", REMEDY,
+    )
+    with np.errstate(over="ignore"):  # infinite is as good as too long
+        vectors = arrays["flow"].astype(np.float32)
+    # NaN compares false.
+    valid = (arrays["mask"] > 0.5) & (np.abs(vectors) <= width + height).all(axis=-1)
     return np.where(valid[..., None], vectors, np.float32(0)), valid
 
 
@@ -108,7 +81,7 @@ def read_flow(
         for row, (number, wanted) in enumerate(zip(index, expected, strict=True))
         if wanted
     }
-    present = {row: path for row, path in files.items() if path.is_file()}
+    present = {row: path for row, path in files.items() if os.path.isfile(path)}
     if not present:
         log.info("no optical flow: no NNN_bwd.npz in %s", folder)
         return None
@@ -139,6 +112,8 @@ def stacked_flow(
     """
     start = time.perf_counter()
     width, height = size
+    folder = next(iter(files.values())).parent
+    check_memory(count * width * height * _BYTES, folder, f"the flow of {count} images")
     vectors = np.zeros((count, height, width, 2), dtype=np.float32)
     valid = np.zeros((count, height, width), dtype=np.bool_)
 
@@ -148,11 +123,10 @@ def stacked_flow(
             flow, mask = shrink_flow(flow, mask, width, height)
         vectors[row], valid[row] = flow, mask
 
-    with ThreadPoolExecutor(workers()) as pool:
+    with ThreadPoolExecutor(workers(*source_size)) as pool:
         for _ in pool.map(fill, files):
             pass
     log.info(
-        "read %d flow files from %s in %.1f s",
-        len(files), next(iter(files.values())).parent, time.perf_counter() - start,
+        "read %d flow files from %s in %.1f s", len(files), folder, time.perf_counter() - start
     )
     return OpticalFlow(torch.from_numpy(vectors), torch.from_numpy(valid))

@@ -13,6 +13,9 @@ from devrf.scenes.validation import problem
 
 # Cosine of the steepest angle, about 84 degrees, to −z: beyond it the box gets out of hand.
 LEAST_COSINE = 0.1
+# How many times as wide as the reference camera's view the box may be: beyond it the other
+# cameras are not before the same scene, and a float32 cannot tell its points apart.
+WIDEST = 1e3
 
 
 def reference_space(cameras: Cameras, near: float) -> NormalizedDevice:
@@ -62,4 +65,13 @@ def _seen(views: Views, space: NormalizedDevice) -> Tensor:
             "image out, or use data=inward for cameras around a scene",
         )
     device = space.rays(rays)
-    return torch.cat([device.origins, device.origins + device.directions])
+    ends = torch.stack([device.origins, device.origins + device.directions])
+    # NaN compares false.
+    away = (~(ends.abs() <= WIDEST).all(dim=-1).all(dim=0)).nonzero().flatten()
+    if len(away):
+        raise problem(
+            views.names[int(image[away[0]])], "its camera is too far from the others for "
+            "normalised device coordinates to hold what it sees; correct its position, or leave "
+            "the image out",
+        )
+    return ends.flatten(0, 1)

@@ -10,4 +10,4 @@ def every_nth(count: int, holdout: int) -> tuple[list[int], list[int]]:
     sequence shows the scene at rest. Of fewer images the last one is held out.
     """
     held_out = list(range(holdout - 1, count, holdout)) or [count - 1]
-    return [i for i in range(count) if i not in set(held_out)], held_out
+    return sorted(set(range(count)) - set(held_out)), held_out

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
 
 from devrf.scenes.images import SUFFIXES
+from devrf.scenes.paths import entries
 from devrf.scenes.validation import problem
 
 _DIGITS = re.compile(r"(\d+)")
@@ -49,9 +51,9 @@ def image_folder(
     """
     pattern = re.compile(re.escape(reduced).replace(r"\{\}", r"([1-9]\d{0,3})"))
     folders = {}
-    for path in parent.iterdir() if parent.is_dir() else ():
+    for path in entries(parent) if os.path.isdir(parent) else ():
         match = pattern.fullmatch(path.name)
-        if path.is_dir() and (match or path.name == full):
+        if os.path.isdir(path) and (match or path.name == full):
             folders[int(match[1]) if match else 1] = path
     fitting = [factor for factor in folders if downscale % factor == 0]
     if not fitting:
@@ -77,8 +79,8 @@ def listed_images(folder: Path, *, by_number: bool = False) -> list[Path]:
         DevrfError: it holds no image.
     """
     found = [
-        path for path in folder.iterdir()
-        if path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()
+        path for path in entries(folder)
+        if path.suffix.lower() in SUFFIXES and path.name[0] != "." and os.path.isfile(path)
     ]
     if not found:
         raise problem(folder, f"no images (looked for {', '.join(SUFFIXES)}); add them")

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from devrf.geometry.distortion import Distortion
-from devrf.scenes.lens import Lens
-from devrf.scenes.validation import number, problem
+from devrf.scenes.lens import MOST_FOCAL, Lens
+from devrf.scenes.validation import number, problem, shown
 
 # Models of the one equation that Distortion states; the simpler ones leave coefficients out.
 CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
@@ -16,6 +16,7 @@ KEYS = (
     "fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_model", "is_fisheye",
     "k1", "k2", "k3", "k4", "p1", "p2",
 )
+_LEAST_ANGLE = 1 / MOST_FOCAL
 # Sides are rounded when images are made smaller; beyond this they were cropped or turned.
 _SAME_SHAPE = 0.05
 
@@ -44,7 +45,8 @@ class Intrinsics:
         """The lens in pixels of a file of ``width`` × ``height`` pixels.
 
         Raises:
-            DevrfError: ``where``, the file, has another shape than its camera.
+            DevrfError: ``where``, the file, has another shape than its camera, or a camera of
+                which it can show nothing.
         """
         w, h = (width, height) if self.size is None else self.size
         if abs(width * h / (height * w) - 1) > _SAME_SHAPE:
@@ -60,7 +62,14 @@ class Intrinsics:
             focal = (square, square)
         cx, cy = self.center
         center = (w / 2 if cx is None else cx, h / 2 if cy is None else cy)
-        return Lens(focal, center, self.distortion, self.skew).scaled(width / w, height / h)
+        lens = Lens(focal, center, self.distortion, self.skew).scaled(width / w, height / h)
+        if not lens.fits(width, height):
+            (fx, fy), (x, y) = lens.focal, lens.center
+            raise problem(
+                where, f"its camera cannot be one of {width}x{height} px: focal lengths {fx:g} and "
+                f"{fy:g} px, middle {x:g}, {y:g}, skew {lens.skew:g}; correct them",
+            )
+        return lens
 
 
 def read_intrinsics(content: dict[str, Any], where: object) -> Intrinsics:
@@ -78,13 +87,13 @@ def read_intrinsics(content: dict[str, Any], where: object) -> Intrinsics:
             return None
         value = number(content[key])
         if value is None or value <= 0:
-            raise problem(where, f"{key} is {content[key]!r}, expected pixels > 0; correct it")
+            raise problem(where, f"{key} is {shown(content[key])}, expected pixels > 0; correct it")
         return value
 
     def coefficient(key: Literal["k1", "k2", "k3", "k4", "p1", "p2"]) -> float:
         value = number(content.get(key, 0.0))
         if value is None:
-            raise problem(where, f"{key} is {content[key]!r}, expected a number; correct it")
+            raise problem(where, f"{key} is {shown(content[key])}, expected a number; correct it")
         return value
 
     _check_model(content, where)
@@ -100,10 +109,10 @@ def read_intrinsics(content: dict[str, Any], where: object) -> Intrinsics:
     if "camera_angle_x" not in content:
         raise problem(where, 'has no "camera_angle_x" (radians) and no "fl_x" (pixels); add one')
     angle = number(content["camera_angle_x"])
-    if angle is None or not 0 < angle < math.pi:
+    if angle is None or not _LEAST_ANGLE <= angle < math.pi:
         raise problem(
-            where, f"camera_angle_x is {content['camera_angle_x']!r}, expected radians between 0 "
-            "and pi; correct it",
+            where, f"camera_angle_x is {shown(content['camera_angle_x'])}, expected radians "
+            "between 0 and pi; correct it",
         )
     return Intrinsics(angle, None, center, size, distortion)
 
@@ -129,8 +138,8 @@ def frame_intrinsics(
 def _check_model(content: dict[str, Any], where: object) -> None:
     model = content.get("camera_model", "OPENCV")
     if model not in CAMERA_MODELS or content.get("is_fisheye"):
-        shown = "a fisheye" if content.get("is_fisheye") else repr(model)
+        kind = "a fisheye" if content.get("is_fisheye") else shown(model)
         raise problem(
-            where, f"camera model {shown} is not supported, only {', '.join(CAMERA_MODELS)}; "
+            where, f"camera model {kind} is not supported, only {', '.join(CAMERA_MODELS)}; "
             "undistort the images and list them as PINHOLE",
         )

@@ -6,24 +6,46 @@ import json
 from pathlib import Path
 from typing import Any
 
-from devrf.scenes.validation import number, problem
+from devrf.scenes.paths import existing_file
+from devrf.scenes.validation import number, problem, shown
+
+# Some 60,000 posed images with every number on a line of its own.
+MAX_BYTES = 64 * 2**20
+# As many images without white space. Python takes up to 100 bytes for each value and key.
+MAX_VALUES = 4_000_000
+_BEFORE_VALUES = b"[{,:"
 
 
 def json_object(file: Path, purpose: str) -> dict[str, Any]:
-    """The content of a JSON file.
+    """The content of a JSON file; of a key that is there twice, the last one.
 
     Args:
         file: a file that holds one object.
         purpose: what it is needed for, for the message when it is missing.
 
     Raises:
-        DevrfError: there is no such file, it is no JSON, or it holds something else.
+        DevrfError: there is no such file, it is no JSON, it holds something else, or it is so
+            large that it cannot be a list of images.
     """
-    if not file.is_file():
-        raise problem(file, f"no such file; {purpose}")
+    if existing_file(file, purpose) > MAX_BYTES:
+        raise problem(
+            file, f"larger than {MAX_BYTES >> 20} MiB, expected a list of posed images; "
+            "write it again",
+        )
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
+        data = file.read_bytes()
+    except OSError as error:
+        raise problem(file, f"cannot be read ({error.strerror}); {purpose}") from None
+    # Counted before they are made: two bytes of text can become a hundred of memory.
+    if sum(data.count(byte) for byte in _BEFORE_VALUES) > MAX_VALUES:
+        raise problem(
+            file, f"holds more than {MAX_VALUES // 10**6} million values, expected a list of "
+            "posed images; write it again",
+        )
+    try:
+        # Some editors begin a file with a byte order mark.
+        content = json.loads(data.decode("utf-8-sig"))
+    except (ValueError, RecursionError) as error:
         raise problem(file, f"not valid JSON ({error}); write it again") from None
     if not isinstance(content, dict):
         raise problem(file, f"expected a JSON object, not {type(content).__name__}; {purpose}")
@@ -34,14 +56,9 @@ def numbers(content: dict[str, Any], key: str, count: int, where: object) -> lis
     """The ``count`` finite numbers that ``content`` lists under ``key``; else DevrfError."""
     values = content.get(key)
     if not isinstance(values, list) or len(values) != count:
-        raise problem(where, f'expected {count} numbers as "{key}", not {_short(values)}')
+        raise problem(where, f'expected {count} numbers as "{key}", not {shown(values)}')
     found = [number(value) for value in values]
     kept = [value for value in found if value is not None]
     if len(kept) < count:
         raise problem(where, f'"{key}" holds NaN, inf or text; give {count} finite numbers')
     return kept
-
-
-def _short(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -6,6 +6,12 @@ from dataclasses import dataclass
 
 from devrf.geometry.distortion import Distortion
 
+# Focal lengths as shares of the image's longer side: a view of 0.0006 to 178.9 degrees.
+LEAST_FOCAL = 0.01
+MOST_FOCAL = 1e5
+# How far from the image its principal point, or its skew, may be: images are cropped.
+MOST_OFFSET = 1e3
+
 
 @dataclass(frozen=True)
 class Lens:
@@ -30,6 +36,14 @@ class Lens:
     def pinhole(self) -> bool:
         """Whether the image is already that of a pinhole camera."""
         return self.distortion.none and self.skew == 0
+
+    def fits(self, width: int, height: int) -> bool:
+        """Whether it can be the lens of an image of ``width`` × ``height`` pixels."""
+        side = max(width, height)
+        # NaN compares false.
+        return all(LEAST_FOCAL * side <= f <= MOST_FOCAL * side for f in self.focal) and all(
+            abs(offset) <= MOST_OFFSET * side for offset in (*self.center, self.skew)
+        )
 
     def scaled(self, x: float, y: float) -> Lens:
         """The same lens for an image whose sides are ``x`` and ``y`` times as long."""

@@ -16,8 +16,9 @@ from devrf.scenes.forward_bounds import forward_bounds, reference_space
 from devrf.scenes.image_folders import image_folder, listed_images
 from devrf.scenes.images import image_size, load_images
 from devrf.scenes.llff_poses import PosedSet, read_dynamic_poses, read_static_poses
+from devrf.scenes.paths import existing_folder, scene_folder
 from devrf.scenes.scene import Background, Capture, Scene, Views
-from devrf.scenes.validation import check_choice, check_count, existing_folder, number, problem
+from devrf.scenes.validation import check_choice, check_count, number, problem
 from devrf.scenes.view_folders import ViewFolder, flow_files, view_folders
 
 log = logging.getLogger(__name__)
@@ -71,7 +72,7 @@ def read_llff(
     plane = number(near)
     if plane is None or plane <= 0:
         raise problem("data.near", f"expected a distance above 0, not {near!r}")
-    folder = existing_folder(Path(root).expanduser())
+    folder = scene_folder(root)
 
     static = _static(existing_folder(folder / "static"), folder, downscale, holdout)
     moving = chosen_dynamic(folder, dynamic)

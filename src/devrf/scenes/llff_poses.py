@@ -16,10 +16,10 @@ from torch import Tensor
 from devrf.geometry.average_pose import average_pose, relative_to
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.array_files import Numbers, read_numbers
+from devrf.scenes.lens import LEAST_FOCAL, MOST_FOCAL, MOST_OFFSET
+from devrf.scenes.poses import FARTHEST, in_reach, is_rotation
 from devrf.scenes.validation import problem
 
-# Rotations are written by programs, in full precision; further off they are no rotations.
-ROTATION_TOLERANCE = 1e-2
 # Images made smaller lose a fraction of a pixel; images of another shape belong to other poses.
 ASPECT_TOLERANCE = 0.05
 # The nearest point of the scene comes to rest at 1/0.75 of the near plane, as the field does it.
@@ -60,7 +60,8 @@ class PosedSet:
         """The set in units of 0.75 · its least depth, its average pose the identity.
 
         Raises:
-            DevrfError: the cameras look in such different directions that there is no average.
+            DevrfError: the cameras look in such different directions that there is no average, or
+                are far away from one another.
         """
         scale = 1 / (BOUND_FACTOR * float(self.bounds[:, 0].min()))
         middle = average_pose(self.poses)
@@ -74,6 +75,11 @@ class PosedSet:
             )
         poses = relative_to(middle, self.poses)
         poses[:, :, 3] *= scale
+        if not bool(in_reach(poses[:, :, 3]).all()):
+            raise problem(
+                self.file, f"the cameras are farther than {FARTHEST:g} times the least depth from "
+                "one another; correct positions and depths",
+            )
         return replace(self, poses=poses, bounds=self.bounds * scale)
 
     def cameras(self, width: int, height: int) -> Cameras:
@@ -151,7 +157,7 @@ def _of_column(column: Numbers) -> Numbers:
 def _shared(file: Path) -> Numbers:
     """W, H, fx, fy, cx, cy (6,) of ``hwf_cxcy.npy``."""
     values = read_numbers(file, "H, W, focal, cx, cy next to a poses_bounds.npy of (N, 14)")
-    given = values.flatten().tolist()
+    given = values.flatten()[:7].tolist()
     if len(given) == 3:
         h, w, focal = given
         given = [h, w, focal, w / 2, h / 2]
@@ -159,7 +165,7 @@ def _shared(file: Path) -> Numbers:
         h, w, focal, cx, cy = given
         given = [h, w, focal, focal, cx, cy]
     if len(given) != 6:
-        raise problem(file, f"holds {len(given)} numbers, expected H, W, focal, cx, cy, or H, W, "
+        raise problem(file, f"holds {values.size} numbers, expected H, W, focal, cx, cy, or H, W, "
                       "fx, fy, cx, cy; write it again")
     h, w, fx, fy, cx, cy = given
     return np.array([w, h, fx, fy, cx, cy])
@@ -169,21 +175,24 @@ def _checked(
     file: Path, poses: Numbers, inner: Path, intrinsics: Numbers, outer: Path, bounds: Numbers
 ) -> PosedSet:
     """The set, or DevrfError that names the file and the row at fault."""
-    rotation = poses[:, :, :3]
-    off = np.abs(rotation.transpose(0, 2, 1) @ rotation - np.eye(3)).max(axis=(1, 2))
-    for bad, where, what in (
-        ((off > ROTATION_TOLERANCE) | (np.linalg.det(rotation) < 0), file,
+    matrices = torch.from_numpy(np.ascontiguousarray(poses))
+    values, depths = torch.from_numpy(intrinsics), torch.from_numpy(np.ascontiguousarray(bounds))
+    size, focal, center = values[:, :2], values[:, 2:4], values[:, 4:]
+    side = size.amax(dim=1, keepdim=True)
+    for good, where, what in (
+        (is_rotation(matrices[:, :, :3]), file,
          "its axes are no rotation (scaled, sheared, mirrored or of another convention)"),
-        ((intrinsics[:, :2] < 1).any(axis=1), inner, "height or width is under 1 px"),
-        ((intrinsics[:, 2:4] <= 0).any(axis=1), inner, "the focal length is not above 0"),
-        (~((bounds[:, 0] > 0) & (bounds[:, 0] < bounds[:, 1])), outer,
+        (in_reach(matrices[:, :, 3]), file, f"it is farther than {FARTHEST:g} from the origin"),
+        ((size >= 1).all(dim=1), inner, "height or width is under 1 px"),
+        ((focal > 0).all(dim=1), inner, "the focal length is not above 0"),
+        (((focal >= LEAST_FOCAL * side) & (focal <= MOST_FOCAL * side)).all(dim=1), inner,
+         "the focal length cannot be that of an image of this height and width"),
+        ((center.abs() <= MOST_OFFSET * side).all(dim=1), inner,
+         "the principal point is far outside the image"),
+        ((depths[:, 0] > 0) & (depths[:, 0] < depths[:, 1]), outer,
          "expected 0 < least depth < largest depth"),
     ):
-        if bad.any():
-            raise problem(where, f"camera {int(bad.argmax())}: {what}; correct or leave out the "
-                          "image and its row")
-    values = torch.from_numpy(intrinsics)
-    return PosedSet(
-        file, torch.from_numpy(np.ascontiguousarray(poses)), values[:, :2], values[:, 2:4],
-        values[:, 4:], torch.from_numpy(np.ascontiguousarray(bounds)),
-    )
+        if not bool(good.all()):
+            raise problem(where, f"camera {int((~good).nonzero()[0])}: {what}; correct or leave "
+                          "out the image and its row")
+    return PosedSet(file, matrices, size, focal, center, depths)

@@ -16,10 +16,12 @@ from devrf.scenes.json_files import json_object, numbers
 from devrf.scenes.layout import fewer, load_layout, without_static_set
 from devrf.scenes.nerfies_camera import read_camera
 from devrf.scenes.options import check_options
+from devrf.scenes.paths import scene_folder
+from devrf.scenes.poses import FARTHEST
 from devrf.scenes.scene import Background, Scene
 from devrf.scenes.splits import in_motion
 from devrf.scenes.transforms import Transforms, listed_image
-from devrf.scenes.validation import check_count, existing_folder, number, problem
+from devrf.scenes.validation import check_count, number, problem, shown
 
 log = logging.getLogger(__name__)
 
@@ -70,7 +72,7 @@ def read_nerfies(
         box=box, frames=frames, static_until=static_until,
     )
     check_count("data.holdout", holdout, 2)
-    folder = existing_folder(Path(root).expanduser())
+    folder = scene_folder(root)
     world = _world(folder / SCENE)
     items, train, test = _items(folder / DATASET, holdout)
     images = image_folder(folder / "rgb", downscale, full="1x", reduced="{}x")
@@ -106,8 +108,11 @@ def _world(file: Path) -> _World:
     found = {}
     for key in ("scale", "near", "far"):
         value = number(content.get(key))
-        if value is None or value <= 0:
-            raise problem(file, f"{key} is {content.get(key)!r}, expected a number above 0")
+        if value is None or not 0 < value <= FARTHEST:
+            raise problem(
+                file, f"{key} is {shown(content.get(key))}, expected a number above 0, and no "
+                f"more than {FARTHEST:g}; correct it",
+            )
         found[key] = value
     return _World(tuple(numbers(content, "center", 3, file)), **found)
 
@@ -118,14 +123,16 @@ def _items(file: Path, holdout: int) -> tuple[list[str], list[int], list[int]]:
     ids, train, val = (_ids(content, key, file) for key in ("ids", "train_ids", "val_ids"))
     count = content.get("count", len(ids))
     if ids and count != len(ids):
-        raise problem(file, f'"count" is {count!r}, but "ids" lists {len(ids)} images; correct it')
-    items = ids or train + [item for item in val if item not in set(train)]
-    unknown = [item for item in train + val if item not in set(items)]
+        raise problem(
+            file, f'"count" is {shown(count)}, but "ids" lists {len(ids)} images; correct it'
+        )
+    items = ids or list(dict.fromkeys(train + val))
+    position = {item: i for i, item in enumerate(items)}
+    unknown = [item for item in train + val if item not in position]
     if unknown:
-        raise problem(file, f'{unknown[0]!r} is in train_ids or val_ids, but not in "ids"')
+        raise problem(file, f'{shown(unknown[0])} is in train_ids or val_ids, but not in "ids"')
     if len(items) < 2:
         raise problem(file, f"lists {len(items)} images, expected at least two; correct its ids")
-    position = {item: i for i, item in enumerate(items)}
     if not val:
         chosen = [position[item] for item in train] or list(range(len(items)))
         if len(chosen) < 2:
@@ -169,14 +176,16 @@ def _times(file: Path, items: list[str]) -> tuple[float, ...]:
     for item in items:
         entry = content.get(item)
         if not isinstance(entry, dict):
-            raise problem(file, f"says nothing of image {item!r}; add its warp_id")
+            raise problem(file, f"says nothing of image {shown(item)}; add its warp_id")
         entries.append(entry)
     key = "time_id" if all("time_id" in entry for entry in entries) else "warp_id"
     ids = []
     for item, entry in zip(items, entries, strict=True):
         value = number(entry.get(key))
         if value is None:
-            raise problem(file, f"{key} of image {item!r} is {entry.get(key)!r}, expected a number")
+            raise problem(
+                file, f"{key} of image {shown(item)} is {shown(entry.get(key))}, expected a number"
+            )
         ids.append(value)
     first, last = min(ids), max(ids)
     if first == last:

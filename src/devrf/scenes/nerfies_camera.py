@@ -12,8 +12,9 @@ from torch import Tensor
 from devrf.geometry.distortion import Distortion
 from devrf.scenes.intrinsics import Intrinsics
 from devrf.scenes.json_files import json_object, numbers
-from devrf.scenes.transforms import is_rotation
-from devrf.scenes.validation import inside, number, problem
+from devrf.scenes.paths import inside
+from devrf.scenes.poses import FARTHEST, in_reach, is_rotation
+from devrf.scenes.validation import number, problem, shown
 
 
 def read_camera(
@@ -34,7 +35,7 @@ def read_camera(
     Raises:
         DevrfError: the file is missing or a value in it is none.
     """
-    file = inside(folder, folder / "camera" / f"{item}.json", folder / "dataset.json")
+    file = inside(folder, folder / "camera", f"{item}.json", folder / "dataset.json")
     content = json_object(file, "every image needs its camera; add it")
     return _pose(content, file, center, scale), _intrinsics(content, file)
 
@@ -45,12 +46,17 @@ def _pose(content: dict[str, Any], file: Path, center: Sequence[float], scale: f
         raise problem(file, 'expected 3 rows of 3 numbers as "orientation" (world to camera)')
     listed = [numbers({"orientation": row}, "orientation", 3, file) for row in rows]
     world_to_camera = torch.tensor(listed, dtype=torch.float64)
-    if not is_rotation(world_to_camera):
+    if not bool(is_rotation(world_to_camera)):
         raise problem(file, "orientation is no rotation (scaled, sheared or mirrored axes)")
     position = numbers(content, "position", 3, file)
     # OpenCV's y points down and its z ahead; ours point up and back.
     axes = world_to_camera.T * world_to_camera.new_tensor([1, -1, -1])
     where = (axes.new_tensor(position) - axes.new_tensor(list(center))) * scale
+    if not bool(in_reach(where)):
+        raise problem(
+            file, f"position is farther than {FARTHEST:g} from the scene's center, in units of "
+            "scene.json; correct it, or center and scale there",
+        )
     return torch.cat([axes, where[:, None]], dim=1).float()
 
 
@@ -59,7 +65,7 @@ def _intrinsics(content: dict[str, Any], file: Path) -> Intrinsics:
     aspect = _positive({"pixel_aspect_ratio": 1.0} | content, "pixel_aspect_ratio", file)
     skew = number(content.get("skew", 0.0))
     if skew is None:
-        raise problem(file, f"skew is {content['skew']!r}, expected pixels; correct it")
+        raise problem(file, f"skew is {shown(content['skew'])}, expected pixels; correct it")
     width, height = numbers(content, "image_size", 2, file)
     if min(width, height) <= 0:
         raise problem(file, f"image_size is {width:g}, {height:g}, expected pixels > 0")
@@ -77,5 +83,7 @@ def _intrinsics(content: dict[str, Any], file: Path) -> Intrinsics:
 def _positive(content: dict[str, Any], key: str, file: Path) -> float:
     value = number(content.get(key))
     if value is None or value <= 0:
-        raise problem(file, f"{key} is {content.get(key)!r}, expected a number > 0; correct it")
+        raise problem(
+            file, f"{key} is {shown(content.get(key))}, expected a number > 0; correct it"
+        )
     return value

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,11 @@ from devrf.scenes.holdout import every_nth
 from devrf.scenes.json_files import json_object
 from devrf.scenes.layout import Layout, fewer, load_layout, without_static_set
 from devrf.scenes.options import check_options
+from devrf.scenes.paths import scene_folder
 from devrf.scenes.scene import Background, Scene
 from devrf.scenes.splits import at_rest, distinct_poses, in_motion
 from devrf.scenes.transforms import Transforms, listed_image, read_transforms
-from devrf.scenes.validation import check_count, existing_folder, problem
+from devrf.scenes.validation import check_count, problem, shown
 
 log = logging.getLogger(__name__)
 
@@ -73,7 +75,7 @@ def read_nerfstudio(
         box=box, frames=frames, static_until=static_until, train_views=train_views,
     )
     check_count("data.holdout", holdout, 2)
-    folder = existing_folder(Path(root).expanduser())
+    folder = scene_folder(root)
     layout, _ = fewer(_layout(folder, holdout, static_until), train_views, frames)
     static, dynamic = load_layout(layout, folder, downscale)
     bounds = inward_bounds(
@@ -84,10 +86,10 @@ def read_nerfstudio(
 
 
 def _layout(root: Path, holdout: int, static_until: float | None) -> Layout:
-    if (root / FILE).is_file():
+    if os.path.isfile(root / FILE):
         return _one_file(*_with_times(*_train_and_test(root / FILE, root, holdout)), static_until)
     still, moving = root / "static" / FILE, root / "dynamic" / FILE
-    if not still.is_file() and not moving.is_file():
+    if not os.path.isfile(still) and not os.path.isfile(moving):
         raise problem(
             root, f"expected {FILE}, or static/{FILE} and dynamic/{FILE}; set data.root to the "
             "scene's folder",
@@ -118,7 +120,7 @@ def _train_and_test(file: Path, root: Path, holdout: int) -> tuple[Transforms, T
     elsewhere = set(listed["val"] + listed["test"])
     train = listed["train"] or [i for i in range(count) if i not in elsewhere]
     if listed["train"] and not test:
-        test = [i for i in range(count) if i not in set(train)]
+        test = sorted(set(range(count)) - set(train))
     elif not test and count > 1:
         train, test = every_nth(count, holdout)
     if not train or not test or set(train) & set(test):
@@ -141,7 +143,8 @@ def _listed(content: dict[str, Any], key: str, transforms: Transforms, root: Pat
         image = listed_image(name, transforms.file, root)
         if image not in position:
             raise problem(
-                transforms.file, f"{key} lists {name}, which is in none of the frames; correct it"
+                transforms.file,
+                f"{key} lists {shown(name)}, which is in none of the frames; correct it",
             )
         found.append(position[image])
     return sorted(set(found))

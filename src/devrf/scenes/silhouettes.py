@@ -96,7 +96,8 @@ def _reach(views: Views, area: Box, cell: float) -> int:
     low, high = area.corners(views.cameras.positions)
     distance = float((views.cameras.positions - (low + high) / 2).norm(dim=1).median())
     focal = float(views.cameras.focal.amax())
-    return max(1, math.ceil(math.sqrt(3) / 2 * cell * focal / max(distance, 1e-6)))
+    pixels = math.sqrt(3) / 2 * cell * focal / max(distance, cell)
+    return max(1, min(math.ceil(pixels), max(views.width, views.height)))
 
 
 def _silhouettes(views: Views, reach: int) -> Array:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
+from bisect import bisect_left, bisect_right, insort
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -55,15 +57,26 @@ class Split:
 
 def distinct_poses(poses: Tensor) -> Tensor:
     """(N,) int64: which of the distinct poses each of (N, 3, 4) is, in order of appearance."""
-    scale = 1 + float(poses[:, :, 3].norm(dim=1).median())
-    numbers, known = [], poses[:0]
-    for pose in poses:
-        same = ((known - pose).abs().amax(dim=(1, 2)) <= SAME_POSE * scale).nonzero()
+    near = SAME_POSE * (1 + float(poses[:, :, 3].norm(dim=1).median()))
+    entries = poses.flatten(1).double().numpy()
+    # Poses that are near are near in the sum of their entries too: few are left to compare with,
+    # however many images a moving camera took.
+    sums, reach = entries.sum(axis=1).tolist(), 1.01 * near * entries.shape[1]
+    first: list[int] = []  # of each distinct pose
+    known: list[tuple[float, int]] = []  # its sum and number, by sum
+    numbers = []
+    for row, total in enumerate(sums):
+        low = bisect_left(known, total - reach, key=lambda pair: pair[0])
+        high = bisect_right(known, total + reach, key=lambda pair: pair[0])
+        candidates = sorted(number for _, number in known[low:high])
+        apart = np.abs(entries[[first[c] for c in candidates]] - entries[row]).max(axis=1)
+        same = np.flatnonzero(apart <= near)
         if len(same) == 0:
-            numbers.append(len(known))
-            known = torch.cat([known, pose[None]])
+            insort(known, (total, len(first)))
+            numbers.append(len(first))
+            first.append(row)
         else:
-            numbers.append(int(same[0]))
+            numbers.append(candidates[same[0]])
     return torch.tensor(numbers, dtype=torch.int64)
 
 
@@ -186,6 +199,5 @@ def load_views(split: Split, root: Path, downscale: int) -> Views:
         width,
         height,
     )
-    base = root.resolve()
-    names = tuple(str(file.relative_to(base)) for file in files)
+    names = tuple(str(file.relative_to(root)) for file in files)
     return Views(pixels, cameras, split.times[used], split.view[used], names)

@@ -17,10 +17,10 @@ from torch import Tensor
 from devrf.scenes.images import find_image
 from devrf.scenes.intrinsics import Intrinsics, frame_intrinsics, read_intrinsics
 from devrf.scenes.json_files import json_object
-from devrf.scenes.validation import inside, number, problem
+from devrf.scenes.paths import inside
+from devrf.scenes.poses import FARTHEST, in_reach, is_rotation
+from devrf.scenes.validation import number, problem, shown
 
-# Rotations are written with 5 digits or more; further off they are scaled, sheared or mirrored.
-ROTATION_TOLERANCE = 1e-2
 TIME_TOLERANCE = 1e-6
 
 
@@ -82,12 +82,12 @@ def read_transforms(file: Path, root: Path) -> Transforms:
             where[times.index(None)],
             'has no "time" although others have; give every frame its time, or none',
         )
-    poses = [_pose(frame, place) for frame, place in zip(frames, where, strict=True)]
+    poses = _poses(frames, where)
     return Transforms(
         file,
         _intrinsics(content, frames, where, file),
         tuple(_image(frame, place, file, root) for frame, place in zip(frames, where, strict=True)),
-        torch.tensor(poses, dtype=torch.float32),
+        poses.float(),
         tuple(known) or None,
     )
 
@@ -111,15 +111,22 @@ def _image(frame: dict[str, Any], where: str, file: Path, root: Path) -> Path:
 
 def listed_image(name: str, file: Path, root: Path) -> Path:
     """The existing image inside ``root`` that ``file`` calls ``name``; else DevrfError."""
-    image = find_image(inside(root, file.parent / name, file))
-    inside(root, image, file)
-    return image
+    return find_image(inside(root, file.parent, name, file))
 
 
-def is_rotation(matrix: Tensor) -> bool:
-    """Whether a matrix (3, 3) turns without scaling, shearing or mirroring, up to rounding."""
-    off = (matrix.T @ matrix - torch.eye(3).to(matrix)).abs().max()
-    return bool(off <= ROTATION_TOLERANCE) and float(torch.linalg.det(matrix)) > 0
+def _poses(frames: list[dict[str, Any]], where: list[str]) -> Tensor:
+    """(N, 3, 4) float64 camera-to-world."""
+    rows = [_pose(frame, place) for frame, place in zip(frames, where, strict=True)]
+    poses = torch.tensor(rows, dtype=torch.float64)
+    for bad, what in (
+        (~is_rotation(poses[:, :, :3]), "is no rigid transform (scaled, sheared or mirrored axes); "
+         "give a rotation and a translation"),
+        (~in_reach(poses[:, :, 3]), f"is farther than {FARTHEST:g} from the origin; give smaller "
+         "world units"),
+    ):
+        if bool(bad.any()):
+            raise problem(where[int(bad.nonzero()[0])], f"transform_matrix {what}")
+    return poses
 
 
 def _pose(frame: dict[str, Any], where: str) -> list[list[float]]:
@@ -133,11 +140,6 @@ def _pose(frame: dict[str, Any], where: str) -> list[list[float]]:
     pose = [[value for value in row if value is not None] for row in rows]
     if any(len(row) < 4 for row in pose):
         raise problem(where, "transform_matrix holds NaN, inf or text; give finite numbers")
-    if not is_rotation(torch.tensor(pose, dtype=torch.float64)[:, :3]):
-        raise problem(
-            where, "transform_matrix is no rigid transform (scaled, sheared or mirrored axes); "
-            "give a rotation and a translation",
-        )
     return pose
 
 
@@ -146,5 +148,5 @@ def _time(frame: dict[str, Any], where: str) -> float | None:
         return None
     time = number(frame["time"])
     if time is None or not -TIME_TOLERANCE <= time <= 1 + TIME_TOLERANCE:
-        raise problem(where, f"time is {frame['time']!r}, outside [0, 1]; rescale the times")
+        raise problem(where, f"time is {shown(frame['time'])}, outside [0, 1]; rescale the times")
     return min(max(time, 0.0), 1.0)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
+import reprlib
 from collections.abc import Iterable
-from pathlib import Path
 
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
@@ -15,39 +15,33 @@ MAX_PIXELS = 100_000_000
 MIN_SIDE = 8
 # Numbers become float32 tensors: what overflows there is as bad as infinity.
 LARGEST = 3e38
+# A name in a file can be of any length; a message has to be read.
+LONGEST_MESSAGE = 480
+LONGEST_VALUE = 60
+
+_brief = reprlib.Repr()
+_brief.maxlevel = 2
 
 
 def problem(where: object, what: str) -> DevrfError:
-    """The error ``where: what``, made one line whatever its parts contain."""
-    return DevrfError(" ".join(f"{where}: {what}".split()))
+    """The error ``where: what``, made one short printable line whatever its parts contain."""
+    line = " ".join(_shortened(f"{where}: {what}", LONGEST_MESSAGE).split())
+    # Names may hold what a terminal takes for a command, or what no file can be written with.
+    printable = "".join(
+        c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in line
+    )
+    return DevrfError(_shortened(printable, LONGEST_MESSAGE))
 
 
-def existing_folder(folder: Path) -> Path:
-    """``folder`` itself, or DevrfError when there is no such folder."""
-    if not folder.is_dir():
-        raise problem(folder, "no such folder; set data.root to the scene's folder")
-    return folder
+def shown(value: object) -> str:
+    """A value from a file as a message shows it: however large or deep, in a few words."""
+    return _shortened(_brief.repr(value), LONGEST_VALUE)
 
 
-def inside(root: Path, path: Path, file: Path) -> Path:
-    """``path`` with links and ``..`` resolved, or DevrfError when it leaves ``root``.
-
-    Args:
-        root: the scene's folder.
-        path: a path built from text in a file.
-        file: the file that the text came from, for the message.
-    """
-    try:
-        resolved = path.resolve()
-        inner = resolved.is_relative_to(root.resolve())
-    except (OSError, ValueError, RuntimeError) as error:
-        raise problem(file, f"file_path {str(path)!r} is not a path ({error})") from None
-    if not inner:
-        raise problem(
-            file, f"file_path leads to {resolved}, outside the scene's folder; put the images "
-            "into it",
-        )
-    return resolved
+def _shortened(text: str, most: int) -> str:
+    """``text``, its middle left out where it is longer than ``most`` characters."""
+    half = most // 2 - 2
+    return text if len(text) <= most else f"{text[:half]}...{text[-half:]}"
 
 
 def number(value: object) -> float | None:

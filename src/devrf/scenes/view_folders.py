@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from devrf.scenes.image_folders import image_folder, listed_images
+from devrf.scenes.paths import entries
 from devrf.scenes.validation import problem
 
 log = logging.getLogger(__name__)
@@ -41,9 +43,9 @@ def view_folders(folder: Path, downscale: int) -> list[ViewFolder]:
             images or fewer than two.
     """
     numbered = {}
-    for path in folder.iterdir():
+    for path in entries(folder):
         match = _VIEW.fullmatch(path.name)
-        if match and path.is_dir():
+        if match and os.path.isdir(path):
             numbered[int(match[1])] = path
     if not numbered:
         raise problem(folder, "no folders view1, view2, …; add one for each fixed camera")
@@ -89,8 +91,10 @@ def flow_files(views: list[ViewFolder]) -> dict[tuple[int, int], Path]:
         found: dict[tuple[int, int], Path] = {}
         for v, view in enumerate(views):
             named: dict[str | int | None, Path] = {}
-            for path in sorted(view.flow.glob(f"*{_SUFFIX}")):
+            for path in entries(view.flow) if os.path.isdir(view.flow) else ():
                 name = path.name.removesuffix(_SUFFIX)
+                if name == path.name or not os.path.isfile(path):
+                    continue
                 named[name] = path
                 if name.isdecimal():
                     named[int(name)] = path

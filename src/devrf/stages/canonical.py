@@ -27,6 +27,7 @@ from devrf.rendering.model import SceneModel
 from devrf.rendering.render import RenderSettings, render
 from devrf.scenes.scene import CaptureName, Views
 from devrf.stages.checkpoint import Passport, Stored
+from devrf.stages.ranks import share
 from devrf.stages.schedules import CanonicalPhase, CanonicalSchedule
 from devrf.stages.settings import FINE_LOSS, SEARCH_LOSS, CanonicalRates, Sampling
 from devrf.stages.stage import Phase, ScheduledStage
@@ -113,6 +114,7 @@ class CanonicalStage(ScheduledStage):
 
     def setup(self, stage: str) -> None:
         """Build the field of the first phase in the scene's box."""
+        super().setup(stage)
         if self.scene_model is not None:
             return
         box, first = self.scene.bounds.box, self.schedule.phase(0)
@@ -135,8 +137,9 @@ class CanonicalStage(ScheduledStage):
                 {"params": list(canonical.decoder.parameters()), "lr": rates.decoder},
             ]
         )
-        for group in self._optimizer.param_groups:
-            group["base_lr"] = group["lr"]
+        names = ("density", "color", "decoder")
+        for name, group in zip(names, self._optimizer.param_groups, strict=True):
+            group.update(name=name, base_lr=group["lr"])
 
     def _settings(self, phase: CanonicalPhase) -> RenderSettings:
         bounds, sampling = self.scene.bounds, self.sampling
@@ -231,10 +234,8 @@ class CanonicalStage(ScheduledStage):
         """Render a batch of random pixels and compare it with the images."""
         assert isinstance(self.phase, CanonicalPhase) and self._pool is not None
         with span("batch"):
-            image, flat = self._pool.draw(self.schedule.rays)
-            background = background_color(
-                self.scene.background, len(image), self.device, training=True
-            )
+            image, flat = self._pool.draw(share(self.schedule.rays), self.generator)
+            background = background_color(self.scene.background, len(image), self.generator)
             batch = gather_batch(views, image, flat, background, self.scene.space)
         model = self.model
         output = render(

@@ -26,6 +26,7 @@ from devrf.rendering.render import render
 from devrf.scenes.scene import CaptureName, Views
 from devrf.stages.checkpoint import Passport, Stored
 from devrf.stages.flow_start import follow, start_from_tracks
+from devrf.stages.ranks import share, take_from_first
 from devrf.stages.schedules import DeformationPhase, DeformationSchedule
 from devrf.stages.settings import DEFORMATION_LOSS, MotionSettings
 from devrf.stages.stage import Phase, ScheduledStage
@@ -90,7 +91,9 @@ class DeformationStage(ScheduledStage):
         self.architecture = rest.passport.architecture
         self.records = rest.passport.records
         placeholder = torch.zeros(2, 2, 2, 3, requires_grad=True)
-        self._optimizer = GridAdam([{"params": [placeholder], "lr": self.motion.learning_rate}])
+        self._optimizer = GridAdam(
+            [{"params": [placeholder], "lr": self.motion.learning_rate, "name": "motion"}]
+        )
         self._visit: Visit | None = None
         self._previous: Tensor | None = None
 
@@ -130,6 +133,7 @@ class DeformationStage(ScheduledStage):
 
     def setup(self, stage: str) -> None:
         """Build the field at rest, at the coarsest resolution, in the canonical field's box."""
+        super().setup(stage)
         if self.scene_model.deformation is None:
             self.scene_model.deformation = DeformationField(
                 self.scene_model.canonical.box,
@@ -167,9 +171,13 @@ class DeformationStage(ScheduledStage):
         assert self._previous is not None
         clock = self.field.clock
         pool = all_pixels(views, (clock.frames_of(views.times) == frame).nonzero()[:, 0])
-        tracks = follow(self.scene_model, views, pool, self._previous, clock.times[frame - 1])
+        tracks = follow(
+            self.scene_model, views, pool, self._previous, clock.times[frame - 1], self.generator
+        )
         space = self.scene_model.space
         start_from_tracks(self.field, frame, tracks, views.cameras, space)
+        # Each process has followed pixels of its own.
+        take_from_first([self.field.to_canonical[frame], self.field.to_time[frame]])
 
     @property
     def visit(self) -> Visit:
@@ -243,10 +251,8 @@ class DeformationStage(ScheduledStage):
         space = self.scene_model.space
         with span("batch"):
             pool = self.visit.pools[self.iteration % len(self.visit.pools)]
-            image, flat = pool.draw(self.schedule.rays)
-            background = background_color(
-                self.scene.background, len(image), self.device, training=True
-            )
+            image, flat = pool.draw(share(self.schedule.rays), self.generator)
+            background = background_color(self.scene.background, len(image), self.generator)
             batch = gather_batch(views, image, flat, background, space)
         model = self.scene_model
         output = render(

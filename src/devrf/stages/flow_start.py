@@ -48,7 +48,7 @@ class Tracks:
 @torch.no_grad()
 def follow(
     model: SceneModel, views: Views, pool: PixelPool, previous: Tensor, time_before: float,
-    most: int = 4096,
+    generator: torch.Generator, most: int = 4096,
 ) -> Tracks:
     """Tracks from the frame before to the present one.
 
@@ -58,13 +58,14 @@ def follow(
         pool: pixels of the present frame's images.
         previous: (N,) for each image the one its flow leads to.
         time_before: the time of the frame before.
+        generator: of the random choice, on the pool's device.
         most: tracks at most; more pixels are thinned out at random.
     """
     assert views.flow is not None
     area = views.height * views.width
     valid = views.flow.valid.flatten()[pool.image.long() * area + pool.flat.long()]
     kept = valid.nonzero()[:, 0]
-    kept = kept[torch.randperm(len(kept), device=kept.device)[:most]]
+    kept = kept[torch.randperm(len(kept), device=kept.device, generator=generator)[:most]]
     image, flat = pool.image[kept].long(), pool.flat[kept].long()
     now = gather_batch(views, image, flat, torch.ones(3, device=image.device))
     assert now.flow is not None

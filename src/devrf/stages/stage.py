@@ -6,6 +6,8 @@ from abc import ABC, abstractmethod
 from dataclasses import asdict
 from typing import Any, ClassVar
 
+import numpy as np
+import torch
 from lightning import LightningModule
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
@@ -17,6 +19,14 @@ from devrf.rendering.model import SceneModel
 from devrf.scenes.scene import CaptureName, Scene, Views
 from devrf.stages.checkpoint import Passport
 from devrf.stages.held_out import score
+from devrf.stages.ranks import (
+    RaysByRank,
+    average,
+    average_gradients,
+    check_alike,
+    rank,
+    take_from_first,
+)
 from devrf.stages.schedules import CanonicalPhase, DeformationPhase
 
 Phase = CanonicalPhase | DeformationPhase
@@ -35,6 +45,8 @@ class ScheduledStage(LightningModule, ABC):
         iteration: optimiser iterations done.
         phase: the stretch of the schedule that the grids are ready for; None before the first.
         record: what training took, once a ``TrainingRecord`` callback has measured it.
+        generator: what pixels are drawn with, on the stage's device. At the beginning of each
+            Lightning step it depends on the seed, the process and the iteration alone.
     """
 
     capture: ClassVar[CaptureName]
@@ -46,6 +58,8 @@ class ScheduledStage(LightningModule, ABC):
         self.iteration = 0
         self.phase: Phase | None = None
         self.record: dict[str, float | None] = {}
+        self.generator = torch.Generator()
+        self._seed = 0
 
     @property
     def scene(self) -> Scene:
@@ -87,6 +101,39 @@ class ScheduledStage(LightningModule, ABC):
     def add_gradients(self) -> None:
         """Add gradients that are known in closed form, after the backward pass."""
 
+    def setup(self, stage: str) -> None:
+        """Make the generator.
+
+        Raises:
+            DevrfError: several processes, and a strategy that cannot follow growing grids.
+        """
+        if self.trainer.world_size > 1 and not isinstance(self.trainer.strategy, RaysByRank):
+            raise DevrfError(
+                f"trainer: {self.trainer.world_size} processes need trainer=ddp (the strategy "
+                "devrf.stages.ranks.RaysByRank)"
+            )
+        self._seed = torch.initial_seed()
+        self.generator = torch.Generator(self.device)
+
+    def on_fit_start(self) -> None:
+        """Begin with the same fields in every process."""
+        take_from_first([*self.parameters(), *self.buffers()])
+
+    def on_train_start(self) -> None:
+        """Make the generator ready."""
+        self._draw_anew()
+
+    def on_fit_end(self) -> None:
+        """See that every process has come to the same fields."""
+        if self.iteration >= self.total_iterations:
+            state = self.state_dict().items()
+            check_alike({name: t for name, t in state if isinstance(t, Tensor)})
+
+    def _draw_anew(self) -> None:
+        """Seed the generator for the coming iterations, in each process differently."""
+        mixed = np.random.SeedSequence([self._seed, rank(), self.iteration])
+        self.generator.manual_seed(int(mixed.generate_state(1, np.uint64)[0]))
+
     def training_step(self, views: Views, batch_idx: int) -> None:
         """Run iterations up to ``iterations_per_step``, never beyond the present phase."""
         if self.phase != self.phase_at(self.iteration):
@@ -108,13 +155,15 @@ class ScheduledStage(LightningModule, ABC):
             if total.requires_grad:
                 with span("backward"):
                     self.manual_backward(total)
+            average_gradients(p for group in optimizer.param_groups for p in group["params"])
             with span("optimiser"):
                 self.add_gradients()
                 optimizer.step()
             self.iteration += 1
             for name, value in {"loss": total.detach(), **terms}.items():
                 sums[name] = sums[name] + value if name in sums else value
-        means = {f"{self.capture}/{name}": value / count for name, value in sums.items()}
+        self._draw_anew()
+        means = {f"{self.capture}/{k}": value / count for k, value in average(sums).items()}
         self.log_dict({**means, "step": float(self.iteration)})
         if self.iteration >= self.total_iterations:
             self.trainer.should_stop = True
@@ -129,7 +178,8 @@ class ScheduledStage(LightningModule, ABC):
         views = scene.capture(self.capture).test
         view = score(self.model, views, index, scene.background, self.device)
         scores = {"psnr": view.psnr, "ssim": view.ssim, "rest_pose_psnr": view.rest_pose_psnr}
-        self.log_dict({f"test/{self.capture}/{k}": v for k, v in scores.items()}, batch_size=1)
+        means = {f"test/{self.capture}/{k}": v for k, v in scores.items()}
+        self.log_dict(means, batch_size=1, sync_dist=True)
         return {"view": view}
 
     def configure_optimizers(self) -> GridAdam:

@@ -22,7 +22,7 @@ from triton.runtime.jit import JITFunction
 
 import devrf.ops.kernels
 from devrf.ops import choice
-from devrf.ops.selfcheck import CASES, Draw
+from devrf.ops.selfcheck import CASES, Draw, interpolation, sample_search, warped_depths
 
 POINTERS = {
     torch.float32: "*fp32", torch.float64: "*fp64", torch.int32: "*i32", torch.int64: "*i64",
@@ -73,9 +73,14 @@ def main(capabilities: list[int]) -> None:
     names = kernel_names()
     JITFunction.run = record
     choice.reaches = lambda device: True
-    for case in CASES:
-        with choice.using("triton"):
-            case(Draw(torch.device("cpu")))
+    draw = Draw(torch.device("cpu"))
+    with choice.using("triton"):
+        for case in CASES:
+            case(draw)
+        # What the check leaves out: other rows of channels, and no displacement.
+        interpolation(draw, (1, 9))
+        warped_depths(draw, (0,))
+        sample_search(draw, (0,))
     found = []
     done: set[str] = set()
     for (name, *_), (source, options) in recorded.items():

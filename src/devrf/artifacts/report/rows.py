@@ -23,7 +23,7 @@ ABLATIONS = {
 
 # Groups and keys that say how a run is watched, not what it learns.
 WATCHING = {"logger", "callbacks", "video", "report", "hydra"}
-NOT_OF_A_ROW = {"seed", "stage"}
+NOT_OF_A_ROW = {"objective", "seed", "stage"}
 
 # What tells rows apart, most telling first; then other groups and overrides by name.
 ALWAYS = ("ablation", "folder")

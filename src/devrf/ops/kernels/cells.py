@@ -17,7 +17,7 @@ def cell(coordinate, points):
     A coordinate outside is clamped to the grid; one that is no number counts as 0.
     """
     last = points - 1.0
-    clamped = tl.minimum(tl.maximum(coordinate, 0.0), last)
+    clamped = tl.where(coordinate > 0.0, tl.minimum(coordinate, last), 0.0)
     base = tl.minimum(tl.floor(clamped), last - 1.0)
     return base.to(tl.int32), clamped - base
 

@@ -74,8 +74,11 @@ def find_samples_on_device(
 
 @triton.jit
 def nearest(coordinate, points):
-    """The nearest grid point along an axis, halves to the even one; −1 or ``points`` outside."""
-    coordinate = tl.minimum(tl.maximum(coordinate, -1.0), points * 1.0)
+    """The nearest grid point along an axis, halves to the even one; −1 or ``points`` outside.
+
+    One that is no number is outside.
+    """
+    coordinate = tl.where(coordinate > -1.0, tl.minimum(coordinate, points * 1.0), -1.0)
     low = tl.floor(coordinate)
     number = low.to(tl.int32)
     above = coordinate - low

@@ -1,0 +1,37 @@
+"""A look at one held-out view."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from devrf.artifacts.colors import error_colors
+from devrf.artifacts.contact_sheet import side_by_side
+from devrf.artifacts.film import depth_picture
+from devrf.rendering.model import SceneModel
+from devrf.scenes.scene import Background, Views
+from devrf.stages.held_out import background_value, truth_image
+
+
+def preview(
+    model: SceneModel, views: Views, index: int, background: Background, device: torch.device
+) -> dict[str, Tensor]:
+    """Pictures (H, W', 3) in [0, 1] by name.
+
+    ``view`` is what the model sees beside the truth and the error, ``depth`` how far away.
+
+    Args:
+        model: what has been learned so far, on ``device``.
+        views: the held-out views, on the host.
+        index: which of them.
+        background: what is behind the matte.
+        device: where to render.
+    """
+    behind = torch.full((3,), background_value(background), device=device)
+    rays = views.cameras.image_rays(index).to(device)
+    seen = model.picture(rays, float(views.times[index]), behind)
+    prediction = seen.color.view(views.height, views.width, 3).clamp(0, 1).cpu()
+    truth = truth_image(views, index, background).cpu()
+    strip = side_by_side([prediction, truth, error_colors(prediction, truth)])
+    depth = depth_picture(model, seen, views.cameras.positions[index], strip.shape[0])
+    return {"view": strip, "depth": depth}

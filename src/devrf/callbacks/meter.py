@@ -1,0 +1,52 @@
+"""Curves beside those of the losses: learning rates, speed, resolution, memory."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import torch
+from lightning import Callback, LightningModule, Trainer
+
+from devrf.artifacts.records import peak_host_memory
+from devrf.stages.schedules import DeformationPhase
+from devrf.stages.stage import ScheduledStage
+
+
+class Meter(Callback):
+    """Adds what a stage is doing to the rows that its losses are logged in."""
+
+    def __init__(self) -> None:
+        self._last = (0.0, 0)
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start the clock."""
+        assert isinstance(pl_module, ScheduledStage)
+        self._last = (time.perf_counter(), pl_module.iteration)
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Log, in the steps that Lightning writes down; no number is read from the device."""
+        assert isinstance(pl_module, ScheduledStage)
+        every: int = trainer.log_every_n_steps  # type: ignore[attr-defined]
+        if not trainer.should_stop and (every == 0 or (batch_idx + 1) % every):
+            return
+        now, done = time.perf_counter(), pl_module.iteration
+        since, before = self._last
+        self._last = (now, done)
+        x, y, z = pl_module.resolution
+        values: dict[str, float | None] = {
+            "iterations_per_second": (done - before) / (now - since),
+            "voxels": x * y * z,
+            "peak_host_gb": peak_host_memory(),
+        }
+        for group in pl_module.optimizer.param_groups:
+            values[f"lr/{group['name']}"] = group["lr"]
+        if isinstance(pl_module.phase, DeformationPhase):
+            values["frame"] = pl_module.phase.frame
+        if pl_module.device.type == "cuda":
+            values["peak_gpu_gb"] = torch.cuda.max_memory_allocated(pl_module.device) / 2**30
+        pl_module.log_dict(
+            {f"{pl_module.capture}/{k}": float(v) for k, v in values.items() if v is not None}
+        )

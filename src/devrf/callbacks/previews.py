@@ -1,0 +1,59 @@
+"""Pictures of a held-out view while a stage learns, for those who watch."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from lightning import Callback, LightningModule, Trainer
+
+from devrf.artifacts.preview import preview
+from devrf.artifacts.tracking import trackers
+from devrf.stages.stage import ScheduledStage
+
+
+class Previews(Callback):
+    """Shows the held-out view in the middle of the recording, where a logger takes pictures.
+
+    Attributes:
+        seconds: what the pictures of the present stage have taken.
+    """
+
+    def __init__(self, times: int = 6) -> None:
+        """Say how often.
+
+        Args:
+            times: pictures of each stage, evenly spread over its iterations, the last at its end.
+        """
+        self.times = times
+        self.seconds = 0.0
+        self._shown = 0
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Begin to count."""
+        assert isinstance(pl_module, ScheduledStage)
+        self.seconds, self._shown = 0.0, self._due(pl_module)
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Show the view, when it is time."""
+        assert isinstance(pl_module, ScheduledStage)
+        due = self._due(pl_module)
+        if due == self._shown or not trainer.is_global_zero:
+            return
+        self._shown = due
+        started = time.perf_counter()
+        if found := trackers(trainer.loggers):
+            views = pl_module.scene.capture(pl_module.capture).test
+            seen = preview(
+                pl_module.model, views, len(views) // 2, pl_module.scene.background,
+                pl_module.device,
+            )
+            for tracker in found:
+                for name, image in seen.items():
+                    tracker.show_image(f"{pl_module.capture}/{name}", image, pl_module.iteration)
+        self.seconds += time.perf_counter() - started
+
+    def _due(self, stage: ScheduledStage) -> int:
+        return stage.iteration * self.times // stage.total_iterations

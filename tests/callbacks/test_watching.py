@@ -1,0 +1,139 @@
+"""The callbacks that only watch: curves and previews change nothing, and cost what they say."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from lightning import Callback, Trainer
+from lightning.pytorch.loggers import CSVLogger, Logger
+from torch import Tensor
+
+from devrf.artifacts.tracking import Row, Tracker, trackers
+from devrf.callbacks import GridUpscaling, LearningRateDecay, Meter, Previews, TrainingRecord
+from devrf.data.datamodule import SceneDataModule
+from devrf.fields.architecture import Architecture
+from devrf.stages.canonical import CanonicalStage
+from devrf.stages.schedules import CanonicalSchedule
+
+SCHEDULE = CanonicalSchedule(
+    search_iterations=0, search_side=16, carve=True, iterations=12, side=12, doublings=(3, 7),
+    decay_iterations=6, rays=64,
+)
+
+
+class Album(Logger):
+    """A tracker that keeps what it is shown."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.images: dict[str, list[tuple[int | None, Tensor]]] = {}
+        self.rows: list[dict[str, float]] = []
+
+    name = "album"
+    version = 0
+
+    def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
+        self.rows.append({**metrics, "step": float(step or 0)})
+
+    def log_hyperparams(self, params: dict[str, Any]) -> None: ...  # type: ignore[override]
+
+    def go_on(self) -> None: ...
+
+    def show_image(self, name: str, image: Tensor, step: int | None = None) -> None:
+        self.images.setdefault(name, []).append((step, image))
+
+    def show_video(self, name: str, path: Path) -> None: ...
+
+    def show_table(self, name: str, rows: Sequence[Row]) -> None: ...
+
+    def conclude(self, values: Mapping[str, float]) -> None: ...
+
+    def close(self, *, failed: bool) -> None: ...
+
+
+def learn(
+    datamodule: SceneDataModule, logger: Logger, *callbacks: Callback
+) -> CanonicalStage:
+    torch.manual_seed(3)
+    stage = CanonicalStage(
+        SCHEDULE, Architecture(channels=4, width=8, frequencies=1), iterations_per_step=1
+    )
+    Trainer(
+        accelerator="cpu", devices=1, logger=logger, enable_checkpointing=False, max_epochs=1,
+        enable_progress_bar=False, enable_model_summary=False, log_every_n_steps=4,
+        callbacks=[GridUpscaling(), LearningRateDecay(), *callbacks],
+    ).fit(stage, datamodule=datamodule)
+    return stage
+
+
+def test_only_a_logger_that_takes_pictures_is_a_tracker(tmp_path: Path) -> None:
+    album = Album()
+    assert isinstance(album, Tracker)
+    assert trackers([CSVLogger(tmp_path), album]) == [album]
+
+
+def test_previews_come_as_often_as_asked_for_and_look_right(datamodule: SceneDataModule) -> None:
+    album = Album()
+    learn(datamodule, album, Previews(times=3))
+    shown = album.images["static/view"]
+    assert [step for step, _ in shown] == [4, 8, 12]
+    views = datamodule.scene.static.test
+    (_, strip), (_, depth) = shown[-1], album.images["static/depth"][-1]
+    # Prediction, truth and error, four pixels apart.
+    assert strip.shape == (views.height, 3 * views.width + 8, 3)
+    assert depth.shape == (views.height, views.width, 3)
+    truth = strip[:, views.width + 4 : 2 * views.width + 4]
+    pixels = views.pixels[len(views) // 2].float() / 255
+    expected = 1 + pixels[..., 3:] * (pixels[..., :3] - 1)  # on white
+    torch.testing.assert_close(truth, expected)
+
+
+def test_watching_changes_nothing_of_what_is_learned(datamodule: SceneDataModule) -> None:
+    watched = learn(datamodule, Album(), Meter(), Previews(times=4)).model
+    alone = learn(datamodule, Album()).model
+    assert torch.equal(watched.canonical.density.values, alone.canonical.density.values)
+    assert torch.equal(watched.canonical.color.values, alone.canonical.color.values)
+
+
+def test_what_previews_take_is_not_time_of_training(
+    datamodule: SceneDataModule, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    previews = Previews(times=2)
+    stage = learn(datamodule, Album(), previews, TrainingRecord())
+    seconds = stage.record["seconds"]
+    assert previews.seconds > 0 and seconds is not None
+
+    class Slow(Album):
+        def show_image(self, name: str, image: Tensor, step: int | None = None) -> None:
+            import time
+
+            time.sleep(0.5)
+
+    slow = Previews(times=1)
+    again = learn(datamodule, Slow(), slow, TrainingRecord()).record["seconds"]
+    assert slow.seconds > 1.0  # two pictures
+    assert again is not None and again < seconds + 0.5
+
+
+def test_without_a_tracker_no_picture_is_made(
+    datamodule: SceneDataModule, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("devrf.callbacks.previews.preview", lambda *_: pytest.fail("rendered"))
+    learn(datamodule, CSVLogger(tmp_path), Previews(times=3))
+
+
+def test_curves_stand_in_the_rows_of_the_losses(datamodule: SceneDataModule) -> None:
+    album = Album()
+    stage = learn(datamodule, album, Meter())
+    assert [row["step"] for row in album.rows] == [4, 8, 12]
+    x, y, z = stage.resolution
+    for row in album.rows:
+        assert row["static/loss"] > 0 and row["static/iterations_per_second"] > 0
+        factor = 0.1 ** ((row["step"] - 1) / 6)
+        rates = [row[f"static/lr/{name}"] for name in ("density", "color", "decoder")]
+        assert rates == pytest.approx([0.1 * factor, 0.1 * factor, 1e-3 * factor])
+    assert [row["static/voxels"] for row in album.rows][-1] == x * y * z

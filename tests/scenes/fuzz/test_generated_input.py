@@ -1,0 +1,437 @@
+"""Thousands of damaged files for every parser: each is read, or refused in one clear line.
+
+The table says how many inputs each parser is given, and how many of them it has to refuse at
+least; the last test adds these up.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import shutil
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.strategies import DrawFn, SearchStrategy
+from PIL import Image
+
+from devrf.data.forward import ForwardFacingDataModule
+from devrf.data.inward import InwardFacingDataModule
+from devrf.data.nerfies import NerfiesDataModule
+from devrf.data.nerfstudio import NerfstudioDataModule
+from devrf.scenes.flow_cache import load_flow
+from devrf.scenes.flow_files import read_flow_file
+from devrf.scenes.images import load_images
+from devrf.scenes.llff_poses import read_dynamic_poses, read_static_poses
+from devrf.scenes.nerfies_camera import read_camera
+from devrf.scenes.transforms import read_transforms
+
+WIDTH, HEIGHT = 32, 24
+Fixture = Callable[[str], Any]
+# What to draw inputs from, and how one of them is written and read.
+Prepared = tuple[SearchStrategy[Any], Callable[[Any], Any]]
+
+
+def written(file: Path, content: bytes | str) -> Path:
+    file.unlink(missing_ok=True)
+    if isinstance(content, str):
+        content = content.encode("utf-8", "surrogatepass")
+    file.write_bytes(content)
+    return file
+
+
+# --- transforms*.json
+
+
+def transforms_values(fixture: Fixture) -> Prepared:
+    folder = fixture("scene_folder")
+    file = folder.dynamic / "transforms_train.json"
+    content = json.loads(file.read_text())
+    content |= {"fl_x": 40.0, "w": WIDTH, "h": HEIGHT, "k1": 0.01, "camera_model": "OPENCV"}
+    content["frames"] = content["frames"][:3]
+    content["frames"][2] |= {"fl_x": 41.0, "cx": 16.0}
+    return fixture("damage").json(content), lambda text: read_transforms(
+        written(file, text), folder.root
+    )
+
+
+def transforms_bytes(fixture: Fixture) -> Prepared:
+    folder = fixture("scene_folder")
+    file = folder.dynamic / "transforms_train.json"
+    return fixture("damage").bytes(file.read_bytes()), lambda data: read_transforms(
+        written(file, data), folder.root
+    )
+
+
+# --- arrays
+
+
+def static_poses(fixture: Fixture) -> Prepared:
+    folder, damage = fixture("llff_folder"), fixture("damage")
+    file = folder.static / "poses_bounds.npy"
+    values = np.load(file)
+    inputs = st.one_of(
+        damage.bytes(file.read_bytes()), damage.header(values), damage.array(values).map(npy)
+    )
+
+    def read(data: bytes) -> Any:
+        return read_static_poses(written(file, data).parent).normalised().cameras(24, 16)
+
+    return inputs, read
+
+
+def shared_intrinsics(fixture: Fixture) -> Prepared:
+    folder, damage = fixture("llff_folder"), fixture("damage")
+    rows = np.load(folder.static / "poses_bounds.npy")
+    np.save(folder.static / "poses_bounds.npy", np.delete(rows, [4, 9, 14], axis=1))
+    file, values = folder.static / "hwf_cxcy.npy", np.array([64, 96, 80, 80, 48.0, 32.0])
+    inputs = st.one_of(
+        damage.bytes(npy(values)), damage.header(values), damage.array(values).map(npy)
+    )
+    return inputs, lambda data: read_static_poses(written(file, data).parent).cameras(24, 16)
+
+
+def moving_poses(fixture: Fixture) -> Prepared:
+    folder, damage = fixture("llff_folder"), fixture("damage")
+    files = [folder.dynamic / "poses.npy", folder.dynamic / "bds.npy"]
+    whole = [file.read_bytes() for file in files]
+
+    def of(k: int) -> SearchStrategy[Any]:
+        values = np.load(files[k])
+        damaged = st.one_of(
+            damage.bytes(whole[k]), damage.header(values), damage.array(values).map(npy)
+        )
+        return st.tuples(st.just(k), damaged)
+
+    def read(drawn: tuple[int, bytes]) -> Any:
+        for k, file in enumerate(files):
+            written(file, drawn[1] if k == drawn[0] else whole[k])
+        return read_dynamic_poses(folder.dynamic).cameras(24, 16)
+
+    return st.one_of(of(0), of(1)), read
+
+
+def npy(values: np.ndarray) -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, values)
+    return stream.getvalue()
+
+
+def npz(members: dict[str, bytes], compression: int = zipfile.ZIP_DEFLATED) -> bytes:
+    """An archive whose members need not be arrays."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", compression) as archive:
+        for name, data in members.items():
+            archive.writestr(f"{name}.npy", data)
+    return stream.getvalue()
+
+
+@st.composite
+def archives(draw: DrawFn, damage: Any, arrays: dict[str, np.ndarray]) -> bytes:
+    """Archives with whole check sums around damaged members, or damaged as a whole."""
+    members = {name: npy(values) for name, values in arrays.items()}
+    compression = draw(st.sampled_from([zipfile.ZIP_DEFLATED, zipfile.ZIP_STORED]))
+    if draw(st.booleans()):
+        data: bytes = draw(damage.bytes(npz(members, compression)))
+        return data
+    name = draw(st.sampled_from(sorted(members)))
+    change = draw(st.sampled_from(["header", "bytes", "array", "gone", "other"]))
+    if change == "gone":
+        del members[name]
+    elif change == "other":
+        members[name] = draw(st.sampled_from(list(members.values()) + [b"", npz(members)]))
+    elif change != "array":
+        members[name] = draw(
+            damage.header(arrays[name]) if change == "header" else damage.bytes(members[name])
+        )
+    elif arrays[name].dtype.kind == "f":
+        members[name] = npy(draw(damage.array(arrays[name])))
+    return npz(members, compression)
+
+
+def flow(fixture: Fixture) -> Prepared:
+    file = fixture("tmp_path") / "001_bwd.npz"
+    arrays = {"flow": np.ones((4, 6, 2), np.float32), "mask": np.ones((4, 6), bool)}
+    return archives(fixture("damage"), arrays), lambda data: read_flow_file(
+        written(file, data), width=6, height=4
+    )
+
+
+def cached_flow(fixture: Fixture) -> Prepared:
+    file = fixture("tmp_path") / "cache.npz"
+    arrays = {
+        "key": np.array("0" * 64), "vectors": np.ones((2, 4, 6, 2), np.float32),
+        "valid": np.ones((2, 4, 6), bool),
+    }
+    return archives(fixture("damage"), arrays), lambda data: load_flow(
+        written(file, data), "0" * 64, (2, 4, 6)
+    )
+
+
+# --- images
+
+
+def images(*formats: str) -> Callable[[Fixture], Prepared]:
+    def prepare(fixture: Fixture) -> Prepared:
+        folder, damage = fixture("tmp_path"), fixture("damage")
+        rng = np.random.default_rng(0)
+        picture = Image.fromarray(rng.integers(0, 255, (HEIGHT, WIDTH, 4), dtype=np.uint8))
+        picture.save(folder / "first.png")
+        whole = []
+        for name in formats:
+            stream = io.BytesIO()
+            kind, _, mode = name.partition(" ")
+            picture.convert(mode).save(stream, kind)
+            whole.append(stream.getvalue())
+        file = folder / "second.png"
+        return st.one_of([damage.bytes(data) for data in whole]), lambda data: load_images(
+            [folder / "first.png", written(file, data)], 1
+        )
+
+    return prepare
+
+
+# --- Nerfies
+
+
+def nerfies_folder(fixture: Fixture) -> Path:
+    """The scene of one folder with a moving camera, in Nerfies' layout."""
+    source, ring = fixture("single_folder"), fixture("ring_cameras")
+    root: Path = fixture("tmp_path") / "nerfies"
+    ids = [f"{i:06d}" for i in range(6)]
+    shutil.copytree(source / "train", root / "rgb" / "1x")
+    (root / "camera").mkdir()
+    poses = ring(6, width=WIDTH, height=HEIGHT, angle=0.8).camera_to_world
+    for i, (item, pose) in enumerate(zip(ids, poses, strict=True)):
+        (root / f"rgb/1x/r_{i:03d}.png").rename(root / f"rgb/1x/{item}.png")
+        axes = pose[:, :3] * pose.new_tensor([1.0, -1.0, -1.0])
+        (root / f"camera/{item}.json").write_text(json.dumps({
+            "orientation": axes.T.tolist(), "position": pose[:, 3].tolist(),
+            "focal_length": 38.0, "pixel_aspect_ratio": 1.0, "skew": 0.0,
+            "principal_point": [16.0, 12.0], "image_size": [WIDTH, HEIGHT],
+            "radial_distortion": [0.0, 0.0, 0.0], "tangential_distortion": [0.0, 0.0],
+        }))
+    for name, content in {
+        "scene": {"center": [0.0, 0, 0], "scale": 1.0, "near": 0.5, "far": 9.0},
+        "metadata": {item: {"warp_id": i, "camera_id": 0} for i, item in enumerate(ids)},
+        "dataset": {"count": 6, "ids": ids, "train_ids": ids[:4], "val_ids": ids[4:]},
+    }.items():
+        (root / f"{name}.json").write_text(json.dumps(content))
+    return root
+
+
+def nerfies_camera(fixture: Fixture) -> Prepared:
+    root = nerfies_folder(fixture)
+    file = root / "camera/000001.json"
+    content = json.loads(file.read_text())
+
+    def read(text: str) -> Any:
+        written(file, text)
+        pose, inner = read_camera(root, "000001", [0.0, 0.0, 0.0], 1.0)
+        return pose, inner.lens(WIDTH, HEIGHT, root / "rgb/1x/000001.png")
+
+    return fixture("damage").json(content), read
+
+
+def nerfies_lists(fixture: Fixture) -> Prepared:
+    root = nerfies_folder(fixture)
+    whole = {name: (root / name).read_text() for name in (
+        "dataset.json", "metadata.json", "scene.json"
+    )}
+    inputs = st.one_of([
+        st.tuples(st.just(name), fixture("damage").json(json.loads(text)))
+        for name, text in whole.items()
+    ])
+
+    def read(drawn: tuple[str, str]) -> Any:
+        for name, text in whole.items():
+            written(root / name, drawn[1] if name == drawn[0] else text)
+        return NerfiesDataModule(root, downscale=1, flow="none", bound_scale=1.5).load()
+
+    return inputs, read
+
+
+# --- whole scenes
+
+
+def nerfstudio_folder(fixture: Fixture) -> Path:
+    root: Path = fixture("single_folder")
+    content = json.loads((root / "transforms_train.json").read_text())
+    del content["camera_angle_x"]
+    content |= {"fl_x": 38.0, "fl_y": 38.0, "w": WIDTH, "h": HEIGHT, "k1": 0.01}
+    content |= {"train_filenames": [f["file_path"] for f in content["frames"][:5]]}
+    (root / "transforms.json").write_text(json.dumps(content))
+    return root
+
+
+def nerfstudio(fixture: Fixture) -> Prepared:
+    root = nerfstudio_folder(fixture)
+    file = root / "transforms.json"
+    content = json.loads(file.read_text())
+    return fixture("damage").json(content), lambda text: NerfstudioDataModule(
+        written(file, text).parent, flow="none", bound_scale=1.5
+    ).load()
+
+
+CHANGES = [
+    "gone", "empty", "folder", "loop", "dangling", "pipe", "half", "rubbish", "damaged", "swapped"
+]
+
+
+def scene_files(
+    of: Callable[[Fixture], Path], load: Callable[[Path], Any]
+) -> Callable[[Fixture], Prepared]:
+    """A scene in which one file, or a folder, is not what it was."""
+
+    def prepare(fixture: Fixture) -> Prepared:
+        whole = of(fixture)
+        files = sorted(path.relative_to(whole) for path in whole.rglob("*"))
+        changed = fixture("tmp_path") / "changed"
+        shutil.copytree(whole, changed)
+
+        @st.composite
+        def inputs(draw: DrawFn) -> tuple[Path, str, Any]:
+            file = draw(st.sampled_from(files))
+            change = draw(st.sampled_from(CHANGES))
+            if (whole / file).is_dir() and change in ("half", "damaged"):
+                change = "gone"
+            if change == "damaged":
+                return file, change, draw(fixture("damage").bytes((whole / file).read_bytes()))
+            return file, change, draw(st.sampled_from(files)) if change == "swapped" else None
+
+        def read(drawn: tuple[Path, str, Any]) -> Any:
+            change_file(changed, whole, *drawn)
+            try:
+                return load(changed)
+            finally:
+                remove(changed / drawn[0])
+                copy(whole / drawn[0], changed / drawn[0])
+
+        return inputs(), read
+
+    return prepare
+
+
+def change_file(root: Path, whole: Path, name: Path, change: str, with_what: Any) -> None:
+    """Put something else in the place of the file or folder ``name``."""
+    file = root / name
+    remove(file)
+    if change in ("empty", "rubbish"):
+        file.write_bytes(b"" if change == "empty" else bytes(range(256)))
+    elif change == "folder":
+        file.mkdir()
+    elif change in ("loop", "dangling"):
+        file.symlink_to(file if change == "loop" else root / "nowhere")
+    elif change == "pipe":
+        os.mkfifo(file)
+    elif change == "half":
+        data = (whole / name).read_bytes()
+        file.write_bytes(data[: len(data) // 2])
+    elif change == "damaged":
+        file.write_bytes(with_what)
+    elif change == "swapped":
+        copy(whole / with_what, file)
+
+
+def remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def copy(source: Path, target: Path) -> None:
+    (shutil.copytree if source.is_dir() else shutil.copyfile)(source, target)
+
+
+def with_flow(fixture: Fixture) -> Path:
+    folder = fixture("scene_folder")
+    (folder.dynamic / "train_flow").mkdir()
+    for k in range(2, 6):
+        np.savez(
+            folder.dynamic / f"train_flow/{k:03d}_bwd.npz",
+            flow=np.ones((HEIGHT, WIDTH, 2), np.float32), mask=np.ones((HEIGHT, WIDTH), bool),
+        )
+    root: Path = folder.root
+    return root
+
+
+def forward(fixture: Fixture) -> Path:
+    folder = fixture("llff_folder")
+    for frame in ("001", "002"):
+        folder.flow(1, frame, 0.5)
+    root: Path = folder.root
+    return root
+
+
+@dataclass(frozen=True)
+class Parser:
+    """What is read, how many damaged inputs it is given, and how many it has to refuse."""
+
+    name: str
+    inputs: int
+    refused: int
+    prepare: Callable[[Fixture], Prepared]
+
+
+PARSERS = (
+    Parser("values of transforms.json", 2600, 1800, transforms_values),
+    Parser("text of transforms.json", 1300, 1100, transforms_bytes),
+    Parser("poses_bounds.npy", 1700, 1400, static_poses),
+    Parser("hwf_cxcy.npy", 600, 500, shared_intrinsics),
+    Parser("poses.npy and bds.npy", 1300, 1100, moving_poses),
+    Parser("optical flow", 1800, 1450, flow),
+    Parser("cached optical flow", 700, 550, cached_flow),
+    Parser("png", 1000, 850, images("PNG RGBA", "PNG P", "PNG RGB")),
+    Parser("jpeg and webp", 700, 400, images("JPEG RGB", "WEBP RGBA", "JPEG CMYK")),
+    Parser("camera of nerfies", 800, 650, nerfies_camera),
+    Parser("lists of nerfies", 400, 280, nerfies_lists),
+    Parser("nerfstudio", 300, 220, nerfstudio),
+    Parser("files of an inward-facing scene", 120, 80, scene_files(
+        with_flow,
+        lambda root: InwardFacingDataModule(root, flow="files", bound_scale=1.5).load(),
+    )),
+    Parser("files of D-NeRF's layout", 80, 55, scene_files(
+        lambda fixture: fixture("single_folder"),
+        lambda root: InwardFacingDataModule(root, flow="files", bound_scale=1.5).load(),
+    )),
+    Parser("files of a forward-facing scene", 120, 80, scene_files(
+        forward, lambda root: ForwardFacingDataModule(root, flow="files").load()
+    )),
+    Parser("files of nerfstudio", 80, 30, scene_files(
+        nerfstudio_folder,
+        lambda root: NerfstudioDataModule(root, flow="none", bound_scale=1.5).load(),
+    )),
+    Parser("files of nerfies", 80, 50, scene_files(
+        nerfies_folder,
+        lambda root: NerfiesDataModule(root, downscale=1, flow="none", bound_scale=1.5).load(),
+    )),
+)
+
+
+@pytest.mark.parametrize("parser", PARSERS, ids=lambda parser: parser.name)
+@pytest.mark.filterwarnings("ignore")
+def test_damaged_input_is_read_or_refused(
+    parser: Parser, request: pytest.FixtureRequest, verdicts: Any
+) -> None:
+    inputs, read = parser.prepare(request.getfixturevalue)
+
+    @settings(max_examples=parser.inputs, suppress_health_check=list(HealthCheck))
+    @given(inputs)
+    def each(drawn: Any) -> None:
+        verdicts.of(lambda: read(drawn))
+
+    each()
+    assert verdicts.refused >= parser.refused, (verdicts.refused, verdicts.read)
+
+
+def test_ten_thousand_inputs_are_refused() -> None:
+    assert sum(parser.refused for parser in PARSERS) >= 10_000
