@@ -16,7 +16,9 @@ from torch import Tensor
 from devrf.artifacts.colors import depth_colors, to_bytes
 from devrf.artifacts.files import whole_file
 from devrf.geometry.cameras import Cameras
-from devrf.rendering.model import Picture, SceneModel
+from devrf.rendering.model import SceneModel
+from devrf.rendering.picture import Picture
+from devrf.rendering.player import Player
 
 # Small pictures are shown enlarged: a video of 100 pixels is too small to watch.
 WATCHABLE = 240
@@ -40,15 +42,12 @@ class FilmSettings:
     orbit_elevation: float = 25.0
 
 
-def pictures(
-    model: SceneModel, cameras: Cameras, background: float, device: torch.device
-) -> Iterator[Tensor]:
+def pictures(player: Player, cameras: Cameras, background: float) -> Iterator[Tensor]:
     """Colour beside depth (H, 2W, 3) from each of N cameras, while time runs from 0 to 1."""
-    behind = torch.full((3,), background, device=device)
-    for k in range(len(cameras)):
-        time = k / max(len(cameras) - 1, 1)
-        picture = model.picture(cameras.image_rays(k).to(device), time, behind)
-        depth = depth_picture(model, picture, cameras.positions[k], cameras.height)
+    times = [k / max(len(cameras) - 1, 1) for k in range(len(cameras))]
+    seen = player.stream(cameras, times, background)
+    for picture, position in zip(seen, cameras.positions, strict=True):
+        depth = depth_picture(player.model, picture, position, cameras.height)
         yield torch.cat([picture.color.view(depth.shape).cpu(), depth], dim=1)
 
 

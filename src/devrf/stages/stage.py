@@ -16,6 +16,7 @@ from devrf.errors import DevrfError
 from devrf.ops.adam import GridAdam
 from devrf.ops.spans import span
 from devrf.rendering.model import SceneModel
+from devrf.rendering.player import Player
 from devrf.scenes.scene import CaptureName, Scene, Views
 from devrf.stages.checkpoint import Passport
 from devrf.stages.held_out import score
@@ -176,7 +177,7 @@ class ScheduledStage(LightningModule, ABC):
         """
         scene = self.scene
         views = scene.capture(self.capture).test
-        view = score(self.model, views, index, scene.background, self.device)
+        view = score(Player(self.model), views, index, scene.background)
         scores = {"psnr": view.psnr, "ssim": view.ssim, "rest_pose_psnr": view.rest_pose_psnr}
         means = {f"test/{self.capture}/{k}": v for k, v in scores.items()}
         self.log_dict(means, batch_size=1, sync_dist=True)
