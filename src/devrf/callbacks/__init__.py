@@ -1,5 +1,6 @@
 """Callbacks: what watches a stage and acts on it from outside."""
 
+from devrf.callbacks.excerpts import Excerpts
 from devrf.callbacks.meter import Meter
 from devrf.callbacks.previews import Previews
 from devrf.callbacks.progress import Progress
@@ -7,5 +8,6 @@ from devrf.callbacks.record import TrainingRecord
 from devrf.callbacks.schedule import GridUpscaling, LearningRateDecay
 
 __all__ = [
-    "GridUpscaling", "LearningRateDecay", "Meter", "Previews", "Progress", "TrainingRecord",
+    "Excerpts", "GridUpscaling", "LearningRateDecay", "Meter", "Previews", "Progress",
+    "TrainingRecord",
 ]

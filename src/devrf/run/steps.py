@@ -16,6 +16,7 @@ from devrf import job
 from devrf.errors import DevrfError
 from devrf.losses.composer import WeightedLoss
 from devrf.losses.motion import MOTION_TERMS
+from devrf.run.benchmark import benchmark
 from devrf.run.context import FROM_NOTHING, RunContext
 from devrf.run.film import render
 from devrf.run.look import inspect, prepare
@@ -33,6 +34,7 @@ STEPS: dict[str, tuple[Callable[[RunContext], None], ...]] = {
     "evaluate": (evaluate,),
     "render": (render,),
     "pipeline": (canonical, deformation, evaluate, render),
+    "benchmark": (benchmark,),
     "report": (report,),
 }
 
@@ -129,3 +131,4 @@ def _check(run: RunContext, stage: str) -> None:
     if job.in_search() and evaluate not in STEPS[stage]:
         raise DevrfError(f"stage: a search needs the objective, which stage={stage} does not score")
     instantiate(config.video)
+    instantiate(config.benchmark)
