@@ -15,7 +15,9 @@ from torch import Tensor
 
 from devrf.errors import DevrfError
 from devrf.ops.adam import GridAdam
+from devrf.ops.spans import span
 from devrf.rendering.model import SceneModel
+from devrf.rendering.player import Player
 from devrf.scenes.scene import CaptureName, Scene, Views
 from devrf.stages.checkpoint import Passport, check_scene, passport_in
 from devrf.stages.compact_state import compact_state
@@ -160,10 +162,12 @@ class ScheduledStage(LightningModule, ABC):
             optimizer.zero_grad()
             total, terms = self.loss(views)
             if total.requires_grad:
-                self.manual_backward(total)
+                with span("backward"):
+                    self.manual_backward(total)
             average_gradients(p for group in optimizer.param_groups for p in group["params"])
-            self.add_gradients()
-            optimizer.step()
+            with span("optimiser"):
+                self.add_gradients()
+                optimizer.step()
             self.iteration += 1
             for name, value in {"loss": total.detach(), **terms}.items():
                 sums[name] = sums[name] + value if name in sums else value
@@ -181,7 +185,7 @@ class ScheduledStage(LightningModule, ABC):
         """
         scene = self.scene
         views = scene.capture(self.capture).test
-        view = score(self.model, views, index, scene.background, self.device)
+        view = score(Player(self.model), views, index, scene.background)
         scores = {"psnr": view.psnr, "ssim": view.ssim, "rest_pose_psnr": view.rest_pose_psnr}
         means = {f"test/{self.capture}/{k}": v for k, v in scores.items()}
         self.log_dict(means, batch_size=1, sync_dist=True)
