@@ -177,20 +177,20 @@ def test_a_deformation_that_goes_wrong_twice_ends(fit, rest: Stored) -> None:
 
 
 def test_a_field_that_empties_is_taken_back(fit, caplog: pytest.LogCaptureFixture) -> None:
-    longer = replace(SCHEDULE, iterations=100, doublings=(20,), rays=256)
+    longer = replace(SCHEDULE, iterations=60, doublings=(20,), rays=128)
     stage = CanonicalStage(longer, SMALL, iterations_per_step=1)
     with caplog.at_level(logging.WARNING, logger="devrf"):
-        fit(stage, Spoil("-100", 50), Health(every_iterations=20))
+        fit(stage, Spoil("-100", 40), Health(every_iterations=20))
     assert "everything has become empty by iteration" in caplog.text
     assert "data.background" in caplog.text and "data.box" in caplog.text
-    assert stage.back_offs == 1 and stage.iteration == 100
+    assert stage.back_offs == 1 and stage.iteration == 60
 
 
 def test_a_field_that_fills_is_taken_back(fit, caplog: pytest.LogCaptureFixture) -> None:
-    longer = replace(SCHEDULE, iterations=100, doublings=(20,), rays=256, carve=False)
+    longer = replace(SCHEDULE, iterations=60, doublings=(20,), rays=128, carve=False)
     stage = CanonicalStage(longer, SMALL, iterations_per_step=1)
     with caplog.at_level(logging.WARNING, logger="devrf"):
-        fit(stage, Spoil("100", 50), Health(every_iterations=20))
+        fit(stage, Spoil("100", 40), Health(every_iterations=20))
     assert "everything has become opaque by iteration" in caplog.text
     assert stage.back_offs == 1
 
@@ -202,11 +202,11 @@ def test_a_field_that_keeps_emptying_ends_the_stage(
     static, channels = tiny_scene.static, 4 if mattes else 3
     train = replace(static.train, pixels=static.train.pixels[..., :channels].contiguous())
     scene = replace(tiny_scene, static=replace(static, train=train))
-    longer = replace(SCHEDULE, iterations=100, doublings=(), rays=256)
+    longer = replace(SCHEDULE, iterations=60, doublings=(), rays=128)
     stage = CanonicalStage(longer, replace(SMALL, alpha_init=0.1), iterations_per_step=1)
     with pytest.raises(DevrfError) as caught:
         fit(
-            stage, Spoil("-100", 30, 70), Health(every_iterations=20),
+            stage, Spoil("-100", 20, 40), Health(every_iterations=20),
             data=type(datamodule)(scene),  # type: ignore[call-arg]
         )
     said = str(caught.value)
@@ -295,7 +295,7 @@ def test_looking_costs_next_to_nothing(fit, monkeypatch: pytest.MonkeyPatch) -> 
             spent[0] += time.process_time() - began
 
         monkeypatch.setattr(Health, name, timed)
-    schedule = replace(SCHEDULE, iterations=200, side=24, rays=512)
+    schedule = replace(SCHEDULE, iterations=120, side=24, rays=512)
     stage = CanonicalStage(schedule, SMALL)
     began = time.process_time()
     fit(stage, Health())

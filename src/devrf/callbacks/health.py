@@ -171,25 +171,24 @@ class Health(Callback):
         self, stage: ScheduledStage, steps: list[dict[str, float]], since: int
     ) -> str | None:
         """In words, that nothing is seen any more where something should be, or matter alone."""
-        seen = sum(means["opacity"] for means in steps) / len(steps)
-        mattes = "coverage" in steps[0]
-        covered = sum(means["coverage"] for means in steps) / len(steps) if mattes else None
+        late = steps[len(steps) // 2 :]  # what went wrong since the last look is seen at this one
+        seen = sum(means["opacity"] for means in late) / len(late)
+        mattes = "coverage" in late[0]
+        covered = sum(means["coverage"] for means in late) / len(late) if mattes else None
+        least, most = self._range
+        where = stage.where(stage.iteration)
+        if since >= TELLING:
+            self._range = [min(least, seen), max(most, seen)]
+            # Without mattes a scene may fill every picture, and what moves may leave it.
+            if covered is not None and filled(seen, least, covered):
+                return f"everything has become opaque by {where} ({BACKGROUND})"
+            if emptied(seen, most, most if covered is None else covered):
+                words = f"everything has become empty by {where} ({BACKGROUND})"
+                if covered is not None or stage.name == "canonical":
+                    return words
+                self._tell(stage, words)
         if stage.iteration >= stage.total_iterations and seen < GONE * (covered or THERE):
             self._tell(stage, f"nothing is to be seen at the end ({BACKGROUND})")
-        if since < TELLING:
-            return None
-        least, most = self._range
-        self._range = [min(least, seen), max(most, seen)]
-        where = stage.where(stage.iteration)
-        # Without mattes a scene may fill every picture, and what moves may leave it.
-        if covered is not None and filled(seen, least, covered):
-            return f"everything has become opaque by {where} ({BACKGROUND})"
-        if not emptied(seen, most, most if covered is None else covered):
-            return None
-        words = f"everything has become empty by {where} ({BACKGROUND})"
-        if covered is not None or stage.name == "canonical":
-            return words
-        self._tell(stage, words)
         return None
 
     def _tell(self, stage: ScheduledStage, words: str) -> None:

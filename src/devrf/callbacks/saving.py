@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -110,8 +111,8 @@ class Saving(Callback):
             self.saved, self._failing = stage.iteration, False
             files = progress_files(self.folder, stage.name)
             # Those further on are of a course that was taken back.
-            ahead = files.index(path)
-            for old in [*files[:ahead], *files[ahead + self.KEPT :]]:
+            ahead = list(takewhile(lambda file: file != path, files))
+            for old in [*ahead, *files[len(ahead) + self.KEPT :]]:
                 old.unlink(missing_ok=True)
         now = time.monotonic()
         rest = (now - began) * (1 / self.share - 1)
