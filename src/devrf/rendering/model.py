@@ -10,6 +10,7 @@ from devrf.fields.deformation import DeformationField
 from devrf.fields.occupancy import Occupancy, dilate
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import WORLD, Space
+from devrf.rendering.chunks import in_chunks
 from devrf.rendering.picture import Picture
 from devrf.rendering.render import RenderSettings, Warp, render
 
@@ -68,14 +69,14 @@ class SceneModel(nn.Module):
             rays: R rays in world space.
             time: in [0, 1].
             background: (3,) RGB.
-            chunk: rays rendered at once.
+            chunk: rays rendered at once; fewer when memory runs out.
         """
         rays = self.space.rays(rays)
         warp, occupancy = self.warp(time), self.occupancy_at(time)
-        parts = [
-            render(rays[k : k + chunk], self.canonical, occupancy, self.settings, background, warp)
-            for k in range(0, len(rays), chunk)
-        ]
+        parts = in_chunks(
+            lambda some: render(some, self.canonical, occupancy, self.settings, background, warp),
+            rays, chunk,
+        )
         return Picture.joined([Picture.of(part) for part in parts])
 
 

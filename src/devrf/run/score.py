@@ -27,7 +27,7 @@ from devrf.stages.held_out import HeldOutView, score
 log = logging.getLogger(__name__)
 
 # What a checkpoint knows of its training that stands beside the scores.
-TRAINING = ("seconds", "iterations", "iterations_per_second", "peak_gpu_gb")
+TRAINING = ("seconds", "iterations", "iterations_per_second", "peak_gpu_gb", "back_offs")
 
 
 def evaluate(run: RunContext) -> None:

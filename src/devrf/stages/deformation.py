@@ -17,6 +17,7 @@ from devrf.fields.deformation import DeformationField
 from devrf.fields.occupancy import Occupancy
 from devrf.losses.composer import WeightedLoss
 from devrf.losses.motion import MOTION_TERMS, MotionPrediction, total_variation_weight
+from devrf.losses.photometric import visibility
 from devrf.ops.adam import GridAdam
 from devrf.ops.spans import span
 from devrf.ops.total_variation import add_total_variation_gradient
@@ -60,6 +61,7 @@ class DeformationStage(ScheduledStage):
 
     name: ClassVar[str] = "deformation"
     capture: ClassVar[CaptureName] = "dynamic"
+    costly: ClassVar[tuple[str, ...]] = ("schedule.deformation.sides", "schedule.deformation.rays")
 
     def __init__(
         self,
@@ -259,10 +261,10 @@ class DeformationStage(ScheduledStage):
             pool = self.visit.pools[self.iteration % len(self.visit.pools)]
             image, flat = pool.draw(share(self.schedule.rays), self.generator)
             background = background_color(self.scene.background, len(image), self.generator)
-            batch = gather_batch(views, image, flat, background, space)
+            batch = self.parts.of(gather_batch(views, image, flat, background, space))
         model = self.scene_model
         output = render(
-            batch.rays, model.canonical, self.visit.occupancy, model.settings, background,
+            batch.rays, model.canonical, self.visit.occupancy, model.settings, batch.background,
             self._warp,
         )
         prediction = MotionPrediction(
@@ -270,7 +272,13 @@ class DeformationStage(ScheduledStage):
             space,
         )
         with span("losses"):
-            return self.losses(prediction)
+            total, terms = self.losses(prediction)
+            return total, {**terms, **visibility(prediction)}
+
+    def go_back(self, iteration: int, caution: float) -> None:
+        """Go on from an earlier iteration of the present visit; look anew where matter is."""
+        super().go_back(iteration, caution)
+        self._look_around()
 
     @torch.no_grad()
     def add_gradients(self) -> None:
