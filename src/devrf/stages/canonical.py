@@ -19,8 +19,9 @@ from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.losses.composer import WeightedLoss
 from devrf.losses.motion import total_variation_weight
-from devrf.losses.photometric import PHOTOMETRIC_TERMS, Prediction
+from devrf.losses.photometric import PHOTOMETRIC_TERMS, Prediction, visibility
 from devrf.ops.adam import GridAdam
+from devrf.ops.spans import span
 from devrf.rendering.model import SceneModel
 from devrf.rendering.render import RenderSettings
 from devrf.scenes.scene import CaptureName, Views
@@ -47,6 +48,7 @@ class CanonicalStage(ScheduledStage):
 
     name: ClassVar[str] = "canonical"
     capture: ClassVar[CaptureName] = "static"
+    costly: ClassVar[tuple[str, ...]] = ("schedule.canonical.side", "schedule.canonical.rays")
 
     def __init__(
         self,
@@ -228,6 +230,11 @@ class CanonicalStage(ScheduledStage):
                 for image in range(len(views))
             ]
         )
+        if not bool(kept.any()):
+            raise DevrfError(
+                f"the field has become empty by iteration {self.iteration}: check data.background, "
+                "data.box and data.near, or lower schedule.rates.density"
+            )
         return PixelPool(pool.image[kept], pool.flat[kept])
 
     def _hand_over(self, cameras: Cameras, *, skip_zero: bool) -> None:
@@ -265,11 +272,18 @@ class CanonicalStage(ScheduledStage):
     def loss(self, views: Views, pixels: Pixels) -> tuple[Tensor, dict[str, Tensor]]:
         """Render a batch of pixels and compare it with the images."""
         assert isinstance(self.phase, CanonicalPhase)
-        batch = gather_batch(
-            views, pixels.image, pixels.flat, pixels.background, self.scene.space
+        with span("batch"):
+            batch = self.parts.of(
+                gather_batch(
+                    views, pixels.image, pixels.flat, pixels.background, self.scene.space
+                )
+            )
+        prediction = Prediction(
+            self.see(batch.rays, self.model.occupancy, batch.background), batch
         )
-        output = self.see(batch.rays, self.model.occupancy, batch.background)
-        return self.losses[self.phase.kind](Prediction(output, batch))
+        with span("losses"):
+            total, terms = self.losses[self.phase.kind](prediction)
+            return total, {**terms, **visibility(prediction)}
 
     @torch.no_grad()
     def on_train_end(self) -> None:

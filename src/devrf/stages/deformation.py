@@ -17,7 +17,9 @@ from devrf.fields.deformation import DeformationField
 from devrf.fields.occupancy import Occupancy
 from devrf.losses.composer import WeightedLoss
 from devrf.losses.motion import MOTION_TERMS, MotionPrediction, total_variation_weight
+from devrf.losses.photometric import visibility
 from devrf.ops.adam import GridAdam
+from devrf.ops.spans import span
 from devrf.rendering.model import SceneModel, deformed_occupancy
 from devrf.scenes.scene import CaptureName, Views
 from devrf.stages.checkpoint import Passport, Stored
@@ -44,6 +46,7 @@ class DeformationStage(ScheduledStage):
 
     name: ClassVar[str] = "deformation"
     capture: ClassVar[CaptureName] = "dynamic"
+    costly: ClassVar[tuple[str, ...]] = ("schedule.deformation.sides", "schedule.deformation.rays")
 
     def __init__(
         self,
@@ -285,7 +288,8 @@ class DeformationStage(ScheduledStage):
         assert isinstance(self.phase, DeformationPhase)
         since = self.iteration - self.phase.start
         if since and since % self.motion.occupancy_every == 0:
-            self._look_around()
+            with span("sampling"):
+                self._look_around()
 
     def draw(self) -> Pixels:
         """Random pixels of the visited frame, of its views by turns or of all."""
@@ -298,13 +302,23 @@ class DeformationStage(ScheduledStage):
         """Render a batch of the visited frame through its warp; compare images and motion."""
         assert self._previous is not None
         visit, space = self.visit, self.scene_model.space
-        batch = gather_batch(views, pixels.image, pixels.flat, pixels.background, space)
+        with span("batch"):
+            batch = self.parts.of(
+                gather_batch(views, pixels.image, pixels.flat, pixels.background, space)
+            )
         output = self.see(batch.rays, visit.occupancy, batch.background, visit.warp)
         before = visit.unwarp_previous(looked_up=self.room is not None)
         prediction = MotionPrediction(
             output, batch, visit.unwarp, before, views.cameras, self._previous, space
         )
-        return self.losses(prediction)
+        with span("losses"):
+            total, terms = self.losses(prediction)
+            return total, {**terms, **visibility(prediction)}
+
+    def go_back(self, iteration: int, caution: float) -> None:
+        """Go on from an earlier iteration of the present visit; look anew where matter is."""
+        super().go_back(iteration, caution)
+        self._look_around()
 
     def at_hand(self) -> dict[str, Any]:
         """Where the visited frame's matter was last seen, and the pixels to learn from.

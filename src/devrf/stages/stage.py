@@ -21,15 +21,19 @@ from devrf.fields.warp import GridWarp
 from devrf.geometry.rays import Rays
 from devrf.ops.adam import GridAdam
 from devrf.ops.choice import triton_runs
+from devrf.ops.spans import measured, span
 from devrf.rendering.fused import render_in_lists
 from devrf.rendering.model import SceneModel
+from devrf.rendering.player import Player
 from devrf.rendering.render import RenderOutput, render
 from devrf.rendering.room import Room
 from devrf.scenes.scene import CaptureName, Scene, Views
+from devrf.shortage import ShortageError, give_back, is_shortage
 from devrf.stages.checkpoint import Passport, check_scene, passport_in
 from devrf.stages.compact_state import compact_state
 from devrf.stages.held_out import score
 from devrf.stages.memory import StageMemory
+from devrf.stages.parts import Parts
 from devrf.stages.progress import random_states, set_random_states
 from devrf.stages.ranks import (
     RaysByRank,
@@ -70,6 +74,7 @@ class ScheduledStage(LightningModule, ABC):
     Attributes:
         name: what the stage is called in files and messages.
         capture: the part of the scene that is learned from.
+        costly: the config keys that its memory depends on most.
         iteration: optimiser iterations done.
         phase: the stretch of the schedule that the grids are ready for; None before the first.
         record: what training took, once a ``TrainingRecord`` callback has measured it.
@@ -78,10 +83,15 @@ class ScheduledStage(LightningModule, ABC):
         made_with: the settings that decide what is learned, by config key, if somebody told.
         graphs: whether steady iterations are captured in a CUDA graph where that is possible.
         room: the length of the lists of samples; None while they are as long as need be.
+        parts: how batches are divided when memory runs out.
+        back_offs: how often learning went wrong and was taken back.
+        caution: what the scheduled learning rates are multiplied by; below 1 after a back-off.
+        gave_up: why the stage ended before its schedule; None while it has not.
     """
 
     name: ClassVar[str]
     capture: ClassVar[CaptureName]
+    costly: ClassVar[tuple[str, ...]]
 
     def __init__(self, iterations_per_step: int, graphs: Graphs = "auto") -> None:
         super().__init__()
@@ -98,6 +108,10 @@ class ScheduledStage(LightningModule, ABC):
         self._repeated: Repeated | None = None
         self._seed = 0
         self.made_with: dict[str, Any] = {}
+        self.parts = Parts()
+        self.back_offs = 0
+        self.caution = 1.0
+        self.gave_up: str | None = None
         self._left_off: dict[str, Any] | None = None
 
     @property
@@ -171,7 +185,8 @@ class ScheduledStage(LightningModule, ABC):
         them.
         """
         self._sums, self._pixels, self._repeated, self.room = {}, None, None, None
-        if triton_runs(self.model_now.canonical.density.values):
+        # A batch that is taken in parts is not the same work each time.
+        if self.parts.count == 1 and triton_runs(self.model_now.canonical.density.values):
             self.room = Room(share(rays), self.device)
             self.optimizer.keep_gradients()
 
@@ -197,18 +212,66 @@ class ScheduledStage(LightningModule, ABC):
             log.info("%s: needs %s on the %s", self.name, self.memory().in_words(), self.device)
 
     def on_fit_end(self) -> None:
-        """See that every process has come to the same fields."""
+        """See that every process has come to the same fields.
+
+        Raises:
+            DevrfError: they have not, or the stage gave up.
+        """
+        if self.gave_up is not None:
+            raise DevrfError(self.gave_up)
         if self.iteration >= self.total_iterations:
             state = self.state_dict().items()
             check_alike({name: t for name, t in state if isinstance(t, Tensor)})
 
     def _draw_anew(self) -> None:
         """Seed the generator for the coming iterations, in each process differently."""
-        mixed = np.random.SeedSequence([self._seed, rank(), self.iteration])
+        mixed = np.random.SeedSequence([self._seed, rank(), self.iteration, self.back_offs])
         self.generator.manual_seed(int(mixed.generate_state(1, np.uint64)[0]))
 
-    def training_step(self, views: Views, batch_idx: int) -> None:
-        """Run iterations up to ``iterations_per_step``, never beyond the present phase."""
+    def where(self, iteration: int) -> str:
+        """An iteration of the present phase, its frame and its resolution, in words."""
+        frame = f"frame {self.phase.frame}, " if isinstance(self.phase, DeformationPhase) else ""
+        shape = "x".join(str(n) for n in self.resolution)
+        return f"iteration {iteration} of {self.total_iterations} ({frame}{shape})"
+
+    def give_up(self, why: str) -> None:
+        """End the stage after the present step, with a progress file if somebody writes one.
+
+        Args:
+            why: the line that the fit ends with.
+        """
+        self.gave_up = f"{self.name} stage: {why}"
+        self.trainer.should_stop = True
+
+    def go_back(self, iteration: int, caution: float) -> None:
+        """Go on from an earlier iteration of the present phase, whose fields have been put back.
+
+        With fresh moments and other random numbers than the first time.
+
+        Args:
+            iteration: where to go on.
+            caution: what all learning rates are multiplied by from now on.
+        """
+        self.iteration = iteration
+        self.back_offs += 1
+        self.caution *= caution
+        for state in self.optimizer.state.values():
+            for value in state.values():
+                value.zero_()
+        self._draw_anew()
+        self.trainer.should_stop = False
+
+    def _backward(self, total: Tensor) -> None:
+        with span("backward"):
+            self.manual_backward(total)
+
+    def training_step(self, views: Views, batch_idx: int) -> dict[str, Tensor]:
+        """Run iterations up to ``iterations_per_step``, never beyond the present phase.
+
+        Returns:
+            The means of the loss and of its terms over these iterations, by name; empty if
+            memory ran out before the first.
+        """
         if self.phase != self.phase_at(self.iteration):
             raise DevrfError(
                 f"{type(self).__name__}: nobody prepared the phase of iteration "
@@ -221,17 +284,19 @@ class ScheduledStage(LightningModule, ABC):
         count = min(self.iterations_per_step, left)
         if self.trainer.max_steps > 0:
             count = min(count, self.trainer.max_steps - self.trainer.global_step)
+        first = self.iteration
         for _ in range(count):
-            self.prepare()
-            if self.room is None:
-                optimizer.zero_grad()
-                self._learn(views, self.draw())
-                optimizer.step()
-            else:
-                self._repeat(views, optimizer)
+            try:
+                self._iterate(views, optimizer)
+            except ShortageError as shortage:
+                self.give_up(f"{shortage} at {self.where(self.iteration)}; {self.remedy}")
+                break
             self.iteration += 1
         self._draw_anew()
-        means = {k: value / count for k, value in average(self._sums).items()}
+        if self.iteration == first:
+            return {}
+        done = self.iteration - first
+        means = {k: value / done for k, value in average(self._sums).items()}
         for value in self._sums.values():
             value.zero_()
         if self.room is not None and self.room.look():
@@ -240,12 +305,40 @@ class ScheduledStage(LightningModule, ABC):
         self.log_dict({**named, "step": float(self.iteration)})
         if self.iteration >= self.total_iterations:
             self.trainer.should_stop = True
+        return means
 
-    def _learn(self, views: Views, pixels: Pixels) -> None:
-        """The gradients of a batch; its loss and terms are added to the sums of this step."""
-        total, terms = self.loss(views, pixels)
-        if total.requires_grad:
-            self.manual_backward(total)
+    @property
+    def remedy(self) -> str:
+        """What to do when memory is short, in words."""
+        return (
+            "the same command goes on where there is more memory; with less, begin afresh "
+            f"(resume=false) with lower {' or '.join(self.costly)}, or higher data.downscale"
+        )
+
+    def _iterate(self, views: Views, optimizer: LightningOptimizer) -> None:
+        """One iteration, steady if there is room for it."""
+        self.prepare()
+        with span("batch"):
+            pixels = self.draw()
+        if self.room is not None and not self._repeat(views, pixels, optimizer):
+            log.warning("%s: out of memory: iterations are steady no longer", self.name)
+            self.room = self._repeated = self._pixels = None
+            give_back(self.device)
+        if self.room is None:
+            self._add_up(
+                *self.parts.gradients(
+                    lambda: self.loss(views, pixels), self._backward, optimizer.zero_grad,
+                    self.generator,
+                )
+            )
+            with span("optimiser"):
+                optimizer.step()
+
+    def _add_up(self, total: Tensor, terms: dict[str, Tensor]) -> None:
+        """Add the loss of an iteration, and its terms, to the sums of this step.
+
+        Its gradients are there: of several processes each has its own until now.
+        """
         groups = self.optimizer.param_groups
         average_gradients(p for group in groups for p in group["params"])
         for name, value in {"loss": total.detach(), **terms}.items():
@@ -254,10 +347,13 @@ class ScheduledStage(LightningModule, ABC):
             else:
                 self._sums[name] = value.clone()
 
-    def _repeat(self, views: Views, optimizer: LightningOptimizer) -> None:
-        """A steady iteration: the same work on the same tensors, with other pixels in them."""
+    def _repeat(self, views: Views, drawn: Pixels, optimizer: LightningOptimizer) -> bool:
+        """A steady iteration: the same work on the same tensors, with other pixels in them.
+
+        Returns:
+            False if memory ran out; then nothing was learned.
+        """
         assert self.room is not None
-        drawn = self.draw()
         if self._pixels is None:
             self._pixels = drawn.clone()
         else:
@@ -265,17 +361,28 @@ class ScheduledStage(LightningModule, ABC):
         pixels = self._pixels
 
         def work() -> None:
-            self._learn(views, pixels)
-            self.optimizer.apply()
+            total, terms = self.loss(views, pixels)
+            if total.requires_grad:
+                self._backward(total)
+            self._add_up(total, terms)
+            with span("optimiser"):
+                self.optimizer.apply()
 
         if self._repeated is None:
             self._repeated = Repeated(work, self._capturer())
-        with self.optimizer.stepping_by(self._repeated):
-            optimizer.step()
+        try:
+            # Parts are told apart where they are done one by one.
+            with self.optimizer.stepping_by(work if measured() else self._repeated):
+                optimizer.step()
+        except (RuntimeError, MemoryError) as error:
+            if not is_shortage(error):
+                raise
+            return False
         if self._repeated.is_warm:
             self.room.measure()
         if self._repeated.failed:
             self.graphs = "off"  # one warning is enough
+        return True
 
     def _capturer(self) -> Capturer | None:
         """How iterations are captured: on one GPU, if at all."""
@@ -290,7 +397,7 @@ class ScheduledStage(LightningModule, ABC):
         """
         scene = self.scene
         views = scene.capture(self.capture).test
-        view = score(self.model, views, index, scene.background, self.device)
+        view = score(Player(self.model), views, index, scene.background)
         scores = {"psnr": view.psnr, "ssim": view.ssim, "rest_pose_psnr": view.rest_pose_psnr}
         means = {f"test/{self.capture}/{k}": v for k, v in scores.items()}
         self.log_dict(means, batch_size=1, sync_dist=True)
@@ -324,6 +431,9 @@ class ScheduledStage(LightningModule, ABC):
                 "at_hand": {} if self.phase is None else self.at_hand(),
                 "seed": self._seed,
                 "random": random_states(self.device),
+                "parts": self.parts.count,
+                "back_offs": self.back_offs,
+                "caution": self.caution,
             }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -345,6 +455,8 @@ class ScheduledStage(LightningModule, ABC):
                 f"this is the {ours[0]} stage on one of {ours[1]}; give it its own schedule"
             )
         self.iteration, self._seed = kept["iteration"], kept["seed"]
+        self.parts.count = kept["parts"]
+        self.back_offs, self.caution = kept["back_offs"], kept["caution"]
         self.phase = None if kept["phase"] is None else self.phase_at(kept["phase"])
         self._left_off = kept
 
