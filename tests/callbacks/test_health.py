@@ -254,8 +254,8 @@ def test_a_frame_whose_loss_stands_out_is_told(
 ) -> None:
     usual = DeformationStage.loss
 
-    def dear(stage: DeformationStage, views: Any) -> Any:
-        total, terms = usual(stage, views)
+    def dear(stage: DeformationStage, views: Any, pixels: Any) -> Any:
+        total, terms = usual(stage, views, pixels)
         return total * (50.0 if stage.iteration >= 50 else 1.0), terms
 
     monkeypatch.setattr(DeformationStage, "loss", dear)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from devrf.ops.adam import GridAdam
+from devrf.ops.total_variation import add_total_variation_gradient
 
 SHAPE = (2, 3, 2, 2)
 
@@ -124,3 +125,85 @@ def test_a_parameter_without_gradient_stands_still_and_the_closure_is_asked() ->
 
     assert optimizer.step(closure).item() == 2.0
     assert parameter.item() == pytest.approx(0.9) and other.item() == 1.0
+
+
+def smooth_groups(values: Tensor, **settings: object) -> GridAdam:
+    return GridAdam([{"params": [values], "smoothing": 0.4, **settings}], lr=0.1)
+
+
+@pytest.mark.parametrize("touched_only", [False, True])
+def test_smoothing_adds_the_gradient_of_the_total_variation(
+    rng: torch.Generator, touched_only: bool
+) -> None:
+    start, grads = torch.randn(SHAPE, generator=rng, dtype=torch.float64), gradients(rng, 5)
+    grads = [grad.clamp(min=0) for grad in grads]
+    ours, theirs = (start.clone().requires_grad_() for _ in range(2))
+    smooth = smooth_groups(ours, touched_only=touched_only)
+    plain = GridAdam([theirs], lr=0.1)
+    for grad in grads:
+        more = torch.zeros_like(grad)
+        add_total_variation_gradient(theirs.detach(), more, 0.4)
+        run(plain, theirs, [grad + (more * (grad != 0) if touched_only else more)])
+        run(smooth, ours, [grad])
+    torch.testing.assert_close(ours, theirs)
+
+
+def test_smoothing_moves_what_the_loss_did_not_reach() -> None:
+    grid = torch.zeros(2, 2, 2, 1)
+    grid[0, 0, 0] = 1.0
+    reached, alone = (grid.clone().requires_grad_() for _ in range(2))
+    smooth_groups(reached).step()
+    assert reached[0, 0, 0].item() == pytest.approx(0.9)
+    smooth_groups(alone, touched_only=True).step()
+    assert torch.equal(alone.detach(), grid)
+
+
+def test_kept_gradients_stay_where_they_are_and_are_zero_after_a_step() -> None:
+    leaves = [torch.ones(1, 1, 1, 2, requires_grad=True), torch.ones(3, requires_grad=True)]
+    optimizer = GridAdam([{"params": [leaves[0]], "skip_zero": True}, {"params": [leaves[1]]}])
+    optimizer.keep_gradients()
+    places = [leaf.grad for leaf in leaves]
+    (2 * leaves[0].sum() + leaves[1].sum()).backward()
+    assert [leaf.grad for leaf in leaves] == places and places[0] is not None
+    assert places[0].flatten().tolist() == [2, 2]
+    optimizer.step()
+    assert leaves[0][0, 0, 0, 0].item() == pytest.approx(1 - 1e-3)
+    (leaves[0].sum() + leaves[1].sum()).backward()
+    optimizer.zero_grad()
+    for leaf, place in zip(leaves, places, strict=True):
+        assert leaf.grad is place and not place.any()
+    other = torch.ones(2, requires_grad=True)
+    optimizer.replace(1, [other])
+    assert other.grad is not None
+
+
+def test_what_is_forgotten_starts_afresh_in_the_same_memory() -> None:
+    parameter = torch.zeros(1, 1, 1, 1, requires_grad=True)
+    optimizer = GridAdam([parameter], lr=0.1)
+    optimizer.forget(0)
+    run(optimizer, parameter, [torch.ones(1, 1, 1, 1)] * 3)
+    moments = optimizer.state[parameter]["mean"]
+    optimizer.forget(0)
+    run(optimizer, parameter, [torch.full((1, 1, 1, 1), -5.0)])
+    assert optimizer.state[parameter]["mean"] is moments
+    assert parameter.item() == pytest.approx(-0.2)
+
+
+def test_other_work_may_stand_in_for_the_step_after_the_rates_are_set() -> None:
+    parameter = torch.zeros(1, 1, 1, 1, requires_grad=True)
+    optimizer, order = GridAdam([parameter], lr=0.5), []
+
+    def closure() -> None:
+        order.append("asked")
+        optimizer.param_groups[0]["lr"] = 0.25
+
+    def work() -> None:
+        order.append("work")
+        parameter.grad = torch.ones(1, 1, 1, 1)
+        optimizer.apply()
+
+    with optimizer.stepping_by(work):
+        optimizer.step(closure)
+    assert order == ["asked", "work"] and parameter.item() == pytest.approx(-0.25)
+    optimizer.step()
+    assert len(order) == 2

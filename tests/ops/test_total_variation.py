@@ -46,3 +46,13 @@ def test_gradient_value_passes_gradcheck(rng: torch.Generator) -> None:
     # Steps of up to 0.9 stay off the kink of the penalty's second derivative.
     grid = 0.3 * torch.rand(3, 3, 2, 1, generator=rng, dtype=torch.float64)
     assert torch.autograd.gradcheck(total_variation, (grid.requires_grad_(),))
+
+
+def test_only_what_is_touched_is_smoothed(rng: torch.Generator) -> None:
+    grid = torch.randn(3, 4, 2, 2, generator=rng)
+    gradient = torch.randn(3, 4, 2, 2, generator=rng).clamp(min=0)
+    everywhere, touched = gradient.clone(), gradient.clone()
+    add_total_variation_gradient(grid, everywhere, 0.3)
+    add_total_variation_gradient(grid, touched, 0.3, touched_only=True)
+    torch.testing.assert_close(touched, torch.where(gradient != 0, everywhere, 0.0))
+    assert (touched == 0).any() and (touched != 0).any()

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
-from lightning import Trainer
+from lightning import Callback, Trainer
+from torch import Tensor
 
 from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
@@ -60,23 +63,80 @@ def test_a_whole_schedule_sees_the_motion_better_than_the_rest_pose(
     assert min(gains[2:]) > 0.5 and sum(gains[2:]) / 4 > 1
 
 
+class Peak(Callback):
+    """Puts a peak into Δ_f before the first step, and looks at the moments behind it."""
+
+    mean: Tensor
+    values: Tensor
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: Any, *args: Any) -> None:
+        pl_module.visit.forward.data[1, 1, 1] = 0.5
+        self.values = pl_module.visit.forward.detach().clone().requires_grad_()
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, *args: Any) -> None:
+        self.mean = pl_module.optimizer.state[pl_module.visit.forward]["mean"].clone()
+
+
 def test_total_variation_alone_smooths_both_directions(
     rest: Stored, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
 ) -> None:
     # With "render" at a vanishing weight only the closed-form gradient moves Δ_f.
-    stage = DeformationStage(rest, SHORT, loss={"render": 1e-20, "tv": 1.0})
-    fit = trainer(max_steps=1)
-    fit.fit(stage, datamodule=datamodule)
+    stage, peak = DeformationStage(rest, SHORT, loss={"render": 1e-20, "tv": 1.0}), Peak()
+    trainer(peak, max_steps=1).fit(stage, datamodule=datamodule)
     forward = stage.field.to_time[1]
-    assert not forward.any()
-    forward[1, 1, 1] = 0.5
-    stage.visit.forward.grad = None
-    stage.add_gradients()
-    grad = stage.visit.forward.grad
-    assert grad is not None and grad[1, 1, 1, 0] > 0 and grad[0, 1, 1, 0] < 0
-    copied = forward.detach().clone().requires_grad_()
-    (slope,) = torch.autograd.grad(total_variation(copied), copied)
-    torch.testing.assert_close(grad, slope * (max(stage.field.shape) / 128 / 256 / 6))
+    assert forward[1, 1, 1, 0] < 0.5 and forward[0, 1, 1, 0] > 0
+    (slope,) = torch.autograd.grad(total_variation(peak.values), peak.values)
+    # The first step's mean is a tenth of the gradient.
+    expected = 0.1 * slope * (max(stage.field.shape) / 128 / 256 / 6)
+    torch.testing.assert_close(peak.mean, expected)
+
+
+class Look(Callback):
+    """Notes the frame's slices, and what others see of them, in the midst of a visit."""
+
+    def __init__(self) -> None:
+        self.seen: list[tuple[Tensor, Tensor, Tensor]] = []
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, *args: Any) -> None:
+        name = "scene_model.deformation.to_time"
+        frame, learned = pl_module.visit.frame, pl_module.visit.forward.detach().clone()
+        stored = pl_module.state_dict()[name][frame].clone()
+        field = pl_module.model.deformation
+        self.seen.append((learned, stored, field.to_time[frame].clone()))
+
+
+def test_whoever_looks_in_the_midst_of_a_visit_sees_what_it_has_learned(
+    rest: Stored, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
+) -> None:
+    stage, look = DeformationStage(rest, SHORT, FAST, iterations_per_step=7), Look()
+    trainer(look, max_steps=50).fit(stage, datamodule=datamodule)
+    assert len(look.seen) > 6
+    for learned, stored, seen in look.seen:
+        assert learned.any()
+        assert torch.equal(stored, learned) and torch.equal(seen, learned)
+    # The last visit is put back, and what happens to the field later is its own affair.
+    assert torch.equal(stage.field.to_time[2], look.seen[-1][0])
+    stage.field.to_time[2] += 1
+    assert torch.equal(stage.model.deformation.to_time[2], look.seen[-1][0] + 1)
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_where_the_field_rests_changes_what_is_learned_by_its_rounding_alone(
+    rest: Stored, datamodule: SceneDataModule, trainer: Callable[..., Trainer], half: bool
+) -> None:
+    fields = []
+    for store, rounded in (("device", False), ("host", half)):
+        torch.manual_seed(0)
+        motion = replace(FAST, store=store, store_half=rounded)
+        stage = DeformationStage(rest, SHORT, motion)
+        trainer(max_epochs=1).fit(stage, datamodule=datamodule)
+        assert stage.field.to_time.dtype == (torch.float16 if rounded else torch.float32)
+        fields.append(stage.field.to_canonical.float())
+    if half:
+        assert not torch.equal(*fields)
+        torch.testing.assert_close(*fields, atol=0.05, rtol=0)
+    else:
+        assert torch.equal(*fields)
 
 
 def test_stages_built_on_one_rest_do_not_meet(

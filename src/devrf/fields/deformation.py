@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from devrf.fields.grid import resample
+from devrf.fields.warp import GridWarp
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
-from devrf.ops.trilinear import interpolate
+
+log = logging.getLogger(__name__)
+
+Directions = tuple[Tensor, Tensor]
 
 
 class DeformationField(nn.Module):
@@ -21,15 +27,21 @@ class DeformationField(nn.Module):
     interpolation in space makes the quadruple interpolation. Frame 0 is zero and is never
     trained: at t = 0 the warp is the identity, exactly.
 
+    All frames together are large, and few are needed at a time: they may rest on the host, or in
+    half precision (:meth:`rest`). Whatever is taken out of the field is in single precision and on
+    the device that the module is on.
+
     Attributes:
         to_canonical: (T, X, Y, Z, 3) Δ_b in the box's units.
         to_time: (T, X, Y, Z, 3) Δ_f in the box's units.
         box: where the field lives.
         clock: the times of the T frames.
+        on_host: whether the displacements stay on the host wherever the module goes.
     """
 
     to_canonical: Tensor
     to_time: Tensor
+    here: Tensor
 
     def __init__(self, box: Box, clock: FrameClock, *, voxels: int) -> None:
         """A field at rest: no displacement anywhere.
@@ -42,9 +54,14 @@ class DeformationField(nn.Module):
         super().__init__()
         self.box = box
         self.clock = clock
+        self.on_host = False
         shape = (len(clock), *box.grid_shape(voxels), 3)
         self.register_buffer("to_canonical", torch.zeros(shape))
         self.register_buffer("to_time", torch.zeros(shape))
+        # It goes where the module goes, and so tells where that is.
+        self.register_buffer("here", torch.zeros(0), persistent=False)
+        self._coming: tuple[int, Directions] | None = None
+        self._side: torch.cuda.Stream | None = None
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -54,20 +71,25 @@ class DeformationField(nn.Module):
 
     def warp(self, points: Tensor, time: float) -> Tensor:
         """Canonical positions (M, 3) of ``points`` (M, 3) at ``time``; the identity at 0."""
-        return points + self.displacement(self.to_canonical, points, time)
+        return self.warp_at(time)(points)
 
     def unwarp(self, points: Tensor, time: float) -> Tensor:
         """Positions (M, 3) at ``time`` of canonical ``points`` (M, 3); the identity at 0."""
-        return points + self.displacement(self.to_time, points, time)
+        return self.unwarp_at(time)(points)
 
-    def displacement(self, frames: Tensor, points: Tensor, time: float) -> Tensor:
-        """4-linear interpolation (M, 3) of ``frames`` (T, X, Y, Z, 3) at ``points``, ``time``."""
+    def warp_at(self, time: float) -> GridWarp:
+        """The map of points at ``time`` into canonical space."""
+        return self._at(self.to_canonical, time)
+
+    def unwarp_at(self, time: float) -> GridWarp:
+        """The map of canonical points to where they are at ``time``."""
+        return self._at(self.to_time, time)
+
+    def _at(self, frames: Tensor, time: float) -> GridWarp:
         moment = self.clock.at(time)
-        coords = self.box.to_grid(points, self.shape)
-        value = interpolate(frames[moment.before], coords)
-        if moment.weight == 0.0:
-            return value
-        return value.lerp(interpolate(frames[moment.after], coords), moment.weight)
+        chosen = (moment.before,) if moment.weight == 0.0 else (moment.before, moment.after)
+        slices = tuple(frames[k].to(self.here) for k in chosen if len(chosen) > 1 or k)
+        return GridWarp(slices, self.box, moment.weight)
 
     def blended(self, frames: Tensor, time: float) -> Tensor:
         """The one grid (X, Y, Z, 3) that says at ``time`` what ``frames`` (T, X, Y, Z, 3) say.
@@ -79,7 +101,7 @@ class DeformationField(nn.Module):
         before = frames[moment.before]
         return before.lerp(frames[moment.after], moment.weight) if moment.weight else before
 
-    def slice(self, frame: int) -> tuple[Tensor, Tensor]:
+    def slice(self, frame: int) -> Directions:
         """Leaves that share the memory of one frame, for an optimiser to step on in place.
 
         Args:
@@ -88,14 +110,76 @@ class DeformationField(nn.Module):
         Returns:
             backward and forward displacements (X, Y, Z, 3), requiring gradients.
         """
-        if not 1 <= frame < len(self.clock):
-            raise IndexError(f"frame {frame} cannot be trained: only 1 to {len(self.clock) - 1}")
+        self._check(frame)
         leaves = (self.to_canonical[frame].detach(), self.to_time[frame].detach())
         return leaves[0].requires_grad_(), leaves[1].requires_grad_()
+
+    def _check(self, frame: int) -> None:
+        if not 1 <= frame < len(self.clock):
+            raise IndexError(f"frame {frame} cannot be trained: only 1 to {len(self.clock) - 1}")
+
+    @torch.no_grad()
+    def read(self, frame: int, into: Directions) -> None:
+        """Copy a frame out of the field, without waiting for the device.
+
+        Args:
+            frame: which.
+            into: backward and forward displacements (X, Y, Z, 3), overwritten.
+        """
+        source = (self.to_canonical[frame], self.to_time[frame])
+        if self._coming is not None and self._coming[0] == frame:
+            assert self._side is not None
+            present = torch.cuda.current_stream(self.here.device)
+            present.wait_stream(self._side)
+            source = self._coming[1]
+            for tensor in source:
+                tensor.record_stream(present)
+        self._coming = None
+        for tensor, value in zip(into, source, strict=True):
+            tensor.copy_(value, non_blocking=True)
+
+    @torch.no_grad()
+    def read_forward(self, frame: int, into: Tensor) -> None:
+        """As :meth:`read`, of the forward displacements alone."""
+        into.copy_(self.to_time[frame], non_blocking=True)
+
+    @torch.no_grad()
+    def write(self, frame: int, displacements: Directions) -> None:
+        """Copy a frame back: backward and forward ``displacements`` (X, Y, Z, 3).
+
+        A device that is not the frames' own need not have come to it when this returns:
+        :meth:`settle` before the host looks at them.
+        """
+        self._check(frame)
+        for frames, value in zip((self.to_canonical, self.to_time), displacements, strict=True):
+            frames[frame].copy_(value, non_blocking=True)
+
+    def settle(self) -> None:
+        """Wait until the host sees everything that was written."""
+        if self.on_host and self.here.is_cuda:
+            torch.cuda.current_stream(self.here.device).synchronize()
+
+    @torch.no_grad()
+    def expect(self, frame: int) -> None:
+        """Begin to fetch a frame from the host, beside other work: it is read next."""
+        if not (self.on_host and self.here.is_cuda):
+            return
+        device = self.here.device
+        if self._side is None:
+            self._side = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+        # What was written to the frame has to be there first.
+        self._side.wait_stream(torch.cuda.current_stream(device))
+        with torch.cuda.stream(self._side):
+            fetched = tuple(
+                frames[frame].to(device, non_blocking=True)
+                for frames in (self.to_canonical, self.to_time)
+            )
+        self._coming = (frame, (fetched[0], fetched[1]))
 
     @torch.no_grad()
     def carry(self, frame: int) -> None:
         """Start ``frame`` from the frame before it, in both directions."""
+        self.settle()
         self.to_canonical[frame] = self.to_canonical[frame - 1]
         self.to_time[frame] = self.to_time[frame - 1]
 
@@ -103,16 +187,55 @@ class DeformationField(nn.Module):
     def resize(self, voxels: int) -> None:
         """Resample every frame to about ``voxels`` voxels, trilinearly."""
         shape = self.box.grid_shape(voxels)
-        self.to_canonical = _resampled(self.to_canonical, shape)
-        self.to_time = _resampled(self.to_time, shape)
+        for name in ("to_canonical", "to_time"):
+            frames = getattr(self, name)
+            resized = self._room((len(frames), *shape, 3), frames.dtype)
+            # Each written to its place: no copy of all.
+            for into, frame in zip(resized, frames, strict=True):
+                into.copy_(resample(frame.to(self.here), shape), non_blocking=True)
+            self.settle()
+            setattr(self, name, resized)
+
+    @torch.no_grad()
+    def rest(self, *, on_host: bool, half: bool) -> None:
+        """Say where the displacements rest, and how.
+
+        Args:
+            on_host: keep them on the host, in memory that a CUDA device reaches beside its work.
+            half: keep them in half precision: to 1/2048 of each value.
+        """
+        self.on_host = on_host
+        for name in ("to_canonical", "to_time"):
+            frames = getattr(self, name)
+            moved = self._room(frames.shape, torch.float16 if half else torch.float32)
+            setattr(self, name, moved.copy_(frames))
+
+    def _room(self, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+        """An uninitialised tensor where displacements rest."""
+        if not self.on_host:
+            return torch.empty(shape, dtype=dtype, device=self.here.device)
+        if torch.cuda.is_available():
+            try:
+                return torch.empty(shape, dtype=dtype, pin_memory=True)
+            except RuntimeError as error:
+                reason = str(error).splitlines()[0]
+                log.warning("displacements are fetched slowly: no page-locked memory (%s)", reason)
+        return torch.empty(shape, dtype=dtype)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> DeformationField:
+        kept = ("to_canonical", "to_time") if self.on_host else ()
+        frames = {name: self._buffers.pop(name) for name in kept}
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
+        self._buffers.update(frames)
+        return self
 
     def _load_from_state_dict(
         self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
     ) -> None:
         for name in ("to_canonical", "to_time"):
-            stored = state_dict.get(prefix + name)
-            if stored is not None and stored.shape != getattr(self, name).shape:
-                setattr(self, name, getattr(self, name).new_empty(stored.shape))
+            stored, frames = state_dict.get(prefix + name), getattr(self, name)
+            if stored is not None and stored.shape != frames.shape:
+                setattr(self, name, self._room(stored.shape, frames.dtype))
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     def get_extra_state(self) -> dict[str, Any]:
@@ -127,11 +250,3 @@ class DeformationField(nn.Module):
         """Restore what :meth:`get_extra_state` gave."""
         self.box = Box.of(state["low"], state["high"])
         self.clock = FrameClock(tuple(state["times"]))
-
-
-def _resampled(frames: Tensor, shape: tuple[int, int, int]) -> Tensor:
-    """Frames (T, X, Y, Z, 3) at another resolution, each written to its place: no copy of all."""
-    resized = frames.new_empty(len(frames), *shape, 3)
-    for into, frame in zip(resized, frames, strict=True):
-        into.copy_(resample(frame, shape))
-    return resized

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from devrf.geometry.box import Box
-from devrf.ops.trilinear import interpolate
+from devrf.ops.corners import to_grid
+from devrf.ops.trilinear import interpolate, kept_gradient
 
 
 class VoxelGrid(nn.Module):
@@ -32,7 +33,8 @@ class VoxelGrid(nn.Module):
 
     def forward(self, points: Tensor, box: Box) -> Tensor:
         """Values (M, C) at ``points`` (M, 3) in the space of ``box``; outside, the border's."""
-        return interpolate(self.values, box.to_grid(points, self.shape))
+        coords = to_grid(points, box, self.shape)
+        return interpolate(self.values, coords, gradient=kept_gradient(self.values))
 
     @torch.no_grad()
     def resize(self, shape: tuple[int, int, int]) -> None:

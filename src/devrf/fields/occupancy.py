@@ -72,6 +72,11 @@ class Occupancy(nn.Module):
         self.vicinity = dilate(mask, self.REACH)
         self.box = box or self.box
 
+    def refill(self, other: Occupancy) -> None:
+        """Become another occupancy of the same shape and box, in the same memory."""
+        self.mask.copy_(other.mask)
+        self.vicinity.copy_(other.vicinity)
+
     def _load_from_state_dict(
         self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
     ) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -91,13 +92,18 @@ class Box:
         return torch.minimum(torch.maximum(points, low), high)
 
     def corners(self, like: Tensor) -> tuple[Tensor, Tensor]:
-        """The two corners (3,) as tensors with the dtype and device of ``like``."""
-        return like.new_tensor(self.low), like.new_tensor(self.high)
+        """The two corners (3,) as tensors with the dtype and device of ``like``; to be read only.
+
+        They are made once: a tensor made of Python's numbers at every step would make the device
+        wait for the host.
+        """
+        low, high = (_kept(corner, like.dtype, like.device) for corner in (self.low, self.high))
+        return low, high
 
     def to_grid(self, points: Tensor, shape: tuple[int, int, int]) -> Tensor:
         """Grid coordinates (..., 3): 0 on the low faces, shape − 1 on the high ones."""
         low, high = self.corners(points)
-        extent = points.new_tensor(shape) - 1
+        extent = _kept(shape, points.dtype, points.device) - 1
         return (points - low) * (extent / (high - low))
 
     def grid_points(self, shape: tuple[int, int, int], like: Tensor) -> Tensor:
@@ -127,3 +133,12 @@ class Box:
         a, b, c = (float(v) for v in low)
         d, e, f = (float(v) for v in high)
         return Box((a, b, c), (d, e, f))
+
+
+@lru_cache(maxsize=256)
+def _kept(
+    numbers: tuple[float, float, float], dtype: torch.dtype, device: torch.device
+) -> Tensor:
+    # A tensor made in inference mode could not be used for training later.
+    with torch.inference_mode(False):
+        return torch.tensor(numbers, dtype=dtype, device=device)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from devrf.geometry.cameras import Cameras
@@ -34,11 +35,15 @@ class MotionPrediction(Prediction):
 
 def cycle(prediction: MotionPrediction) -> Tensor:
     """Mean over samples of ½ |x − (q + Δ_f(q, t))|²: there and back again."""
-    points = prediction.output.samples.points
-    if len(points) == 0:
+    samples = prediction.output.samples
+    if len(samples) == 0:
         return prediction.output.canonical.sum()
     returned = prediction.unwarp(prediction.output.canonical)
-    return 0.5 * (points - returned).square().sum(dim=1).mean()
+    missed = 0.5 * (samples.points - returned).square().sum(dim=1)
+    if samples.present is None:
+        return missed.mean()
+    total = torch.where(samples.present, missed, 0.0).sum()
+    return total / samples.present.sum().clamp(min=1)
 
 
 def flow(prediction: MotionPrediction) -> Tensor:
@@ -51,16 +56,26 @@ def flow(prediction: MotionPrediction) -> Tensor:
     batch, output = prediction.batch, prediction.output
     if batch.flow is None or batch.flow_valid is None:
         return output.canonical.new_zeros(())
-    ray = output.samples.ray
-    kept = batch.flow_valid[ray].nonzero()[:, 0]
-    ray = ray[kept]
+    ray, canonical, weight = output.samples.ray, output.canonical, output.weight
+    counts = batch.flow_valid[ray]
+    if output.samples.present is None:
+        kept = counts.nonzero()[:, 0]
+        ray, canonical, weight = ray[kept], canonical[kept], weight[kept]
+        observed = batch.flow[ray]
+    else:
+        # A list of fixed length stays as long as it is: what does not count is made harmless,
+        # wherever it lies and whatever was observed there.
+        counts = (counts & output.samples.present)[:, None]
+        canonical = torch.where(counts, canonical, 0.0)
+        weight = torch.where(counts[:, 0], weight, 0.0)
+        observed = torch.where(counts, batch.flow[ray], 0.0)
     camera = prediction.previous_image[batch.image[ray]]
     induced = induced_flow(
-        output.canonical[kept], prediction.unwarp_previous, prediction.cameras, camera,
-        batch.pixel[ray], prediction.space,
+        canonical, prediction.unwarp_previous, prediction.cameras, camera, batch.pixel[ray],
+        prediction.space,
     )
-    error = (induced - batch.flow[ray]).abs().sum(dim=1)
-    return (output.weight[kept] * error).sum() / batch.flow_valid.sum().clamp(min=1)
+    error = (induced - observed).abs().sum(dim=1)
+    return (weight * error).sum() / batch.flow_valid.sum().clamp(min=1)
 
 
 def induced_flow(

@@ -138,21 +138,39 @@ def _step_touched(
     """As :func:`_step_all` on the rows with a gradient: most of a grid is not touched."""
     beta1, beta2 = rule.betas
     channels = values.shape[-1]
-    flat_grad = grad.reshape(-1, channels)
-    rows = (flat_grad != 0).any(dim=1).nonzero()[:, 0]
-    g = flat_grad[rows]
+    flat_grad = grad.reshape(-1, channels).contiguous()
+    rows = _touched_rows(flat_grad)
+    g = flat_grad.index_select(0, rows)
     touched = g != 0
     means, squares = mean.view(-1, channels), square.view(-1, channels)
-    m, s = means[rows], squares[rows]
+    m, s = means.index_select(0, rows), squares.index_select(0, rows)
     m = torch.where(touched, m + (1 - beta1) * (g - m), m)
     s = torch.where(touched, s + (1 - beta2) * (g * g - s), s)
-    means[rows], squares[rows] = m, s
+    means.index_copy_(0, rows, m)
+    squares.index_copy_(0, rows, s)
     size, correction = _step_size(rule)
     move = m / (s / correction).sqrt_().add_(rule.eps)
     if rule.pace is not None:
         move *= rule.pace.view(-1, 1)[rows]
     table = values.view(-1, channels)
-    table[rows] = table[rows] - size * torch.where(touched, move, torch.zeros_like(move))
+    before = table.index_select(0, rows)
+    after = before - size * torch.where(touched, move, torch.zeros_like(move))
+    table.index_copy_(0, rows, after)
+
+
+def _touched_rows(table: Tensor) -> Tensor:
+    """The rows (K,) of a table (N, C) that are not zero; some that are may be among them.
+
+    Bits are put together word by word, two floats at a time if they come in pairs: a third of the
+    time that it takes to compare each with zero.
+    """
+    size = table.element_size()
+    pairs = table.shape[1] * size % 8 == 0 == table.storage_offset() * size % 8
+    words = table.view(torch.int64 if pairs else torch.int32).unbind(1)
+    bits = words[0]
+    for word in words[1:]:
+        bits = bits | word
+    return bits.nonzero()[:, 0]
 
 
 def _step_size(rule: AdamRule) -> tuple[Tensor, Tensor]:

@@ -136,7 +136,7 @@ def find_samples(
     samples = count.clamp(max=longest)
     ray = torch.repeat_interleave(samples)
     number = torch.arange(len(ray), device=ray.device) - (samples.cumsum(0) - samples)[ray]
-    distance = entry[ray] + step * number
+    distance = torch.add(entry[ray], number, alpha=step)
     points = torch.addcmul(origins[ray], directions[ray], distance[:, None])
     kept = _occupied(mask, to_grid(points, mask_box, shape_of(mask))).nonzero()[:, 0]
     ray, distance, points = ray[kept], distance[kept], points[kept]

@@ -127,10 +127,12 @@ def compositing(draw: Draw) -> Results:
 
 
 def total_variation(draw: Draw) -> Results:
-    """The gradient is added."""
-    grid, gradient = 2 * draw(4, 3, 5, 3), draw(4, 3, 5, 3)
+    """The gradient is added, everywhere and to what is touched."""
+    grid, gradient = 2 * draw(4, 3, 5, 3), draw(4, 3, 5, 3).clamp(min=0)
+    add_total_variation_gradient(grid, gradient, 0.3, touched_only=True)
+    before = gradient.clone()
     add_total_variation_gradient(grid, gradient, 0.3)
-    return (gradient,)
+    return before, gradient
 
 
 def adam(draw: Draw) -> Results:

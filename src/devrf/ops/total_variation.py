@@ -25,7 +25,9 @@ def total_variation(grid: Tensor) -> Tensor:
     ).sum()
 
 
-def add_total_variation_gradient(grid: Tensor, gradient: Tensor, weight: float) -> None:
+def add_total_variation_gradient(
+    grid: Tensor, gradient: Tensor, weight: float, *, touched_only: bool = False
+) -> None:
     """Add ``weight`` · ∂ total_variation(grid) / ∂ grid to ``gradient`` in place (method §3, TV).
 
     The derivative at a voxel is Σ_neighbours clamp(v − v', −1, 1); it is added without building
@@ -35,18 +37,22 @@ def add_total_variation_gradient(grid: Tensor, gradient: Tensor, weight: float) 
         grid: (X, Y, Z, C).
         gradient: the same shape.
         weight: factor of the penalty.
+        touched_only: add to entries that are not zero alone.
     """
     if grid.is_contiguous() and gradient.is_contiguous() and triton_runs(grid, gradient):
         from devrf.ops.kernels.adam import add_gradient_in_one_pass
 
-        add_gradient_in_one_pass(grid, gradient, weight)
+        add_gradient_in_one_pass(grid, gradient, weight, touched_only=touched_only)
         return
+    into = torch.zeros_like(gradient) if touched_only else gradient
     for axis in range(3):
         after, before = _neighbours(grid, axis)
         slope = (after - before).clamp_(-1, 1)
-        into_after, into_before = _neighbours(gradient, axis)
+        into_after, into_before = _neighbours(into, axis)
         into_after.add_(slope, alpha=weight)
         into_before.sub_(slope, alpha=weight)
+    if touched_only:
+        gradient += into * (gradient != 0)
 
 
 def _neighbours(grid: Tensor, axis: int) -> tuple[Tensor, Tensor]:

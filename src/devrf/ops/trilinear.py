@@ -47,6 +47,15 @@ def interpolate(grid: Tensor, coords: Tensor, *, gradient: Tensor | None = None)
     return values
 
 
+def kept_gradient(leaf: Tensor) -> Tensor | None:
+    """What the gradient of ``leaf`` is to be added to: the gradient that it has, if it has one.
+
+    As autograd would add it, but without a tensor of the grid's size in between. For
+    ``gradient`` of :func:`interpolate`.
+    """
+    return leaf.grad if leaf.requires_grad and leaf.is_leaf else None
+
+
 class _Interpolate(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, grid: Tensor, coords: Tensor, gradient: Tensor | None) -> Tensor:

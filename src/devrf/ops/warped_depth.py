@@ -23,7 +23,7 @@ def warped_depth(
     shift: float,
     delta: float,
     density_gradient: Tensor | None = None,
-    slice_gradients: Sequence[Tensor] = (),
+    slice_gradients: Sequence[Tensor | None] = (),
 ) -> tuple[Tensor, Tensor]:
     """Where points lie in canonical space, and how opaque it is there (method §2 and §3).
 
@@ -41,7 +41,7 @@ def warped_depth(
         shift: b, what is added to a raw density.
         delta: δ, the length of a step in base voxels.
         density_gradient: as ``gradient`` of :func:`~devrf.ops.trilinear.interpolate`.
-        slice_gradients: the same for each of ``slices``; empty for none.
+        slice_gradients: the same for each of ``slices``, or None; empty for none at all.
 
     Returns:
         q (M, 3) and τ (M,), differentiable once in ``density`` and ``slices``; the gradient of τ

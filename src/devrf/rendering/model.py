@@ -50,7 +50,7 @@ class SceneModel(nn.Module):
         deformation = self.deformation
         if deformation is None or deformation.clock.at(time).after == 0:
             return None
-        return lambda points: deformation.warp(points, time)
+        return deformation.warp_at(time)
 
     def occupancy_at(self, time: float) -> Occupancy:
         """Where something is at ``time`` in [0, 1]."""

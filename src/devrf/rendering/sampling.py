@@ -21,12 +21,16 @@ class Samples:
         distance: (S,) along the ray, in units of its direction.
         points: (S, 3) positions in the fields' space.
         rays: R, how many rays there are.
+        present: None, or (S,) bool where the list is longer than need be: which places are
+            samples. The others have no weight; what else stands there is finite, but means
+            nothing.
     """
 
     ray: Tensor
     distance: Tensor
     points: Tensor
     rays: int
+    present: Tensor | None = None
 
     def __len__(self) -> int:
         return self.ray.shape[0]
@@ -38,6 +42,7 @@ class Samples:
             self.distance.index_select(0, index),
             self.points.t().index_select(1, index).t(),
             self.rays,
+            None if self.present is None else self.present.index_select(0, index),
         )
 
 
@@ -54,6 +59,12 @@ def steps_through(
     # The sample on the way out counts: in NDC it is the last plane, which closes the scene.
     count = torch.where(leave >= entry, ((leave - entry) / step + 1e-3).floor() + 1, 0.0)
     return entry, count.long()
+
+
+def most_steps(box: Box, *, step: float, near: float, far: float) -> int:
+    """No ray has more samples, whose direction is at least of length 1: arguments as above."""
+    diagonal = sum(edge**2 for edge in box.size) ** 0.5
+    return int(min(far - near, diagonal) / step) + 2
 
 
 @torch.no_grad()

@@ -31,8 +31,10 @@ def inspect(run: RunContext) -> None:
     """Say and draw what the scene holds and what may be wrong with it; learn nothing."""
     canonical = instantiate(run.config.canonical, _convert_="all")
     moving = instantiate(run.config.deformation.schedule, _convert_="all")
+    motion = instantiate(run.config.deformation.motion, _convert_="all")
     budget = estimate(
-        run.scene, canonical.schedule, moving, canonical.architecture, canonical.sampling.step
+        run.scene, canonical.schedule, moving, canonical.architecture, canonical.sampling.step,
+        motion,
     )
     found = inspect_scene(run.scene)
     console = Console()

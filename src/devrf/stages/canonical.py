@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from devrf.data.batch import background_color, gather_batch
+from devrf.data.batch import Pixels, background_color, gather_batch
 from devrf.data.pool import PixelPool, all_pixels
 from devrf.errors import DevrfError
 from devrf.fields.architecture import Architecture
@@ -22,13 +22,14 @@ from devrf.losses.motion import total_variation_weight
 from devrf.losses.photometric import PHOTOMETRIC_TERMS, Prediction, visibility
 from devrf.ops.adam import GridAdam
 from devrf.ops.spans import span
-from devrf.ops.total_variation import add_total_variation_gradient
 from devrf.rendering.model import SceneModel
-from devrf.rendering.render import RenderSettings, render
+from devrf.rendering.render import RenderSettings
 from devrf.scenes.scene import CaptureName, Views
 from devrf.stages.checkpoint import Passport, Stored
+from devrf.stages.memory import StageMemory, canonical_memory
 from devrf.stages.progress import pack, unpack
 from devrf.stages.ranks import share
+from devrf.stages.replay import Graphs
 from devrf.stages.schedules import CanonicalPhase, CanonicalSchedule
 from devrf.stages.settings import FINE_LOSS, SEARCH_LOSS, CanonicalRates, Sampling
 from devrf.stages.stage import Phase, ScheduledStage
@@ -58,6 +59,7 @@ class CanonicalStage(ScheduledStage):
         search_loss: Mapping[str, float] = SEARCH_LOSS,
         fine_loss: Mapping[str, float] = FINE_LOSS,
         iterations_per_step: int = 10,
+        graphs: Graphs = "auto",
     ) -> None:
         """Build the stage; the defaults are the paper's for inward-facing scenes.
 
@@ -70,8 +72,9 @@ class CanonicalStage(ScheduledStage):
                 ``tv`` is the total variation of both grids.
             fine_loss: their weights afterwards.
             iterations_per_step: optimiser iterations in one Lightning step.
+            graphs: whether a GPU replays iterations from CUDA graphs: ``auto`` where it can.
         """
-        super().__init__(iterations_per_step)
+        super().__init__(iterations_per_step, graphs)
         self.schedule = schedule or CanonicalSchedule()
         self.architecture = architecture or Architecture()
         self.rates = rates or CanonicalRates()
@@ -95,6 +98,17 @@ class CanonicalStage(ScheduledStage):
         """The rest state learned so far."""
         assert self.scene_model is not None, "the stage has not been set up"
         return self.scene_model
+
+    @property
+    def model_now(self) -> SceneModel:
+        """The same."""
+        return self.model
+
+    def memory(self) -> StageMemory:
+        """Counted from the schedule."""
+        return canonical_memory(
+            self.scene, self.schedule, self.architecture, self.sampling.step
+        )
 
     @property
     def optimizer(self) -> GridAdam:
@@ -224,50 +238,50 @@ class CanonicalStage(ScheduledStage):
         return PixelPool(pool.image[kept], pool.flat[kept])
 
     def _hand_over(self, cameras: Cameras, *, skip_zero: bool) -> None:
-        """Give the optimiser the present grids, each voxel paced by how many views see it."""
+        """Give the optimiser the present grids, each voxel paced by how many views see it.
+
+        The total variation of both is smoothed at the voxels that a batch has touched.
+        """
+        assert isinstance(self.phase, CanonicalPhase)
         field = self.model.canonical
+        smoothing = total_variation_weight(
+            self.tv[self.phase.kind], max(field.density.shape), self.schedule.rays
+        )
         pace = None
         if not skip_zero:
             points = field.box.grid_points(field.density.shape, field.density.values)
             points = self.scene.space.to_world(points)
             pace = share_of_views(cameras.to(self.device), points)[..., None]
         for group, grid in ((0, field.density), (1, field.color)):
-            self.optimizer.replace(group, list(grid.parameters()), pace)
-            self.optimizer.param_groups[group]["skip_zero"] = skip_zero
+            self.optimizer.replace(
+                group, list(grid.parameters()), pace=pace, skip_zero=skip_zero,
+                smoothing=smoothing, touched_only=True,
+            )
         decoder = list(field.decoder.parameters())
         if [id(p) for p in decoder] != [id(p) for p in self.optimizer.param_groups[2]["params"]]:
             self.optimizer.replace(2, decoder)
+        self.renew(self.schedule.rays)
 
-    def loss(self, views: Views) -> tuple[Tensor, dict[str, Tensor]]:
-        """Render a batch of random pixels and compare it with the images."""
-        assert isinstance(self.phase, CanonicalPhase) and self._pool is not None
+    def draw(self) -> Pixels:
+        """Random pixels of all images."""
+        assert self._pool is not None
         with span("batch"):
             image, flat = self._pool.draw(share(self.schedule.rays), self.generator)
             background = background_color(self.scene.background, len(image), self.generator)
-            batch = self.parts.of(gather_batch(views, image, flat, background, self.scene.space))
-        model = self.model
-        output = render(
-            batch.rays, model.canonical, model.occupancy, model.settings, batch.background
-        )
+            return Pixels(image, flat, background)
+
+    def loss(self, views: Views, pixels: Pixels) -> tuple[Tensor, dict[str, Tensor]]:
+        """Render a batch of pixels and compare it with the images."""
+        assert isinstance(self.phase, CanonicalPhase)
+        with span("batch"):
+            batch = gather_batch(
+                views, pixels.image, pixels.flat, pixels.background, self.scene.space
+            )
+        output = self.see(batch.rays, self.model.occupancy, batch.background)
         prediction = Prediction(output, batch)
         with span("losses"):
             total, terms = self.losses[self.phase.kind](prediction)
             return total, {**terms, **visibility(prediction)}
-
-    @torch.no_grad()
-    def add_gradients(self) -> None:
-        """The total variation of both grids, at the voxels that this batch has touched."""
-        assert isinstance(self.phase, CanonicalPhase)
-        if not self.tv[self.phase.kind]:
-            return
-        field = self.model.canonical
-        side = max(field.density.shape)
-        weight = total_variation_weight(self.tv[self.phase.kind], side, self.schedule.rays)
-        for grid in (field.density.values, field.color.values):
-            if grid.grad is not None:
-                smooth = torch.zeros_like(grid)
-                add_total_variation_gradient(grid, smooth, weight)
-                grid.grad += smooth * (grid.grad != 0)
 
     @torch.no_grad()
     def on_train_end(self) -> None:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from devrf.data.batch import background_color, gather_batch
+from devrf.data.batch import Pixels, background_color, gather_batch
 from devrf.data.correspondence import previous_images
 from devrf.data.pool import PixelPool, all_pixels
 from devrf.errors import DevrfError
@@ -20,36 +20,21 @@ from devrf.losses.motion import MOTION_TERMS, MotionPrediction, total_variation_
 from devrf.losses.photometric import visibility
 from devrf.ops.adam import GridAdam
 from devrf.ops.spans import span
-from devrf.ops.total_variation import add_total_variation_gradient
-from devrf.ops.trilinear import interpolate
 from devrf.rendering.model import SceneModel, deformed_occupancy
-from devrf.rendering.render import render
 from devrf.scenes.scene import CaptureName, Views
 from devrf.stages.checkpoint import Passport, Stored
 from devrf.stages.flow_start import follow, start_from_tracks
+from devrf.stages.memory import StageMemory, motion_memory
 from devrf.stages.progress import pack, unpack
 from devrf.stages.ranks import share, take_from_first
+from devrf.stages.replay import Graphs
 from devrf.stages.schedules import DeformationPhase, DeformationSchedule
 from devrf.stages.settings import DEFORMATION_LOSS, MotionSettings
 from devrf.stages.stage import Phase, ScheduledStage
 from devrf.stages.useful import meets_matter
+from devrf.stages.visit import Visit
 
-
-@dataclass
-class Visit:
-    """What is at hand while one frame is visited.
-
-    Attributes:
-        backward: (X, Y, Z, 3) the frame's Δ_b, a leaf in the field's memory.
-        forward: (X, Y, Z, 3) the frame's Δ_f, likewise.
-        occupancy: where the frame's matter is.
-        pools: the pixels to learn from; batches are drawn from each in turn.
-    """
-
-    backward: Tensor
-    forward: Tensor
-    occupancy: Occupancy
-    pools: list[PixelPool]
+log = logging.getLogger(__name__)
 
 
 class DeformationStage(ScheduledStage):
@@ -70,6 +55,7 @@ class DeformationStage(ScheduledStage):
         motion: MotionSettings | None = None,
         loss: Mapping[str, float] = DEFORMATION_LOSS,
         iterations_per_step: int = 10,
+        graphs: Graphs = "auto",
     ) -> None:
         """Build the stage; the defaults are the paper's for inward-facing scenes.
 
@@ -80,8 +66,9 @@ class DeformationStage(ScheduledStage):
             motion: learning rate and how batches are drawn.
             loss: weights of the loss terms; ``tv`` is the total variation of both fields.
             iterations_per_step: optimiser iterations in one Lightning step.
+            graphs: whether a GPU replays iterations from CUDA graphs: ``auto`` where it can.
         """
-        super().__init__(iterations_per_step)
+        super().__init__(iterations_per_step, graphs)
         self.schedule = schedule or DeformationSchedule()
         self.motion = motion or MotionSettings()
         weights = dict(loss)
@@ -100,6 +87,12 @@ class DeformationStage(ScheduledStage):
         )
         self._visit: Visit | None = None
         self._previous: Tensor | None = None
+        self.register_state_dict_pre_hook(  # type: ignore[no-untyped-call]
+            lambda *_: self._put_back()
+        )
+        self.register_load_state_dict_post_hook(  # type: ignore[no-untyped-call]
+            lambda *_: self._take_out()
+        )
 
     @property
     def resolution(self) -> tuple[int, int, int]:
@@ -108,7 +101,13 @@ class DeformationStage(ScheduledStage):
 
     @property
     def model(self) -> SceneModel:
-        """The moving scene learned so far."""
+        """The moving scene learned so far, the present visit included."""
+        self._put_back()
+        return self.scene_model
+
+    @property
+    def model_now(self) -> SceneModel:
+        """The moving scene; what the present visit has learned may not be in it yet."""
         return self.scene_model
 
     @property
@@ -116,6 +115,17 @@ class DeformationStage(ScheduledStage):
         """The deformation field."""
         assert self.scene_model.deformation is not None, "the stage has not been set up"
         return self.scene_model.deformation
+
+    def memory(self) -> StageMemory:
+        """Counted from the schedule and from where the displacements rest."""
+        return self._memory(self.field.on_host)
+
+    def _memory(self, on_host: bool) -> StageMemory:
+        model = self.scene_model
+        return motion_memory(
+            self.scene, model.canonical, self.schedule, model.settings.step, on_host=on_host,
+            half=self.motion.store_half,
+        )
 
     @property
     def optimizer(self) -> GridAdam:
@@ -144,16 +154,32 @@ class DeformationStage(ScheduledStage):
                 self.scene.clock,
                 voxels=self.schedule.sides[0] ** 3,
             )
+            self.field.rest(on_host=self._rests_on_host(), half=self.motion.store_half)
         scale = self.scene_model.canonical.box.longest if self.motion.unit == "box" else 1.0
         self._optimizer.param_groups[0]["base_lr"] = self.motion.learning_rate * scale
+
+    def _rests_on_host(self) -> bool:
+        """Whether the displacements of all frames are kept on the host."""
+        device = self.trainer.strategy.root_device
+        if self.trainer.world_size > 1 or self.motion.store == "device":
+            return False  # processes talk device to device
+        if self.motion.store == "host":
+            return True
+        if device.type != "cuda":
+            return False
+        free, _ = torch.cuda.mem_get_info(device)
+        too_much = self._memory(on_host=False).peak > free
+        if too_much:
+            log.info("motion: %.1f GB are free on the GPU; the frames rest on the host", free / 1e9)
+        return too_much
 
     def enter(self, phase: Phase) -> None:
         """Go to the phase's frame: grow the grids if a level begins, fresh Adam."""
         assert isinstance(phase, DeformationPhase)
         previous, self.phase = self.phase, phase
         assert previous is None or isinstance(previous, DeformationPhase)
+        self._put_back()
         if previous is not None and previous.level != phase.level:
-            # What was visited shares the old grids' memory: let go of it first.
             self._visit = None
             self._optimizer.replace(0, [])
             self.field.resize(phase.side**3)
@@ -164,11 +190,39 @@ class DeformationStage(ScheduledStage):
             self.field.carry(phase.frame)
         if phase.level == 0 and self.motion.start == "flow" and views.flow is not None:
             self._follow_flow(views, phase.frame)
-        backward, forward = self.field.slice(phase.frame)
-        self._visit = Visit(backward, forward, self.scene_model.occupancy, [])
-        self._optimizer.replace(0, [backward, forward])
+        if self._visit is None:
+            self._begin_level()
+        else:
+            self._optimizer.forget(0)
+        self.visit.enter(self.field, phase.frame)
+        following = self.schedule.phase(phase.stop, len(self.field.clock))
+        if following.level == phase.level and not following.carries:
+            self.field.expect(following.frame)
         self._look_around()
-        self._visit.pools = self._frame_pools(views, phase.frame)
+        self.visit.pools = self._frame_pools(views, phase.frame)
+
+    def _begin_level(self) -> None:
+        """Make room for visits at the field's present resolution."""
+        self._visit = Visit.of(self.field, self.scene_model.occupancy)
+        smoothing = total_variation_weight(self.tv, max(self.field.shape), self.schedule.rays)
+        self._optimizer.replace(0, self._visit.slices, smoothing=smoothing)
+        self.renew(self.schedule.rays)
+
+    def _put_back(self) -> None:
+        """Put what the present visit has learned into the field."""
+        if self._visit is not None:
+            self._visit.leave(self.field)
+            self.field.settle()
+
+    def _take_out(self) -> None:
+        """Take the visited frame out of a field that has been loaded again."""
+        if self._visit is not None and self._visit.frame:
+            self._visit.enter(self.field, self._visit.frame)
+
+    def on_train_end(self) -> None:
+        """End the last visit."""
+        self._put_back()
+        self._visit = None
 
     def _follow_flow(self, views: Views, frame: int) -> None:
         """Move the frame's slices to where the flow says the frame before has gone."""
@@ -195,29 +249,9 @@ class DeformationStage(ScheduledStage):
         )
         return views
 
-    def _warp(self, points: Tensor) -> Tensor:
-        """Points of the visited frame → canonical space."""
-        return points + interpolate(self.visit.backward, self._coords(points))
-
-    def _unwarp(self, points: Tensor) -> Tensor:
-        """Canonical points → the visited frame."""
-        return points + interpolate(self.visit.forward, self._coords(points))
-
-    def _unwarp_previous(self, points: Tensor) -> Tensor:
-        """Canonical points → the frame before; the identity where that is frame 0."""
-        assert isinstance(self.phase, DeformationPhase)
-        if self.phase.frame == 1:
-            return points
-        frozen = self.field.to_time[self.phase.frame - 1]
-        return points + interpolate(frozen, self._coords(points))
-
-    def _coords(self, points: Tensor) -> Tensor:
-        return self.field.box.to_grid(points, self.field.shape)
-
-    @torch.no_grad()
     def _look_around(self) -> None:
         """Find where the visited frame's matter is under the present field."""
-        self.visit.occupancy = deformed_occupancy(self.scene_model, self._warp)
+        self.visit.occupancy.refill(deformed_occupancy(self.scene_model, self.visit.warp))
 
     @torch.no_grad()
     def _frame_pools(self, views: Views, frame: int) -> list[PixelPool]:
@@ -249,26 +283,31 @@ class DeformationStage(ScheduledStage):
             kept |= views.pixels[image, :, :, 3].flatten() > 0
         return PixelPool(pool.image[kept], pool.flat[kept]) if bool(kept.any()) else pool
 
-    def loss(self, views: Views) -> tuple[Tensor, dict[str, Tensor]]:
-        """Render a batch of the visited frame through its warp; compare images and motion."""
-        assert isinstance(self.phase, DeformationPhase) and self._previous is not None
+    def prepare(self) -> None:
+        """Look up the frame's occupancy anew, when it is time."""
+        assert isinstance(self.phase, DeformationPhase)
         since = self.iteration - self.phase.start
         if since and since % self.motion.occupancy_every == 0:
             with span("sampling"):
                 self._look_around()
-        space = self.scene_model.space
+
+    def draw(self) -> Pixels:
+        """Random pixels of the visited frame, of its views by turns or of all."""
         with span("batch"):
             pool = self.visit.pools[self.iteration % len(self.visit.pools)]
             image, flat = pool.draw(share(self.schedule.rays), self.generator)
             background = background_color(self.scene.background, len(image), self.generator)
-            batch = self.parts.of(gather_batch(views, image, flat, background, space))
-        model = self.scene_model
-        output = render(
-            batch.rays, model.canonical, self.visit.occupancy, model.settings, batch.background,
-            self._warp,
-        )
+            return Pixels(image, flat, background)
+
+    def loss(self, views: Views, pixels: Pixels) -> tuple[Tensor, dict[str, Tensor]]:
+        """Render a batch of the visited frame through its warp; compare images and motion."""
+        assert self._previous is not None
+        visit, space = self.visit, self.scene_model.space
+        with span("batch"):
+            batch = gather_batch(views, pixels.image, pixels.flat, pixels.background, space)
+        output = self.see(batch.rays, visit.occupancy, batch.background, visit.warp)
         prediction = MotionPrediction(
-            output, batch, self._unwarp, self._unwarp_previous, views.cameras, self._previous,
+            output, batch, visit.unwarp, visit.unwarp_previous, views.cameras, self._previous,
             space,
         )
         with span("losses"):
@@ -280,44 +319,39 @@ class DeformationStage(ScheduledStage):
         super().go_back(iteration, caution)
         self._look_around()
 
-    @torch.no_grad()
-    def add_gradients(self) -> None:
-        """The total variation of the visited frame's slices, on all voxels."""
-        if not self.tv:
-            return
-        weight = total_variation_weight(self.tv, max(self.field.shape), self.schedule.rays)
-        for grid in (self.visit.backward, self.visit.forward):
-            if grid.grad is None:
-                grid.grad = torch.zeros_like(grid)
-            add_total_variation_gradient(grid, grid.grad, weight)
-
     def at_hand(self) -> dict[str, Any]:
-        """Where the visited frame's matter was last seen, and the pixels to learn from."""
+        """Where the visited frame's matter was last seen, and the pixels to learn from.
+
+        And the frame itself, where the field would not keep it exactly.
+        """
         assert isinstance(self.phase, DeformationPhase)
         views, mask = self._device_views(), self.visit.occupancy.mask
         images, area = self._images(views, self.phase.frame), views.height * views.width
+        exact = self.visit.slices if self.motion.store_half else ()
         return {
             "occupancy": pack(mask),
             "shape": list(mask.shape),
             "pixels": [pack(pool.mask(images, area)) for pool in self.visit.pools],
+            "displacements": [tensor.detach().cpu() for tensor in exact],
         }
 
+    @torch.no_grad()
     def take_up(self, phase: Phase, kept: dict[str, Any]) -> None:
         """Go on with the visit of ``phase``, the field being loaded."""
         assert isinstance(phase, DeformationPhase)
         views = self._device_views()
         self._previous = previous_images(views)
         images, area = self._images(views, phase.frame), views.height * views.width
+        self._begin_level()
+        self.visit.enter(self.field, phase.frame)
+        for tensor, exact in zip(self.visit.slices, kept["displacements"], strict=False):
+            tensor.copy_(exact)
         mask = unpack(kept["occupancy"], kept["shape"], self.device)
-        self._visit = Visit(
-            *self.field.slice(phase.frame),
-            Occupancy(mask, self.scene_model.canonical.box),
-            [
-                PixelPool.of_mask(images, unpack(bits, (len(images), area), self.device))
-                for bits in kept["pixels"]
-            ],
-        )
-        self._optimizer.replace(0, [self.visit.backward, self.visit.forward])
+        self.visit.occupancy.refill(Occupancy(mask, self.scene_model.canonical.box))
+        self.visit.pools = [
+            PixelPool.of_mask(images, unpack(bits, (len(images), area), self.device))
+            for bits in kept["pixels"]
+        ]
 
     def passport(self) -> Passport:
         """What the checkpoint is, and how to build its model."""

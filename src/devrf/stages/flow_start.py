@@ -109,26 +109,25 @@ def start_from_tracks(
     if len(tracks) == 0:
         return
     scale = _pixels_per_unit(tracks, cameras, space, 1e-3 * field.box.longest)
-    _, forward = field.slice(frame)
+    backward, forward = (field.here.new_empty(*field.shape, 3) for _ in range(2))
+    field.read(frame, (backward, forward))
     coords = field.box.to_grid(tracks.canonical, field.shape)
 
     def misses(change: Tensor) -> Tensor:
-        points = tracks.canonical + interpolate(forward.detach() + change, coords)
+        points = tracks.canonical + interpolate(forward + change, coords)
         pixel, _ = cameras.project(tracks.camera, space.to_world(points))
         return pixel - tracks.pixel
 
-    with torch.no_grad():
-        field.to_time[frame] += _fit(misses, forward, scale, smoothness, steps)
-        arrived = tracks.canonical + interpolate(field.to_time[frame], coords)
-    back, _ = field.slice(frame)
+    forward += _fit(misses, forward, scale, smoothness, steps)
+    arrived = tracks.canonical + interpolate(forward, coords)
     there = field.box.to_grid(arrived, field.shape)
 
     def errs(change: Tensor) -> Tensor:
-        returned = arrived + interpolate(back.detach() + change, there)
+        returned = arrived + interpolate(backward + change, there)
         return (returned - tracks.canonical) * scale
 
-    with torch.no_grad():
-        field.to_canonical[frame] += _fit(errs, back, scale, smoothness, steps)
+    backward += _fit(errs, backward, scale, smoothness, steps)
+    field.write(frame, (backward, forward))
 
 
 def _pixels_per_unit(tracks: Tracks, cameras: Cameras, space: Space, small: float) -> float:

@@ -13,10 +13,12 @@ import torch
 from torch import nn
 
 from devrf.fields.architecture import Architecture
-from devrf.fields.deformation import DeformationField
+from devrf.fields.canonical import CanonicalField
+from devrf.fields.decoder import ColorDecoder
 from devrf.geometry.box import Box
 from devrf.scenes.scene import Scene, Views
 from devrf.stages.schedules import CanonicalSchedule, DeformationSchedule
+from devrf.stages.settings import MotionSettings
 
 # Python and its libraries on the host, without what the driver of a GPU adds.
 PROGRAM = 500_000_000
@@ -47,6 +49,12 @@ class StageMemory:
 
     held: Mapping[str, int]
     passing: Mapping[str, int]
+
+    def in_words(self) -> str:
+        """The peak and the three largest parts, on one line."""
+        parts = sorted({**self.held, **self.passing}.items(), key=lambda part: -part[1])[:3]
+        largest = ", ".join(f"{name} {size / 1e9:.2f}" for name, size in parts)
+        return f"about {self.peak / 1e9:.2f} GB ({largest})"
 
     @property
     def peak(self) -> int:
@@ -100,6 +108,7 @@ def estimate(
     deformation: DeformationSchedule,
     architecture: Architecture,
     step: float = 0.5,
+    motion: MotionSettings | None = None,
 ) -> Budget:
     """What a run on ``scene`` will need.
 
@@ -112,77 +121,137 @@ def estimate(
         deformation: grid sizes and rays of the deformation stage.
         architecture: sizes of the canonical field.
         step: distance between samples in voxels.
+        motion: where the displacements rest, and how; ``auto`` counts as on the device.
     """
-    box, frames = scene.bounds.motion or scene.bounds.box, len(scene.clock)
-    voxels, final = round(canonical.side**3), deformation.sides[-1] ** 3
-    with torch.device("meta"):  # shapes without memory
-        field = architecture.radiance_field(box, voxels, voxels)
-        motion = DeformationField(box, scene.clock, voxels=final)
-    points = field.density.values.numel()
-    grids = tensor_bytes(field.density) + tensor_bytes(field.color)
-    decoder, displacements = tensor_bytes(field.decoder), tensor_bytes(motion)
-    slices = displacements // frames
-    growth = 0
-    if len(deformation.sides) > 1:
-        x, y, z = box.grid_shape(deformation.sides[-2] ** 3)
-        # One direction after the other: the old grids of one stand beside the new of both.
-        growth = frames * x * y * z * DISPLACEMENT
-    static, dynamic = scene.static.train, scene.dynamic.train
-    area = static.height * static.width
-    frame_area = dynamic.height * dynamic.width * -(-len(dynamic) // frames)
+    motion = motion or MotionSettings()
+    field = final_field(scene, canonical, architecture)
     return Budget(
         scene=_sum([
             view_bytes(views)
             for capture in (scene.static, scene.dynamic)
             for views in (capture.train, capture.test)
         ]),
-        canonical=StageMemory(
-            held={
-                **view_bytes(static),
-                "pixels to draw from": len(static) * area * POOLED,
-                "density and features": grids,
-                "their gradients": grids,
-                "their Adam moments": 2 * grids,
-                "decoder, with gradients and moments": 4 * decoder,
-                "occupancy": 2 * points,
-            },
-            passing={
-                "a batch": max(
-                    batch_bytes(canonical, k, architecture, box, step)
-                    for k in range(len(canonical.phases))
-                ),
-                "an optimiser step": 2 * grids,
-                "looking for what is occupied": SOUGHT * points,
-            },
-        ),
-        deformation=StageMemory(
-            held={
-                **view_bytes(dynamic),
-                "pixels to draw from": frame_area * POOLED,
-                "density and features": grids,
-                "decoder": decoder,
-                "occupancy": 4 * points,
-                f"displacements of {frames} frames, both ways": displacements,
-                "gradients of one frame": slices,
-                "Adam moments of one frame": 2 * slices,
-            },
-            passing={
-                "a batch": motion_batch_bytes(
-                    deformation.rays, samples_per_ray(box, voxels, architecture.planes, step),
-                    architecture,
-                ),
-                "an optimiser step": 2 * slices,
-                "looking for what is occupied": SOUGHT_WARPED * points,
-                "growing the grids": growth,
-            },
+        canonical=canonical_memory(scene, canonical, architecture, step),
+        deformation=motion_memory(
+            scene, field, deformation, step, on_host=motion.store == "host",
+            half=motion.store_half,
         ),
         checkpoint={
-            "density and features": grids,
-            "decoder": decoder,
-            "occupancy": points,
-            f"displacements of {frames} frames, both ways": displacements,
+            "density and features": _grid_bytes(field),
+            "decoder": tensor_bytes(field.decoder),
+            "occupancy": field.density.values.numel(),
+            _all_frames(scene): displacement_bytes(scene, field.box, deformation),
         },
     )
+
+
+def final_field(
+    scene: Scene, schedule: CanonicalSchedule, architecture: Architecture
+) -> CanonicalField:
+    """The radiance field that a schedule leads to, without its memory."""
+    voxels = round(schedule.side**3)
+    with torch.device("meta"):
+        return architecture.radiance_field(
+            scene.bounds.motion or scene.bounds.box, voxels, voxels
+        )
+
+
+def canonical_memory(
+    scene: Scene, schedule: CanonicalSchedule, architecture: Architecture, step: float
+) -> StageMemory:
+    """What the canonical stage needs; arguments as :func:`estimate`."""
+    field, static = final_field(scene, schedule, architecture), scene.static.train
+    points, grids = field.density.values.numel(), _grid_bytes(field)
+    return StageMemory(
+        held={
+            **view_bytes(static),
+            "pixels to draw from": len(static) * static.height * static.width * POOLED,
+            "density and features": grids,
+            "their gradients": grids,
+            "their Adam moments": 2 * grids,
+            "decoder, with gradients and moments": 4 * tensor_bytes(field.decoder),
+            "occupancy": 2 * points,
+        },
+        passing={
+            "a batch": max(
+                batch_bytes(schedule, k, architecture, field.box, step)
+                for k in range(len(schedule.phases))
+            ),
+            "an optimiser step": 2 * grids,
+            "looking for what is occupied": SOUGHT * points,
+        },
+    )
+
+
+def motion_memory(
+    scene: Scene, field: CanonicalField, schedule: DeformationSchedule, step: float, *,
+    on_host: bool, half: bool,
+) -> StageMemory:
+    """What the deformation stage needs on its device.
+
+    Args:
+        scene: images and times.
+        field: the canonical field that it builds on.
+        schedule: grid sizes and rays.
+        step: distance between samples in voxels.
+        on_host: whether the displacements of all frames rest on the host.
+        half: whether they rest in half precision.
+    """
+    dynamic, frames, points = scene.dynamic.train, len(scene.clock), field.density.values.numel()
+    displacements = displacement_bytes(scene, field.box, schedule)
+    slices, growth = displacements // frames, 0
+    if len(schedule.sides) > 1:
+        x, y, z = field.box.grid_shape(schedule.sides[-2] ** 3)
+        # One direction after the other: the old grids of one stand beside the new of both.
+        growth = frames * x * y * z * DISPLACEMENT
+    if half:
+        displacements, growth = displacements // 2, growth // 2
+    rested = {} if on_host else {_all_frames(scene): displacements}
+    channels, width = field.color.values.shape[-1], _width(field)
+    return StageMemory(
+        held={
+            **view_bytes(dynamic),
+            "pixels to draw from":
+                dynamic.height * dynamic.width * -(-len(dynamic) // frames) * POOLED,
+            "density and features": _grid_bytes(field),
+            "decoder": tensor_bytes(field.decoder),
+            "occupancy": 4 * points,
+            **rested,
+            # Both its directions, the forward one of the frame before it; on their way from the
+            # host, those of the frame after it.
+            "one frame": (5 if on_host else 3) * slices // 2,
+            "gradients of one frame": slices,
+            "Adam moments of one frame": 2 * slices,
+        },
+        passing={
+            "a batch": motion_batch_bytes(
+                schedule.rays, samples_per_ray(field.box, field.base_voxels, field.planes, step),
+                channels, width, planes=field.planes,
+            ),
+            "an optimiser step": 2 * slices,
+            "looking for what is occupied": SOUGHT_WARPED * points,
+            "growing the grids": 0 if on_host else growth,
+        },
+    )
+
+
+def displacement_bytes(scene: Scene, box: Box, schedule: DeformationSchedule) -> int:
+    """Bytes of the displacements of all frames, both ways, in single precision."""
+    x, y, z = box.grid_shape(schedule.sides[-1] ** 3)
+    return 2 * len(scene.clock) * x * y * z * DISPLACEMENT
+
+
+def _all_frames(scene: Scene) -> str:
+    return f"displacements of {len(scene.clock)} frames, both ways"
+
+
+def _grid_bytes(field: CanonicalField) -> int:
+    return tensor_bytes(field.density) + tensor_bytes(field.color)
+
+
+def _width(field: CanonicalField) -> int:
+    """Units of a hidden layer of the field's decoder; 0 if it has none."""
+    return field.decoder.hidden.out_features if isinstance(field.decoder, ColorDecoder) else 0
 
 
 def tensor_bytes(module: nn.Module) -> int:
@@ -228,18 +297,20 @@ def batch_bytes(
     if not searching and planes is None:
         samples *= OCCUPIED
     decoded = samples if foggy else DECODED * samples
-    return round(MARCHED * samples + _color_bytes(architecture, searching) * decoded)
+    sizes = (3, 0) if searching else (architecture.channels, architecture.width)
+    return round(MARCHED * samples + _color_bytes(*sizes) * decoded)
 
 
-def motion_batch_bytes(rays: int, samples: float, architecture: Architecture) -> int:
+def motion_batch_bytes(
+    rays: int, samples: float, channels: int, width: int, *, planes: int | None
+) -> int:
     """About what a batch of the deformation stage takes, of ``rays`` with ``samples`` each."""
-    met = rays * samples * (OCCUPIED if architecture.planes is None else 1.0)
-    return round((MARCHED + WARPED) * met + _color_bytes(architecture, False) * DECODED * met)
+    met = rays * samples * (OCCUPIED if planes is None else 1.0)
+    return round((MARCHED + WARPED) * met + _color_bytes(channels, width) * DECODED * met)
 
 
-def _color_bytes(architecture: Architecture, searching: bool) -> int:
+def _color_bytes(channels: int, width: int) -> int:
     """Bytes of a sample whose colour is computed, with all that its gradient needs."""
-    channels, width = (3, 0) if searching else (architecture.channels, architecture.width)
     return 4 * (6 * width + 24 * channels) + 400
 
 

@@ -66,6 +66,10 @@ class MotionSettings:
         start: where a frame starts from at the coarsest level: ``previous`` is the result of
             the frame before it; ``flow`` moves that along the observed optical flow, so that
             parts that move far are not lost (without flow it is the same as ``previous``).
+        store: where the displacements of all frames rest while one is visited: ``device``,
+            ``host``, or ``auto``: on the device if they fit there beside all else. Of several
+            processes each keeps them on its device.
+        store_half: whether they rest in half precision; what is visited never does.
     """
 
     learning_rate: float = 1e-3
@@ -74,3 +78,5 @@ class MotionSettings:
     pixels: Literal["all", "useful"] = "all"
     occupancy_every: int = 25
     start: Literal["previous", "flow"] = "previous"
+    store: Literal["auto", "device", "host"] = "auto"
+    store_half: bool = False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from abc import ABC, abstractmethod
 from dataclasses import asdict
 from pathlib import Path
@@ -13,16 +14,25 @@ from lightning import LightningModule
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
 
+from devrf.data.batch import Pixels
 from devrf.errors import DevrfError
+from devrf.fields.occupancy import Occupancy
+from devrf.fields.warp import GridWarp
+from devrf.geometry.rays import Rays
 from devrf.ops.adam import GridAdam
+from devrf.ops.choice import triton_runs
 from devrf.ops.spans import span
+from devrf.rendering.fused import render_in_lists
 from devrf.rendering.model import SceneModel
 from devrf.rendering.player import Player
+from devrf.rendering.render import RenderOutput, render
+from devrf.rendering.room import Room
 from devrf.scenes.scene import CaptureName, Scene, Views
 from devrf.shortage import ShortageError
 from devrf.stages.checkpoint import Passport, check_scene, passport_in
 from devrf.stages.compact_state import compact_state
 from devrf.stages.held_out import score
+from devrf.stages.memory import StageMemory
 from devrf.stages.parts import Parts
 from devrf.stages.progress import random_states, set_random_states
 from devrf.stages.ranks import (
@@ -31,9 +41,14 @@ from devrf.stages.ranks import (
     average_gradients,
     check_alike,
     rank,
+    share,
     take_from_first,
+    world_size,
 )
+from devrf.stages.replay import Capturer, Graphs, OnCuda, Repeated
 from devrf.stages.schedules import CanonicalPhase, DeformationPhase
+
+log = logging.getLogger(__name__)
 
 Phase = CanonicalPhase | DeformationPhase
 
@@ -45,6 +60,12 @@ class ScheduledStage(LightningModule, ABC):
     does not show. The stage never changes its grids by itself: the callback ``GridUpscaling``
     calls :meth:`enter` where a phase begins, ``LearningRateDecay`` scales the learning rates
     before every step.
+
+    Where Triton runs, iterations are steady: lists of samples have a fixed length (``room``),
+    gradients, moments and whatever else goes from one iteration to the next stay in the same
+    memory, and nothing waits for the device. On one GPU each is then a CUDA graph that is
+    replayed (``graphs``). Callbacks see the same steps and the same rates; what is asked before a
+    step is asked before the whole iteration.
 
     A checkpoint with the optimiser's state in it (any of Lightning's that is not ``weights_only``)
     holds all that it takes to go on: ``Trainer.fit(ckpt_path=…)`` continues as if the run had
@@ -64,20 +85,28 @@ class ScheduledStage(LightningModule, ABC):
         back_offs: how often learning went wrong and was taken back.
         caution: what the scheduled learning rates are multiplied by; below 1 after a back-off.
         gave_up: why the stage ended before its schedule; None while it has not.
+        graphs: whether steady iterations are captured in a CUDA graph where that is possible.
+        room: the length of the lists of samples; None while they are as long as need be.
     """
 
     name: ClassVar[str]
     capture: ClassVar[CaptureName]
     costly: ClassVar[tuple[str, ...]]
 
-    def __init__(self, iterations_per_step: int) -> None:
+    def __init__(self, iterations_per_step: int, graphs: Graphs = "auto") -> None:
         super().__init__()
         self.automatic_optimization = False
+        self.graphs = graphs
+        self.room: Room | None = None
         self.iterations_per_step = iterations_per_step
         self.iteration = 0
         self.phase: Phase | None = None
         self.record: dict[str, float | None] = {}
         self.generator = torch.Generator()
+        self._rays = 0
+        self._sums: dict[str, Tensor] = {}
+        self._pixels: Pixels | None = None
+        self._repeated: Repeated | None = None
         self._seed = 0
         self.made_with: dict[str, Any] = {}
         self.parts = Parts()
@@ -107,6 +136,15 @@ class ScheduledStage(LightningModule, ABC):
     def model(self) -> SceneModel:
         """What has been learned so far, ready to render."""
 
+    @property
+    @abstractmethod
+    def model_now(self) -> SceneModel:
+        """The model that is being learned, in which what is at hand may not have its place yet."""
+
+    @abstractmethod
+    def memory(self) -> StageMemory:
+        """What the stage will need on the device that it trains on."""
+
     @abstractmethod
     def phase_at(self, iteration: int) -> Phase:
         """The phase of the schedule that ``iteration`` belongs to."""
@@ -119,12 +157,42 @@ class ScheduledStage(LightningModule, ABC):
     def enter(self, phase: Phase) -> None:
         """Make grids and optimiser ready for ``phase``."""
 
-    @abstractmethod
-    def loss(self, views: Views) -> tuple[Tensor, dict[str, Tensor]]:
-        """The weighted loss of one batch drawn from ``views``, and its terms by name."""
+    def prepare(self) -> None:
+        """What an iteration needs beside what is learned in it; it may wait for the device."""
 
-    def add_gradients(self) -> None:
-        """Add gradients that are known in closed form, after the backward pass."""
+    @abstractmethod
+    def draw(self) -> Pixels:
+        """The pixels of the coming iteration, drawn with ``generator``."""
+
+    @abstractmethod
+    def loss(self, views: Views, pixels: Pixels) -> tuple[Tensor, dict[str, Tensor]]:
+        """The weighted loss of a batch of pixels of ``views``, and its terms by name."""
+
+    def see(
+        self, rays: Rays, occupancy: Occupancy, background: Tensor, warp: GridWarp | None = None
+    ) -> RenderOutput:
+        """Render rays to learn from them: in lists of fixed length if iterations are steady."""
+        model = self.model_now
+        if self.room is None:
+            return render(rays, model.canonical, occupancy, model.settings, background, warp)
+        return render_in_lists(
+            rays, model.canonical, occupancy, model.settings, background, warp, self.room
+        )
+
+    def renew(self, rays: int) -> None:
+        """Get ready for iterations on other tensors than before, of ``rays`` in all processes.
+
+        Whoever enters a phase calls it once the phase's tensors are there and the optimiser has
+        them.
+        """
+        self._rays = rays
+        self._sums, self._pixels, self._repeated, self.room = {}, None, None, None
+        if triton_runs(self.model_now.canonical.density.values):
+            self.room = self._new_room()
+            self.optimizer.keep_gradients()
+
+    def _new_room(self) -> Room:
+        return Room(-(-share(self._rays) // self.parts.count), self.device)
 
     def setup(self, stage: str) -> None:
         """Make the generator.
@@ -138,11 +206,14 @@ class ScheduledStage(LightningModule, ABC):
                 "devrf.stages.ranks.RaysByRank)"
             )
         self._seed = torch.initial_seed()
-        self.generator = torch.Generator(self.device)
+        # Lightning moves the stage there later.
+        self.generator = torch.Generator(self.trainer.strategy.root_device)
 
     def on_fit_start(self) -> None:
         """Begin with the same fields in every process."""
         take_from_first([*self.parameters(), *self.buffers()])
+        if self.trainer.is_global_zero:
+            log.info("%s: needs %s on the %s", self.name, self.memory().in_words(), self.device)
 
     def on_fit_end(self) -> None:
         """See that every process has come to the same fields.
@@ -217,28 +288,30 @@ class ScheduledStage(LightningModule, ABC):
         count = min(self.iterations_per_step, left)
         if self.trainer.max_steps > 0:
             count = min(count, self.trainer.max_steps - self.trainer.global_step)
-        sums: dict[str, Tensor] = {}
         first = self.iteration
         for _ in range(count):
+            self.prepare()
             try:
-                total, terms = self.parts.gradients(
-                    lambda: self.loss(views), self._backward, optimizer.zero_grad,
-                    self.generator,
-                )
+                if self.room is None:
+                    optimizer.zero_grad()
+                    self._learn(views, self.draw())
+                    with span("optimiser"):
+                        optimizer.step()
+                else:
+                    self._repeat(views, optimizer)
             except ShortageError as shortage:
                 self.give_up(f"{shortage} at {self.where(self.iteration)}; {self.remedy}")
                 break
-            average_gradients(p for group in optimizer.param_groups for p in group["params"])
-            with span("optimiser"):
-                self.add_gradients()
-                optimizer.step()
             self.iteration += 1
-            for name, value in {"loss": total.detach(), **terms}.items():
-                sums[name] = sums[name] + value if name in sums else value
         self._draw_anew()
-        if self.iteration == first:
+        done = self.iteration - first
+        means = {k: value / done for k, value in average(self._sums).items()} if done else {}
+        for value in self._sums.values():
+            value.zero_()
+        if self.room is not None and self.room.look():
+            self._repeated = None  # captured with lists of another length
+        if not done:
             return {}
-        means = {k: value / (self.iteration - first) for k, value in average(sums).items()}
         named = {f"{self.capture}/{k}": value for k, value in means.items()}
         self.log_dict({**named, "step": float(self.iteration)})
         if self.iteration >= self.total_iterations:
@@ -252,6 +325,54 @@ class ScheduledStage(LightningModule, ABC):
             "the same command goes on where there is more memory; with less, begin afresh "
             f"(resume=false) with lower {' or '.join(self.costly)}, or higher data.downscale"
         )
+
+    def _learn(self, views: Views, pixels: Pixels) -> None:
+        """The gradients of a batch; its loss and terms are added to the sums of this step."""
+        total, terms = self.parts.gradients(
+            lambda part: self.loss(views, part), pixels, self._backward, self._divided
+        )
+        groups = self.optimizer.param_groups
+        average_gradients(p for group in groups for p in group["params"])
+        for name, value in {"loss": total.detach(), **terms}.items():
+            if name in self._sums:
+                self._sums[name] += value
+            else:
+                self._sums[name] = value.clone()
+
+    def _divided(self) -> None:
+        """Begin the iteration anew in smaller parts."""
+        self.optimizer.zero_grad()
+        if self.room is not None:
+            self.room = self._new_room()
+            self._repeated = None
+
+    def _repeat(self, views: Views, optimizer: LightningOptimizer) -> None:
+        """A steady iteration: the same work on the same tensors, with other pixels in them."""
+        assert self.room is not None
+        drawn = self.draw()
+        if self._pixels is None:
+            self._pixels = drawn.clone()
+        else:
+            self._pixels.take(drawn)
+        pixels = self._pixels
+
+        def work() -> None:
+            self._learn(views, pixels)
+            self.optimizer.apply()
+
+        if self._repeated is None:
+            self._repeated = Repeated(work, self._capturer())
+        with self.optimizer.stepping_by(self._repeated):
+            optimizer.step()
+        if self._repeated.is_warm:
+            self.room.measure()
+        if self._repeated.failed:
+            self.graphs = "off"  # one warning is enough
+
+    def _capturer(self) -> Capturer | None:
+        """How iterations are captured: on one GPU, if at all."""
+        possible = self.graphs == "auto" and self.device.type == "cuda" and world_size() == 1
+        return OnCuda(self.device) if possible else None
 
     def test_step(self, index: int, batch_idx: int) -> dict[str, Any]:
         """Render and score one held-out image; the means are logged.

@@ -70,12 +70,13 @@ def test_the_gradient_may_be_kept(draw: Draw, agree: Both, device: torch.device)
 def test_gradient_of_the_total_variation(
     draw: Draw, agree: Both, shape: tuple[int, ...]
 ) -> None:
-    grid, gradient = 2 * draw(*shape), draw(*shape)
+    grid, gradient = 2 * draw(*shape), draw(*shape).clamp(min=0)
 
     def work() -> tuple[Tensor, ...]:
-        into = gradient.clone()
+        into, touched = gradient.clone(), gradient.clone()
         add_total_variation_gradient(grid, into, 0.3)
-        return (into,)
+        add_total_variation_gradient(grid, touched, 0.3, touched_only=True)
+        return into, touched
 
     agree(work)
 

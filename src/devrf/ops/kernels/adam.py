@@ -43,12 +43,14 @@ def step_in_one_pass(
     )
 
 
-def add_gradient_in_one_pass(grid: Tensor, gradient: Tensor, weight: float) -> None:
+def add_gradient_in_one_pass(
+    grid: Tensor, gradient: Tensor, weight: float, *, touched_only: bool = False
+) -> None:
     """As devrf.ops.total_variation.add_total_variation_gradient."""
     length = _row(grid)
     launch(
         total_variation_kernel, _programs(grid, length), grid,
-        grid, gradient, length, *grid.shape[:2], weight,
+        grid, gradient, length, *grid.shape[:2], weight, TOUCHED_ONLY=touched_only,
         CHANNELS=grid.shape[3], WIDE=_is_wide(grid), BLOCK=_block(length),
     )
 
@@ -109,15 +111,17 @@ def slope_of_variation(values, at, own, here, row, number, length, x, y, CHANNEL
 @triton.jit(do_not_specialize=["x", "y"])
 def total_variation_kernel(
     values, gradient, length, x, y, weight,
-    CHANNELS: tl.constexpr, WIDE: tl.constexpr, BLOCK: tl.constexpr,
+    TOUCHED_ONLY: tl.constexpr, CHANNELS: tl.constexpr, WIDE: tl.constexpr, BLOCK: tl.constexpr,
 ):
     """gradient += weight · Σ clamp(v − v', −1, 1)."""
     row, number = piece(length, WIDE, BLOCK)
     here = number < length
     at = row * length + number
+    before = tl.load(gradient + at, mask=here, other=0.0)
+    if TOUCHED_ONLY:
+        here = here & (before != 0.0)
     own = tl.load(values + at, mask=here, other=0.0)
     slope = slope_of_variation(values, at, own, here, row, number, length, x, y, CHANNELS)
-    before = tl.load(gradient + at, mask=here, other=0.0)
     tl.store(gradient + at, before + weight * slope, mask=here)
 
 

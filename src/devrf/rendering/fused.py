@@ -1,0 +1,107 @@
+"""Rendering for training in a few launches, on lists of fixed length: nothing waits for the device.
+
+It sees what :func:`devrf.rendering.render.render` sees. Triton's kernels make it fast; with plain
+PyTorch it gives the same, more slowly.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from devrf.fields.canonical import CanonicalField
+from devrf.fields.occupancy import Occupancy
+from devrf.fields.warp import GridWarp
+from devrf.geometry.rays import Rays
+from devrf.ops.compositing import composite_segments, sum_segments
+from devrf.ops.search import Found, Selected, Thresholds, find_samples, select
+from devrf.ops.trilinear import kept_gradient
+from devrf.ops.warped_depth import warped_depth
+from devrf.rendering.render import STOP, RenderOutput, RenderSettings
+from devrf.rendering.room import Room
+from devrf.rendering.sampling import Samples, most_steps, steps_through
+
+
+def render_in_lists(
+    rays: Rays,
+    field: CanonicalField,
+    occupancy: Occupancy,
+    settings: RenderSettings,
+    background: Tensor,
+    warp: GridWarp | None,
+    room: Room,
+) -> RenderOutput:
+    """What ``render`` gives, in lists of ``room.heavy`` places (method §2).
+
+    Gradients of grids that have one already (``grad``) are added to it in place.
+
+    Args:
+        rays: R rays.
+        field: the canonical field.
+        occupancy: where something may be, in the space of the rays.
+        settings: step length and thresholds.
+        background: (3,) or (R, 3) RGB behind everything.
+        warp: maps the rays' points into canonical space, over the field's own box; None leaves
+            them.
+        room: how long the lists are; it is told how long they would have to be.
+
+    Returns:
+        What the rays see; ``samples.present`` tells samples from padding.
+    """
+    warp = warp or GridWarp((), field.box)
+    delta, density = field.step_in_base_voxels(settings.step), field.density.values
+    found = _search(rays, field, occupancy, settings, warp, room.visible)
+    canonical, tau = warped_depth(
+        found.points, density, warp.slices, warp.weight,
+        box=field.box, shift=field.shift, delta=delta, density_gradient=kept_gradient(density),
+        slice_gradients=[kept_gradient(frame) for frame in warp.slices],
+    )
+    weight, transmittance = composite_segments(tau, found.first)
+    chosen = select(found.heavy, found.first, room.heavy)
+    room.note(found.total, chosen.total)
+    samples, present = _listed(found, chosen, len(rays))
+    canonical = canonical.index_select(0, chosen.index)
+    weight = torch.where(present, weight.index_select(0, chosen.index), 0.0)
+    color = field.rgb(canonical, rays.viewdirs, samples.ray)
+    seen = sum_segments(weight, color, chosen.first)
+    with torch.no_grad():
+        distance = torch.stack([samples.distance, torch.ones_like(samples.distance)], dim=1)
+        reached, mass = sum_segments(weight, distance, chosen.first).unbind(1)
+    return RenderOutput(
+        color=seen + transmittance[:, None] * background,
+        depth=reached / mass.clamp(min=1e-6),
+        transmittance=transmittance,
+        samples=samples,
+        canonical=canonical,
+        weight=weight,
+        sample_color=color,
+    )
+
+
+def _search(
+    rays: Rays, field: CanonicalField, occupancy: Occupancy, settings: RenderSettings,
+    warp: GridWarp, capacity: int,
+) -> Found:
+    """The samples that can be seen, in lists of ``capacity`` places."""
+    stretch = {
+        "step": field.step_length(settings.step), "near": settings.near, "far": settings.far
+    }
+    entry, count = steps_through(rays, field.box, **stretch)
+    threshold = settings.alpha_threshold
+    return find_samples(
+        rays.origins, rays.directions, entry, count, occupancy.mask, field.density.values,
+        warp.slices, warp.weight, step=stretch["step"], longest=most_steps(field.box, **stretch),
+        capacity=capacity, mask_box=occupancy.box, box=field.box, shift=field.shift,
+        delta=field.step_in_base_voxels(settings.step),
+        thresholds=Thresholds(threshold, STOP, threshold),
+    )
+
+
+def _listed(found: Found, chosen: Selected, rays: int) -> tuple[Samples, Tensor]:
+    """The chosen samples, and which they are; the padding's rays are spread over all."""
+    place = torch.arange(len(chosen.index), device=chosen.index.device)
+    present = place < chosen.first[-1]
+    ray = torch.where(present, found.ray.index_select(0, chosen.index), place % max(rays, 1))
+    distance = found.distance.index_select(0, chosen.index)
+    points = found.points.index_select(0, chosen.index)
+    return Samples(ray, distance, points, rays, present), present
