@@ -7,9 +7,11 @@ import shutil
 from pathlib import Path
 
 import pytest
+import torch
 from omegaconf import OmegaConf
 
 from devrf.run.resume import set_aside
+from devrf.stages.checkpoint import load_checkpoint
 from devrf.stages.sealed_file import read_sealed, write_sealed
 
 
@@ -187,11 +189,10 @@ def test_a_run_that_was_cut_short_goes_on(devrf, tiny, tmp_path):
     assert {path.name for path in checkpoints.glob("*.ckpt")} == {"canonical.ckpt"}
     assert devrf(*command, "hydra.run.dir=whole").status == 0
     ours, whole = (
-        read_sealed(tmp_path / folder / "checkpoints" / "canonical.ckpt")["state_dict"]
+        load_checkpoint(tmp_path / folder / "checkpoints" / "canonical.ckpt").model
         for folder in ("run", "whole")
     )
-    name = "scene_model.canonical.density.values"
-    assert (ours[name] == whole[name]).all()
+    assert torch.equal(ours.canonical.density.values, whole.canonical.density.values)
 
 
 def test_a_damaged_progress_file_gives_way_to_the_one_before(devrf, tiny, tmp_path):
