@@ -15,6 +15,7 @@ FURTHER = {
 }
 CANONICAL_KEYS = {
     "psnr", "ssim", "seconds", "iterations", "iterations_per_second", "peak_gpu_gb",
+    "back_offs",
 } | FURTHER
 DEFORMATION_KEYS = CANONICAL_KEYS | {"rest_pose_psnr", "checkpoint_mb"}
 

@@ -20,6 +20,7 @@ from devrf.fields.occupancy import Occupancy
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.rendering.model import SceneModel
+from devrf.rendering.player import Player
 from devrf.rendering.render import RenderSettings
 from devrf.stages.held_out import HeldOutView
 
@@ -135,7 +136,7 @@ def test_pictures_show_colour_beside_depth_while_time_runs(cube: Box) -> None:
         canonical.color.values.copy_(torch.tensor([9.0, -9.0, -9.0]).expand(5, 5, 5, 3))
     settings = RenderSettings(0.5, 1e-4, 0.0, 9.0)
     model = SceneModel(canonical, Occupancy.full((5, 5, 5), cube), settings)
-    shown = list(pictures(model, ring(3), 1.0, torch.device("cpu")))
+    shown = list(pictures(Player(model), ring(3), 1.0))
     assert len(shown) == 3
     for image in shown:
         assert image.shape == (10, 30, 3)

@@ -44,7 +44,7 @@ class TrainingRecord(Callback):
         self._peak_before = state_dict["peak_gpu_gb"]
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Write down seconds, iterations, iterations a second, peak GPU memory.
+        """Write down seconds, iterations, iterations a second, peak GPU memory, back-offs.
 
         Seconds are wall clock, without what previews took: they teach the fields nothing. Memory
         is in GiB; None on a CPU.
@@ -58,6 +58,7 @@ class TrainingRecord(Callback):
             "iterations": pl_module.iteration,
             "iterations_per_second": round(pl_module.iteration / seconds, 2),
             "peak_gpu_gb": self._peak(),
+            "back_offs": pl_module.back_offs,
         }
 
     def _seconds(self) -> float:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import logging
 import time
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
 from lightning import Callback, LightningModule, Trainer
 
+from devrf.callbacks.health import Health
 from devrf.errors import DevrfError
 from devrf.stages.checkpoint import save_checkpoint
 from devrf.stages.progress import progress_file, progress_files
@@ -74,7 +76,8 @@ class Saving(Callback):
         assert isinstance(pl_module, ScheduledStage)
         asked, due = self._asked, time.monotonic() >= self._due
         if trainer.world_size > 1:  # what one process is asked, all must do
-            asked = trainer.strategy.reduce_boolean_decision(asked, all=False)
+            agreed = trainer.strategy.reduce_boolean_decision
+            asked, due = agreed(asked, all=False), agreed(due and trainer.is_global_zero, all=False)
         if pl_module.iteration >= pl_module.total_iterations:
             return  # the stage is done: its checkpoint is next
         # This step's line of the curves, if it has one, is only written after this: a file
@@ -82,8 +85,13 @@ class Saving(Callback):
         every: int = trainer.log_every_n_steps  # type: ignore[attr-defined]
         logged_next = every > 1 and (batch_idx + 1) % every == 0
         last = trainer.should_stop or 0 < trainer.max_steps <= trainer.global_step
-        if trainer.is_global_zero and (asked or last or due and not logged_next):
-            self._write(trainer, pl_module)
+        if asked or last or due and not logged_next:
+            callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
+            for one in callbacks:
+                if isinstance(one, Health):
+                    one.look(pl_module)  # what has gone wrong is not worth going on from
+            if trainer.is_global_zero:
+                self._write(trainer, pl_module)
         if asked:
             self._asked, trainer.should_stop = False, True
 
@@ -101,7 +109,10 @@ class Saving(Callback):
             self._failing = True
         else:
             self.saved, self._failing = stage.iteration, False
-            for old in progress_files(self.folder, stage.name)[self.KEPT :]:
+            files = progress_files(self.folder, stage.name)
+            # Those further on are of a course that was taken back.
+            ahead = list(takewhile(lambda file: file != path, files))
+            for old in [*ahead, *files[len(ahead) + self.KEPT :]]:
                 old.unlink(missing_ok=True)
         now = time.monotonic()
         rest = (now - began) * (1 / self.share - 1)

@@ -29,8 +29,11 @@ class LearningRateDecay(Callback):
     def on_before_optimizer_step(
         self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer
     ) -> None:
-        """Set ``lr`` to ``base_lr`` times the factor of the present iteration."""
+        """Set ``lr`` to ``base_lr`` times the factor of the present iteration.
+
+        Lower still after the stage was taken back, by its ``caution``.
+        """
         assert isinstance(pl_module, ScheduledStage)
-        factor = pl_module.learning_rate_factor(pl_module.iteration)
+        factor = pl_module.learning_rate_factor(pl_module.iteration) * pl_module.caution
         for group in optimizer.param_groups:
             group["lr"] = group["base_lr"] * factor

@@ -36,6 +36,20 @@ class RayBatch:
     flow: Tensor | None
     flow_valid: Tensor | None
 
+    def between(self, start: int, stop: int) -> RayBatch:
+        """The rays from ``start`` up to ``stop``, sharing memory."""
+        kept = slice(start, stop)
+        return RayBatch(
+            rays=self.rays[kept],
+            color=self.color[kept],
+            alpha=None if self.alpha is None else self.alpha[kept],
+            background=self.background if self.background.dim() == 1 else self.background[kept],
+            image=self.image[kept],
+            pixel=self.pixel[kept],
+            flow=None if self.flow is None else self.flow[kept],
+            flow_valid=None if self.flow_valid is None else self.flow_valid[kept],
+        )
+
 
 def pixel_positions(flat: Tensor, width: int) -> Tensor:
     """Centres (R, 2), x then y, of pixels given by their row-major number (R,)."""

@@ -54,6 +54,17 @@ def matte(prediction: Prediction) -> Tensor:
     return (prediction.output.transmittance - (1 - alpha)).square().mean()
 
 
+@torch.no_grad()
+def visibility(prediction: Prediction) -> dict[str, Tensor]:
+    """How much is seen, and how much should be: means over rays in [0, 1], no part of the loss.
+
+    ``opacity`` is 1 − T_end; ``coverage`` the matte, for images that have one.
+    """
+    seen = {"opacity": 1 - prediction.output.transmittance.mean()}
+    alpha = prediction.batch.alpha
+    return seen if alpha is None else {**seen, "coverage": alpha.mean()}
+
+
 PHOTOMETRIC_TERMS = {
     "color": color_error,
     "per_sample_color": per_sample_color,

@@ -16,8 +16,9 @@ from devrf import job
 from devrf.errors import DevrfError
 from devrf.losses.composer import WeightedLoss
 from devrf.losses.motion import MOTION_TERMS
+from devrf.run.benchmark import benchmark
 from devrf.run.context import FROM_NOTHING, RunContext
-from devrf.run.film import render
+from devrf.run.film import picture, render
 from devrf.run.look import inspect, prepare
 from devrf.run.objective import check_objective, objective
 from devrf.run.processes import together
@@ -33,7 +34,9 @@ STEPS: dict[str, tuple[Callable[[RunContext], None], ...]] = {
     "deformation": (deformation,),
     "evaluate": (evaluate,),
     "render": (render,),
+    "still": (picture,),
     "pipeline": (canonical, deformation, evaluate, render),
+    "benchmark": (benchmark,),
     "report": (report,),
 }
 
@@ -119,7 +122,7 @@ def _check(run: RunContext, stage: str) -> None:
     if config.ckpt is not None and stage in FROM_NOTHING:
         raise DevrfError(
             f"ckpt: stage={stage} starts from nothing; with ckpt=PATH give stage=deformation, "
-            "stage=evaluate or stage=render"
+            "stage=evaluate, stage=render, stage=still or stage=benchmark"
         )
     if stage in OF_NO_SCENE:
         return
@@ -133,3 +136,5 @@ def _check(run: RunContext, stage: str) -> None:
     if job.in_search() and evaluate not in STEPS[stage]:
         raise DevrfError(f"stage: a search needs the objective, which stage={stage} does not score")
     instantiate(config.video)
+    instantiate(config.still)
+    instantiate(config.benchmark)

@@ -19,8 +19,9 @@ from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.losses.composer import WeightedLoss
 from devrf.losses.motion import total_variation_weight
-from devrf.losses.photometric import PHOTOMETRIC_TERMS, Prediction
+from devrf.losses.photometric import PHOTOMETRIC_TERMS, Prediction, visibility
 from devrf.ops.adam import GridAdam
+from devrf.ops.spans import span
 from devrf.ops.total_variation import add_total_variation_gradient
 from devrf.rendering.model import SceneModel
 from devrf.rendering.render import RenderSettings, render
@@ -46,6 +47,7 @@ class CanonicalStage(ScheduledStage):
 
     name: ClassVar[str] = "canonical"
     capture: ClassVar[CaptureName] = "static"
+    costly: ClassVar[tuple[str, ...]] = ("schedule.canonical.side", "schedule.canonical.rays")
 
     def __init__(
         self,
@@ -214,6 +216,11 @@ class CanonicalStage(ScheduledStage):
                 for image in range(len(views))
             ]
         )
+        if not bool(kept.any()):
+            raise DevrfError(
+                f"the field has become empty by iteration {self.iteration}: check data.background, "
+                "data.box and data.near, or lower schedule.rates.density"
+            )
         return PixelPool(pool.image[kept], pool.flat[kept])
 
     def _hand_over(self, cameras: Cameras, *, skip_zero: bool) -> None:
@@ -234,14 +241,18 @@ class CanonicalStage(ScheduledStage):
     def loss(self, views: Views) -> tuple[Tensor, dict[str, Tensor]]:
         """Render a batch of random pixels and compare it with the images."""
         assert isinstance(self.phase, CanonicalPhase) and self._pool is not None
-        image, flat = self._pool.draw(share(self.schedule.rays), self.generator)
-        background = background_color(self.scene.background, len(image), self.generator)
-        batch = gather_batch(views, image, flat, background, self.scene.space)
+        with span("batch"):
+            image, flat = self._pool.draw(share(self.schedule.rays), self.generator)
+            background = background_color(self.scene.background, len(image), self.generator)
+            batch = self.parts.of(gather_batch(views, image, flat, background, self.scene.space))
         model = self.model
         output = render(
-            batch.rays, model.canonical, model.occupancy, model.settings, background
+            batch.rays, model.canonical, model.occupancy, model.settings, batch.background
         )
-        return self.losses[self.phase.kind](Prediction(output, batch))
+        prediction = Prediction(output, batch)
+        with span("losses"):
+            total, terms = self.losses[self.phase.kind](prediction)
+            return total, {**terms, **visibility(prediction)}
 
     @torch.no_grad()
     def add_gradients(self) -> None:

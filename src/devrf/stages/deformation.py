@@ -17,7 +17,9 @@ from devrf.fields.deformation import DeformationField
 from devrf.fields.occupancy import Occupancy
 from devrf.losses.composer import WeightedLoss
 from devrf.losses.motion import MOTION_TERMS, MotionPrediction, total_variation_weight
+from devrf.losses.photometric import visibility
 from devrf.ops.adam import GridAdam
+from devrf.ops.spans import span
 from devrf.ops.total_variation import add_total_variation_gradient
 from devrf.ops.trilinear import interpolate
 from devrf.rendering.model import SceneModel, deformed_occupancy
@@ -59,6 +61,7 @@ class DeformationStage(ScheduledStage):
 
     name: ClassVar[str] = "deformation"
     capture: ClassVar[CaptureName] = "dynamic"
+    costly: ClassVar[tuple[str, ...]] = ("schedule.deformation.sides", "schedule.deformation.rays")
 
     def __init__(
         self,
@@ -251,22 +254,31 @@ class DeformationStage(ScheduledStage):
         assert isinstance(self.phase, DeformationPhase) and self._previous is not None
         since = self.iteration - self.phase.start
         if since and since % self.motion.occupancy_every == 0:
-            self._look_around()
-        pool = self.visit.pools[self.iteration % len(self.visit.pools)]
-        image, flat = pool.draw(share(self.schedule.rays), self.generator)
-        background = background_color(self.scene.background, len(image), self.generator)
+            with span("sampling"):
+                self._look_around()
         space = self.scene_model.space
-        batch = gather_batch(views, image, flat, background, space)
+        with span("batch"):
+            pool = self.visit.pools[self.iteration % len(self.visit.pools)]
+            image, flat = pool.draw(share(self.schedule.rays), self.generator)
+            background = background_color(self.scene.background, len(image), self.generator)
+            batch = self.parts.of(gather_batch(views, image, flat, background, space))
         model = self.scene_model
         output = render(
-            batch.rays, model.canonical, self.visit.occupancy, model.settings, background,
+            batch.rays, model.canonical, self.visit.occupancy, model.settings, batch.background,
             self._warp,
         )
         prediction = MotionPrediction(
             output, batch, self._unwarp, self._unwarp_previous, views.cameras, self._previous,
             space,
         )
-        return self.losses(prediction)
+        with span("losses"):
+            total, terms = self.losses(prediction)
+            return total, {**terms, **visibility(prediction)}
+
+    def go_back(self, iteration: int, caution: float) -> None:
+        """Go on from an earlier iteration of the present visit; look anew where matter is."""
+        super().go_back(iteration, caution)
+        self._look_around()
 
     @torch.no_grad()
     def add_gradients(self) -> None:

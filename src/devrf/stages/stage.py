@@ -15,11 +15,15 @@ from torch import Tensor
 
 from devrf.errors import DevrfError
 from devrf.ops.adam import GridAdam
+from devrf.ops.spans import span
 from devrf.rendering.model import SceneModel
+from devrf.rendering.player import Player
 from devrf.scenes.scene import CaptureName, Scene, Views
+from devrf.shortage import ShortageError
 from devrf.stages.checkpoint import Passport, check_scene, passport_in
 from devrf.stages.compact_state import compact_state
 from devrf.stages.held_out import score
+from devrf.stages.parts import Parts
 from devrf.stages.progress import random_states, set_random_states
 from devrf.stages.ranks import (
     RaysByRank,
@@ -49,16 +53,22 @@ class ScheduledStage(LightningModule, ABC):
     Attributes:
         name: what the stage is called in files and messages.
         capture: the part of the scene that is learned from.
+        costly: the config keys that its memory depends on most.
         iteration: optimiser iterations done.
         phase: the stretch of the schedule that the grids are ready for; None before the first.
         record: what training took, once a ``TrainingRecord`` callback has measured it.
         generator: what pixels are drawn with, on the stage's device. At the beginning of each
             Lightning step it depends on the seed, the process and the iteration alone.
         made_with: the settings that decide what is learned, by config key, if somebody told.
+        parts: how batches are divided when memory runs out.
+        back_offs: how often learning went wrong and was taken back.
+        caution: what the scheduled learning rates are multiplied by; below 1 after a back-off.
+        gave_up: why the stage ended before its schedule; None while it has not.
     """
 
     name: ClassVar[str]
     capture: ClassVar[CaptureName]
+    costly: ClassVar[tuple[str, ...]]
 
     def __init__(self, iterations_per_step: int) -> None:
         super().__init__()
@@ -70,6 +80,10 @@ class ScheduledStage(LightningModule, ABC):
         self.generator = torch.Generator()
         self._seed = 0
         self.made_with: dict[str, Any] = {}
+        self.parts = Parts()
+        self.back_offs = 0
+        self.caution = 1.0
+        self.gave_up: str | None = None
         self._left_off: dict[str, Any] | None = None
 
     @property
@@ -131,18 +145,66 @@ class ScheduledStage(LightningModule, ABC):
         take_from_first([*self.parameters(), *self.buffers()])
 
     def on_fit_end(self) -> None:
-        """See that every process has come to the same fields."""
+        """See that every process has come to the same fields.
+
+        Raises:
+            DevrfError: they have not, or the stage gave up.
+        """
+        if self.gave_up is not None:
+            raise DevrfError(self.gave_up)
         if self.iteration >= self.total_iterations:
             state = self.state_dict().items()
             check_alike({name: t for name, t in state if isinstance(t, Tensor)})
 
     def _draw_anew(self) -> None:
         """Seed the generator for the coming iterations, in each process differently."""
-        mixed = np.random.SeedSequence([self._seed, rank(), self.iteration])
+        mixed = np.random.SeedSequence([self._seed, rank(), self.iteration, self.back_offs])
         self.generator.manual_seed(int(mixed.generate_state(1, np.uint64)[0]))
 
-    def training_step(self, views: Views, batch_idx: int) -> None:
-        """Run iterations up to ``iterations_per_step``, never beyond the present phase."""
+    def where(self, iteration: int) -> str:
+        """An iteration of the present phase, its frame and its resolution, in words."""
+        frame = f"frame {self.phase.frame}, " if isinstance(self.phase, DeformationPhase) else ""
+        shape = "x".join(str(n) for n in self.resolution)
+        return f"iteration {iteration} of {self.total_iterations} ({frame}{shape})"
+
+    def give_up(self, why: str) -> None:
+        """End the stage after the present step, with a progress file if somebody writes one.
+
+        Args:
+            why: the line that the fit ends with.
+        """
+        self.gave_up = f"{self.name} stage: {why}"
+        self.trainer.should_stop = True
+
+    def go_back(self, iteration: int, caution: float) -> None:
+        """Go on from an earlier iteration of the present phase, whose fields have been put back.
+
+        With fresh moments and other random numbers than the first time.
+
+        Args:
+            iteration: where to go on.
+            caution: what all learning rates are multiplied by from now on.
+        """
+        self.iteration = iteration
+        self.back_offs += 1
+        self.caution *= caution
+        for state in self.optimizer.state.values():
+            for value in state.values():
+                value.zero_()
+        self._draw_anew()
+        self.trainer.should_stop = False
+
+    def _backward(self, total: Tensor) -> None:
+        with span("backward"):
+            self.manual_backward(total)
+
+    def training_step(self, views: Views, batch_idx: int) -> dict[str, Tensor]:
+        """Run iterations up to ``iterations_per_step``, never beyond the present phase.
+
+        Returns:
+            The means of the loss and of its terms over these iterations, by name; empty if
+            memory ran out before the first.
+        """
         if self.phase != self.phase_at(self.iteration):
             raise DevrfError(
                 f"{type(self).__name__}: nobody prepared the phase of iteration "
@@ -156,22 +218,40 @@ class ScheduledStage(LightningModule, ABC):
         if self.trainer.max_steps > 0:
             count = min(count, self.trainer.max_steps - self.trainer.global_step)
         sums: dict[str, Tensor] = {}
+        first = self.iteration
         for _ in range(count):
-            optimizer.zero_grad()
-            total, terms = self.loss(views)
-            if total.requires_grad:
-                self.manual_backward(total)
+            try:
+                total, terms = self.parts.gradients(
+                    lambda: self.loss(views), self._backward, optimizer.zero_grad,
+                    self.generator,
+                )
+            except ShortageError as shortage:
+                self.give_up(f"{shortage} at {self.where(self.iteration)}; {self.remedy}")
+                break
             average_gradients(p for group in optimizer.param_groups for p in group["params"])
-            self.add_gradients()
-            optimizer.step()
+            with span("optimiser"):
+                self.add_gradients()
+                optimizer.step()
             self.iteration += 1
             for name, value in {"loss": total.detach(), **terms}.items():
                 sums[name] = sums[name] + value if name in sums else value
         self._draw_anew()
-        means = {f"{self.capture}/{k}": value / count for k, value in average(sums).items()}
-        self.log_dict({**means, "step": float(self.iteration)})
+        if self.iteration == first:
+            return {}
+        means = {k: value / (self.iteration - first) for k, value in average(sums).items()}
+        named = {f"{self.capture}/{k}": value for k, value in means.items()}
+        self.log_dict({**named, "step": float(self.iteration)})
         if self.iteration >= self.total_iterations:
             self.trainer.should_stop = True
+        return means
+
+    @property
+    def remedy(self) -> str:
+        """What to do when memory is short, in words."""
+        return (
+            "the same command goes on where there is more memory; with less, begin afresh "
+            f"(resume=false) with lower {' or '.join(self.costly)}, or higher data.downscale"
+        )
 
     def test_step(self, index: int, batch_idx: int) -> dict[str, Any]:
         """Render and score one held-out image; the means are logged.
@@ -181,7 +261,7 @@ class ScheduledStage(LightningModule, ABC):
         """
         scene = self.scene
         views = scene.capture(self.capture).test
-        view = score(self.model, views, index, scene.background, self.device)
+        view = score(Player(self.model), views, index, scene.background)
         scores = {"psnr": view.psnr, "ssim": view.ssim, "rest_pose_psnr": view.rest_pose_psnr}
         means = {f"test/{self.capture}/{k}": v for k, v in scores.items()}
         self.log_dict(means, batch_size=1, sync_dist=True)
@@ -215,6 +295,9 @@ class ScheduledStage(LightningModule, ABC):
                 "at_hand": {} if self.phase is None else self.at_hand(),
                 "seed": self._seed,
                 "random": random_states(self.device),
+                "parts": self.parts.count,
+                "back_offs": self.back_offs,
+                "caution": self.caution,
             }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -236,6 +319,8 @@ class ScheduledStage(LightningModule, ABC):
                 f"this is the {ours[0]} stage on one of {ours[1]}; give it its own schedule"
             )
         self.iteration, self._seed = kept["iteration"], kept["seed"]
+        self.parts.count = kept["parts"]
+        self.back_offs, self.caution = kept["back_offs"], kept["caution"]
         self.phase = None if kept["phase"] is None else self.phase_at(kept["phase"])
         self._left_off = kept
 

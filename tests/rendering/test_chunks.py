@@ -1,0 +1,78 @@
+"""Pictures come out the same with less memory."""
+
+from __future__ import annotations
+
+import logging
+
+import pytest
+import torch
+
+from devrf.geometry.rays import Rays
+from devrf.rendering import model as module
+from devrf.rendering.chunks import FEWEST, in_chunks
+
+
+@pytest.fixture
+def rays(rng: torch.Generator) -> Rays:
+    origins = torch.rand(1000, 3, generator=rng)
+    return Rays(origins, origins, origins)
+
+
+def test_rays_come_in_order(rays: Rays) -> None:
+    assert [len(part) for part in in_chunks(lambda some: some, rays, 300)] == [300, 300, 300, 100]
+    assert in_chunks(lambda some: some, rays[:0], 300) == []
+
+
+def test_fewer_rays_at_once_when_memory_runs_out(
+    rays: Rays, caplog: pytest.LogCaptureFixture
+) -> None:
+    def see(some: Rays) -> torch.Tensor:
+        if len(some) > 600:
+            raise RuntimeError("[enforce fail at alloc_cpu.cpp] . DefaultCPUAllocator: can't "
+                               "allocate memory: you tried to allocate 10 bytes.")
+        return some.origins
+
+    with caplog.at_level(logging.WARNING, logger="devrf"):
+        parts = in_chunks(see, rays, 16384)
+    assert [len(part) for part in parts] == [500, 500]
+    assert torch.equal(torch.cat(parts), rays.origins)
+    assert caplog.messages[-1].startswith("out of memory: pictures are rendered ")
+
+
+def test_in_the_end_the_error_is_told(rays: Rays) -> None:
+    tried: list[int] = []
+
+    def see(some: Rays) -> None:
+        tried.append(len(some))
+        raise torch.OutOfMemoryError("CUDA out of memory.")
+
+    with pytest.raises(torch.OutOfMemoryError):
+        in_chunks(see, rays, 512)
+    assert tried == [512, FEWEST]
+
+
+def test_other_errors_are_not_retried(rays: Rays) -> None:
+    def see(some: Rays) -> None:
+        raise RuntimeError("ours")
+
+    with pytest.raises(RuntimeError, match="ours"):
+        in_chunks(see, rays, 512)
+
+
+def test_a_picture_is_the_same_with_less_memory(
+    rest, tiny_scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rays = tiny_scene.static.test.cameras.image_rays(0)
+    rays = rays[torch.arange(len(rays)).repeat(2)]
+    whole = rest.model.picture(rays, 0.0, torch.ones(3))
+    usual = module.render
+
+    def render(some, *others):
+        if len(some) > 450:
+            raise torch.OutOfMemoryError("CUDA out of memory.")
+        return usual(some, *others)
+
+    monkeypatch.setattr(module, "render", render)
+    divided = rest.model.picture(rays, 0.0, torch.ones(3))
+    for name in ("color", "depth", "opacity"):
+        torch.testing.assert_close(getattr(divided, name), getattr(whole, name))
