@@ -20,6 +20,8 @@ from devrf.rendering.model import Picture, SceneModel
 
 # Small pictures are shown enlarged: a video of 100 pixels is too small to watch.
 WATCHABLE = 240
+# Bytes that a pixel of a video takes, at most: met in scenes of two hundred pixels and less.
+PIXEL = 0.2
 
 
 @dataclass(frozen=True)
@@ -78,6 +80,18 @@ def write_video(path: Path, images: Iterator[Tensor], fps: int) -> None:
         with closing(writer):
             for image in images:
                 writer.append_data(_watchable(to_bytes(image).numpy()))
+
+
+def film_bytes(frames: int, height: int, width: int) -> int:
+    """About how large a video of ``frames`` pictures becomes, colour beside depth; rather less.
+
+    Args:
+        frames: how many pictures.
+        height: of a camera's picture, pixels.
+        width: likewise.
+    """
+    enlarged = max(1, math.ceil(WATCHABLE / height)) ** 2
+    return round(frames * 2 * height * width * enlarged * PIXEL)
 
 
 def _watchable(image: np.ndarray) -> np.ndarray:

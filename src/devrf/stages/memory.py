@@ -16,10 +16,17 @@ from devrf.fields.architecture import Architecture
 from devrf.fields.deformation import DeformationField
 from devrf.geometry.box import Box
 from devrf.scenes.scene import Scene, Views
+from devrf.stages.parts import Parts
 from devrf.stages.schedules import CanonicalSchedule, DeformationSchedule
 
 # Python and its libraries on the host, without what the driver of a GPU adds.
-PROGRAM = 500_000_000
+PROGRAM = 600_000_000
+# What the C library keeps of memory that was freed in between makes a stage on the host so much
+# larger than its tensors: measured on scenes of 48 to 160 pixels.
+KEPT_BACK = 1.3
+# What passes, by name; and what a stage shares with the scene where both are on the host.
+BATCH = "a batch"
+VIEWS = ("images", "optical flow", "depth")
 # Two int32 tell a pixel of a pool.
 POOLED = 8
 # A displacement: three float32.
@@ -53,6 +60,37 @@ class StageMemory:
         """Bytes at the worst moment: all that is held, and the largest of what passes."""
         return sum(self.held.values()) + max(self.passing.values(), default=0)
 
+    @property
+    def least(self) -> int:
+        """Bytes at the worst moment when batches are taken in as many parts as is tried."""
+        passing = {
+            name: size // Parts.MOST if name == BATCH else size
+            for name, size in self.passing.items()
+        }
+        return StageMemory(self.held, passing).peak
+
+    @property
+    def on_host(self) -> int:
+        """Bytes on the host at the worst moment; the scene's own images are used in place."""
+        return round(KEPT_BACK * (self.peak - sum(self.held.get(name, 0) for name in VIEWS)))
+
+
+@dataclass(frozen=True)
+class StageFiles:
+    """What a stage writes, in bytes.
+
+    Attributes:
+        finished: its checkpoint.
+        progress: one of its progress files at the final resolution.
+    """
+
+    finished: int
+    progress: int
+
+    def peak(self, kept: int) -> int:
+        """The most that is there at once: ``kept`` progress files and a file being written."""
+        return kept * self.progress + max(self.progress, self.finished)
+
 
 @dataclass(frozen=True)
 class Budget:
@@ -63,12 +101,14 @@ class Budget:
         canonical: the canonical stage on its device.
         deformation: the deformation stage on its device.
         checkpoint: the tensors of ``deformation.ckpt``.
+        files: what each stage writes, by its name.
     """
 
     scene: Mapping[str, int]
     canonical: StageMemory
     deformation: StageMemory
     checkpoint: Mapping[str, int]
+    files: Mapping[str, StageFiles]
 
     @property
     def gpu(self) -> int:
@@ -86,12 +126,8 @@ class Budget:
     @property
     def host_alone(self) -> int:
         """Bytes on the host of a run without a GPU: the stages use the scene's images in place."""
-        views = ("images", "optical flow", "depth")
-        own = [
-            stage.peak - sum(stage.held.get(name, 0) for name in views)
-            for stage in (self.canonical, self.deformation)
-        ]
-        return max(self.host, PROGRAM + sum(self.scene.values()) + max(own))
+        own = max(self.canonical.on_host, self.deformation.on_host)
+        return max(self.host, PROGRAM + sum(self.scene.values()) + own)
 
 
 def estimate(
@@ -121,7 +157,7 @@ def estimate(
     points = field.density.values.numel()
     grids = tensor_bytes(field.density) + tensor_bytes(field.color)
     decoder, displacements = tensor_bytes(field.decoder), tensor_bytes(motion)
-    slices = displacements // frames
+    slices, rest = displacements // frames, grids + decoder + points
     growth = 0
     if len(deformation.sides) > 1:
         x, y, z = box.grid_shape(deformation.sides[-2] ** 3)
@@ -144,10 +180,11 @@ def estimate(
                 "their gradients": grids,
                 "their Adam moments": 2 * grids,
                 "decoder, with gradients and moments": 4 * decoder,
+                "a copy to go back to": grids + decoder,
                 "occupancy": 2 * points,
             },
             passing={
-                "a batch": max(
+                BATCH: max(
                     batch_bytes(canonical, k, architecture, box, step)
                     for k in range(len(canonical.phases))
                 ),
@@ -165,9 +202,10 @@ def estimate(
                 f"displacements of {frames} frames, both ways": displacements,
                 "gradients of one frame": slices,
                 "Adam moments of one frame": 2 * slices,
+                "a copy of one frame to go back to": slices,
             },
             passing={
-                "a batch": motion_batch_bytes(
+                BATCH: motion_batch_bytes(
                     deformation.rays, samples_per_ray(box, voxels, architecture.planes, step),
                     architecture,
                 ),
@@ -181,6 +219,11 @@ def estimate(
             "decoder": decoder,
             "occupancy": points,
             f"displacements of {frames} frames, both ways": displacements,
+        },
+        files={
+            # With moments, and the share of the views of each voxel.
+            "canonical": StageFiles(rest, rest + 2 * (grids + decoder) + 4 * points),
+            "deformation": StageFiles(rest + displacements, rest + displacements + 2 * slices),
         },
     )
 
