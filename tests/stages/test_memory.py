@@ -12,7 +12,9 @@ from devrf.fields.architecture import Architecture
 from devrf.geometry.box import Box
 from devrf.scenes.scene import Scene
 from devrf.stages.memory import (
+    BATCH,
     PROGRAM,
+    StageFiles,
     StageMemory,
     batch_bytes,
     estimate,
@@ -76,6 +78,29 @@ def test_the_host_holds_all_views_and_twice_the_fields(cubic: Scene) -> None:
     scene = sum(budget.scene.values())
     assert budget.host == PROGRAM + scene + 2 * sum(budget.checkpoint.values())
     assert budget.host_alone >= budget.host
+
+
+def test_a_copy_to_go_back_to_counts(cubic: Scene) -> None:
+    budget = estimate(cubic, CANONICAL, DEFORMATION, SMALL)
+    fields = budget.canonical.held["density and features"] + budget.deformation.held["decoder"]
+    assert budget.canonical.held["a copy to go back to"] == fields
+    slices = budget.deformation.held["gradients of one frame"]
+    assert budget.deformation.held["a copy of one frame to go back to"] == slices
+
+
+def test_in_hard_times_a_batch_is_taken_in_eight_parts() -> None:
+    assert StageMemory({"a": 3}, {BATCH: 80, "b": 4}).least == 13
+    assert StageMemory({"a": 3}, {BATCH: 80, "b": 40}).least == 43
+
+
+def test_on_the_host_the_images_are_there_anyway() -> None:
+    assert StageMemory({"a": 100, "images": 50, "depth": 7}, {"c": 100}).on_host == 260
+
+
+def test_the_files_of_a_stage() -> None:
+    # Two that are kept, and the next beside them; or the finished one.
+    assert StageFiles(finished=5, progress=8).peak(kept=2) == 24
+    assert StageFiles(finished=9, progress=8).peak(kept=2) == 25
 
 
 def test_a_peak_is_what_is_held_and_the_largest_of_what_passes() -> None:

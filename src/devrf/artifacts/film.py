@@ -25,6 +25,8 @@ from devrf.rendering.player import Player
 WATCHABLE = 240
 # H.264 has blocks of so many pixels.
 SMALLEST = 16
+# Bytes that a pixel of a video takes, at most: met in scenes of two hundred pixels and less.
+PIXEL = 0.2
 
 
 @dataclass(frozen=True)
@@ -100,6 +102,18 @@ def write_video(path: Path, images: Iterator[Tensor], fps: int, *, least: int = 
         with closing(writer):
             for image in images:
                 writer.append_data(_enlarged(to_bytes(image).numpy(), least))
+
+
+def film_bytes(frames: int, height: int, width: int) -> int:
+    """About how large a video of ``frames`` pictures becomes, colour beside depth; rather less.
+
+    Args:
+        frames: how many pictures.
+        height: of a camera's picture, pixels.
+        width: likewise.
+    """
+    enlarged = max(1, math.ceil(WATCHABLE / height)) ** 2
+    return round(frames * 2 * height * width * enlarged * PIXEL)
 
 
 def _enlarged(image: np.ndarray, least: int) -> np.ndarray:

@@ -24,6 +24,7 @@ from devrf.run.objective import check_objective, objective
 from devrf.run.processes import together
 from devrf.run.report import report
 from devrf.run.resume import set_aside
+from devrf.run.room import check_room, shortage_in_words
 from devrf.run.score import evaluate
 from devrf.run.train import canonical, deformation
 
@@ -74,6 +75,10 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
         raise DevrfError(f"stage: expected one of {', '.join(STEPS)}, not {stage!r}")
     run = RunContext(config, folder)
     _check(run, stage)
+    learns = [step.__name__ for step in STEPS[stage] if step in LEARNING]
+    if learns and config.memory_check and run.leads:
+        further = {evaluate, render} & set(STEPS[stage])
+        check_room(run, learns, scores=bool(further), films=render in further)
     if not config.resume and not {canonical, deformation}.isdisjoint(STEPS[stage]):
         needed = () if canonical in STEPS[stage] else (run.own_checkpoint("canonical"),)
         set_aside(folder, *needed)
@@ -110,7 +115,8 @@ def _take(steps: Sequence[Callable[[RunContext], None]], run: RunContext) -> Non
     for step in steps:
         seed_everything(run.config.seed, verbose=False)
         run.begin_step()
-        step(run)
+        with shortage_in_words(step.__name__, run):
+            step(run)
 
 
 def _check(run: RunContext, stage: str) -> None:
