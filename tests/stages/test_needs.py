@@ -15,6 +15,7 @@ BUDGET = Budget(
     deformation=StageMemory(
         {"images": 40, "displacements of 5 frames, both ways": 1000}, {BATCH: 800}
     ),
+    fields={"density and features": 400, "displacements of 5 frames, both ways": 1000},
     checkpoint={"density and features": 400, "displacements of 5 frames, both ways": 1000},
     files={"canonical": StageFiles(400, 1200), "deformation": StageFiles(1400, 1500)},
 )
