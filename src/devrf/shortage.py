@@ -16,7 +16,7 @@ ASKED = re.compile(r"tried to allocate (\d[\d.]*) ?(\w+)", re.IGNORECASE)
 UNITS = {"b": 1, "bytes": 1, "kib": 2**10, "mib": 2**20, "gib": 2**30, "tib": 2**40}
 
 
-class Shortage(DevrfError):
+class ShortageError(DevrfError):
     """Memory has run out, and whatever could be done about it has been done."""
 
 

@@ -194,7 +194,8 @@ def test_parts_are_the_batch_in_order(tiny_scene: Scene, rng: torch.Generator) -
     batch = gather_batch(views, image, torch.arange(7) * 5, background)
     parts = Parts()
     parts.count, seen, shares = 3, [], []
-    for parts._present in range(3):
+    for part in range(3):
+        parts._present = part
         seen.append(parts.of(batch))
         shares.append(parts._share)
     assert [len(part.rays) for part in seen] == [2, 2, 3] and sum(shares) == pytest.approx(1)

@@ -76,8 +76,9 @@ class Saving(Callback):
         assert isinstance(pl_module, ScheduledStage)
         asked, due = self._asked, time.monotonic() >= self._due
         if trainer.world_size > 1:  # what one process is asked, all must do
-            asked = trainer.strategy.reduce_boolean_decision(asked, all=False)
-            due = trainer.strategy.reduce_boolean_decision(due and trainer.is_global_zero, all=False)
+            decide = trainer.strategy.reduce_boolean_decision
+            asked = decide(asked, all=False)
+            due = decide(due and trainer.is_global_zero, all=False)
         if pl_module.iteration >= pl_module.total_iterations:
             return  # the stage is done: its checkpoint is next
         # This step's line of the curves, if it has one, is only written after this: a file

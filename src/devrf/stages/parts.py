@@ -10,7 +10,7 @@ from torch import Tensor
 
 from devrf.data.batch import RayBatch
 from devrf.errors import DevrfError
-from devrf.shortage import Shortage, give_back, is_shortage, numbers
+from devrf.shortage import ShortageError, give_back, is_shortage, numbers
 from devrf.stages.ranks import world_size
 
 log = logging.getLogger(__name__)
@@ -62,7 +62,7 @@ class Parts:
             generator: what the batch is drawn with; it draws the same batch for all its parts.
 
         Raises:
-            Shortage: there is no room for the smallest part; nothing has changed.
+            ShortageError: there is no room for the smallest part; nothing has changed.
             DevrfError: several processes learn together, and one has no room.
         """
         while True:
@@ -88,8 +88,9 @@ class Parts:
         state: Tensor,
     ) -> tuple[Tensor, Terms]:
         sums: Terms = {}
-        for self._present in range(self.count):
-            if self._present:
+        for part in range(self.count):
+            self._present = part
+            if part:
                 generator.set_state(state)
             total, terms = loss()
             if self.count > 1:
@@ -110,7 +111,7 @@ class Parts:
                 f"({numbers(said, device)}); fewer rays, smaller grids or more processes"
             )
         if self.count >= min(self.MOST, self._rays):
-            raise Shortage(f"out of memory ({numbers(said, device)})")
+            raise ShortageError(f"out of memory ({numbers(said, device)})")
         self.count *= 2
         log.warning(
             "out of memory (%s): batches are taken in %d parts from now on", numbers(said, device),

@@ -17,7 +17,7 @@ from devrf.errors import DevrfError
 from devrf.ops.adam import GridAdam
 from devrf.rendering.model import SceneModel
 from devrf.scenes.scene import CaptureName, Scene, Views
-from devrf.shortage import Shortage
+from devrf.shortage import ShortageError
 from devrf.stages.checkpoint import Passport, check_scene, passport_in
 from devrf.stages.held_out import score
 from devrf.stages.parts import Parts
@@ -218,7 +218,7 @@ class ScheduledStage(LightningModule, ABC):
                     lambda: self.loss(views), self.manual_backward, optimizer.zero_grad,
                     self.generator,
                 )
-            except Shortage as shortage:
+            except ShortageError as shortage:
                 self.give_up(f"{shortage} at {self.where(self.iteration)}; {self.remedy}")
                 break
             average_gradients(p for group in optimizer.param_groups for p in group["params"])
