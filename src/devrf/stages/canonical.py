@@ -26,7 +26,6 @@ from devrf.rendering.model import SceneModel
 from devrf.rendering.render import RenderSettings
 from devrf.scenes.scene import CaptureName, Views
 from devrf.stages.checkpoint import Passport, Stored
-from devrf.stages.memory import StageMemory, canonical_memory
 from devrf.stages.progress import pack, unpack
 from devrf.stages.ranks import share
 from devrf.stages.replay import Graphs
@@ -103,12 +102,6 @@ class CanonicalStage(ScheduledStage):
     def model_now(self) -> SceneModel:
         """The same."""
         return self.model
-
-    def memory(self) -> StageMemory:
-        """Counted from the schedule."""
-        return canonical_memory(
-            self.scene, self.schedule, self.architecture, self.sampling.step
-        )
 
     @property
     def optimizer(self) -> GridAdam:

@@ -116,10 +116,6 @@ class DeformationStage(ScheduledStage):
         assert self.scene_model.deformation is not None, "the stage has not been set up"
         return self.scene_model.deformation
 
-    def memory(self) -> StageMemory:
-        """Counted from the schedule and from where the displacements rest."""
-        return self._memory(self.field.on_host)
-
     def _memory(self, on_host: bool) -> StageMemory:
         model = self.scene_model
         return motion_memory(

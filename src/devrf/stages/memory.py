@@ -57,12 +57,6 @@ class StageMemory:
     held: Mapping[str, int]
     passing: Mapping[str, int]
 
-    def in_words(self) -> str:
-        """The peak and the three largest parts, on one line."""
-        parts = sorted({**self.held, **self.passing}.items(), key=lambda part: -part[1])[:3]
-        largest = ", ".join(f"{name} {size / 1e9:.2f}" for name, size in parts)
-        return f"about {self.peak / 1e9:.2f} GB ({largest})"
-
     @property
     def peak(self) -> int:
         """Bytes at the worst moment: all that is held, and the largest of what passes."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from abc import ABC, abstractmethod
 from dataclasses import asdict
 from pathlib import Path
@@ -32,7 +31,6 @@ from devrf.shortage import ShortageError
 from devrf.stages.checkpoint import Passport, check_scene, passport_in
 from devrf.stages.compact_state import compact_state
 from devrf.stages.held_out import score
-from devrf.stages.memory import StageMemory
 from devrf.stages.parts import Parts
 from devrf.stages.progress import random_states, set_random_states
 from devrf.stages.ranks import (
@@ -47,8 +45,6 @@ from devrf.stages.ranks import (
 )
 from devrf.stages.replay import Capturer, Graphs, OnCuda, Repeated
 from devrf.stages.schedules import CanonicalPhase, DeformationPhase
-
-log = logging.getLogger(__name__)
 
 Phase = CanonicalPhase | DeformationPhase
 
@@ -142,10 +138,6 @@ class ScheduledStage(LightningModule, ABC):
         """The model that is being learned, in which what is at hand may not have its place yet."""
 
     @abstractmethod
-    def memory(self) -> StageMemory:
-        """What the stage will need on the device that it trains on."""
-
-    @abstractmethod
     def phase_at(self, iteration: int) -> Phase:
         """The phase of the schedule that ``iteration`` belongs to."""
 
@@ -212,8 +204,6 @@ class ScheduledStage(LightningModule, ABC):
     def on_fit_start(self) -> None:
         """Begin with the same fields in every process."""
         take_from_first([*self.parameters(), *self.buffers()])
-        if self.trainer.is_global_zero:
-            log.info("%s: needs %s on the %s", self.name, self.memory().in_words(), self.device)
 
     def on_fit_end(self) -> None:
         """See that every process has come to the same fields.
