@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar
@@ -71,7 +72,8 @@ class ScheduledStage(LightningModule, ABC):
         name: what the stage is called in files and messages.
         capture: the part of the scene that is learned from.
         costly: the config keys that its memory depends on most.
-        iteration: optimiser iterations done.
+        iteration: where the stage is in its schedule: optimiser iterations done or left out.
+        skipped: how many were left out, since a phase had nothing left to gain.
         phase: the stretch of the schedule that the grids are ready for; None before the first.
         record: what training took, once a ``TrainingRecord`` callback has measured it.
         generator: what pixels are drawn with, on the stage's device. At the beginning of each
@@ -96,6 +98,7 @@ class ScheduledStage(LightningModule, ABC):
         self.room: Room | None = None
         self.iterations_per_step = iterations_per_step
         self.iteration = 0
+        self.skipped = 0
         self.phase: Phase | None = None
         self.record: dict[str, float | None] = {}
         self.generator = torch.Generator()
@@ -159,6 +162,14 @@ class ScheduledStage(LightningModule, ABC):
     @abstractmethod
     def loss(self, views: Views, pixels: Pixels) -> tuple[Tensor, dict[str, Tensor]]:
         """The weighted loss of a batch of pixels of ``views``, and its terms by name."""
+
+    def settled(self, means: Mapping[str, Tensor]) -> bool:
+        """Whether the present phase has nothing left to gain, so that its rest is left out.
+
+        Args:
+            means: of the loss and its terms over the Lightning step that is done.
+        """
+        return False
 
     def see(
         self, rays: Rays, occupancy: Occupancy, background: Tensor, warp: GridWarp | None = None
@@ -293,13 +304,17 @@ class ScheduledStage(LightningModule, ABC):
                 self.give_up(f"{shortage} at {self.where(self.iteration)}; {self.remedy}")
                 break
             self.iteration += 1
-        self._draw_anew()
         done = self.iteration - first
         means = {k: value / done for k, value in average(self._sums).items()} if done else {}
         for value in self._sums.values():
             value.zero_()
         if self.room is not None and self.room.look():
             self._repeated = None  # captured with lists of another length
+        stop = min(self.phase.stop, self.total_iterations)
+        if done and self.iteration < stop and self.settled(means):
+            self.skipped += stop - self.iteration
+            self.iteration = stop
+        self._draw_anew()
         if not done:
             return {}
         named = {f"{self.capture}/{k}": value for k, value in means.items()}
@@ -401,6 +416,7 @@ class ScheduledStage(LightningModule, ABC):
             checkpoint["progress"] = {
                 "stage": self.name,
                 "iteration": self.iteration,
+                "skipped": self.skipped,
                 "total": self.total_iterations,
                 "phase": None if self.phase is None else self.phase.start,
                 "at_hand": {} if self.phase is None else self.at_hand(),
@@ -430,6 +446,7 @@ class ScheduledStage(LightningModule, ABC):
                 f"this is the {ours[0]} stage on one of {ours[1]}; give it its own schedule"
             )
         self.iteration, self._seed = kept["iteration"], kept["seed"]
+        self.skipped = kept["skipped"]
         self.parts.count = kept["parts"]
         self.back_offs, self.caution = kept["back_offs"], kept["caution"]
         self.phase = None if kept["phase"] is None else self.phase_at(kept["phase"])
