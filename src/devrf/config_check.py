@@ -11,7 +11,7 @@ import inspect
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, Literal, get_type_hints
 
 from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
@@ -22,7 +22,8 @@ from devrf.value_types import described, fits, held
 # What the run itself reads, beside the parts.
 ROOT: dict[str, Any] = {
     "stage": str, "seed": int, "resume": bool, "memory_check": bool, "ckpt": str | Path | None,
-    "objective": str, "scene": str,
+    "objective": str, "scene": str, "kernels": Literal["auto", "torch", "triton"],
+    "graphs": Literal["auto", "off"],
 }
 # Hydra's own keys in a part's config.
 RESERVED = {"_target_", "_partial_", "_convert_", "_recursive_", "_args_"}

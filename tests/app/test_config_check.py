@@ -33,7 +33,7 @@ def config(**changes: object):
     here = f"{__name__}."
     base = {
         "stage": "pipeline", "seed": 0, "resume": True, "memory_check": True, "ckpt": None,
-        "scene": "robot", "objective": "deformation.psnr",
+        "scene": "robot", "objective": "deformation.psnr", "kernels": "auto", "graphs": "auto",
         "sizes": {"inner": {"_target_": f"{here}Inner", "size": 2}},
         "loss": {"fine": {"color": 1.0}},
         "outer": {

@@ -52,7 +52,6 @@ class GridAdam(torch.optim.Optimizer):
         self._work = self.apply
         super().__init__(params, defaults)
 
-    @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
         """One step on every parameter that has a gradient, after ``closure``."""
         result = None
@@ -69,7 +68,8 @@ class GridAdam(torch.optim.Optimizer):
                     )
                 # A fill, not a copy from the host: the device need not wait.
                 rate.fill_(group["lr"])
-        self._work()
+        with torch.enable_grad():
+            self._work()
         return result
 
     @contextmanager

@@ -16,6 +16,7 @@ from devrf import job
 from devrf.errors import DevrfError
 from devrf.losses.composer import WeightedLoss
 from devrf.losses.motion import MOTION_TERMS
+from devrf.ops.choice import using
 from devrf.run.benchmark import benchmark
 from devrf.run.context import FROM_NOTHING, RunContext
 from devrf.run.film import picture, render
@@ -115,7 +116,7 @@ def _take(steps: Sequence[Callable[[RunContext], None]], run: RunContext) -> Non
     for step in steps:
         seed_everything(run.config.seed, verbose=False)
         run.begin_step()
-        with shortage_in_words(step.__name__, run):
+        with using(run.config.kernels), shortage_in_words(step.__name__, run):
             step(run)
 
 

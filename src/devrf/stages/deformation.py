@@ -305,9 +305,9 @@ class DeformationStage(ScheduledStage):
         with span("batch"):
             batch = gather_batch(views, pixels.image, pixels.flat, pixels.background, space)
         output = self.see(batch.rays, visit.occupancy, batch.background, visit.warp)
+        before = visit.unwarp_previous(looked_up=self.room is not None)
         prediction = MotionPrediction(
-            output, batch, visit.unwarp, visit.unwarp_previous, views.cameras, self._previous,
-            space,
+            output, batch, visit.unwarp, before, views.cameras, self._previous, space
         )
         with span("losses"):
             total, terms = self.losses(prediction)

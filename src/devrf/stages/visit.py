@@ -69,10 +69,14 @@ class Visit:
         """Canonical points → the frame."""
         return GridWarp((self.forward,), self.box)
 
-    @property
-    def unwarp_previous(self) -> GridWarp:
-        """Canonical points → the frame before."""
-        return GridWarp((self.before,), self.box)
+    def unwarp_previous(self, *, looked_up: bool) -> GridWarp:
+        """Canonical points → the frame before.
+
+        Args:
+            looked_up: move points by zero for frame 1, too, before which nothing has moved:
+                the same work for every frame.
+        """
+        return GridWarp((self.before,) if looked_up or self.frame > 1 else (), self.box)
 
     def enter(self, motion: DeformationField, frame: int) -> None:
         """Take a frame out of the field."""
