@@ -73,9 +73,10 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
     run = RunContext(config, folder)
     _check(run, stage)
     learns = [step.__name__ for step in STEPS[stage] if step in LEARNING]
+    needs = None
     if learns and config.memory_check and run.leads:
         further = {evaluate, render} & set(STEPS[stage])
-        check_room(run, learns, scores=bool(further), films=render in further)
+        needs = check_room(run, learns, scores=bool(further), films=render in further)
     if not config.resume and not {canonical, deformation}.isdisjoint(STEPS[stage]):
         needed = () if canonical in STEPS[stage] else (run.own_checkpoint("canonical"),)
         set_aside(folder, *needed)
