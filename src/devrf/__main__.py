@@ -28,6 +28,9 @@ def entry() -> None:
     except Interrupted as stop:
         print(f"devrf: {stop.said}", file=sys.stderr)
         raise
+    except KeyboardInterrupt:  # raised by somebody else's answer to Ctrl-C
+        print("devrf: interrupted", file=sys.stderr)
+        sys.exit(130)
 
 
 if __name__ == "__main__":

@@ -169,3 +169,17 @@ def test_fields_that_stray_are_not_passed_off_as_the_result(devrf, tmp_path, arg
     assert outcome.err.startswith("devrf: trainer: the processes have learned different fields (")
     assert "canonical.color.values)" in outcome.err and outcome.err.count("\n") == 1
     assert not (tmp_path / "run" / "checkpoints").exists()
+
+
+def test_both_processes_go_on_where_they_were_left(devrf, tmp_path, arguments):
+    command = (
+        *arguments, "hydra.run.dir=run", "canonical.iterations_per_step=2",
+        "callbacks.saving.every_seconds=0", "callbacks.saving.share=1.0",
+    )
+    checkpoints = tmp_path / "run" / "checkpoints"
+    assert devrf(*command, "trainer.max_steps=4").status == 0
+    assert (checkpoints / "canonical-progress-4.ckpt").is_file()
+    outcome = devrf(*command)
+    assert (outcome.status, outcome.err) == (0, "")
+    assert "canonical: goes on at iteration 4" in outcome.out
+    assert {path.name for path in checkpoints.glob("*.ckpt")} == {"canonical.ckpt"}

@@ -20,6 +20,7 @@ from devrf.fields.occupancy import Occupancy
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.rendering.model import SceneModel
+from devrf.rendering.player import Player
 from devrf.rendering.render import RenderSettings
 from devrf.stages.held_out import HeldOutView
 
@@ -135,7 +136,7 @@ def test_pictures_show_colour_beside_depth_while_time_runs(cube: Box) -> None:
         canonical.color.values.copy_(torch.tensor([9.0, -9.0, -9.0]).expand(5, 5, 5, 3))
     settings = RenderSettings(0.5, 1e-4, 0.0, 9.0)
     model = SceneModel(canonical, Occupancy.full((5, 5, 5), cube), settings)
-    shown = list(pictures(model, ring(3), 1.0, torch.device("cpu")))
+    shown = list(pictures(Player(model), ring(3), 1.0))
     assert len(shown) == 3
     for image in shown:
         assert image.shape == (10, 30, 3)
@@ -144,3 +145,14 @@ def test_pictures_show_colour_beside_depth_while_time_runs(cube: Box) -> None:
         torch.testing.assert_close(image[0, 0], torch.ones(3))
         torch.testing.assert_close(image[0, 15], torch.ones(3))
         assert image[5, 22].min() < 0.9
+
+
+def test_a_video_is_no_larger_than_was_said(rest, tiny_scene, tmp_path):
+    cameras = tiny_scene.static.train.cameras
+    for height in (None, 40):
+        film = FilmSettings(frames=8, height=height)
+        turned = orbit(cameras, rest.model.canonical.box, film)
+        path = tmp_path / "orbit.mp4"
+        shown = pictures(Player(rest.model, torch.device("cpu")), turned, 1.0)
+        write_video(path, shown, film.fps, least=WATCHABLE if height is None else 0)
+        assert 0.02 * film_bytes(film, cameras) < path.stat().st_size < film_bytes(film, cameras)

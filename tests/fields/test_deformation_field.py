@@ -9,6 +9,7 @@ from torch import Tensor
 from devrf.fields.deformation import DeformationField
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
+from devrf.ops.trilinear import interpolate
 
 CLOCK = FrameClock((0.0, 0.2, 0.6, 1.0))
 
@@ -63,6 +64,17 @@ def test_time_runs_linearly_between_the_warps_of_two_frames(
         move = getattr(field, name)
         mixed = 0.25 * move(x, 0.6) + 0.75 * move(x, 1.0)
         torch.testing.assert_close(move(x, 0.9), mixed, atol=1e-5, rtol=0)
+
+
+def test_one_grid_stands_for_the_two_frames_around_a_time(
+    field: DeformationField, rng: torch.Generator
+) -> None:
+    x = points(100, rng)
+    for time in (0.0, 0.1, 0.3, 1.0):
+        grid = field.blended(field.to_time, time)
+        found = x + interpolate(grid, field.box.to_grid(x, field.shape))
+        torch.testing.assert_close(found, field.unwarp(x, time))
+    assert field.blended(field.to_time, 0.6).data_ptr() == field.to_time[2].data_ptr()
 
 
 def test_every_frame_is_met_exactly_at_its_grid_points(field: DeformationField) -> None:

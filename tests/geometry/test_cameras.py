@@ -141,3 +141,13 @@ def test_a_selection_keeps_each_camera_whole(scattered: Cameras) -> None:
     for name in ("camera_to_world", "focal", "center"):
         assert torch.equal(getattr(chosen, name)[1], getattr(scattered, name)[1])
         assert torch.equal(getattr(chosen, name)[2], getattr(scattered, name)[4])
+
+
+@pytest.mark.parametrize(("height", "width"), [(40, 60), (5, 8), (1, 2)])
+def test_another_height_keeps_the_proportions(
+    scattered: Cameras, height: int, width: int
+) -> None:
+    # The cameras have 30 x 20 pixels; a width of 7.5 is rounded to even.
+    sized = scattered.of_height(height)
+    assert (sized.width, sized.height) == (width, height)
+    assert torch.equal(sized.focal[:, 1], scattered.focal[:, 1] * (height / 20))

@@ -49,6 +49,17 @@ def test_on_a_gpu_it_is_triton_where_the_check_passes(monkeypatch: pytest.Monkey
     assert not triton_runs(OnGpu(torch.float64))  # type: ignore[arg-type]
 
 
+def test_where_the_order_of_sums_must_be_fixed_it_is_pytorch(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(choice, "passes_check", lambda device: True)
+    assert triton_runs(OnGpu())  # type: ignore[arg-type]
+    monkeypatch.setattr(torch, "are_deterministic_algorithms_enabled", lambda: True)
+    assert not triton_runs(OnGpu())  # type: ignore[arg-type]
+    with using("triton"), pytest.raises(DevrfError, match="no fixed order.*deterministic=false"):
+        triton_runs(OnGpu())  # type: ignore[arg-type]
+
+
 def test_a_failed_check_is_said_once(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

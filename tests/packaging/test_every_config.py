@@ -40,7 +40,7 @@ def rooted(composed, *overrides):
 def test_the_groups_are_the_documented_ones():
     assert {
         "ablation", "callbacks", "data", "experiment", "field", "logger", "loss", "report",
-        "sampling", "schedule", "stages", "trainer", "video",
+        "benchmark", "sampling", "schedule", "stages", "still", "trainer", "video",
     } <= set(GROUPS)
 
 

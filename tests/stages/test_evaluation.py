@@ -19,6 +19,7 @@ from devrf.geometry.ndc import NormalizedDevice
 from devrf.metrics.masked import psnr_masked, ssim_masked
 from devrf.metrics.perceptual import TRUNKS
 from devrf.rendering.model import SceneModel
+from devrf.rendering.player import Player
 from devrf.rendering.render import RenderSettings
 from devrf.scenes.scene import Scene, Views
 from devrf.stages.canonical import CanonicalStage
@@ -70,7 +71,7 @@ def test_depth_of_a_slab_by_hand(cube: Box) -> None:
     judge = Evaluation(metrics=["depth_error"]).judge(HOST)
     for off in (0.0, 0.25, -0.5):
         known = replace(images, depth=truth[None] + off)
-        found = score(model, known, 0, "black", HOST, judge).further["depth_error"]
+        found = score(Player(model), known, 0, "black", judge).further["depth_error"]
         # A step is 0.005 long.
         assert found == pytest.approx(abs(off), abs=0.01)
 
@@ -87,7 +88,7 @@ def test_depth_of_a_scene_in_ndc_is_in_world_units() -> None:
     truth = 4 / 0.975 / -images.cameras.image_rays(0).directions[:, 2].view(8, 8)
     images = replace(images, depth=truth[None] + 0.5)
     judge = Evaluation(metrics=["depth_error"]).judge(HOST)
-    found = score(model, images, 0, "black", HOST, judge).further["depth_error"]
+    found = score(Player(model), images, 0, "black", judge).further["depth_error"]
     assert found == pytest.approx(0.5, abs=0.03)
 
 
@@ -96,7 +97,7 @@ def test_every_metric_of_a_learned_scene(
 ) -> None:
     judge = Evaluation(lpips_network="alex", lpips_weights=alex).judge(HOST)
     held_out, model = tiny_scene.dynamic.test, learned[0].model
-    view = score(model, held_out, 2, "white", HOST, judge)
+    view = score(Player(model), held_out, 2, "white", judge)
     assert list(view.further) == list(MEASURES)
     assert list(view.scores)[:3] == ["psnr", "ssim", "rest_pose_psnr"]
     mask = held_out.pixels[2, ..., 3] > 127
@@ -117,7 +118,7 @@ def test_what_a_scene_does_not_know_is_none(
     bare = replace(held_out, pixels=held_out.pixels[..., :3], flow=None, depth=None)
     names = [name for name in MEASURES if not name.startswith("lpips")]
     judge = Evaluation(metrics=names).judge(HOST)
-    found = score(learned[0].model, bare, 1, "white", HOST, judge).further
+    found = score(Player(learned[0].model), bare, 1, "white", judge).further
     assert found == dict.fromkeys(names)
 
 
@@ -129,7 +130,7 @@ def test_without_weights_lpips_is_none_and_a_line_says_why(
     with caplog.at_level(logging.INFO):
         judge = Evaluation(metrics=["lpips", "lpips_masked"]).judge(HOST)
         for index in range(2):
-            view = score(learned[0].model, tiny_scene.static.test, index, "white", HOST, judge)
+            view = score(Player(learned[0].model), tiny_scene.static.test, index, "white", judge)
             assert view.further == {"lpips": None, "lpips_masked": None}
         Evaluation(metrics=["ms_ssim"]).judge(HOST)
     assert len(caplog.messages) == 1 and "LPIPS is null" in caplog.text

@@ -8,10 +8,19 @@ from typing import Literal
 import pytest
 import torch
 from lightning import Trainer
+from torch import Tensor
 
+from devrf.fields.deformation import DeformationField
+from devrf.fields.occupancy import Occupancy
+from devrf.geometry.clock import FrameClock
 from devrf.metrics.image import psnr, ssim
+from devrf.rendering import player as player_module
+from devrf.rendering.model import SceneModel, occupancy_through
+from devrf.rendering.player import Player
 from devrf.scenes.scene import Scene
 from devrf.stages.canonical import CanonicalStage
+from devrf.stages.checkpoint import Stored
+from devrf.stages.evaluation import Judge
 from devrf.stages.held_out import background_value, score, truth_image
 
 
@@ -38,7 +47,7 @@ def test_a_score_is_that_of_the_picture_at_the_views_time(
     learned: tuple[CanonicalStage, Trainer], tiny_scene: Scene
 ) -> None:
     views, model = tiny_scene.dynamic.test, learned[0].model
-    scored = score(model, views, 2, "white", torch.device("cpu"))
+    scored = score(Player(model), views, 2, "white")
     assert scored.name == views.names[2] and scored.time == 1.0
     assert scored.prediction.shape == scored.truth.shape == (18, 24, 3)
     seen = model.picture(views.cameras.image_rays(2), 1.0, torch.ones(3)).color.clamp(0, 1)
@@ -47,3 +56,22 @@ def test_a_score_is_that_of_the_picture_at_the_views_time(
     assert scored.ssim == pytest.approx(ssim(scored.prediction, scored.truth))
     # Without a deformation the rest pose is all that can be shown.
     assert scored.rest_pose_psnr == scored.psnr
+
+
+def test_where_a_frame_s_matter_is_is_looked_for_once(
+    rest: Stored, tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, looked = rest.model, []
+    model.deformation = DeformationField(model.canonical.box, FrameClock((0.0, 0.5, 1.0)), voxels=8)
+
+    def counted(model: SceneModel, canonical: Tensor) -> Occupancy:
+        looked.append(1)
+        return occupancy_through(model, canonical)
+
+    monkeypatch.setattr(player_module, "occupancy_through", counted)
+    player, judge = Player(model), Judge(("psnr_masked", "flow_error"))
+    view = score(player, tiny_scene.dynamic.test, 1, "white", judge)
+    # The picture, the rest pose and the flow: the field is at rest, so all flow is missed.
+    assert view.further["flow_error"] is not None
+    assert view.psnr == pytest.approx(view.rest_pose_psnr, abs=1e-3)
+    assert len(looked) == 1

@@ -18,6 +18,7 @@ from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
 from devrf.geometry.space import WORLD
 from devrf.rendering.model import SceneModel
+from devrf.rendering.player import Player, Ready
 from devrf.rendering.render import RenderSettings
 from devrf.scenes.procedural import Material, ProceduralScene
 from devrf.scenes.scene import OpticalFlow, Scene, Views
@@ -49,8 +50,8 @@ class ExactField:
         return torch.zeros_like(points)
 
 
-def exact_model(scene: Scene, recipe: ProceduralScene) -> Any:
-    """What a scene model would be that knows the shape and its motion."""
+def exact_player(scene: Scene, recipe: ProceduralScene) -> Any:
+    """What would show a scene model that knows the shape and its motion."""
     field, shape = ExactField(scene, recipe), recipe.model()
 
     def unwarp(points: Tensor, time: float) -> Tensor:
@@ -58,11 +59,18 @@ def exact_model(scene: Scene, recipe: ProceduralScene) -> Any:
         return shape.forward(Material(points, part), time)
 
     occupancy = Occupancy.full((12, 12, 12), field.box)
-    return SimpleNamespace(
+    model = SimpleNamespace(
         canonical=field, deformation=SimpleNamespace(unwarp=unwarp), settings=SETTINGS,
-        space=WORLD, occupancy_at=lambda time: occupancy,
-        warp=lambda time: lambda points: shape.material(points, time).rest,
+        space=WORLD,
     )
+
+    def ready(time: float) -> Ready:
+        moves = model.deformation is not None
+        return Ready(
+            occupancy, warp=(lambda points: shape.material(points, time).rest) if moves else None
+        )
+
+    return SimpleNamespace(model=model, device=torch.device("cpu"), ready=ready)
 
 
 @pytest.mark.parametrize("index", [1, 2])
@@ -74,26 +82,26 @@ def test_the_exact_motion_of_a_procedural_scene_gives_its_exact_flow(
     truth = views.flow.vectors[index][views.flow.valid[index]]
     assert len(truth) > 40 and truth.norm(dim=1).mean() > 0.5
     flat = views.flow.valid[index].flatten().nonzero()[:, 0]
-    model = exact_model(tiny_scene, tiny_recipe)
-    errors = (seen_flow(model, views, index, index - 1, flat) - truth).norm(dim=1)
+    player = exact_player(tiny_scene, tiny_recipe)
+    errors = (seen_flow(player, views, index, index - 1, flat) - truth).norm(dim=1)
     # Where parts touch, a canonical point may belong to either: a few pixels go astray.
     assert errors.quantile(0.85) < 0.03 and errors.median() < 0.01
-    assert flow_error(model, views, index) == pytest.approx(float(errors.mean()))
+    assert flow_error(player, views, index) == pytest.approx(float(errors.mean()))
     # A scene that stays at rest is off by about the flow itself.
-    model.deformation, model.warp = None, lambda time: None
-    at_rest = flow_error(model, views, index)
+    player.model.deformation = None
+    at_rest = flow_error(player, views, index)
     assert at_rest is not None and at_rest > 3 * float(errors.mean())
 
 
 def test_without_flow_or_an_earlier_frame_it_is_unknown(
     tiny_scene: Scene, tiny_recipe: ProceduralScene
 ) -> None:
-    views, model = tiny_scene.dynamic.test, exact_model(tiny_scene, tiny_recipe)
-    assert flow_error(model, views, 0) is None
-    assert flow_error(model, replace(views, flow=None), 1) is None
+    views, player = tiny_scene.dynamic.test, exact_player(tiny_scene, tiny_recipe)
+    assert flow_error(player, views, 0) is None
+    assert flow_error(player, replace(views, flow=None), 1) is None
     assert views.flow is not None
     nowhere = OpticalFlow(views.flow.vectors, torch.zeros_like(views.flow.valid))
-    assert flow_error(model, replace(views, flow=nowhere), 1) is None
+    assert flow_error(player, replace(views, flow=nowhere), 1) is None
 
 
 SIDE = 21
@@ -136,17 +144,18 @@ def filmed_from_above(flow: tuple[float, float]) -> Views:
 def test_a_moving_block_by_hand(block: SceneModel) -> None:
     # The face is 4 away, the lens has 40 px: 0.3 units along x are 3 px, and came from the left.
     views = filmed_from_above((-3.0, 1.0))
-    seen = seen_flow(block, views, 2, 1, torch.arange(64), chunk=10)
+    seen = seen_flow(Player(block), views, 2, 1, torch.arange(64), chunk=10)
     torch.testing.assert_close(seen, torch.tensor([-3.0, 0.0]).expand(64, 2), atol=0.015, rtol=0)
-    assert flow_error(block, views, 2) == pytest.approx(1.0, abs=0.015)
+    assert flow_error(Player(block), views, 2) == pytest.approx(1.0, abs=0.015)
     # From rest to the first frame: 2 px.
-    assert flow_error(block, filmed_from_above((-2.0, 0.0)), 1) == pytest.approx(0, abs=0.015)
+    views = filmed_from_above((-2.0, 0.0))
+    assert flow_error(Player(block), views, 1) == pytest.approx(0, abs=0.015)
 
 
 def test_a_scene_without_motion_or_matter_shows_none(block: SceneModel) -> None:
     views = filmed_from_above((-3.0, 4.0))
     block.deformation = None
-    assert flow_error(block, views, 2) == pytest.approx(5.0, abs=1e-3)
+    assert flow_error(Player(block), views, 2) == pytest.approx(5.0, abs=1e-3)
     with torch.no_grad():
         block.canonical.density.values.fill_(-400.0)
-    assert flow_error(block, views, 2) == pytest.approx(5.0)
+    assert flow_error(Player(block), views, 2) == pytest.approx(5.0)

@@ -11,6 +11,7 @@ from lightning import Trainer
 from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
 from devrf.ops.total_variation import total_variation
+from devrf.rendering.player import Player
 from devrf.scenes.scene import Scene
 from devrf.stages.checkpoint import Stored
 from devrf.stages.deformation import DeformationStage
@@ -52,8 +53,8 @@ def test_a_whole_schedule_sees_the_motion_better_than_the_rest_pose(
         assert not frames[0].any()
         assert (frames[1:].abs().amax(dim=(1, 2, 3, 4)) > 1e-3).all()
     # Two views of three frames: at rest there is nothing to win.
-    cpu, train = torch.device("cpu"), tiny_scene.dynamic.train
-    views = [score(stage.model, train, k, "white", cpu) for k in range(6)]
+    player, train = Player(stage.model), tiny_scene.dynamic.train
+    views = [score(player, train, k, "white") for k in range(6)]
     gains = [view.psnr - view.rest_pose_psnr for view in views]
     assert gains[:2] == [0.0, 0.0]
     assert min(gains[2:]) > 0.5 and sum(gains[2:]) / 4 > 1

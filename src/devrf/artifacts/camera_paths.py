@@ -9,7 +9,7 @@ import torch
 from devrf.artifacts.film import FilmSettings
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
-from devrf.rendering.model import SceneModel
+from devrf.rendering.player import Player
 
 
 def orbit(cameras: Cameras, box: Box, settings: FilmSettings) -> Cameras:
@@ -70,14 +70,14 @@ def spiral(cameras: Cameras, focus: float, settings: FilmSettings) -> Cameras:
     )
 
 
-def focus_distance(model: SceneModel, cameras: Cameras, device: torch.device) -> float:
+def focus_distance(player: Player, cameras: Cameras) -> float:
     """Median depth along the optical axis, world units, of what the first camera sees at rest."""
-    rays = cameras.image_rays(0).to(device)
-    seen = model.picture(rays, 0.0, torch.ones(3, device=device))
+    cameras, space = cameras.to(player.device), player.model.space
+    rays = cameras.image_rays(0)
+    seen = player.picture(rays, 0.0, 1.0)
     solid = (seen.opacity > 0.5).nonzero()[:, 0]
     if len(solid) == 0:
         return float(cameras.positions.norm(dim=1).mean()) + 1.0
-    mapped = model.space.rays(rays)
-    points = model.space.to_world(mapped.at(solid, seen.depth[solid]))
-    _, depth = cameras.to(device).project_into(0, points)
+    points = space.to_world(space.rays(rays).at(solid, seen.depth[solid]))
+    _, depth = cameras.project_into(0, points)
     return float(depth.median())

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import imageio.v3 as iio
 import torch
 from torch import Tensor
 
-from devrf.artifacts.colors import error_colors, to_bytes
-from devrf.artifacts.files import whole_file
+from devrf.artifacts.colors import error_colors
+from devrf.artifacts.images import write_image
 from devrf.stages.held_out import HeldOutView
 
 GAP = 4
@@ -28,8 +27,7 @@ def write_contact_sheet(path: Path, views: Sequence[HeldOutView], rows: int = 6)
         side_by_side([v.prediction, v.truth, error_colors(v.prediction, v.truth)]) for v in chosen
     ]
     sheet = side_by_side([strip.transpose(0, 1) for strip in strips]).transpose(0, 1)
-    with whole_file(path) as partial:
-        iio.imwrite(partial, to_bytes(sheet).numpy(), extension=".png")
+    write_image(path, sheet)
     return sheet
 
 

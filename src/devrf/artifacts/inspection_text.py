@@ -3,33 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
-from rich import box as borders
 from rich.console import Group, RenderableType
-from rich.table import Table
 from rich.text import Text
 
 from devrf.artifacts.inspection import FlowFacts, Inspection, ViewsFacts
+from devrf.artifacts.sections import Section, as_lines, as_tables
 from devrf.geometry.box import Box
 from devrf.scenes.scene import Bounds
 from devrf.stages.memory import Budget, StageMemory
-
-
-@dataclass(frozen=True)
-class Section:
-    """A titled table.
-
-    Attributes:
-        title: what it is about.
-        rows: cells of text, of one number in all rows; the first row is the heading if
-            ``heading`` is set.
-        heading: whether the first row names the columns.
-    """
-
-    title: str
-    rows: tuple[tuple[str, ...], ...]
-    heading: bool = False
 
 
 def sections(found: Inspection, budget: Budget) -> list[Section]:
@@ -48,13 +30,7 @@ def sections(found: Inspection, budget: Budget) -> list[Section]:
 
 def plain(found: Inspection, budget: Budget) -> str:
     """The report as plain text, columns aligned."""
-    lines: list[str] = []
-    for section in sections(found, budget):
-        widths = [max(map(len, column)) for column in zip(*section.rows, strict=True)]
-        lines.append(section.title)
-        for row in section.rows:
-            cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
-            lines.append(("  " + "  ".join(cells)).rstrip())
+    lines = as_lines(sections(found, budget))
     lines.append(_verdict(found))
     lines += [f"  {advice}" for advice in found.advice]
     return "\n".join(lines)
@@ -62,18 +38,7 @@ def plain(found: Inspection, budget: Budget) -> str:
 
 def tables(found: Inspection, budget: Budget) -> RenderableType:
     """The report as tables for a terminal."""
-    parts: list[RenderableType] = []
-    for section in sections(found, budget):
-        table = Table(
-            title=section.title, title_justify="left", title_style="bold",
-            box=borders.SIMPLE_HEAD if section.heading else None, show_header=section.heading,
-        )
-        rows = section.rows
-        for name in rows[0] if section.heading else [""] * len(rows[0]):
-            table.add_column(name, style="" if table.columns else "cyan")
-        for row in rows[1:] if section.heading else rows:
-            table.add_row(*map(Text, row))  # Text: a name may hold [brackets]
-        parts += [table, Text()]
+    parts = as_tables(sections(found, budget))
     parts.append(Text(_verdict(found), style="bold yellow" if found.advice else "bold green"))
     for advice in found.advice:
         parts.append(Text.assemble(

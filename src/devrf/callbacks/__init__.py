@@ -1,5 +1,6 @@
 """Callbacks: what watches a stage and acts on it from outside."""
 
+from devrf.callbacks.excerpts import Excerpts
 from devrf.callbacks.health import Health
 from devrf.callbacks.meter import Meter
 from devrf.callbacks.previews import Previews
@@ -10,6 +11,6 @@ from devrf.callbacks.schedule import GridUpscaling, LearningRateDecay
 from devrf.callbacks.stopping import StopOnSignal
 
 __all__ = [
-    "GridUpscaling", "Health", "LearningRateDecay", "Meter", "Previews", "Progress", "Saving",
-    "StopOnSignal", "TrainingRecord",
+    "Excerpts", "GridUpscaling", "Health", "LearningRateDecay", "Meter", "Previews", "Progress",
+    "Saving", "StopOnSignal", "TrainingRecord",
 ]

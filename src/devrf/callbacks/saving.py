@@ -76,9 +76,8 @@ class Saving(Callback):
         assert isinstance(pl_module, ScheduledStage)
         asked, due = self._asked, time.monotonic() >= self._due
         if trainer.world_size > 1:  # what one process is asked, all must do
-            decide = trainer.strategy.reduce_boolean_decision
-            asked = decide(asked, all=False)
-            due = decide(due and trainer.is_global_zero, all=False)
+            agreed = trainer.strategy.reduce_boolean_decision
+            asked, due = agreed(asked, all=False), agreed(due and trainer.is_global_zero, all=False)
         if pl_module.iteration >= pl_module.total_iterations:
             return  # the stage is done: its checkpoint is next
         # This step's line of the curves, if it has one, is only written after this: a file

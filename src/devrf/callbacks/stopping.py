@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable
 from contextlib import ExitStack
 
@@ -12,7 +13,9 @@ from devrf.signals import Interrupted, answered_by
 
 
 class StopOnSignal(Callback):
-    """Lets the first signal stop the stage, saved; a second one ends the run at once.
+    """Lets the first signal stop the stage, saved; after it Ctrl-C ends the run at once.
+
+    Launchers may send theirs more than once: those change nothing any more.
 
     As a context it answers signals within its block; as a callback it takes them back from
     Lightning, whose own handler would end the run between two steps with nothing written.
@@ -35,10 +38,11 @@ class StopOnSignal(Callback):
         self._block.close()
 
     def _answer(self, number: int) -> None:
-        if self.number is not None:
-            raise Interrupted(number, "ended at once, at the second signal")
-        self.number = number
-        self._saving.ask_to_stop()
+        if self.number is None:
+            self.number = number
+            self._saving.ask_to_stop()
+        elif number == signal.SIGINT:
+            raise Interrupted(number, "ended at once; run the same command again to go on")
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Take the signals back from Lightning."""

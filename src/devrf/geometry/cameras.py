@@ -116,6 +116,10 @@ class Cameras:
             self.camera_to_world, self.focal * scale, self.center * scale, width, height
         )
 
+    def of_height(self, height: int) -> Cameras:
+        """The same cameras with images ``height`` pixels high and as wide as they were for it."""
+        return self.resized(max(1, round(self.width * height / self.height)), height)
+
     def to(self, device: torch.device | str) -> Cameras:
         """The same cameras on ``device``."""
         return Cameras(

@@ -11,6 +11,7 @@
 | ``adam`` | ``GridAdam``: the optimiser made of such steps |
 | ``corners`` | ``to_grid``: positions in a box to grid coordinates |
 | ``choice`` | ``using``: which implementation runs |
+| ``spans`` | ``span``: which part of the work is being done, for whoever measures |
 | ``selfcheck`` | ``check_kernels``: do both agree on this device? |
 
 Shapes never depend on data in ``warped_depth``, ``find_samples`` (with Triton), ``select``,

@@ -33,7 +33,8 @@ def using(kind: Kind) -> Iterator[None]:
 
     Args:
         kind: ``auto`` takes Triton for float32 tensors on a CUDA device where Triton is installed
-            and has passed a check on that device, plain PyTorch for all others; ``torch`` and
+            and has passed a check on that device, plain PyTorch for all others and where torch
+            is told to be deterministic (Triton's kernels add in no fixed order); ``torch`` and
             ``triton`` insist. A thread that is started inside begins with ``auto``.
 
     Raises:
@@ -59,8 +60,13 @@ def triton_runs(*tensors: Tensor) -> bool:
         return False
     first = tensors[0]
     single = all(tensor.dtype == torch.float32 for tensor in tensors)
+    ordered = torch.are_deterministic_algorithms_enabled()
     if kind == "auto":
-        return first.is_cuda and single and passes_check(first.device)
+        return first.is_cuda and single and not ordered and passes_check(first.device)
+    if ordered:
+        raise DevrfError(
+            "kernels: triton adds in no fixed order: choose kernels=auto, or deterministic=false"
+        )
     if not find_spec("triton"):
         raise DevrfError(
             "kernels: triton is not installed: pip install triton, or choose kernels=auto"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor, nn
 
@@ -13,22 +11,8 @@ from devrf.fields.occupancy import Occupancy, dilate
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import WORLD, Space
 from devrf.rendering.chunks import in_chunks
+from devrf.rendering.picture import Picture
 from devrf.rendering.render import RenderSettings, Warp, render
-
-
-@dataclass(frozen=True)
-class Picture:
-    """What R rays see, to be looked at.
-
-    Attributes:
-        color: (R, 3) RGB in [0, 1].
-        depth: (R,) mean distance of what is seen along the ray; 0 where nothing is.
-        opacity: (R,) in [0, 1], 1 − T_end.
-    """
-
-    color: Tensor
-    depth: Tensor
-    opacity: Tensor
 
 
 class SceneModel(nn.Module):
@@ -77,7 +61,9 @@ class SceneModel(nn.Module):
     def picture(
         self, rays: Rays, time: float, background: Tensor, chunk: int = 16384
     ) -> Picture:
-        """What rays see at ``time``.
+        """What rays see at ``time``: the plain way, which keeps nothing for another picture.
+
+        :class:`~devrf.rendering.player.Player` is the quick one, for a scene that is learned.
 
         Args:
             rays: R rays in world space.
@@ -91,26 +77,33 @@ class SceneModel(nn.Module):
             lambda some: render(some, self.canonical, occupancy, self.settings, background, warp),
             rays, chunk,
         )
-        return Picture(
-            color=torch.cat([part.color for part in parts]),
-            depth=torch.cat([part.depth for part in parts]),
-            opacity=1 - torch.cat([part.transmittance for part in parts]),
-        )
+        return Picture.joined([Picture.of(part) for part in parts])
 
 
 @torch.no_grad()
 def deformed_occupancy(model: SceneModel, warp: Warp) -> Occupancy:
     """Where something is once it has moved: the grid points that the warp sends to matter.
 
-    The canonical occupancy has a rim of one grid point, for what a stretching warp would step
-    over; so has the result, for what lies between its own grid points.
-
     Args:
         model: gives the canonical occupancy and the box.
         warp: maps points (M, 3) at the time in question into canonical space.
     """
+    points = occupancy_points(model)
+    return occupancy_through(model, warp(points.view(-1, 3)).view(points.shape))
+
+
+def occupancy_points(model: SceneModel) -> Tensor:
+    """The grid points (X, Y, Z, 3) at which a moment's occupancy is looked at."""
     x, y, z = model.occupancy.mask.shape
-    box = model.canonical.box
-    points = box.grid_points((x, y, z), model.canonical.density.values).view(-1, 3)
-    found = model.occupancy.at(warp(points)).view(x, y, z)
-    return Occupancy(dilate(found, 1), box)
+    return model.canonical.box.grid_points((x, y, z), model.canonical.density.values)
+
+
+@torch.no_grad()
+def occupancy_through(model: SceneModel, canonical: Tensor) -> Occupancy:
+    """The occupancy of a moment whose grid points are seen at ``canonical`` (X, Y, Z, 3).
+
+    The canonical occupancy has a rim of one grid point, for what a stretching warp would step
+    over; so has the result, for what lies between its own grid points.
+    """
+    found = model.occupancy.at(canonical.view(-1, 3)).view(canonical.shape[:3])
+    return Occupancy(dilate(found, 1), model.canonical.box)

@@ -12,6 +12,7 @@ from devrf.fields.canonical import CanonicalField
 from devrf.fields.occupancy import Occupancy
 from devrf.geometry.rays import Rays
 from devrf.ops.compositing import composite, sum_by_ray, transmittances
+from devrf.ops.spans import span, tally
 from devrf.rendering.sampling import Samples, march
 
 Warp = Callable[[Tensor], Tensor]
@@ -83,33 +84,37 @@ def render(
         What the rays see; differentiable in the field's and the warp's parameters.
     """
     delta = field.step_in_base_voxels(settings.step)
-    samples = march(
-        rays,
-        field.box,
-        occupancy,
-        step=field.step_length(settings.step),
-        near=settings.near,
-        far=settings.far,
-    )
+    with span("sampling"):
+        samples = march(
+            rays,
+            field.box,
+            occupancy,
+            step=field.step_length(settings.step),
+            near=settings.near,
+            far=settings.far,
+        )
     # Most samples turn out to be empty or hidden. That is found out without a graph, so that
     # gradients are computed for the others only.
     with torch.no_grad():
-        tau = field.optical_depth(_warped(samples, warp), delta)
-        opaque = _at_least(-torch.expm1(-tau), settings.alpha_threshold)
-        samples, tau = samples[opaque], tau.index_select(0, opaque)
-        reached = _at_least(transmittances(tau, samples.ray, len(rays)), STOP)
-        samples = samples[reached]
-    canonical = _warped(samples, warp)
-    tau = field.optical_depth(canonical, delta)
-    weight, transmittance = composite(tau, samples.ray, len(rays))
-    heavy = _at_least(weight.detach(), settings.alpha_threshold)
-    samples, canonical = samples[heavy], canonical.index_select(0, heavy)
-    weight = weight.index_select(0, heavy)
-    color = field.rgb(canonical, rays.viewdirs, samples.ray)
-    seen = sum_by_ray(weight[:, None] * color, samples.ray, len(rays))
-    with torch.no_grad():
-        mass = sum_by_ray(weight, samples.ray, len(rays))
-        depth = sum_by_ray(weight * samples.distance, samples.ray, len(rays))
+        samples, canonical, tau = _visible(samples, field, delta, settings.alpha_threshold, warp)
+    if torch.is_grad_enabled():
+        canonical = _warped(samples, warp)
+        with span("density"):
+            tau = field.optical_depth(canonical, delta)
+    with span("compositing"):
+        weight, transmittance = composite(tau, samples.ray, len(rays))
+    with span("sampling"):
+        heavy = _at_least(weight.detach(), settings.alpha_threshold)
+        samples, canonical = samples[heavy], canonical.index_select(0, heavy)
+        weight = weight.index_select(0, heavy)
+        tally("heavy", len(samples))
+    with span("decoder"):
+        color = field.rgb(canonical, rays.viewdirs, samples.ray)
+    with span("compositing"):
+        seen = sum_by_ray(weight[:, None] * color, samples.ray, len(rays))
+        with torch.no_grad():
+            mass = sum_by_ray(weight, samples.ray, len(rays))
+            depth = sum_by_ray(weight * samples.distance, samples.ray, len(rays))
     return RenderOutput(
         color=seen + transmittance[:, None] * background,
         depth=depth / mass.clamp(min=1e-6),
@@ -121,8 +126,32 @@ def render(
     )
 
 
+def _visible(
+    samples: Samples, field: CanonicalField, delta: float, threshold: float, warp: Warp | None
+) -> tuple[Samples, Tensor, Tensor]:
+    """The samples that are neither empty nor hidden, their canonical positions, and their τ."""
+    tally("tested", len(samples))
+    canonical = _warped(samples, warp)
+    with span("density"):
+        tau = field.optical_depth(canonical, delta)
+    with span("sampling"):
+        opaque = _at_least(-torch.expm1(-tau), threshold)
+        ray, tau = samples.ray.index_select(0, opaque), tau.index_select(0, opaque)
+        tally("opaque", len(opaque))
+    with span("compositing"):
+        left = transmittances(tau, ray, samples.rays)
+    with span("sampling"):
+        reached = _at_least(left, STOP)
+        kept = opaque.index_select(0, reached)
+        tally("reached", len(kept))
+        return samples[kept], canonical.index_select(0, kept), tau.index_select(0, reached)
+
+
 def _warped(samples: Samples, warp: Warp | None) -> Tensor:
-    return samples.points if warp is None else warp(samples.points)
+    if warp is None:
+        return samples.points
+    with span("warp"):
+        return warp(samples.points)
 
 
 def _at_least(values: Tensor, threshold: float) -> Tensor:

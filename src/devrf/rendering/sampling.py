@@ -41,6 +41,21 @@ class Samples:
         )
 
 
+def steps_through(
+    rays: Rays, box: Box, *, step: float, near: float, far: float
+) -> tuple[Tensor, Tensor]:
+    """Where the samples of R rays begin, and how many fit: arguments as :func:`march`.
+
+    Returns:
+        distance (R,) of each ray's first sample, and how many (R,) int64 there are up to its exit.
+    """
+    entry, leave = box.crossing(rays)
+    entry, leave = entry.clamp(min=near), leave.clamp(max=far)
+    # The sample on the way out counts: in NDC it is the last plane, which closes the scene.
+    count = torch.where(leave >= entry, ((leave - entry) / step + 1e-3).floor() + 1, 0.0)
+    return entry, count.long()
+
+
 @torch.no_grad()
 def march(
     rays: Rays,
@@ -67,10 +82,7 @@ def march(
     Returns:
         The samples in occupied cells; the k-th of a ray is at entry + k·step.
     """
-    entry, leave = box.crossing(rays)
-    entry, leave = entry.clamp(min=near), leave.clamp(max=far)
-    # The sample on the way out counts: in NDC it is the last plane, which closes the scene.
-    count = torch.where(leave >= entry, ((leave - entry) / step + 1e-3).floor() + 1, 0.0).long()
+    entry, count = steps_through(rays, box, step=step, near=near, far=far)
     per_stretch = max(1, int(2 * _reach(rays, occupancy) / step))
     stretches = (count + per_stretch - 1) // per_stretch
     ray = torch.repeat_interleave(stretches)

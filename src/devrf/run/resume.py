@@ -34,8 +34,9 @@ from devrf.stages.sealed_file import digest_of, read_sealed
 
 log = logging.getLogger(__name__)
 
-# Settings of a datamodule or a stage that change nothing that is learned.
-ELSEWHERE = {"root", "name", "flow_cache", "export", "iterations_per_step"}
+# Settings of a datamodule that change nothing that is learned.
+ELSEWHERE = {"root", "name", "flow_cache", "export"}
+
 
 @dataclass(frozen=True)
 class Beginning:

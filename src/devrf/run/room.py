@@ -63,8 +63,7 @@ def check_room(
     )
     disk, videos = free_disk(run.folder), 0
     if films:
-        views = run.scene.static.train
-        videos = 2 * film_bytes(run.config.video.frames, views.height, views.width)
+        videos = 2 * film_bytes(instantiate(run.config.video), run.scene.static.train.cameras)
     if disk is not None and resumed:
         disk += sum(file.stat().st_size for file in run.folder.glob("checkpoints/*.ckpt"))
     needs.append(disk_need(budget, stages, disk, kept=Saving.KEPT, films=videos))

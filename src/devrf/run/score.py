@@ -17,6 +17,7 @@ from devrf.artifacts.records import (
     provenance,
     write_frames,
 )
+from devrf.rendering.player import Player
 from devrf.run.context import RunContext
 from devrf.scenes.scene import CaptureName
 from devrf.stages.checkpoint import Stored
@@ -110,8 +111,9 @@ def _score(
     views, model = run.scene.capture(capture).test, stored.model.to(run.device)
     if capture == "static":
         model = model.at_rest()
+    player = Player(model)
     scored = [
-        score(model, views, k, run.scene.background, run.device, judge) for k in range(len(views))
+        score(player, views, k, run.scene.background, judge) for k in range(len(views))
     ]
     sheet = write_contact_sheet(run.folder / "images" / f"{capture}.png", scored)
     for tracker in run.trackers:

@@ -16,8 +16,9 @@ from devrf import job
 from devrf.errors import DevrfError
 from devrf.losses.composer import WeightedLoss
 from devrf.losses.motion import MOTION_TERMS
+from devrf.run.benchmark import benchmark
 from devrf.run.context import FROM_NOTHING, RunContext
-from devrf.run.film import render
+from devrf.run.film import picture, render
 from devrf.run.look import inspect, prepare
 from devrf.run.objective import check_objective, objective
 from devrf.run.processes import together
@@ -27,6 +28,8 @@ from devrf.run.room import check_room, shortage_in_words
 from devrf.run.score import evaluate
 from devrf.run.train import canonical, deformation
 
+log = logging.getLogger(__name__)
+
 STEPS: dict[str, tuple[Callable[[RunContext], None], ...]] = {
     "prepare": (prepare,),
     "inspect": (inspect,),
@@ -34,7 +37,9 @@ STEPS: dict[str, tuple[Callable[[RunContext], None], ...]] = {
     "deformation": (deformation,),
     "evaluate": (evaluate,),
     "render": (render,),
+    "still": (picture,),
     "pipeline": (canonical, deformation, evaluate, render),
+    "benchmark": (benchmark,),
     "report": (report,),
 }
 
@@ -80,6 +85,8 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
     if not config.resume and not {canonical, deformation}.isdisjoint(STEPS[stage]):
         needed = () if canonical in STEPS[stage] else (run.own_checkpoint("canonical"),)
         set_aside(folder, *needed)
+    if needs is not None:
+        log.info("%s", needs)
     learning = [step for step in STEPS[stage] if step in LEARNING]
     others = [step for step in STEPS[stage] if step not in LEARNING]
     ended = False
@@ -126,7 +133,7 @@ def _check(run: RunContext, stage: str) -> None:
     if config.ckpt is not None and stage in FROM_NOTHING:
         raise DevrfError(
             f"ckpt: stage={stage} starts from nothing; with ckpt=PATH give stage=deformation, "
-            "stage=evaluate or stage=render"
+            "stage=evaluate, stage=render, stage=still or stage=benchmark"
         )
     if stage in OF_NO_SCENE:
         return
@@ -140,3 +147,5 @@ def _check(run: RunContext, stage: str) -> None:
     if job.in_search() and evaluate not in STEPS[stage]:
         raise DevrfError(f"stage: a search needs the objective, which stage={stage} does not score")
     instantiate(config.video)
+    instantiate(config.still)
+    instantiate(config.benchmark)

@@ -27,14 +27,14 @@ log = logging.getLogger(__name__)
 
 def canonical(run: RunContext) -> None:
     """Learn the scene at rest, or what is left to learn of it."""
-    begin = beginning(run, "canonical")
+    begin = _begin(run, "canonical")
     if not begin.finished:
         _fit(run, instantiate(run.config.canonical, _convert_="all"), begin)
 
 
 def deformation(run: RunContext) -> None:
     """Learn how the scene moves, on top of a canonical checkpoint, or what is left of that."""
-    begin = beginning(run, "deformation")
+    begin = _begin(run, "deformation")
     if begin.finished:
         return
     rest = run.load("canonical")
@@ -44,6 +44,13 @@ def deformation(run: RunContext) -> None:
         )
     build = instantiate(run.config.deformation, _partial_=True, _convert_="all")
     _fit(run, build(rest=rest), begin)
+
+
+def _begin(run: RunContext, stage: str) -> Beginning:
+    """Where the stage begins, as the leading process finds it: all must begin there."""
+    agreed = run.strategy.broadcast(beginning(run, stage) if run.leads else None)
+    assert isinstance(agreed, Beginning)
+    return agreed
 
 
 def _fit(run: RunContext, stage: ScheduledStage, begin: Beginning) -> None:

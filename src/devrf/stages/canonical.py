@@ -21,6 +21,7 @@ from devrf.losses.composer import WeightedLoss
 from devrf.losses.motion import total_variation_weight
 from devrf.losses.photometric import PHOTOMETRIC_TERMS, Prediction, visibility
 from devrf.ops.adam import GridAdam
+from devrf.ops.spans import span
 from devrf.ops.total_variation import add_total_variation_gradient
 from devrf.rendering.model import SceneModel
 from devrf.rendering.render import RenderSettings, render
@@ -240,16 +241,18 @@ class CanonicalStage(ScheduledStage):
     def loss(self, views: Views) -> tuple[Tensor, dict[str, Tensor]]:
         """Render a batch of random pixels and compare it with the images."""
         assert isinstance(self.phase, CanonicalPhase) and self._pool is not None
-        image, flat = self._pool.draw(share(self.schedule.rays), self.generator)
-        background = background_color(self.scene.background, len(image), self.generator)
-        batch = self.parts.of(gather_batch(views, image, flat, background, self.scene.space))
+        with span("batch"):
+            image, flat = self._pool.draw(share(self.schedule.rays), self.generator)
+            background = background_color(self.scene.background, len(image), self.generator)
+            batch = self.parts.of(gather_batch(views, image, flat, background, self.scene.space))
         model = self.model
         output = render(
             batch.rays, model.canonical, model.occupancy, model.settings, batch.background
         )
         prediction = Prediction(output, batch)
-        total, terms = self.losses[self.phase.kind](prediction)
-        return total, {**terms, **visibility(prediction)}
+        with span("losses"):
+            total, terms = self.losses[self.phase.kind](prediction)
+            return total, {**terms, **visibility(prediction)}
 
     @torch.no_grad()
     def add_gradients(self) -> None:

@@ -20,6 +20,7 @@ from devrf.geometry.space import WORLD, Space
 from devrf.rendering.model import SceneModel
 from devrf.rendering.render import RenderSettings
 from devrf.scenes.scene import Scene
+from devrf.stages.compact_state import expanded_state
 from devrf.stages.sealed_file import read_sealed, write_sealed
 
 
@@ -177,7 +178,7 @@ def _model(path: Path, passport: Passport, state: dict[str, Any]) -> SceneModel:
     if any(key.startswith("deformation.") for key in own):
         model.deformation = DeformationField(box, FrameClock((0.0, 1.0)), voxels=8)
     try:
-        model.load_state_dict(own)
+        model.load_state_dict(expanded_state(own))
     except (RuntimeError, KeyError, ValueError, TypeError, AttributeError):
         raise DevrfError(f"{path}: its fields do not fit its description; train again") from None
     return model

@@ -19,6 +19,7 @@ from devrf.losses.composer import WeightedLoss
 from devrf.losses.motion import MOTION_TERMS, MotionPrediction, total_variation_weight
 from devrf.losses.photometric import visibility
 from devrf.ops.adam import GridAdam
+from devrf.ops.spans import span
 from devrf.ops.total_variation import add_total_variation_gradient
 from devrf.ops.trilinear import interpolate
 from devrf.rendering.model import SceneModel, deformed_occupancy
@@ -253,12 +254,14 @@ class DeformationStage(ScheduledStage):
         assert isinstance(self.phase, DeformationPhase) and self._previous is not None
         since = self.iteration - self.phase.start
         if since and since % self.motion.occupancy_every == 0:
-            self._look_around()
-        pool = self.visit.pools[self.iteration % len(self.visit.pools)]
-        image, flat = pool.draw(share(self.schedule.rays), self.generator)
-        background = background_color(self.scene.background, len(image), self.generator)
+            with span("sampling"):
+                self._look_around()
         space = self.scene_model.space
-        batch = self.parts.of(gather_batch(views, image, flat, background, space))
+        with span("batch"):
+            pool = self.visit.pools[self.iteration % len(self.visit.pools)]
+            image, flat = pool.draw(share(self.schedule.rays), self.generator)
+            background = background_color(self.scene.background, len(image), self.generator)
+            batch = self.parts.of(gather_batch(views, image, flat, background, space))
         model = self.scene_model
         output = render(
             batch.rays, model.canonical, self.visit.occupancy, model.settings, batch.background,
@@ -268,8 +271,9 @@ class DeformationStage(ScheduledStage):
             output, batch, self._unwarp, self._unwarp_previous, views.cameras, self._previous,
             space,
         )
-        total, terms = self.losses(prediction)
-        return total, {**terms, **visibility(prediction)}
+        with span("losses"):
+            total, terms = self.losses(prediction)
+            return total, {**terms, **visibility(prediction)}
 
     def go_back(self, iteration: int, caution: float) -> None:
         """Go on from an earlier iteration of the present visit; look anew where matter is."""

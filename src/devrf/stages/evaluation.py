@@ -15,7 +15,7 @@ from devrf.metrics.image import ms_ssim
 from devrf.metrics.masked import psnr_masked, ssim_masked
 from devrf.metrics.perceptual import Lpips
 from devrf.metrics.pretrained import Network, load_lpips
-from devrf.rendering.model import SceneModel
+from devrf.rendering.player import Player
 from devrf.scenes.scene import Views
 from devrf.stages.held_out_flow import flow_error
 
@@ -25,7 +25,7 @@ class Sight:
     """What is compared with the truth: one held-out image, on the host.
 
     Attributes:
-        model: what was learned.
+        player: shows what was learned.
         views: the held-out views.
         index: which of them.
         prediction: (H, W, 3) RGB in [0, 1].
@@ -35,7 +35,7 @@ class Sight:
         lpips: the perceptual metric, or None where it cannot be had.
     """
 
-    model: SceneModel
+    player: Player
     views: Views
     index: int
     prediction: Tensor
@@ -77,7 +77,7 @@ MEASURES: dict[str, Callable[[Sight], float | None]] = {
     "ssim_masked": lambda sight: ssim_masked(sight.prediction, sight.truth, sight.mask),
     "lpips_masked": _lpips_masked,
     "depth_error": _depth_error,
-    "flow_error": lambda sight: flow_error(sight.model, sight.views, sight.index),
+    "flow_error": lambda sight: flow_error(sight.player, sight.views, sight.index),
 }
 
 

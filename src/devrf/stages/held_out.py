@@ -8,7 +8,9 @@ import torch
 from torch import Tensor
 
 from devrf.metrics.image import psnr, ssim
-from devrf.rendering.model import Picture, SceneModel
+from devrf.rendering.model import SceneModel
+from devrf.rendering.picture import Picture
+from devrf.rendering.player import Player
 from devrf.scenes.scene import Background, Views
 from devrf.stages.evaluation import Judge, Sight
 
@@ -45,37 +47,36 @@ class HeldOutView:
 
 
 def score(
-    model: SceneModel,
+    player: Player,
     views: Views,
     index: int,
     background: Background,
-    device: torch.device,
     judge: Judge | None = None,
 ) -> HeldOutView:
     """Render image ``index`` of held-out ``views`` and compare it with the truth.
 
     Args:
-        model: what was learned, on ``device``.
+        player: shows what was learned.
         views: the held-out views, on the host.
         index: which of them.
         background: what is behind the matte.
-        device: where to render.
         judge: measures more than PSNR and SSIM.
     """
     time = float(views.times[index])
     truth = truth_image(views, index, background)
-    seen = _see(model, views, index, time, background, device)
+    behind = background_value(background)
+    seen = player.view(views.cameras, index, time, behind)
     prediction = _image(seen, views)
     rest = prediction
-    if model.warp(time) is not None:
-        rest = _image(_see(model, views, index, 0.0, background, device), views)
+    if player.ready(time).warp is not None:
+        rest = _image(player.view(views.cameras, index, 0.0, behind), views)
     further: dict[str, float | None] = {}
     if judge is not None and judge.metrics:
         shape = (views.height, views.width)
-        distance = _world_distance(model, views, index, seen)
+        distance = _world_distance(player.model, views, index, seen)
         further = judge.scores(
             Sight(
-                model, views, index, prediction, truth, distance.view(shape),
+                player, views, index, prediction, truth, distance.view(shape),
                 seen.opacity.cpu().view(shape), judge.lpips,
             )
         )
@@ -103,19 +104,6 @@ def truth_image(views: Views, index: int, background: Background) -> Tensor:
 def background_value(background: Background) -> float:
     """The grey level in [0, 1] behind held-out views."""
     return 0.0 if background == "black" else 1.0
-
-
-def _see(
-    model: SceneModel,
-    views: Views,
-    index: int,
-    time: float,
-    background: Background,
-    device: torch.device,
-) -> Picture:
-    rays = views.cameras.image_rays(index).to(device)
-    behind = torch.full((3,), background_value(background), device=device)
-    return model.picture(rays, time, behind)
 
 
 def _image(seen: Picture, views: Views) -> Tensor:

@@ -10,12 +10,12 @@ from devrf.data.correspondence import previous_images
 from devrf.losses.motion import induced_flow
 from devrf.metrics.geometric import SOLID, end_point_error
 from devrf.ops.compositing import sum_by_ray
-from devrf.rendering.model import SceneModel
+from devrf.rendering.player import Player
 from devrf.rendering.render import render
 from devrf.scenes.scene import Views
 
 
-def flow_error(model: SceneModel, views: Views, index: int) -> float | None:
+def flow_error(player: Player, views: Views, index: int) -> float | None:
     """Mean end-point error in pixels of image ``index``'s backward flow, where that is known.
 
     None of a view without flow, or without an earlier frame.
@@ -26,13 +26,13 @@ def flow_error(model: SceneModel, views: Views, index: int) -> float | None:
     flat = views.flow.valid[index].flatten().nonzero()[:, 0]
     if before == index or len(flat) == 0:
         return None
-    seen = seen_flow(model, views, index, before, flat)
+    seen = seen_flow(player, views, index, before, flat)
     return end_point_error(seen, views.flow.vectors[index].view(-1, 2)[flat])
 
 
 @torch.no_grad()
 def seen_flow(
-    model: SceneModel, views: Views, index: int, before: int, flat: Tensor, chunk: int = 16384
+    player: Player, views: Views, index: int, before: int, flat: Tensor, chunk: int = 16384
 ) -> Tensor:
     """The backward flow (P, 2) in pixels that is seen at some pixels of an image.
 
@@ -42,20 +42,20 @@ def seen_flow(
     flow is zero there.
 
     Args:
-        model: the learned scene, on any device.
+        player: shows the learned scene.
         views: the views, on the host.
         index: the image.
         before: the same view's image one frame earlier.
         flat: (P,) row-major numbers of the pixels.
         chunk: rays rendered at once.
     """
-    device = model.canonical.density.values.device
+    model, device = player.model, player.device
     time, earlier = float(views.times[index]), float(views.times[before])
     pixels = pixel_positions(flat, views.width)
     rays = views.cameras.rays(torch.full_like(flat, index), pixels).to(device)
     rays, pixels = model.space.rays(rays), pixels.to(device)
     cameras = views.cameras[[before]].to(device)
-    warp, occupancy, motion = model.warp(time), model.occupancy_at(time), model.deformation
+    ready, motion = player.ready(time), model.deformation
     black = torch.zeros(3, device=device)
 
     def unwarp(points: Tensor) -> Tensor:
@@ -64,7 +64,9 @@ def seen_flow(
     parts = []
     for k in range(0, len(rays), chunk):
         part = rays[k : k + chunk]
-        output = render(part, model.canonical, occupancy, model.settings, black, warp)
+        output = render(
+            part, model.canonical, ready.occupancy, model.settings, black, ready.warp
+        )
         ray, weight = output.samples.ray, output.weight
         own = pixels[k : k + chunk][ray]
         moved = induced_flow(

@@ -88,9 +88,9 @@ class Parts:
         state: Tensor,
     ) -> tuple[Tensor, Terms]:
         sums: Terms = {}
-        for part in range(self.count):
-            self._present = part
-            if part:
+        for present in range(self.count):
+            self._present = present
+            if present:
                 generator.set_state(state)
             total, terms = loss()
             if self.count > 1:

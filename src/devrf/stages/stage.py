@@ -15,10 +15,13 @@ from torch import Tensor
 
 from devrf.errors import DevrfError
 from devrf.ops.adam import GridAdam
+from devrf.ops.spans import span
 from devrf.rendering.model import SceneModel
+from devrf.rendering.player import Player
 from devrf.scenes.scene import CaptureName, Scene, Views
 from devrf.shortage import ShortageError
 from devrf.stages.checkpoint import Passport, check_scene, passport_in
+from devrf.stages.compact_state import compact_state
 from devrf.stages.held_out import score
 from devrf.stages.parts import Parts
 from devrf.stages.progress import random_states, set_random_states
@@ -191,6 +194,10 @@ class ScheduledStage(LightningModule, ABC):
         self._draw_anew()
         self.trainer.should_stop = False
 
+    def _backward(self, total: Tensor) -> None:
+        with span("backward"):
+            self.manual_backward(total)
+
     def training_step(self, views: Views, batch_idx: int) -> dict[str, Tensor]:
         """Run iterations up to ``iterations_per_step``, never beyond the present phase.
 
@@ -215,15 +222,16 @@ class ScheduledStage(LightningModule, ABC):
         for _ in range(count):
             try:
                 total, terms = self.parts.gradients(
-                    lambda: self.loss(views), self.manual_backward, optimizer.zero_grad,
+                    lambda: self.loss(views), self._backward, optimizer.zero_grad,
                     self.generator,
                 )
             except ShortageError as shortage:
                 self.give_up(f"{shortage} at {self.where(self.iteration)}; {self.remedy}")
                 break
             average_gradients(p for group in optimizer.param_groups for p in group["params"])
-            self.add_gradients()
-            optimizer.step()
+            with span("optimiser"):
+                self.add_gradients()
+                optimizer.step()
             self.iteration += 1
             for name, value in {"loss": total.detach(), **terms}.items():
                 sums[name] = sums[name] + value if name in sums else value
@@ -253,7 +261,7 @@ class ScheduledStage(LightningModule, ABC):
         """
         scene = self.scene
         views = scene.capture(self.capture).test
-        view = score(self.model, views, index, scene.background, self.device)
+        view = score(Player(self.model), views, index, scene.background)
         scores = {"psnr": view.psnr, "ssim": view.ssim, "rest_pose_psnr": view.rest_pose_psnr}
         means = {f"test/{self.capture}/{k}": v for k, v in scores.items()}
         self.log_dict(means, batch_size=1, sync_dist=True)
@@ -274,7 +282,11 @@ class ScheduledStage(LightningModule, ABC):
         """Add what the tensors do not tell."""
         checkpoint["devrf"] = asdict(self.passport())
         # Without the optimiser's state it is there to be rendered, not to be gone on from.
-        if "optimizer_states" in checkpoint:
+        if "optimizer_states" not in checkpoint:
+            if self.iteration >= self.total_iterations:
+                small = compact_state(self.model)
+                checkpoint["state_dict"] = {f"scene_model.{k}": v for k, v in small.items()}
+        else:
             checkpoint["progress"] = {
                 "stage": self.name,
                 "iteration": self.iteration,

@@ -1,0 +1,138 @@
+"""A learned scene to be looked at: pictures of any size, from anywhere, at any time, quickly."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+from devrf.fields.deformation import DeformationField
+from devrf.fields.grid import resample
+from devrf.fields.occupancy import Occupancy
+from devrf.geometry.cameras import Cameras
+from devrf.geometry.rays import Rays
+from devrf.ops.choice import triton_runs
+from devrf.ops.corners import shape_of
+from devrf.ops.trilinear import interpolate
+from devrf.rendering.lists import ListRenderer
+from devrf.rendering.model import SceneModel, occupancy_points, occupancy_through
+from devrf.rendering.picture import Picture
+from devrf.rendering.render import Warp, render
+
+# Rays at once: on a CPU what its caches hold, on a GPU what keeps it busy and fits.
+ON_CPU, ON_GPU, IN_LISTS = 8192, 2**15, 2**18
+
+
+@dataclass(frozen=True)
+class Ready:
+    """A time of a scene, ready to be looked at from anywhere.
+
+    Attributes:
+        occupancy: where something is then.
+        displacement: (X, Y, Z, 3) from there to canonical space, over the fields' box; None at
+            rest.
+        warp: the same as a map of points (M, 3); None at rest.
+    """
+
+    occupancy: Occupancy
+    displacement: Tensor | None = None
+    warp: Warp | None = None
+
+
+class Player:
+    """Shows a scene that is learned, without gradients.
+
+    It shows what :meth:`SceneModel.picture` shows, and keeps what it has found out about the
+    times that it was asked for last. What is learned afterwards is not seen at these times.
+
+    Attributes:
+        model: the scene.
+        device: where it is, and where pictures are made.
+    """
+
+    def __init__(self, model: SceneModel, *, times: int = 4, half: bool = False) -> None:
+        """Get ready.
+
+        Args:
+            model: a learned scene; it should not be moved to another device afterwards.
+            times: how many times to keep ready.
+            half: let the colour network work in half precision, on a CUDA device only.
+        """
+        self.model = model
+        self.device = model.canonical.density.values.device
+        self.ready = lru_cache(maxsize=times)(self._prepared)
+        self._lists = ListRenderer(model.canonical, model.settings, half=half)
+
+    @torch.no_grad()
+    def _prepared(self, time: float) -> Ready:
+        """Make ``time`` ready; ``ready`` looks among what is kept first."""
+        model, motion = self.model, self.model.deformation
+        if motion is None or motion.clock.at(time).after == 0:
+            return Ready(model.occupancy)
+        displacement = motion.blended(motion.to_canonical, time)
+        # At the points of a grid over the same box, looking up is resampling: several times faster.
+        points = occupancy_points(model)
+        moved = points + resample(displacement, shape_of(points))
+        return Ready(occupancy_through(model, moved), displacement, _along(motion, displacement))
+
+    @torch.no_grad()
+    def picture(self, rays: Rays, time: float, background: float | Tensor) -> Picture:
+        """What rays see at ``time``.
+
+        Args:
+            rays: R rays in world space, on any device.
+            time: in [0, 1].
+            background: grey level, or RGB (3,).
+        """
+        rays, model, ready = rays.to(self.device), self.model, self.ready(time)
+        if not isinstance(background, Tensor):
+            background = torch.full((3,), background, device=self.device)
+        rays = model.space.rays(rays)
+        if triton_runs(model.canonical.density.values):
+            parts = [
+                self._lists.picture(part, ready.occupancy, ready.displacement, background)
+                for part in _chunks(rays, IN_LISTS)
+            ]
+        else:
+            parts = [
+                Picture.of(render(
+                    part, model.canonical, ready.occupancy, model.settings, background, ready.warp
+                ))
+                for part in _chunks(rays, ON_GPU if self.device.type == "cuda" else ON_CPU)
+            ]
+        return Picture.joined(parts)
+
+    def view(
+        self, cameras: Cameras, index: int, time: float, background: float | Tensor
+    ) -> Picture:
+        """All H·W pixels of camera ``index`` at ``time``, in row-major order."""
+        rays = cameras[[index]].to(self.device).image_rays(0)
+        return self.picture(rays, time, background)
+
+    def stream(
+        self, cameras: Cameras, times: Sequence[float], background: float | Tensor
+    ) -> Iterator[Picture]:
+        """One picture after another, each made when it is asked for.
+
+        Args:
+            cameras: N cameras.
+            times: N times in [0, 1].
+            background: as for :meth:`picture`.
+        """
+        cameras = cameras.to(self.device)
+        for index, time in enumerate(times):
+            yield self.view(cameras, index, time, background)
+
+
+def _along(motion: DeformationField, displacement: Tensor) -> Warp:
+    """The map of points (M, 3) that a grid of displacements (X, Y, Z, 3) stands for."""
+    return lambda points: points + interpolate(
+        displacement, motion.box.to_grid(points, motion.shape)
+    )
+
+
+def _chunks(rays: Rays, size: int) -> list[Rays]:
+    return [rays[k : k + size] for k in range(0, max(len(rays), 1), size)]

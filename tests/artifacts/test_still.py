@@ -1,0 +1,60 @@
+"""A still: which camera, which size, and that it is what the model shows."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from lightning import Trainer
+
+from devrf.artifacts.film import FilmSettings
+from devrf.artifacts.still import StillSettings, still
+from devrf.errors import DevrfError
+from devrf.rendering.player import Player
+from devrf.scenes.scene import Scene
+from devrf.stages.canonical import CanonicalStage
+
+
+def test_the_camera_that_is_meant(tiny_scene: Scene) -> None:
+    held_out = StillSettings().camera(tiny_scene)
+    assert torch.equal(held_out.positions, tiny_scene.dynamic.test.cameras.positions[:1])
+    assert (held_out.width, held_out.height) == (24, 18)
+    fifth = StillSettings(view=5, height=36).camera(tiny_scene)
+    assert torch.equal(fifth.positions, tiny_scene.static.train.cameras.positions[5:6])
+    assert (fifth.width, fifth.height) == (48, 36)
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({"view": 8}, "still.view: expected held_out or 0 to 7, not 8"),
+        ({"view": -1}, "still.view: expected held_out or 0 to 7, not -1"),
+        ({"time": 1.5}, "still.time: expected 0 to 1, not 1.5"),
+        ({"height": 0}, "still.height: expected at least 1, not 0"),
+    ],
+)
+def test_what_cannot_be_pictured(
+    tiny_scene: Scene, given: dict[str, Any], expected: str
+) -> None:
+    with pytest.raises(DevrfError) as caught:
+        StillSettings(**given).camera(tiny_scene)
+    assert str(caught.value) == expected
+
+
+def test_a_film_too_small_for_its_format() -> None:
+    with pytest.raises(DevrfError, match="video.height: expected at least 16, not 15"):
+        FilmSettings(height=15)
+
+
+def test_colour_and_depth_of_any_size(
+    learned: tuple[CanonicalStage, Trainer], tiny_scene: Scene
+) -> None:
+    model, camera = learned[0].model, StillSettings(view=2, height=31).camera(tiny_scene)
+    color, depth = still(Player(model), camera, 0.0, 0.0)
+    assert color.shape == depth.shape == (31, 41, 3)
+    seen = model.picture(camera.image_rays(0), 0.0, torch.zeros(3))
+    torch.testing.assert_close(color.view(-1, 3), seen.color.clamp(0, 1))
+    # Where nothing is, the colour is that of the background, and the depth is white.
+    nothing = seen.opacity.view(31, 41) == 0
+    assert nothing.any() and not color[nothing].any() and (depth[nothing] == 1).all()
