@@ -85,13 +85,13 @@ def test_a_lack_of_memory_that_nothing_helps_against_is_told_in_a_line(
 
 
 # Half of the fields and a small part of a batch fit into what is left of the program.
-LARGE = ("schedule.canonical.rays=40000", "schedule.canonical.iterations=2",
-         "schedule.canonical.doublings=[]")
+LARGE = ("schedule.canonical.rays=60000", "schedule.canonical.iterations=2",
+         "schedule.canonical.doublings=[]", "stage=canonical", "hydra.run.dir=run")
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits as Linux knows them")
 def test_a_stage_learns_in_parts_where_memory_is_short(warm, tiny, tmp_path) -> None:
-    command = (*tiny, *LARGE, "stage=canonical", "hydra.run.dir=run")
+    command = (*tiny, *LARGE)
     outcome = warm(tmp_path, *command, most_memory=300 * 2**20)
     assert outcome.status == 0, outcome.out
     assert re.search(r"out of memory \(.*: batches are taken in \d parts from now on", outcome.out)
@@ -101,6 +101,17 @@ def test_a_stage_learns_in_parts_where_memory_is_short(warm, tiny, tmp_path) -> 
     free = read_sealed(tmp_path / "free" / "run" / "checkpoints" / "canonical.ckpt")["state_dict"]
     name = "scene_model.canonical.color.values"
     torch.testing.assert_close(limited[name], free[name], rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits as Linux knows them")
+def test_a_stage_that_not_even_parts_fit_for_ends_saved(warm, tiny, tmp_path) -> None:
+    command = (*tiny, *LARGE, "schedule.canonical.rays=400000")
+    outcome = warm(tmp_path, *command, most_memory=200 * 2**20)
+    assert outcome.status == 2, outcome.out
+    said = outcome.out.splitlines()[-1]
+    assert said.startswith("devrf: canonical stage: out of memory (") and " GiB free on cpu" in said
+    assert "schedule.canonical.rays" in said and "the same command goes on" in said
+    assert list((tmp_path / "run" / "checkpoints").glob("canonical-progress-*.ckpt"))
 
 
 # The sizes of stages, and how many pixels their images have.

@@ -23,10 +23,10 @@ from devrf.rendering.player import Player
 
 # Small pictures are shown enlarged: a video of 100 pixels is too small to watch.
 WATCHABLE = 240
-# H.264 has blocks of so many pixels.
-SMALLEST = 16
 # Bytes that a pixel of a video takes, at most: met in scenes of two hundred pixels and less.
 PIXEL = 0.2
+# H.264 has blocks of so many pixels.
+SMALLEST = 16
 
 
 @dataclass(frozen=True)
@@ -104,16 +104,16 @@ def write_video(path: Path, images: Iterator[Tensor], fps: int, *, least: int = 
                 writer.append_data(_enlarged(to_bytes(image).numpy(), least))
 
 
-def film_bytes(frames: int, height: int, width: int) -> int:
-    """About how large a video of ``frames`` pictures becomes, colour beside depth; rather less.
+def film_bytes(film: FilmSettings, cameras: Cameras) -> int:
+    """About how large a video becomes, colour beside depth; rather less.
 
     Args:
-        frames: how many pictures.
-        height: of a camera's picture, pixels.
-        width: likewise.
+        film: what is filmed.
+        cameras: captured cameras with images of the usual size.
     """
-    enlarged = max(1, math.ceil(WATCHABLE / height)) ** 2
-    return round(frames * 2 * height * width * enlarged * PIXEL)
+    sized = film.sized(cameras)
+    enlarged = max(1, math.ceil(WATCHABLE / sized.height)) if film.height is None else 1
+    return round(film.frames * 2 * sized.height * sized.width * enlarged**2 * PIXEL)
 
 
 def _enlarged(image: np.ndarray, least: int) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -20,8 +19,6 @@ from devrf.shortage import is_shortage, numbers
 from devrf.stages.memory import Budget, estimate
 from devrf.stages.needs import Need, check, disk_need, gpu_need, host_need
 
-log = logging.getLogger(__name__)
-
 # What lowers the need, by the step that has too little.
 LOWER = {
     "canonical": "schedule.canonical.side or schedule.canonical.rays",
@@ -29,8 +26,10 @@ LOWER = {
 }
 
 
-def check_room(run: RunContext, learns: Sequence[str], *, scores: bool, films: bool) -> None:
-    """Compare what a run needs with what there is, and say both; all figures are estimates.
+def check_room(
+    run: RunContext, learns: Sequence[str], *, scores: bool, films: bool
+) -> str | None:
+    """Compare what a run needs with what there is; all figures are estimates.
 
     Stages whose checkpoint is there already need nothing.
 
@@ -40,13 +39,16 @@ def check_room(run: RunContext, learns: Sequence[str], *, scores: bool, films: b
         scores: whether it also scores or films.
         films: whether it makes videos.
 
+    Returns:
+        Both, in one line; None where nothing is needed.
+
     Raises:
         DevrfError: memory or disk cannot suffice.
     """
     resumed = run.config.resume
     stages = [name for name in learns if not (resumed and run.own_checkpoint(name).is_file())]
     if not stages:
-        return
+        return None
     processes = getattr(run.strategy, "num_processes", 1)
     world = getattr(run.strategy, "world_size", 1)
     budget = estimated(run, world)
@@ -61,16 +63,13 @@ def check_room(run: RunContext, learns: Sequence[str], *, scores: bool, films: b
     )
     disk, videos = free_disk(run.folder), 0
     if films:
-        views, film = run.scene.static.train, run.config.video
-        height = film.height or views.height
-        width = round(views.width * height / views.height)
-        videos = 2 * film_bytes(film.frames, height, width)
+        videos = 2 * film_bytes(instantiate(run.config.video), run.scene.static.train.cameras)
     if disk is not None and resumed:
         disk += sum(file.stat().st_size for file in run.folder.glob("checkpoints/*.ckpt"))
     needs.append(disk_need(budget, stages, disk, kept=Saving.KEPT, films=videos))
     settings = OmegaConf.to_container(run.config)
     assert isinstance(settings, dict)
-    log.info("%s", check(needs, set(_keys(settings))))
+    return check(needs, set(_keys(settings)))
 
 
 def estimated(run: RunContext, processes: int = 1) -> Budget:

@@ -29,6 +29,8 @@ from devrf.run.room import check_room, shortage_in_words
 from devrf.run.score import evaluate
 from devrf.run.train import canonical, deformation
 
+log = logging.getLogger(__name__)
+
 STEPS: dict[str, tuple[Callable[[RunContext], None], ...]] = {
     "prepare": (prepare,),
     "inspect": (inspect,),
@@ -77,12 +79,15 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
     run = RunContext(config, folder)
     _check(run, stage)
     learns = [step.__name__ for step in STEPS[stage] if step in LEARNING]
+    needs = None
     if learns and config.memory_check and run.leads:
         further = {evaluate, render} & set(STEPS[stage])
-        check_room(run, learns, scores=bool(further), films=render in further)
+        needs = check_room(run, learns, scores=bool(further), films=render in further)
     if not config.resume and not {canonical, deformation}.isdisjoint(STEPS[stage]):
         needed = () if canonical in STEPS[stage] else (run.own_checkpoint("canonical"),)
         set_aside(folder, *needed)
+    if needs is not None:
+        log.info("%s", needs)
     learning = [step for step in STEPS[stage] if step in LEARNING]
     others = [step for step in STEPS[stage] if step not in LEARNING]
     ended = False
