@@ -15,11 +15,12 @@ from devrf.fields.warp import GridWarp
 from devrf.geometry.rays import Rays
 from devrf.ops.compositing import composite_segments, sum_segments
 from devrf.ops.search import Found, Selected, Thresholds, find_samples, select
+from devrf.ops.spans import measured, span, tally
 from devrf.ops.trilinear import kept_gradient
 from devrf.ops.warped_depth import warped_depth
 from devrf.rendering.render import STOP, RenderOutput, RenderSettings
 from devrf.rendering.room import Room
-from devrf.rendering.sampling import Samples, most_steps, steps_through
+from devrf.rendering.sampling import Samples, march, most_steps, steps_through
 
 
 def render_in_lists(
@@ -50,23 +51,32 @@ def render_in_lists(
     """
     warp = warp or GridWarp((), field.box)
     delta, density = field.step_in_base_voxels(settings.step), field.density.values
-    found = _search(rays, field, occupancy, settings, warp, room.visible)
-    canonical, tau = warped_depth(
-        found.points, density, warp.slices, warp.weight,
-        box=field.box, shift=field.shift, delta=delta, density_gradient=kept_gradient(density),
-        slice_gradients=[kept_gradient(frame) for frame in warp.slices],
-    )
-    weight, transmittance = composite_segments(tau, found.first)
-    chosen = select(found.heavy, found.first, room.heavy)
-    room.note(found.total, chosen.total)
-    samples, present = _listed(found, chosen, len(rays))
-    canonical = canonical.index_select(0, chosen.index)
-    weight = torch.where(present, weight.index_select(0, chosen.index), 0.0)
-    color = field.rgb(canonical, rays.viewdirs, samples.ray)
-    seen = sum_segments(weight, color, chosen.first)
-    with torch.no_grad():
+    with span("sampling"):
+        found = _search(rays, field, occupancy, settings, warp, room.visible)
+    with span("density"):
+        canonical, tau = warped_depth(
+            found.points, density, warp.slices, warp.weight,
+            box=field.box, shift=field.shift, delta=delta,
+            density_gradient=kept_gradient(density),
+            slice_gradients=[kept_gradient(frame) for frame in warp.slices],
+        )
+    with span("compositing"):
+        weight, transmittance = composite_segments(tau, found.first)
+    with span("sampling"):
+        chosen = select(found.heavy, found.first, room.heavy)
+        room.note(found.total, chosen.total)
+        tally("reached", found.total)
+        tally("heavy", chosen.total)
+        samples, present = _listed(found, chosen, len(rays))
+        canonical = canonical.index_select(0, chosen.index)
+        weight = torch.where(present, weight.index_select(0, chosen.index), 0.0)
+    with span("decoder"):
+        color = field.rgb(canonical, rays.viewdirs, samples.ray)
+    with span("compositing"), torch.no_grad():
         distance = torch.stack([samples.distance, torch.ones_like(samples.distance)], dim=1)
         reached, mass = sum_segments(weight, distance, chosen.first).unbind(1)
+    with span("compositing"):
+        seen = sum_segments(weight, color, chosen.first)
     return RenderOutput(
         color=seen + transmittance[:, None] * background,
         depth=reached / mass.clamp(min=1e-6),
@@ -86,6 +96,9 @@ def _search(
     stretch = {
         "step": field.step_length(settings.step), "near": settings.near, "far": settings.far
     }
+    if measured():
+        # The kernel looks at these at most: it ends with the ray. It does not say at how many.
+        tally("tested", len(march(rays, field.box, occupancy, **stretch)))
     entry, count = steps_through(rays, field.box, **stretch)
     threshold = settings.alpha_threshold
     return find_samples(

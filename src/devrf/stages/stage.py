@@ -21,7 +21,7 @@ from devrf.fields.warp import GridWarp
 from devrf.geometry.rays import Rays
 from devrf.ops.adam import GridAdam
 from devrf.ops.choice import triton_runs
-from devrf.ops.spans import span
+from devrf.ops.spans import measured, span
 from devrf.rendering.fused import render_in_lists
 from devrf.rendering.model import SceneModel
 from devrf.rendering.player import Player
@@ -363,11 +363,13 @@ class ScheduledStage(LightningModule, ABC):
 
         def work() -> None:
             self._learn(views, pixels)
-            self.optimizer.apply()
+            with span("optimiser"):
+                self.optimizer.apply()
 
         if self._repeated is None:
             self._repeated = Repeated(work, self._capturer())
-        with self.optimizer.stepping_by(self._repeated):
+        # What is replayed shows none of its parts to those who measure them.
+        with self.optimizer.stepping_by(work if measured() else self._repeated):
             optimizer.step()
         if self._repeated.is_warm:
             self.room.measure()
