@@ -368,12 +368,13 @@ class ScheduledStage(LightningModule, ABC):
 
         if self._repeated is None:
             self._repeated = Repeated(work, self._capturer())
+        repeated = self._repeated  # which is gone if memory runs out on the way
         # What is replayed shows none of its parts to those who measure them.
-        with self.optimizer.stepping_by(work if measured() else self._repeated):
+        with self.optimizer.stepping_by(work if measured() else repeated):
             optimizer.step()
-        if self._repeated.is_warm:
+        if repeated.is_warm:
             self.room.measure()
-        if self._repeated.failed:
+        if repeated.failed:
             self.graphs = "off"  # one warning is enough
 
     def _capturer(self) -> Capturer | None:
