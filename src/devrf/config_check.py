@@ -21,8 +21,9 @@ from devrf.value_types import described, fits, held
 
 # What the run itself reads, beside the parts.
 ROOT: dict[str, Any] = {
-    "stage": str, "seed": int, "resume": bool, "ckpt": str | Path | None, "objective": str,
-    "scene": str, "kernels": Literal["auto", "torch", "triton"], "graphs": Literal["auto", "off"],
+    "stage": str, "seed": int, "resume": bool, "memory_check": bool, "ckpt": str | Path | None,
+    "objective": str, "scene": str, "kernels": Literal["auto", "torch", "triton"],
+    "graphs": Literal["auto", "off"],
 }
 # Hydra's own keys in a part's config.
 RESERVED = {"_target_", "_partial_", "_convert_", "_recursive_", "_args_"}

@@ -116,6 +116,7 @@ class Warm:
         delay: float = 0.0,
         signals: tuple[int, ...] = (),
         most_bytes: int = 0,
+        most_memory: int = 0,
     ) -> Outcome:
         """``devrf ARGUMENTS`` in ``folder``; ``warm_process.py`` says what the others do."""
         assert self._process.stdin is not None and self._process.stdout is not None
@@ -123,7 +124,7 @@ class Warm:
         before = said.stat().st_size if said.exists() else 0
         asked = {
             "folder": str(folder), "arguments": arguments, "after": after, "delay": delay,
-            "signals": signals, "most_bytes": most_bytes,
+            "signals": signals, "most_bytes": most_bytes, "most_memory": most_memory,
         }
         self._process.stdin.write(json.dumps(asked) + "\n")
         self._process.stdin.flush()

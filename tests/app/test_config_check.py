@@ -32,8 +32,8 @@ def config(**changes: object):
     """A config whose ``outer`` takes ``inner`` and ``weights`` from elsewhere."""
     here = f"{__name__}."
     base = {
-        "stage": "pipeline", "seed": 0, "resume": True, "ckpt": None, "scene": "robot",
-        "objective": "deformation.psnr", "kernels": "auto", "graphs": "auto",
+        "stage": "pipeline", "seed": 0, "resume": True, "memory_check": True, "ckpt": None,
+        "scene": "robot", "objective": "deformation.psnr", "kernels": "auto", "graphs": "auto",
         "sizes": {"inner": {"_target_": f"{here}Inner", "size": 2}},
         "loss": {"fine": {"color": 1.0}},
         "outer": {

@@ -11,6 +11,7 @@ the signal that ended it:
 * ``delay``: seconds from that moment to the signal.
 * ``signals``: the numbers of the signals to send.
 * ``most_bytes``: how large a file may become, as on a disk that is full.
+* ``most_memory``: bytes that the process may take beside what it has already.
 """
 
 from __future__ import annotations
@@ -102,6 +103,9 @@ def run(asked: dict[str, Any]) -> int:
         os.dup2(said.fileno(), 2)
     if asked["most_bytes"]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (asked["most_bytes"],) * 2)
+    if asked["most_memory"]:
+        taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (taken + asked["most_memory"],) * 2)
     fuse = Fuse(asked)
     fuse.install()
     sys.argv = ["devrf", *asked["arguments"]]

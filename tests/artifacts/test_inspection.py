@@ -20,7 +20,9 @@ BUDGET = Budget(
     scene={"images": 3_000_000},
     canonical=StageMemory({"density and features": 40_000_000}, {"a batch": 2_000_000}),
     deformation=StageMemory({"displacements": 1_600_000_000}, {"a batch": 5_000_000}),
+    fields={"displacements": 1_600_000_000},
     checkpoint={"displacements": 1_600_000_000},
+    files={},
 )
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from devrf.artifacts.camera_paths import orbit
 from devrf.artifacts.colors import depth_colors, error_colors, to_bytes
 from devrf.artifacts.contact_sheet import GAP, side_by_side, write_contact_sheet
-from devrf.artifacts.film import FilmSettings, pictures, write_video
+from devrf.artifacts.film import WATCHABLE, FilmSettings, film_bytes, pictures, write_video
 from devrf.fields.architecture import Architecture
 from devrf.fields.occupancy import Occupancy
 from devrf.geometry.box import Box
@@ -145,3 +145,14 @@ def test_pictures_show_colour_beside_depth_while_time_runs(cube: Box) -> None:
         torch.testing.assert_close(image[0, 0], torch.ones(3))
         torch.testing.assert_close(image[0, 15], torch.ones(3))
         assert image[5, 22].min() < 0.9
+
+
+def test_a_video_is_no_larger_than_was_said(rest, tiny_scene, tmp_path):
+    cameras = tiny_scene.static.train.cameras
+    for height in (None, 40):
+        film = FilmSettings(frames=8, height=height)
+        turned = orbit(cameras, rest.model.canonical.box, film)
+        path = tmp_path / "orbit.mp4"
+        shown = pictures(Player(rest.model), turned, 1.0)
+        write_video(path, shown, film.fps, least=WATCHABLE if height is None else 0)
+        assert 0.02 * film_bytes(film, cameras) < path.stat().st_size < film_bytes(film, cameras)

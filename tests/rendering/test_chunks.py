@@ -9,7 +9,9 @@ import torch
 
 from devrf.geometry.rays import Rays
 from devrf.rendering import model as module
+from devrf.rendering import player
 from devrf.rendering.chunks import FEWEST, in_chunks
+from devrf.rendering.player import Player
 
 
 @pytest.fixture
@@ -20,7 +22,7 @@ def rays(rng: torch.Generator) -> Rays:
 
 def test_rays_come_in_order(rays: Rays) -> None:
     assert [len(part) for part in in_chunks(lambda some: some, rays, 300)] == [300, 300, 300, 100]
-    assert in_chunks(lambda some: some, rays[:0], 300) == []
+    assert [len(part) for part in in_chunks(lambda some: some, rays[:0], 300)] == [0]
 
 
 def test_fewer_rays_at_once_when_memory_runs_out(
@@ -64,15 +66,19 @@ def test_a_picture_is_the_same_with_less_memory(
 ) -> None:
     rays = tiny_scene.static.test.cameras.image_rays(0)
     rays = rays[torch.arange(len(rays)).repeat(2)]
-    whole = rest.model.picture(rays, 0.0, torch.ones(3))
-    usual = module.render
+    plain, quick = rest.model, Player(rest.model)
+    whole = plain.picture(rays, 0.0, torch.ones(3))
+    usual, tried = module.render, []
 
     def render(some, *others):
+        tried.append(len(some))
         if len(some) > 450:
             raise torch.OutOfMemoryError("CUDA out of memory.")
         return usual(some, *others)
 
     monkeypatch.setattr(module, "render", render)
-    divided = rest.model.picture(rays, 0.0, torch.ones(3))
-    for name in ("color", "depth", "opacity"):
-        torch.testing.assert_close(getattr(divided, name), getattr(whole, name))
+    monkeypatch.setattr(player, "render", render)
+    for divided in (plain.picture(rays, 0.0, torch.ones(3)), quick.picture(rays, 0.0, 1.0)):
+        for name in ("color", "depth", "opacity"):
+            torch.testing.assert_close(getattr(divided, name), getattr(whole, name))
+    assert tried == [864, 432, 432] * 2

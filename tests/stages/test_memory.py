@@ -12,7 +12,9 @@ from devrf.fields.architecture import Architecture
 from devrf.geometry.box import Box
 from devrf.scenes.scene import Scene
 from devrf.stages.memory import (
+    BATCH,
     PROGRAM,
+    StageFiles,
     StageMemory,
     batch_bytes,
     estimate,
@@ -54,7 +56,14 @@ def test_fields_gradients_and_moments_by_hand(cubic: Scene) -> None:
     # The old grids of one direction.
     grown = 3 * 4**3 * 12
     assert budget.deformation.passing["growing the grids"] == grown
-    assert sum(budget.checkpoint.values()) == grids + decoder + 10**3 + displacements
+    assert sum(budget.fields.values()) == grids + decoder + 10**3 + displacements
+    # Grids in half precision.
+    small = grids // 2 + decoder + 10**3
+    assert sum(budget.checkpoint.values()) == small + displacements // 2
+    assert budget.files["canonical"].finished == small
+    assert budget.files["deformation"].progress == (
+        grids + decoder + 10**3 + displacements + 2 * displacements // 3
+    )
 
 
 def test_images_flow_and_depth_by_hand(tiny_scene: Scene) -> None:
@@ -69,13 +78,37 @@ def test_images_flow_and_depth_by_hand(tiny_scene: Scene) -> None:
     assert set(view_bytes(replace(moving, flow=None, depth=None))) == {"images"}
 
 
-def test_the_host_holds_all_views_and_twice_the_fields(cubic: Scene) -> None:
+def test_the_host_holds_all_views_the_fields_and_their_checkpoint(cubic: Scene) -> None:
     budget = estimate(cubic, CANONICAL, DEFORMATION, SMALL)
     everything = [v for c in (cubic.static, cubic.dynamic) for v in (c.train, c.test)]
     assert budget.scene["images"] == sum(v.pixels.numel() for v in everything)
     scene = sum(budget.scene.values())
-    assert budget.host == PROGRAM + scene + 2 * sum(budget.checkpoint.values())
+    learned = sum(budget.fields.values()) + sum(budget.checkpoint.values())
+    assert budget.host == PROGRAM + scene + learned
     assert budget.host_alone >= budget.host
+
+
+def test_a_copy_to_go_back_to_counts(cubic: Scene) -> None:
+    budget = estimate(cubic, CANONICAL, DEFORMATION, SMALL)
+    fields = budget.canonical.held["density and features"] + budget.deformation.held["decoder"]
+    assert budget.canonical.held["a copy to go back to"] == fields
+    slices = budget.deformation.held["gradients of one frame"]
+    assert budget.deformation.held["a copy of one frame to go back to"] == slices
+
+
+def test_in_hard_times_a_batch_is_taken_in_eight_parts() -> None:
+    assert StageMemory({"a": 3}, {BATCH: 80, "b": 4}).least == 13
+    assert StageMemory({"a": 3}, {BATCH: 80, "b": 40}).least == 43
+
+
+def test_on_the_host_the_images_are_there_anyway() -> None:
+    assert StageMemory({"a": 100, "images": 50, "depth": 7}, {"c": 100}).on_host == 260
+
+
+def test_the_files_of_a_stage() -> None:
+    # Two that are kept, and the next beside them; or the finished one.
+    assert StageFiles(finished=5, progress=8).peak(kept=2) == 24
+    assert StageFiles(finished=9, progress=8).peak(kept=2) == 25
 
 
 def test_a_peak_is_what_is_held_and_the_largest_of_what_passes() -> None:
@@ -83,10 +116,10 @@ def test_a_peak_is_what_is_held_and_the_largest_of_what_passes() -> None:
     assert StageMemory({"a": 3}, {}).peak == 3
 
 
-def test_the_checkpoint_of_a_learned_scene(tiny_scene: Scene, rest) -> None:
+def test_the_fields_of_a_learned_scene(tiny_scene: Scene, rest) -> None:
     # As the fixture was learned: side 20; the box that it found is another than the bounds'.
     schedule = CanonicalSchedule(search_iterations=0, iterations=120, side=20, doublings=(40,))
-    parts = estimate(tiny_scene, schedule, DEFORMATION, SMALL).checkpoint
+    parts = estimate(tiny_scene, schedule, DEFORMATION, SMALL).fields
     said = sum(size for name, size in parts.items() if "frames" not in name)
     kept = [v for v in rest.model.state_dict().values() if isinstance(v, torch.Tensor)]
     assert said == pytest.approx(sum(v.numel() * v.element_size() for v in kept), rel=0.1)
@@ -115,7 +148,7 @@ def test_the_papers_sizes(cubic: Scene) -> None:
     budget = estimate(
         replace(cubic, dynamic=dynamic), CanonicalSchedule(), DeformationSchedule(), Architecture()
     )
-    both = budget.checkpoint["displacements of 50 frames, both ways"]
+    both = budget.fields["displacements of 50 frames, both ways"]
     assert both == pytest.approx(2 * 2.46e9, rel=0.01)
     assert 5e9 < budget.gpu < 12e9
     assert math.isfinite(budget.host)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import logging
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +13,11 @@ import torch
 from lightning import Trainer
 
 from devrf.callbacks import Health, Saving
-from devrf.data.batch import gather_batch
+from devrf.data.batch import Pixels
 from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
 from devrf.fields.architecture import Architecture
 from devrf.rendering import render as rendering
-from devrf.scenes.scene import Scene
 from devrf.stages import parts as parts_module
 from devrf.stages import stage as stage_module
 from devrf.stages.canonical import CanonicalStage
@@ -178,25 +176,29 @@ def test_other_errors_pass_through(fit, monkeypatch: pytest.MonkeyPatch) -> None
 def test_one_of_several_processes_says_so_and_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parts_module, "world_size", lambda: 2)
 
-    def loss() -> Any:
+    def loss(pixels: Pixels) -> Any:
         raise MemoryError
 
+    pixels = Pixels(torch.zeros(8), torch.zeros(8), torch.ones(3))
     with pytest.raises(DevrfError, match="one of 2 processes is out of memory .* fewer rays"):
-        Parts().gradients(loss, lambda total: None, lambda: None, torch.Generator())
+        Parts().gradients(loss, pixels, lambda total: None, lambda: None)
 
 
-def test_parts_are_the_batch_in_order(tiny_scene: Scene, rng: torch.Generator) -> None:
-    views = tiny_scene.dynamic.train
-    image = torch.randint(6, (7,), generator=rng)
-    background = torch.rand(7, 3, generator=rng)
-    batch = gather_batch(views, image, torch.arange(7) * 5, background)
-    parts = Parts()
-    parts.count, seen, shares = 3, [], []
-    for parts._present in range(3):
-        seen.append(parts.of(batch))
-        shares.append(parts._share)
-    assert [len(part.rays) for part in seen] == [2, 2, 3] and sum(shares) == pytest.approx(1)
-    for name in ("color", "alpha", "background", "image", "pixel", "flow", "flow_valid"):
-        assert torch.equal(torch.cat([getattr(p, name) for p in seen]), getattr(batch, name))
-    assert torch.equal(torch.cat([p.rays.origins for p in seen]), batch.rays.origins)
-    assert replace(batch, background=torch.ones(3)).between(1, 3).background.shape == (3,)
+def test_parts_are_the_batch_in_order(rng: torch.Generator) -> None:
+    pixels = Pixels(torch.randint(6, (7,), generator=rng), torch.arange(7) * 5,
+                    torch.rand(7, 3, generator=rng))
+    parts, seen = Parts(), []
+    parts.count = 3
+
+    def loss(part: Pixels) -> Any:
+        seen.append(part)
+        return torch.ones(()), {"rays": torch.tensor(float(len(part)))}
+
+    total, terms = parts.gradients(loss, pixels, lambda total: None, lambda: None)
+    assert [len(part) for part in seen] == [2, 2, 3]
+    assert total == pytest.approx(1.0)
+    assert terms["rays"] == pytest.approx((2 * 2 + 2 * 2 + 3 * 3) / 7)
+    for name in ("image", "flat", "background"):
+        assert torch.equal(torch.cat([getattr(p, name) for p in seen]), getattr(pixels, name))
+    white = Pixels(pixels.image, pixels.flat, torch.ones(3))
+    assert white.between(1, 3).background.shape == (3,)

@@ -51,6 +51,8 @@ def test_a_frame_is_compared_with_its_neighbours() -> None:
     wide = [1.0, 3.0, 9.0, 27.0, 81.0]
     assert stands_out(9.0 * 3**7, wide) is None
     assert stands_out(9.0 * 3**8, wide) == pytest.approx(3**8)
+    # Little by little it may grow as far as it likes.
+    assert stands_out(9.0, [1.0, 1.0, 1.1, 1.0, 5.0]) is None
     # What stood out itself does not widen the range, and what is long past does not count.
     assert stands_out(4.0, [1.0, 1.0, 50.0, 1.0, 1.0]) == pytest.approx(4.0)
     assert stands_out(4.0, [1.0] * 50 + [4.0] * 10) is None

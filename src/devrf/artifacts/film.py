@@ -23,6 +23,8 @@ from devrf.rendering.player import Player
 
 # Small pictures are shown enlarged: a video of 100 pixels is too small to watch.
 WATCHABLE = 240
+# Bytes that a pixel of a video takes, at most: met in scenes of two hundred pixels and less.
+PIXEL = 0.2
 # H.264 has blocks of so many pixels.
 SMALLEST = 16
 
@@ -100,6 +102,18 @@ def write_video(path: Path, images: Iterator[Tensor], fps: int, *, least: int = 
         with closing(writer):
             for image in images:
                 writer.append_data(_enlarged(to_bytes(image).numpy(), least))
+
+
+def film_bytes(film: FilmSettings, cameras: Cameras) -> int:
+    """About how large a video becomes, colour beside depth; rather less.
+
+    Args:
+        film: what is filmed.
+        cameras: captured cameras with images of the usual size.
+    """
+    sized = film.sized(cameras)
+    enlarged = max(1, math.ceil(WATCHABLE / sized.height)) if film.height is None else 1
+    return round(film.frames * 2 * sized.height * sized.width * enlarged**2 * PIXEL)
 
 
 def _enlarged(image: np.ndarray, least: int) -> np.ndarray:

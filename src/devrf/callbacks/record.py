@@ -52,11 +52,11 @@ class TrainingRecord(Callback):
         assert isinstance(pl_module, ScheduledStage)
         if pl_module.device.type == "cuda":
             torch.cuda.synchronize(pl_module.device)
-        seconds = self._seconds()
+        seconds, done = self._seconds(), pl_module.iteration - pl_module.skipped
         pl_module.record = {
             "seconds": round(seconds, 2),
-            "iterations": pl_module.iteration,
-            "iterations_per_second": round(pl_module.iteration / seconds, 2),
+            "iterations": done,
+            "iterations_per_second": round(done / seconds, 2),
             "peak_gpu_gb": self._peak(),
             "back_offs": pl_module.back_offs,
         }

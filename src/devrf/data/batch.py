@@ -26,11 +26,20 @@ class Pixels:
     flat: Tensor
     background: Tensor
 
+    def __len__(self) -> int:
+        return self.image.shape[0]
+
     def take(self, others: Pixels) -> None:
         """Become as many others, in the same memory."""
         self.image.copy_(others.image)
         self.flat.copy_(others.flat)
         self.background.copy_(others.background)
+
+    def between(self, start: int, stop: int) -> Pixels:
+        """The pixels from ``start`` up to ``stop``, sharing memory."""
+        kept = slice(start, stop)
+        behind = self.background if self.background.dim() == 1 else self.background[kept]
+        return Pixels(self.image[kept], self.flat[kept], behind)
 
     def clone(self) -> Pixels:
         """The same pixels in other memory."""
@@ -60,20 +69,6 @@ class RayBatch:
     pixel: Tensor
     flow: Tensor | None
     flow_valid: Tensor | None
-
-    def between(self, start: int, stop: int) -> RayBatch:
-        """The rays from ``start`` up to ``stop``, sharing memory."""
-        kept = slice(start, stop)
-        return RayBatch(
-            rays=self.rays[kept],
-            color=self.color[kept],
-            alpha=None if self.alpha is None else self.alpha[kept],
-            background=self.background if self.background.dim() == 1 else self.background[kept],
-            image=self.image[kept],
-            pixel=self.pixel[kept],
-            flow=None if self.flow is None else self.flow[kept],
-            flow_valid=None if self.flow_valid is None else self.flow_valid[kept],
-        )
 
 
 def pixel_positions(flat: Tensor, width: int) -> Tensor:

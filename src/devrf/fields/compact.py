@@ -19,6 +19,10 @@ from devrf.fields.grid import resample
 # Grid points of the detailed grid to one of the thinned-out grid.
 THINNING = 4
 
+# Packing makes grids smaller by this factor at most, whatever is in them: whoever claims more
+# wants memory.
+MOST = 1000
+
 Packed = dict[str, Any]
 
 
@@ -67,6 +71,9 @@ def unpack(packed: Packed) -> Tensor:
     x, y, z = (int(points) for points in packed["shape"])
     shape = (x, y, z)
     elsewhere, kept = packed["elsewhere"].float(), packed["kept"]
+    stored = sum(packed[name].nbytes for name in ("keep", "kept", "elsewhere"))
+    if 4 * len(elsewhere) * elsewhere.shape[-1] * x * y * z > MOST * stored:
+        raise ValueError("the stored grids claim to be larger than they can be")
     keep = [_mask(bits, x * y * z).view(x, y, z) for bits in packed["keep"]]
     counts = [int(one.sum()) for one in keep]
     if len(keep) == 1:

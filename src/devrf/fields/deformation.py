@@ -94,14 +94,12 @@ class DeformationField(nn.Module):
     def blended(self, frames: Tensor, time: float) -> Tensor:
         """The one grid (X, Y, Z, 3) that says at ``time`` what ``frames`` (T, X, Y, Z, 3) say.
 
-        On a frame it may be the frame's own memory. Looking a point up there takes one trilinear
+        On a frame it is the frame's own memory. Looking a point up there takes one trilinear
         interpolation instead of two, and a rounding of its own.
         """
         moment = self.clock.at(time)
-        before = frames[moment.before].to(self.here)
-        if not moment.weight:
-            return before
-        return before.lerp(frames[moment.after].to(self.here), moment.weight)
+        before = frames[moment.before]
+        return before.lerp(frames[moment.after], moment.weight) if moment.weight else before
 
     def slice(self, frame: int) -> Directions:
         """Leaves that share the memory of one frame, for an optimiser to step on in place.

@@ -18,7 +18,7 @@ FEWEST = 256
 
 
 def in_chunks(see: Callable[[Rays], Part], rays: Rays, chunk: int) -> list[Part]:
-    """``see(rays[k:l])`` for consecutive stretches of rays, in order.
+    """``see(rays[k:l])`` for consecutive stretches of rays, in order; at least one.
 
     When memory runs out, the stretch is halved and tried again, down to ``FEWEST`` rays; those
     after it stay as short.
@@ -30,7 +30,7 @@ def in_chunks(see: Callable[[Rays], Part], rays: Rays, chunk: int) -> list[Part]
     """
     parts: list[Part] = []
     first, chunk = 0, min(chunk, max(len(rays), 1))
-    while first < len(rays):
+    while first < len(rays) or not parts:
         part = _see(see, rays[first : first + chunk], chunk)
         if part is None:
             give_back(rays.origins.device)

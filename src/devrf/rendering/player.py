@@ -17,6 +17,7 @@ from devrf.geometry.rays import Rays
 from devrf.ops.choice import triton_runs
 from devrf.ops.corners import shape_of
 from devrf.ops.trilinear import interpolate
+from devrf.rendering.chunks import in_chunks
 from devrf.rendering.lists import ListRenderer
 from devrf.rendering.model import SceneModel, occupancy_points, occupancy_through
 from devrf.rendering.picture import Picture
@@ -92,18 +93,21 @@ class Player:
             background = torch.full((3,), background, device=self.device)
         rays = model.space.rays(rays)
         if triton_runs(model.canonical.density.values):
-            parts = [
-                self._lists.picture(part, ready.occupancy, ready.displacement, background)
-                for part in _chunks(rays, IN_LISTS)
-            ]
+            size = IN_LISTS
+
+            def see(part: Rays) -> Picture:
+                displacement = ready.displacement
+                return self._lists.picture(part, ready.occupancy, displacement, background)
         else:
-            parts = [
-                Picture.of(render(
-                    part, model.canonical, ready.occupancy, model.settings, background, ready.warp
-                ))
-                for part in _chunks(rays, ON_GPU if self.device.type == "cuda" else ON_CPU)
-            ]
-        return Picture.joined(parts)
+            size = ON_GPU if self.device.type == "cuda" else ON_CPU
+
+            def see(part: Rays) -> Picture:
+                occupancy, settings = ready.occupancy, model.settings
+                return Picture.of(
+                    render(part, model.canonical, occupancy, settings, background, ready.warp)
+                )
+
+        return Picture.joined(in_chunks(see, rays, size))
 
     def view(
         self, cameras: Cameras, index: int, time: float, background: float | Tensor
@@ -132,7 +136,3 @@ def _along(motion: DeformationField, displacement: Tensor) -> Warp:
     return lambda points: points + interpolate(
         displacement, motion.box.to_grid(points, motion.shape)
     )
-
-
-def _chunks(rays: Rays, size: int) -> list[Rays]:
-    return [rays[k : k + size] for k in range(0, max(len(rays), 1), size)]

@@ -49,10 +49,13 @@ class RunContext:
         self.config = config
         self.folder = folder
         self._began = time.perf_counter()
+        self._stepping = False
 
     def begin_step(self) -> None:
-        """Start the clock of a step."""
-        self._began = time.perf_counter()
+        """Start the clock of a step; the first one's runs since the scene was read."""
+        if self._stepping:
+            self._began = time.perf_counter()
+        self._stepping = True
 
     @property
     def step_seconds(self) -> float:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 
-from hydra.utils import instantiate
 from rich.console import Console
 
 from devrf.artifacts.inspection import inspect_scene
@@ -12,8 +11,8 @@ from devrf.artifacts.inspection_picture import write_inspection_picture
 from devrf.artifacts.inspection_text import plain, tables
 from devrf.errors import DevrfError
 from devrf.run.context import RunContext
+from devrf.run.room import estimated
 from devrf.scenes.export import export
-from devrf.stages.memory import estimate
 
 log = logging.getLogger(__name__)
 
@@ -29,13 +28,7 @@ def prepare(run: RunContext) -> None:
 
 def inspect(run: RunContext) -> None:
     """Say and draw what the scene holds and what may be wrong with it; learn nothing."""
-    canonical = instantiate(run.config.canonical, _convert_="all")
-    moving = instantiate(run.config.deformation.schedule, _convert_="all")
-    motion = instantiate(run.config.deformation.motion, _convert_="all")
-    budget = estimate(
-        run.scene, canonical.schedule, moving, canonical.architecture, canonical.sampling.step,
-        motion,
-    )
+    budget = estimated(run)
     found = inspect_scene(run.scene)
     console = Console()
     if console.is_terminal:

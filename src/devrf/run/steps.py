@@ -25,8 +25,11 @@ from devrf.run.objective import check_objective, objective
 from devrf.run.processes import together
 from devrf.run.report import report
 from devrf.run.resume import set_aside
+from devrf.run.room import check_room, shortage_in_words
 from devrf.run.score import evaluate
 from devrf.run.train import canonical, deformation
+
+log = logging.getLogger(__name__)
 
 STEPS: dict[str, tuple[Callable[[RunContext], None], ...]] = {
     "prepare": (prepare,),
@@ -75,9 +78,16 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
         raise DevrfError(f"stage: expected one of {', '.join(STEPS)}, not {stage!r}")
     run = RunContext(config, folder)
     _check(run, stage)
+    learns = [step.__name__ for step in STEPS[stage] if step in LEARNING]
+    needs = None
+    if learns and config.memory_check and run.leads:
+        further = {evaluate, render} & set(STEPS[stage])
+        needs = check_room(run, learns, scores=bool(further), films=render in further)
     if not config.resume and not {canonical, deformation}.isdisjoint(STEPS[stage]):
         needed = () if canonical in STEPS[stage] else (run.own_checkpoint("canonical"),)
         set_aside(folder, *needed)
+    if needs is not None:
+        log.info("%s", needs)
     learning = [step for step in STEPS[stage] if step in LEARNING]
     others = [step for step in STEPS[stage] if step not in LEARNING]
     ended = False
@@ -111,7 +121,7 @@ def _take(steps: Sequence[Callable[[RunContext], None]], run: RunContext) -> Non
     for step in steps:
         seed_everything(run.config.seed, verbose=False)
         run.begin_step()
-        with using(run.config.kernels):
+        with using(run.config.kernels), shortage_in_words(step.__name__, run):
             step(run)
 
 

@@ -26,7 +26,6 @@ from devrf.rendering.model import SceneModel
 from devrf.rendering.render import RenderSettings
 from devrf.scenes.scene import CaptureName, Views
 from devrf.stages.checkpoint import Passport, Stored
-from devrf.stages.memory import StageMemory, canonical_memory
 from devrf.stages.progress import pack, unpack
 from devrf.stages.ranks import share
 from devrf.stages.replay import Graphs
@@ -103,12 +102,6 @@ class CanonicalStage(ScheduledStage):
     def model_now(self) -> SceneModel:
         """The same."""
         return self.model
-
-    def memory(self) -> StageMemory:
-        """Counted from the schedule."""
-        return canonical_memory(
-            self.scene, self.schedule, self.architecture, self.sampling.step
-        )
 
     @property
     def optimizer(self) -> GridAdam:
@@ -265,22 +258,20 @@ class CanonicalStage(ScheduledStage):
     def draw(self) -> Pixels:
         """Random pixels of all images."""
         assert self._pool is not None
-        image, flat = self._pool.draw(share(self.schedule.rays), self.generator)
-        background = background_color(self.scene.background, len(image), self.generator)
-        return Pixels(image, flat, background)
+        with span("batch"):
+            image, flat = self._pool.draw(share(self.schedule.rays), self.generator)
+            background = background_color(self.scene.background, len(image), self.generator)
+            return Pixels(image, flat, background)
 
     def loss(self, views: Views, pixels: Pixels) -> tuple[Tensor, dict[str, Tensor]]:
         """Render a batch of pixels and compare it with the images."""
         assert isinstance(self.phase, CanonicalPhase)
         with span("batch"):
-            batch = self.parts.of(
-                gather_batch(
-                    views, pixels.image, pixels.flat, pixels.background, self.scene.space
-                )
+            batch = gather_batch(
+                views, pixels.image, pixels.flat, pixels.background, self.scene.space
             )
-        prediction = Prediction(
-            self.see(batch.rays, self.model.occupancy, batch.background), batch
-        )
+        output = self.see(batch.rays, self.model.occupancy, batch.background)
+        prediction = Prediction(output, batch)
         with span("losses"):
             total, terms = self.losses[self.phase.kind](prediction)
             return total, {**terms, **visibility(prediction)}

@@ -30,6 +30,7 @@ from devrf.stages.ranks import share, take_from_first
 from devrf.stages.replay import Graphs
 from devrf.stages.schedules import DeformationPhase, DeformationSchedule
 from devrf.stages.settings import DEFORMATION_LOSS, MotionSettings
+from devrf.stages.settling import settled
 from devrf.stages.stage import Phase, ScheduledStage
 from devrf.stages.useful import meets_matter
 from devrf.stages.visit import Visit
@@ -86,6 +87,7 @@ class DeformationStage(ScheduledStage):
             [{"params": [placeholder], "lr": self.motion.learning_rate, "name": "motion"}]
         )
         self._visit: Visit | None = None
+        self._losses: list[float] = []
         self._previous: Tensor | None = None
         self.register_state_dict_pre_hook(  # type: ignore[no-untyped-call]
             lambda *_: self._put_back()
@@ -115,10 +117,6 @@ class DeformationStage(ScheduledStage):
         """The deformation field."""
         assert self.scene_model.deformation is not None, "the stage has not been set up"
         return self.scene_model.deformation
-
-    def memory(self) -> StageMemory:
-        """Counted from the schedule and from where the displacements rest."""
-        return self._memory(self.field.on_host)
 
     def _memory(self, on_host: bool) -> StageMemory:
         model = self.scene_model
@@ -178,6 +176,7 @@ class DeformationStage(ScheduledStage):
         assert isinstance(phase, DeformationPhase)
         previous, self.phase = self.phase, phase
         assert previous is None or isinstance(previous, DeformationPhase)
+        self._losses = []
         self._put_back()
         if previous is not None and previous.level != phase.level:
             self._visit = None
@@ -293,19 +292,18 @@ class DeformationStage(ScheduledStage):
 
     def draw(self) -> Pixels:
         """Random pixels of the visited frame, of its views by turns or of all."""
-        pool = self.visit.pools[self.iteration % len(self.visit.pools)]
-        image, flat = pool.draw(share(self.schedule.rays), self.generator)
-        background = background_color(self.scene.background, len(image), self.generator)
-        return Pixels(image, flat, background)
+        with span("batch"):
+            pool = self.visit.pools[self.iteration % len(self.visit.pools)]
+            image, flat = pool.draw(share(self.schedule.rays), self.generator)
+            background = background_color(self.scene.background, len(image), self.generator)
+            return Pixels(image, flat, background)
 
     def loss(self, views: Views, pixels: Pixels) -> tuple[Tensor, dict[str, Tensor]]:
         """Render a batch of the visited frame through its warp; compare images and motion."""
         assert self._previous is not None
         visit, space = self.visit, self.scene_model.space
         with span("batch"):
-            batch = self.parts.of(
-                gather_batch(views, pixels.image, pixels.flat, pixels.background, space)
-            )
+            batch = gather_batch(views, pixels.image, pixels.flat, pixels.background, space)
         output = self.see(batch.rays, visit.occupancy, batch.background, visit.warp)
         before = visit.unwarp_previous(looked_up=self.room is not None)
         prediction = MotionPrediction(
@@ -318,7 +316,16 @@ class DeformationStage(ScheduledStage):
     def go_back(self, iteration: int, caution: float) -> None:
         """Go on from an earlier iteration of the present visit; look anew where matter is."""
         super().go_back(iteration, caution)
+        self._losses = []
         self._look_around()
+
+    def settled(self, means: Mapping[str, Tensor]) -> bool:
+        """Whether the visited frame's loss has stopped falling, if anybody wants to know."""
+        gain = self.motion.least_gain
+        if gain is None:
+            return False
+        self._losses.append(float(means["loss"]))
+        return settled(self._losses, gain)
 
     def at_hand(self) -> dict[str, Any]:
         """Where the visited frame's matter was last seen, and the pixels to learn from.
@@ -334,6 +341,7 @@ class DeformationStage(ScheduledStage):
             "shape": list(mask.shape),
             "pixels": [pack(pool.mask(images, area)) for pool in self.visit.pools],
             "displacements": [tensor.detach().cpu() for tensor in exact],
+            "losses": list(self._losses),
         }
 
     @torch.no_grad()
@@ -344,6 +352,7 @@ class DeformationStage(ScheduledStage):
         self._previous = previous_images(views)
         images, area = self._images(views, phase.frame), views.height * views.width
         self._begin_level()
+        self._losses = list(kept["losses"])
         self.visit.enter(self.field, phase.frame)
         for tensor, exact in zip(self.visit.slices, kept["displacements"], strict=False):
             tensor.copy_(exact)

@@ -23,6 +23,7 @@ where it is frozen.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -102,8 +103,7 @@ def _deformation(stage: DeformationStage, tested: float, reached: float, heavy: 
         looked_up += DISPLACEMENT * (ONCE + ADDED) * heavy
     if weights.get("flow"):
         looked_up += DISPLACEMENT * ONCE * heavy
-    x, y, z = stage.resolution
-    stepped = 2 * 3 * x * y * z
+    stepped = 2 * 3 * math.prod(stage.resolution)
     learned = decoder_operations(field, stage.schedule.rays, heavy)
     return Work(CORNERS * looked_up + ADAM * stepped, 2 * learned)
 

@@ -17,11 +17,18 @@ from devrf.fields.canonical import CanonicalField
 from devrf.fields.decoder import ColorDecoder
 from devrf.geometry.box import Box
 from devrf.scenes.scene import Scene, Views
+from devrf.stages.parts import Parts
 from devrf.stages.schedules import CanonicalSchedule, DeformationSchedule
 from devrf.stages.settings import MotionSettings
 
 # Python and its libraries on the host, without what the driver of a GPU adds.
-PROGRAM = 500_000_000
+PROGRAM = 600_000_000
+# What the C library keeps of memory that was freed in between makes a stage on the host so much
+# larger than its tensors: measured on scenes of 48 to 160 pixels.
+KEPT_BACK = 1.3
+# What passes, by name; and what a stage shares with the scene where both are on the host.
+BATCH = "a batch"
+VIEWS = ("images", "optical flow", "depth")
 # Two int32 tell a pixel of a pool.
 POOLED = 8
 # A displacement: three float32.
@@ -50,16 +57,41 @@ class StageMemory:
     held: Mapping[str, int]
     passing: Mapping[str, int]
 
-    def in_words(self) -> str:
-        """The peak and the three largest parts, on one line."""
-        parts = sorted({**self.held, **self.passing}.items(), key=lambda part: -part[1])[:3]
-        largest = ", ".join(f"{name} {size / 1e9:.2f}" for name, size in parts)
-        return f"about {self.peak / 1e9:.2f} GB ({largest})"
-
     @property
     def peak(self) -> int:
         """Bytes at the worst moment: all that is held, and the largest of what passes."""
         return sum(self.held.values()) + max(self.passing.values(), default=0)
+
+    @property
+    def least(self) -> int:
+        """Bytes at the worst moment when batches are taken in as many parts as is tried."""
+        passing = {
+            name: size // Parts.MOST if name == BATCH else size
+            for name, size in self.passing.items()
+        }
+        return StageMemory(self.held, passing).peak
+
+    @property
+    def on_host(self) -> int:
+        """Bytes on the host at the worst moment; the scene's own images are used in place."""
+        return round(KEPT_BACK * (self.peak - sum(self.held.get(name, 0) for name in VIEWS)))
+
+
+@dataclass(frozen=True)
+class StageFiles:
+    """What a stage writes, in bytes.
+
+    Attributes:
+        finished: its checkpoint.
+        progress: one of its progress files at the final resolution.
+    """
+
+    finished: int
+    progress: int
+
+    def peak(self, kept: int) -> int:
+        """The most that is there at once: ``kept`` progress files and a file being written."""
+        return kept * self.progress + max(self.progress, self.finished)
 
 
 @dataclass(frozen=True)
@@ -70,13 +102,18 @@ class Budget:
         scene: what the scene takes on the host, training and held-out views.
         canonical: the canonical stage on its device.
         deformation: the deformation stage on its device.
-        checkpoint: the tensors of ``deformation.ckpt``.
+        fields: what is learned, as it is worked with.
+        checkpoint: the same in ``deformation.ckpt``, at most: in half precision. Away from
+            matter less is kept.
+        files: what each stage writes, by its name.
     """
 
     scene: Mapping[str, int]
     canonical: StageMemory
     deformation: StageMemory
+    fields: Mapping[str, int]
     checkpoint: Mapping[str, int]
+    files: Mapping[str, StageFiles]
 
     @property
     def gpu(self) -> int:
@@ -87,19 +124,16 @@ class Budget:
     def host(self) -> int:
         """Bytes on the host of a run that trains on a GPU.
 
-        Scoring reads the checkpoint and builds its model: the fields are there twice.
+        Scoring reads the checkpoint and builds its model.
         """
-        return PROGRAM + sum(self.scene.values()) + 2 * sum(self.checkpoint.values())
+        learned = sum(self.fields.values()) + sum(self.checkpoint.values())
+        return PROGRAM + sum(self.scene.values()) + learned
 
     @property
     def host_alone(self) -> int:
         """Bytes on the host of a run without a GPU: the stages use the scene's images in place."""
-        views = ("images", "optical flow", "depth")
-        own = [
-            stage.peak - sum(stage.held.get(name, 0) for name in views)
-            for stage in (self.canonical, self.deformation)
-        ]
-        return max(self.host, PROGRAM + sum(self.scene.values()) + max(own))
+        own = max(self.canonical.on_host, self.deformation.on_host)
+        return max(self.host, PROGRAM + sum(self.scene.values()) + own)
 
 
 def estimate(
@@ -125,6 +159,17 @@ def estimate(
     """
     motion = motion or MotionSettings()
     field = final_field(scene, canonical, architecture)
+    grids, decoder = _grid_bytes(field), tensor_bytes(field.decoder)
+    points, moving = field.density.values.numel(), _all_frames(scene)
+    displacements = displacement_bytes(scene, field.box, deformation)
+    rest = grids + decoder + points
+    fields = {
+        "density and features": grids, "decoder": decoder, "occupancy": points,
+        moving: displacements,
+    }
+    checkpoint = {
+        **fields, "density and features": grids // 2, moving: displacements // 2,
+    }
     return Budget(
         scene=_sum([
             view_bytes(views)
@@ -136,11 +181,18 @@ def estimate(
             scene, field, deformation, step, on_host=motion.store == "host",
             half=motion.store_half,
         ),
-        checkpoint={
-            "density and features": _grid_bytes(field),
-            "decoder": tensor_bytes(field.decoder),
-            "occupancy": field.density.values.numel(),
-            _all_frames(scene): displacement_bytes(scene, field.box, deformation),
+        fields=fields,
+        checkpoint=checkpoint,
+        files={
+            # With moments, and the share of the views of each voxel.
+            "canonical": StageFiles(
+                sum(checkpoint.values()) - checkpoint[moving],
+                rest + 2 * (grids + decoder) + 4 * points,
+            ),
+            "deformation": StageFiles(
+                sum(checkpoint.values()),
+                rest + displacements + 2 * displacements // len(scene.clock),
+            ),
         },
     )
 
@@ -170,10 +222,11 @@ def canonical_memory(
             "their gradients": grids,
             "their Adam moments": 2 * grids,
             "decoder, with gradients and moments": 4 * tensor_bytes(field.decoder),
+            "a copy to go back to": grids + tensor_bytes(field.decoder),
             "occupancy": 2 * points,
         },
         passing={
-            "a batch": max(
+            BATCH: max(
                 batch_bytes(schedule, k, architecture, field.box, step)
                 for k in range(len(schedule.phases))
             ),
@@ -222,9 +275,10 @@ def motion_memory(
             "one frame": (5 if on_host else 3) * slices // 2,
             "gradients of one frame": slices,
             "Adam moments of one frame": 2 * slices,
+            "a copy of one frame to go back to": slices,
         },
         passing={
-            "a batch": motion_batch_bytes(
+            BATCH: motion_batch_bytes(
                 schedule.rays, samples_per_ray(field.box, field.base_voxels, field.planes, step),
                 channels, width, planes=field.planes,
             ),

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from devrf.errors import DevrfError
+
 SEARCH_LOSS = {"color": 1.0, "per_sample_color": 0.1, "entropy": 0.01}
 FINE_LOSS = {"color": 1.0, "per_sample_color": 0.01, "entropy": 0.001}
 DEFORMATION_LOSS = {
@@ -70,6 +72,8 @@ class MotionSettings:
             ``host``, or ``auto``: on the device if they fit there beside all else. Of several
             processes each keeps them on its device.
         store_half: whether they rest in half precision; what is visited never does.
+        least_gain: a visit ends early when two Lightning steps have taken less than this share
+            off its loss; None goes through the whole schedule.
     """
 
     learning_rate: float = 1e-3
@@ -80,3 +84,11 @@ class MotionSettings:
     start: Literal["previous", "flow"] = "previous"
     store: Literal["auto", "device", "host"] = "auto"
     store_half: bool = False
+    least_gain: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.least_gain is not None and not 0 < self.least_gain <= 1:
+            raise DevrfError(
+                "schedule.motion.least_gain: expected above 0, at most 1, or null, not "
+                f"{self.least_gain}"
+            )

@@ -23,6 +23,9 @@ NEIGHBOURS, FEWEST = 10, 4
 # Deviations (of a normal distribution) that a frame may be off, and the least that counts as one:
 # losses of frames differ by a quarter for no reason.
 DEVIATIONS, SPREAD = 5.0, 0.25
+# Motion that grows from frame to frame raises the loss little by little; what is wrong with a
+# frame raises it at once, by this factor of the frame before.
+JUMP = 2.0
 
 
 @dataclass(frozen=True)
@@ -119,7 +122,7 @@ def stands_out(loss: float, others: Sequence[float]) -> float | None:
         others: of the frames visited before it, the last one last.
     """
     near = [math.log(other) for other in others[-NEIGHBOURS:] if other > 0]
-    if len(near) < FEWEST or not loss > 0:
+    if len(near) < FEWEST or not loss > JUMP * others[-1]:
         return None
     middle = median(near)
     spread = 1.4826 * median(abs(other - middle) for other in near)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import logging
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar
@@ -28,11 +28,10 @@ from devrf.rendering.player import Player
 from devrf.rendering.render import RenderOutput, render
 from devrf.rendering.room import Room
 from devrf.scenes.scene import CaptureName, Scene, Views
-from devrf.shortage import ShortageError, give_back, is_shortage
+from devrf.shortage import ShortageError
 from devrf.stages.checkpoint import Passport, check_scene, passport_in
 from devrf.stages.compact_state import compact_state
 from devrf.stages.held_out import score
-from devrf.stages.memory import StageMemory
 from devrf.stages.parts import Parts
 from devrf.stages.progress import random_states, set_random_states
 from devrf.stages.ranks import (
@@ -47,8 +46,6 @@ from devrf.stages.ranks import (
 )
 from devrf.stages.replay import Capturer, Graphs, OnCuda, Repeated
 from devrf.stages.schedules import CanonicalPhase, DeformationPhase
-
-log = logging.getLogger(__name__)
 
 Phase = CanonicalPhase | DeformationPhase
 
@@ -75,18 +72,19 @@ class ScheduledStage(LightningModule, ABC):
         name: what the stage is called in files and messages.
         capture: the part of the scene that is learned from.
         costly: the config keys that its memory depends on most.
-        iteration: optimiser iterations done.
+        iteration: where the stage is in its schedule: optimiser iterations done or left out.
+        skipped: how many were left out, since a phase had nothing left to gain.
         phase: the stretch of the schedule that the grids are ready for; None before the first.
         record: what training took, once a ``TrainingRecord`` callback has measured it.
         generator: what pixels are drawn with, on the stage's device. At the beginning of each
             Lightning step it depends on the seed, the process and the iteration alone.
         made_with: the settings that decide what is learned, by config key, if somebody told.
-        graphs: whether steady iterations are captured in a CUDA graph where that is possible.
-        room: the length of the lists of samples; None while they are as long as need be.
         parts: how batches are divided when memory runs out.
         back_offs: how often learning went wrong and was taken back.
         caution: what the scheduled learning rates are multiplied by; below 1 after a back-off.
         gave_up: why the stage ended before its schedule; None while it has not.
+        graphs: whether steady iterations are captured in a CUDA graph where that is possible.
+        room: the length of the lists of samples; None while they are as long as need be.
     """
 
     name: ClassVar[str]
@@ -100,9 +98,11 @@ class ScheduledStage(LightningModule, ABC):
         self.room: Room | None = None
         self.iterations_per_step = iterations_per_step
         self.iteration = 0
+        self.skipped = 0
         self.phase: Phase | None = None
         self.record: dict[str, float | None] = {}
         self.generator = torch.Generator()
+        self._rays = 0
         self._sums: dict[str, Tensor] = {}
         self._pixels: Pixels | None = None
         self._repeated: Repeated | None = None
@@ -141,10 +141,6 @@ class ScheduledStage(LightningModule, ABC):
         """The model that is being learned, in which what is at hand may not have its place yet."""
 
     @abstractmethod
-    def memory(self) -> StageMemory:
-        """What the stage will need on the device that it trains on."""
-
-    @abstractmethod
     def phase_at(self, iteration: int) -> Phase:
         """The phase of the schedule that ``iteration`` belongs to."""
 
@@ -167,6 +163,14 @@ class ScheduledStage(LightningModule, ABC):
     def loss(self, views: Views, pixels: Pixels) -> tuple[Tensor, dict[str, Tensor]]:
         """The weighted loss of a batch of pixels of ``views``, and its terms by name."""
 
+    def settled(self, means: Mapping[str, Tensor]) -> bool:
+        """Whether the present phase has nothing left to gain, so that its rest is left out.
+
+        Args:
+            means: of the loss and its terms over the Lightning step that is done.
+        """
+        return False
+
     def see(
         self, rays: Rays, occupancy: Occupancy, background: Tensor, warp: GridWarp | None = None
     ) -> RenderOutput:
@@ -184,11 +188,14 @@ class ScheduledStage(LightningModule, ABC):
         Whoever enters a phase calls it once the phase's tensors are there and the optimiser has
         them.
         """
+        self._rays = rays
         self._sums, self._pixels, self._repeated, self.room = {}, None, None, None
-        # A batch that is taken in parts is not the same work each time.
-        if self.parts.count == 1 and triton_runs(self.model_now.canonical.density.values):
-            self.room = Room(share(rays), self.device)
+        if triton_runs(self.model_now.canonical.density.values):
+            self.room = self._new_room()
             self.optimizer.keep_gradients()
+
+    def _new_room(self) -> Room:
+        return Room(-(-share(self._rays) // self.parts.count), self.device)
 
     def setup(self, stage: str) -> None:
         """Make the generator.
@@ -208,8 +215,6 @@ class ScheduledStage(LightningModule, ABC):
     def on_fit_start(self) -> None:
         """Begin with the same fields in every process."""
         take_from_first([*self.parameters(), *self.buffers()])
-        if self.trainer.is_global_zero:
-            log.info("%s: needs %s on the %s", self.name, self.memory().in_words(), self.device)
 
     def on_fit_end(self) -> None:
         """See that every process has come to the same fields.
@@ -286,21 +291,32 @@ class ScheduledStage(LightningModule, ABC):
             count = min(count, self.trainer.max_steps - self.trainer.global_step)
         first = self.iteration
         for _ in range(count):
+            self.prepare()
             try:
-                self._iterate(views, optimizer)
+                if self.room is None:
+                    optimizer.zero_grad()
+                    self._learn(views, self.draw())
+                    with span("optimiser"):
+                        optimizer.step()
+                else:
+                    self._repeat(views, optimizer)
             except ShortageError as shortage:
                 self.give_up(f"{shortage} at {self.where(self.iteration)}; {self.remedy}")
                 break
             self.iteration += 1
-        self._draw_anew()
-        if self.iteration == first:
-            return {}
         done = self.iteration - first
-        means = {k: value / done for k, value in average(self._sums).items()}
+        means = {k: value / done for k, value in average(self._sums).items()} if done else {}
         for value in self._sums.values():
             value.zero_()
         if self.room is not None and self.room.look():
             self._repeated = None  # captured with lists of another length
+        stop = min(self.phase.stop, self.total_iterations)
+        if done and self.iteration < stop and self.settled(means):
+            self.skipped += stop - self.iteration
+            self.iteration = stop
+        self._draw_anew()
+        if not done:
+            return {}
         named = {f"{self.capture}/{k}": value for k, value in means.items()}
         self.log_dict({**named, "step": float(self.iteration)})
         if self.iteration >= self.total_iterations:
@@ -315,30 +331,11 @@ class ScheduledStage(LightningModule, ABC):
             f"(resume=false) with lower {' or '.join(self.costly)}, or higher data.downscale"
         )
 
-    def _iterate(self, views: Views, optimizer: LightningOptimizer) -> None:
-        """One iteration, steady if there is room for it."""
-        self.prepare()
-        with span("batch"):
-            pixels = self.draw()
-        if self.room is not None and not self._repeat(views, pixels, optimizer):
-            log.warning("%s: out of memory: iterations are steady no longer", self.name)
-            self.room = self._repeated = self._pixels = None
-            give_back(self.device)
-        if self.room is None:
-            self._add_up(
-                *self.parts.gradients(
-                    lambda: self.loss(views, pixels), self._backward, optimizer.zero_grad,
-                    self.generator,
-                )
-            )
-            with span("optimiser"):
-                optimizer.step()
-
-    def _add_up(self, total: Tensor, terms: dict[str, Tensor]) -> None:
-        """Add the loss of an iteration, and its terms, to the sums of this step.
-
-        Its gradients are there: of several processes each has its own until now.
-        """
+    def _learn(self, views: Views, pixels: Pixels) -> None:
+        """The gradients of a batch; its loss and terms are added to the sums of this step."""
+        total, terms = self.parts.gradients(
+            lambda part: self.loss(views, part), pixels, self._backward, self._divided
+        )
         groups = self.optimizer.param_groups
         average_gradients(p for group in groups for p in group["params"])
         for name, value in {"loss": total.detach(), **terms}.items():
@@ -347,13 +344,17 @@ class ScheduledStage(LightningModule, ABC):
             else:
                 self._sums[name] = value.clone()
 
-    def _repeat(self, views: Views, drawn: Pixels, optimizer: LightningOptimizer) -> bool:
-        """A steady iteration: the same work on the same tensors, with other pixels in them.
+    def _divided(self) -> None:
+        """Begin the iteration anew in smaller parts."""
+        self.optimizer.zero_grad()
+        if self.room is not None:
+            self.room = self._new_room()
+            self._repeated = None
 
-        Returns:
-            False if memory ran out; then nothing was learned.
-        """
+    def _repeat(self, views: Views, optimizer: LightningOptimizer) -> None:
+        """A steady iteration: the same work on the same tensors, with other pixels in them."""
         assert self.room is not None
+        drawn = self.draw()
         if self._pixels is None:
             self._pixels = drawn.clone()
         else:
@@ -361,28 +362,20 @@ class ScheduledStage(LightningModule, ABC):
         pixels = self._pixels
 
         def work() -> None:
-            total, terms = self.loss(views, pixels)
-            if total.requires_grad:
-                self._backward(total)
-            self._add_up(total, terms)
+            self._learn(views, pixels)
             with span("optimiser"):
                 self.optimizer.apply()
 
         if self._repeated is None:
             self._repeated = Repeated(work, self._capturer())
-        try:
-            # Parts are told apart where they are done one by one.
-            with self.optimizer.stepping_by(work if measured() else self._repeated):
-                optimizer.step()
-        except (RuntimeError, MemoryError) as error:
-            if not is_shortage(error):
-                raise
-            return False
-        if self._repeated.is_warm:
+        repeated = self._repeated  # which is gone if memory runs out on the way
+        # What is replayed shows none of its parts to those who measure them.
+        with self.optimizer.stepping_by(work if measured() else repeated):
+            optimizer.step()
+        if repeated.is_warm:
             self.room.measure()
-        if self._repeated.failed:
+        if repeated.failed:
             self.graphs = "off"  # one warning is enough
-        return True
 
     def _capturer(self) -> Capturer | None:
         """How iterations are captured: on one GPU, if at all."""
@@ -426,6 +419,7 @@ class ScheduledStage(LightningModule, ABC):
             checkpoint["progress"] = {
                 "stage": self.name,
                 "iteration": self.iteration,
+                "skipped": self.skipped,
                 "total": self.total_iterations,
                 "phase": None if self.phase is None else self.phase.start,
                 "at_hand": {} if self.phase is None else self.at_hand(),
@@ -455,6 +449,7 @@ class ScheduledStage(LightningModule, ABC):
                 f"this is the {ours[0]} stage on one of {ours[1]}; give it its own schedule"
             )
         self.iteration, self._seed = kept["iteration"], kept["seed"]
+        self.skipped = kept["skipped"]
         self.parts.count = kept["parts"]
         self.back_offs, self.caution = kept["back_offs"], kept["caution"]
         self.phase = None if kept["phase"] is None else self.phase_at(kept["phase"])
