@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor
@@ -158,3 +161,45 @@ def test_all_that_is_learned_is_in_the_state_dict(field: DeformationField) -> No
     assert {"to_canonical", "to_time"} <= set(field.state_dict())
     # No optimiser may take the frames from the module: they are trained slice by slice.
     assert list(field.parameters()) == []
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_frames_that_rest_elsewhere_are_taken_out_as_the_field_works(
+    field: DeformationField, rng: torch.Generator, half: bool
+) -> None:
+    x, times = points(50, rng), (0.1, 0.2, 0.77)
+    expected = [(field.warp(x, t), field.blended(field.to_canonical, t)) for t in times]
+    field.rest(on_host=True, half=half)
+    close = {"atol": 2e-3, "rtol": 1e-3} if half else {"atol": 0.0, "rtol": 0.0}
+    for time, (moved, grid) in zip(times, expected, strict=True):
+        torch.testing.assert_close(field.warp(x, time), moved, **close)
+        torch.testing.assert_close(field.blended(field.to_canonical, time), grid, **close)
+    # Wherever the module goes, its frames stay as they are.
+    resting = field.to_time
+    field.double()
+    assert field.to_time is resting and resting.dtype == (torch.half if half else torch.float)
+    assert field.warp(x.double(), 0.77).dtype == torch.float64
+    field.float().resize(27)
+    assert field.to_time.dtype == resting.dtype and field.shape == (3, 3, 3)
+
+
+def test_a_frame_is_read_changed_and_written_back(field: DeformationField) -> None:
+    before = field.to_canonical.clone(), field.to_time.clone()
+    pair = torch.empty(*field.shape, 3), torch.empty(*field.shape, 3)
+    field.read(2, pair)
+    assert torch.equal(pair[0], before[0][2]) and torch.equal(pair[1], before[1][2])
+    pair[0].add_(1)
+    assert torch.equal(field.to_canonical, before[0])
+    field.write(2, pair)
+    assert torch.equal(field.to_canonical[2], before[0][2] + 1)
+    assert torch.equal(field.to_canonical[[0, 1, 3]], before[0][[0, 1, 3]])
+    assert torch.equal(field.to_time, before[1])
+    with pytest.raises(IndexError, match="only 1 to 3"):
+        field.write(0, pair)
+
+
+def test_what_is_on_its_way_from_the_host_is_not_copied(field: DeformationField) -> None:
+    stream: Any = (number for number in ())  # like a stream, nothing that can be copied
+    field._coming = (1, (field.to_time[1], field.to_time[1]), stream)
+    assert copy.deepcopy(field)._coming is None
+    field._coming = None

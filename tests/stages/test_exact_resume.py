@@ -40,6 +40,8 @@ ALONG_FLOW = MotionSettings(
     learning_rate=2e-3, unit="box", views="all", pixels="useful", occupancy_every=3, start="flow"
 )
 BY_TURNS = MotionSettings(occupancy_every=3)
+# The field would not keep exactly what a visit has learned.
+ROUNDED = MotionSettings(occupancy_every=3, store="host", store_half=True)
 
 
 class Leave(Callback):
@@ -125,7 +127,9 @@ def test_the_canonical_stage_goes_on_exactly(learn) -> None:
     assert_same(learn(canonical, *leaves), learn(canonical))
 
 
-@pytest.mark.parametrize("motion", [ALONG_FLOW, BY_TURNS], ids=["all views", "by turns"])
+@pytest.mark.parametrize(
+    "motion", [ALONG_FLOW, BY_TURNS, ROUNDED], ids=["all views", "by turns", "in half precision"]
+)
 def test_the_deformation_stage_goes_on_exactly(learn, rest: Stored, motion: MotionSettings) -> None:
     def build() -> ScheduledStage:
         return DeformationStage(copy.deepcopy(rest), MOVING, motion, iterations_per_step=1)

@@ -17,6 +17,7 @@ from devrf.ops.total_variation import total_variation
 from devrf.rendering.player import Player
 from devrf.scenes.scene import Scene
 from devrf.stages.checkpoint import Stored
+from devrf.stages.compact_state import compact_state, expanded_state
 from devrf.stages.deformation import DeformationStage
 from devrf.stages.held_out import score
 from devrf.stages.schedules import DeformationSchedule
@@ -122,7 +123,8 @@ def test_whoever_looks_in_the_midst_of_a_visit_sees_what_it_has_learned(
 
 @pytest.mark.parametrize("half", [False, True])
 def test_where_the_field_rests_changes_what_is_learned_by_its_rounding_alone(
-    rest: Stored, datamodule: SceneDataModule, trainer: Callable[..., Trainer], half: bool
+    rest: Stored, datamodule: SceneDataModule, trainer: Callable[..., Trainer], half: bool,
+    tiny_scene: Scene,
 ) -> None:
     fields = []
     for store, rounded in (("device", False), ("host", half)):
@@ -132,6 +134,10 @@ def test_where_the_field_rests_changes_what_is_learned_by_its_rounding_alone(
         trainer(max_epochs=1).fit(stage, datamodule=datamodule)
         assert stage.field.to_time.dtype == (torch.float16 if rounded else torch.float32)
         fields.append(stage.field.to_canonical.float())
+        # What is kept of it, and pictures of it, do not depend on how it rests.
+        model = expanded_state(compact_state(stage.model))
+        assert model["deformation.to_time"].dtype == torch.float32
+        assert score(Player(stage.model), tiny_scene.dynamic.train, 5, "white").psnr > 10
     if half:
         assert not torch.equal(*fields)
         torch.testing.assert_close(*fields, atol=0.05, rtol=0)

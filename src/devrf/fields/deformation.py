@@ -60,8 +60,7 @@ class DeformationField(nn.Module):
         self.register_buffer("to_time", torch.zeros(shape))
         # It goes where the module goes, and so tells where that is.
         self.register_buffer("here", torch.zeros(0), persistent=False)
-        self._coming: tuple[int, Directions] | None = None
-        self._side: torch.cuda.Stream | None = None
+        self._coming: tuple[int, Directions, torch.cuda.Stream] | None = None
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -94,12 +93,15 @@ class DeformationField(nn.Module):
     def blended(self, frames: Tensor, time: float) -> Tensor:
         """The one grid (X, Y, Z, 3) that says at ``time`` what ``frames`` (T, X, Y, Z, 3) say.
 
-        On a frame it is the frame's own memory. Looking a point up there takes one trilinear
-        interpolation instead of two, and a rounding of its own.
+        On a frame it is the frame's own memory, if that is where the field works, in single
+        precision. Looking a point up there takes one trilinear interpolation instead of two, and a
+        rounding of its own.
         """
         moment = self.clock.at(time)
-        before = frames[moment.before]
-        return before.lerp(frames[moment.after], moment.weight) if moment.weight else before
+        before = frames[moment.before].to(self.here)
+        if not moment.weight:
+            return before
+        return before.lerp(frames[moment.after].to(self.here), moment.weight)
 
     def slice(self, frame: int) -> Directions:
         """Leaves that share the memory of one frame, for an optimiser to step on in place.
@@ -128,10 +130,9 @@ class DeformationField(nn.Module):
         """
         source = (self.to_canonical[frame], self.to_time[frame])
         if self._coming is not None and self._coming[0] == frame:
-            assert self._side is not None
+            _, source, side = self._coming
             present = torch.cuda.current_stream(self.here.device)
-            present.wait_stream(self._side)
-            source = self._coming[1]
+            present.wait_stream(side)
             for tensor in source:
                 tensor.record_stream(present)
         self._coming = None
@@ -165,16 +166,13 @@ class DeformationField(nn.Module):
         if not (self.on_host and self.here.is_cuda):
             return
         device = self.here.device
-        if self._side is None:
-            self._side = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+        side = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
         # What was written to the frame has to be there first.
-        self._side.wait_stream(torch.cuda.current_stream(device))
-        with torch.cuda.stream(self._side):
-            fetched = tuple(
-                frames[frame].to(device, non_blocking=True)
-                for frames in (self.to_canonical, self.to_time)
-            )
-        self._coming = (frame, (fetched[0], fetched[1]))
+        side.wait_stream(torch.cuda.current_stream(device))
+        with torch.cuda.stream(side):
+            backward = self.to_canonical[frame].to(device, non_blocking=True)
+            forward = self.to_time[frame].to(device, non_blocking=True)
+        self._coming = (frame, (backward, forward), side)
 
     @torch.no_grad()
     def carry(self, frame: int) -> None:
@@ -186,7 +184,7 @@ class DeformationField(nn.Module):
     @torch.no_grad()
     def resize(self, voxels: int) -> None:
         """Resample every frame to about ``voxels`` voxels, trilinearly."""
-        shape = self.box.grid_shape(voxels)
+        shape, self._coming = self.box.grid_shape(voxels), None
         for name in ("to_canonical", "to_time"):
             frames = getattr(self, name)
             resized = self._room((len(frames), *shape, 3), frames.dtype)
@@ -228,6 +226,10 @@ class DeformationField(nn.Module):
         super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
         self._buffers.update(frames)
         return self
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy takes over: not what is on its way."""
+        return {**self.__dict__, "_coming": None}
 
     def _load_from_state_dict(
         self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
