@@ -228,6 +228,10 @@ class ScheduledStage(LightningModule, ABC):
             state = self.state_dict().items()
             check_alike({name: t for name, t in state if isinstance(t, Tensor)})
 
+    def teardown(self, stage: str) -> None:
+        """Let go of what only iterations need: a captured one holds memory of its own."""
+        self._repeated = self._pixels = None
+
     def _draw_anew(self) -> None:
         """Seed the generator for the coming iterations, in each process differently."""
         mixed = np.random.SeedSequence([self._seed, rank(), self.iteration, self.back_offs])
@@ -318,7 +322,8 @@ class ScheduledStage(LightningModule, ABC):
         if not done:
             return {}
         named = {f"{self.capture}/{k}": value for k, value in means.items()}
-        self.log_dict({**named, "step": float(self.iteration)})
+        # On the host, where it is wanted: Lightning would put a number on the device, and wait.
+        self.log_dict({**named, "step": torch.tensor(float(self.iteration))})
         if self.iteration >= self.total_iterations:
             self.trainer.should_stop = True
         return means
