@@ -144,7 +144,8 @@ class Health(Callback):
             return
         assert self._good is not None and stage.phase is not None
         if stage.iteration >= stage.phase.stop:
-            self._compare(stage, steps[-1]["loss"])
+            # What holds the motion together differs widely from frame to frame.
+            self._compare(stage, steps[-1].get("render", steps[-1]["loss"]))
         elif stage.iteration - self._good.iteration >= COPIED_EVERY:
             self._good = None
             self._good = Snapshot.of(stage)
@@ -223,7 +224,7 @@ class Health(Callback):
         factor = stands_out(loss, self._visited)
         if factor is not None:
             log.warning(
-                "%s: the loss is %.3g by %s, %.1f times that of the frames before; are its images "
+                "%s: the rendering loss is %.3g by %s, %.1f times that of the frames before; are its images "
                 "and its flow as they should be?", stage.name, loss, stage.where(stage.iteration),
                 factor,
             )
