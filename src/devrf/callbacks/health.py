@@ -224,8 +224,8 @@ class Health(Callback):
         factor = stands_out(loss, self._visited)
         if factor is not None:
             log.warning(
-                "%s: the rendering loss is %.3g by %s, %.1f times that of the frames before; are its images "
-                "and its flow as they should be?", stage.name, loss, stage.where(stage.iteration),
-                factor,
+                "%s: the rendering loss is %.3g by %s, %.1f times that of the frames before; are "
+                "its images and its flow as they should be?", stage.name, loss,
+                stage.where(stage.iteration), factor,
             )
         self._visited.append(loss)

@@ -25,7 +25,7 @@ NEIGHBOURS, FEWEST = 10, 4
 DEVIATIONS, SPREAD = 5.0, 0.25
 # Motion that grows from frame to frame raises the loss little by little; what is wrong with a
 # frame raises it at once, by this factor of the frame before.
-JUMP = 5.0
+JUMP = 2.0
 
 
 @dataclass(frozen=True)
