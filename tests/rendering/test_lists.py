@@ -29,13 +29,13 @@ Same = Callable[[Picture, Picture], None]
 def searches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """The capacity of each search for samples."""
     capacities: list[int] = []
-    inner: Callable[..., object] = module.find_samples
+    inner: Callable[..., object] = module.search
 
     def counted(*arguments: object, capacity: int, **named: object) -> object:
         capacities.append(capacity)
         return inner(*arguments, capacity=capacity, **named)
 
-    monkeypatch.setattr(module, "find_samples", counted)
+    monkeypatch.setattr(module, "search", counted)
     return capacities
 
 

@@ -14,13 +14,14 @@ from devrf.fields.occupancy import Occupancy
 from devrf.fields.warp import GridWarp
 from devrf.geometry.rays import Rays
 from devrf.ops.compositing import composite_segments, sum_segments
-from devrf.ops.search import Found, Selected, Thresholds, find_samples, select
+from devrf.ops.search import Found, Selected, select
 from devrf.ops.spans import measured, span, tally
 from devrf.ops.trilinear import kept_gradient
 from devrf.ops.warped_depth import warped_depth
-from devrf.rendering.render import STOP, RenderOutput, RenderSettings
+from devrf.rendering.render import RenderOutput, RenderSettings
 from devrf.rendering.room import Room
 from devrf.rendering.sampling import Samples, march, most_steps, steps_through
+from devrf.rendering.search import search
 
 
 def render_in_lists(
@@ -99,14 +100,9 @@ def _search(
     if measured():
         # The kernel looks at these at most: it ends with the ray. It does not say at how many.
         tally("tested", len(march(rays, field.box, occupancy, **stretch)))
-    entry, count = steps_through(rays, field.box, **stretch)
-    threshold = settings.alpha_threshold
-    return find_samples(
-        rays.origins, rays.directions, entry, count, occupancy.mask, field.density.values,
-        warp.slices, warp.weight, step=stretch["step"], longest=most_steps(field.box, **stretch),
-        capacity=capacity, mask_box=occupancy.box, box=field.box, shift=field.shift,
-        delta=field.step_in_base_voxels(settings.step),
-        thresholds=Thresholds(threshold, STOP, threshold),
+    return search(
+        rays, steps_through(rays, field.box, **stretch), field, occupancy, settings,
+        warp.slices, warp.weight, longest=most_steps(field.box, **stretch), capacity=capacity,
     )
 
 

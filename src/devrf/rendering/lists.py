@@ -12,11 +12,12 @@ from devrf.fields.canonical import CanonicalField
 from devrf.fields.occupancy import Occupancy
 from devrf.geometry.rays import Rays
 from devrf.ops.compositing import composite_segments, sum_segments
-from devrf.ops.search import Found, Thresholds, find_samples, select
+from devrf.ops.search import Found, select
 from devrf.ops.warped_depth import warped_depth
 from devrf.rendering.picture import Picture
-from devrf.rendering.render import STOP, RenderSettings
+from devrf.rendering.render import RenderSettings
 from devrf.rendering.sampling import steps_through
+from devrf.rendering.search import search
 
 # Lists are this much longer than the last one had to be.
 SPARE = 1.25
@@ -80,19 +81,15 @@ class ListRenderer:
     ) -> tuple[Found, int]:
         """The samples that can be seen, and how many they are, in lists that are long enough."""
         field, settings = self.field, self.settings
-        step = field.step_length(settings.step)
-        entry, counts = steps_through(
-            rays, field.box, step=step, near=settings.near, far=settings.far
+        begins = steps_through(
+            rays, field.box, step=field.step_length(settings.step), near=settings.near,
+            far=settings.far,
         )
-        longest = int(counts.amax()) if len(rays) else 0
-        threshold = settings.alpha_threshold
+        longest = int(begins[1].amax()) if len(rays) else 0
         while True:
-            found = find_samples(
-                rays.origins, rays.directions, entry, counts, occupancy.mask,
-                field.density.values, slices, step=step, longest=longest,
-                capacity=self._capacity, mask_box=occupancy.box, box=field.box,
-                shift=field.shift, delta=field.step_in_base_voxels(settings.step),
-                thresholds=Thresholds(threshold, STOP, threshold),
+            found = search(
+                rays, begins, field, occupancy, settings, slices, longest=longest,
+                capacity=self._capacity,
             )
             total = int(found.total)
             if total <= self._capacity:

@@ -9,14 +9,13 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from devrf.fields.deformation import DeformationField
 from devrf.fields.grid import resample
 from devrf.fields.occupancy import Occupancy
+from devrf.fields.warp import GridWarp
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.rays import Rays
 from devrf.ops.choice import triton_runs
 from devrf.ops.corners import shape_of
-from devrf.ops.trilinear import interpolate
 from devrf.rendering.chunks import in_chunks
 from devrf.rendering.lists import ListRenderer
 from devrf.rendering.model import SceneModel, occupancy_points, occupancy_through
@@ -77,7 +76,8 @@ class Player:
         # At the points of a grid over the same box, looking up is resampling: several times faster.
         points = occupancy_points(model)
         moved = points + resample(displacement, shape_of(points))
-        return Ready(occupancy_through(model, moved), displacement, _along(motion, displacement))
+        warp = GridWarp((displacement,), motion.box)
+        return Ready(occupancy_through(model, moved), displacement, warp)
 
     @torch.no_grad()
     def picture(self, rays: Rays, time: float, background: float | Tensor) -> Picture:
@@ -129,10 +129,3 @@ class Player:
         cameras = cameras.to(self.device)
         for index, time in enumerate(times):
             yield self.view(cameras, index, time, background)
-
-
-def _along(motion: DeformationField, displacement: Tensor) -> Warp:
-    """The map of points (M, 3) that a grid of displacements (X, Y, Z, 3) stands for."""
-    return lambda points: points + interpolate(
-        displacement, motion.box.to_grid(points, motion.shape)
-    )
