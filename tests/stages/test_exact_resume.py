@@ -21,7 +21,7 @@ from devrf.scenes.scene import Scene
 from devrf.stages.canonical import CanonicalStage
 from devrf.stages.checkpoint import SealedFiles, Stored, load_checkpoint, save_checkpoint
 from devrf.stages.deformation import DeformationStage
-from devrf.stages.progress import pack, progress_files, unpack
+from devrf.stages.progress import progress_files
 from devrf.stages.schedules import CanonicalSchedule, DeformationSchedule
 from devrf.stages.sealed_file import read_sealed
 from devrf.stages.settings import MotionSettings
@@ -191,12 +191,6 @@ def test_another_scene_is_refused(
     fewer = replace(tiny_scene.static, train=tiny_scene.static.train[torch.arange(7)])
     other = type(datamodule)(replace(tiny_scene, static=fewer))  # type: ignore[call-arg]
     assert "another scene" in refused(trainer(max_epochs=1), canonical(), other, left)
-
-
-def test_masks_are_packed_to_bits() -> None:
-    mask = torch.rand(3, 5, 7) > 0.5
-    assert pack(mask).numel() == 14  # 105 bits
-    assert torch.equal(unpack(pack(mask), mask.shape, torch.device("cpu")), mask)
 
 
 def test_the_furthest_progress_comes_first(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from devrf.fields.bits import pack_bits, unpack_bits
 from devrf.fields.grid import resample
 
 # Grid points of the detailed grid to one of the thinned-out grid.
@@ -56,7 +57,7 @@ def pack(grids: Tensor, keep: Tensor, *, smooth: bool) -> Packed:
             elsewhere.append(mean.half())
     return {
         "shape": list(grids.shape[1:4]),
-        "keep": torch.stack([_bits(one) for one in keep]),
+        "keep": torch.stack([pack_bits(one) for one in keep]),
         "kept": torch.cat(kept),
         "elsewhere": torch.stack(elsewhere),
     }
@@ -74,7 +75,7 @@ def unpack(packed: Packed) -> Tensor:
     stored = sum(packed[name].nbytes for name in ("keep", "kept", "elsewhere"))
     if 4 * len(elsewhere) * elsewhere.shape[-1] * x * y * z > MOST * stored:
         raise ValueError("the stored grids claim to be larger than they can be")
-    keep = [_mask(bits, x * y * z).view(x, y, z) for bits in packed["keep"]]
+    keep = [unpack_bits(bits, shape) for bits in packed["keep"]]
     counts = [int(one.sum()) for one in keep]
     if len(keep) == 1:
         keep, counts = keep * len(elsewhere), counts * len(elsewhere)
@@ -91,20 +92,3 @@ def unpack(packed: Packed) -> Tensor:
 def _thinned(shape: Sequence[int]) -> tuple[int, int, int]:
     x, y, z = (max(2, math.ceil((points - 1) / THINNING) + 1) for points in shape)
     return x, y, z
-
-
-def _bits(mask: Tensor) -> Tensor:
-    """Eight cells of a mask in a byte."""
-    flat = mask.reshape(-1).to(torch.uint8)
-    flat = torch.nn.functional.pad(flat, (0, -len(flat) % 8)).view(-1, 8)
-    powers = 2 ** torch.arange(8, dtype=torch.uint8, device=mask.device)
-    return (flat * powers).sum(dim=1, dtype=torch.uint8)
-
-
-def _mask(bits: Tensor, cells: int) -> Tensor:
-    """What :func:`_bits` stored, (cells,) bool."""
-    powers = 2 ** torch.arange(8, dtype=torch.uint8, device=bits.device)
-    flat = (bits[:, None] & powers != 0).reshape(-1)
-    if len(flat) < cells:
-        raise ValueError("the stored mask is not as long as it should be")
-    return flat[:cells]

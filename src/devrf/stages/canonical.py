@@ -13,6 +13,7 @@ from devrf.data.batch import Pixels, background_color, gather_batch
 from devrf.data.pool import PixelPool, all_pixels
 from devrf.errors import DevrfError
 from devrf.fields.architecture import Architecture
+from devrf.fields.bits import pack_bits, unpack_bits
 from devrf.fields.canonical import CanonicalField
 from devrf.fields.occupancy import Occupancy, bounding_box, dilate
 from devrf.geometry.box import Box
@@ -26,7 +27,6 @@ from devrf.rendering.model import SceneModel
 from devrf.rendering.render import RenderSettings
 from devrf.scenes.scene import CaptureName, Views
 from devrf.stages.checkpoint import Passport, Stored
-from devrf.stages.progress import pack, unpack
 from devrf.stages.ranks import share
 from devrf.stages.replay import Graphs
 from devrf.stages.schedules import CanonicalPhase, CanonicalSchedule
@@ -296,7 +296,7 @@ class CanonicalStage(ScheduledStage):
         assert self._pool is not None
         views = self.scene.static.train
         images = torch.arange(len(views), device=self.device)
-        return {"pixels": pack(self._pool.mask(images, views.height * views.width))}
+        return {"pixels": pack_bits(self._pool.mask(images, views.height * views.width))}
 
     def take_up(self, phase: Phase, kept: dict[str, Any]) -> None:
         """Go on with ``phase``, the field being loaded."""
@@ -305,7 +305,7 @@ class CanonicalStage(ScheduledStage):
         self.model.settings = self._settings(phase)
         shape = (len(views), views.height * views.width)
         images = torch.arange(len(views), device=self.device)
-        self._pool = PixelPool.of_mask(images, unpack(kept["pixels"], shape, self.device))
+        self._pool = PixelPool.of_mask(images, unpack_bits(kept["pixels"], shape, self.device))
         self._hand_over(views.cameras, skip_zero=phase.kind == "fine")
 
     def passport(self) -> Passport:

@@ -13,6 +13,7 @@ from devrf.data.batch import Pixels, background_color, gather_batch
 from devrf.data.correspondence import previous_images
 from devrf.data.pool import PixelPool, all_pixels
 from devrf.errors import DevrfError
+from devrf.fields.bits import pack_bits, unpack_bits
 from devrf.fields.deformation import DeformationField
 from devrf.fields.occupancy import Occupancy
 from devrf.losses.composer import WeightedLoss
@@ -25,7 +26,6 @@ from devrf.scenes.scene import CaptureName, Views
 from devrf.stages.checkpoint import Passport, Stored
 from devrf.stages.flow_start import follow, start_from_tracks
 from devrf.stages.memory import StageMemory, motion_memory
-from devrf.stages.progress import pack, unpack
 from devrf.stages.ranks import share, take_from_first
 from devrf.stages.replay import Graphs
 from devrf.stages.schedules import DeformationPhase, DeformationSchedule
@@ -337,9 +337,9 @@ class DeformationStage(ScheduledStage):
         images, area = self._images(views, self.phase.frame), views.height * views.width
         exact = self.visit.slices if self.motion.store_half else ()
         return {
-            "occupancy": pack(mask),
+            "occupancy": pack_bits(mask),
             "shape": list(mask.shape),
-            "pixels": [pack(pool.mask(images, area)) for pool in self.visit.pools],
+            "pixels": [pack_bits(pool.mask(images, area)) for pool in self.visit.pools],
             "displacements": [tensor.detach().cpu() for tensor in exact],
             "losses": list(self._losses),
         }
@@ -356,10 +356,10 @@ class DeformationStage(ScheduledStage):
         self.visit.enter(self.field, phase.frame)
         for tensor, exact in zip(self.visit.slices, kept["displacements"], strict=False):
             tensor.copy_(exact)
-        mask = unpack(kept["occupancy"], kept["shape"], self.device)
+        mask = unpack_bits(kept["occupancy"], kept["shape"], self.device)
         self.visit.occupancy.refill(Occupancy(mask, self.scene_model.canonical.box))
         self.visit.pools = [
-            PixelPool.of_mask(images, unpack(bits, (len(images), area), self.device))
+            PixelPool.of_mask(images, unpack_bits(bits, (len(images), area), self.device))
             for bits in kept["pixels"]
         ]
 

@@ -22,16 +22,13 @@ A finished stage leaves one checkpoint without any of this, and its progress fil
 
 from __future__ import annotations
 
-import math
 import random
 import re
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 
 def progress_file(folder: Path, stage: str, iteration: int) -> Path:
@@ -47,17 +44,6 @@ def progress_files(folder: Path, stage: str) -> list[Path]:
         if (match := re.fullmatch(rf"{stage}-progress-(\d+)\.ckpt", path.name))
     }
     return [found[iteration] for iteration in sorted(found, reverse=True)]
-
-
-def pack(mask: Tensor) -> Tensor:
-    """A mask of any shape as bits on the host: (⌈N/8⌉,) uint8."""
-    return torch.from_numpy(np.packbits(mask.cpu().numpy().reshape(-1)))
-
-
-def unpack(bits: Tensor, shape: Sequence[int], device: torch.device) -> Tensor:
-    """The mask of ``shape`` that :func:`pack` packed, on ``device``."""
-    flat = np.unpackbits(bits.numpy(), count=math.prod(shape)).astype(bool)
-    return torch.from_numpy(flat).view(*shape).to(device)
 
 
 def random_states(device: torch.device) -> dict[str, Any]:
