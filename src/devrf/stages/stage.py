@@ -264,9 +264,8 @@ class ScheduledStage(LightningModule, ABC):
         self.iteration = iteration
         self.back_offs += 1
         self.caution *= caution
-        for state in self.optimizer.state.values():
-            for value in state.values():
-                value.zero_()
+        for group in range(len(self.optimizer.param_groups)):
+            self.optimizer.forget(group)
         self._draw_anew()
         self.trainer.should_stop = False
 
@@ -289,8 +288,8 @@ class ScheduledStage(LightningModule, ABC):
         assert self.phase is not None
         optimizer = self.optimizers()
         assert isinstance(optimizer, LightningOptimizer)
-        left = min(self.phase.stop, self.total_iterations) - self.iteration
-        count = min(self.iterations_per_step, left)
+        stop = min(self.phase.stop, self.total_iterations)
+        count = min(self.iterations_per_step, stop - self.iteration)
         if self.trainer.max_steps > 0:
             count = min(count, self.trainer.max_steps - self.trainer.global_step)
         first = self.iteration
@@ -314,7 +313,6 @@ class ScheduledStage(LightningModule, ABC):
             value.zero_()
         if self.room is not None and self.room.look():
             self._repeated = None  # captured with lists of another length
-        stop = min(self.phase.stop, self.total_iterations)
         if done and self.iteration < stop and self.settled(means):
             self.skipped += stop - self.iteration
             self.iteration = stop
