@@ -41,8 +41,6 @@ class Album(Logger):
 
     def log_hyperparams(self, params: dict[str, Any]) -> None: ...  # type: ignore[override]
 
-    def go_on(self) -> None: ...
-
     def show_image(self, name: str, image: Tensor, step: int | None = None) -> None:
         self.images.setdefault(name, []).append((step, image))
 

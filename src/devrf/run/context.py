@@ -83,7 +83,6 @@ class RunContext:
             return False
         logger = instantiate(self.config.logger)
         for tracker in trackers([logger]):
-            tracker.go_on()
             settings = OmegaConf.to_container(self.config, resolve=True)
             assert isinstance(settings, dict)
             tracker.log_hyperparams({str(key): value for key, value in settings.items()})

@@ -22,9 +22,6 @@ class Tracker(Protocol):
     def log_hyperparams(self, params: dict[str, Any]) -> None:
         """Keep the run's composed config."""
 
-    def go_on(self) -> None:
-        """Go on with the run that the folder's earlier steps began, before anything is logged."""
-
     def show_image(self, name: str, image: Tensor, step: int | None = None) -> None:
         """Show an image (H, W, 3) in [0, 1], as of a stage's iteration ``step``."""
 

@@ -13,7 +13,7 @@ from devrf.artifacts.tracking import Row, columns
 
 
 class TensorBoardTracker(TensorBoardLogger):
-    """One set of event files for all stages of a devrf run."""
+    """One set of event files for all stages of a devrf run, added to by each."""
 
     def __init__(self, save_dir: str | Path, name: str = "tensorboard") -> None:
         """Say where the event files go; the first is written when something is logged.
@@ -22,14 +22,7 @@ class TensorBoardTracker(TensorBoardLogger):
             save_dir: the run's folder.
             name: the folder in it.
         """
-        # A run that starts afresh in an old one's folder hides what that one has written.
-        super().__init__(
-            save_dir=save_dir, name=name, version="", default_hp_metric=False, purge_step=0
-        )
-
-    def go_on(self) -> None:
-        """Add to what earlier steps have written."""
-        self._kwargs.pop("purge_step", None)
+        super().__init__(save_dir=save_dir, name=name, version="", default_hp_metric=False)
 
     def show_image(self, name: str, image: Tensor, step: int | None = None) -> None:
         """Log an image (H, W, 3) in [0, 1]."""

@@ -58,6 +58,8 @@ class WandbTracker(WandbLogger):
         # Of no use any more; wandb warns when it is given.
         self._wandb_init.pop("anonymous", None)
         self._id_file = Path(save_dir) / "wandb" / "run_id"
+        if self._id_file.is_file():
+            self._id = self._wandb_init["id"] = self._id_file.read_text().strip()
 
     @property
     def experiment(self) -> Run:
@@ -84,11 +86,6 @@ class WandbTracker(WandbLogger):
             self._id_file.parent.mkdir(exist_ok=True)
             self._id_file.write_text(f"{run.id}\n")
         return run
-
-    def go_on(self) -> None:
-        """Go on with the run whose id the folder holds, if there is one."""
-        if self._id_file.is_file():
-            self._id = self._wandb_init["id"] = self._id_file.read_text().strip()
 
     def show_image(self, name: str, image: Tensor, step: int | None = None) -> None:
         """Log an image (H, W, 3) in [0, 1]."""
