@@ -23,7 +23,7 @@ from devrf.value_types import described, fits, held
 ROOT: dict[str, Any] = {
     "stage": str, "seed": int, "resume": bool, "memory_check": bool, "ckpt": str | Path | None,
     "objective": str, "scene": str, "kernels": Literal["auto", "torch", "triton"],
-    "graphs": Literal["auto", "off"],
+    "graphs": Literal["auto", "off"], "decoder_precision": Literal["auto", "float32", "bfloat16"],
 }
 # Hydra's own keys in a part's config.
 RESERVED = {"_target_", "_partial_", "_convert_", "_recursive_", "_args_"}

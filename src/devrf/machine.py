@@ -1,10 +1,10 @@
-"""What the machine has to give: memory on the host and on a GPU, room on a disk."""
+"""What the machine has to give: memory, room on a disk, arithmetic."""
 
 from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import torch
@@ -41,6 +41,20 @@ def free_host_memory(root: Path = Path("/")) -> int | None:
         except (AttributeError, OSError, ValueError):
             pass
     return min(rooms, default=None)
+
+
+def multiplies_bfloat16(device: torch.device) -> bool:
+    """Whether ``device`` has instructions for products of bfloat16.
+
+    NVIDIA's from Ampere on have, and CPUs whose AVX-512 or AMX does. Elsewhere such products are
+    imitated, which is slower than single precision.
+    """
+    if device.type == "cuda":
+        return torch.cuda.get_device_capability(device) >= (8, 0)
+    # Older versions of torch do not tell of a CPU.
+    tell: Callable[[], Mapping[str, object]] = getattr(torch.cpu, "get_capabilities", dict)
+    capabilities = tell()
+    return any(capabilities.get(name) for name in ("avx512_bf16", "amx_bf16"))
 
 
 def own_memory() -> int:

@@ -19,6 +19,7 @@ from devrf.geometry.cameras import Cameras
 from devrf.scenes.scene import Scene
 from devrf.stages.canonical import CanonicalStage
 from devrf.stages.schedules import CanonicalSchedule
+from devrf.stages.settings import Precision
 from devrf.stages.visibility import share_of_views
 
 SMALL = Architecture(channels=4, width=16, frequencies=2)
@@ -52,6 +53,37 @@ def test_two_steps_learn_something(
     assert stage.iteration == fit.global_step == 2
     assert stage.model.canonical.density.values.abs().max() > 0
     assert stage.model.canonical.color.values.abs().max() > 0
+
+
+@pytest.mark.parametrize(("asked", "made_for_it", "expected"), [
+    ("auto", True, torch.bfloat16), ("auto", False, torch.float32),
+    ("float32", True, torch.float32), ("bfloat16", False, torch.bfloat16),
+])
+def test_the_color_network_learns_in_the_chosen_precision(
+    asked: Precision, made_for_it: bool, expected: torch.dtype, datamodule: SceneDataModule,
+    trainer: Callable[..., Trainer], monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    used, forward = set(), ColorDecoder.forward
+
+    def watched(self: ColorDecoder, *args: Any) -> torch.Tensor:
+        used.add(args[3])
+        return forward(self, *args)
+
+    monkeypatch.setattr(ColorDecoder, "forward", watched)
+    monkeypatch.setattr("devrf.stages.stage.multiplies_bfloat16", lambda device: made_for_it)
+    stage = CanonicalStage(CARVED, SMALL, decoder_precision=asked)
+    trainer(max_steps=2).fit(stage, datamodule=datamodule)
+    assert used == {expected}
+    assert {value.dtype for value in stage.model.canonical.parameters()} == {torch.float32}
+    assert stage.model.canonical.color.values.abs().max() > 0
+
+
+def test_all_in_reduced_precision_is_refused(
+    datamodule: SceneDataModule, trainer: Callable[..., Trainer]
+) -> None:
+    with pytest.raises(DevrfError, match="trainer.precision: .*decoder_precision=bfloat16"):
+        fit = trainer(max_steps=1, precision="bf16-mixed")
+        fit.fit(CanonicalStage(CARVED, SMALL), datamodule=datamodule)
 
 
 def test_the_whole_schedule_is_run_and_the_loss_falls(

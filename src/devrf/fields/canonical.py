@@ -105,9 +105,15 @@ class CanonicalField(nn.Module):
         raw = self.density(points, self.box)[:, 0]
         return torch.nn.functional.softplus(raw + self.shift) * delta
 
-    def rgb(self, points: Tensor, viewdirs: Tensor, ray: Tensor) -> Tensor:
-        """RGB (S, 3) at ``points`` (S, 3) on rays ``ray`` (S,) with ``viewdirs`` (R, 3)."""
-        color: Tensor = self.decoder(self.color(points, self.box), viewdirs, ray)
+    def rgb(
+        self, points: Tensor, viewdirs: Tensor, ray: Tensor,
+        precision: torch.dtype = torch.float32,
+    ) -> Tensor:
+        """RGB (S, 3) at ``points`` (S, 3) on rays ``ray`` (S,) with ``viewdirs`` (R, 3).
+
+        The decoder works in ``precision``; the result is in single precision.
+        """
+        color: Tensor = self.decoder(self.color(points, self.box), viewdirs, ray, precision)
         return color
 
     @torch.no_grad()

@@ -9,8 +9,11 @@ from torch import Tensor, nn
 class SigmoidColor(nn.Module):
     """Three channels are the colour itself, before a sigmoid: no network, no view dependence."""
 
-    def forward(self, features: Tensor, viewdirs: Tensor, ray: Tensor) -> Tensor:
-        """RGB (S, 3) in [0, 1] of ``features`` (S, 3); the directions are not looked at."""
+    def forward(
+        self, features: Tensor, viewdirs: Tensor, ray: Tensor,
+        precision: torch.dtype = torch.float32,
+    ) -> Tensor:
+        """RGB (S, 3) in [0, 1] of ``features`` (S, 3), all else aside: there is no network."""
         return torch.sigmoid(features)
 
 
@@ -39,20 +42,28 @@ class ColorDecoder(nn.Module):
         self.output = nn.Linear(width, 3)
         nn.init.zeros_(self.output.bias)
 
-    def forward(self, features: Tensor, viewdirs: Tensor, ray: Tensor) -> Tensor:
+    def forward(
+        self, features: Tensor, viewdirs: Tensor, ray: Tensor,
+        precision: torch.dtype = torch.float32,
+    ) -> Tensor:
         """Colours of samples.
 
         Args:
             features: (S, C) interpolated features.
             viewdirs: (R, 3) unit directions of the rays, in world space.
             ray: (S,) int64, the ray of each sample.
+            precision: what the hidden layers and their gradients are computed in. Weights,
+                sums, and the last layer stay in single precision: colours keep all their shades.
 
         Returns:
             RGB (S, 3) in [0, 1].
         """
-        by_ray = self.from_direction(self._encode(viewdirs))
-        x = torch.relu(self.from_feature(features) + by_ray.index_select(0, ray))
-        return torch.sigmoid(self.output(torch.relu(self.hidden(x))))
+        reduced = precision != torch.float32
+        with torch.autocast(features.device.type, precision, enabled=reduced):
+            by_ray = self.from_direction(self._encode(viewdirs))
+            x = torch.relu(self.from_feature(features) + by_ray.index_select(0, ray))
+            x = torch.relu(self.hidden(x))
+        return torch.sigmoid(self.output(x.to(self.output.weight.dtype)))
 
     def _encode(self, viewdirs: Tensor) -> Tensor:
         angles = (viewdirs[:, None, :] * self.octaves[:, None]).flatten(1)

@@ -32,6 +32,7 @@ def render_in_lists(
     background: Tensor,
     warp: GridWarp | None,
     room: Room,
+    precision: torch.dtype = torch.float32,
 ) -> RenderOutput:
     """What ``render`` gives, in lists of ``room.heavy`` places (method §2).
 
@@ -46,6 +47,7 @@ def render_in_lists(
         warp: maps the rays' points into canonical space, over the field's own box; None leaves
             them.
         room: how long the lists are; it is told how long they would have to be.
+        precision: what the colour network works in.
 
     Returns:
         What the rays see; ``samples.present`` tells samples from padding.
@@ -72,7 +74,7 @@ def render_in_lists(
         canonical = canonical.index_select(0, chosen.index)
         weight = torch.where(present, weight.index_select(0, chosen.index), 0.0)
     with span("decoder"):
-        color = field.rgb(canonical, rays.viewdirs, samples.ray)
+        color = field.rgb(canonical, rays.viewdirs, samples.ray, precision)
     with span("compositing"), torch.no_grad():
         distance = torch.stack([samples.distance, torch.ones_like(samples.distance)], dim=1)
         reached, mass = sum_segments(weight, distance, chosen.first).unbind(1)

@@ -63,11 +63,11 @@ class ListRenderer:
         weight, left = composite_segments(depth, found.first)
         chosen = select(found.heavy[:count], found.first, count)
         heavy = chosen.index[: int(chosen.total)]
-        with torch.autocast("cuda", torch.float16, enabled=self.half and depth.is_cuda):
-            color = field.rgb(canonical[heavy], rays.viewdirs, found.ray[heavy])
+        precision = torch.float16 if self.half and depth.is_cuda else torch.float32
+        color = field.rgb(canonical[heavy], rays.viewdirs, found.ray[heavy], precision)
         distance = found.distance[heavy, None]
         seen = sum_segments(
-            weight[heavy], torch.cat([color.float(), distance, torch.ones_like(distance)], dim=1),
+            weight[heavy], torch.cat([color, distance, torch.ones_like(distance)], dim=1),
             chosen.first,
         )
         return Picture(

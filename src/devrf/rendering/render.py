@@ -69,6 +69,7 @@ def render(
     settings: RenderSettings,
     background: Tensor,
     warp: Warp | None = None,
+    precision: torch.dtype = torch.float32,
 ) -> RenderOutput:
     """Colours and depths of rays: C = Σ w_i c_i + T_end · background (method §2).
 
@@ -79,6 +80,7 @@ def render(
         settings: step length and thresholds.
         background: (3,) or (R, 3) RGB behind everything.
         warp: maps the rays' points (M, 3) into canonical space; None leaves them.
+        precision: what the colour network works in.
 
     Returns:
         What the rays see; differentiable in the field's and the warp's parameters.
@@ -109,7 +111,7 @@ def render(
         weight = weight.index_select(0, heavy)
         tally("heavy", len(samples))
     with span("decoder"):
-        color = field.rgb(canonical, rays.viewdirs, samples.ray)
+        color = field.rgb(canonical, rays.viewdirs, samples.ray, precision)
     with span("compositing"):
         seen = sum_by_ray(weight[:, None] * color, samples.ray, len(rays))
         with torch.no_grad():

@@ -30,7 +30,7 @@ from devrf.stages.checkpoint import Passport, Stored
 from devrf.stages.ranks import share
 from devrf.stages.replay import Graphs
 from devrf.stages.schedules import CanonicalPhase, CanonicalSchedule
-from devrf.stages.settings import FINE_LOSS, SEARCH_LOSS, CanonicalRates, Sampling
+from devrf.stages.settings import FINE_LOSS, SEARCH_LOSS, CanonicalRates, Precision, Sampling
 from devrf.stages.stage import Phase, ScheduledStage
 from devrf.stages.useful import meets_matter
 from devrf.stages.visibility import possible_space, share_of_views
@@ -59,6 +59,7 @@ class CanonicalStage(ScheduledStage):
         fine_loss: Mapping[str, float] = FINE_LOSS,
         iterations_per_step: int = 10,
         graphs: Graphs = "auto",
+        decoder_precision: Precision = "auto",
     ) -> None:
         """Build the stage; the defaults are the paper's for inward-facing scenes.
 
@@ -72,8 +73,10 @@ class CanonicalStage(ScheduledStage):
             fine_loss: their weights afterwards.
             iterations_per_step: optimiser iterations in one Lightning step.
             graphs: whether a GPU replays iterations from CUDA graphs: ``auto`` where it can.
+            decoder_precision: what the colour network computes in; ``auto``: ``bfloat16`` where
+                the device multiplies it.
         """
-        super().__init__(iterations_per_step, graphs)
+        super().__init__(iterations_per_step, graphs, decoder_precision)
         self.schedule = schedule or CanonicalSchedule()
         self.architecture = architecture or Architecture()
         self.rates = rates or CanonicalRates()

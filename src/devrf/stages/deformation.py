@@ -29,7 +29,7 @@ from devrf.stages.memory import StageMemory, motion_memory
 from devrf.stages.ranks import share, take_from_first
 from devrf.stages.replay import Graphs
 from devrf.stages.schedules import DeformationPhase, DeformationSchedule
-from devrf.stages.settings import DEFORMATION_LOSS, MotionSettings
+from devrf.stages.settings import DEFORMATION_LOSS, MotionSettings, Precision
 from devrf.stages.settling import settled
 from devrf.stages.stage import Phase, ScheduledStage
 from devrf.stages.useful import meets_matter
@@ -57,6 +57,7 @@ class DeformationStage(ScheduledStage):
         loss: Mapping[str, float] = DEFORMATION_LOSS,
         iterations_per_step: int = 10,
         graphs: Graphs = "auto",
+        decoder_precision: Precision = "auto",
     ) -> None:
         """Build the stage; the defaults are the paper's for inward-facing scenes.
 
@@ -68,8 +69,10 @@ class DeformationStage(ScheduledStage):
             loss: weights of the loss terms; ``tv`` is the total variation of both fields.
             iterations_per_step: optimiser iterations in one Lightning step.
             graphs: whether a GPU replays iterations from CUDA graphs: ``auto`` where it can.
+            decoder_precision: what the colour network computes in; ``auto``: ``bfloat16`` where
+                the device multiplies it.
         """
-        super().__init__(iterations_per_step, graphs)
+        super().__init__(iterations_per_step, graphs, decoder_precision)
         self.schedule = schedule or DeformationSchedule()
         self.motion = motion or MotionSettings()
         weights = dict(loss)

@@ -7,6 +7,9 @@ from typing import Literal
 
 from devrf.errors import DevrfError
 
+# What the colour network computes in.
+Precision = Literal["auto", "float32", "bfloat16"]
+
 SEARCH_LOSS = {"color": 1.0, "per_sample_color": 0.1, "entropy": 0.01}
 FINE_LOSS = {"color": 1.0, "per_sample_color": 0.01, "entropy": 0.001}
 DEFORMATION_LOSS = {

@@ -19,6 +19,7 @@ from devrf.errors import DevrfError
 from devrf.fields.occupancy import Occupancy
 from devrf.fields.warp import GridWarp
 from devrf.geometry.rays import Rays
+from devrf.machine import multiplies_bfloat16
 from devrf.ops.adam import GridAdam
 from devrf.ops.choice import triton_runs
 from devrf.ops.spans import measured, span
@@ -46,6 +47,7 @@ from devrf.stages.ranks import (
 )
 from devrf.stages.replay import Capturer, Graphs, OnCuda, Repeated
 from devrf.stages.schedules import CanonicalPhase, DeformationPhase
+from devrf.stages.settings import Precision
 
 Phase = CanonicalPhase | DeformationPhase
 
@@ -84,6 +86,7 @@ class ScheduledStage(LightningModule, ABC):
         caution: what the scheduled learning rates are multiplied by; below 1 after a back-off.
         gave_up: why the stage ended before its schedule; None while it has not.
         graphs: whether steady iterations are captured in a CUDA graph where that is possible.
+        decoder_precision: what the colour network computes in while it learns.
         room: the length of the lists of samples; None while they are as long as need be.
     """
 
@@ -91,10 +94,14 @@ class ScheduledStage(LightningModule, ABC):
     capture: ClassVar[CaptureName]
     costly: ClassVar[tuple[str, ...]]
 
-    def __init__(self, iterations_per_step: int, graphs: Graphs = "auto") -> None:
+    def __init__(
+        self, iterations_per_step: int, graphs: Graphs = "auto",
+        decoder_precision: Precision = "auto",
+    ) -> None:
         super().__init__()
         self.automatic_optimization = False
         self.graphs = graphs
+        self.decoder_precision = decoder_precision
         self.room: Room | None = None
         self.iterations_per_step = iterations_per_step
         self.iteration = 0
@@ -175,12 +182,22 @@ class ScheduledStage(LightningModule, ABC):
         self, rays: Rays, occupancy: Occupancy, background: Tensor, warp: GridWarp | None = None
     ) -> RenderOutput:
         """Render rays to learn from them: in lists of fixed length if iterations are steady."""
-        model = self.model_now
+        model, precision = self.model_now, self._precision
         if self.room is None:
-            return render(rays, model.canonical, occupancy, model.settings, background, warp)
+            return render(
+                rays, model.canonical, occupancy, model.settings, background, warp, precision
+            )
         return render_in_lists(
-            rays, model.canonical, occupancy, model.settings, background, warp, self.room
+            rays, model.canonical, occupancy, model.settings, background, warp, self.room,
+            precision,
         )
+
+    @property
+    def _precision(self) -> torch.dtype:
+        """What the colour network computes in on the stage's device."""
+        chosen = self.decoder_precision
+        reduced = multiplies_bfloat16(self.device) if chosen == "auto" else chosen == "bfloat16"
+        return torch.bfloat16 if reduced else torch.float32
 
     def renew(self, rays: int) -> None:
         """Get ready for iterations on other tensors than before, of ``rays`` in all processes.
@@ -201,8 +218,14 @@ class ScheduledStage(LightningModule, ABC):
         """Make the generator.
 
         Raises:
-            DevrfError: several processes, and a strategy that cannot follow growing grids.
+            DevrfError: several processes, and a strategy that cannot follow growing grids; or a
+                precision in which points would not find their voxels.
         """
+        if self.trainer.precision != "32-true":
+            raise DevrfError(
+                f"trainer.precision: expected 32-true, not {self.trainer.precision}: positions "
+                "need all their digits; decoder_precision=bfloat16 takes fewer for colours alone"
+            )
         if self.trainer.world_size > 1 and not isinstance(self.trainer.strategy, RaysByRank):
             raise DevrfError(
                 f"trainer: {self.trainer.world_size} processes need trainer=ddp (the strategy "
