@@ -45,7 +45,7 @@ def with_flow(scene: Scene, source: FlowSource, cache: Path | None) -> Scene:
     if method == "auto" and train.flow is None:
         method, how = "dis", "estimated with DIS"
         if not importlib.util.find_spec("cv2"):
-            method, how = "none", "left out (OpenCV is not installed)"
+            method, how = "none", 'left out (OpenCV is not installed: pip install "devrf[flow]")'
         elif camera_turn(train) > JUMP_DEGREES:
             method, how = "none", "left out (the cameras jump from frame to frame)"
         log.info("%s: no optical flow files; flow is %s", scene.name, how)
