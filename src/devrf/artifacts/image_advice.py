@@ -19,7 +19,10 @@ LEAST_FLOW = 0.02
 
 def image_advice(scene: Scene) -> list[Advice]:
     """Everything that images, mattes, times and flow tell."""
-    return [*_blank(scene), *_mattes(scene), *_times(scene), *_flow(scene.dynamic.train)]
+    return [
+        *_blank(scene), *_turned(scene), *_mattes(scene), *_times(scene),
+        *_flow(scene.dynamic.train),
+    ]
 
 
 def _everyone(scene: Scene) -> list[tuple[str, Views]]:
@@ -56,6 +59,24 @@ def _blank(scene: Scene) -> list[Advice]:
             "look at the alpha channel, or leave the image out",
         ))
     return found
+
+
+def _turned(scene: Scene) -> list[Advice]:
+    names = [
+        views.names[k]
+        for _, views in _everyone(scene) if views.turn_doubtful is not None
+        for k in views.turn_doubtful.nonzero()[:, 0].tolist()
+    ]
+    if not names:
+        return []
+    return [Advice(
+        # Without a static set the captures share files.
+        listed(list(dict.fromkeys(names))),
+        "its EXIF orientation says that it is to be seen turned; it is read as it is stored, since "
+        "its camera does not tell",
+        "if the cameras were found on turned images, turn the files too (mogrify -auto-orient); "
+        "else take the orientation out (exiftool -Orientation=)",
+    )]
 
 
 def _mattes(scene: Scene) -> list[Advice]:

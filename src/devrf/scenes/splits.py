@@ -178,9 +178,9 @@ def load_views(split: Split, root: Path, downscale: int) -> Views:
     """
     used = split.index
     files = [split.transforms.images[i] for i in used.tolist()]
-    loaded = load_images(files, downscale)
-    height, width = loaded.pixels.shape[1:3]
     known = [split.transforms.intrinsics[i] for i in used.tolist()]
+    loaded = load_images(files, downscale, [inner.size for inner in known])
+    height, width = loaded.pixels.shape[1:3]
     # Undistorted after the images are made smaller: a tenth of the work for the same picture.
     pixels, lenses = as_pinhole(
         loaded.pixels,
@@ -200,4 +200,7 @@ def load_views(split: Split, root: Path, downscale: int) -> Views:
         height,
     )
     names = tuple(str(file.relative_to(root)) for file in files)
-    return Views(pixels, cameras, split.times[used], split.view[used], names)
+    return Views(
+        pixels, cameras, split.times[used], split.view[used], names,
+        turn_doubtful=loaded.doubtful,
+    )

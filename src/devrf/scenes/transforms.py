@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from devrf.scenes.images import find_image
+from devrf.scenes.image_files import find_image
 from devrf.scenes.intrinsics import Intrinsics, frame_intrinsics, read_intrinsics
 from devrf.scenes.json_files import json_object
 from devrf.scenes.paths import inside
