@@ -15,12 +15,14 @@ FLAT = 2
 MATTE = 127
 # Share of the pixels (on the matte, where there is one) that the flow should cover at least.
 LEAST_FLOW = 0.02
+# Share of the pixels that masks rarely leave out if they are of passers-by.
+MUCH_LEFT_OUT = 0.5
 
 
 def image_advice(scene: Scene) -> list[Advice]:
     """Everything that images, mattes, times and flow tell."""
     return [
-        *_blank(scene), *_turned(scene), *_mattes(scene), *_times(scene),
+        *_blank(scene), *_turned(scene), *_mattes(scene), *_masks(scene), *_times(scene),
         *_flow(scene.dynamic.train),
     ]
 
@@ -37,7 +39,9 @@ def _everyone(scene: Scene) -> list[tuple[str, Views]]:
 def _blank(scene: Scene) -> list[Advice]:
     flat, empty = [], []
     for _, views in _everyone(scene):
-        for image, name in zip(views.pixels, views.names, strict=True):
+        for k, (image, name) in enumerate(zip(views.pixels, views.names, strict=True)):
+            if views.counted is not None:
+                image = image[views.counted[k]]
             shown = image[..., :3].reshape(-1, 3)
             if views.has_alpha:
                 shown = shown[image[..., 3].reshape(-1) > MATTE]
@@ -93,6 +97,21 @@ def _mattes(scene: Scene) -> list[Advice]:
             found.append(Advice(
                 name, "has an alpha channel that is opaque everywhere, which tells nothing",
                 "give real mattes, or write the images without alpha",
+            ))
+    return found
+
+
+def _masks(scene: Scene) -> list[Advice]:
+    found = []
+    for name, views in _everyone(scene):
+        if views.counted is None:
+            continue
+        share = 1 - sum(float(one.float().mean()) for one in views.counted) / len(views)
+        if share > MUCH_LEFT_OUT:
+            found.append(Advice(
+                name, f"masks leave out {100 * share:.0f} % of the pixels, of which nothing is "
+                "learned", "if they cut out the subject, set data.masks=matte: what they leave "
+                "out is background then",
             ))
     return found
 

@@ -6,12 +6,13 @@ import logging
 import math
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -28,6 +29,10 @@ _IN_FLIGHT = 2**30
 # most. An empty WebP image can do with less, but not all of a set that takes much memory.
 _INFLATION = 2000
 _MUCH = 2**28
+
+
+# (position in the set, RGBA) → RGBA.
+Finish = Callable[[int, npt.NDArray[np.uint8]], npt.NDArray[np.uint8]]
 
 
 @dataclass(frozen=True)
@@ -54,7 +59,10 @@ def workers(width: int, height: int) -> int:
 
 
 def load_images(
-    paths: Sequence[Path], downscale: int, cameras: Sequence[Size | None] | None = None
+    paths: Sequence[Path],
+    downscale: int,
+    cameras: Sequence[Size | None] | None = None,
+    finish: Finish | None = None,
 ) -> Loaded:
     """Read images of one size, a few at a time.
 
@@ -67,6 +75,8 @@ def load_images(
             averages of premultiplied colours.
         cameras: (width, height) of the images that each camera is for, of any scale; None where
             it is unknown, or of all.
+        finish: what to make of each RGBA image, by its position, before it is made smaller;
+            images without alpha come to it opaque.
 
     Raises:
         DevrfError: a file cannot be read, is larger than 100 megapixels, differs in size from
@@ -77,7 +87,7 @@ def load_images(
     headers = _headers(paths, cameras or [None] * len(paths))
     first = headers[0]
     size = reduced_size(first.width, first.height, downscale, paths[0])
-    alpha = any(header.has_alpha for header in headers)
+    alpha = finish is not None or any(header.has_alpha for header in headers)
     shape = (len(paths), size[1], size[0], 4 if alpha else 3)
     _check_size(math.prod(shape), headers, f"{len(paths)} images of {size[0]}x{size[1]} px", paths)
     # NumPy in the threads: each would otherwise start a team of torch threads of its own.
@@ -86,6 +96,7 @@ def load_images(
     def fill(index: int) -> None:
         # An image without a matte in a set with mattes is opaque: WebP drops a full alpha.
         image = decode(paths[index], headers[index], "RGBA" if alpha else "RGB")
+        image = image if finish is None else finish(index, image)
         whole = size == (first.width, first.height)
         pixels[index] = image if whole else shrink_pixels(image, *size)
 
@@ -99,7 +110,8 @@ def load_images(
     turned = sum(header.turn != 1 for header in headers)
     if turned:
         log.info(
-            "%d of them turned as their EXIF orientation says: only so they fit their cameras", turned
+            "%d of them turned as their EXIF orientation says: only so they fit their cameras",
+            turned,
         )
     doubtful = torch.tensor([header.doubtful for header in headers])
     return Loaded(torch.from_numpy(pixels), first.width, first.height, doubtful)
