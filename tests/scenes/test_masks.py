@@ -234,7 +234,8 @@ def test_inspecting_says_how_much_they_cover(root: Path, caplog: pytest.LogCaptu
 
 def test_masks_that_cut_out_the_subject_are_told_from_others(root: Path) -> None:
     found = [a for a in image_advice(read_nerfstudio(root)) if "masks" in a.what]
-    assert found and "set data.masks=matte" in found[0].remedy
+    assert len(found) == 1 and "set data.masks=matte" in found[0].remedy
+    assert found[0].where.startswith("static training set, ")
 
 
 def test_where_pixels_do_not_count_nothing_is_carved_away(root: Path) -> None:

@@ -102,18 +102,19 @@ def _mattes(scene: Scene) -> list[Advice]:
 
 
 def _masks(scene: Scene) -> list[Advice]:
-    found = []
+    much = {}
     for name, views in _everyone(scene):
-        if views.counted is None:
-            continue
-        share = 1 - sum(float(one.float().mean()) for one in views.counted) / len(views)
-        if share > MUCH_LEFT_OUT:
-            found.append(Advice(
-                name, f"masks leave out {100 * share:.0f} % of the pixels, of which nothing is "
-                "learned", "if they cut out the subject, set data.masks=matte: what they leave "
-                "out is background then",
-            ))
-    return found
+        if views.counted is not None:
+            share = 1 - sum(float(one.float().mean()) for one in views.counted) / len(views)
+            if share > MUCH_LEFT_OUT:
+                much[name] = share
+    if not much:
+        return []
+    return [Advice(
+        listed(list(much), 4), f"masks leave out up to {100 * max(much.values()):.0f} % of the "
+        "pixels, of which nothing is learned",
+        "if they cut out the subject, set data.masks=matte: what they leave out is background then",
+    )]
 
 
 def _times(scene: Scene) -> list[Advice]:

@@ -105,6 +105,7 @@ def cutting_out(
             names[list(paths).index(None)], "has no mask_path although others have; with "
             "data.masks=matte give every image a mask",
         )
+    log.info("masks of %d images are their mattes", len(masks))
 
     def finish(index: int, image: Grey) -> Grey:
         height, width = image.shape[:2]
