@@ -13,6 +13,7 @@ from devrf.config import config_folder, register_resolvers
 from devrf.config_check import check_config
 from devrf.messages import mistakes_in_one_line
 from devrf.run_folder import nothing_left_of_mistakes
+from devrf.run_lock import alone_in
 from devrf.sweep import forget_failure, one_of_many
 
 register_resolvers()
@@ -22,11 +23,20 @@ def run(config: DictConfig) -> float | None:
     """Run ``stage=…`` in the folder that Hydra made for it; return the objective, if measured."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     if job.in_sweep():
-        return one_of_many(lambda: _checked(config, folder), config, folder)
-    with mistakes_in_one_line(), nothing_left_of_mistakes(folder):
+        return one_of_many(lambda: _job(config, folder), config, folder)
+    with (
+        mistakes_in_one_line(),
+        alone_in(folder, config, "hydra.run.dir"),
+        nothing_left_of_mistakes(folder),
+    ):
         value = _checked(config, folder)
-    forget_failure(folder)
-    return value
+        forget_failure(folder)
+        return value
+
+
+def _job(config: DictConfig, folder: Path) -> float | None:
+    with alone_in(folder, config, "hydra.sweep.dir"):
+        return _checked(config, folder)
 
 
 def _checked(config: DictConfig, folder: Path) -> float | None:

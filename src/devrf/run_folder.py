@@ -9,9 +9,10 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from devrf.messages import is_mistake
+from devrf.run_lock import PLACE
 
-# Hydra makes the folder and these before the program has had a look at its input.
-OF_HYDRA = {".hydra", "run.log"}
+# What is made in the folder before the program has had a look at its input.
+AT_FIRST = {".hydra", PLACE}
 
 
 @contextmanager
@@ -21,12 +22,12 @@ def nothing_left_of_mistakes(folder: Path) -> Iterator[None]:
     A folder that holds the results of an earlier run, or a first result of this one, stays.
     Parents that are empty then go too, up to the working folder.
     """
-    held_nothing = _holds_at_most(folder, {".hydra"})
+    held_nothing = _holds_at_most(folder, AT_FIRST)
     try:
         yield
     except Exception as error:
         if is_mistake(error) and held_nothing:
-            remove_if_only(folder, OF_HYDRA)
+            remove_if_only(folder, {*AT_FIRST, "run.log"})
         raise
 
 

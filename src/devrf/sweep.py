@@ -20,14 +20,15 @@ from devrf.artifacts.files import write_json
 from devrf.messages import is_mistake, one_line
 from devrf.process import forget_peak_memory
 from devrf.run_folder import remove_if_only
+from devrf.run_lock import PLACE
 
 log = logging.getLogger(__name__)
 
 # The exit status of a sweep of which jobs failed.
 JOBS_FAILED = 3
 FAILURE = "failure.json"
-# What Hydra writes into the sweep's folder before it looks at the jobs.
-OF_SWEEP = {"multirun.yaml"}
+# What is in the sweep's folder before Hydra looks at the jobs.
+OF_SWEEP = {"multirun.yaml", PLACE}
 # How Optuna ends when it asks for the best of no finished trial.
 NOTHING_FINISHED = "No trials are completed"
 

@@ -89,7 +89,7 @@ def test_beginning_afresh_keeps_the_old_run_whole(again, run):
     assert (outcome.status, outcome.err) == (0, "")
     assert f"what was in {run} is kept in {run}/previous-1" in outcome.out
     kept = contents(run / "previous-1")
-    assert kept == {k: v for k, v in before.items() if not k.startswith(".hydra")}
+    assert kept == {k: v for k, v in before.items() if not k.startswith((".hydra", ".devrf"))}
     # What it was learned with lies beside what was learned.
     assert OmegaConf.load(run / "previous-1" / "checkpoints" / "config.yaml").seed == 0
     assert OmegaConf.load(run / "checkpoints" / "config.yaml").seed == 1
@@ -124,7 +124,7 @@ def test_a_mistake_sets_nothing_aside(again, run):
 
 
 def test_setting_aside_finds_a_free_name(tmp_path):
-    for name in ("previous-1", "previous-12", "previous-x", ".hydra"):
+    for name in ("previous-1", "previous-12", "previous-x", ".hydra", ".devrf"):
         (tmp_path / name).mkdir()
     set_aside(tmp_path)
     assert not (tmp_path / "previous-13").exists()

@@ -34,7 +34,9 @@ def test_the_sets_of_a_scene(tiny_scene: Scene) -> None:
         ("static train", 8, 8, 1), ("static test", 2, 2, 1),
         ("dynamic train", 6, 2, 3), ("dynamic test", 3, 1, 3),
     ]
-    assert {(f.width, f.height, f.mattes) for f in found.sets} == {(24, 18, True)}
+    assert {(f.width, f.height, f.left_out) for f in found.sets} == {(24, 18, None)}
+    alpha = tiny_scene.static.test.pixels[..., 3]
+    assert found.sets[1].mattes == pytest.approx(float((alpha > 127).float().mean()))
 
 
 def test_cameras_by_hand(tiny_scene: Scene) -> None:

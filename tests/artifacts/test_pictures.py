@@ -57,7 +57,7 @@ def test_no_error_is_black_and_more_is_brighter_up_to_the_full_one() -> None:
 def view(number: int, height: int = 6, width: int = 9) -> HeldOutView:
     truth = flat(height, width, (0.0, 0.0, 1.0))
     prediction = flat(height, width, (number / 255, 0.0, 0.0))
-    return HeldOutView(f"{number}", 0.0, truth, prediction, 10.0, 0.5, 9.0)
+    return HeldOutView(f"{number}", 0.0, truth, prediction, 10.0, 0.5, 9.0, compared=prediction)
 
 
 def test_a_contact_sheet_shows_prediction_truth_and_error_of_spread_views(tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ HOST = torch.device("cpu")
 
 def view(name: str, time: float, psnr: float, **further: float | None) -> HeldOutView:
     image = torch.zeros(2, 2, 3)
-    return HeldOutView(name, time, image, image, psnr, 0.5, 9.0, further)
+    return HeldOutView(name, time, image, image, psnr, 0.5, 9.0, further, compared=image)
 
 
 def test_means_are_over_what_is_known() -> None:

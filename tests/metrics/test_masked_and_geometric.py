@@ -10,7 +10,7 @@ import torch
 
 from devrf.metrics.geometric import depth_error, end_point_error
 from devrf.metrics.image import ssim, ssim_map
-from devrf.metrics.masked import psnr_masked, ssim_masked
+from devrf.metrics.masked import psnr_masked, ssim_masked, ssim_within
 
 
 def test_masked_psnr_counts_the_masked_pixels_alone() -> None:
@@ -42,6 +42,28 @@ def test_masked_ssim_of_an_image_smaller_than_a_window(rng: torch.Generator) -> 
     mask = torch.zeros(8, 9, dtype=torch.bool)
     mask[2, 3] = True
     assert ssim_masked(a, b, mask) == pytest.approx(float(ssim_map(a, b)[2, 3].mean()))
+
+
+def test_ssim_within_a_mask_knows_nothing_of_what_is_beyond(rng: torch.Generator) -> None:
+    a, b = torch.rand(20, 18, 3, generator=rng), torch.rand(20, 18, 3, generator=rng)
+    mask = torch.zeros(20, 18, dtype=torch.bool)
+    mask[3:16, 2:14] = True
+    inside = ssim(a[3:16, 2:14], b[3:16, 2:14])
+    assert ssim_within(a, b, mask) == pytest.approx(inside, abs=1e-5)
+    a[~mask] = 0
+    assert ssim_within(a, b, mask) == pytest.approx(inside, abs=1e-5)
+    mask[9, 7] = False  # no window of 11 x 11 is without it
+    assert ssim_within(a, b, mask) is None
+
+
+def test_ssim_within_a_mask_of_an_image_smaller_than_a_window(rng: torch.Generator) -> None:
+    a, b = torch.rand(8, 9, 3, generator=rng), torch.rand(8, 9, 3, generator=rng)
+    everywhere = torch.ones(8, 9, dtype=torch.bool)
+    assert ssim_within(a, b, everywhere) == pytest.approx(ssim(a, b))
+    everywhere[7, 8] = False
+    assert ssim_within(a, b, everywhere) == pytest.approx(
+        float(ssim_map(a, b)[~(torch.arange(8)[:, None] >= 2) | (torch.arange(9) < 3)].mean())
+    )
 
 
 def test_depth_error_by_hand() -> None:

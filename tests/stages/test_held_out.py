@@ -43,6 +43,30 @@ def test_truth_by_hand(tiny_scene: Scene) -> None:
     torch.testing.assert_close(truth_image(opaque, 0, "white")[0, 0, 2], torch.tensor(0.4))
 
 
+def test_only_pixels_that_count_are_scored(
+    learned: tuple[CanonicalStage, Trainer], tiny_scene: Scene
+) -> None:
+    views, player = tiny_scene.dynamic.test, Player(learned[0].model)
+    counted = torch.ones(len(views), 18, 24, dtype=torch.bool)
+    whole = score(player, views, 1, "white")
+    same = score(player, replace(views, counted=counted), 1, "white")
+    assert same.scores == pytest.approx(whole.scores)
+    counted[:, :, 16:] = False
+    some = score(player, replace(views, counted=counted), 1, "white")
+    seen, truth = whole.prediction[:, :16], whole.truth[:, :16]
+    assert some.psnr == some.rest_pose_psnr == pytest.approx(psnr(seen, truth))
+    assert some.ssim == pytest.approx(ssim(seen, truth), abs=1e-6)
+    # What is shown is what was seen; what it is compared by is right where nothing counts.
+    assert torch.equal(some.prediction, whole.prediction)
+    assert torch.equal(some.compared[:, 16:], whole.truth[:, 16:])
+    # Too narrow for a window, or only the image's rim.
+    counted[:, :, 8:] = False
+    assert -1 <= score(player, replace(views, counted=counted), 1, "white").ssim <= 1
+    counted[:, 1:] = False
+    rim = score(player, replace(views, counted=counted), 1, "white")
+    assert rim.psnr == pytest.approx(psnr(whole.prediction[:1, :8], whole.truth[:1, :8]))
+
+
 def test_a_score_is_that_of_the_picture_at_the_views_time(
     learned: tuple[CanonicalStage, Trainer], tiny_scene: Scene
 ) -> None:

@@ -76,6 +76,8 @@ def test_images_flow_and_depth_by_hand(tiny_scene: Scene) -> None:
         "images": channels * pixels, "optical flow": (2 * 4 + 1) * pixels, "depth": 4 * pixels
     }
     assert set(view_bytes(replace(moving, flow=None, depth=None))) == {"images"}
+    masked = replace(moving, counted=torch.ones(6, 18, 24, dtype=torch.bool))
+    assert view_bytes(masked)["masks"] == pixels
 
 
 def test_the_host_holds_all_views_the_fields_and_their_checkpoint(cubic: Scene) -> None:

@@ -24,7 +24,7 @@ def write_contact_sheet(path: Path, views: Sequence[HeldOutView], rows: int = 6)
     count = min(rows, len(views))
     chosen = [views[round(k * (len(views) - 1) / max(count - 1, 1))] for k in range(count)]
     strips = [
-        side_by_side([v.prediction, v.truth, error_colors(v.prediction, v.truth)]) for v in chosen
+        side_by_side([v.prediction, v.truth, error_colors(v.compared, v.truth)]) for v in chosen
     ]
     sheet = side_by_side([strip.transpose(0, 1) for strip in strips]).transpose(0, 1)
     write_image(path, sheet)

@@ -15,11 +15,16 @@ FLAT = 2
 MATTE = 127
 # Share of the pixels (on the matte, where there is one) that the flow should cover at least.
 LEAST_FLOW = 0.02
+# Share of the pixels that masks rarely leave out if they are of passers-by.
+MUCH_LEFT_OUT = 0.5
 
 
 def image_advice(scene: Scene) -> list[Advice]:
     """Everything that images, mattes, times and flow tell."""
-    return [*_blank(scene), *_mattes(scene), *_times(scene), *_flow(scene.dynamic.train)]
+    return [
+        *_blank(scene), *_turned(scene), *_mattes(scene), *_masks(scene), *_times(scene),
+        *_flow(scene.dynamic.train),
+    ]
 
 
 def _everyone(scene: Scene) -> list[tuple[str, Views]]:
@@ -34,7 +39,9 @@ def _everyone(scene: Scene) -> list[tuple[str, Views]]:
 def _blank(scene: Scene) -> list[Advice]:
     flat, empty = [], []
     for _, views in _everyone(scene):
-        for image, name in zip(views.pixels, views.names, strict=True):
+        for k, (image, name) in enumerate(zip(views.pixels, views.names, strict=True)):
+            if views.counted is not None:
+                image = image[views.counted[k]]
             shown = image[..., :3].reshape(-1, 3)
             if views.has_alpha:
                 shown = shown[image[..., 3].reshape(-1) > MATTE]
@@ -58,6 +65,24 @@ def _blank(scene: Scene) -> list[Advice]:
     return found
 
 
+def _turned(scene: Scene) -> list[Advice]:
+    names = [
+        views.names[k]
+        for _, views in _everyone(scene) if views.turn_doubtful is not None
+        for k in views.turn_doubtful.nonzero()[:, 0].tolist()
+    ]
+    if not names:
+        return []
+    return [Advice(
+        # Without a static set the captures share files.
+        listed(list(dict.fromkeys(names))),
+        "its EXIF orientation says that it is to be seen turned; it is read as it is stored, since "
+        "its camera does not tell",
+        "if the cameras were found on turned images, turn the files too (mogrify -auto-orient); "
+        "else take the orientation out (exiftool -Orientation=)",
+    )]
+
+
 def _mattes(scene: Scene) -> list[Advice]:
     found = []
     with_alpha = {name: views.has_alpha for name, views in _everyone(scene) if len(views)}
@@ -74,6 +99,22 @@ def _mattes(scene: Scene) -> list[Advice]:
                 "give real mattes, or write the images without alpha",
             ))
     return found
+
+
+def _masks(scene: Scene) -> list[Advice]:
+    much = {}
+    for name, views in _everyone(scene):
+        if views.counted is not None:
+            share = 1 - sum(float(one.float().mean()) for one in views.counted) / len(views)
+            if share > MUCH_LEFT_OUT:
+                much[name] = share
+    if not much:
+        return []
+    return [Advice(
+        listed(list(much), 4), f"masks leave out up to {100 * max(much.values()):.0f} % of the "
+        "pixels, of which nothing is learned",
+        "if they cut out the subject, set data.masks=matte: what they leave out is background then",
+    )]
 
 
 def _times(scene: Scene) -> list[Advice]:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+
+from torch import Tensor
 
 from devrf.artifacts.advice import Advice
 from devrf.artifacts.camera_advice import box_middle, camera_advice, widest_gap
@@ -23,7 +26,8 @@ class ViewsFacts:
         frames: at how many times.
         width: image width in pixels.
         height: image height in pixels.
-        mattes: whether the images have an alpha channel.
+        mattes: share of the pixels that mattes cover; None without an alpha channel.
+        left_out: share of the pixels that do not count; None where all do.
         focal: least and largest focal length in pixels, both axes.
         distance: least, mean and largest distance of the cameras from the middle of the box,
             world units.
@@ -35,7 +39,8 @@ class ViewsFacts:
     frames: int
     width: int
     height: int
-    mattes: bool
+    mattes: float | None
+    left_out: float | None
     focal: tuple[float, float]
     distance: tuple[float, float, float]
 
@@ -145,10 +150,17 @@ def _views_facts(name: str, views: Views, scene: Scene) -> ViewsFacts:
         frames=len(distinct_times(views)),
         width=views.width,
         height=views.height,
-        mattes=views.has_alpha,
+        mattes=_share(k[..., 3] > MATTE for k in views.pixels) if views.has_alpha else None,
+        left_out=None if views.counted is None else _share(~k for k in views.counted),
         focal=(float(cameras.focal.min()), float(cameras.focal.max())),
         distance=(float(distance.min()), float(distance.mean()), float(distance.max())),
     )
+
+
+def _share(masks: Iterable[Tensor]) -> float:
+    """Mean of masks (H, W), one by one: a large scene's at once would be copied."""
+    shares = [float(mask.float().mean()) for mask in masks]
+    return sum(shares) / len(shares)
 
 
 def _times_facts(views: Views) -> TimesFacts:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 from PIL import Image, ImageDraw
+from torch import Tensor
 
 from devrf.artifacts import scene_sketch
 from devrf.artifacts.colors import flow_colors, flow_wheel
@@ -109,7 +110,7 @@ def _chosen(views: Views, among: set[int] | None = None) -> list[list[int]]:
 
 def _static_tiles(views: Views) -> list[Tile]:
     return [
-        (shown(views.pixels[k], _tile_size(views)), Path(views.names[k]).name)
+        (shown(counted_pixels(views, k), _tile_size(views)), Path(views.names[k]).name)
         for k in evenly(len(views), COLUMNS)
     ]
 
@@ -125,11 +126,21 @@ def _moving_tiles(
         for k in row:
             label = f"view {int(views.view[k])}, time {float(views.times[k]):.2f}"
             if full is None or views.flow is None:
-                tiles[-1].append((shown(views.pixels[k], size), label))
+                tiles[-1].append((shown(counted_pixels(views, k), size), label))
             else:
                 colors = flow_colors(views.flow.vectors[k], views.flow.valid[k], full)
                 tiles[-1].append((resized(picture(colors), size), label))
     return tiles
+
+
+def counted_pixels(views: Views, image: int) -> Tensor:
+    """An image's pixels (H, W, 3 or 4); those that do not count are clear."""
+    pixels = views.pixels[image]
+    if views.counted is None:
+        return pixels
+    alpha = views.counted[image].to(torch.uint8)[..., None] * 255
+    return torch.cat([pixels[..., :3], torch.minimum(alpha, pixels[..., 3:]) if views.has_alpha
+                      else alpha], dim=-1)
 
 
 def _tile_size(views: Views) -> tuple[int, int]:

@@ -20,7 +20,8 @@ def sections(found: Inspection, budget: Budget) -> list[Section]:
         _scene(found),
         Section(
             "images",
-            (("set", "images", "views x times", "size", "mattes", "focal length", "distance"),
+            (("set", "images", "views x times", "size", "mattes", "masks", "focal length",
+              "distance"),
              *(_images(facts) for facts in found.sets)),
             heading=True,
         ),
@@ -106,10 +107,16 @@ def _images(facts: ViewsFacts) -> tuple[str, ...]:
     focal = f"{least:.0f} px" if most - least < 0.5 else f"{least:.0f} to {most:.0f} px"
     near, mean, far = facts.distance
     distance = f"{mean:.3g}" if far - near < 0.01 * mean else f"{near:.3g} to {far:.3g}"
+    mattes = "no" if facts.mattes is None else f"cover {_percent(facts.mattes)}"
+    masks = "no" if facts.left_out is None else f"leave out {_percent(facts.left_out)}"
     return (
         facts.name, str(facts.images), f"{facts.views} x {facts.frames}",
-        f"{facts.width} x {facts.height}", "yes" if facts.mattes else "no", focal, distance,
+        f"{facts.width} x {facts.height}", mattes, masks, focal, distance,
     )
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %"
 
 
 def _memory(budget: Budget) -> Section:

@@ -10,7 +10,7 @@ from devrf.artifacts.contact_sheet import side_by_side
 from devrf.artifacts.film import depth_picture
 from devrf.rendering.model import SceneModel
 from devrf.scenes.scene import Background, Views
-from devrf.stages.held_out import background_value, truth_image
+from devrf.stages.held_out import background_value, compare, truth_image
 
 
 def preview(
@@ -32,6 +32,7 @@ def preview(
     seen = model.picture(rays, float(views.times[index]), behind)
     prediction = seen.color.view(views.height, views.width, 3).clamp(0, 1).cpu()
     truth = truth_image(views, index, background).cpu()
-    strip = side_by_side([prediction, truth, error_colors(prediction, truth)])
+    error = error_colors(compare(views, index, prediction, truth), truth)
+    strip = side_by_side([prediction, truth, error])
     depth = depth_picture(model, seen, views.cameras.positions[index], strip.shape[0])
     return {"view": strip, "depth": depth}

@@ -30,6 +30,8 @@ def files_or_none(source: FlowSource) -> Literal["files", "none"]:
 def with_flow(scene: Scene, source: FlowSource, cache: Path | None) -> Scene:
     """The scene with estimated flow of its moving training views, if that is asked for.
 
+    It is valid only at pixels that count.
+
     Args:
         scene: as its reader gave it, with flow from files or without.
         source: ``dis`` and ``raft`` estimate; ``auto`` keeps what was read from files, else
@@ -52,5 +54,7 @@ def with_flow(scene: Scene, source: FlowSource, cache: Path | None) -> Scene:
     if method not in ("dis", "raft"):
         return scene
     flow = estimate_flow(train, method, cache)
+    if train.counted is not None:
+        flow = replace(flow, valid=flow.valid & train.counted)
     dynamic = replace(scene.dynamic, train=replace(train, flow=flow))
     return replace(scene, dynamic=dynamic)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from devrf.data.flow_source import ESTIMATED, EstimatedFlow
 from devrf.data.recorded import RecordedDataModule
+from devrf.scenes.masks import Masks
 from devrf.scenes.nerfstudio import read_nerfstudio
 from devrf.scenes.scene import Background
 
@@ -32,6 +33,7 @@ class NerfstudioDataModule(RecordedDataModule):
         frames: int | None = None,
         holdout: int = 8,
         static_until: float | None = None,
+        masks: Masks = "ignore",
     ) -> None:
         """Say where the scene is and how to read it; it is read when first needed.
 
@@ -52,6 +54,8 @@ class NerfstudioDataModule(RecordedDataModule):
             holdout: without lists in the file, one of so many images is held out.
             static_until: the latest time that counts as static; None: 0 where several images
                 are of time 0, else 1.
+            masks: ``ignore``: what the frames' masks leave out is neither learned from nor
+                scored; ``matte``: it is background; ``none``: they are left alone.
         """
         read = partial(
             read_nerfstudio,
@@ -67,5 +71,6 @@ class NerfstudioDataModule(RecordedDataModule):
             frames=frames,
             holdout=holdout,
             static_until=static_until,
+            masks=masks,
         )
         super().__init__(read, flow, flow_cache, flows=ESTIMATED)

@@ -57,8 +57,11 @@ class PixelPool:
 
 
 def all_pixels(views: Views, images: Tensor) -> PixelPool:
-    """Every pixel of ``images`` (K,) int64."""
+    """Every pixel of ``images`` (K,) int64 that counts."""
     area = views.height * views.width
+    if views.counted is not None:
+        counted = views.counted[images.to(views.counted.device)]
+        return PixelPool.of_mask(images, counted.flatten(1).to(images.device))
     flat = torch.arange(area, dtype=torch.int32, device=images.device)
     return PixelPool(
         images.to(torch.int32).repeat_interleave(area), flat.repeat(len(images))

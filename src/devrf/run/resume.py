@@ -28,6 +28,7 @@ from omegaconf import DictConfig, OmegaConf
 from devrf.config_check import REFERENCE
 from devrf.errors import DevrfError
 from devrf.run.context import GIVEN_REST, OWN_REST, RunContext
+from devrf.run_folder import AT_FIRST
 from devrf.stages.checkpoint import Passport, passport_in
 from devrf.stages.progress import progress_files
 from devrf.stages.sealed_file import digest_of, read_sealed
@@ -160,8 +161,8 @@ def remove_progress(folder: Path, stage: str) -> None:
 def set_aside(folder: Path, *kept: Path) -> None:
     """Move what earlier commands left in a run's folder into ``previous-<n>/`` within it.
 
-    Moving it back undoes it. ``.hydra`` is the present command's and stays; ``checkpoints/``
-    has the config that was learned with.
+    Moving it back undoes it. ``.hydra`` and the lock are the present command's and stay;
+    ``checkpoints/`` has the config that was learned with.
 
     Args:
         folder: the run's folder.
@@ -169,7 +170,7 @@ def set_aside(folder: Path, *kept: Path) -> None:
     """
     old = [
         path for path in folder.iterdir()
-        if path.name != ".hydra" and not path.name.startswith("previous-")
+        if path.name not in AT_FIRST and not path.name.startswith("previous-")
     ]
     if not old:
         return

@@ -11,7 +11,7 @@ from typing import Literal, get_args
 from devrf.scenes.bounds import inward_bounds
 from devrf.scenes.capture_folders import chosen_dynamic, dynamic_folders
 from devrf.scenes.flow_files import read_flow
-from devrf.scenes.images import image_size
+from devrf.scenes.image_files import image_size
 from devrf.scenes.layout import Layout, fewer, load_layout, without_static_set
 from devrf.scenes.options import check_options
 from devrf.scenes.paths import existing_folder, scene_folder
@@ -116,11 +116,12 @@ def _with_flow(views: Views, split: Split, folder: Path) -> Views:
     if any(not known.distortion.none for known in split.transforms.intrinsics):
         log.warning("flow files in %s left out: they are of images before undistortion", folder)
         return views
+    used = int(split.index[0])
     flow = read_flow(
         folder,
         split.index.tolist(),
         (views.times > first + 1e-6).tolist(),
-        image_size(split.transforms.images[int(split.index[0])]),
+        image_size(split.transforms.images[used], split.transforms.intrinsics[used].size),
         (views.width, views.height),
     )
     return replace(views, flow=flow)

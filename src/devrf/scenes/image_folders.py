@@ -7,7 +7,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from devrf.scenes.images import SUFFIXES
+from devrf.scenes.image_files import SUFFIXES
 from devrf.scenes.paths import entries
 from devrf.scenes.validation import problem
 

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from devrf.geometry.distortion import Distortion
 from devrf.scenes.lens import MOST_FOCAL, Lens
-from devrf.scenes.validation import number, problem, shown
+from devrf.scenes.validation import number, problem, same_shape, shown
 
 # Models of the one equation that Distortion states; the simpler ones leave coefficients out.
 CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
@@ -17,8 +17,6 @@ KEYS = (
     "k1", "k2", "k3", "k4", "p1", "p2",
 )
 _LEAST_ANGLE = 1 / MOST_FOCAL
-# Sides are rounded when images are made smaller; beyond this they were cropped or turned.
-_SAME_SHAPE = 0.05
 
 
 @dataclass(frozen=True)
@@ -49,7 +47,7 @@ class Intrinsics:
                 which it can show nothing.
         """
         w, h = (width, height) if self.size is None else self.size
-        if abs(width * h / (height * w) - 1) > _SAME_SHAPE:
+        if not same_shape((width, height), (w, h)):
             raise problem(
                 where, f"{width}x{height} px, but its camera is one for {w:g}x{h:g} px; crop or "
                 "turn the image back, or correct the camera's size",

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 
+from devrf.scenes.masks import Masks
 from devrf.scenes.scene import Capture, Views
 from devrf.scenes.splits import (
     Split,
@@ -92,8 +93,10 @@ def fewer(layout: Layout, train_views: int | None, frames: int | None) -> tuple[
     return replace(layout, dynamic_train=train, dynamic_test=test), kept is not None
 
 
-def load_layout(layout: Layout, root: Path, downscale: int) -> tuple[Capture, Capture]:
-    """The static and the dynamic capture, images read.
+def load_layout(
+    layout: Layout, root: Path, downscale: int, masks: Masks = "none"
+) -> tuple[Capture, Capture]:
+    """The static and the dynamic capture, images read; ``masks`` as for load_views.
 
     Raises:
         DevrfError: what :func:`devrf.scenes.splits.load_views` raises.
@@ -105,7 +108,8 @@ def load_layout(layout: Layout, root: Path, downscale: int) -> tuple[Capture, Ca
     for split in splits:
         # Without a static set the captures share files: read them once.
         twin = next((v for s, v in loaded if _same_images(s, split)), None)
-        loaded.append((split, load_views(split, root, downscale) if twin is None else twin))
+        views = load_views(split, root, downscale, masks) if twin is None else twin
+        loaded.append((split, views))
     a, b, c, d = (views for _, views in loaded)
     return Capture(a, b), Capture(c, d)
 

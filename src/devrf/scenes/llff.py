@@ -13,8 +13,9 @@ from torch import Tensor
 from devrf.scenes.capture_folders import chosen_dynamic
 from devrf.scenes.flow_files import stacked_flow
 from devrf.scenes.forward_bounds import forward_bounds, reference_space
+from devrf.scenes.image_files import Size, image_size
 from devrf.scenes.image_folders import image_folder, listed_images
-from devrf.scenes.images import image_size, load_images
+from devrf.scenes.images import load_images
 from devrf.scenes.llff_poses import PosedSet, read_dynamic_poses, read_static_poses
 from devrf.scenes.paths import existing_folder, scene_folder
 from devrf.scenes.scene import Background, Capture, Scene, Views
@@ -99,11 +100,11 @@ def _static(folder: Path, root: Path, downscale: int, holdout: int) -> Capture:
         )
     if len(images) < 2:
         raise problem(source.path, "holds one image, expected at least one more to hold out")
-    loaded = load_images(images, source.downscale)
+    loaded = load_images(images, source.downscale, posed.sizes)
     count, height, width = loaded.pixels.shape[:3]
     views = Views(
         loaded.pixels, posed.cameras(width, height), torch.zeros(count), torch.arange(count),
-        _names(images, root),
+        _names(images, root), turn_doubtful=loaded.doubtful,
     )
     order = torch.arange(count)
     train, test = views[order[order % holdout != 0]], views[order[order % holdout == 0]]
@@ -143,7 +144,7 @@ def _dynamic(
     if flow == "files" and len(kept) < total:
         log.info("flow files dropped: with data.frames=%s neighbouring frames are left out", frames)
     elif flow == "files":
-        train_set = _with_flow(train_set, [views[v] for v in train])
+        train_set = _with_flow(train_set, [views[v] for v in train], posed.sizes[train[0]])
     return Capture(train_set, test_set)
 
 
@@ -174,24 +175,25 @@ def _moving(
 ) -> Views:
     """All views at the first frame, then all at the next, and so on."""
     images = [folder.images[k] for k in kept.tolist() for folder in folders]
-    loaded = load_images(images, folders[0].downscale)
+    sizes = [posed.sizes[v] for v in chosen] * len(kept)
+    loaded = load_images(images, folders[0].downscale, sizes)
     count, height, width = loaded.pixels.shape[:3]
     view = torch.arange(len(folders)).repeat(len(kept))
     times = kept / (len(folders[0].images) - 1)
     cameras = posed.cameras(width, height)[torch.tensor(chosen)][view]
     return Views(
         loaded.pixels, cameras, times.float().repeat_interleave(len(folders)), view,
-        _names(images, root),
+        _names(images, root), turn_doubtful=loaded.doubtful,
     )
 
 
-def _with_flow(views: Views, folders: list[ViewFolder]) -> Views:
+def _with_flow(views: Views, folders: list[ViewFolder], camera: Size) -> Views:
     files = flow_files(folders)
     if not files:
         log.info("no optical flow: no <frame>_bwd.npz in %s and its like", folders[0].flow)
         return views
     rows = {frame * len(folders) + view: path for (view, frame), path in sorted(files.items())}
-    source = image_size(folders[0].images[0])
+    source = image_size(folders[0].images[0], camera)
     return replace(
         views, flow=stacked_flow(rows, len(views), source, (views.width, views.height))
     )

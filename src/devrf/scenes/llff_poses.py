@@ -49,6 +49,11 @@ class PosedSet:
     def __len__(self) -> int:
         return self.poses.shape[0]
 
+    @property
+    def sizes(self) -> list[tuple[float, float]]:
+        """N (width, height) in pixels, as in ``size``."""
+        return [(width, height) for width, height in self.size.tolist()]
+
     def last(self, count: int) -> PosedSet:
         """The last ``count`` cameras."""
         return replace(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import torch
 from torch import Tensor
@@ -14,12 +14,13 @@ from devrf.scenes.bounds import inward_bounds
 from devrf.scenes.holdout import every_nth
 from devrf.scenes.json_files import json_object
 from devrf.scenes.layout import Layout, fewer, load_layout, without_static_set
+from devrf.scenes.masks import Masks
 from devrf.scenes.options import check_options
 from devrf.scenes.paths import scene_folder
 from devrf.scenes.scene import Background, Scene
 from devrf.scenes.splits import at_rest, distinct_poses, in_motion
 from devrf.scenes.transforms import Transforms, listed_image, read_transforms
-from devrf.scenes.validation import check_count, problem, shown
+from devrf.scenes.validation import check_choice, check_count, problem, shown
 
 log = logging.getLogger(__name__)
 
@@ -43,6 +44,7 @@ def read_nerfstudio(
     frames: int | None = None,
     holdout: int = 8,
     static_until: float | None = None,
+    masks: Masks = "ignore",
 ) -> Scene:
     """Read a scene that cameras look in at, from ``transforms.json`` and images.
 
@@ -50,6 +52,12 @@ def read_nerfstudio(
     ``root/static`` and, with times, in ``root/dynamic``. Cameras may stand still or move.
     Held-out images are those in ``test_filenames`` (else ``val_filenames``), else every
     ``holdout``-th. Images are undistorted; the world is that of the file's poses.
+
+    A frame's ``mask_path`` is a grey image, black where the mask leaves pixels out, of the size
+    of the image or of its camera. In nerfstudio's meaning these pixels say nothing (people who
+    walk by): "ignore" neither learns from them nor scores them, and the fields show there what
+    other images say. "matte" takes them for background (a person who was cut out), as an alpha
+    channel would be taken: that also shows where the scene is and where it moves.
 
     Args:
         root: the scene's folder.
@@ -66,6 +74,8 @@ def read_nerfstudio(
         holdout: without lists in the file, one of so many images is held out.
         static_until: in one file, the latest time of an image that counts as static; None: 0
             where several images are of time 0, else 1.
+        masks: what the masks of the frames are taken for: "ignore", "matte", or "none" to leave
+            them alone.
 
     Raises:
         DevrfError: a file or an option is wrong; the message names it.
@@ -75,9 +85,11 @@ def read_nerfstudio(
         box=box, frames=frames, static_until=static_until, train_views=train_views,
     )
     check_count("data.holdout", holdout, 2)
+    check_choice("data.masks", masks, get_args(Masks))
     folder = scene_folder(root)
-    layout, _ = fewer(_layout(folder, holdout, static_until), train_views, frames)
-    static, dynamic = load_layout(layout, folder, downscale)
+    masked = masks != "none"
+    layout, _ = fewer(_layout(folder, holdout, static_until, masked), train_views, frames)
+    static, dynamic = load_layout(layout, folder, downscale, masks)
     bounds = inward_bounds(
         static.train, dynamic.train, [static.train, static.test, dynamic.train, dynamic.test],
         bound_scale=bound_scale, near=near, far=far, box=given_box,
@@ -85,17 +97,18 @@ def read_nerfstudio(
     return Scene(name or folder.resolve().name, "inward", static, dynamic, bounds, background)
 
 
-def _layout(root: Path, holdout: int, static_until: float | None) -> Layout:
+def _layout(root: Path, holdout: int, static_until: float | None, masked: bool) -> Layout:
     if os.path.isfile(root / FILE):
-        return _one_file(*_with_times(*_train_and_test(root / FILE, root, holdout)), static_until)
+        both = _train_and_test(root / FILE, root, holdout, masked)
+        return _one_file(*_with_times(*both), static_until)
     still, moving = root / "static" / FILE, root / "dynamic" / FILE
     if not os.path.isfile(still) and not os.path.isfile(moving):
         raise problem(
             root, f"expected {FILE}, or static/{FILE} and dynamic/{FILE}; set data.root to the "
             "scene's folder",
         )
-    rest = _train_and_test(still, root, holdout)
-    motion = _with_times(*_train_and_test(moving, root, holdout))
+    rest = _train_and_test(still, root, holdout, masked)
+    motion = _with_times(*_train_and_test(moving, root, holdout, masked))
     return Layout(at_rest(rest[0]), at_rest(rest[1]), in_motion(motion[0]), in_motion(motion[1]))
 
 
@@ -108,8 +121,10 @@ def _with_times(train: Transforms, test: Transforms) -> tuple[Transforms, Transf
     return train, test
 
 
-def _train_and_test(file: Path, root: Path, holdout: int) -> tuple[Transforms, Transforms]:
-    transforms = read_transforms(file, root)
+def _train_and_test(
+    file: Path, root: Path, holdout: int, masked: bool
+) -> tuple[Transforms, Transforms]:
+    transforms = read_transforms(file, root, masked=masked)
     count = len(transforms.images)
     content = json_object(file, "every capture needs its posed images")
     listed = {

@@ -47,12 +47,12 @@ def shrink_pixels(
     """An 8-bit image averaged over areas; colours count by their alpha.
 
     Args:
-        image: (H, W, 3 or 4) uint8, alpha not premultiplied.
+        image: (H, W, 1, 3 or 4) uint8, alpha not premultiplied.
         width: columns of the result.
         height: rows of the result.
 
     Returns:
-        (height, width, 3 or 4) uint8, alpha not premultiplied; black where alpha is 0.
+        (height, width, 1, 3 or 4) uint8, alpha not premultiplied; black where alpha is 0.
     """
     values = image.astype(np.float32)
     if image.shape[2] == 4:

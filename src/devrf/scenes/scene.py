@@ -46,6 +46,10 @@ class Views:
         flow: backward optical flow, or None where there is none.
         depth: (N, H, W) float32 distance along each pixel's ray in world units, +inf where the
             ray hits nothing; None where it is unknown.
+        turn_doubtful: (N,) bool, files whose EXIF orientation says that they are to be seen
+            turned, which nothing confirms or refutes: they are as they are stored. None: none.
+        counted: (N, H, W) bool, the pixels that are learned from and scored; what the others
+            show is nobody's business. None: all of them.
     """
 
     pixels: Tensor
@@ -55,6 +59,8 @@ class Views:
     names: tuple[str, ...]
     flow: OpticalFlow | None = None
     depth: Tensor | None = None
+    turn_doubtful: Tensor | None = None
+    counted: Tensor | None = None
 
     def __len__(self) -> int:
         return self.pixels.shape[0]
@@ -86,6 +92,8 @@ class Views:
             if self.flow is None
             else OpticalFlow(self.flow.vectors[index], self.flow.valid[index]),
             None if self.depth is None else self.depth[index],
+            None if self.turn_doubtful is None else self.turn_doubtful[index],
+            None if self.counted is None else self.counted[index],
         )
 
     def to(self, device: torch.device | str) -> Views:
@@ -100,6 +108,7 @@ class Views:
             if self.flow is None
             else OpticalFlow(self.flow.vectors.to(device), self.flow.valid.to(device)),
             depth=None if self.depth is None else self.depth.to(device),
+            counted=None if self.counted is None else self.counted.to(device),
         )
 
 

@@ -103,15 +103,19 @@ def _reach(views: Views, area: Box, cell: float) -> int:
 def _silhouettes(views: Views, reach: int) -> Array:
     """(N, H·W + 1) uint8: whether a pixel is INSIDE or OUTSIDE the dilated silhouette.
 
-    The last entry stands for all that is beyond the image: OUTSIDE, or UNSEEN where the image's
-    border cuts the silhouette or the whole object off.
+    Pixels that do not count are UNSEEN. The last entry stands for all that is beyond the image:
+    OUTSIDE, or UNSEEN where the image's border cuts the silhouette or the whole object off.
     """
     matte = views.pixels[..., 3].cpu().numpy() > MATTE_THRESHOLD
     count, height, width = matte.shape
-    at_border = matte[:, [0, -1]].any(axis=(1, 2)) | matte[:, :, [0, -1]].any(axis=(1, 2))
+    unknown = np.zeros_like(matte) if views.counted is None else ~views.counted.cpu().numpy()
+    matte &= ~unknown
+    perhaps = matte | unknown
+    at_border = perhaps[:, [0, -1]].any(axis=(1, 2)) | perhaps[:, :, [0, -1]].any(axis=(1, 2))
     cut_off = at_border | ~matte.any(axis=(1, 2))
     codes = np.empty((count, height * width + 1), dtype=np.uint8)
     codes[:, :-1] = _dilated(matte, reach).reshape(count, -1)
+    codes[:, :-1][unknown.reshape(count, -1)] = UNSEEN
     codes[:, -1] = np.where(cut_off, UNSEEN, OUTSIDE)
     return codes
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
 from devrf.scenes.images import load_images
+from devrf.scenes.masks import Masks, counted_pixels, cutting_out
 from devrf.scenes.scene import Views
 from devrf.scenes.transforms import Transforms, read_transforms
 from devrf.scenes.undistortion import as_pinhole
@@ -166,32 +167,43 @@ def at_times(split: Split, times: Tensor) -> Split:
     return split.where(gap <= FrameClock.TOLERANCE)
 
 
-def load_views(split: Split, root: Path, downscale: int) -> Views:
+def load_views(split: Split, root: Path, downscale: int, masks: Masks = "none") -> Views:
     """Read the used images of a split; cameras are pinholes of the smaller images.
 
-    Images of a lens with distortion are undistorted.
+    Images of a lens with distortion are undistorted, and masks with them.
+
+    Args:
+        split: which images, with which cameras.
+        root: the scene's folder.
+        downscale: integer factor ≥ 1 by which images are made smaller.
+        masks: what the masks that the file lists are taken for.
 
     Raises:
-        DevrfError: what :func:`devrf.scenes.images.load_images` and
-            :func:`devrf.scenes.undistortion.as_pinhole` raise, or an image has not the shape
-            that its camera is for.
+        DevrfError: what :func:`devrf.scenes.images.load_images`,
+            :func:`devrf.scenes.undistortion.as_pinhole` and :mod:`devrf.scenes.masks` raise, or
+            an image has not the shape that its camera is for.
     """
     used = split.index
     files = [split.transforms.images[i] for i in used.tolist()]
-    loaded = load_images(files, downscale)
-    height, width = loaded.pixels.shape[1:3]
     known = [split.transforms.intrinsics[i] for i in used.tolist()]
+    sizes = [inner.size for inner in known]
+    listed = [split.transforms.masks[i] for i in used.tolist()] if split.transforms.masks else []
+    mattes = cutting_out(listed, sizes, files) if masks == "matte" else None
+    loaded = load_images(files, downscale, sizes, mattes)
+    height, width = loaded.pixels.shape[1:3]
+    distorted = [
+        inner.lens(loaded.width, loaded.height, file).scaled(
+            width / loaded.width, height / loaded.height
+        )
+        for inner, file in zip(known, files, strict=True)
+    ]
+    counted = None
+    if masks == "ignore":
+        counted = counted_pixels(
+            listed, (loaded.width, loaded.height), (width, height), sizes, distorted, files
+        )
     # Undistorted after the images are made smaller: a tenth of the work for the same picture.
-    pixels, lenses = as_pinhole(
-        loaded.pixels,
-        [
-            inner.lens(loaded.width, loaded.height, file).scaled(
-                width / loaded.width, height / loaded.height
-            )
-            for inner, file in zip(known, files, strict=True)
-        ],
-        files,
-    )
+    pixels, lenses = as_pinhole(loaded.pixels, distorted, files)
     cameras = Cameras(
         split.transforms.poses[used],
         torch.tensor([lens.focal for lens in lenses]),
@@ -200,4 +212,7 @@ def load_views(split: Split, root: Path, downscale: int) -> Views:
         height,
     )
     names = tuple(str(file.relative_to(root)) for file in files)
-    return Views(pixels, cameras, split.times[used], split.view[used], names)
+    return Views(
+        pixels, cameras, split.times[used], split.view[used], names,
+        turn_doubtful=loaded.doubtful, counted=counted,
+    )

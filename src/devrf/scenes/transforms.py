@@ -6,6 +6,7 @@ alone: poses and images are consistent as they are.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from devrf.scenes.images import find_image
+from devrf.scenes.image_files import find_image
 from devrf.scenes.intrinsics import Intrinsics, frame_intrinsics, read_intrinsics
 from devrf.scenes.json_files import json_object
 from devrf.scenes.paths import inside
@@ -34,6 +35,8 @@ class Transforms:
         images: N existing files inside the scene's folder.
         poses: (N, 3, 4) float32 camera-to-world, OpenGL axes, world units.
         times: N times in [0, 1], or None when the file gives none.
+        masks: N existing files inside the scene's folder, or None of an image without one; None
+            where they were not asked for.
     """
 
     file: Path
@@ -41,6 +44,7 @@ class Transforms:
     images: tuple[Path, ...]
     poses: Tensor
     times: tuple[float, ...] | None
+    masks: tuple[Path | None, ...] | None = None
 
     def __getitem__(self, index: Sequence[int]) -> Transforms:
         """The images at the positions ``index``, at least one, in that order."""
@@ -50,15 +54,17 @@ class Transforms:
             tuple(self.images[i] for i in index),
             self.poses[list(index)],
             None if self.times is None else tuple(self.times[i] for i in index),
+            None if self.masks is None else tuple(self.masks[i] for i in index),
         )
 
 
-def read_transforms(file: Path, root: Path) -> Transforms:
+def read_transforms(file: Path, root: Path, *, masked: bool = False) -> Transforms:
     """Read one split, or one file of all images.
 
     Args:
         file: a ``transforms*.json``; its image paths are relative to its folder.
         root: the scene's folder, which no image path may leave.
+        masked: whether ``mask_path`` is read, too.
 
     Raises:
         DevrfError: the file is missing, is no JSON, lacks a key, holds no frames, or holds a
@@ -89,6 +95,8 @@ def read_transforms(file: Path, root: Path) -> Transforms:
         tuple(_image(frame, place, file, root) for frame, place in zip(frames, where, strict=True)),
         poses.float(),
         tuple(known) or None,
+        tuple(_mask(f, place, file, root) for f, place in zip(frames, where, strict=True))
+        if masked else None,
     )
 
 
@@ -107,6 +115,18 @@ def _image(frame: dict[str, Any], where: str, file: Path, root: Path) -> Path:
     if not isinstance(name, str) or not name:
         raise problem(where, 'has no "file_path"; add the image\'s path')
     return listed_image(name, file, root)
+
+
+def _mask(frame: dict[str, Any], where: str, file: Path, root: Path) -> Path | None:
+    name = frame.get("mask_path")
+    if name is None:
+        return None
+    if not isinstance(name, str) or not name:
+        raise problem(where, f"mask_path is {shown(name)}, expected a file's path; correct it")
+    path = inside(root, file.parent, name, file)
+    if not os.path.isfile(path):
+        raise problem(path, "no such mask; correct mask_path, or set data.masks=none")
+    return path
 
 
 def listed_image(name: str, file: Path, root: Path) -> Path:

@@ -26,7 +26,7 @@ def as_pinhole(
     seen by the lens: there are no empty borders to learn from.
 
     Args:
-        pixels: (N, H, W, 3 or 4) uint8, alpha not premultiplied; changed in place.
+        pixels: (N, H, W, 1, 3 or 4) uint8, alpha not premultiplied; changed in place.
         lenses: N, in pixels of these images.
         names: N, for messages.
 
@@ -56,11 +56,11 @@ def resample(image: Tensor, source: Tensor) -> Tensor:
     """An image looked up elsewhere, bilinearly; colours count by their alpha.
 
     Args:
-        image: (H, W, 3 or 4) uint8, alpha not premultiplied.
+        image: (H, W, 1, 3 or 4) uint8, alpha not premultiplied.
         source: (H', W', 2) x, y in pixels of ``image``, where a pixel's centre is at i + 0.5.
 
     Returns:
-        (H', W', 3 or 4) uint8, alpha not premultiplied; black where alpha is 0. Places outside
+        (H', W', 1, 3 or 4) uint8, alpha not premultiplied; black where alpha is 0. Places outside
         take the nearest pixel of the border.
     """
     height, width, channels = image.shape

@@ -18,6 +18,8 @@ LARGEST = 3e38
 # A name in a file can be of any length; a message has to be read.
 LONGEST_MESSAGE = 480
 LONGEST_VALUE = 60
+# Sides are rounded when images are made smaller; beyond this they were cropped or turned.
+SAME_SHAPE = 0.05
 
 _brief = reprlib.Repr()
 _brief.maxlevel = 2
@@ -65,6 +67,11 @@ def reduced_size(width: int, height: int, downscale: int, where: object) -> tupl
             f"{MIN_SIDE} px a side are needed; use a smaller data.downscale",
         )
     return w, h
+
+
+def same_shape(one: tuple[float, float], other: tuple[float, float]) -> bool:
+    """Whether two (width, height) are those of one image at two scales, sides rounded."""
+    return abs(one[0] * other[1] / (one[1] * other[0]) - 1) <= SAME_SHAPE
 
 
 def check_choice(key: str, value: object, choices: Iterable[str]) -> None:

@@ -15,7 +15,8 @@ def visual_hull(views: Views, box: Box, shape: tuple[int, int, int]) -> Tensor:
     """The visual hull of one state of the scene, on a grid.
 
     A grid point is outside when any view that has it in the picture sees no matte within half
-    a grid cell of it; so the hull holds everything, and more where no view looks.
+    a grid cell of it; so the hull holds everything, and more where no view looks, or where its
+    pixels do not count.
 
     Args:
         views: images with mattes that all show the same state.
@@ -33,6 +34,8 @@ def visual_hull(views: Views, box: Box, shape: tuple[int, int, int]) -> Tensor:
         pixel, depth = views.cameras.project_into(k, points[left])
         reach = _reach(views, k, cell, box)
         matte = views.pixels[k, :, :, 3][None].float()
+        if views.counted is not None:
+            matte = matte.masked_fill(~views.counted[k], 255.0)
         grown = torch.nn.functional.max_pool2d(matte, 2 * reach + 1, 1, reach)[0]
         x, y = pixel.floor().long().unbind(-1)
         seen = (depth > 0) & (x >= 0) & (x < views.width) & (y >= 0) & (y < views.height)

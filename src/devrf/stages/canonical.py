@@ -226,6 +226,8 @@ class CanonicalStage(ScheduledStage):
                 for image in range(len(views))
             ]
         )
+        if views.counted is not None:
+            kept = kept[views.counted.flatten().to(device)]
         if not bool(kept.any()):
             raise DevrfError(
                 f"the field has become empty by iteration {self.iteration}: check data.background, "

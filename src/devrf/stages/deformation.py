@@ -283,6 +283,8 @@ class DeformationStage(ScheduledStage):
         kept = meets_matter(views.cameras, image, self.scene_model, self.visit.occupancy)
         if views.has_alpha:
             kept |= views.pixels[image, :, :, 3].flatten() > 0
+        if views.counted is not None:
+            kept = kept[views.counted[image].flatten()]
         return PixelPool(pool.image[kept], pool.flat[kept]) if bool(kept.any()) else pool
 
     def prepare(self) -> None:

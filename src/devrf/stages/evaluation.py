@@ -28,7 +28,7 @@ class Sight:
         player: shows what was learned.
         views: the held-out views.
         index: which of them.
-        prediction: (H, W, 3) RGB in [0, 1].
+        prediction: (H, W, 3) RGB in [0, 1]; the truth where pixels do not count.
         truth: (H, W, 3) RGB in [0, 1].
         depth: (H, W) rendered distance along each pixel's ray, world units.
         opacity: (H, W) in [0, 1].
@@ -46,15 +46,32 @@ class Sight:
 
     @property
     def mask(self) -> Tensor:
-        """(H, W) bool, inside the matte; nowhere True of images without one."""
+        """(H, W) bool, inside the matte where pixels count; nowhere True of images without one."""
         pixels = self.views.pixels[self.index]
         if not self.views.has_alpha:
             return torch.zeros(pixels.shape[:2], dtype=torch.bool)
-        return pixels[..., 3].cpu() > 127
+        inside = pixels[..., 3].cpu() > 127
+        return inside if self.counted is None else inside & self.counted
+
+    @property
+    def counted(self) -> Tensor | None:
+        """(H, W) bool, the pixels that count; None: all of them."""
+        counted = self.views.counted
+        return None if counted is None else counted[self.index].cpu()
+
+
+def _ms_ssim(sight: Sight) -> float | None:
+    # Its coarse scales mix pixels that count with others.
+    return ms_ssim(sight.prediction, sight.truth) if sight.counted is None else None
 
 
 def _lpips(sight: Sight) -> float | None:
-    return sight.lpips(sight.prediction, sight.truth) if sight.lpips else None
+    if sight.lpips is None:
+        return None
+    if sight.counted is not None:
+        return sight.lpips.inside(sight.prediction, sight.truth, sight.counted)
+    whole: float | None = sight.lpips(sight.prediction, sight.truth)
+    return whole
 
 
 def _lpips_masked(sight: Sight) -> float | None:
@@ -71,7 +88,7 @@ def _depth_error(sight: Sight) -> float | None:
 
 # By name, in the order of tables; None where a view has nothing to compare with.
 MEASURES: dict[str, Callable[[Sight], float | None]] = {
-    "ms_ssim": lambda sight: ms_ssim(sight.prediction, sight.truth),
+    "ms_ssim": _ms_ssim,
     "lpips": _lpips,
     "psnr_masked": lambda sight: psnr_masked(sight.prediction, sight.truth, sight.mask),
     "ssim_masked": lambda sight: ssim_masked(sight.prediction, sight.truth, sight.mask),

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from devrf.metrics.image import psnr, ssim
+from devrf.metrics.masked import psnr_masked, ssim_masked, ssim_within
 from devrf.rendering.model import SceneModel
 from devrf.rendering.picture import Picture
 from devrf.rendering.player import Player
@@ -17,7 +18,7 @@ from devrf.stages.evaluation import Judge, Sight
 
 @dataclass(frozen=True)
 class HeldOutView:
-    """A held-out image, what the model sees there, and how alike they are.
+    """A held-out image, what the model sees there, and how alike they are where pixels count.
 
     Attributes:
         name: the image's name.
@@ -28,6 +29,7 @@ class HeldOutView:
         ssim: in [−1, 1].
         rest_pose_psnr: dB that the canonical field alone reaches there.
         further: what else was measured, by name; None where there is nothing to compare with.
+        compared: (H, W, 3) RGB in [0, 1], the prediction where pixels count, else the truth.
     """
 
     name: str
@@ -38,6 +40,7 @@ class HeldOutView:
     ssim: float
     rest_pose_psnr: float
     further: dict[str, float | None] = field(default_factory=dict)
+    compared: Tensor = field(kw_only=True)
 
     @property
     def scores(self) -> dict[str, float | None]:
@@ -55,6 +58,9 @@ def score(
 ) -> HeldOutView:
     """Render image ``index`` of held-out ``views`` and compare it with the truth.
 
+    Only pixels that count are compared: by PSNR each for itself, by SSIM in windows that lie
+    among them. Other metrics that look at neighbourhoods find the truth beyond them.
+
     Args:
         player: shows what was learned.
         views: the held-out views, on the host.
@@ -70,13 +76,14 @@ def score(
     rest = prediction
     if player.ready(time).warp is not None:
         rest = _image(player.view(views.cameras, index, 0.0, behind), views)
+    compared, rest = (compare(views, index, image, truth) for image in (prediction, rest))
     further: dict[str, float | None] = {}
     if judge is not None and judge.metrics:
         shape = (views.height, views.width)
         distance = _world_distance(player.model, views, index, seen)
         further = judge.scores(
             Sight(
-                player, views, index, prediction, truth, distance.view(shape),
+                player, views, index, compared, truth, distance.view(shape),
                 seen.opacity.cpu().view(shape), judge.lpips,
             )
         )
@@ -85,11 +92,40 @@ def score(
         time=time,
         truth=truth,
         prediction=prediction,
-        psnr=psnr(prediction, truth),
-        ssim=ssim(prediction, truth),
-        rest_pose_psnr=psnr(rest, truth),
+        psnr=_psnr(views, index, compared, truth),
+        ssim=_ssim(views, index, compared, truth),
+        rest_pose_psnr=_psnr(views, index, rest, truth),
         further=further,
+        compared=compared,
     )
+
+
+def compare(views: Views, index: int, prediction: Tensor, truth: Tensor) -> Tensor:
+    """The prediction (H, W, 3) of a held-out image; the truth where its pixels do not count."""
+    if views.counted is None:
+        return prediction
+    return torch.where(views.counted[index].cpu()[..., None], prediction, truth)
+
+
+def _psnr(views: Views, index: int, compared: Tensor, truth: Tensor) -> float:
+    if views.counted is None:
+        return psnr(compared, truth)
+    inside = psnr_masked(compared, truth, views.counted[index].cpu())
+    assert inside is not None  # readers refuse a mask that leaves nothing
+    return inside
+
+
+def _ssim(views: Views, index: int, compared: Tensor, truth: Tensor) -> float:
+    if views.counted is None:
+        return ssim(compared, truth)
+    counted = views.counted[index].cpu()
+    # Where nothing counts that is as wide as a window, windows about what counts have to do,
+    # and where that is the image's rim, all of them.
+    for measure in (ssim_within, ssim_masked):
+        found = measure(compared, truth, counted)
+        if found is not None:
+            return found
+    return ssim(compared, truth)
 
 
 def truth_image(views: Views, index: int, background: Background) -> Tensor:

@@ -28,7 +28,7 @@ PROGRAM = 600_000_000
 KEPT_BACK = 1.3
 # What passes, by name; and what a stage shares with the scene where both are on the host.
 BATCH = "a batch"
-VIEWS = ("images", "optical flow", "depth")
+VIEWS = ("images", "optical flow", "depth", "masks")
 # Two int32 tell a pixel of a pool.
 POOLED = 8
 # A displacement: three float32.
@@ -315,12 +315,14 @@ def tensor_bytes(module: nn.Module) -> int:
 
 
 def view_bytes(views: Views) -> dict[str, int]:
-    """Bytes of N views by part: ``images``, and ``optical flow`` and ``depth`` if they have it."""
+    """Bytes of N views by part: ``images``, and what else they have of :data:`VIEWS`."""
     parts = {"images": views.pixels.numel()}
     if views.flow is not None:
         parts["optical flow"] = 4 * views.flow.vectors.numel() + views.flow.valid.numel()
     if views.depth is not None:
         parts["depth"] = 4 * views.depth.numel()
+    if views.counted is not None:
+        parts["masks"] = views.counted.numel()
     return parts
 
 

@@ -23,7 +23,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.strategies import DrawFn, SearchStrategy
-from PIL import Image
+from PIL import ExifTags, Image
 
 from devrf.data.forward import ForwardFacingDataModule
 from devrf.data.inward import InwardFacingDataModule
@@ -33,6 +33,7 @@ from devrf.scenes.flow_cache import load_flow
 from devrf.scenes.flow_files import read_flow_file
 from devrf.scenes.images import load_images
 from devrf.scenes.llff_poses import read_dynamic_poses, read_static_poses
+from devrf.scenes.masks import read_mask
 from devrf.scenes.nerfies_camera import read_camera
 from devrf.scenes.transforms import read_transforms
 
@@ -201,6 +202,33 @@ def images(*formats: str) -> Callable[[Fixture], Prepared]:
     return prepare
 
 
+def photos(fixture: Fixture) -> Prepared:
+    """Photos that say that they are to be seen turned, beside one whose camera is so."""
+    folder, exif = fixture("tmp_path"), Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6
+    picture = Image.new("RGB", (HEIGHT, WIDTH), "red")
+    picture.save(folder / "first.jpg", exif=exif)
+    whole = (folder / "first.jpg").read_bytes()
+    return fixture("damage").bytes(whole[:150]).map(lambda head: head + whole[150:]), (
+        lambda data: load_images(
+            [folder / "first.jpg", written(folder / "second.jpg", data)], 1, [(WIDTH, HEIGHT)] * 2
+        )
+    )
+
+
+def masks(fixture: Fixture) -> Prepared:
+    folder = fixture("tmp_path")
+    noise = np.random.default_rng(0).integers(0, 2, (HEIGHT, WIDTH), dtype=np.uint8)
+    whole = []
+    for kind, mode in (("PNG", "L"), ("PNG", "1"), ("WEBP", "RGB")):
+        stream = io.BytesIO()
+        Image.fromarray(noise * np.uint8(255)).convert(mode).save(stream, kind)
+        whole.append(stream.getvalue())
+    return st.one_of([fixture("damage").bytes(data) for data in whole]), lambda data: read_mask(
+        written(folder / "mask.png", data), (WIDTH, HEIGHT), None, "its image"
+    )
+
+
 # --- Nerfies
 
 
@@ -270,6 +298,11 @@ def nerfstudio_folder(fixture: Fixture) -> Path:
     del content["camera_angle_x"]
     content |= {"fl_x": 38.0, "fl_y": 38.0, "w": WIDTH, "h": HEIGHT, "k1": 0.01}
     content |= {"train_filenames": [f["file_path"] for f in content["frames"][:5]]}
+    mask = np.full((HEIGHT, WIDTH), 255, dtype=np.uint8)
+    mask[: HEIGHT // 4] = 0
+    Image.fromarray(mask).save(root / "mask.png")
+    for frame in content["frames"]:
+        frame["mask_path"] = "mask.png"
     (root / "transforms.json").write_text(json.dumps(content))
     return root
 
@@ -394,6 +427,8 @@ PARSERS = (
     Parser("cached optical flow", 700, 550, cached_flow),
     Parser("png", 1000, 850, images("PNG RGBA", "PNG P", "PNG RGB")),
     Parser("jpeg and webp", 700, 400, images("JPEG RGB", "WEBP RGBA", "JPEG CMYK")),
+    Parser("photos", 300, 100, photos),
+    Parser("masks", 300, 200, masks),
     Parser("camera of nerfies", 800, 650, nerfies_camera),
     Parser("lists of nerfies", 400, 280, nerfies_lists),
     Parser("nerfstudio", 300, 220, nerfstudio),

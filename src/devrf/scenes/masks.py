@@ -1,0 +1,173 @@
+"""Masks beside images (nerfstudio's ``mask_path``): grey files, black where they leave out.
+
+What a mask leaves out is either nobody's business (a passer-by, a tripod: nerfstudio's meaning)
+or known to be background (a person cut out). A file does not say which; the user does.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from devrf.scenes.image_files import Header, Size, decode, read_header
+from devrf.scenes.images import Finish, workers
+from devrf.scenes.lens import Lens
+from devrf.scenes.memory import check_memory
+from devrf.scenes.resampling import shrink_pixels
+from devrf.scenes.undistortion import as_pinhole
+from devrf.scenes.validation import problem
+
+log = logging.getLogger(__name__)
+
+# ignore: pixels left out are neither learned from nor scored; matte: they are background.
+Masks = Literal["ignore", "matte", "none"]
+
+Grey = npt.NDArray[np.uint8]
+
+WHITE = 255
+# A pixel is left out that is darker than half white; compression leaves edges grey.
+HALF = 127
+# Levels by which the channels of a grey image may differ, as JPEG's do.
+GREY_NOISE = 16
+
+
+def read_mask(path: Path, image: tuple[int, int], camera: Size | None, name: object) -> Grey:
+    """One mask, at the size of its image.
+
+    Args:
+        path: a file of 8 bits a channel that is grey and opaque. Labels 0 and 1 are black
+            and white.
+        image: (width, height) of the image's file.
+        camera: (width, height) that its camera is for; a mask may be given at that size, too.
+        name: the image, for messages.
+
+    Returns:
+        (H, W) uint8.
+
+    Raises:
+        DevrfError: the file cannot be read, has another size, or is not grey.
+    """
+    header = read_header(path, image)
+    _check_size(path, header, image, camera, name)
+    pixels = decode(path, header, "RGBA")
+    spread = pixels[..., :3].max(axis=2) - pixels[..., :3].min(axis=2)
+    if int(spread.max()) > GREY_NOISE or int(pixels[..., 3].min()) < WHITE:
+        raise problem(
+            path, "a mask with colours or an alpha channel; give one channel, black where pixels "
+            "are left out, white elsewhere",
+        )
+    grey = np.ascontiguousarray(pixels[..., :1])
+    if int(grey.max()) == 1:
+        grey *= WHITE
+    if (header.width, header.height) != image:
+        grey = shrink_pixels(grey, *image)
+    return grey[..., 0]
+
+
+def _check_size(
+    path: Path, header: Header, image: tuple[int, int], camera: Size | None, name: object
+) -> None:
+    size = (header.width, header.height)
+    full = camera is not None and size == camera and size[0] >= image[0] and size[1] >= image[1]
+    if size != image and not full:
+        raise problem(
+            path, f"{size[0]}x{size[1]} px, but its image {name} has {image[0]}x{image[1]} px; "
+            "give the mask in the image's size",
+        )
+
+
+def cutting_out(
+    paths: Sequence[Path | None], cameras: Sequence[Size | None], names: Sequence[Path]
+) -> Finish | None:
+    """What makes masks the mattes of their images, the lesser of mask and alpha; None: no masks.
+
+    Args:
+        paths: N masks.
+        cameras: N sizes that the cameras are for, or None.
+        names: N images, for messages.
+
+    Raises:
+        DevrfError: some images have a mask and some have not; later, what :func:`read_mask` raises.
+    """
+    masks = [path for path in paths if path is not None]
+    if not masks:
+        return None
+    if len(masks) < len(paths):
+        raise problem(
+            names[list(paths).index(None)], "has no mask_path although others have; with "
+            "data.masks=matte give every image a mask",
+        )
+    log.info("masks of %d images are their mattes", len(masks))
+
+    def finish(index: int, image: Grey) -> Grey:
+        height, width = image.shape[:2]
+        mask = read_mask(masks[index], (width, height), cameras[index], names[index])
+        cut = image.copy()
+        cut[..., 3] = np.minimum(image[..., 3], mask)
+        return cut
+
+    return finish
+
+
+def counted_pixels(
+    paths: Sequence[Path | None],
+    image: tuple[int, int],
+    size: tuple[int, int],
+    cameras: Sequence[Size | None],
+    lenses: Sequence[Lens],
+    names: Sequence[Path],
+) -> Tensor | None:
+    """Which pixels count, after downscaling and undistortion; None: all of them.
+
+    A pixel counts if all that it is made of does.
+
+    Args:
+        paths: N masks; None for an image that counts as a whole.
+        image: (width, height) of the images' files.
+        size: (width, height) after downscaling.
+        cameras: N sizes that the cameras are for, or None.
+        lenses: N, in pixels of the smaller images, before undistortion.
+        names: N images, for messages.
+
+    Returns:
+        (N, H, W) bool.
+
+    Raises:
+        DevrfError: what :func:`read_mask` raises, a mask leaves nothing, or there is too little
+            memory.
+    """
+    masked = [k for k, path in enumerate(paths) if path is not None]
+    if not masked:
+        return None
+    check_memory(len(paths) * size[0] * size[1], names[0].parent, f"{len(masked)} masks")
+    kept = np.full((len(paths), size[1], size[0], 1), WHITE, dtype=np.uint8)
+
+    def fill(k: int) -> None:
+        path = paths[k]
+        assert path is not None
+        light = read_mask(path, image, cameras[k], names[k]) > HALF
+        sharp = light[..., None].astype(np.uint8) * np.uint8(WHITE)
+        kept[k] = sharp if size == image else shrink_pixels(sharp, *size)
+
+    with ThreadPoolExecutor(workers(*image)) as pool:
+        for _ in pool.map(fill, masked):
+            pass
+    pixels, _ = as_pinhole(torch.from_numpy(kept), lenses, names)
+    counted = pixels[..., 0] == WHITE
+    for k in masked:
+        if not bool(counted[k].any()):
+            raise problem(
+                paths[k], f"leaves nothing of {names[k]} to learn from; leave the image out, or "
+                "set data.masks=none",
+            )
+    share = 100 * float((~counted).float().mean())
+    log.info("masks of %d images leave out %.1f %% of the pixels of all", len(masked), share)
+    return counted

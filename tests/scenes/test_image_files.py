@@ -1,0 +1,127 @@
+"""EXIF orientation: images are turned only where their cameras ask for that."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import ExifTags, Image, ImageOps
+
+from devrf.artifacts.image_advice import image_advice
+from devrf.errors import DevrfError
+from devrf.geometry.cameras import Cameras
+from devrf.scenes.image_files import decode, image_size, read_header
+from devrf.scenes.images import load_images
+from devrf.scenes.nerfstudio import read_nerfstudio
+
+WIDE, HIGH = (24, 16), (16, 24)
+
+
+def photo(path: Path, orientation: int, size=WIDE, seed: int = 0) -> Path:
+    """A file that says how its image is to be seen."""
+    values = np.random.default_rng(seed).integers(0, 255, (4, 4, 3), dtype=np.uint8)
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(values).resize(size, Image.Resampling.BILINEAR).save(path, exif=exif)
+    return path
+
+
+def pixels(path: Path, camera) -> np.ndarray:
+    return decode(path, read_header(path, camera), "RGB")
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "webp"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_an_image_is_turned_where_only_so_it_fits_its_camera(tmp_path, orientation, suffix):
+    path = photo(tmp_path / f"a.{suffix}", orientation)
+    with Image.open(path) as image:
+        stored, seen = np.asarray(image), np.asarray(ImageOps.exif_transpose(image))
+    quarter = orientation >= 5
+    # The camera may be one of an image four times as large.
+    fits = (64.0, 96.0) if quarter else (96.0, 64.0)
+    assert np.array_equal(pixels(path, fits), seen if quarter else stored)
+    assert image_size(path, fits) == (HIGH if quarter else WIDE)
+    # Half turns and mirrors leave the shape: nobody can tell.
+    assert read_header(path, fits).doubtful == (orientation in (2, 3, 4))
+    # The camera is one of the image as it is stored.
+    assert np.array_equal(pixels(path, WIDE), stored)
+    assert read_header(path, WIDE).doubtful == (orientation in (2, 3, 4))
+    # No camera says anything, or all that it says fits neither.
+    for unknown in (None, (300, 100)):
+        assert np.array_equal(pixels(path, unknown), stored)
+        assert read_header(path, unknown).doubtful == (orientation != 1)
+
+
+def test_of_a_square_nobody_can_tell(tmp_path):
+    header = read_header(photo(tmp_path / "a.jpg", 6, (16, 16)), (16, 16))
+    assert (header.turn, header.doubtful) == (1, True)
+
+
+@pytest.mark.parametrize("orientation", [0, 9, 77])
+def test_an_orientation_that_is_none_is_as_it_is(tmp_path, orientation):
+    header = read_header(photo(tmp_path / "a.jpg", orientation), HIGH)
+    assert (header.turn, header.doubtful) == (1, False)
+
+
+def test_damaged_notes_do_not_spoil_a_picture(tmp_path):
+    path = photo(tmp_path / "a.jpg", 6)
+    data = path.read_bytes()
+    at = data.index(b"Exif\0\0") + 6
+    for length in (2, 4, 8, 12):
+        path.write_bytes(data[:at] + b"\xff" * length + data[at + length :])
+        assert image_size(path, HIGH) == WIDE
+
+
+def test_a_set_is_of_one_size_once_it_is_turned(tmp_path, caplog):
+    paths = [photo(tmp_path / "0.jpg", 1), photo(tmp_path / "1.jpg", 6, HIGH)]
+    with caplog.at_level(logging.INFO):
+        loaded = load_images(paths, 2, [WIDE, WIDE])
+    assert loaded.pixels.shape == (2, 8, 12, 3) and (loaded.width, loaded.height) == WIDE
+    assert not bool(loaded.doubtful.any())
+    assert "1 of them turned as their EXIF orientation says" in caplog.text
+    with pytest.raises(DevrfError, match="1.jpg: 16x24 px, but .*0.jpg of the same set has 24x16"):
+        load_images(paths, 1)
+
+
+def capture(folder: Path, orientation: int, **shared: float) -> None:
+    """A scene of nine photos from a ring, a time on each."""
+    frames = []
+    for k in range(9):
+        photo(folder / f"{k}.jpg", orientation, HIGH, k)
+        angle = torch.tensor(0.7 * k)
+        x, z = torch.sin(angle), torch.cos(angle)
+        pose = torch.eye(4)
+        pose[:3, :3] = torch.stack([torch.stack([z, z * 0, -x]), torch.eye(3)[1],
+                                    torch.stack([x, z * 0, z])], dim=1)
+        pose[:3, 3] = torch.stack([4 * x, z * 0, 4 * z])
+        frames.append({
+            "file_path": f"{k}.jpg", "transform_matrix": pose.tolist(), "time": k / 8,
+        })
+    content = {"fl_x": 20.0, "cx": 13.0, "cy": 8.0, **shared, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(content))
+
+
+def test_a_capture_follows_its_cameras(tmp_path):
+    capture(tmp_path, 6, w=24, h=16)
+    train = read_nerfstudio(tmp_path).dynamic.train
+    assert (train.width, train.height) == WIDE
+    with Image.open(tmp_path / train.names[0]) as image:
+        seen = np.asarray(ImageOps.exif_transpose(image))
+    assert np.array_equal(train.pixels[0].numpy(), seen)
+    assert isinstance(train.cameras, Cameras) and train.cameras.center[0].tolist() == [13.0, 8.0]
+
+
+def test_inspecting_names_the_files_of_which_nobody_can_tell(tmp_path):
+    capture(tmp_path, 6)
+    scene = read_nerfstudio(tmp_path)
+    assert (scene.dynamic.train.width, scene.dynamic.train.height) == HIGH
+    said = [str(advice) for advice in image_advice(scene) if "EXIF" in advice.what]
+    assert len(said) == 1
+    assert said[0].startswith("0.jpg, 1.jpg, 2.jpg and 6 more: its EXIF orientation says")
+    capture(tmp_path, 1)
+    assert not [a for a in image_advice(read_nerfstudio(tmp_path)) if "EXIF" in a.what]
