@@ -60,7 +60,7 @@ def test_the_rest_state_at_every_resolution(
     # One step to warm up, two of either kind, in both phases.
     assert fitted.global_step == 2 * 5 * 5 and fine.iterations == 5
     for timing in excerpts.timings:
-        assert (timing.stage, timing.phase, timing.frame) == ("canonical", "fine", None)
+        assert (timing.stage, timing.phase, timing.frames) == ("canonical", "fine", ())
         assert set(timing.parts) == {*get_args(Part), OVERHEAD} - {"warp"}
         assert 0 < timing.seconds.low <= timing.seconds.median <= timing.seconds.high
         parts = sum(spread.median for spread in timing.parts.values())
@@ -84,8 +84,8 @@ def test_a_moving_scene_at_every_level(
     excerpts = Excerpts([15, 4], 0, 1, learned.model)
     excerpt(stage, excerpts)
     box = rest.model.canonical.box
-    assert [(t.phase, t.frame, t.resolution) for t in excerpts.timings] == [
-        ("level 1", 1, box.grid_shape(6**3)), ("level 0", 1, box.grid_shape(4**3)),
+    assert [(t.phase, t.frames, t.resolution) for t in excerpts.timings] == [
+        ("level 1", (1,), box.grid_shape(6**3)), ("level 0", (1,), box.grid_shape(4**3)),
     ]
     assert set(excerpts.timings[0].parts) == {*get_args(Part), OVERHEAD}
     # A visit shorter than a step of ten iterations is measured as it is.

@@ -163,7 +163,7 @@ def test_a_frame_is_visited_again(
     with caplog.at_level(logging.WARNING, logger="devrf"):
         fit(stage, Spoil("nan", iteration), Health())
     entered, frame = next(
-        (p.start, p.frame) for p in [MOVING.phase(iteration, 3)]
+        (p.start, p.frames[0]) for p in [MOVING.phase(iteration, 3)]
     )
     assert f"(frame {frame}, " in caplog.text and f"back to iteration {entered}," in caplog.text
     assert (stage.iteration, stage.back_offs) == (30, 1) and finite(stage)
@@ -254,8 +254,8 @@ def test_a_frame_whose_loss_stands_out_is_told(
 ) -> None:
     usual = DeformationStage.loss
 
-    def dear(stage: DeformationStage, views: Any, pixels: Any) -> Any:
-        total, terms = usual(stage, views, pixels)
+    def dear(stage: DeformationStage, *others: Any) -> Any:
+        total, terms = usual(stage, *others)
         factor = 50.0 if stage.iteration >= 50 else 1.0
         return total * factor, {**terms, "render": terms["render"] * factor}
 

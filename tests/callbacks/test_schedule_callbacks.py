@@ -62,7 +62,7 @@ def test_deformation_rates_and_phases_are_the_schedules_at_every_step(
     trainer(watch, max_epochs=1).fit(stage, datamodule=datamodule)
     assert [step for step, _, _ in watch.steps] == list(range(15))
     # Three frames, shares of 3 and 2; frame 1 has two shares.
-    visits = [(phase.level, phase.frame) for _, phase, _ in watch.steps]
+    visits = [(phase.level, *phase.frames) for _, phase, _ in watch.steps]
     assert visits == [(0, 1)] * 6 + [(0, 2)] * 3 + [(1, 1)] * 4 + [(1, 2)] * 2
     scale = stage.field.box.longest if unit == "box" else 1.0
     for _, phase, rates in watch.steps:

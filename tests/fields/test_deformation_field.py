@@ -200,6 +200,6 @@ def test_a_frame_is_read_changed_and_written_back(field: DeformationField) -> No
 
 def test_what_is_on_its_way_from_the_host_is_not_copied(field: DeformationField) -> None:
     stream: Any = (number for number in ())  # like a stream, nothing that can be copied
-    field._coming = (1, (field.to_time[1], field.to_time[1]), stream)
-    assert copy.deepcopy(field)._coming is None
-    field._coming = None
+    field._coming = {1: ((field.to_time[1], field.to_time[1]), stream)}
+    assert copy.deepcopy(field)._coming == {}
+    field._coming = {}

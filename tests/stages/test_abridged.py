@@ -46,4 +46,4 @@ def test_the_whole_at_one_resolution_stays_at_one() -> None:
 def test_the_middle_frame_of_every_level(frames: int, frame: int) -> None:
     schedule = DeformationSchedule()
     visits = [schedule.phase(iteration, frames) for iteration in middle_visits(schedule, frames)]
-    assert [(visit.level, visit.frame) for visit in visits] == [(k, frame) for k in range(5)]
+    assert [(visit.level, visit.frames) for visit in visits] == [(k, (frame,)) for k in range(5)]

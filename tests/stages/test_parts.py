@@ -165,7 +165,7 @@ def test_before_the_first_iteration_nothing_is_logged(fit, room, tmp_path: Path)
 def test_other_errors_pass_through(fit, monkeypatch: pytest.MonkeyPatch) -> None:
     stage = canonical()
 
-    def broken(views: Any, pixels: Any) -> Any:
+    def broken(lane: Any, views: Any, pixels: Any) -> Any:
         raise RuntimeError("shapes cannot be multiplied")
 
     monkeypatch.setattr(stage, "loss", broken)

@@ -85,7 +85,7 @@ def test_deformation_forward_facing_is_the_papers() -> None:
 
 def test_frames_are_carried_at_the_coarsest_level_only() -> None:
     for phase in deformation_phases(DeformationSchedule(), 6):
-        assert phase.carries == (phase.level == 0 and phase.frame >= 2)
+        assert phase.carries == (phase.level == 0 and phase.frames[0] >= 2)
 
 
 def test_without_coarse_to_fine_every_share_goes_to_the_finest_grid() -> None:
@@ -93,7 +93,7 @@ def test_without_coarse_to_fine_every_share_goes_to_the_finest_grid() -> None:
     phases = deformation_phases(schedule, 50)
     assert schedule.total(50) == 25000 and schedule.growths(50) == []
     assert {(p.side, p.level, p.learning_rate_factor) for p in phases} == {(160, 0, 1.0)}
-    assert [p.frame for p in phases] == list(range(1, 50))
+    assert [p.frames for p in phases] == [(k,) for k in range(1, 50)]
 
 
 @given(
@@ -133,8 +133,8 @@ def test_deformation_phases_tile_every_schedule(
         assert {schedule.phase(k, frames) for k in range(phase.start, phase.stop)} == {phase}
     depth = len(levels) if coarse_to_fine else 1
     visits = [(level, frame) for level in range(depth) for frame in range(1, frames)]
-    assert [(p.level, p.frame) for p in phases] == visits
-    begun = [p.start for p in phases if p.frame == 1]
+    assert [(p.level, *p.frames) for p in phases] == visits
+    begun = [p.start for p in phases if p.frames == (1,)]
     assert begun == [0, *schedule.growths(frames)]
     assert schedule.phase(schedule.total(frames) + 3, frames) == phases[-1]
 
