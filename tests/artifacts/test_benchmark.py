@@ -93,6 +93,12 @@ def test_the_same_in_words_for_a_log_and_for_a_terminal(found: Benchmark) -> Non
         assert "something was not measured" in words
 
 
+def test_frames_that_were_visited_together_are_counted(found: Benchmark) -> None:
+    together = replace(found, training={"torch": [replace(FINE, frames=(3, 10))]})
+    assert "deformation, level 1, 2 frames" in plain(together)
+    assert as_data(together)["training"][0]["frames"] == [3, 10]
+
+
 def test_without_a_gpu_there_is_no_word_of_its_memory(found: Benchmark) -> None:
     alone = replace(found, training={"torch": [COARSE]})
     assert "GPU memory" in plain(found) and "GPU memory" not in plain(alone)

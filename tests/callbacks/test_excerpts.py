@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import get_args
 
 import pytest
@@ -91,6 +92,19 @@ def test_a_moving_scene_at_every_level(
     # A visit shorter than a step of ten iterations is measured as it is.
     assert [timing.iterations for timing in excerpts.timings] == [6, 8]
     assert torch.equal(learned.field.to_canonical, moved)
+
+
+def test_frames_that_are_visited_together(
+    rest: Stored, four_frames: SceneDataModule, trainer: Callable[..., Trainer]
+) -> None:
+    schedule = replace(MOTION, coarse_to_fine=False, frames_at_once=(1, 2))
+    stage, excerpts = DeformationStage(rest, schedule), Excerpts([0, 7], 0, 1, None)
+    fitted = trainer(max_epochs=1)
+    fitted.callbacks = [excerpts, LearningRateDecay()]  # type: ignore[attr-defined]
+    fitted.fit(stage, datamodule=four_frames)
+    assert [(t.frames, t.rays) for t in excerpts.timings] == [((2,), 128), ((1, 3), 256)]
+    for timing in excerpts.timings:
+        assert set(timing.parts) == {*get_args(Part), OVERHEAD}
 
 
 def test_a_search_starts_where_searches_start(

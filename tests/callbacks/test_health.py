@@ -169,6 +169,19 @@ def test_a_frame_is_visited_again(
     assert (stage.iteration, stage.back_offs) == (30, 1) and finite(stage)
 
 
+def test_frames_that_are_visited_together_are_visited_again_together(
+    fit, rest: Stored, caplog: pytest.LogCaptureFixture, four_frames: SceneDataModule
+) -> None:
+    schedule = DeformationSchedule(
+        sides=(4, 6), iterations_per_frame=(2, 5), rays=64, frames_at_once=(1, 2)
+    )
+    stage = DeformationStage(copy.deepcopy(rest), schedule, iterations_per_step=1)
+    with caplog.at_level(logging.WARNING, logger="devrf"):
+        fit(stage, Spoil("nan", 15), Health(), data=four_frames)
+    assert "of 18 (frames 1, 3, " in caplog.text and "back to iteration 13," in caplog.text
+    assert (stage.iteration, stage.back_offs) == (18, 1) and finite(stage)
+
+
 def test_a_deformation_that_goes_wrong_twice_ends(fit, rest: Stored) -> None:
     stage = DeformationStage(copy.deepcopy(rest), MOVING, iterations_per_step=1)
     with pytest.raises(DevrfError, match="deformation stage: .*frame 2.*motion.learning_rate"):

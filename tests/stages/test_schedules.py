@@ -126,9 +126,10 @@ def test_frames_of_two_stretches_are_visited_together() -> None:
     (5, 4, [(2, 4), (1, 3)]),             # two frames a stretch: three are enough
     (6, 4, [(2, 4), (1, 3, 5)]),
     (7, 3, [(3, 6), (1, 4), (2, 5)]),     # the last stretch is frame 6 alone
-    (4, 4, [(1, 2, 3)]),                  # each is a stretch
-    (4, 9, [(1, 2, 3)]),
-    (2, 2, [(1,)]),
+    (4, 4, [(2,), (1, 3)]),               # never neighbours
+    (4, 9, [(2,), (1, 3)]),
+    (3, 2, [(2,), (1,)]),
+    (2, 2, [(1,)]),                       # one stretch, in which frame 0 idles
     (2, 1, [(1,)]),
 ])
 def test_stretches_of_all_kinds(
@@ -140,7 +141,7 @@ def test_stretches_of_all_kinds(
     found = [visit for visit in course(schedule, frames) if visit[0] == 1]
     assert [visited for _, visited, _, _ in found] == visits
     assert schedule.beside(1, frames) == max(len(visit) for visit in visits)
-    assert schedule.total(frames) - frames == 3 * -(-frames // at_once)
+    assert schedule.total(frames) - frames == 3 * max(2, -(-frames // at_once))
 
 
 def test_one_at_once_is_one_after_another() -> None:
@@ -209,6 +210,7 @@ def test_deformation_phases_tile_every_schedule(
     visits = [(level, frame) for level in range(depth) for frame in range(1, frames)]
     visited = [(p.level, frame) for p in phases for frame in p.frames]
     assert sorted(visited) == visits  # each exactly once
+    assert not any(frame + 1 in p.frames for p in phases for frame in p.frames)
     assert together or visited == visits
     begun = [[p.start for p in phases if p.level == level][0] for level in range(depth)]
     assert begun == [0, *schedule.growths(frames)]

@@ -220,6 +220,30 @@ def test_a_replay_is_the_same_work_on_the_same_memory_and_learns_the_same(
             assert off.mean() <= 0.02 * value.abs().mean() + 1e-6, name
 
 
+def test_one_graph_is_of_all_frames_that_are_visited_together(
+    rest: Stored, trainer: Callable[..., Trainer], four_frames: SceneDataModule
+) -> None:
+    def build() -> ScheduledStage:
+        stage = moving(rest)
+        # Frame 2 in three iterations, which are left out, then frames 1 and 3.
+        stage.schedule = DeformationSchedule(
+            sides=(3,), iterations_per_frame=(3,), rays=5, coarse_to_fine=False,
+            frames_at_once=(2,),
+        )
+        stage.iteration = 3
+        return stage
+
+    capturer = StandIn()
+    stage = learn(build, trainer, four_frames, "triton", capturer)
+    # Captured in the second iteration, and the same in the third.
+    (graph,) = capturer.graphs
+    assert graph.first is not None and stage.iteration == 6
+    assert stage.model.deformation is not None
+    assert [bool(frame.any()) for frame in stage.model.deformation.to_canonical] == [
+        False, True, False, True,
+    ]
+
+
 @pytest.mark.parametrize("work", [
     lambda x: x[x > 0.5], lambda x: x.nonzero(), lambda x: float(x.sum()), lambda x: bool(x.any()),
     lambda x: x.new_tensor([1.0]), lambda x: torch.arange(2).repeat_interleave(x.long()),

@@ -138,13 +138,14 @@ class DeformationSchedule:
     iterations for each of T frames; frame 0 is the identity and needs none, so frame 1 takes
     its share beside its own: the level's length is share · T.
 
-    Where K frames may be learned at once the T frames are cut into K contiguous stretches of
-    L = ⌈T / K⌉ (the last may be shorter; where T is small there may be fewer). The j-th visit of
-    the level, 0 ≤ j < L, is to the j-th frame of each: frames j, j + L, j + 2L, … An iteration is
-    one optimiser step on all of them, each with a batch of its own, so the level's length is
-    share · L. But for the first of a stretch, the frame before has been learned at this level by
-    then; the first of a stretch knows what the level before has made of its neighbour. Frame 0
-    is left out. Only for K = 1 that leaves a visit empty, whose share frame 1 has as said.
+    Where K frames may be learned at once the T frames are cut into contiguous stretches of
+    L = ⌈T / K⌉, but of two at least: neighbours are never learned at once. (The last stretch may be
+    shorter, and there may be fewer than K.) The j-th visit of the level, 0 ≤ j < L, is to the j-th
+    frame of each: frames j, j + L, j + 2L, … An iteration is one optimiser step on all of them,
+    each with a batch of its own, so the level's length is share · L. But for the first of a
+    stretch, the frame before has been learned at this level by then; the first of a stretch knows
+    what the level before has made of its neighbour. Frame 0 is left out. Where that leaves the
+    first visit empty, for there is one stretch, frame 1 has its share as said.
 
     Attributes:
         sides: sides of the motion grids, coarse to fine.
@@ -204,7 +205,7 @@ class DeformationSchedule:
         Also how many frames lie between two that are visited together.
         """
         at_once = 1 if self.frames_at_once is None else self.frames_at_once[level]
-        return -(-frames // at_once)
+        return max(2, -(-frames // at_once))
 
     def beside(self, level: int, frames: int) -> int:
         """The most of T = ``frames`` frames that are visited together at a level."""
