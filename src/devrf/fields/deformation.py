@@ -165,8 +165,8 @@ class DeformationField(nn.Module):
         """Begin to fetch frames from the host, beside other work: they are read next."""
         if not (self.on_host and self.here.is_cuda):
             return
-        device = self.here.device
-        side, self._coming = torch.cuda.Stream(device), {}  # type: ignore[no-untyped-call]
+        device, self._coming = self.here.device, {}
+        side = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
         # What was written to the frames has to be there first.
         side.wait_stream(torch.cuda.current_stream(device))
         with torch.cuda.stream(side):

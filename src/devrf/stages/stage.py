@@ -34,12 +34,11 @@ from devrf.shortage import ShortageError
 from devrf.stages.checkpoint import Passport, check_scene, passport_in
 from devrf.stages.compact_state import compact_state
 from devrf.stages.held_out import score
-from devrf.stages.lane import Lane
+from devrf.stages.lane import Lane, Sums
 from devrf.stages.parts import Parts
 from devrf.stages.progress import random_states, set_random_states
 from devrf.stages.ranks import (
     RaysByRank,
-    average,
     average_gradients,
     check_alike,
     rank,
@@ -108,8 +107,7 @@ class ScheduledStage(LightningModule, ABC):
         self.record: dict[str, float | None] = {}
         self.generator = torch.Generator()
         self._rays = 0
-        self._names: tuple[str, ...] = ()
-        self._sums: Tensor | None = None  # (lanes, names)
+        self._sums = Sums()
         self._side_by_side = SideBySide()
         self._repeated: Repeated | None = None
         self._seed = 0
@@ -213,7 +211,7 @@ class ScheduledStage(LightningModule, ABC):
 
     def let_go(self) -> None:
         """Let go of what only iterations need: a captured one holds memory of its own."""
-        self.lanes, self._sums, self._repeated = [], None, None
+        self.lanes, self._sums, self._repeated = [], Sums(), None
 
     @property
     def rooms(self) -> list[Room]:
@@ -346,11 +344,8 @@ class ScheduledStage(LightningModule, ABC):
         if not done:
             self._draw_anew()
             return {}
-        assert self._sums is not None
-        of_lanes = average(self._sums) / done
-        self._sums.zero_()
-        means = dict(zip(self._names, of_lanes.mean(dim=0).unbind(), strict=True))
-        if self.iteration < stop and self.settled(of_lanes[:, self._names.index("loss")]):
+        means, losses = self._sums.take(done)
+        if self.iteration < stop and self.settled(losses):
             self.skipped += stop - self.iteration
             self.iteration = stop
         self._draw_anew()
@@ -375,13 +370,7 @@ class ScheduledStage(LightningModule, ABC):
         found = self._side_by_side(pieces, self.device)
         groups = self.optimizer.param_groups
         average_gradients(p for group in groups for p in group["params"])
-        self._names = tuple(found[0])
-        values = torch.stack([value for terms in found for value in terms.values()])
-        values = values.view(len(found), len(self._names))
-        if self._sums is None:
-            self._sums = values
-        else:
-            self._sums += values
+        self._sums.add(found)
 
     def _learn_from(self, lane: Lane, views: Views) -> dict[str, Tensor]:
         """The gradients of a lane's batch, its loss and its terms."""
