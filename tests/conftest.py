@@ -7,6 +7,7 @@ import logging
 import os
 import warnings
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 # Before torch, which loads Triton: Triton decides then whether its interpreter runs kernels.
@@ -99,6 +100,18 @@ class GivenScene(SceneDataModule):
 def datamodule(tiny_scene: Scene) -> SceneDataModule:
     """Serves the tiny scene."""
     return GivenScene(tiny_scene)
+
+
+@pytest.fixture(scope="session")
+def four_frame_scene(tiny_recipe: ProceduralScene) -> Scene:
+    """The tiny scene in 4 frames, of which the first and the last that move are no neighbours."""
+    return replace(tiny_recipe, frames=4)()
+
+
+@pytest.fixture
+def four_frames(four_frame_scene: Scene) -> SceneDataModule:
+    """Serves the tiny scene in 4 frames."""
+    return GivenScene(four_frame_scene)
 
 
 def quiet_trainer(*callbacks: Callback, **options: Any) -> Trainer:

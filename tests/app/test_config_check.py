@@ -34,6 +34,7 @@ def config(**changes: object):
     base = {
         "stage": "pipeline", "seed": 0, "resume": True, "memory_check": True, "ckpt": None,
         "scene": "robot", "objective": "deformation.psnr", "kernels": "auto", "graphs": "auto",
+        "decoder_precision": "auto",
         "sizes": {"inner": {"_target_": f"{here}Inner", "size": 2}},
         "loss": {"fine": {"color": 1.0}},
         "outer": {

@@ -36,6 +36,15 @@ MISTAKES = {
         ["schedule.canonical.doublings=[5,3]"], "schedule.canonical.doublings",
     ),
     "levels that do not match": (["schedule.deformation.sides=[4]"], "schedule.deformation.sides"),
+    "words for frames at once": (
+        ["schedule.deformation.frames_at_once=[1,many]"],
+        "schedule.deformation.frames_at_once: expected a list of which each is a whole number or "
+        "null, not",
+    ),
+    "frames at once where they start from one another": (
+        ["schedule.deformation.frames_at_once=[2,2]"],
+        "schedule.deformation.frames_at_once: expected 1 at the first level",
+    ),
     "unknown loss term": (["+loss.deformation.foo=1"], "unknown term 'foo'"),
     "word for a weight": (["loss.fine.color=high"], "loss.fine.color: expected a number"),
     "unknown trainer setting": (["+trainer.max_step=3"], "did you mean trainer.max_steps?"),

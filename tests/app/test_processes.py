@@ -23,6 +23,7 @@ MEANINGFUL = (
     "schedule.canonical.search_side=24", "schedule.canonical.doublings=[20]",
     "schedule.canonical.rays=512", "schedule.deformation.sides=[6,12]",
     "schedule.deformation.iterations_per_frame=[8,8]", "schedule.deformation.rays=512",
+    "schedule.deformation.frames_at_once=[1,2]",
     "video.frames=1", "evaluation.metrics=[]",
 )
 # Callbacks for both processes, in a module that both can import.

@@ -19,14 +19,14 @@ def steady(value: float) -> Spread:
 
 
 COARSE = Timing(
-    stage="canonical", phase="search", resolution=(9, 8, 7), frame=None, rays=64, iterations=10,
+    stage="canonical", phase="search", resolution=(9, 8, 7), frames=(), rays=64, iterations=10,
     seconds=steady(0.02), measured_seconds=steady(0.03),
     parts={"sampling": steady(0.01), "overhead": steady(0.02)},
     counts={"tested": 1000.0, "opaque": 500.0, "reached": 400.0, "heavy": 123.4},
     work=Work(bytes=4e6, operations=2e6), allocated=None, reserved=None,
 )
 FINE = replace(
-    COARSE, stage="deformation", phase="level 1", frame=3, parts={"warp": steady(0.005)},
+    COARSE, stage="deformation", phase="level 1", frames=(3,), parts={"warp": steady(0.005)},
     counts={"heavy": 5.0}, work=None, allocated=2**30, reserved=3 * 2**29,
 )
 QUICK = replace(COARSE, seconds=steady(0.004))
@@ -60,7 +60,7 @@ def test_the_data_have_units_in_their_names(found: Benchmark) -> None:
         "mb": 4.0, "gflop": 0.002, "ms": 5.0, "share": 0.25, "achieved_gb_per_s": 0.2,
     }
     last = data["training"][-1]
-    assert last["floor"] is None and last["frame"] == 3
+    assert last["floor"] is None and last["frames"] == [3]
     assert (last["allocated_gb"], last["reserved_gb"]) == (1.0, 1.5)
     assert data["rendering"][1] == {
         "kernels": "triton", "width": 40, "height": 30, "views": 5,
@@ -91,6 +91,12 @@ def test_the_same_in_words_for_a_log_and_for_a_terminal(found: Benchmark) -> Non
                                "GB"]
         assert ["triton", "40", "x", "30", "10", "20", "3e-06"] in rows
         assert "something was not measured" in words
+
+
+def test_frames_that_were_visited_together_are_counted(found: Benchmark) -> None:
+    together = replace(found, training={"torch": [replace(FINE, frames=(3, 10))]})
+    assert "deformation, level 1, 2 frames" in plain(together)
+    assert as_data(together)["training"][0]["frames"] == [3, 10]
 
 
 def test_without_a_gpu_there_is_no_word_of_its_memory(found: Benchmark) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import get_args
 
 import pytest
@@ -60,7 +61,7 @@ def test_the_rest_state_at_every_resolution(
     # One step to warm up, two of either kind, in both phases.
     assert fitted.global_step == 2 * 5 * 5 and fine.iterations == 5
     for timing in excerpts.timings:
-        assert (timing.stage, timing.phase, timing.frame) == ("canonical", "fine", None)
+        assert (timing.stage, timing.phase, timing.frames) == ("canonical", "fine", ())
         assert set(timing.parts) == {*get_args(Part), OVERHEAD} - {"warp"}
         assert 0 < timing.seconds.low <= timing.seconds.median <= timing.seconds.high
         parts = sum(spread.median for spread in timing.parts.values())
@@ -84,13 +85,26 @@ def test_a_moving_scene_at_every_level(
     excerpts = Excerpts([15, 4], 0, 1, learned.model)
     excerpt(stage, excerpts)
     box = rest.model.canonical.box
-    assert [(t.phase, t.frame, t.resolution) for t in excerpts.timings] == [
-        ("level 1", 1, box.grid_shape(6**3)), ("level 0", 1, box.grid_shape(4**3)),
+    assert [(t.phase, t.frames, t.resolution) for t in excerpts.timings] == [
+        ("level 1", (1,), box.grid_shape(6**3)), ("level 0", (1,), box.grid_shape(4**3)),
     ]
     assert set(excerpts.timings[0].parts) == {*get_args(Part), OVERHEAD}
     # A visit shorter than a step of ten iterations is measured as it is.
     assert [timing.iterations for timing in excerpts.timings] == [6, 8]
     assert torch.equal(learned.field.to_canonical, moved)
+
+
+def test_frames_that_are_visited_together(
+    rest: Stored, four_frames: SceneDataModule, trainer: Callable[..., Trainer]
+) -> None:
+    schedule = replace(MOTION, coarse_to_fine=False, frames_at_once=(1, 2))
+    stage, excerpts = DeformationStage(rest, schedule), Excerpts([0, 7], 0, 1, None)
+    fitted = trainer(max_epochs=1)
+    fitted.callbacks = [excerpts, LearningRateDecay()]  # type: ignore[attr-defined]
+    fitted.fit(stage, datamodule=four_frames)
+    assert [(t.frames, t.rays) for t in excerpts.timings] == [((2,), 128), ((1, 3), 256)]
+    for timing in excerpts.timings:
+        assert set(timing.parts) == {*get_args(Part), OVERHEAD}
 
 
 def test_a_search_starts_where_searches_start(

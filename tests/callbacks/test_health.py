@@ -163,10 +163,23 @@ def test_a_frame_is_visited_again(
     with caplog.at_level(logging.WARNING, logger="devrf"):
         fit(stage, Spoil("nan", iteration), Health())
     entered, frame = next(
-        (p.start, p.frame) for p in [MOVING.phase(iteration, 3)]
+        (p.start, p.frames[0]) for p in [MOVING.phase(iteration, 3)]
     )
     assert f"(frame {frame}, " in caplog.text and f"back to iteration {entered}," in caplog.text
     assert (stage.iteration, stage.back_offs) == (30, 1) and finite(stage)
+
+
+def test_frames_that_are_visited_together_are_visited_again_together(
+    fit, rest: Stored, caplog: pytest.LogCaptureFixture, four_frames: SceneDataModule
+) -> None:
+    schedule = DeformationSchedule(
+        sides=(4, 6), iterations_per_frame=(2, 5), rays=64, frames_at_once=(1, 2)
+    )
+    stage = DeformationStage(copy.deepcopy(rest), schedule, iterations_per_step=1)
+    with caplog.at_level(logging.WARNING, logger="devrf"):
+        fit(stage, Spoil("nan", 15), Health(), data=four_frames)
+    assert "of 18 (frames 1, 3, " in caplog.text and "back to iteration 13," in caplog.text
+    assert (stage.iteration, stage.back_offs) == (18, 1) and finite(stage)
 
 
 def test_a_deformation_that_goes_wrong_twice_ends(fit, rest: Stored) -> None:
@@ -254,8 +267,8 @@ def test_a_frame_whose_loss_stands_out_is_told(
 ) -> None:
     usual = DeformationStage.loss
 
-    def dear(stage: DeformationStage, views: Any, pixels: Any) -> Any:
-        total, terms = usual(stage, views, pixels)
+    def dear(stage: DeformationStage, *others: Any) -> Any:
+        total, terms = usual(stage, *others)
         factor = 50.0 if stage.iteration >= 50 else 1.0
         return total * factor, {**terms, "render": terms["render"] * factor}
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
 from lightning import Callback, Trainer
 from torch.optim import Optimizer
 
-from devrf.callbacks import GridUpscaling, LearningRateDecay, Progress, TrainingRecord
+from devrf.callbacks import GridUpscaling, LearningRateDecay, Meter, Progress, TrainingRecord
 from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
 from devrf.fields.architecture import Architecture
@@ -62,7 +63,7 @@ def test_deformation_rates_and_phases_are_the_schedules_at_every_step(
     trainer(watch, max_epochs=1).fit(stage, datamodule=datamodule)
     assert [step for step, _, _ in watch.steps] == list(range(15))
     # Three frames, shares of 3 and 2; frame 1 has two shares.
-    visits = [(phase.level, phase.frame) for _, phase, _ in watch.steps]
+    visits = [(phase.level, *phase.frames) for _, phase, _ in watch.steps]
     assert visits == [(0, 1)] * 6 + [(0, 2)] * 3 + [(1, 1)] * 4 + [(1, 2)] * 2
     scale = stage.field.box.longest if unit == "box" else 1.0
     for _, phase, rates in watch.steps:
@@ -109,6 +110,20 @@ def test_progress_writes_lines_where_there_is_no_terminal(
     shape = "x".join(str(n) for n in stage.resolution)
     assert "dB" in lines[-1] and "it/s" in lines[-1]
     assert lines[-1].endswith(f"{shape}  frame 2")
+
+
+def test_progress_and_curves_name_the_frames_of_a_visit(
+    rest: Stored, four_frames: SceneDataModule, trainer: Callable[..., Trainer],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    schedule = replace(DEFORMATION, coarse_to_fine=False, frames_at_once=(1, 2))
+    stage = DeformationStage(rest, schedule, iterations_per_step=100)
+    with caplog.at_level(logging.INFO, logger="devrf"):
+        fit = trainer(Progress(line_every_seconds=0.0), Meter(), max_epochs=1)
+        fit.fit(stage, datamodule=four_frames)
+    lines = [line for line in caplog.messages if line.startswith("dynamic ")]
+    assert [line.split("  ")[-1] for line in lines] == ["frame 2", "frames 1, 3"]
+    assert fit.callback_metrics["dynamic/frame"] == 1
 
 
 def test_phases_are_entered_once(

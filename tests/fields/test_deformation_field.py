@@ -198,8 +198,19 @@ def test_a_frame_is_read_changed_and_written_back(field: DeformationField) -> No
         field.write(0, pair)
 
 
+def test_what_is_on_its_way_counts_no_more_once_it_has_been_written(
+    field: DeformationField,
+) -> None:
+    pair, stream = (field.to_canonical[1], field.to_time[1]), object()
+    field._coming = {1: (pair, stream), 2: (pair, stream)}  # type: ignore[dict-item]
+    field.write(1, pair)
+    assert list(field._coming) == [2]
+    field.resize(4**3)
+    assert field._coming == {}
+
+
 def test_what_is_on_its_way_from_the_host_is_not_copied(field: DeformationField) -> None:
     stream: Any = (number for number in ())  # like a stream, nothing that can be copied
-    field._coming = (1, (field.to_time[1], field.to_time[1]), stream)
-    assert copy.deepcopy(field)._coming is None
-    field._coming = None
+    field._coming = {1: ((field.to_time[1], field.to_time[1]), stream)}
+    assert copy.deepcopy(field)._coming == {}
+    field._coming = {}

@@ -169,6 +169,8 @@ def test_kept_gradients_stay_where_they_are_and_are_zero_after_a_step() -> None:
     optimizer.step()
     assert leaves[0][0, 0, 0, 0].item() == pytest.approx(1 - 1e-3)
     (leaves[0].sum() + leaves[1].sum()).backward()
+    optimizer.drop_gradients(leaves[1:])
+    assert places[0].all() and leaves[1].grad is places[1] and not places[1].any()
     optimizer.zero_grad()
     for leaf, place in zip(leaves, places, strict=True):
         assert leaf.grad is place and not place.any()

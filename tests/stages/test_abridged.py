@@ -46,4 +46,13 @@ def test_the_whole_at_one_resolution_stays_at_one() -> None:
 def test_the_middle_frame_of_every_level(frames: int, frame: int) -> None:
     schedule = DeformationSchedule()
     visits = [schedule.phase(iteration, frames) for iteration in middle_visits(schedule, frames)]
-    assert [(visit.level, visit.frame) for visit in visits] == [(k, frame) for k in range(5)]
+    assert [(visit.level, visit.frames) for visit in visits] == [(k, (frame,)) for k in range(5)]
+
+
+def test_the_middle_visit_of_frames_that_are_visited_together() -> None:
+    schedule = DeformationSchedule(
+        sides=(4, 6, 8), iterations_per_frame=(3, 2, 4), frames_at_once=(1, 2, 9)
+    )
+    visits = [schedule.phase(iteration, 7) for iteration in middle_visits(schedule, 7)]
+    assert [visit.frames for visit in visits] == [(3,), (2, 6), (1, 3, 5)]
+    assert shorter_deformation(schedule, 0.5).frames_at_once == (1, 2, 9)

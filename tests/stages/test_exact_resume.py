@@ -39,6 +39,10 @@ MOVING = DeformationSchedule(sides=(4, 6), iterations_per_frame=(6, 4), rays=64)
 ALONG_FLOW = MotionSettings(
     learning_rate=2e-3, unit="box", views="all", pixels="useful", occupancy_every=3, start="flow"
 )
+# Four frames. Level 0 in 0–15; level 1: frame 2 in 16–21, frames 1 and 3 in 22–27.
+TOGETHER = DeformationSchedule(
+    sides=(4, 6), iterations_per_frame=(4, 6), rays=64, frames_at_once=(1, 2)
+)
 BY_TURNS = MotionSettings(occupancy_every=3)
 # The field would not keep exactly what a visit has learned.
 ROUNDED = MotionSettings(occupancy_every=3, store="host", store_half=True)
@@ -103,14 +107,16 @@ def learn(
 ) -> Callable[..., dict[str, Any]]:
     """Learn, leaving after each of some iterations and going on with a new stage each time."""
 
-    def run(build: Callable[[], ScheduledStage], *leaves: int) -> dict[str, Any]:
+    def run(
+        build: Callable[[], ScheduledStage], *leaves: int, data: SceneDataModule = datamodule
+    ) -> dict[str, Any]:
         begin_at(3)
         left: str | None = None
         for at in [*leaves, None]:
             stage, path = build(), tmp_path / f"{at}.ckpt"
             fit = trainer(*([] if at is None else [Leave(path, at)]), max_epochs=1)
             fit.strategy.checkpoint_io = SealedFiles()
-            fit.fit(stage, datamodule=datamodule, ckpt_path=left)
+            fit.fit(stage, datamodule=data, ckpt_path=left)
             if at is not None:
                 assert stage.iteration == at
                 # Another process would draw other numbers if it were not told where to go on.
@@ -137,6 +143,24 @@ def test_the_deformation_stage_goes_on_exactly(learn, rest: Stored, motion: Moti
     # Mid-frame, around a look at the occupancy, around a frame's end, around a level's, at last.
     leaves = (1, 2, 3, 4, 11, 12, 13, 17, 18, 19, 26, 29)
     assert_same(learn(build, *leaves), learn(build))
+
+
+@pytest.mark.parametrize(("motion", "leaves"), [
+    # Around each visit of level 1, and mid-visit.
+    (ALONG_FLOW, (15, 16, 17, 21, 22, 23, 24, 26, 27)),
+    # A visit ends after three steps, as their losses tell.
+    (replace(ROUNDED, least_gain=1.0), (14, 16, 17, 18, 22, 23, 24)),
+], ids=["all views", "in half precision"])
+def test_frames_that_are_visited_together_go_on_exactly(
+    learn, rest: Stored, motion: MotionSettings, leaves: tuple[int, ...],
+    four_frames: SceneDataModule,
+) -> None:
+    def build() -> ScheduledStage:
+        return DeformationStage(copy.deepcopy(rest), TOGETHER, motion, iterations_per_step=1)
+
+    whole = learn(build, data=four_frames)
+    assert_same(learn(build, *leaves, data=four_frames), whole)
+    assert len(whole["optimizer"]["param_groups"][0]["params"]) == 4
 
 
 def test_a_step_of_many_iterations_goes_on_exactly(learn, rest: Stored) -> None:

@@ -48,6 +48,19 @@ def test_the_deformation_stage(
     assert least_work(stage, COUNTS) == Work(expected, 2 * (BY_SAMPLE * 100 + BY_RAY * 64))
 
 
+def test_frames_that_are_visited_together_are_stepped_on_together(
+    rest: Stored, four_frames: SceneDataModule, trainer: Callable[..., Trainer]
+) -> None:
+    schedule = DeformationSchedule(
+        sides=(6,), iterations_per_frame=(1,), rays=64, coarse_to_fine=False, frames_at_once=(2,)
+    )
+    stage = DeformationStage(rest, schedule, loss={"render": 1.0})
+    trainer(max_steps=2).fit(stage, datamodule=four_frames)
+    x, y, z = stage.resolution
+    expected = 1000 * (32 + 96) + 300 * 2 * 96 + 100 * 4 * 32 + 2 * 2 * 3 * x * y * z * 28
+    assert least_work(stage, COUNTS) == Work(expected, 2 * (BY_SAMPLE * 100 + BY_RAY * 2 * 64))
+
+
 @pytest.mark.parametrize("searching", [True, False])
 def test_the_canonical_stage(
     datamodule: SceneDataModule, trainer: Callable[..., Trainer], searching: bool

@@ -98,6 +98,45 @@ def test_a_copy_to_go_back_to_counts(cubic: Scene) -> None:
     assert budget.deformation.held["a copy of one frame to go back to"] == slices
 
 
+@pytest.fixture
+def four_cubic(four_frame_scene: Scene, cube: Box) -> Scene:
+    """The same in four frames."""
+    bounds = replace(four_frame_scene.bounds, box=cube, motion=None)
+    return replace(four_frame_scene, bounds=bounds)
+
+
+def test_frames_that_are_learned_together_count_each(four_cubic: Scene) -> None:
+    alone = estimate(four_cubic, CANONICAL, DEFORMATION, SMALL)
+    both = estimate(four_cubic, CANONICAL, replace(DEFORMATION, frames_at_once=(1, 2)), SMALL)
+    one, two = alone.deformation, both.deformation
+    for part in ("{}", "gradients of {}", "Adam moments of {}", "a copy of {} to go back to"):
+        name = part.format("2 frames side by side")
+        assert two.held[name] == 2 * one.held[part.format("one frame")]
+    assert two.held["pixels to draw from"] == 2 * one.held["pixels to draw from"]
+    assert two.held["occupancy"] - one.held["occupancy"] == 10**3
+    assert two.passing[BATCH] == 2 * one.passing[BATCH]
+    # The place beside each of both, and what each needs in its turn.
+    slices = one.held["gradients of one frame"]
+    assert two.passing["an optimiser step"] == 3 * slices
+    moments = both.files["deformation"].progress - alone.files["deformation"].progress
+    assert moments == 2 * slices
+
+
+def test_the_level_that_needs_most_counts(four_cubic: Scene) -> None:
+    # Both frames on nearly as many voxels, or one on all.
+    schedule = DeformationSchedule(
+        sides=(4, 22, 24), iterations_per_frame=(1, 1, 1), rays=64, frames_at_once=(1, 2, 1)
+    )
+    held = estimate(four_cubic, CANONICAL, schedule, SMALL).deformation.held
+    assert held["gradients of 2 frames side by side"] == 2 * 2 * 22**3 * 12
+    assert held["displacements of 4 frames, both ways"] == 2 * 4 * 22**3 * 12
+
+
+def test_a_cpu_has_one_batch_at_a_time() -> None:
+    together = StageMemory({"a": 100}, {BATCH: 800, "b": 200}, batches=4)
+    assert (together.peak, together.least, together.on_host) == (900, 300, 390)
+
+
 def test_in_hard_times_a_batch_is_taken_in_eight_parts() -> None:
     assert StageMemory({"a": 3}, {BATCH: 80, "b": 4}).least == 13
     assert StageMemory({"a": 3}, {BATCH: 80, "b": 40}).least == 43

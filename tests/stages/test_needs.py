@@ -54,6 +54,13 @@ def test_a_disk_needs_what_is_there_at_once() -> None:
     assert disk_need(BUDGET, BOTH, None, kept=2, films=9000).needed == 400 + 1400 + 9000
 
 
+def test_frames_side_by_side_may_be_fewer() -> None:
+    parts = {"gradients of 4 frames side by side": 9, "displacements of 50 frames, both ways": 5}
+    assert keys_of(parts, ("deformation",)) == [
+        "schedule.deformation.frames_at_once", "schedule.deformation.sides", "data.frames",
+    ]
+
+
 def test_keys_of_the_largest_part_come_first() -> None:
     parts = {"images": 10, "density and features": 30, "a batch": 20}
     assert keys_of(parts, ("canonical",)) == [

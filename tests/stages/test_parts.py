@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,8 @@ SCHEDULE = CanonicalSchedule(
     decay_iterations=100, rays=64,
 )
 MOVING = DeformationSchedule(sides=(4,), iterations_per_frame=(4,), rays=64)
+# Of four frames number 2 in iterations 0 to 3, then 1 and 3.
+TOGETHER = replace(MOVING, coarse_to_fine=False, frames_at_once=(2,))
 # Without the terms that are means over what rays have met.
 BY_RAY = {"render": 1.0, "per_sample_color": 0.1, "entropy": 0.01}
 
@@ -64,7 +67,7 @@ def fit(
         torch.manual_seed(2)
         made = trainer(*callbacks, max_epochs=1, log_every_n_steps=1000)
         made.strategy.checkpoint_io = SealedFiles()
-        made.fit(stage, datamodule=datamodule, **how)
+        made.fit(stage, datamodule=how.pop("data", datamodule), **how)
         return stage
 
     return learn
@@ -74,8 +77,8 @@ def canonical() -> CanonicalStage:
     return CanonicalStage(SCHEDULE, SMALL, iterations_per_step=4)
 
 
-def moving(rest: Stored) -> DeformationStage:
-    return DeformationStage(copy.deepcopy(rest), MOVING, loss=BY_RAY)
+def moving(rest: Stored, schedule: DeformationSchedule = MOVING) -> DeformationStage:
+    return DeformationStage(copy.deepcopy(rest), schedule, loss=BY_RAY)
 
 
 def assert_alike(one: ScheduledStage, other: ScheduledStage) -> None:
@@ -108,6 +111,32 @@ def test_the_deformation_stage_learns_the_same_in_parts(fit, room, rest: Stored)
     divided = fit(moving(rest))
     assert divided.parts.count == 4
     assert_alike(divided, whole)
+
+
+def test_a_frame_that_runs_short_takes_nothing_from_the_one_beside_it(
+    fit, room, rest: Stored, four_frames: SceneDataModule
+) -> None:
+    whole = fit(moving(rest, TOGETHER), data=four_frames)
+    # Four iterations of one frame, one of two; then the second of them runs short.
+    calls = room(32, from_call=4 + 2 + 1)
+    divided = fit(moving(rest, TOGETHER), data=four_frames)
+    assert divided.parts.count == 2 and calls == [64] * 8 + [32] * 2 + [32] * 2 * 2 * 2
+    assert_alike(divided, whole)
+
+
+def test_a_frame_that_never_has_room_ends_the_stage(
+    fit, room, rest: Stored, four_frames: SceneDataModule
+) -> None:
+    room(4, from_call=4 + 2 + 1)
+    stage = moving(rest, TOGETHER)
+    with pytest.raises(DevrfError, match=r"at iteration 5 of 8 \(frames 1, 3, ") as caught:
+        fit(stage, data=four_frames)
+    assert "schedule.deformation.rays or schedule.deformation.frames_at_once, or" in str(
+        caught.value
+    )
+    # What the first frame's batch would have taught is gone with the other's.
+    gradients = [p.grad for group in stage.optimizer.param_groups for p in group["params"]]
+    assert gradients == [None] * 4 and stage.iteration == 5
 
 
 def test_memory_that_runs_out_at_the_backward_pass_does_no_harm(
@@ -165,7 +194,7 @@ def test_before_the_first_iteration_nothing_is_logged(fit, room, tmp_path: Path)
 def test_other_errors_pass_through(fit, monkeypatch: pytest.MonkeyPatch) -> None:
     stage = canonical()
 
-    def broken(views: Any, pixels: Any) -> Any:
+    def broken(lane: Any, views: Any, pixels: Any) -> Any:
         raise RuntimeError("shapes cannot be multiplied")
 
     monkeypatch.setattr(stage, "loss", broken)

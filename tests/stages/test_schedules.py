@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -85,7 +86,7 @@ def test_deformation_forward_facing_is_the_papers() -> None:
 
 def test_frames_are_carried_at_the_coarsest_level_only() -> None:
     for phase in deformation_phases(DeformationSchedule(), 6):
-        assert phase.carries == (phase.level == 0 and phase.frame >= 2)
+        assert phase.carries == (phase.level == 0 and phase.frames[0] >= 2)
 
 
 def test_without_coarse_to_fine_every_share_goes_to_the_finest_grid() -> None:
@@ -93,7 +94,74 @@ def test_without_coarse_to_fine_every_share_goes_to_the_finest_grid() -> None:
     phases = deformation_phases(schedule, 50)
     assert schedule.total(50) == 25000 and schedule.growths(50) == []
     assert {(p.side, p.level, p.learning_rate_factor) for p in phases} == {(160, 0, 1.0)}
-    assert [p.frame for p in phases] == list(range(1, 50))
+    assert [p.frames for p in phases] == [(k,) for k in range(1, 50)]
+
+
+def course(schedule: DeformationSchedule, frames: int) -> list[tuple[Any, ...]]:
+    """Level, frames and iterations of each visit."""
+    phases = deformation_phases(schedule, frames)
+    return [(p.level, p.frames, p.start, p.stop) for p in phases]
+
+
+def test_frames_of_two_stretches_are_visited_together() -> None:
+    schedule = DeformationSchedule(
+        sides=(4, 6), iterations_per_frame=(6, 4), frames_at_once=(1, 2)
+    )
+    # Frames 0 to 6 and 7 to 13.
+    assert course(schedule, 14) == [
+        (0, (1,), 0, 12), *((0, (k,), 6 * k, 6 * k + 6) for k in range(2, 14)),
+        (1, (7,), 84, 88), (1, (1, 8), 88, 92), (1, (2, 9), 92, 96), (1, (3, 10), 96, 100),
+        (1, (4, 11), 100, 104), (1, (5, 12), 104, 108), (1, (6, 13), 108, 112),
+    ]
+    assert schedule.total(14) == 112 and schedule.growths(14) == [84]
+    phases = deformation_phases(schedule, 14)
+    assert [p.carries for p in phases] == [False] + [True] * 12 + [False] * 7
+    # Nobody has learned frame 6 at level 1 when frame 7 is.
+    assert [p.follows for p in phases] == [True] * 13 + [False] + [True] * 6
+    assert (schedule.beside(0, 14), schedule.beside(1, 14)) == (1, 2)
+    assert (phases[0].in_words, phases[14].in_words) == ("frame 1", "frames 1, 8")
+
+
+@pytest.mark.parametrize(("frames", "at_once", "visits"), [
+    (5, 4, [(2, 4), (1, 3)]),             # two frames a stretch: three are enough
+    (6, 4, [(2, 4), (1, 3, 5)]),
+    (7, 3, [(3, 6), (1, 4), (2, 5)]),     # the last stretch is frame 6 alone
+    (4, 4, [(2,), (1, 3)]),               # never neighbours
+    (4, 9, [(2,), (1, 3)]),
+    (3, 2, [(2,), (1,)]),
+    (2, 2, [(1,)]),                       # one stretch, in which frame 0 idles
+    (2, 1, [(1,)]),
+])
+def test_stretches_of_all_kinds(
+    frames: int, at_once: int, visits: list[tuple[int, ...]]
+) -> None:
+    schedule = DeformationSchedule(
+        sides=(4, 6), iterations_per_frame=(1, 3), frames_at_once=(1, at_once)
+    )
+    found = [visit for visit in course(schedule, frames) if visit[0] == 1]
+    assert [visited for _, visited, _, _ in found] == visits
+    assert schedule.beside(1, frames) == max(len(visit) for visit in visits)
+    assert schedule.total(frames) - frames == 3 * max(2, -(-frames // at_once))
+
+
+def test_one_at_once_is_one_after_another() -> None:
+    levels = {"sides": (4, 6), "iterations_per_frame": (6, 4)}
+    by_hand = [(0, (1,), 0, 12), (0, (2,), 12, 18), (1, (1,), 18, 26), (1, (2,), 26, 30)]
+    for at_once in (None, (1, 1)):
+        assert course(DeformationSchedule(**levels, frames_at_once=at_once), 3) == by_hand
+    for schedule in (DeformationSchedule(), DeformationSchedule(coarse_to_fine=False)):
+        ones = replace(schedule, frames_at_once=(1,) * len(schedule.sides))
+        assert deformation_phases(ones, 50) == deformation_phases(schedule, 50)
+
+
+def test_without_coarse_to_fine_the_finest_level_says_how_many() -> None:
+    schedule = DeformationSchedule(
+        sides=(4, 6), iterations_per_frame=(2, 1), coarse_to_fine=False, frames_at_once=(1, 2)
+    )
+    assert course(schedule, 4) == [(0, (2,), 0, 3), (0, (1, 3), 3, 6)]
+    assert not any(phase.carries for phase in deformation_phases(schedule, 4))
+    # From rest, several may begin at once.
+    assert replace(schedule, rays=9).frames_at_once == (2,)
 
 
 @given(
@@ -116,15 +184,22 @@ def test_canonical_phases_tile_every_schedule(
 
 
 @given(
-    st.lists(st.tuples(st.integers(2, 99), st.integers(1, 9)), min_size=1, max_size=5),
+    st.lists(
+        st.tuples(st.integers(2, 99), st.integers(1, 9), st.integers(1, 15)),
+        min_size=1, max_size=5,
+    ),
     st.integers(2, 12),
+    st.booleans(),
     st.booleans(),
 )
 def test_deformation_phases_tile_every_schedule(
-    levels: list[tuple[int, int]], frames: int, coarse_to_fine: bool
+    levels: list[tuple[int, int, int]], frames: int, coarse_to_fine: bool, together: bool
 ) -> None:
-    sides, shares = zip(*levels, strict=True)
-    schedule = DeformationSchedule(sorted(sides), shares, coarse_to_fine)
+    sides, shares, at_once = zip(*levels, strict=True)
+    schedule = DeformationSchedule(
+        sorted(sides), shares, coarse_to_fine,
+        frames_at_once=(1 if coarse_to_fine else 3, *at_once[1:]) if together else None,
+    )
     phases = deformation_phases(schedule, frames)
     assert phases[0].start == 0 and phases[-1].stop == schedule.total(frames)
     for phase, after in zip(phases, phases[1:], strict=False):
@@ -133,9 +208,15 @@ def test_deformation_phases_tile_every_schedule(
         assert {schedule.phase(k, frames) for k in range(phase.start, phase.stop)} == {phase}
     depth = len(levels) if coarse_to_fine else 1
     visits = [(level, frame) for level in range(depth) for frame in range(1, frames)]
-    assert [(p.level, p.frame) for p in phases] == visits
-    begun = [p.start for p in phases if p.frame == 1]
+    visited = [(p.level, frame) for p in phases for frame in p.frames]
+    assert sorted(visited) == visits  # each exactly once
+    assert not any(frame + 1 in p.frames for p in phases for frame in p.frames)
+    assert together or visited == visits
+    begun = [[p.start for p in phases if p.level == level][0] for level in range(depth)]
     assert begun == [0, *schedule.growths(frames)]
+    for level in range(depth):
+        most = max(len(p.frames) for p in phases if p.level == level)
+        assert most == schedule.beside(level, frames)
     assert schedule.phase(schedule.total(frames) + 3, frames) == phases[-1]
 
 
@@ -169,6 +250,11 @@ def test_a_wrong_canonical_schedule_is_an_error(wrong: dict[str, Any]) -> None:
         {"sides": (10, 20, 40, 80, 1)},
         {"decay": 0.0},
         {"rays": 0},
+        {"frames_at_once": (1, 8, 8, 4)},
+        {"frames_at_once": ()},
+        {"frames_at_once": (1, 8, 8, 4, 0)},
+        {"frames_at_once": (2, 8, 8, 4, 2)},
+        {"frames_at_once": (2, 0, 8, 4, 2), "coarse_to_fine": False},
     ],
     ids=str,
 )

@@ -71,11 +71,11 @@ class Peak(Callback):
     values: Tensor
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: Any, *args: Any) -> None:
-        pl_module.visit.forward.data[1, 1, 1] = 0.5
-        self.values = pl_module.visit.forward.detach().clone().requires_grad_()
+        pl_module.visits[0].forward.data[1, 1, 1] = 0.5
+        self.values = pl_module.visits[0].forward.detach().clone().requires_grad_()
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, *args: Any) -> None:
-        self.mean = pl_module.optimizer.state[pl_module.visit.forward]["mean"].clone()
+        self.mean = pl_module.optimizer.state[pl_module.visits[0].forward]["mean"].clone()
 
 
 def test_total_variation_alone_smooths_both_directions(
@@ -100,7 +100,7 @@ class Look(Callback):
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, *args: Any) -> None:
         name = "scene_model.deformation.to_time"
-        frame, learned = pl_module.visit.frame, pl_module.visit.forward.detach().clone()
+        frame, learned = pl_module.visits[0].frame, pl_module.visits[0].forward.detach().clone()
         stored = pl_module.state_dict()[name][frame].clone()
         field = pl_module.model.deformation
         self.seen.append((learned, stored, field.to_time[frame].clone()))

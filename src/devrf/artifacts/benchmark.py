@@ -79,7 +79,7 @@ def _iteration(found: Benchmark, timing: Timing) -> dict[str, Any]:
         "stage": timing.stage,
         "phase": timing.phase,
         "resolution": list(timing.resolution),
-        "frame": timing.frame,
+        "frames": list(timing.frames),
         "rays": timing.rays,
         "iterations": timing.iterations,
         "ms": _ms(timing.seconds),

@@ -95,7 +95,8 @@ def _pictures(found: Benchmark) -> list[tuple[str, ...]]:
 
 
 def _name(timing: Timing) -> str:
-    return f"{timing.stage}, {timing.phase}"
+    together = f", {len(timing.frames)} frames" if len(timing.frames) > 1 else ""
+    return f"{timing.stage}, {timing.phase}{together}"
 
 
 def _grid(timing: Timing) -> str:

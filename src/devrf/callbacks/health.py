@@ -43,7 +43,7 @@ class Health(Callback):
     latest when the phase began: for the deformation, when the frame was), and the stage goes on
     from there with lower learning rates and other pixels. If that happens again the stage
     ends, as it last was well. Of a frame whose loss stands out from its neighbours' it only
-    tells.
+    tells. Frames that are visited together are looked at together, by their mean loss.
 
     Between looks nothing is read from the device.
     """

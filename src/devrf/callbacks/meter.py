@@ -44,7 +44,7 @@ class Meter(Callback):
         for group in pl_module.optimizer.param_groups:
             values[f"lr/{group['name']}"] = group["lr"]
         if isinstance(pl_module.phase, DeformationPhase):
-            values["frame"] = pl_module.phase.frame
+            values["frame"] = pl_module.phase.frames[0]  # a column has one number
         if pl_module.device.type == "cuda":
             values["peak_gpu_gb"] = torch.cuda.max_memory_allocated(pl_module.device) / 2**30
         pl_module.log_dict(

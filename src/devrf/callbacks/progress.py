@@ -92,11 +92,11 @@ class Progress(Callback):
 
 
 def describe(trainer: Trainer, stage: ScheduledStage, speed: float) -> str:
-    """PSNR of the last batches, iterations a second, resolution, and the frame if there is one."""
+    """PSNR of the last batches, iterations a second, resolution, and the frames if any."""
     means = trainer.callback_metrics
     error = means.get(f"{stage.capture}/color", means.get(f"{stage.capture}/render"))
     parts = [] if error is None else [f"{-10 * math.log10(max(float(error), 1e-12)):.1f} dB"]
     parts += [f"{speed:.0f} it/s", "x".join(str(n) for n in stage.resolution)]
     if isinstance(stage.phase, DeformationPhase):
-        parts.append(f"frame {stage.phase.frame}")
+        parts.append(stage.phase.in_words)
     return "  ".join(parts)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -60,7 +60,7 @@ class DeformationField(nn.Module):
         self.register_buffer("to_time", torch.zeros(shape))
         # It goes where the module goes, and so tells where that is.
         self.register_buffer("here", torch.zeros(0), persistent=False)
-        self._coming: tuple[int, Directions, torch.cuda.Stream] | None = None
+        self._coming: dict[int, tuple[Directions, torch.cuda.Stream]] = {}
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -129,13 +129,12 @@ class DeformationField(nn.Module):
             into: backward and forward displacements (X, Y, Z, 3), overwritten.
         """
         source = (self.to_canonical[frame], self.to_time[frame])
-        if self._coming is not None and self._coming[0] == frame:
-            _, source, side = self._coming
+        if frame in self._coming:
+            source, side = self._coming.pop(frame)
             present = torch.cuda.current_stream(self.here.device)
             present.wait_stream(side)
             for tensor in source:
                 tensor.record_stream(present)
-        self._coming = None
         for tensor, value in zip(into, source, strict=True):
             tensor.copy_(value, non_blocking=True)
 
@@ -154,6 +153,7 @@ class DeformationField(nn.Module):
         self._check(frame)
         for frames, value in zip((self.to_canonical, self.to_time), displacements, strict=True):
             frames[frame].copy_(value, non_blocking=True)
+        self._coming.pop(frame, None)  # what is on its way is of before
 
     def settle(self) -> None:
         """Wait until the host sees everything that was written."""
@@ -161,18 +161,19 @@ class DeformationField(nn.Module):
             torch.cuda.current_stream(self.here.device).synchronize()
 
     @torch.no_grad()
-    def expect(self, frame: int) -> None:
-        """Begin to fetch a frame from the host, beside other work: it is read next."""
+    def expect(self, frames: Sequence[int]) -> None:
+        """Begin to fetch frames from the host, beside other work: they are read next."""
         if not (self.on_host and self.here.is_cuda):
             return
-        device = self.here.device
+        device, self._coming = self.here.device, {}
         side = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
-        # What was written to the frame has to be there first.
+        # What was written to the frames has to be there first.
         side.wait_stream(torch.cuda.current_stream(device))
         with torch.cuda.stream(side):
-            backward = self.to_canonical[frame].to(device, non_blocking=True)
-            forward = self.to_time[frame].to(device, non_blocking=True)
-        self._coming = (frame, (backward, forward), side)
+            for frame in frames:
+                backward = self.to_canonical[frame].to(device, non_blocking=True)
+                forward = self.to_time[frame].to(device, non_blocking=True)
+                self._coming[frame] = ((backward, forward), side)
 
     @torch.no_grad()
     def carry(self, frame: int) -> None:
@@ -184,7 +185,7 @@ class DeformationField(nn.Module):
     @torch.no_grad()
     def resize(self, voxels: int) -> None:
         """Resample every frame to about ``voxels`` voxels, trilinearly."""
-        shape, self._coming = self.box.grid_shape(voxels), None
+        shape, self._coming = self.box.grid_shape(voxels), {}
         for name in ("to_canonical", "to_time"):
             frames = getattr(self, name)
             resized = self._room((len(frames), *shape, 3), frames.dtype)
@@ -229,11 +230,12 @@ class DeformationField(nn.Module):
 
     def __getstate__(self) -> dict[str, Any]:
         """What a copy takes over: not what is on its way."""
-        return {**self.__dict__, "_coming": None}
+        return {**self.__dict__, "_coming": {}}
 
     def _load_from_state_dict(
         self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
     ) -> None:
+        self._coming = {}
         for name in ("to_canonical", "to_time"):
             stored, frames = state_dict.get(prefix + name), getattr(self, name)
             if stored is not None and stored.shape != frames.shape:

@@ -136,6 +136,14 @@ class GridAdam(torch.optim.Optimizer):
         """Remove all gradients; zero them where they are tensors that stay."""
         super().zero_grad(set_to_none and not self.keeps_gradients)
 
+    def drop_gradients(self, parameters: Iterable[Tensor]) -> None:
+        """As :meth:`zero_grad`, of some parameters."""
+        for parameter in parameters:
+            if self.keeps_gradients and parameter.grad is not None:
+                parameter.grad.zero_()
+            else:
+                parameter.grad = None
+
     def keep_gradients(self) -> None:
         """Let gradients be tensors that stay, those of later parameters too."""
         self.keeps_gradients = True

@@ -30,11 +30,12 @@ def shorter_deformation(schedule: DeformationSchedule, share: float) -> Deformat
 
 
 def middle_visits(schedule: DeformationSchedule, frames: int) -> list[int]:
-    """An iteration of the visit to the middle one of T = ``frames`` frames, for each level."""
-    frame = max(1, frames // 2)
+    """An iteration of the middle visit of each level, going through T = ``frames`` frames."""
     starts = [0, *schedule.growths(frames)]
-    shares = schedule.iterations_per_frame
-    return [start + frame * share for start, share in zip(starts, shares, strict=True)]
+    return [
+        start + schedule.visits(level, frames) // 2 * schedule.iterations_per_frame[level]
+        for level, start in enumerate(starts)
+    ]
 
 
 def _some(count: int, share: float) -> int:

@@ -27,6 +27,7 @@ from devrf.rendering.model import SceneModel
 from devrf.rendering.render import RenderSettings
 from devrf.scenes.scene import CaptureName, Views
 from devrf.stages.checkpoint import Passport, Stored
+from devrf.stages.lane import Lane
 from devrf.stages.ranks import share
 from devrf.stages.replay import Graphs
 from devrf.stages.schedules import CanonicalPhase, CanonicalSchedule
@@ -47,7 +48,6 @@ class CanonicalStage(ScheduledStage):
 
     name: ClassVar[str] = "canonical"
     capture: ClassVar[CaptureName] = "static"
-    costly: ClassVar[tuple[str, ...]] = ("schedule.canonical.side", "schedule.canonical.rays")
 
     def __init__(
         self,
@@ -111,6 +111,11 @@ class CanonicalStage(ScheduledStage):
         """Adam over density, features and decoder, in that order of groups."""
         assert self._optimizer is not None, "the stage has not been set up"
         return self._optimizer
+
+    @property
+    def costly(self) -> tuple[str, ...]:
+        """Grid sizes and rays."""
+        return "schedule.canonical.side", "schedule.canonical.rays"
 
     @property
     def total_iterations(self) -> int:
@@ -258,9 +263,10 @@ class CanonicalStage(ScheduledStage):
         decoder = list(field.decoder.parameters())
         if [id(p) for p in decoder] != [id(p) for p in self.optimizer.param_groups[2]["params"]]:
             self.optimizer.replace(2, decoder)
-        self.renew(self.schedule.rays)
+        groups = self.optimizer.param_groups
+        self.renew(self.schedule.rays, [[p for group in groups for p in group["params"]]])
 
-    def draw(self) -> Pixels:
+    def draw(self, lane: Lane) -> Pixels:
         """Random pixels of all images."""
         assert self._pool is not None
         with span("batch"):
@@ -268,14 +274,14 @@ class CanonicalStage(ScheduledStage):
             background = background_color(self.scene.background, len(image), self.generator)
             return Pixels(image, flat, background)
 
-    def loss(self, views: Views, pixels: Pixels) -> tuple[Tensor, dict[str, Tensor]]:
+    def loss(self, lane: Lane, views: Views, pixels: Pixels) -> tuple[Tensor, dict[str, Tensor]]:
         """Render a batch of pixels and compare it with the images."""
         assert isinstance(self.phase, CanonicalPhase)
         with span("batch"):
             batch = gather_batch(
                 views, pixels.image, pixels.flat, pixels.background, self.scene.space
             )
-        output = self.see(batch.rays, self.model.occupancy, batch.background)
+        output = self.see(batch.rays, self.model.occupancy, batch.background, lane.room)
         prediction = Prediction(output, batch)
         with span("losses"):
             total, terms = self.losses[self.phase.kind](prediction)

@@ -25,6 +25,7 @@ from devrf.rendering.model import SceneModel, deformed_occupancy
 from devrf.scenes.scene import CaptureName, Views
 from devrf.stages.checkpoint import Passport, Stored
 from devrf.stages.flow_start import follow, start_from_tracks
+from devrf.stages.lane import Lane
 from devrf.stages.memory import StageMemory, motion_memory
 from devrf.stages.ranks import share, take_from_first
 from devrf.stages.replay import Graphs
@@ -41,13 +42,13 @@ log = logging.getLogger(__name__)
 class DeformationStage(ScheduledStage):
     """Learns the 4D deformation field of a scene whose canonical field is known (method §3).
 
-    Frames are visited one after another, coarse to fine. Only the visited frame's two slices
-    are trained; the canonical field and all other frames are frozen.
+    Frames are visited one after another, or several side by side, coarse to fine. Only their two
+    slices are trained; the canonical field and all other frames are frozen. Frames that are
+    visited together learn as if each were alone: each has a lane of its own.
     """
 
     name: ClassVar[str] = "deformation"
     capture: ClassVar[CaptureName] = "dynamic"
-    costly: ClassVar[tuple[str, ...]] = ("schedule.deformation.sides", "schedule.deformation.rays")
 
     def __init__(
         self,
@@ -89,8 +90,8 @@ class DeformationStage(ScheduledStage):
         self._optimizer = GridAdam(
             [{"params": [placeholder], "lr": self.motion.learning_rate, "name": "motion"}]
         )
-        self._visit: Visit | None = None
-        self._losses: list[float] = []
+        self.visits: list[Visit] = []
+        self._losses: list[list[float]] = []
         self._previous: Tensor | None = None
         self.register_state_dict_pre_hook(  # type: ignore[no-untyped-call]
             lambda *_: self._put_back()
@@ -100,19 +101,25 @@ class DeformationStage(ScheduledStage):
         )
 
     @property
+    def costly(self) -> tuple[str, ...]:
+        """Grid sizes and rays; how many frames are visited together, if there are several."""
+        keys = ("schedule.deformation.sides", "schedule.deformation.rays")
+        return (*keys, "schedule.deformation.frames_at_once") if len(self.visits) > 1 else keys
+
+    @property
     def resolution(self) -> tuple[int, int, int]:
         """Present shape of the motion grids."""
         return self.field.shape
 
     @property
     def model(self) -> SceneModel:
-        """The moving scene learned so far, the present visit included."""
+        """The moving scene learned so far, the present visits included."""
         self._put_back()
         return self.scene_model
 
     @property
     def model_now(self) -> SceneModel:
-        """The moving scene; what the present visit has learned may not be in it yet."""
+        """The moving scene; what the present visits have learned may not be in it yet."""
         return self.scene_model
 
     @property
@@ -130,7 +137,7 @@ class DeformationStage(ScheduledStage):
 
     @property
     def optimizer(self) -> GridAdam:
-        """Adam over the visited frame's two slices."""
+        """Adam over the two slices of each visited frame."""
         return self._optimizer
 
     @property
@@ -175,56 +182,74 @@ class DeformationStage(ScheduledStage):
         return too_much
 
     def enter(self, phase: Phase) -> None:
-        """Go to the phase's frame: grow the grids if a level begins, fresh Adam."""
+        """Go to the phase's frames: grow the grids if a level begins, fresh Adam."""
         assert isinstance(phase, DeformationPhase)
         previous, self.phase = self.phase, phase
         assert previous is None or isinstance(previous, DeformationPhase)
-        self._losses = []
+        self._losses = [[] for _ in phase.frames]
         self._put_back()
         if previous is not None and previous.level != phase.level:
-            self._visit = None
-            self._optimizer.replace(0, [])
+            self._open_visits(0)
             self.field.resize(phase.side**3)
         views = self._device_views()
         if self._previous is None:
             self._previous = previous_images(views)
         if phase.carries:
-            self.field.carry(phase.frame)
-        if phase.level == 0 and self.motion.start == "flow" and views.flow is not None:
-            self._follow_flow(views, phase.frame)
-        if self._visit is None:
-            self._begin_level()
-        else:
+            for frame in phase.frames:
+                self.field.carry(frame)
+        if self._along_flow(phase, views):
+            for frame in phase.frames:
+                self._follow_flow(views, frame)
+        if len(self.visits) == len(phase.frames):
             self._optimizer.forget(0)
-        self.visit.enter(self.field, phase.frame)
+        else:
+            self._open_visits(len(phase.frames))
+        for visit, frame in zip(self.visits, phase.frames, strict=True):
+            visit.enter(self.field, frame)
         following = self.schedule.phase(phase.stop, len(self.field.clock))
-        if following.level == phase.level and not following.carries:
-            self.field.expect(following.frame)
+        made_anew = following.carries or self._along_flow(following, views)
+        if following.level == phase.level and following != phase and not made_anew:
+            self.field.expect(following.frames)
         self._look_around()
-        self.visit.pools = self._frame_pools(views, phase.frame)
+        for visit in self.visits:
+            visit.pools = self._frame_pools(views, visit)
 
-    def _begin_level(self) -> None:
-        """Make room for visits at the field's present resolution."""
-        self._visit = Visit.of(self.field, self.scene_model.occupancy)
+    def _along_flow(self, phase: DeformationPhase, views: Views) -> bool:
+        """Whether the phase's frames are moved from where the frames before them have been seen."""
+        asked = self.motion.start == "flow" and views.flow is not None
+        return asked and phase.level == 0 and phase.follows
+
+    def _open_visits(self, count: int) -> None:
+        """Make room for so many visits at the field's present resolution."""
+        # What belonged to those before is gone before theirs is made.
+        self.let_go()
+        self.visits = []
+        self._optimizer.replace(0, [])
+        self.visits = [Visit.of(self.field, self.scene_model.occupancy) for _ in range(count)]
+        slices = [visit.slices for visit in self.visits]
         smoothing = total_variation_weight(self.tv, max(self.field.shape), self.schedule.rays)
-        self._optimizer.replace(0, self._visit.slices, smoothing=smoothing)
-        self.renew(self.schedule.rays)
+        self._optimizer.replace(
+            0, [tensor for pair in slices for tensor in pair], smoothing=smoothing
+        )
+        self.renew(self.schedule.rays, slices)
 
     def _put_back(self) -> None:
-        """Put what the present visit has learned into the field."""
-        if self._visit is not None:
-            self._visit.leave(self.field)
+        """Put what the present visits have learned into the field."""
+        for visit in self.visits:
+            visit.leave(self.field)
+        if self.visits:
             self.field.settle()
 
     def _take_out(self) -> None:
-        """Take the visited frame out of a field that has been loaded again."""
-        if self._visit is not None and self._visit.frame:
-            self._visit.enter(self.field, self._visit.frame)
+        """Take the visited frames out of a field that has been loaded again."""
+        for visit in self.visits:
+            if visit.frame:
+                visit.enter(self.field, visit.frame)
 
     def on_train_end(self) -> None:
-        """End the last visit."""
+        """End the last visits."""
         self._put_back()
-        self._visit = None
+        self.visits = []
 
     def _follow_flow(self, views: Views, frame: int) -> None:
         """Move the frame's slices to where the flow says the frame before has gone."""
@@ -239,12 +264,6 @@ class DeformationStage(ScheduledStage):
         # Each process has followed pixels of its own.
         take_from_first([self.field.to_canonical[frame], self.field.to_time[frame]])
 
-    @property
-    def visit(self) -> Visit:
-        """The frame that is being visited."""
-        assert self._visit is not None, "no phase has been entered"
-        return self._visit
-
     def _device_views(self) -> Views:
         views: Views = self.trainer.datamodule.training_views(  # type: ignore[attr-defined]
             self.capture, self.device
@@ -252,18 +271,19 @@ class DeformationStage(ScheduledStage):
         return views
 
     def _look_around(self) -> None:
-        """Find where the visited frame's matter is under the present field."""
-        self.visit.occupancy.refill(deformed_occupancy(self.scene_model, self.visit.warp))
+        """Find where each visited frame's matter is under the present field."""
+        for visit in self.visits:
+            visit.occupancy.refill(deformed_occupancy(self.scene_model, visit.warp))
 
     @torch.no_grad()
-    def _frame_pools(self, views: Views, frame: int) -> list[PixelPool]:
-        """The pixels to learn the frame from: a pool a batch can be drawn from, by turns."""
-        images = self._images(views, frame)
+    def _frame_pools(self, views: Views, visit: Visit) -> list[PixelPool]:
+        """The pixels to learn a frame from: a pool a batch can be drawn from, by turns."""
+        images = self._images(views, visit.frame)
         if len(images) == 0:
-            raise DevrfError(f"dynamic training set: no image at frame {frame}")
+            raise DevrfError(f"dynamic training set: no image at frame {visit.frame}")
         pools = [all_pixels(views, image[None]) for image in images]
         if self.motion.pixels == "useful":
-            pools = [self._useful(views, pool) for pool in pools]
+            pools = [self._useful(views, pool, visit.occupancy) for pool in pools]
         if self.motion.views == "all":
             pools = [
                 PixelPool(
@@ -277,10 +297,10 @@ class DeformationStage(ScheduledStage):
         """The images (K,) of a frame, ascending."""
         return (self.field.clock.frames_of(views.times) == frame).nonzero()[:, 0]
 
-    def _useful(self, views: Views, pool: PixelPool) -> PixelPool:
+    def _useful(self, views: Views, pool: PixelPool, matter: Occupancy) -> PixelPool:
         """Pixels on the matte, or whose rays meet the frame's matter; all if there are none."""
         image = int(pool.image[0])
-        kept = meets_matter(views.cameras, image, self.scene_model, self.visit.occupancy)
+        kept = meets_matter(views.cameras, image, self.scene_model, matter)
         if views.has_alpha:
             kept |= views.pixels[image, :, :, 3].flatten() > 0
         if views.counted is not None:
@@ -288,29 +308,30 @@ class DeformationStage(ScheduledStage):
         return PixelPool(pool.image[kept], pool.flat[kept]) if bool(kept.any()) else pool
 
     def prepare(self) -> None:
-        """Look up the frame's occupancy anew, when it is time."""
+        """Look up the frames' occupancy anew, when it is time."""
         assert isinstance(self.phase, DeformationPhase)
         since = self.iteration - self.phase.start
         if since and since % self.motion.occupancy_every == 0:
             with span("sampling"):
                 self._look_around()
 
-    def draw(self) -> Pixels:
-        """Random pixels of the visited frame, of its views by turns or of all."""
+    def draw(self, lane: Lane) -> Pixels:
+        """Random pixels of the lane's frame, of its views by turns or of all."""
         with span("batch"):
-            pool = self.visit.pools[self.iteration % len(self.visit.pools)]
+            pools = self.visits[lane.number].pools
+            pool = pools[self.iteration % len(pools)]
             image, flat = pool.draw(share(self.schedule.rays), self.generator)
             background = background_color(self.scene.background, len(image), self.generator)
             return Pixels(image, flat, background)
 
-    def loss(self, views: Views, pixels: Pixels) -> tuple[Tensor, dict[str, Tensor]]:
-        """Render a batch of the visited frame through its warp; compare images and motion."""
+    def loss(self, lane: Lane, views: Views, pixels: Pixels) -> tuple[Tensor, dict[str, Tensor]]:
+        """Render a batch of the lane's frame through its warp; compare images and motion."""
         assert self._previous is not None
-        visit, space = self.visit, self.scene_model.space
+        visit, space = self.visits[lane.number], self.scene_model.space
         with span("batch"):
             batch = gather_batch(views, pixels.image, pixels.flat, pixels.background, space)
-        output = self.see(batch.rays, visit.occupancy, batch.background, visit.warp)
-        before = visit.unwarp_previous(looked_up=self.room is not None)
+        output = self.see(batch.rays, visit.occupancy, batch.background, lane.room, visit.warp)
+        before = visit.unwarp_previous(looked_up=lane.room is not None)
         prediction = MotionPrediction(
             output, batch, visit.unwarp, before, views.cameras, self._previous, space
         )
@@ -319,51 +340,61 @@ class DeformationStage(ScheduledStage):
             return total, {**terms, **visibility(prediction)}
 
     def go_back(self, iteration: int, caution: float) -> None:
-        """Go on from an earlier iteration of the present visit; look anew where matter is."""
+        """Go on from an earlier iteration of the present visits; look anew where matter is."""
         super().go_back(iteration, caution)
-        self._losses = []
+        self._losses = [[] for _ in self.visits]
         self._look_around()
 
-    def settled(self, means: Mapping[str, Tensor]) -> bool:
-        """Whether the visited frame's loss has stopped falling, if anybody wants to know."""
+    def settled(self, losses: Tensor) -> bool:
+        """Whether each visited frame's loss has stopped falling, if anybody wants to know."""
         gain = self.motion.least_gain
         if gain is None:
             return False
-        self._losses.append(float(means["loss"]))
-        return settled(self._losses, gain)
+        for seen, loss in zip(self._losses, losses.tolist(), strict=True):
+            seen.append(loss)
+        return all(settled(seen, gain) for seen in self._losses)
 
     def at_hand(self) -> dict[str, Any]:
+        """What the visits have at hand, and how their losses fell."""
+        return {
+            "visits": [self._visit_at_hand(visit) for visit in self.visits],
+            "losses": [list(seen) for seen in self._losses],
+        }
+
+    def _visit_at_hand(self, visit: Visit) -> dict[str, Any]:
         """Where the visited frame's matter was last seen, and the pixels to learn from.
 
         And the frame itself, where the field would not keep it exactly.
         """
-        assert isinstance(self.phase, DeformationPhase)
-        views, mask = self._device_views(), self.visit.occupancy.mask
-        images, area = self._images(views, self.phase.frame), views.height * views.width
-        exact = self.visit.slices if self.motion.store_half else ()
+        views, mask = self._device_views(), visit.occupancy.mask
+        images, area = self._images(views, visit.frame), views.height * views.width
+        exact = visit.slices if self.motion.store_half else ()
         return {
             "occupancy": pack_bits(mask),
             "shape": list(mask.shape),
-            "pixels": [pack_bits(pool.mask(images, area)) for pool in self.visit.pools],
+            "pixels": [pack_bits(pool.mask(images, area)) for pool in visit.pools],
             "displacements": [tensor.detach().cpu() for tensor in exact],
-            "losses": list(self._losses),
         }
 
-    @torch.no_grad()
     def take_up(self, phase: Phase, kept: dict[str, Any]) -> None:
-        """Go on with the visit of ``phase``, the field being loaded."""
+        """Go on with the visits of ``phase``, the field being loaded."""
         assert isinstance(phase, DeformationPhase)
+        self._previous = previous_images(self._device_views())
+        self._open_visits(len(phase.frames))
+        self._losses = [list(seen) for seen in kept["losses"]]
+        for visit, frame, one in zip(self.visits, phase.frames, kept["visits"], strict=True):
+            visit.enter(self.field, frame)
+            self._take_up_visit(visit, one)
+
+    @torch.no_grad()
+    def _take_up_visit(self, visit: Visit, kept: dict[str, Any]) -> None:
         views = self._device_views()
-        self._previous = previous_images(views)
-        images, area = self._images(views, phase.frame), views.height * views.width
-        self._begin_level()
-        self._losses = list(kept["losses"])
-        self.visit.enter(self.field, phase.frame)
-        for tensor, exact in zip(self.visit.slices, kept["displacements"], strict=False):
+        images, area = self._images(views, visit.frame), views.height * views.width
+        for tensor, exact in zip(visit.slices, kept["displacements"], strict=False):
             tensor.copy_(exact)
         mask = unpack_bits(kept["occupancy"], kept["shape"], self.device)
-        self.visit.occupancy.refill(Occupancy(mask, self.scene_model.canonical.box))
-        self.visit.pools = [
+        visit.occupancy.refill(Occupancy(mask, self.scene_model.canonical.box))
+        visit.pools = [
             PixelPool.of_mask(images, unpack_bits(bits, (len(images), area), self.device))
             for bits in kept["pixels"]
         ]

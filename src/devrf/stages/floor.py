@@ -12,9 +12,10 @@ displacements of three numbers and C features a voxel, an iteration moves
   their gradient, 8 · 8C; with the cycle loss the forward displacement and its gradient, 8 · 36;
   with the flow loss that of the frame before, 8 · 12;
 * for each value that Adam steps on 28: itself, its mean and its square, read and written, and its
-  gradient, read. In the deformation stage these are the two slices of a frame. In the fine part of
-  the canonical stage they are the values that got a gradient; counted as four voxels a sample,
-  since samples half a voxel apart share half of their corners or more.
+  gradient, read. In the deformation stage these are the two slices of each visited frame (rays and
+  samples, too, are those of all of them together). In the fine part of the canonical stage they
+  are the values that got a gradient; counted as four voxels a sample, since samples half a voxel
+  apart share half of their corners or more.
 
 The network of widths C → W → W → 3 costs 2·W·(C + W + 3) operations a sample and 2·W·D a ray for
 its direction of D numbers; three times that with the gradients of its weights and inputs, twice
@@ -31,7 +32,7 @@ from devrf.fields.canonical import CanonicalField
 from devrf.fields.decoder import ColorDecoder
 from devrf.stages.canonical import CanonicalStage
 from devrf.stages.deformation import DeformationStage
-from devrf.stages.schedules import CanonicalPhase
+from devrf.stages.schedules import CanonicalPhase, DeformationPhase
 from devrf.stages.stage import ScheduledStage
 
 CORNERS, NUMBER, DISPLACEMENT = 8, 4, 12
@@ -103,8 +104,10 @@ def _deformation(stage: DeformationStage, tested: float, reached: float, heavy: 
         looked_up += DISPLACEMENT * (ONCE + ADDED) * heavy
     if weights.get("flow"):
         looked_up += DISPLACEMENT * ONCE * heavy
-    stepped = 2 * 3 * math.prod(stage.resolution)
-    learned = decoder_operations(field, stage.schedule.rays, heavy)
+    assert isinstance(stage.phase, DeformationPhase)
+    frames = len(stage.phase.frames)
+    stepped = 2 * 3 * math.prod(stage.resolution) * frames
+    learned = decoder_operations(field, stage.schedule.rays * frames, heavy)
     return Work(CORNERS * looked_up + ADAM * stepped, 2 * learned)
 
 

@@ -7,7 +7,7 @@ on what will be learned; that part is estimated, as :func:`batch_bytes` says.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import nn
@@ -52,10 +52,12 @@ class StageMemory:
     Attributes:
         held: there all the time, at the final resolution.
         passing: needed one after another, and given back each time.
+        batches: how many batches a GPU works on at the same time; ``passing`` counts them all.
     """
 
     held: Mapping[str, int]
     passing: Mapping[str, int]
+    batches: int = 1
 
     @property
     def peak(self) -> int:
@@ -65,16 +67,23 @@ class StageMemory:
     @property
     def least(self) -> int:
         """Bytes at the worst moment when batches are taken in as many parts as is tried."""
-        passing = {
-            name: size // Parts.MOST if name == BATCH else size
-            for name, size in self.passing.items()
-        }
-        return StageMemory(self.held, passing).peak
+        return self._with_less(Parts.MOST).peak
 
     @property
     def on_host(self) -> int:
-        """Bytes on the host at the worst moment; the scene's own images are used in place."""
-        return round(KEPT_BACK * (self.peak - sum(self.held.get(name, 0) for name in VIEWS)))
+        """Bytes on the host at the worst moment; the scene's own images are used in place.
+
+        A CPU takes one batch after the other.
+        """
+        views = sum(self.held.get(name, 0) for name in VIEWS)
+        return round(KEPT_BACK * (self._with_less(self.batches).peak - views))
+
+    def _with_less(self, parts: int) -> StageMemory:
+        """The same with one part of what batches take."""
+        passing = {
+            name: size // parts if name == BATCH else size for name, size in self.passing.items()
+        }
+        return replace(self, passing=passing)
 
 
 @dataclass(frozen=True)
@@ -161,7 +170,8 @@ def estimate(
     field = final_field(scene, canonical, architecture)
     grids, decoder = _grid_bytes(field), tensor_bytes(field.decoder)
     points, moving = field.density.values.numel(), _all_frames(scene)
-    displacements = displacement_bytes(scene, field.box, deformation)
+    displacements = displacement_bytes(scene, field.box, deformation.sides[-1])
+    together = deformation.beside(len(deformation.sides) - 1, len(scene.clock))
     rest = grids + decoder + points
     fields = {
         "density and features": grids, "decoder": decoder, "occupancy": points,
@@ -191,7 +201,7 @@ def estimate(
             ),
             "deformation": StageFiles(
                 sum(checkpoint.values()),
-                rest + displacements + 2 * displacements // len(scene.clock),
+                rest + displacements + 2 * together * displacements // len(scene.clock),
             ),
         },
     )
@@ -240,7 +250,7 @@ def motion_memory(
     scene: Scene, field: CanonicalField, schedule: DeformationSchedule, step: float, *,
     on_host: bool, half: bool,
 ) -> StageMemory:
-    """What the deformation stage needs on its device.
+    """What the deformation stage needs on its device, at the level that needs most.
 
     Args:
         scene: images and times.
@@ -250,48 +260,63 @@ def motion_memory(
         on_host: whether the displacements of all frames rest on the host.
         half: whether they rest in half precision.
     """
+    levels = [
+        _level_memory(scene, field, schedule, step, level, on_host=on_host, half=half)
+        for level in range(len(schedule.sides))
+    ]
+    return max(levels, key=lambda memory: memory.peak)
+
+
+def _level_memory(
+    scene: Scene, field: CanonicalField, schedule: DeformationSchedule, step: float, level: int, *,
+    on_host: bool, half: bool,
+) -> StageMemory:
+    """What one level of the deformation stage needs; arguments as :func:`motion_memory`."""
     dynamic, frames, points = scene.dynamic.train, len(scene.clock), field.density.values.numel()
-    displacements = displacement_bytes(scene, field.box, schedule)
+    displacements = displacement_bytes(scene, field.box, schedule.sides[level])
     slices, growth = displacements // frames, 0
-    if len(schedule.sides) > 1:
-        x, y, z = field.box.grid_shape(schedule.sides[-2] ** 3)
+    if level:
         # One direction after the other: the old grids of one stand beside the new of both.
-        growth = frames * x * y * z * DISPLACEMENT
+        growth = displacement_bytes(scene, field.box, schedule.sides[level - 1]) // 2
     if half:
         displacements, growth = displacements // 2, growth // 2
     rested = {} if on_host else {_all_frames(scene): displacements}
     channels, width = field.color.values.shape[-1], _width(field)
+    together = schedule.beside(level, frames)
+    visited = "one frame" if together == 1 else f"{together} frames side by side"
     return StageMemory(
         held={
             **view_bytes(dynamic),
             "pixels to draw from":
-                dynamic.height * dynamic.width * -(-len(dynamic) // frames) * POOLED,
+                dynamic.height * dynamic.width * -(-len(dynamic) // frames) * POOLED * together,
             "density and features": _grid_bytes(field),
             "decoder": tensor_bytes(field.decoder),
-            "occupancy": 4 * points,
+            "occupancy": (3 + together) * points,
             **rested,
             # Both its directions, the forward one of the frame before it; on their way from the
             # host, those of the frame after it.
-            "one frame": (5 if on_host else 3) * slices // 2,
-            "gradients of one frame": slices,
-            "Adam moments of one frame": 2 * slices,
-            "a copy of one frame to go back to": slices,
+            visited: (5 if on_host else 3) * slices * together // 2,
+            f"gradients of {visited}": slices * together,
+            f"Adam moments of {visited}": 2 * slices * together,
+            f"a copy of {visited} to go back to": slices * together,
         },
         passing={
-            BATCH: motion_batch_bytes(
+            BATCH: together * motion_batch_bytes(
                 schedule.rays, samples_per_ray(field.box, field.base_voxels, field.planes, step),
                 channels, width, planes=field.planes,
             ),
-            "an optimiser step": 2 * slices,
+            # What is smoothed has a place beside it, one frame after the other the rest.
+            "an optimiser step": (1 + together) * slices,
             "looking for what is occupied": SOUGHT_WARPED * points,
             "growing the grids": 0 if on_host else growth,
         },
+        batches=together,
     )
 
 
-def displacement_bytes(scene: Scene, box: Box, schedule: DeformationSchedule) -> int:
-    """Bytes of the displacements of all frames, both ways, in single precision."""
-    x, y, z = box.grid_shape(schedule.sides[-1] ** 3)
+def displacement_bytes(scene: Scene, box: Box, side: int) -> int:
+    """Bytes of the displacements of all frames, both ways, in single precision, on side³ voxels."""
+    x, y, z = box.grid_shape(side**3)
     return 2 * len(scene.clock) * x * y * z * DISPLACEMENT
 
 

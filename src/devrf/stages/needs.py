@@ -12,6 +12,7 @@ from devrf.stages.memory import PROGRAM, Budget, StageMemory
 # The keys that a part's size depends on, by words of its name, as `estimate` calls it.
 KEYS: tuple[tuple[tuple[str, ...], tuple[str, ...]], ...] = (
     (("images", "flow", "depth", "pixels"), ("data.downscale", "data.width", "data.frames")),
+    (("side by side",), ("schedule.deformation.frames_at_once", "schedule.deformation.sides")),
     (("displacements", "frame", "growing"), ("schedule.deformation.sides", "data.frames")),
     (("density", "gradients", "moments", "step", "copy", "occup", "decoder"),
      ("schedule.canonical.side",)),

@@ -10,7 +10,7 @@ How a run survives being killed, from end to end:
 * ``ScheduledStage.on_save_checkpoint`` adds the rest: the iteration, the phase that the grids
   are ready for, every random state, and what the phase has at hand that the
   schedule alone does not tell (:meth:`ScheduledStage.at_hand`): the pixels to draw from, and the
-  visited frame's occupancy as it is now, as bits.
+  visited frames' occupancy as it is now, as bits.
 * ``stages.sealed_file`` writes it whole or not at all, with a checksum.
 * ``Trainer.fit(ckpt_path=…)`` reads it. The stage is set up as at its beginning and takes its
   fields' shapes from the file; the optimiser is given the grids, then its state; the random

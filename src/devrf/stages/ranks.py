@@ -100,14 +100,14 @@ def average_gradients(parameters: Iterable[Tensor]) -> None:
         gradient.div_(size)
 
 
-def average(values: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The mean over the processes of each scalar; all processes give the same names."""
+def average(values: Tensor) -> Tensor:
+    """The mean over the processes of each number; all processes give the same shape."""
     size = world_size()
     if size == 1:
-        return dict(values)
-    means = torch.stack(list(values.values())) / size
+        return values
+    means = values / size
     distributed.all_reduce(means)
-    return dict(zip(values, means.unbind(), strict=True))
+    return means
 
 
 @torch.no_grad()

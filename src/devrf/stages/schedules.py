@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import accumulate
 from typing import Literal
 
 from devrf.errors import DevrfError
@@ -99,25 +101,33 @@ class CanonicalSchedule:
 
 @dataclass(frozen=True)
 class DeformationPhase:
-    """A visit to one frame at one resolution.
+    """A visit to one frame at one resolution, or to several side by side.
 
     Attributes:
         level: 0 is the coarsest resolution.
-        frame: the frame that is learned, from 1 on.
+        frames: the frames that are learned, from 1 on, ascending.
         start: first iteration.
         stop: one past the last iteration.
         side: side of the motion grid: it has about side³ voxels.
         learning_rate_factor: what the learning rate is multiplied by.
         carries: whether the frame starts from the result of the frame before it.
+        follows: whether the frames before these have been learned at this level, or are at rest.
     """
 
     level: int
-    frame: int
+    frames: tuple[int, ...]
     start: int
     stop: int
     side: int
     learning_rate_factor: float
     carries: bool
+    follows: bool
+
+    @property
+    def in_words(self) -> str:
+        """The frames: ``frame 3``, or ``frames 3, 10``."""
+        noun = "frame" if len(self.frames) == 1 else "frames"
+        return f"{noun} {', '.join(str(frame) for frame in self.frames)}"
 
 
 @dataclass(frozen=True)
@@ -128,6 +138,15 @@ class DeformationSchedule:
     iterations for each of T frames; frame 0 is the identity and needs none, so frame 1 takes
     its share beside its own: the level's length is share · T.
 
+    Where K frames may be learned at once the T frames are cut into contiguous stretches of
+    L = ⌈T / K⌉, but of two at least: neighbours are never learned at once. (The last stretch may be
+    shorter, and there may be fewer than K.) The j-th visit of the level, 0 ≤ j < L, is to the j-th
+    frame of each: frames j, j + L, j + 2L, … An iteration is one optimiser step on all of them,
+    each with a batch of its own, so the level's length is share · L. But for the first of a
+    stretch, the frame before has been learned at this level by then; the first of a stretch knows
+    what the level before has made of its neighbour. Frame 0 is left out. Where that leaves the
+    first visit empty, for there is one stretch, frame 1 has its share as said.
+
     Attributes:
         sides: sides of the motion grids, coarse to fine.
         iterations_per_frame: share of a frame at each level.
@@ -135,6 +154,8 @@ class DeformationSchedule:
             frame starting from rest (the ``base`` row of the ablation tables).
         decay: factor of the learning rate from a level to the next.
         rays: rays a batch.
+        frames_at_once: K of each level, 1 at the coarsest, where a frame starts from the one
+            before it; None: 1 throughout.
     """
 
     sides: Sequence[int] = (10, 20, 40, 80, 160)
@@ -142,6 +163,7 @@ class DeformationSchedule:
     coarse_to_fine: bool = True
     decay: float = 10 ** (-1 / 4)
     rays: int = 8192
+    frames_at_once: Sequence[int] | None = None
 
     def __post_init__(self) -> None:
         if len(self.sides) != len(self.iterations_per_frame) or not self.sides:
@@ -149,10 +171,17 @@ class DeformationSchedule:
                 "schedule.deformation.sides and .iterations_per_frame must be of one length, "
                 f"not {len(self.sides)} and {len(self.iterations_per_frame)}"
             )
+        at_once = (1,) * len(self.sides) if self.frames_at_once is None else self.frames_at_once
+        if len(at_once) != len(self.sides):
+            raise DevrfError(
+                f"schedule.deformation.frames_at_once: expected {len(self.sides)} numbers, one "
+                f"for each of .sides, or null, not {len(at_once)}"
+            )
         for name, values, bound in (
             ("sides", self.sides, 2),
             ("iterations_per_frame", self.iterations_per_frame, 1),
             ("rays", (self.rays,), 1),
+            ("frames_at_once", at_once, 1),
         ):
             if min(values) < bound:
                 raise DevrfError(
@@ -160,39 +189,57 @@ class DeformationSchedule:
                 )
         if not self.decay > 0:
             raise DevrfError(f"schedule.deformation.decay: expected more than 0, not {self.decay}")
+        if self.coarse_to_fine and at_once[0] > 1:
+            raise DevrfError(
+                "schedule.deformation.frames_at_once: expected 1 at the first level, where a "
+                f"frame starts from the one before it, not {at_once[0]}"
+            )
         if not self.coarse_to_fine:
             object.__setattr__(self, "sides", (self.sides[-1],))
             object.__setattr__(self, "iterations_per_frame", (sum(self.iterations_per_frame),))
+            object.__setattr__(self, "frames_at_once", (at_once[-1],))
+
+    def visits(self, level: int, frames: int) -> int:
+        """L: in how many visits a level goes through T = ``frames`` frames, the idle one counted.
+
+        Also how many frames lie between two that are visited together.
+        """
+        at_once = 1 if self.frames_at_once is None else self.frames_at_once[level]
+        return max(2, -(-frames // at_once))
+
+    def beside(self, level: int, frames: int) -> int:
+        """The most of T = ``frames`` frames that are visited together at a level."""
+        return len(range(1, frames, self.visits(level, frames)))
 
     def total(self, frames: int) -> int:
         """Iterations of the whole stage for T = ``frames`` frames, the rest frame counted."""
-        return sum(self.iterations_per_frame) * frames
+        return sum(self._lengths(frames))
 
     def growths(self, frames: int) -> list[int]:
         """Iterations at which the motion grid grows."""
-        ends, end = [], 0
-        for share in self.iterations_per_frame[:-1]:
-            end += share * frames
-            ends.append(end)
-        return ends
+        return list(accumulate(self._lengths(frames)[:-1]))
+
+    def _lengths(self, frames: int) -> list[int]:
+        """Iterations of each level."""
+        shares = enumerate(self.iterations_per_frame)
+        return [share * self.visits(level, frames) for level, share in shares]
 
     def phase(self, iteration: int, frames: int) -> DeformationPhase:
         """The visit that ``iteration`` belongs to; the last one from the end on."""
-        start, level = 0, 0
-        while level + 1 < len(self.sides):
-            length = self.iterations_per_frame[level] * frames
-            if iteration < start + length:
-                break
-            start += length
-            level += 1
+        begins = [0, *self.growths(frames)]
+        level = bisect_right(begins, iteration) - 1
+        begin, apart = begins[level], self.visits(level, frames)
         share = self.iterations_per_frame[level]
-        frame = min(max((iteration - start) // share, 1), frames - 1)
+        first = 1 if apart == frames else 0  # frame 0 alone
+        visit = min(max((iteration - begin) // share, first), apart - 1)
+        visited = tuple(range(visit or apart, frames, apart))
         return DeformationPhase(
             level=level,
-            frame=frame,
-            start=start + (0 if frame == 1 else frame * share),
-            stop=start + (frame + 1) * share,
+            frames=visited,
+            start=begin + (0 if visit == first else visit * share),
+            stop=begin + (visit + 1) * share,
             side=self.sides[level],
             learning_rate_factor=self.decay**level,
-            carries=self.coarse_to_fine and level == 0 and frame > 1,
+            carries=self.coarse_to_fine and level == 0 and visit > 1,
+            follows=visit > 0,
         )

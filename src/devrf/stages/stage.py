@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -23,6 +24,7 @@ from devrf.machine import multiplies_bfloat16
 from devrf.ops.adam import GridAdam
 from devrf.ops.choice import triton_runs
 from devrf.ops.spans import measured, span
+from devrf.ops.speed import wait
 from devrf.rendering.fused import render_in_lists
 from devrf.rendering.model import SceneModel
 from devrf.rendering.player import Player
@@ -33,11 +35,11 @@ from devrf.shortage import ShortageError
 from devrf.stages.checkpoint import Passport, check_scene, passport_in
 from devrf.stages.compact_state import compact_state
 from devrf.stages.held_out import score
+from devrf.stages.lane import Lane, Sums
 from devrf.stages.parts import Parts
 from devrf.stages.progress import random_states, set_random_states
 from devrf.stages.ranks import (
     RaysByRank,
-    average,
     average_gradients,
     check_alike,
     rank,
@@ -48,6 +50,7 @@ from devrf.stages.ranks import (
 from devrf.stages.replay import Capturer, Graphs, OnCuda, Repeated
 from devrf.stages.schedules import CanonicalPhase, DeformationPhase
 from devrf.stages.settings import Precision
+from devrf.stages.side_by_side import SideBySide
 
 Phase = CanonicalPhase | DeformationPhase
 
@@ -60,7 +63,10 @@ class ScheduledStage(LightningModule, ABC):
     calls :meth:`enter` where a phase begins, ``LearningRateDecay`` scales the learning rates
     before every step.
 
-    Where Triton runs, iterations are steady: lists of samples have a fixed length (``room``),
+    An iteration is one optimiser step, on what is learned from one batch, or from several that
+    have nothing to do with one another (``lanes``).
+
+    Where Triton runs, iterations are steady: lists of samples have a fixed length (``rooms``),
     gradients, moments and whatever else goes from one iteration to the next stay in the same
     memory, and nothing waits for the device. On one GPU each is then a CUDA graph that is
     replayed (``graphs``). Callbacks see the same steps and the same rates; what is asked before a
@@ -73,7 +79,6 @@ class ScheduledStage(LightningModule, ABC):
     Attributes:
         name: what the stage is called in files and messages.
         capture: the part of the scene that is learned from.
-        costly: the config keys that its memory depends on most.
         iteration: where the stage is in its schedule: optimiser iterations done or left out.
         skipped: how many were left out, since a phase had nothing left to gain.
         phase: the stretch of the schedule that the grids are ready for; None before the first.
@@ -87,12 +92,11 @@ class ScheduledStage(LightningModule, ABC):
         gave_up: why the stage ended before its schedule; None while it has not.
         graphs: whether steady iterations are captured in a CUDA graph where that is possible.
         decoder_precision: what the colour network computes in while it learns.
-        room: the length of the lists of samples; None while they are as long as need be.
+        lanes: the batches of an iteration; none before the first phase.
     """
 
     name: ClassVar[str]
     capture: ClassVar[CaptureName]
-    costly: ClassVar[tuple[str, ...]]
 
     def __init__(
         self, iterations_per_step: int, graphs: Graphs = "auto",
@@ -102,7 +106,7 @@ class ScheduledStage(LightningModule, ABC):
         self.automatic_optimization = False
         self.graphs = graphs
         self.decoder_precision = decoder_precision
-        self.room: Room | None = None
+        self.lanes: list[Lane] = []
         self.iterations_per_step = iterations_per_step
         self.iteration = 0
         self.skipped = 0
@@ -110,8 +114,8 @@ class ScheduledStage(LightningModule, ABC):
         self.record: dict[str, float | None] = {}
         self.generator = torch.Generator()
         self._rays = 0
-        self._sums: dict[str, Tensor] = {}
-        self._pixels: Pixels | None = None
+        self._sums = Sums()
+        self._side_by_side = SideBySide()
         self._repeated: Repeated | None = None
         self._seed = 0
         self.made_with: dict[str, Any] = {}
@@ -126,6 +130,11 @@ class ScheduledStage(LightningModule, ABC):
         """The scene of the trainer's datamodule."""
         scene: Scene = self.trainer.datamodule.scene  # type: ignore[attr-defined]
         return scene
+
+    @property
+    @abstractmethod
+    def costly(self) -> tuple[str, ...]:
+        """The config keys that its memory depends on most."""
 
     @property
     @abstractmethod
@@ -163,33 +172,33 @@ class ScheduledStage(LightningModule, ABC):
         """What an iteration needs beside what is learned in it; it may wait for the device."""
 
     @abstractmethod
-    def draw(self) -> Pixels:
-        """The pixels of the coming iteration, drawn with ``generator``."""
+    def draw(self, lane: Lane) -> Pixels:
+        """The pixels of a lane's coming iteration, drawn with ``generator``."""
 
     @abstractmethod
-    def loss(self, views: Views, pixels: Pixels) -> tuple[Tensor, dict[str, Tensor]]:
-        """The weighted loss of a batch of pixels of ``views``, and its terms by name."""
+    def loss(self, lane: Lane, views: Views, pixels: Pixels) -> tuple[Tensor, dict[str, Tensor]]:
+        """The weighted loss of a lane's pixels of ``views``, and its terms by name."""
 
-    def settled(self, means: Mapping[str, Tensor]) -> bool:
+    def settled(self, losses: Tensor) -> bool:
         """Whether the present phase has nothing left to gain, so that its rest is left out.
 
         Args:
-            means: of the loss and its terms over the Lightning step that is done.
+            losses: (lanes,) mean of each lane's over the Lightning step that is done.
         """
         return False
 
     def see(
-        self, rays: Rays, occupancy: Occupancy, background: Tensor, warp: GridWarp | None = None
+        self, rays: Rays, occupancy: Occupancy, background: Tensor, room: Room | None,
+        warp: GridWarp | None = None,
     ) -> RenderOutput:
-        """Render rays to learn from them: in lists of fixed length if iterations are steady."""
+        """Render rays to learn from them: in a lane's lists of fixed length if it has ``room``."""
         model, precision = self.model_now, self._precision
-        if self.room is None:
+        if room is None:
             return render(
                 rays, model.canonical, occupancy, model.settings, background, warp, precision
             )
         return render_in_lists(
-            rays, model.canonical, occupancy, model.settings, background, warp, self.room,
-            precision,
+            rays, model.canonical, occupancy, model.settings, background, warp, room, precision
         )
 
     @property
@@ -199,17 +208,35 @@ class ScheduledStage(LightningModule, ABC):
         reduced = multiplies_bfloat16(self.device) if chosen == "auto" else chosen == "bfloat16"
         return torch.bfloat16 if reduced else torch.float32
 
-    def renew(self, rays: int) -> None:
-        """Get ready for iterations on other tensors than before, of ``rays`` in all processes.
+    def renew(self, rays: int, lanes: Sequence[Sequence[Tensor]]) -> None:
+        """Get ready for iterations on other tensors than before.
 
         Whoever enters a phase calls it once the phase's tensors are there and the optimiser has
         them.
+
+        Args:
+            rays: of a batch, in all processes together.
+            lanes: what is learned from each of the batches of an iteration.
         """
+        self.let_go()
         self._rays = rays
-        self._sums, self._pixels, self._repeated, self.room = {}, None, None, None
+        self.lanes = [Lane(number, learned) for number, learned in enumerate(lanes)]
         if triton_runs(self.model_now.canonical.density.values):
-            self.room = self._new_room()
+            self._make_rooms()
             self.optimizer.keep_gradients()
+
+    def let_go(self) -> None:
+        """Let go of what only iterations need: a captured one holds memory of its own."""
+        self.lanes, self._sums, self._repeated = [], Sums(), None
+
+    @property
+    def rooms(self) -> list[Room]:
+        """How long each lane's lists of samples are; none unless iterations are steady."""
+        return [lane.room for lane in self.lanes if lane.room is not None]
+
+    def _make_rooms(self) -> None:
+        for lane in self.lanes:
+            lane.room = self._new_room()
 
     def _new_room(self) -> Room:
         return Room(-(-share(self._rays) // self.parts.count), self.device)
@@ -252,8 +279,8 @@ class ScheduledStage(LightningModule, ABC):
             check_alike({name: t for name, t in state if isinstance(t, Tensor)})
 
     def teardown(self, stage: str) -> None:
-        """Let go of what only iterations need: a captured one holds memory of its own."""
-        self._repeated = self._pixels = None
+        """Let go of what only iterations need."""
+        self.let_go()
 
     def _draw_anew(self) -> None:
         """Seed the generator for the coming iterations, in each process differently."""
@@ -261,10 +288,10 @@ class ScheduledStage(LightningModule, ABC):
         self.generator.manual_seed(int(mixed.generate_state(1, np.uint64)[0]))
 
     def where(self, iteration: int) -> str:
-        """An iteration of the present phase, its frame and its resolution, in words."""
-        frame = f"frame {self.phase.frame}, " if isinstance(self.phase, DeformationPhase) else ""
+        """An iteration of the present phase, its frames and its resolution, in words."""
+        visit = f"{self.phase.in_words}, " if isinstance(self.phase, DeformationPhase) else ""
         shape = "x".join(str(n) for n in self.resolution)
-        return f"iteration {iteration} of {self.total_iterations} ({frame}{shape})"
+        return f"iteration {iteration} of {self.total_iterations} ({visit}{shape})"
 
     def give_up(self, why: str) -> None:
         """End the stage after the present step, with a progress file if somebody writes one.
@@ -300,8 +327,8 @@ class ScheduledStage(LightningModule, ABC):
         """Run iterations up to ``iterations_per_step``, never beyond the present phase.
 
         Returns:
-            The means of the loss and of its terms over these iterations, by name; empty if
-            memory ran out before the first.
+            The means of the loss and of its terms over these iterations and all lanes, by name;
+            empty if memory ran out before the first.
         """
         if self.phase != self.phase_at(self.iteration):
             raise DevrfError(
@@ -318,30 +345,32 @@ class ScheduledStage(LightningModule, ABC):
         first = self.iteration
         for _ in range(count):
             self.prepare()
+            for lane in self.lanes:
+                lane.take(self.draw(lane))
             try:
-                if self.room is None:
+                if self.rooms:
+                    self._repeat(views, optimizer)
+                else:
                     optimizer.zero_grad()
-                    self._learn(views, self.draw())
+                    self._learn(views)
                     with span("optimiser"):
                         optimizer.step()
-                else:
-                    self._repeat(views, optimizer)
             except ShortageError as shortage:
+                optimizer.zero_grad()  # of lanes that had room
                 self.give_up(f"{shortage} at {self.where(self.iteration)}; {self.remedy}")
                 break
             self.iteration += 1
         done = self.iteration - first
-        means = {k: value / done for k, value in average(self._sums).items()} if done else {}
-        for value in self._sums.values():
-            value.zero_()
-        if self.room is not None and self.room.look():
+        if any([room.look() for room in self.rooms]):  # a list: all of them look
             self._repeated = None  # captured with lists of another length
-        if done and self.iteration < stop and self.settled(means):
+        if not done:
+            self._draw_anew()
+            return {}
+        means, losses = self._sums.take(done)
+        if self.iteration < stop and self.settled(losses):
             self.skipped += stop - self.iteration
             self.iteration = stop
         self._draw_anew()
-        if not done:
-            return {}
         named = {f"{self.capture}/{k}": value for k, value in means.items()}
         # On the host, where it is wanted: Lightning would put a number on the device, and wait.
         self.log_dict({**named, "step": torch.tensor(float(self.iteration))})
@@ -357,38 +386,36 @@ class ScheduledStage(LightningModule, ABC):
             f"(resume=false) with lower {' or '.join(self.costly)}, or higher data.downscale"
         )
 
-    def _learn(self, views: Views, pixels: Pixels) -> None:
-        """The gradients of a batch; its loss and terms are added to the sums of this step."""
-        total, terms = self.parts.gradients(
-            lambda part: self.loss(views, part), pixels, self._backward, self._divided
-        )
+    def _learn(self, views: Views) -> None:
+        """The gradients of each lane's batch; losses and terms are added to this step's sums."""
+        pieces = [partial(self._learn_from, lane, views) for lane in self.lanes]
+        found = self._side_by_side(pieces, self.device)
         groups = self.optimizer.param_groups
         average_gradients(p for group in groups for p in group["params"])
-        for name, value in {"loss": total.detach(), **terms}.items():
-            if name in self._sums:
-                self._sums[name] += value
-            else:
-                self._sums[name] = value.clone()
+        self._sums.add(found)
 
-    def _divided(self) -> None:
-        """Begin the iteration anew in smaller parts."""
-        self.optimizer.zero_grad()
-        if self.room is not None:
-            self.room = self._new_room()
+    def _learn_from(self, lane: Lane, views: Views) -> dict[str, Tensor]:
+        """The gradients of a lane's batch, its loss and its terms."""
+        assert lane.pixels is not None
+        total, terms = self.parts.gradients(
+            lambda part: self.loss(lane, views, part), lane.pixels, self._backward,
+            lambda: self._divided(lane),
+        )
+        return {"loss": total.detach(), **terms}
+
+    def _divided(self, lane: Lane) -> None:
+        """Begin a lane's iteration anew in smaller parts, which are those of all lanes."""
+        wait(self.device)  # other lanes may be at work in their rooms
+        self.optimizer.drop_gradients(lane.parameters)
+        if self.rooms:
+            self._make_rooms()
             self._repeated = None
 
     def _repeat(self, views: Views, optimizer: LightningOptimizer) -> None:
         """A steady iteration: the same work on the same tensors, with other pixels in them."""
-        assert self.room is not None
-        drawn = self.draw()
-        if self._pixels is None:
-            self._pixels = drawn.clone()
-        else:
-            self._pixels.take(drawn)
-        pixels = self._pixels
 
         def work() -> None:
-            self._learn(views, pixels)
+            self._learn(views)
             with span("optimiser"):
                 self.optimizer.apply()
 
@@ -399,7 +426,8 @@ class ScheduledStage(LightningModule, ABC):
         with self.optimizer.stepping_by(work if measured() else repeated):
             optimizer.step()
         if repeated.is_warm:
-            self.room.measure()
+            for room in self.rooms:
+                room.measure()
         if repeated.failed:
             self.graphs = "off"  # one warning is enough
 

@@ -66,8 +66,8 @@ class Timing:
         stage: ``canonical`` or ``deformation``.
         phase: ``search``, ``fine``, or the level's number.
         resolution: shape of the grid that is learned.
-        frame: the frame that was visited; None in the canonical stage.
-        rays: rays a batch.
+        frames: the frames that were visited; none in the canonical stage.
+        rays: rays of an iteration.
         iterations: how many a repeat covers.
         seconds: of an iteration that nobody disturbs.
         measured_seconds: of an iteration whose parts are measured.
@@ -81,7 +81,7 @@ class Timing:
     stage: str
     phase: str
     resolution: tuple[int, int, int]
-    frame: int | None
+    frames: tuple[int, ...]
     rays: int
     iterations: int
     seconds: Spread

@@ -1,4 +1,4 @@
-"""What is at hand while one frame is visited: copies of what is learned of it, and its matter."""
+"""What is at hand while a frame is visited: copies of what is learned of it, and its matter."""
 
 from __future__ import annotations
 
