@@ -10,8 +10,12 @@ import torch
 from devrf.errors import DevrfError
 from devrf.machine import free_memory
 
-# What torch's allocators and its libraries say; on a GPU the error has a class of its own.
-SAID = ("out of memory", "can't allocate memory", "bad_alloc", "STATUS_ALLOC_FAILED")
+# What torch's allocators and its libraries say, oneDNN without a word of memory; on a GPU the
+# error has a class of its own.
+SAID = (
+    "out of memory", "can't allocate memory", "bad_alloc", "STATUS_ALLOC_FAILED",
+    "could not create a primitive", "could not create a memory",
+)
 ASKED = re.compile(r"tried to allocate (\d[\d.]*) ?(\w+)", re.IGNORECASE)
 UNITS = {"b": 1, "bytes": 1, "kib": 2**10, "mib": 2**20, "gib": 2**30, "tib": 2**40}
 
