@@ -96,7 +96,7 @@ def test_the_canonical_stage_learns_the_same_in_parts(
     calls = room(rays)
     with caplog.at_level(logging.WARNING, logger="devrf"):
         divided = fit(canonical())
-    assert divided.parts.count == parts
+    assert divided.loop.parts.count == parts
     assert calls[-parts:] == [rays] * parts
     assert_alike(divided, whole)
     said = [line for line in caplog.messages if "out of memory" in line]
@@ -109,7 +109,7 @@ def test_the_deformation_stage_learns_the_same_in_parts(fit, room, rest: Stored)
     whole = fit(moving(rest))
     room(16, from_call=5)
     divided = fit(moving(rest))
-    assert divided.parts.count == 4
+    assert divided.loop.parts.count == 4
     assert_alike(divided, whole)
 
 
@@ -120,7 +120,7 @@ def test_a_frame_that_runs_short_takes_nothing_from_the_one_beside_it(
     # Four iterations of one frame, one of two; then the second of them runs short.
     calls = room(32, from_call=4 + 2 + 1)
     divided = fit(moving(rest, TOGETHER), data=four_frames)
-    assert divided.parts.count == 2 and calls == [64] * 8 + [32] * 2 + [32] * 2 * 2 * 2
+    assert divided.loop.parts.count == 2 and calls == [64] * 8 + [32] * 2 + [32] * 2 * 2 * 2
     assert_alike(divided, whole)
 
 
@@ -153,7 +153,7 @@ def test_memory_that_runs_out_at_the_backward_pass_does_no_harm(
 
     monkeypatch.setattr(failing, "manual_backward", backward)
     fit(failing)
-    assert failing.parts.count == 2
+    assert failing.loop.parts.count == 2
     assert_alike(failing, whole)
 
 
@@ -164,7 +164,7 @@ def test_the_parts_are_remembered(fit, room, tmp_path: Path) -> None:
     calls = room(64)
     again = canonical()
     fit(again, ckpt_path=str(tmp_path / "canonical-progress-4.ckpt"))
-    assert again.parts.count == 2 and set(calls) == {32}
+    assert again.loop.parts.count == 2 and set(calls) == {32}
 
 
 def test_memory_that_never_suffices_ends_the_stage_saved(fit, room, tmp_path: Path) -> None:

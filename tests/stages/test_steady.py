@@ -187,7 +187,7 @@ def learn(
 ) -> ScheduledStage:
     torch.manual_seed(3)
     stage = build()
-    stage._capturer = lambda: capturer  # type: ignore[method-assign]
+    stage.loop._capturer = lambda: capturer  # type: ignore[method-assign]
     if capturer is not None:
         draw, prepare = stage.draw, stage.prepare
         stage.draw = lambda lane: watched(lambda: draw(lane))  # type: ignore[method-assign]

@@ -145,7 +145,7 @@ class Excerpts(Callback):
             phase=phase.kind if isinstance(phase, CanonicalPhase) else f"level {phase.level}",
             resolution=stage.resolution,
             frames=phase.frames if isinstance(phase, DeformationPhase) else (),
-            rays=stage.schedule.rays * len(stage.lanes),
+            rays=stage.schedule.rays * len(stage.loop.lanes),
             iterations=iterations,
             seconds=Spread.of(self._undisturbed),
             measured_seconds=Spread.of([sum(parts.values()) for parts in spent]),

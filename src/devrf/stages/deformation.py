@@ -222,7 +222,7 @@ class DeformationStage(ScheduledStage):
     def _open_visits(self, count: int) -> None:
         """Make room for so many visits at the field's present resolution."""
         # What belonged to those before is gone before theirs is made.
-        self.let_go()
+        self.loop.let_go()
         self.visits = []
         self._optimizer.replace(0, [])
         self.visits = [Visit.of(self.field, self.scene_model.occupancy) for _ in range(count)]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -22,9 +21,6 @@ from devrf.fields.warp import GridWarp
 from devrf.geometry.rays import Rays
 from devrf.machine import multiplies_bfloat16
 from devrf.ops.adam import GridAdam
-from devrf.ops.choice import triton_runs
-from devrf.ops.spans import measured, span
-from devrf.ops.speed import wait
 from devrf.rendering.fused import render_in_lists
 from devrf.rendering.model import SceneModel
 from devrf.rendering.player import Player
@@ -35,22 +31,18 @@ from devrf.shortage import ShortageError
 from devrf.stages.checkpoint import Passport, check_scene, passport_in
 from devrf.stages.compact_state import compact_state
 from devrf.stages.held_out import score
-from devrf.stages.lane import Lane, Sums
-from devrf.stages.parts import Parts
+from devrf.stages.lane import Lane
+from devrf.stages.loop import Loop
 from devrf.stages.progress import random_states, set_random_states
 from devrf.stages.ranks import (
     RaysByRank,
-    average_gradients,
     check_alike,
     rank,
-    share,
     take_from_first,
-    world_size,
 )
-from devrf.stages.replay import Capturer, Graphs, OnCuda, Repeated
+from devrf.stages.replay import Graphs
 from devrf.stages.schedules import CanonicalPhase, DeformationPhase
 from devrf.stages.settings import Precision
-from devrf.stages.side_by_side import SideBySide
 
 Phase = CanonicalPhase | DeformationPhase
 
@@ -63,14 +55,9 @@ class ScheduledStage(LightningModule, ABC):
     calls :meth:`enter` where a phase begins, ``LearningRateDecay`` scales the learning rates
     before every step.
 
-    An iteration is one optimiser step, on what is learned from one batch, or from several that
-    have nothing to do with one another (``lanes``).
-
-    Where Triton runs, iterations are steady: lists of samples have a fixed length (``rooms``),
-    gradients, moments and whatever else goes from one iteration to the next stay in the same
-    memory, and nothing waits for the device. On one GPU each is then a CUDA graph that is
-    replayed (``graphs``). Callbacks see the same steps and the same rates; what is asked before a
-    step is asked before the whole iteration.
+    What an iteration is, and how it is carried out, is the loop's business
+    (:class:`~devrf.stages.loop.Loop`). Callbacks see the same steps and the same rates whatever
+    runs it; what is asked before a step is asked before the whole iteration if that is steady.
 
     A checkpoint with the optimiser's state in it (any of Lightning's that is not ``weights_only``)
     holds all that it takes to go on: ``Trainer.fit(ckpt_path=…)`` continues as if the run had
@@ -86,13 +73,11 @@ class ScheduledStage(LightningModule, ABC):
         generator: what pixels are drawn with, on the stage's device. At the beginning of each
             Lightning step it depends on the seed, the process and the iteration alone.
         made_with: the settings that decide what is learned, by config key, if somebody told.
-        parts: how batches are divided when memory runs out.
         back_offs: how often learning went wrong and was taken back.
         caution: what the scheduled learning rates are multiplied by; below 1 after a back-off.
         gave_up: why the stage ended before its schedule; None while it has not.
-        graphs: whether steady iterations are captured in a CUDA graph where that is possible.
         decoder_precision: what the colour network computes in while it learns.
-        lanes: the batches of an iteration; none before the first phase.
+        loop: carries the iterations out.
     """
 
     name: ClassVar[str]
@@ -104,22 +89,16 @@ class ScheduledStage(LightningModule, ABC):
     ) -> None:
         super().__init__()
         self.automatic_optimization = False
-        self.graphs = graphs
         self.decoder_precision = decoder_precision
-        self.lanes: list[Lane] = []
+        self.loop = Loop(graphs)
         self.iterations_per_step = iterations_per_step
         self.iteration = 0
         self.skipped = 0
         self.phase: Phase | None = None
         self.record: dict[str, float | None] = {}
         self.generator = torch.Generator()
-        self._rays = 0
-        self._sums = Sums()
-        self._side_by_side = SideBySide()
-        self._repeated: Repeated | None = None
         self._seed = 0
         self.made_with: dict[str, Any] = {}
-        self.parts = Parts()
         self.back_offs = 0
         self.caution = 1.0
         self.gave_up: str | None = None
@@ -218,28 +197,8 @@ class ScheduledStage(LightningModule, ABC):
             rays: of a batch, in all processes together.
             lanes: what is learned from each of the batches of an iteration.
         """
-        self.let_go()
-        self._rays = rays
-        self.lanes = [Lane(number, learned) for number, learned in enumerate(lanes)]
-        if triton_runs(self.model_now.canonical.density.values):
-            self._make_rooms()
-            self.optimizer.keep_gradients()
-
-    def let_go(self) -> None:
-        """Let go of what only iterations need: a captured one holds memory of its own."""
-        self.lanes, self._sums, self._repeated = [], Sums(), None
-
-    @property
-    def rooms(self) -> list[Room]:
-        """How long each lane's lists of samples are; none unless iterations are steady."""
-        return [lane.room for lane in self.lanes if lane.room is not None]
-
-    def _make_rooms(self) -> None:
-        for lane in self.lanes:
-            lane.room = self._new_room()
-
-    def _new_room(self) -> Room:
-        return Room(-(-share(self._rays) // self.parts.count), self.device)
+        density = self.model_now.canonical.density.values
+        self.loop.renew(rays, lanes, density, self.optimizer)
 
     def setup(self, stage: str) -> None:
         """Make the generator.
@@ -280,7 +239,7 @@ class ScheduledStage(LightningModule, ABC):
 
     def teardown(self, stage: str) -> None:
         """Let go of what only iterations need."""
-        self.let_go()
+        self.loop.let_go()
 
     def _draw_anew(self) -> None:
         """Seed the generator for the coming iterations, in each process differently."""
@@ -319,10 +278,6 @@ class ScheduledStage(LightningModule, ABC):
         self._draw_anew()
         self.trainer.should_stop = False
 
-    def _backward(self, total: Tensor) -> None:
-        with span("backward"):
-            self.manual_backward(total)
-
     def training_step(self, views: Views, batch_idx: int) -> dict[str, Tensor]:
         """Run iterations up to ``iterations_per_step``, never beyond the present phase.
 
@@ -345,28 +300,18 @@ class ScheduledStage(LightningModule, ABC):
         first = self.iteration
         for _ in range(count):
             self.prepare()
-            for lane in self.lanes:
-                lane.take(self.draw(lane))
             try:
-                if self.rooms:
-                    self._repeat(views, optimizer)
-                else:
-                    optimizer.zero_grad()
-                    self._learn(views)
-                    with span("optimiser"):
-                        optimizer.step()
+                self.loop.once(self, views, optimizer)
             except ShortageError as shortage:
-                optimizer.zero_grad()  # of lanes that had room
                 self.give_up(f"{shortage} at {self.where(self.iteration)}; {self.remedy}")
                 break
             self.iteration += 1
         done = self.iteration - first
-        if any([room.look() for room in self.rooms]):  # a list: all of them look
-            self._repeated = None  # captured with lists of another length
+        self.loop.look()
         if not done:
             self._draw_anew()
             return {}
-        means, losses = self._sums.take(done)
+        means, losses = self.loop.sums.take(done)
         if self.iteration < stop and self.settled(losses):
             self.skipped += stop - self.iteration
             self.iteration = stop
@@ -385,56 +330,6 @@ class ScheduledStage(LightningModule, ABC):
             "the same command goes on where there is more memory; with less, begin afresh "
             f"(resume=false) with lower {' or '.join(self.costly)}, or higher data.downscale"
         )
-
-    def _learn(self, views: Views) -> None:
-        """The gradients of each lane's batch; losses and terms are added to this step's sums."""
-        pieces = [partial(self._learn_from, lane, views) for lane in self.lanes]
-        found = self._side_by_side(pieces, self.device)
-        groups = self.optimizer.param_groups
-        average_gradients(p for group in groups for p in group["params"])
-        self._sums.add(found)
-
-    def _learn_from(self, lane: Lane, views: Views) -> dict[str, Tensor]:
-        """The gradients of a lane's batch, its loss and its terms."""
-        assert lane.pixels is not None
-        total, terms = self.parts.gradients(
-            lambda part: self.loss(lane, views, part), lane.pixels, self._backward,
-            lambda: self._divided(lane),
-        )
-        return {"loss": total.detach(), **terms}
-
-    def _divided(self, lane: Lane) -> None:
-        """Begin a lane's iteration anew in smaller parts, which are those of all lanes."""
-        wait(self.device)  # other lanes may be at work in their rooms
-        self.optimizer.drop_gradients(lane.parameters)
-        if self.rooms:
-            self._make_rooms()
-            self._repeated = None
-
-    def _repeat(self, views: Views, optimizer: LightningOptimizer) -> None:
-        """A steady iteration: the same work on the same tensors, with other pixels in them."""
-
-        def work() -> None:
-            self._learn(views)
-            with span("optimiser"):
-                self.optimizer.apply()
-
-        if self._repeated is None:
-            self._repeated = Repeated(work, self._capturer())
-        repeated = self._repeated  # which is gone if memory runs out on the way
-        # What is replayed shows none of its parts to those who measure them.
-        with self.optimizer.stepping_by(work if measured() else repeated):
-            optimizer.step()
-        if repeated.is_warm:
-            for room in self.rooms:
-                room.measure()
-        if repeated.failed:
-            self.graphs = "off"  # one warning is enough
-
-    def _capturer(self) -> Capturer | None:
-        """How iterations are captured: on one GPU, if at all."""
-        possible = self.graphs == "auto" and self.device.type == "cuda" and world_size() == 1
-        return OnCuda(self.device) if possible else None
 
     def test_step(self, index: int, batch_idx: int) -> dict[str, Any]:
         """Render and score one held-out image; the means are logged.
@@ -479,7 +374,7 @@ class ScheduledStage(LightningModule, ABC):
                 "at_hand": {} if self.phase is None else self.at_hand(),
                 "seed": self._seed,
                 "random": random_states(self.device),
-                "parts": self.parts.count,
+                "parts": self.loop.parts.count,
                 "back_offs": self.back_offs,
                 "caution": self.caution,
             }
@@ -504,7 +399,7 @@ class ScheduledStage(LightningModule, ABC):
             )
         self.iteration, self._seed = kept["iteration"], kept["seed"]
         self.skipped = kept["skipped"]
-        self.parts.count = kept["parts"]
+        self.loop.parts.count = kept["parts"]
         self.back_offs, self.caution = kept["back_offs"], kept["caution"]
         self.phase = None if kept["phase"] is None else self.phase_at(kept["phase"])
         self._left_off = kept
