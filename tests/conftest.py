@@ -46,12 +46,6 @@ def single_thread() -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True)
-def single_precision(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Stages compute in the same precision on every machine, unless a test says otherwise."""
-    monkeypatch.setattr("devrf.stages.stage.multiplies_bfloat16", lambda device: False)
-
-
-@pytest.fixture(autouse=True)
 def seeded() -> None:
     """The global generator starts each test at the same place, whatever ran before."""
     torch.manual_seed(0)

@@ -88,27 +88,10 @@ def test_a_disk_is_that_of_the_first_folder_that_exists(tmp_path: Path) -> None:
     assert here == pytest.approx(later, rel=0.05)
 
 
-@pytest.mark.parametrize(("told", "expected"), [
-    ({"avx512_bf16": True, "amx_bf16": False}, True),
-    ({"amx_bf16": True}, True),
-    ({"avx512_bf16": False}, False),
-    ({}, False),
-])
-def test_what_a_cpu_says_of_bfloat16(
-    told: dict[str, bool], expected: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: told, raising=False)
-    assert multiplies_bfloat16(torch.device("cpu")) is expected
-
-
-def test_a_torch_that_says_nothing_of_a_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delattr(torch.cpu, "get_capabilities", raising=False)
-    assert not multiplies_bfloat16(torch.device("cpu"))
-
-
 @pytest.mark.parametrize(("capability", "expected"), [((7, 5), False), ((8, 0), True)])
 def test_what_a_gpu_multiplies(
     capability: tuple[int, int], expected: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: capability)
     assert multiplies_bfloat16(torch.device("cuda", 0)) is expected
+    assert not multiplies_bfloat16(torch.device("cpu"))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 
 import torch
@@ -44,17 +44,12 @@ def free_host_memory(root: Path = Path("/")) -> int | None:
 
 
 def multiplies_bfloat16(device: torch.device) -> bool:
-    """Whether ``device`` has instructions for products of bfloat16.
+    """Whether ``device`` is faster with products of bfloat16: NVIDIA's GPUs are from Ampere on.
 
-    NVIDIA's from Ampere on have, and CPUs whose AVX-512 or AMX does. Elsewhere such products are
-    imitated, which is slower than single precision.
+    A CPU is not, even one with instructions for them: oneDNN compiles its products anew for each
+    number of samples, and no two batches have the same.
     """
-    if device.type == "cuda":
-        return torch.cuda.get_device_capability(device) >= (8, 0)
-    # Older versions of torch do not tell of a CPU.
-    tell: Callable[[], Mapping[str, object]] = getattr(torch.cpu, "get_capabilities", dict)
-    capabilities = tell()
-    return any(capabilities.get(name) for name in ("avx512_bf16", "amx_bf16"))
+    return device.type == "cuda" and torch.cuda.get_device_capability(device) >= (8, 0)
 
 
 def own_memory() -> int:

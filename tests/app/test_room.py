@@ -86,8 +86,7 @@ def test_a_lack_of_memory_that_nothing_helps_against_is_told_in_a_line(
 
 # Half of the fields and a small part of a batch fit into what is left of the program.
 LARGE = ("schedule.canonical.rays=60000", "schedule.canonical.iterations=2",
-         "schedule.canonical.doublings=[]", "decoder_precision=float32", "stage=canonical",
-         "hydra.run.dir=run")
+         "schedule.canonical.doublings=[]", "stage=canonical", "hydra.run.dir=run")
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits as Linux knows them")

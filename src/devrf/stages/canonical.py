@@ -73,8 +73,8 @@ class CanonicalStage(ScheduledStage):
             fine_loss: their weights afterwards.
             iterations_per_step: optimiser iterations in one Lightning step.
             graphs: whether a GPU replays iterations from CUDA graphs: ``auto`` where it can.
-            decoder_precision: what the colour network computes in; ``auto``: ``bfloat16`` where
-                the device multiplies it.
+            decoder_precision: what the colour network computes in; ``auto``: ``bfloat16`` on a
+                GPU that multiplies it.
         """
         super().__init__(iterations_per_step, graphs, decoder_precision)
         self.schedule = schedule or CanonicalSchedule()
