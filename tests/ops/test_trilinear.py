@@ -108,3 +108,10 @@ def test_a_shape_first_met_in_inference_mode_can_be_trained() -> None:
     coords = torch.ones(1, 3, requires_grad=True)
     interpolate(torch.zeros(2, 3, 9, 1), coords).sum().backward()
     assert coords.grad is not None
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_no_points_have_no_gradients(channels: int) -> None:
+    coords = torch.zeros(0, 3, requires_grad=True)
+    interpolate(torch.ones(2, 3, 4, channels), coords).sum().backward()
+    assert coords.grad is not None and coords.grad.shape == (0, 3)

@@ -73,20 +73,15 @@ class _Interpolate(torch.autograd.Function):
         grid_grad = coords_grad = None
         rows = _corner_rows(first, shape_of(grid))
         table = grid.reshape(-1, grid.shape[3])
-        weights = _linear(fraction)
-        if ctx.gradient is not None:
-            _scatter(rows, _corner_weights(weights), grad, ctx.gradient.view(table.shape))
-        elif ctx.needs_input_grad[0]:
-            grid_grad = torch.zeros_like(grid, memory_format=torch.contiguous_format)
-            _scatter(rows, _corner_weights(weights), grad, grid_grad.view(table.shape))
+        into = ctx.gradient
+        if into is None and ctx.needs_input_grad[0]:
+            into = grid_grad = torch.zeros_like(grid, memory_format=torch.contiguous_format)
+        if into is not None:
+            _scatter(rows, _corner_weights(_linear(fraction)), grad, into.view(table.shape))
         if ctx.needs_input_grad[1]:
-            slopes = torch.empty_like(fraction)
-            rise = torch.ones_like(fraction[0])
+            slopes = torch.stack(_slopes(_pulls(rows, table, grad), fraction))
             for axis, points in enumerate(shape_of(grid)):
-                sloped = [*weights[:axis], (-rise, rise), *weights[axis + 1 :]]
-                change = _bag(rows, table, _corner_weights(sloped))
-                inside = (coords[:, axis] >= 0) & (coords[:, axis] <= points - 1)
-                torch.mul((change * grad).sum(dim=1), inside, out=slopes[axis])
+                slopes[axis] *= (coords[:, axis] >= 0) & (coords[:, axis] <= points - 1)
             coords_grad = slopes.t()
         return grid_grad, coords_grad, None
 
@@ -138,9 +133,34 @@ def _corner_weights(axes: list[Pair]) -> Tensor:
     for pair in range(4):
         side = x[pair >> 1] * y[pair & 1]
         # Column by column: broadcasting over pairs, or one transposition at the end, is slower.
-        weights[:, 2 * pair] = side * z[0]
-        weights[:, 2 * pair + 1] = side * z[1]
+        torch.mul(side, z[0], out=weights[:, 2 * pair])
+        torch.mul(side, z[1], out=weights[:, 2 * pair + 1])
     return weights
+
+
+def _pulls(rows: Tensor, table: Tensor, grad: Tensor) -> Tensor:
+    """What the weight of each corner is worth, (8, M): its row times the gradient (M, C)."""
+    corners = table.index_select(0, rows.t().reshape(-1)).view(8, *grad.shape)
+    if grad.shape[1] == 1:
+        return corners[..., 0] * grad[:, 0]
+    return corners.mul_(grad).sum(dim=2)
+
+
+def _slopes(pulls: Tensor, fraction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """How Σ weights · pulls rises along x, y and z, (M,) each; corners are joined axis by axis.
+
+    Args:
+        pulls: (8, M) in the order of the corners' rows.
+        fraction: (3, M) within the cell.
+    """
+    (x, y, z), count = fraction, pulls.shape[1]
+    low, high = pulls.view(4, 2, count).unbind(1)
+    over_z, at_z = high - low, low.lerp(high, z)
+    low, high = at_z.view(2, 2, count).unbind(1)
+    over_y, at_y = high - low, low.lerp(high, y)
+    low, high = over_z.view(2, 2, count).unbind(1)
+    over_z = low.lerp(high, y)
+    return at_y[1] - at_y[0], over_y[0].lerp(over_y[1], x), over_z[0].lerp(over_z[1], x)
 
 
 def _bag(rows: Tensor, table: Tensor, weights: Tensor) -> Tensor:
