@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
 
 from devrf.data.batch import background_color, gather_batch, pixel_positions
-from devrf.data.pool import PixelPool, all_pixels
+from devrf.data.pool import PixelPool, all_pixels, wanted_pixels
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.scene import OpticalFlow, Views
 
@@ -114,3 +116,19 @@ def test_a_pool_is_told_by_its_mask() -> None:
         again = PixelPool.of_mask(images, mask)
         assert torch.equal(again.image, pool.image) and again.image.dtype == torch.int32
         assert torch.equal(again.flat, pool.flat) and again.flat.dtype == torch.int32
+
+
+def test_what_is_wanted_but_does_not_count_is_left_out() -> None:
+    shown = views()
+    area = shown.height * shown.width
+    wanted = torch.zeros(2, area, dtype=torch.bool)
+    wanted[0, [1, 2]] = wanted[1, 3] = True
+    images = torch.tensor([1, 0])
+    pool = wanted_pixels(shown, images, wanted)
+    assert list(zip(pool.image.tolist(), pool.flat.tolist(), strict=True)) == [
+        (1, 1), (1, 2), (0, 3),
+    ]
+    counted = torch.ones(len(shown), shown.height, shown.width, dtype=torch.bool)
+    counted[1, 0, 1] = False
+    pool = wanted_pixels(replace(shown, counted=counted), images, wanted)
+    assert list(zip(pool.image.tolist(), pool.flat.tolist(), strict=True)) == [(1, 2), (0, 3)]

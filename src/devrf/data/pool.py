@@ -60,9 +60,17 @@ def all_pixels(views: Views, images: Tensor) -> PixelPool:
     """Every pixel of ``images`` (K,) int64 that counts."""
     area = views.height * views.width
     if views.counted is not None:
-        counted = views.counted[images.to(views.counted.device)]
-        return PixelPool.of_mask(images, counted.flatten(1).to(images.device))
+        everything = torch.ones(len(images), area, dtype=torch.bool, device=images.device)
+        return wanted_pixels(views, images, everything)
     flat = torch.arange(area, dtype=torch.int32, device=images.device)
     return PixelPool(
         images.to(torch.int32).repeat_interleave(area), flat.repeat(len(images))
     )
+
+
+def wanted_pixels(views: Views, images: Tensor, wanted: Tensor) -> PixelPool:
+    """The pixels of ``images`` (K,) int64 that are ``wanted``, (K, H·W) bool, and count."""
+    if views.counted is not None:
+        counted = views.counted[images.to(views.counted.device)]
+        wanted = wanted & counted.flatten(1).to(wanted.device)
+    return PixelPool.of_mask(images, wanted)

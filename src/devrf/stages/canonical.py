@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from devrf.data.batch import Pixels, background_color, gather_batch
-from devrf.data.pool import PixelPool, all_pixels
+from devrf.data.pool import PixelPool, all_pixels, wanted_pixels
 from devrf.errors import DevrfError
 from devrf.fields.architecture import Architecture
 from devrf.fields.bits import pack_bits, unpack_bits
@@ -220,25 +220,21 @@ class CanonicalStage(ScheduledStage):
 
     def _useful_pixels(self, views: Views, *, everywhere: bool) -> PixelPool:
         """The pixels whose rays meet something that may be occupied."""
-        device = self.device
-        pool = all_pixels(views, torch.arange(len(views), device=device))
+        images = torch.arange(len(views), device=self.device)
         if everywhere:
-            return pool
-        cameras = views.cameras.to(device)
-        kept = torch.cat(
-            [
-                meets_matter(cameras, image, self.model, self.model.occupancy)
-                for image in range(len(views))
-            ]
-        )
-        if views.counted is not None:
-            kept = kept[views.counted.flatten().to(device)]
-        if not bool(kept.any()):
+            return all_pixels(views, images)
+        cameras = views.cameras.to(self.device)
+        meeting = [
+            meets_matter(cameras, image, self.model, self.model.occupancy)
+            for image in range(len(views))
+        ]
+        pool = wanted_pixels(views, images, torch.stack(meeting))
+        if not len(pool):
             raise DevrfError(
                 f"the field has become empty by iteration {self.iteration}: check data.background, "
                 "data.box and data.near, or lower schedule.rates.density"
             )
-        return PixelPool(pool.image[kept], pool.flat[kept])
+        return pool
 
     def _hand_over(self, cameras: Cameras, *, skip_zero: bool) -> None:
         """Give the optimiser the present grids, each voxel paced by how many views see it.

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from devrf.data.batch import Pixels, background_color, gather_batch
 from devrf.data.correspondence import previous_images
-from devrf.data.pool import PixelPool, all_pixels
+from devrf.data.pool import PixelPool, all_pixels, wanted_pixels
 from devrf.errors import DevrfError
 from devrf.fields.bits import pack_bits, unpack_bits
 from devrf.fields.deformation import DeformationField
@@ -281,9 +281,10 @@ class DeformationStage(ScheduledStage):
         images = self._images(views, visit.frame)
         if len(images) == 0:
             raise DevrfError(f"dynamic training set: no image at frame {visit.frame}")
-        pools = [all_pixels(views, image[None]) for image in images]
         if self.motion.pixels == "useful":
-            pools = [self._useful(views, pool, visit.occupancy) for pool in pools]
+            pools = [self._useful(views, image, visit.occupancy) for image in images]
+        else:
+            pools = [all_pixels(views, image[None]) for image in images]
         if self.motion.views == "all":
             pools = [
                 PixelPool(
@@ -297,15 +298,13 @@ class DeformationStage(ScheduledStage):
         """The images (K,) of a frame, ascending."""
         return (self.field.clock.frames_of(views.times) == frame).nonzero()[:, 0]
 
-    def _useful(self, views: Views, pool: PixelPool, matter: Occupancy) -> PixelPool:
+    def _useful(self, views: Views, image: Tensor, matter: Occupancy) -> PixelPool:
         """Pixels on the matte, or whose rays meet the frame's matter; all if there are none."""
-        image = int(pool.image[0])
-        kept = meets_matter(views.cameras, image, self.scene_model, matter)
+        wanted = meets_matter(views.cameras, int(image), self.scene_model, matter)
         if views.has_alpha:
-            kept |= views.pixels[image, :, :, 3].flatten() > 0
-        if views.counted is not None:
-            kept = kept[views.counted[image].flatten()]
-        return PixelPool(pool.image[kept], pool.flat[kept]) if bool(kept.any()) else pool
+            wanted |= views.pixels[image, :, :, 3].flatten() > 0
+        pool = wanted_pixels(views, image[None], wanted[None])
+        return pool if len(pool) else all_pixels(views, image[None])
 
     def prepare(self) -> None:
         """Look up the frames' occupancy anew, when it is time."""
