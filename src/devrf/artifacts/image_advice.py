@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import torch
+from torch import Tensor
 
 from devrf.artifacts.advice import Advice, listed
 from devrf.geometry.clock import FrameClock
@@ -25,6 +28,12 @@ def image_advice(scene: Scene) -> list[Advice]:
         *_blank(scene), *_turned(scene), *_mattes(scene), *_masks(scene), *_times(scene),
         *_flow(scene.dynamic.train),
     ]
+
+
+def mean_share(masks: Iterable[Tensor]) -> float:
+    """Mean of masks (H, W), one by one: a large scene's at once would be copied."""
+    shares = [float(mask.float().mean()) for mask in masks]
+    return sum(shares) / len(shares)
 
 
 def _everyone(scene: Scene) -> list[tuple[str, Views]]:
@@ -105,9 +114,9 @@ def _masks(scene: Scene) -> list[Advice]:
     much = {}
     for name, views in _everyone(scene):
         if views.counted is not None:
-            share = 1 - sum(float(one.float().mean()) for one in views.counted) / len(views)
-            if share > MUCH_LEFT_OUT:
-                much[name] = share
+            left_out = mean_share(~one for one in views.counted)
+            if left_out > MUCH_LEFT_OUT:
+                much[name] = left_out
     if not much:
         return []
     return [Advice(

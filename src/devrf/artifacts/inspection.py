@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
-
-from torch import Tensor
 
 from devrf.artifacts.advice import Advice
 from devrf.artifacts.camera_advice import box_middle, camera_advice, widest_gap
-from devrf.artifacts.image_advice import MATTE, image_advice
+from devrf.artifacts.image_advice import MATTE, image_advice, mean_share
 from devrf.geometry.clock import FrameClock
 from devrf.scenes.optical_flow import frame_pairs
 from devrf.scenes.scene import Bounds, Scene, Views
@@ -150,17 +147,11 @@ def _views_facts(name: str, views: Views, scene: Scene) -> ViewsFacts:
         frames=len(distinct_times(views)),
         width=views.width,
         height=views.height,
-        mattes=_share(k[..., 3] > MATTE for k in views.pixels) if views.has_alpha else None,
-        left_out=None if views.counted is None else _share(~k for k in views.counted),
+        mattes=mean_share(k[..., 3] > MATTE for k in views.pixels) if views.has_alpha else None,
+        left_out=None if views.counted is None else mean_share(~k for k in views.counted),
         focal=(float(cameras.focal.min()), float(cameras.focal.max())),
         distance=(float(distance.min()), float(distance.mean()), float(distance.max())),
     )
-
-
-def _share(masks: Iterable[Tensor]) -> float:
-    """Mean of masks (H, W), one by one: a large scene's at once would be copied."""
-    shares = [float(mask.float().mean()) for mask in masks]
-    return sum(shares) / len(shares)
 
 
 def _times_facts(views: Views) -> TimesFacts:

@@ -32,7 +32,7 @@ def preview(
     seen = model.picture(rays, float(views.times[index]), behind)
     prediction = seen.color.view(views.height, views.width, 3).clamp(0, 1).cpu()
     truth = truth_image(views, index, background).cpu()
-    error = error_colors(compare(views, index, prediction, truth), truth)
+    error = error_colors(compare(prediction, truth, views.counted_in(index)), truth)
     strip = side_by_side([prediction, truth, error])
     depth = depth_picture(model, seen, views.cameras.positions[index], strip.shape[0])
     return {"view": strip, "depth": depth}

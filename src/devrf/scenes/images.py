@@ -30,7 +30,6 @@ _IN_FLIGHT = 2**30
 _INFLATION = 2000
 _MUCH = 2**28
 
-
 # (position in the set, RGBA) → RGBA.
 Finish = Callable[[int, npt.NDArray[np.uint8]], npt.NDArray[np.uint8]]
 

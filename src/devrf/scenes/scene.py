@@ -96,6 +96,10 @@ class Views:
             None if self.counted is None else self.counted[index],
         )
 
+    def counted_in(self, image: int) -> Tensor | None:
+        """(H, W) bool on the host, the pixels of an image that count; None: all of them."""
+        return None if self.counted is None else self.counted[image].cpu()
+
     def to(self, device: torch.device | str) -> Views:
         """The same views on ``device``; images stay uint8."""
         return replace(

@@ -56,8 +56,7 @@ class Sight:
     @property
     def counted(self) -> Tensor | None:
         """(H, W) bool, the pixels that count; None: all of them."""
-        counted = self.views.counted
-        return None if counted is None else counted[self.index].cpu()
+        return self.views.counted_in(self.index)
 
 
 def _ms_ssim(sight: Sight) -> float | None:

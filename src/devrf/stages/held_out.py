@@ -76,7 +76,8 @@ def score(
     rest = prediction
     if player.ready(time).warp is not None:
         rest = _image(player.view(views.cameras, index, 0.0, behind), views)
-    compared, rest = (compare(views, index, image, truth) for image in (prediction, rest))
+    counted = views.counted_in(index)
+    compared, rest = (compare(image, truth, counted) for image in (prediction, rest))
     further: dict[str, float | None] = {}
     if judge is not None and judge.metrics:
         shape = (views.height, views.width)
@@ -92,33 +93,30 @@ def score(
         time=time,
         truth=truth,
         prediction=prediction,
-        psnr=_psnr(views, index, compared, truth),
-        ssim=_ssim(views, index, compared, truth),
-        rest_pose_psnr=_psnr(views, index, rest, truth),
+        psnr=_psnr(compared, truth, counted),
+        ssim=_ssim(compared, truth, counted),
+        rest_pose_psnr=_psnr(rest, truth, counted),
         further=further,
         compared=compared,
     )
 
 
-def compare(views: Views, index: int, prediction: Tensor, truth: Tensor) -> Tensor:
+def compare(prediction: Tensor, truth: Tensor, counted: Tensor | None) -> Tensor:
     """The prediction (H, W, 3) of a held-out image; the truth where its pixels do not count."""
-    if views.counted is None:
-        return prediction
-    return torch.where(views.counted[index].cpu()[..., None], prediction, truth)
+    return prediction if counted is None else torch.where(counted[..., None], prediction, truth)
 
 
-def _psnr(views: Views, index: int, compared: Tensor, truth: Tensor) -> float:
-    if views.counted is None:
+def _psnr(compared: Tensor, truth: Tensor, counted: Tensor | None) -> float:
+    if counted is None:
         return psnr(compared, truth)
-    inside = psnr_masked(compared, truth, views.counted[index].cpu())
+    inside = psnr_masked(compared, truth, counted)
     assert inside is not None  # readers refuse a mask that leaves nothing
     return inside
 
 
-def _ssim(views: Views, index: int, compared: Tensor, truth: Tensor) -> float:
-    if views.counted is None:
+def _ssim(compared: Tensor, truth: Tensor, counted: Tensor | None) -> float:
+    if counted is None:
         return ssim(compared, truth)
-    counted = views.counted[index].cpu()
     # Where nothing counts that is as wide as a window, windows about what counts have to do,
     # and where that is the image's rim, all of them.
     for measure in (ssim_within, ssim_masked):
