@@ -20,14 +20,18 @@ from hypothesis import settings
 from lightning import Callback, Trainer
 
 from devrf.callbacks import GridUpscaling, LearningRateDecay
+from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
-from devrf.fields.architecture import Architecture
 from devrf.geometry.box import Box
+from devrf.geometry.clock import FrameClock
+from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.devrf.deformation_field import DeformationField
+from devrf.methods.devrf.model import SceneModel
+from devrf.methods.devrf.schedules import CanonicalSchedule
+from devrf.rendering.rendered_image import RenderedImage
 from devrf.scenes.procedural import ProceduralScene
 from devrf.scenes.scene import Scene
-from devrf.stages.canonical import CanonicalStage
-from devrf.stages.checkpoint import Stored
-from devrf.stages.schedules import CanonicalSchedule
 
 logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
 
@@ -67,8 +71,14 @@ def cube() -> Box:
 def tiny_recipe() -> ProceduralScene:
     """How the tiny scene is made; its ``model()`` knows every motion exactly."""
     return ProceduralScene(
-        shape="robot", width=24, height=18, static_views=8, static_test_views=2,
-        train_views=2, frames=3, supersample=1,
+        shape="robot",
+        width=24,
+        height=18,
+        static_views=8,
+        static_test_views=2,
+        train_views=2,
+        frames=3,
+        supersample=1,
     )
 
 
@@ -112,9 +122,14 @@ def quiet_trainer(*callbacks: Callback, **options: Any) -> Trainer:
     """A trainer on the CPU with the two callbacks that a schedule needs, and no files."""
     warnings.filterwarnings("ignore", module="lightning")
     return Trainer(
-        accelerator="cpu", devices=1, logger=False, enable_checkpointing=False,
-        enable_progress_bar=False, enable_model_summary=False,
-        callbacks=[GridUpscaling(), LearningRateDecay(), *callbacks], **options,
+        accelerator="cpu",
+        devices=1,
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        callbacks=[GridUpscaling(), LearningRateDecay(), *callbacks],
+        **options,
     )
 
 
@@ -132,8 +147,13 @@ def learned(tiny_scene: Scene) -> tuple[CanonicalStage, Trainer]:
     """The tiny scene at rest, learned in under a second; not to be changed."""
     torch.manual_seed(0)
     schedule = CanonicalSchedule(
-        search_iterations=0, search_side=16, carve=True, iterations=120, side=20,
-        doublings=(40,), rays=256,
+        search_iterations=0,
+        search_side=16,
+        carve=True,
+        iterations=120,
+        side=20,
+        doublings=(40,),
+        rays=256,
     )
     stage = CanonicalStage(schedule, SMALL)
     fitted = quiet_trainer(max_epochs=1)
@@ -142,6 +162,31 @@ def learned(tiny_scene: Scene) -> tuple[CanonicalStage, Trainer]:
 
 
 @pytest.fixture
-def rest(learned: tuple[CanonicalStage, Trainer]) -> Stored:
+def rest(learned: tuple[CanonicalStage, Trainer]) -> LoadedCheckpoint:
     """A copy of the tiny scene at rest, for a deformation stage to build on."""
     return copy.deepcopy(learned[0].result())
+
+
+@pytest.fixture
+def moving(learned: tuple[CanonicalStage, Trainer], rng: torch.Generator) -> SceneModel:
+    """The tiny scene; at the times 0.4 and 1 every point has moved by up to 5 % of its box."""
+    model = copy.deepcopy(learned[0].model)
+    box = model.canonical.box
+    motion = DeformationField(box, FrameClock((0.0, 0.4, 1.0)), voxels=5**3)
+    shape = motion.to_canonical[1:].shape
+    motion.to_canonical[1:] = 0.1 * box.longest * (torch.rand(shape, generator=rng) - 0.5)
+    model.deformation = motion
+    return model
+
+
+@pytest.fixture
+def same() -> Callable[[RenderedImage, RenderedImage], None]:
+    """Fails unless two pictures show the same, up to 1e-5."""
+
+    def compare(one: RenderedImage, other: RenderedImage) -> None:
+        for name in ("color", "depth", "opacity"):
+            torch.testing.assert_close(
+                getattr(one, name), getattr(other, name), atol=1e-5, rtol=1e-5
+            )
+
+    return compare

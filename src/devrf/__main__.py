@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 import sys
 
-from devrf.app import main
-from devrf.messages import mistakes_in_one_line
-from devrf.process import tune_for_cpu
-from devrf.signals import Interrupted, answered_by, end_at_once
-from devrf.sweep import failures_at_the_end
+from devrf.cli.app import main
+from devrf.cli.messages import report_user_errors
+from devrf.cli.sweep import failures_at_the_end
+from devrf.system.process import tune_for_cpu
+from devrf.system.signals import Interrupted, answered_by, end_at_once
 
 
 def entry() -> None:
@@ -23,7 +23,7 @@ def entry() -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"
     tune_for_cpu()
     try:
-        with answered_by(end_at_once), mistakes_in_one_line(), failures_at_the_end():
+        with answered_by(end_at_once), report_user_errors(), failures_at_the_end():
             main()
     except Interrupted as stop:
         print(f"devrf: {stop.said}", file=sys.stderr)

@@ -26,8 +26,14 @@ from devrf.scenes.scene import Capture, OpticalFlow, Scene, Views
 def healthy() -> Scene:
     """A robot in 24×18 pixels: 16 static views all around, 2 moving views of 3 frames."""
     return ProceduralScene(
-        shape="robot", width=24, height=18, static_views=16, static_test_views=2,
-        train_views=2, frames=3, supersample=1,
+        shape="robot",
+        width=24,
+        height=18,
+        static_views=16,
+        static_test_views=2,
+        train_views=2,
+        frames=3,
+        supersample=1,
     )()
 
 
@@ -54,14 +60,12 @@ def turned(views: Views, image: int, degrees: float) -> Views:
 
 def without_mattes(scene: Scene, box: Box | None = None) -> Scene:
     def opaque(capture: Capture) -> Capture:
-        return Capture(*(
-            replace(v, pixels=v.pixels[..., :3]) for v in (capture.train, capture.test)
-        ))
+        return Capture(
+            *(replace(v, pixels=v.pixels[..., :3]) for v in (capture.train, capture.test))
+        )
 
     bounds = replace(scene.bounds, box=box or scene.bounds.box)
-    return replace(
-        scene, static=opaque(scene.static), dynamic=opaque(scene.dynamic), bounds=bounds
-    )
+    return replace(scene, static=opaque(scene.static), dynamic=opaque(scene.dynamic), bounds=bounds)
 
 
 def painted(views: Views, image: int, value: list[int]) -> Views:

@@ -12,9 +12,9 @@ from rich.console import Console
 from devrf.artifacts.advice import Advice
 from devrf.artifacts.inspection import FlowFacts, TimesFacts, inspect_scene
 from devrf.artifacts.inspection_text import plain, size, tables
+from devrf.cli.memory import Budget, StageMemory
 from devrf.geometry.box import Box
 from devrf.scenes.scene import OpticalFlow, Scene
-from devrf.stages.memory import Budget, StageMemory
 
 BUDGET = Budget(
     scene={"images": 3_000_000},
@@ -31,8 +31,10 @@ def test_the_sets_of_a_scene(tiny_scene: Scene) -> None:
     assert (found.name, found.kind, found.background) == ("robot", "inward", "white")
     counts = [(f.name, f.images, f.views, f.frames) for f in found.sets]
     assert counts == [
-        ("static train", 8, 8, 1), ("static test", 2, 2, 1),
-        ("dynamic train", 6, 2, 3), ("dynamic test", 3, 1, 3),
+        ("static train", 8, 8, 1),
+        ("static test", 2, 2, 1),
+        ("dynamic train", 6, 2, 3),
+        ("dynamic test", 3, 1, 3),
     ]
     assert {(f.width, f.height, f.left_out) for f in found.sets} == {(24, 18, None)}
     alpha = tiny_scene.static.test.pixels[..., 3]
@@ -49,7 +51,8 @@ def test_cameras_by_hand(tiny_scene: Scene) -> None:
     cameras = replace(views.cameras, camera_to_world=pose, focal=focal)
     box = Box((2.0, -1.0, -1.0), (4.0, 1.0, 1.0))
     scene = replace(
-        tiny_scene, static=replace(tiny_scene.static, train=replace(views, cameras=cameras)),
+        tiny_scene,
+        static=replace(tiny_scene.static, train=replace(views, cameras=cameras)),
         bounds=replace(tiny_scene.bounds, box=box),
     )
     facts = inspect_scene(scene).sets[0]
@@ -86,9 +89,7 @@ def test_flow_by_hand(tiny_scene: Scene) -> None:
     matte = tiny_scene.dynamic.train.pixels[later, ..., 3] > 127
     found = inspect_scene(with_flow(tiny_scene, OpticalFlow(vectors, valid))).flow
     share = float((matte & valid[later]).sum()) / float(matte.sum())
-    assert found == FlowFacts(
-        4, 0.5, pytest.approx(share), pytest.approx(2.0), pytest.approx(5.0)
-    )
+    assert found == FlowFacts(4, 0.5, pytest.approx(share), pytest.approx(2.0), pytest.approx(5.0))
 
 
 def test_no_flow(tiny_scene: Scene) -> None:

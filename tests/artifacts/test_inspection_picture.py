@@ -55,7 +55,8 @@ def test_a_line_is_drawn_where_it_projects_and_far_ones_are_paler() -> None:
 def dark(image: Image.Image, x: float, y: float) -> bool:
     """Whether something was drawn within a pixel of (x, y)."""
     found = [
-        image.getpixel((i, j)) for i in range(int(x) - 1, int(x) + 2)
+        image.getpixel((i, j))
+        for i in range(int(x) - 1, int(x) + 2)
         for j in range(int(y) - 1, int(y) + 2)
     ]
     return any(sum(p) < sum(PAPER) - 120 for p in found)  # type: ignore[arg-type,misc]
@@ -71,14 +72,21 @@ def forward_scene(scene: Scene) -> Scene:
         return pose
 
     def moved(capture):
-        return replace(capture, **{
-            name: replace(v, cameras=replace(v.cameras, camera_to_world=facing(len(v))))
-            for name, v in (("train", capture.train), ("test", capture.test))
-        })
+        return replace(
+            capture,
+            **{
+                name: replace(v, cameras=replace(v.cameras, camera_to_world=facing(len(v))))
+                for name, v in (("train", capture.train), ("test", capture.test))
+            },
+        )
 
     return replace(
-        scene, kind="forward", space=NormalizedDevice(24, 18, (24.0, 24.0)), bounds=bounds,
-        static=moved(scene.static), dynamic=moved(scene.dynamic),
+        scene,
+        kind="forward",
+        space=NormalizedDevice(24, 18, (24.0, 24.0)),
+        bounds=bounds,
+        static=moved(scene.static),
+        dynamic=moved(scene.dynamic),
     )
 
 
@@ -140,13 +148,15 @@ def test_flow_as_colours() -> None:
     valid = torch.tensor([[True, True, True, True, False]])
     colors = flow_colors(vectors, valid, full=2.0)
     assert colors.shape == (1, 5, 3)
-    expected = torch.tensor([
-        [0.9, 0.0, 0.0],    # to the right: red
-        [0.45, 0.9, 0.0],   # up: a quarter turn further
-        [0.0, 0.9, 0.9],    # to the left, as saturated as it gets
-        [1.0, 1.0, 1.0],    # nowhere
-        [UNKNOWN] * 3,
-    ])
+    expected = torch.tensor(
+        [
+            [0.9, 0.0, 0.0],  # to the right: red
+            [0.45, 0.9, 0.0],  # up: a quarter turn further
+            [0.0, 0.9, 0.9],  # to the left, as saturated as it gets
+            [1.0, 1.0, 1.0],  # nowhere
+            [UNKNOWN] * 3,
+        ]
+    )
     torch.testing.assert_close(colors[0], expected, atol=1e-5, rtol=0)
 
 

@@ -15,14 +15,14 @@ from devrf.artifacts.camera_paths import orbit
 from devrf.artifacts.colors import depth_colors, error_colors, to_bytes
 from devrf.artifacts.contact_sheet import GAP, side_by_side, write_contact_sheet
 from devrf.artifacts.film import WATCHABLE, FilmSettings, film_bytes, pictures, write_video
-from devrf.fields.architecture import Architecture
-from devrf.fields.occupancy import Occupancy
+from devrf.evaluation.held_out import HeldOutView
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
-from devrf.rendering.model import SceneModel
-from devrf.rendering.player import Player
-from devrf.rendering.render import RenderSettings
-from devrf.stages.held_out import HeldOutView
+from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.model import SceneModel
+from devrf.methods.devrf.renderer import Renderer
+from devrf.methods.devrf.volume_rendering import RenderSettings
+from devrf.rendering.occupancy import Occupancy
 
 
 def flat(height: int, width: int, color: tuple[float, float, float]) -> Tensor:
@@ -31,7 +31,12 @@ def flat(height: int, width: int, color: tuple[float, float, float]) -> Tensor:
 
 def test_bytes_are_rounded_and_clamped() -> None:
     assert to_bytes(torch.tensor([-1.0, 0.0, 0.5, 1.0, 7.0, 0.9985])).tolist() == [
-        0, 0, 128, 255, 255, 255
+        0,
+        0,
+        128,
+        255,
+        255,
+        255,
     ]
 
 
@@ -136,7 +141,7 @@ def test_pictures_show_colour_beside_depth_while_time_runs(cube: Box) -> None:
         canonical.color.values.copy_(torch.tensor([9.0, -9.0, -9.0]).expand(5, 5, 5, 3))
     settings = RenderSettings(0.5, 1e-4, 0.0, 9.0)
     model = SceneModel(canonical, Occupancy.full((5, 5, 5), cube), settings)
-    shown = list(pictures(Player(model), ring(3), 1.0))
+    shown = list(pictures(Renderer(model), ring(3), 1.0))
     assert len(shown) == 3
     for image in shown:
         assert image.shape == (10, 30, 3)
@@ -153,6 +158,6 @@ def test_a_video_is_no_larger_than_was_said(rest, tiny_scene, tmp_path):
         film = FilmSettings(frames=8, height=height)
         turned = orbit(cameras, rest.model.canonical.box, film)
         path = tmp_path / "orbit.mp4"
-        shown = pictures(Player(rest.model), turned, 1.0)
+        shown = pictures(Renderer(rest.model), turned, 1.0)
         write_video(path, shown, film.fps, least=WATCHABLE if height is None else 0)
         assert 0.02 * film_bytes(film, cameras) < path.stat().st_size < film_bytes(film, cameras)

@@ -19,10 +19,10 @@ from devrf.artifacts.records import (
     provenance,
     write_frames,
 )
-from devrf.fields.deformation import DeformationField
+from devrf.checkpoints.checkpoint import LoadedCheckpoint
+from devrf.evaluation.held_out import HeldOutView
 from devrf.geometry.clock import FrameClock
-from devrf.stages.checkpoint import Stored
-from devrf.stages.held_out import HeldOutView
+from devrf.methods.devrf.deformation_field import DeformationField
 
 HOST = torch.device("cpu")
 
@@ -38,7 +38,11 @@ def test_means_are_over_what_is_known() -> None:
         view("b", 1.0, 31.0, depth_error=0.25, flow_error=3.0, lpips=None),
     ]
     assert mean_scores(views) == {
-        "psnr": 25.5, "ssim": 0.5, "depth_error": 0.375, "flow_error": 3.0, "lpips": None,
+        "psnr": 25.5,
+        "ssim": 0.5,
+        "depth_error": 0.375,
+        "flow_error": 3.0,
+        "lpips": None,
     }
 
 
@@ -51,19 +55,32 @@ def test_frames_read_back(tmp_path: Path) -> None:
         rows = list(csv.DictReader(file))
     assert [row["capture"] for row in rows] == ["static"] + ["dynamic"] * 3
     assert rows[0] == {
-        "capture": "static", "name": "r, 0", "time": "0", "psnr": "20", "ssim": "0.5",
-        "rest_pose_psnr": "9", "depth_error": "0.5", "flow_error": "",
+        "capture": "static",
+        "name": "r, 0",
+        "time": "0",
+        "psnr": "20",
+        "ssim": "0.5",
+        "rest_pose_psnr": "9",
+        "depth_error": "0.5",
+        "flow_error": "",
     }
     assert [float(row["time"]) for row in rows[1:]] == [0.0, 0.5, 1.0]
     assert [float(row["psnr"]) for row in rows[1:]] == [20.0, 21.0, 22.0]
     assert {(row["depth_error"], row["flow_error"]) for row in rows[1:]} == {("", "1.5")}
 
 
-def test_provenance_is_plain_and_whole(rest: Stored) -> None:
+def test_provenance_is_plain_and_whole(rest: LoadedCheckpoint) -> None:
     found = provenance(rest.model, HOST)
     assert json.loads(json.dumps(found)) == found
     assert set(found) == {
-        "devrf", "python", "torch", "lightning", "device", "git", "parameters", "peak_host_gb",
+        "devrf",
+        "python",
+        "torch",
+        "lightning",
+        "device",
+        "git",
+        "parameters",
+        "peak_host_gb",
         "date",
     }
     assert found["devrf"] == devrf.__version__ and found["torch"] == torch.__version__
@@ -71,7 +88,7 @@ def test_provenance_is_plain_and_whole(rest: Stored) -> None:
     assert found["date"].endswith("+00:00")
 
 
-def test_learned_values_are_counted_by_hand(rest: Stored) -> None:
+def test_learned_values_are_counted_by_hand(rest: LoadedCheckpoint) -> None:
     model = rest.model
     grids = [model.canonical.density.values, model.canonical.color.values]
     decoder = sum(p.numel() for p in model.canonical.decoder.parameters())
@@ -95,7 +112,10 @@ def test_the_revision_is_that_of_a_checkout(tmp_path: Path) -> None:
     def git(*arguments: str) -> str:
         identity = ["-c", "user.name=a", "-c", "user.email=a@b.c", "-c", "commit.gpgsign=false"]
         done = subprocess.run(
-            ["git", *identity, *arguments], cwd=tmp_path, capture_output=True, text=True,
+            ["git", *identity, *arguments],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
             check=True,
         )
         return done.stdout.strip()

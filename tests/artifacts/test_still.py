@@ -11,9 +11,9 @@ from lightning import Trainer
 from devrf.artifacts.film import FilmSettings
 from devrf.artifacts.still import StillSettings, still
 from devrf.errors import DevrfError
-from devrf.rendering.player import Player
+from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.devrf.renderer import Renderer
 from devrf.scenes.scene import Scene
-from devrf.stages.canonical import CanonicalStage
 
 
 def test_the_camera_that_is_meant(tiny_scene: Scene) -> None:
@@ -34,9 +34,7 @@ def test_the_camera_that_is_meant(tiny_scene: Scene) -> None:
         ({"height": 0}, "still.height: expected at least 1, not 0"),
     ],
 )
-def test_what_cannot_be_pictured(
-    tiny_scene: Scene, given: dict[str, Any], expected: str
-) -> None:
+def test_what_cannot_be_pictured(tiny_scene: Scene, given: dict[str, Any], expected: str) -> None:
     with pytest.raises(DevrfError) as caught:
         StillSettings(**given).camera(tiny_scene)
     assert str(caught.value) == expected
@@ -51,7 +49,7 @@ def test_colour_and_depth_of_any_size(
     learned: tuple[CanonicalStage, Trainer], tiny_scene: Scene
 ) -> None:
     model, camera = learned[0].model, StillSettings(view=2, height=31).camera(tiny_scene)
-    color, depth = still(Player(model), camera, 0.0, 0.0)
+    color, depth = still(Renderer(model), camera, 0.0, 0.0)
     assert color.shape == depth.shape == (31, 41, 3)
     seen = model.picture(camera.image_rays(0), 0.0, torch.zeros(3))
     torch.testing.assert_close(color.view(-1, 3), seen.color.clamp(0, 1))

@@ -12,24 +12,30 @@ from lightning import Callback, Trainer
 from torch.optim import Optimizer
 
 from devrf.callbacks import GridUpscaling, LearningRateDecay, Meter, Progress, TrainingRecord
+from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
-from devrf.fields.architecture import Architecture
-from devrf.stages.canonical import CanonicalStage
-from devrf.stages.checkpoint import Stored
-from devrf.stages.deformation import DeformationStage
-from devrf.stages.schedules import CanonicalSchedule, DeformationSchedule
-from devrf.stages.settings import MotionSettings
+from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.devrf.deformation_stage import DeformationStage
+from devrf.methods.devrf.schedules import CanonicalSchedule, DeformationSchedule
+from devrf.methods.devrf.settings import MotionSettings
 
 SMALL = Architecture(channels=4, width=8, frequencies=1)
 CANONICAL = CanonicalSchedule(
-    search_iterations=0, search_side=16, carve=True, iterations=12, side=12, doublings=(3, 7),
-    decay_iterations=6, rays=64,
+    search_iterations=0,
+    search_side=16,
+    carve=True,
+    iterations=12,
+    side=12,
+    doublings=(3, 7),
+    decay_iterations=6,
+    rays=64,
 )
 DEFORMATION = DeformationSchedule(sides=(4, 6), iterations_per_frame=(3, 2), rays=64)
 
 
-class Watch(Callback):
+class SweepMonitor(Callback):
     """Notes iteration, phase and rates at each optimiser step, after the other callbacks."""
 
     def __init__(self) -> None:
@@ -45,7 +51,7 @@ class Watch(Callback):
 def test_canonical_rates_and_phases_are_the_schedules_at_every_step(
     datamodule: SceneDataModule, trainer: Callable[..., Trainer]
 ) -> None:
-    watch = Watch()
+    watch = SweepMonitor()
     trainer(watch, max_epochs=1).fit(CanonicalStage(CANONICAL, SMALL), datamodule=datamodule)
     assert [step for step, _, _ in watch.steps] == list(range(12))
     for step, phase, rates in watch.steps:
@@ -56,9 +62,9 @@ def test_canonical_rates_and_phases_are_the_schedules_at_every_step(
 
 @pytest.mark.parametrize("unit", ["world", "box"])
 def test_deformation_rates_and_phases_are_the_schedules_at_every_step(
-    rest: Stored, datamodule: SceneDataModule, trainer: Callable[..., Trainer], unit: Any
+    rest: LoadedCheckpoint, datamodule: SceneDataModule, trainer: Callable[..., Trainer], unit: Any
 ) -> None:
-    watch, motion = Watch(), MotionSettings(learning_rate=2e-3, unit=unit)
+    watch, motion = SweepMonitor(), MotionSettings(learning_rate=2e-3, unit=unit)
     stage = DeformationStage(rest, DEFORMATION, motion)
     trainer(watch, max_epochs=1).fit(stage, datamodule=datamodule)
     assert [step for step, _, _ in watch.steps] == list(range(15))
@@ -75,8 +81,13 @@ def test_without_the_upscaling_callback_a_stage_says_what_is_missing(
     datamodule: SceneDataModule,
 ) -> None:
     bare = Trainer(
-        accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False,
-        enable_model_summary=False, max_steps=1, callbacks=[LearningRateDecay()],
+        accelerator="cpu",
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        max_steps=1,
+        callbacks=[LearningRateDecay()],
     )
     with pytest.raises(DevrfError, match="CanonicalStage.*iteration 0.*GridUpscaling"):
         bare.fit(CanonicalStage(CANONICAL, SMALL), datamodule=datamodule)
@@ -93,11 +104,13 @@ def test_the_record_says_what_training_took(
     assert seconds is not None and 0 < seconds < 60
     speed = stage.record["iterations_per_second"]
     assert speed is not None and 12 / speed == pytest.approx(seconds, abs=0.01)
-    assert stage.passport().records["canonical"] == stage.record
+    assert stage.metadata().records["canonical"] == stage.record
 
 
 def test_progress_writes_lines_where_there_is_no_terminal(
-    rest: Stored, datamodule: SceneDataModule, trainer: Callable[..., Trainer],
+    rest: LoadedCheckpoint,
+    datamodule: SceneDataModule,
+    trainer: Callable[..., Trainer],
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     stage = DeformationStage(rest, DEFORMATION, iterations_per_step=100)
@@ -113,10 +126,12 @@ def test_progress_writes_lines_where_there_is_no_terminal(
 
 
 def test_progress_and_curves_name_the_frames_of_a_visit(
-    rest: Stored, four_frames: SceneDataModule, trainer: Callable[..., Trainer],
+    rest: LoadedCheckpoint,
+    four_frames: SceneDataModule,
+    trainer: Callable[..., Trainer],
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    schedule = replace(DEFORMATION, coarse_to_fine=False, frames_at_once=(1, 2))
+    schedule = replace(DEFORMATION, coarse_to_fine=False, parallel_frames=(1, 2))
     stage = DeformationStage(rest, schedule, iterations_per_step=100)
     with caplog.at_level(logging.INFO, logger="devrf"):
         fit = trainer(Progress(line_every_seconds=0.0), Meter(), max_epochs=1)

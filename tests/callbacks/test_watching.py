@@ -15,13 +15,19 @@ from torch import Tensor
 from devrf.artifacts.tracking import Row, Tracker, trackers
 from devrf.callbacks import GridUpscaling, LearningRateDecay, Meter, Previews, TrainingRecord
 from devrf.data.datamodule import SceneDataModule
-from devrf.fields.architecture import Architecture
-from devrf.stages.canonical import CanonicalStage
-from devrf.stages.schedules import CanonicalSchedule
+from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.devrf.schedules import CanonicalSchedule
 
 SCHEDULE = CanonicalSchedule(
-    search_iterations=0, search_side=16, carve=True, iterations=12, side=12, doublings=(3, 7),
-    decay_iterations=6, rays=64,
+    search_iterations=0,
+    search_side=16,
+    carve=True,
+    iterations=12,
+    side=12,
+    doublings=(3, 7),
+    decay_iterations=6,
+    rays=64,
 )
 
 
@@ -53,16 +59,20 @@ class Album(Logger):
     def close(self, *, failed: bool) -> None: ...
 
 
-def learn(
-    datamodule: SceneDataModule, logger: Logger, *callbacks: Callback
-) -> CanonicalStage:
+def learn(datamodule: SceneDataModule, logger: Logger, *callbacks: Callback) -> CanonicalStage:
     torch.manual_seed(3)
     stage = CanonicalStage(
         SCHEDULE, Architecture(channels=4, width=8, frequencies=1), iterations_per_step=1
     )
     Trainer(
-        accelerator="cpu", devices=1, logger=logger, enable_checkpointing=False, max_epochs=1,
-        enable_progress_bar=False, enable_model_summary=False, log_every_n_steps=4,
+        accelerator="cpu",
+        devices=1,
+        logger=logger,
+        enable_checkpointing=False,
+        max_epochs=1,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        log_every_n_steps=4,
         callbacks=[GridUpscaling(), LearningRateDecay(), *callbacks],
     ).fit(stage, datamodule=datamodule)
     return stage

@@ -24,13 +24,20 @@ def views(channels: int = 4, flow: bool = True) -> Views:
     red = 100 * image + 10 * row + column
     pixels = torch.stack([red, 0 * red, 0 * red + 255, 0 * red + 51], dim=-1)[..., :channels]
     cameras = Cameras(
-        torch.eye(3, 4)[None].repeat(2, 1, 1), torch.tensor([[5.0, 5.0], [7.0, 6.0]]),
-        torch.tensor([[2.0, 1.5]] * 2), WIDTH, HEIGHT,
+        torch.eye(3, 4)[None].repeat(2, 1, 1),
+        torch.tensor([[5.0, 5.0], [7.0, 6.0]]),
+        torch.tensor([[2.0, 1.5]] * 2),
+        WIDTH,
+        HEIGHT,
     )
     vectors = torch.stack([column + 0.5, -(row + 0.5)], dim=-1)
     return Views(
-        pixels.to(torch.uint8), cameras, torch.tensor([0.0, 1.0]), torch.tensor([0, 0]),
-        ("a", "b"), OpticalFlow(vectors, column > row) if flow else None,
+        pixels.to(torch.uint8),
+        cameras,
+        torch.tensor([0.0, 1.0]),
+        torch.tensor([0, 0]),
+        ("a", "b"),
+        OpticalFlow(vectors, column > row) if flow else None,
     )
 
 
@@ -126,9 +133,11 @@ def test_what_is_wanted_but_does_not_count_is_left_out() -> None:
     images = torch.tensor([1, 0])
     pool = wanted_pixels(shown, images, wanted)
     assert list(zip(pool.image.tolist(), pool.flat.tolist(), strict=True)) == [
-        (1, 1), (1, 2), (0, 3),
+        (1, 1),
+        (1, 2),
+        (0, 3),
     ]
-    counted = torch.ones(len(shown), shown.height, shown.width, dtype=torch.bool)
-    counted[1, 0, 1] = False
-    pool = wanted_pixels(replace(shown, counted=counted), images, wanted)
+    valid_mask = torch.ones(len(shown), shown.height, shown.width, dtype=torch.bool)
+    valid_mask[1, 0, 1] = False
+    pool = wanted_pixels(replace(shown, valid_mask=valid_mask), images, wanted)
     assert list(zip(pool.image.tolist(), pool.flat.tolist(), strict=True)) == [(1, 2), (0, 3)]

@@ -17,8 +17,11 @@ def views(times: list[float], view: list[int]) -> Views:
         torch.eye(3, 4)[None].repeat(count, 1, 1), torch.ones(count, 2), torch.ones(count, 2), 2, 2
     )
     return Views(
-        torch.zeros(count, 2, 2, 3, dtype=torch.uint8), cameras, torch.tensor(times),
-        torch.tensor(view), tuple(map(str, range(count))),
+        torch.zeros(count, 2, 2, 3, dtype=torch.uint8),
+        cameras,
+        torch.tensor(times),
+        torch.tensor(view),
+        tuple(map(str, range(count))),
     )
 
 

@@ -51,8 +51,14 @@ def test_the_training_loader_never_ends(tiny_scene: Scene) -> None:
 
 def test_the_procedural_module_renders_what_it_was_told() -> None:
     module = ProceduralDataModule(
-        "flower", width=12, height=8, static_views=3, static_test_views=2, train_views=2,
-        frames=2, supersample=1,
+        "flower",
+        width=12,
+        height=8,
+        static_views=3,
+        static_test_views=2,
+        train_views=2,
+        frames=2,
+        supersample=1,
     )
     scene = module.scene
     assert scene.name == "flower"

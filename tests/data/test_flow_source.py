@@ -20,9 +20,7 @@ def circling(degrees: float, count: int = 6) -> Views:
     """A moving camera that goes round by ``degrees`` from an image to the next."""
     angle = torch.arange(count) * math.radians(degrees)
     positions = torch.stack([4 * angle.cos(), 4 * angle.sin(), 0 * angle], dim=1)
-    cameras = Cameras.looking_at(
-        positions, torch.zeros(count, 3), focal=60.0, width=40, height=32
-    )
+    cameras = Cameras.looking_at(positions, torch.zeros(count, 3), focal=60.0, width=40, height=32)
     pixels = torch.full((count, 32, 40, 3), 128, dtype=torch.uint8)
     return Views(
         pixels, cameras, torch.linspace(0, 1, count), torch.arange(count), tuple("abcdef"[:count])

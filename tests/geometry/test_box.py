@@ -60,8 +60,8 @@ def test_grid_points_sit_on_the_corners_and_to_grid_counts_them() -> None:
     torch.testing.assert_close(points[0, 0, 0], torch.tensor([-1.0, 0.0, 2.0]))
     torch.testing.assert_close(points[4, 3, 1], torch.tensor([1.0, 3.0, 2.5]))
     torch.testing.assert_close(points[1, 2, 0], torch.tensor([-0.5, 2.0, 2.0]))
-    counted = torch.cartesian_prod(*[torch.arange(float(n)) for n in shape])
-    torch.testing.assert_close(box.to_grid(points.reshape(-1, 3), shape), counted)
+    valid_mask = torch.cartesian_prod(*[torch.arange(float(n)) for n in shape])
+    torch.testing.assert_close(box.to_grid(points.reshape(-1, 3), shape), valid_mask)
 
 
 def test_contains_its_faces_and_nearest_moves_only_what_is_outside() -> None:
@@ -111,9 +111,7 @@ def test_a_miss_enters_after_it_leaves(
     assert float(entry) > float(leave)
 
 
-@given(
-    st.tuples(*[st.floats(-3, 3, width=32)] * 3), st.tuples(*[st.floats(-1, 1, width=32)] * 3)
-)
+@given(st.tuples(*[st.floats(-3, 3, width=32)] * 3), st.tuples(*[st.floats(-1, 1, width=32)] * 3))
 def test_the_middle_of_a_crossing_is_inside_and_beyond_it_is_outside(
     origin: tuple[float, float, float], direction: tuple[float, float, float]
 ) -> None:

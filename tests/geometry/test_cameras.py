@@ -12,17 +12,18 @@ IDENTITY = torch.eye(3, 4)[None]
 
 def plain(width: int = 8, height: int = 6) -> Cameras:
     """A camera at the origin that looks along −z, with unequal focal lengths."""
-    return Cameras(
-        IDENTITY, torch.tensor([[10.0, 5.0]]), torch.tensor([[4.0, 3.0]]), width, height
-    )
+    return Cameras(IDENTITY, torch.tensor([[10.0, 5.0]]), torch.tensor([[4.0, 3.0]]), width, height)
 
 
 @pytest.fixture
 def scattered(rng: torch.Generator) -> Cameras:
     """Five cameras anywhere, each with its own lens; 30×20 pixels."""
     looking = Cameras.looking_at(
-        torch.randn(5, 3, generator=rng) * 4, torch.randn(5, 3, generator=rng),
-        focal=1.0, width=30, height=20,
+        torch.randn(5, 3, generator=rng) * 4,
+        torch.randn(5, 3, generator=rng),
+        focal=1.0,
+        width=30,
+        height=20,
     )
     focal = 20 + 10 * torch.rand(5, 2, generator=rng)
     center = torch.tensor([15.0, 10.0]) + torch.randn(5, 2, generator=rng)
@@ -68,13 +69,12 @@ def test_projection_undoes_rays(scattered: Cameras, rng: torch.Generator) -> Non
     torch.testing.assert_close(depth, along, atol=1e-5, rtol=1e-5)
 
 
-def test_project_into_is_project_with_one_camera(
-    scattered: Cameras, rng: torch.Generator
-) -> None:
+def test_project_into_is_project_with_one_camera(scattered: Cameras, rng: torch.Generator) -> None:
     points = torch.randn(50, 3, generator=rng)
     for k in range(5):
-        one, many = scattered.project_into(k, points), scattered.project(
-            torch.full((50,), k), points
+        one, many = (
+            scattered.project_into(k, points),
+            scattered.project(torch.full((50,), k), points),
         )
         torch.testing.assert_close(one[0], many[0], atol=1e-3, rtol=1e-4)
         torch.testing.assert_close(one[1], many[1], atol=1e-5, rtol=1e-5)
@@ -117,9 +117,7 @@ def test_looking_at_puts_the_target_in_the_middle_and_up_above(rng: torch.Genera
 
 def test_looking_at_gives_right_handed_rigid_poses_even_straight_down() -> None:
     positions = torch.tensor([[0.0, 0.0, 3.0], [0.0, 0.0, -3.0], [2.0, 1.0, 1.0]])
-    cameras = Cameras.looking_at(
-        positions, torch.zeros(3, 3), focal=1.0, width=4, height=4
-    )
+    cameras = Cameras.looking_at(positions, torch.zeros(3, 3), focal=1.0, width=4, height=4)
     turn = cameras.camera_to_world[:, :, :3]
     eye = torch.eye(3).expand(3, 3, 3)
     torch.testing.assert_close(turn @ turn.transpose(1, 2), eye, atol=1e-6, rtol=0)
@@ -128,7 +126,11 @@ def test_looking_at_gives_right_handed_rigid_poses_even_straight_down() -> None:
 
 def test_looking_at_takes_another_up() -> None:
     camera = Cameras.looking_at(
-        torch.tensor([[0.0, 0.0, 4.0]]), torch.zeros(1, 3), focal=10.0, width=8, height=8,
+        torch.tensor([[0.0, 0.0, 4.0]]),
+        torch.zeros(1, 3),
+        focal=10.0,
+        width=8,
+        height=8,
         up=torch.tensor([1.0, 0.0, 0.0]),
     )
     pixel, _ = camera.project(torch.tensor([0]), torch.tensor([[1.0, 0.0, 0.0]]))
@@ -144,9 +146,7 @@ def test_a_selection_keeps_each_camera_whole(scattered: Cameras) -> None:
 
 
 @pytest.mark.parametrize(("height", "width"), [(40, 60), (5, 8), (1, 2)])
-def test_another_height_keeps_the_proportions(
-    scattered: Cameras, height: int, width: int
-) -> None:
+def test_another_height_keeps_the_proportions(scattered: Cameras, height: int, width: int) -> None:
     # The cameras have 30 x 20 pixels; a width of 7.5 is rounded to even.
     sized = scattered.of_height(height)
     assert (sized.width, sized.height) == (width, height)

@@ -52,8 +52,9 @@ def test_a_ray_by_hand() -> None:
 
 
 def test_rays_start_on_the_near_plane_and_end_at_infinity(rng: torch.Generator) -> None:
-    camera = Cameras(torch.eye(3, 4)[None], torch.tensor([[8.0, 9.0]]),
-                     torch.tensor([[8.0, 6.0]]), 16, 12)
+    camera = Cameras(
+        torch.eye(3, 4)[None], torch.tensor([[8.0, 9.0]]), torch.tensor([[8.0, 6.0]]), 16, 12
+    )
     world = camera.image_rays(0)
     rays = NDC.rays(world)
     torch.testing.assert_close(rays.origins[:, 2], torch.full((192,), -1.0))

@@ -78,9 +78,7 @@ def test_agrees_with_torchmetrics_on_the_same_layers(
     assert ours(pair[0], pair[0]) == 0
 
 
-def test_only_what_lies_inside_the_mask_counts(
-    pair: tuple[Tensor, Tensor], tmp_path: Path
-) -> None:
+def test_only_what_lies_inside_the_mask_counts(pair: tuple[Tensor, Tensor], tmp_path: Path) -> None:
     lpips = read_lpips("vgg", random_weights("vgg", tmp_path))
     truth, other = pair
     mask = torch.zeros(40, 48, dtype=torch.bool)

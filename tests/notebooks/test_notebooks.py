@@ -46,7 +46,9 @@ def test_its_short_form_runs(notebook, monkeypatch, tmp_path):
     # Whatever kernels this machine knows, it is this interpreter that runs the cells.
     command = [sys.executable, "-m", "ipykernel_launcher", "-f", "{connection_file}"]
     client = nbclient.NotebookClient(
-        notebook, timeout=120, kernel_name="python3",
+        notebook,
+        timeout=120,
+        kernel_name="python3",
         resources={"metadata": {"path": str(tmp_path)}},
     )
     client.create_kernel_manager().kernel_spec.argv = command

@@ -59,7 +59,13 @@ def test_smoothing_of_what_is_touched_leaves_the_rest(skip_zero: bool) -> None:
     gradient[1, 1, 1] = 1.0
     mean, square = torch.zeros_like(values), torch.zeros_like(values)
     smooth_adam_step(
-        values, into, gradient, mean, square, rule(skip_zero=skip_zero), smoothing=0.5,
+        values,
+        into,
+        gradient,
+        mean,
+        square,
+        rule(skip_zero=skip_zero),
+        smoothing=0.5,
         touched_only=True,
     )
     assert mean[1, 1, 1].item() == pytest.approx(0.25)

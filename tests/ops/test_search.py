@@ -8,28 +8,37 @@ from typing import Any
 import pytest
 import torch
 
-from devrf.fields.architecture import Architecture
-from devrf.fields.occupancy import Occupancy
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
-from devrf.ops.search import Found, Thresholds, find_samples, select
-from devrf.rendering.render import STOP, RenderSettings, render
+from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.volume_rendering import STOP, RenderSettings, render
+from devrf.ops.search import PackedSamples, Thresholds, find_samples, select
+from devrf.rendering.occupancy import Occupancy
 
 LINE = Box((0.0, 0.0, 0.0), (4.0, 1.0, 1.0))
 # Opacities of five grid points along x: empty, half, half, opaque, half.
 ALPHA = torch.tensor([0.0, 0.5, 0.5, 1 - 1e-6, 0.5])
 
 
-def along_x(**changed: Any) -> Found:
+def along_x(**changed: Any) -> PackedSamples:
     """Two rays along x, the second of which has no samples; one sample at each grid point."""
     tau = (-torch.log1p(-ALPHA.double())).clamp(min=1e-9)
     raw = torch.log(torch.expm1(tau)).float().view(5, 1, 1, 1).expand(5, 2, 2, 1)
     arguments: dict[str, Any] = {
-        "origins": torch.zeros(2, 3), "directions": torch.tensor([[1.0, 0, 0], [0, 1.0, 0]]),
-        "entry": torch.zeros(2), "count": torch.tensor([5, 0]),
-        "mask": torch.ones(5, 2, 2, dtype=torch.bool), "density": raw.contiguous(),
-        "step": 1.0, "longest": 5, "capacity": 6, "mask_box": LINE, "box": LINE,
-        "shift": 0.0, "delta": 1.0, "thresholds": Thresholds(alpha=0.01, stop=1e-4, weight=0.2),
+        "origins": torch.zeros(2, 3),
+        "directions": torch.tensor([[1.0, 0, 0], [0, 1.0, 0]]),
+        "entry": torch.zeros(2),
+        "count": torch.tensor([5, 0]),
+        "mask": torch.ones(5, 2, 2, dtype=torch.bool),
+        "density": raw.contiguous(),
+        "step": 1.0,
+        "longest": 5,
+        "capacity": 6,
+        "mask_box": LINE,
+        "box": LINE,
+        "shift": 0.0,
+        "delta": 1.0,
+        "thresholds": Thresholds(alpha=0.01, stop=1e-4, weight=0.2),
     }
     return find_samples(**(arguments | changed))
 
@@ -95,9 +104,19 @@ def test_finds_what_the_renderer_finds(rng: torch.Generator, cube: Box) -> None:
     step = field.step_length(settings.step)
     count = torch.where(leave >= entry, ((leave - entry) / step + 1e-3).floor() + 1, 0.0).long()
     found = find_samples(
-        rays.origins, rays.directions, entry, count, occupancy.mask, field.density.values,
-        step=step, longest=math.ceil(12**0.5 / step) + 1, capacity=2000, mask_box=cube, box=cube,
-        shift=field.shift, delta=field.step_in_base_voxels(settings.step),
+        rays.origins,
+        rays.directions,
+        entry,
+        count,
+        occupancy.mask,
+        field.density.values,
+        step=step,
+        longest=math.ceil(12**0.5 / step) + 1,
+        capacity=2000,
+        mask_box=cube,
+        box=cube,
+        shift=field.shift,
+        delta=field.step_in_base_voxels(settings.step),
         thresholds=Thresholds(0.02, STOP, 0.02),
     )
     heavy = select(found.heavy, found.first, 1000)

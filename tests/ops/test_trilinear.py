@@ -28,9 +28,7 @@ def corner_grid() -> Tensor:
         ((0.25, 0.5, 0.75), 175.0),
     ],
 )
-def test_interpolates_between_eight_corners(
-    at: tuple[float, float, float], value: float
-) -> None:
+def test_interpolates_between_eight_corners(at: tuple[float, float, float], value: float) -> None:
     assert interpolate(corner_grid(), torch.tensor([at])).item() == pytest.approx(value, rel=1e-6)
 
 
@@ -71,7 +69,8 @@ def test_gradients_of_values_and_positions(rng: torch.Generator) -> None:
     # Off the grid planes, where the slope jumps; one point outside.
     coords = torch.tensor(
         [[0.3, 1.2, 0.7], [1.6, 2.9, 1.1], [0.2, 0.4, 1.9], [1.4, -0.5, 2.6]],
-        dtype=torch.float64, requires_grad=True,
+        dtype=torch.float64,
+        requires_grad=True,
     )
     assert gradcheck(interpolate, (grid, coords))
 

@@ -10,9 +10,9 @@ from torch import Tensor
 from torch.autograd import gradcheck
 
 from devrf.errors import DevrfError
-from devrf.fields.deformation import DeformationField
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
+from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.ops.warped_depth import warped_depth
 
 UNIT = Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
@@ -51,9 +51,7 @@ def test_is_the_warp_of_the_deformation_field(rng: torch.Generator, cube: Box) -
     points, density = 2 * torch.rand(50, 3, generator=rng) - 1, torch.zeros(3, 3, 3, 1)
     moment = field.clock.at(0.8)
     frames = [field.to_canonical[moment.before], field.to_canonical[moment.after]]
-    q, _ = warped_depth(
-        points, density, frames, moment.weight, box=cube, shift=0.0, delta=1.0
-    )
+    q, _ = warped_depth(points, density, frames, moment.weight, box=cube, shift=0.0, delta=1.0)
     torch.testing.assert_close(q, field.warp(points, 0.8))
 
 
@@ -89,8 +87,14 @@ def test_gradients_added_to_buffers() -> None:
     density, frame = ramp().requires_grad_(), shifted(0.0).requires_grad_()
     buffers = torch.ones(2, 2, 2, 1), torch.ones(2, 2, 2, 3)
     _, tau = warped_depth(
-        torch.tensor([[0.25, 0.0, 0.0]]), density, [frame], box=UNIT, shift=-1.0, delta=0.5,
-        density_gradient=buffers[0], slice_gradients=buffers[1:],
+        torch.tensor([[0.25, 0.0, 0.0]]),
+        density,
+        [frame],
+        box=UNIT,
+        shift=-1.0,
+        delta=0.5,
+        density_gradient=buffers[0],
+        slice_gradients=buffers[1:],
     )
     tau.sum().backward()
     assert density.grad is None and frame.grad is None

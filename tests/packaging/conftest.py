@@ -10,7 +10,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, open_dict
 
-from devrf.config import config_folder, register_resolvers
+from devrf.cli.config import config_folder, register_resolvers
 
 Composed = Callable[..., DictConfig]
 

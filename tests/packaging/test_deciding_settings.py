@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from devrf.run.resume import deciding_settings
+from devrf.cli.resume import deciding_settings
 
 
 def test_the_settings_that_decide_are_named_as_the_user_sets_them(composed):

@@ -11,12 +11,12 @@ from hydra.errors import ConfigCompositionException
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from devrf.config import config_folder
-from devrf.config_check import check_config
+from devrf.cli.config import config_folder
+from devrf.cli.config_check import check_config
 from devrf.data.datamodule import SceneDataModule
-from devrf.stages.canonical import CanonicalStage
-from devrf.stages.deformation import DeformationStage
-from devrf.stages.schedules import DeformationSchedule
+from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.devrf.deformation_stage import DeformationStage
+from devrf.methods.devrf.schedules import DeformationSchedule
 
 GROUPS = sorted({path.name for path in config_folder().iterdir() if path.is_dir()} - {"hydra"})
 FILES = [
@@ -39,8 +39,21 @@ def rooted(composed, *overrides):
 
 def test_the_groups_are_the_documented_ones():
     assert {
-        "ablation", "callbacks", "data", "experiment", "field", "logger", "loss", "report",
-        "benchmark", "sampling", "schedule", "stages", "still", "trainer", "video",
+        "ablation",
+        "callbacks",
+        "data",
+        "experiment",
+        "field",
+        "logger",
+        "loss",
+        "report",
+        "benchmark",
+        "sampling",
+        "schedule",
+        "stages",
+        "still",
+        "trainer",
+        "video",
     } <= set(GROUPS)
 
 
@@ -78,8 +91,17 @@ def test_building_writes_nothing(composed, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     "key",
-    ["data.widht", "field.widht", "schedule.canonical.side_length", "loss.fine.colour", "trainr.x",
-     "sampling.steps", "video.speed", "motion.learning_rate", "canonical.schedul"],
+    [
+        "data.widht",
+        "field.widht",
+        "schedule.canonical.side_length",
+        "loss.fine.colour",
+        "trainr.x",
+        "sampling.steps",
+        "video.speed",
+        "motion.learning_rate",
+        "canonical.schedul",
+    ],
 )
 def test_an_unknown_key_is_an_error_that_names_it(composed, key):
     with pytest.raises(ConfigCompositionException, match=key):

@@ -13,29 +13,40 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from devrf.config import config_folder
+from devrf.cli.config import config_folder
 from devrf.data.datamodule import SceneDataModule
+from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.scenes.export import export
 from devrf.scenes.procedural.forward import ProceduralForwardScene
 from devrf.scenes.scene import Scene, Views
-from devrf.stages.deformation import DeformationStage
 
 PUBLISHED_INWARD = ["lego", "floating_robot", "daisy", "glove", "kuka", "flower_360"]
 PUBLISHED_FORWARD = ["plant", "rabbit", "pig_toy"]
 FILES = sorted(path.stem for path in (config_folder() / "data").glob("*.yaml"))
 TINY = [
-    "field.width=8", "field.channels=4", "video=default",
-    "schedule.canonical.search_iterations=0", "schedule.canonical.search_side=12",
-    "schedule.canonical.iterations=2", "schedule.canonical.side=12",
-    "schedule.canonical.doublings=[]", "schedule.canonical.rays=128",
-    "schedule.deformation.sides=[4]", "schedule.deformation.iterations_per_frame=[2]",
-    "schedule.deformation.rays=128", "canonical.iterations_per_step=1",
-    "deformation.iterations_per_step=1", "trainer=cpu",
+    "field.width=8",
+    "field.channels=4",
+    "video=default",
+    "schedule.canonical.search_iterations=0",
+    "schedule.canonical.search_side=12",
+    "schedule.canonical.iterations=2",
+    "schedule.canonical.side=12",
+    "schedule.canonical.doublings=[]",
+    "schedule.canonical.rays=128",
+    "schedule.deformation.sides=[4]",
+    "schedule.deformation.iterations_per_frame=[2]",
+    "schedule.deformation.rays=128",
+    "canonical.iterations_per_step=1",
+    "deformation.iterations_per_step=1",
+    "trainer=cpu",
 ]
 OF_KIND = {
     "inward": [],
     "forward": [
-        "field=forward", "loss=forward", "field.planes=8", "schedule.canonical.carve=false",
+        "field=forward",
+        "loss=forward",
+        "field.planes=8",
+        "schedule.canonical.carve=false",
     ],
 }
 # The embedded scenes in sizes that take no time.
@@ -55,8 +66,12 @@ def forward_scene() -> Scene:
 
 def in_one_list(scene: Scene) -> list[tuple[Views, int, str]]:
     """Every image of an inward-facing scene, dynamic test views last: views, position, name."""
-    parts = [("static", scene.static.train), ("rest", scene.static.test),
-             ("dynamic", scene.dynamic.train), ("held_out", scene.dynamic.test)]
+    parts = [
+        ("static", scene.static.train),
+        ("rest", scene.static.test),
+        ("dynamic", scene.dynamic.train),
+        ("held_out", scene.dynamic.test),
+    ]
     return [(views, i, f"{name}_{i:03d}") for name, views in parts for i in range(len(views))]
 
 
@@ -67,20 +82,33 @@ def write_nerfstudio(scene: Scene, root: Path) -> None:
     for views, i, name in in_one_list(scene):
         iio.imwrite(root / f"images/{name}.png", views.pixels[i].numpy())
         pose = views.cameras.camera_to_world[i].tolist()
-        frames.append({
-            "file_path": f"images/{name}.png", "time": float(views.times[i]),
-            "transform_matrix": [*pose, [0, 0, 0, 1]],
-        })
+        frames.append(
+            {
+                "file_path": f"images/{name}.png",
+                "time": float(views.times[i]),
+                "transform_matrix": [*pose, [0, 0, 0, 1]],
+            }
+        )
     cameras = scene.static.train.cameras
-    (root / "transforms.json").write_text(json.dumps({
-        "camera_model": "OPENCV", "fl_x": float(cameras.focal[0, 0]),
-        "fl_y": float(cameras.focal[0, 1]), "cx": float(cameras.center[0, 0]),
-        "cy": float(cameras.center[0, 1]), "w": cameras.width, "h": cameras.height,
-        "frames": frames,
-        "test_filenames": [
-            f["file_path"] for f in frames if "rest" in f["file_path"] or "held" in f["file_path"]
-        ],
-    }))
+    (root / "transforms.json").write_text(
+        json.dumps(
+            {
+                "camera_model": "OPENCV",
+                "fl_x": float(cameras.focal[0, 0]),
+                "fl_y": float(cameras.focal[0, 1]),
+                "cx": float(cameras.center[0, 0]),
+                "cy": float(cameras.center[0, 1]),
+                "w": cameras.width,
+                "h": cameras.height,
+                "frames": frames,
+                "test_filenames": [
+                    f["file_path"]
+                    for f in frames
+                    if "rest" in f["file_path"] or "held" in f["file_path"]
+                ],
+            }
+        )
+    )
 
 
 def write_nerfies(scene: Scene, root: Path) -> None:
@@ -93,22 +121,33 @@ def write_nerfies(scene: Scene, root: Path) -> None:
         iio.imwrite(root / f"rgb/4x/{name}.png", views.pixels[i].numpy())
         metadata[name] = {"warp_id": round(float(views.times[i]) * 2), "appearance_id": 0}
         pose, focal = views.cameras.camera_to_world[i], views.cameras.focal[i] * 4
-        (root / f"camera/{name}.json").write_text(json.dumps({
-            "orientation": (pose[:, :3] * torch.tensor([1.0, -1.0, -1.0])).T.tolist(),
-            "position": pose[:, 3].tolist(), "focal_length": float(focal[0]),
-            "principal_point": (views.cameras.center[i] * 4).tolist(),
-            "image_size": [views.width * 4, views.height * 4], "skew": 0.0,
-            "pixel_aspect_ratio": float(focal[1] / focal[0]),
-            "radial_distortion": [0.0] * 3, "tangential_distortion": [0.0] * 2,
-        }))
+        (root / f"camera/{name}.json").write_text(
+            json.dumps(
+                {
+                    "orientation": (pose[:, :3] * torch.tensor([1.0, -1.0, -1.0])).T.tolist(),
+                    "position": pose[:, 3].tolist(),
+                    "focal_length": float(focal[0]),
+                    "principal_point": (views.cameras.center[i] * 4).tolist(),
+                    "image_size": [views.width * 4, views.height * 4],
+                    "skew": 0.0,
+                    "pixel_aspect_ratio": float(focal[1] / focal[0]),
+                    "radial_distortion": [0.0] * 3,
+                    "tangential_distortion": [0.0] * 2,
+                }
+            )
+        )
     val = [name for name in ids if name.startswith(("rest", "held"))]
     train = [name for name in ids if name not in val]
     world = {
-        "center": [0, 0, 0], "scale": 1, "near": scene.bounds.near, "far": scene.bounds.far,
+        "center": [0, 0, 0],
+        "scale": 1,
+        "near": scene.bounds.near,
+        "far": scene.bounds.far,
     }
     for file, content in (
         ("dataset", {"count": len(ids), "ids": ids, "train_ids": train, "val_ids": val}),
-        ("metadata", metadata), ("scene", world),
+        ("metadata", metadata),
+        ("scene", world),
     ):
         (root / f"{file}.json").write_text(json.dumps(content))
 
@@ -131,8 +170,14 @@ def scene_config(
     target = composed(*choice).data["_target_"]
     kind = "forward" if "Forward" in target else "inward"
     if name in EMBEDDED:
-        choice += [*EMBEDDED[name], "data.width=24", "data.height=18", "data.frames=3",
-                   "data.train_views=2", "data.supersample=1"]
+        choice += [
+            *EMBEDDED[name],
+            "data.width=24",
+            "data.height=18",
+            "data.frames=3",
+            "data.train_views=2",
+            "data.supersample=1",
+        ]
     else:
         write_scene(target, tmp_path / "scene", inward, forward)
         choice.append(f"data.root={tmp_path}/scene")

@@ -82,15 +82,19 @@ def test_loss_weights(paper):
     assert dict(paper.loss.search) == {"color": 1.0, "per_sample_color": 0.1, "entropy": 0.01}
     assert dict(paper.loss.fine) == {"color": 1.0, "per_sample_color": 0.01, "entropy": 0.001}
     assert dict(paper.loss.deformation) == {
-        "render": 1.0, "cycle": 100.0, "flow": 0.005, "tv": 1.0,
-        "per_sample_color": 0.1, "entropy": 0.01,
+        "render": 1.0,
+        "cycle": 100.0,
+        "flow": 0.005,
+        "tv": 1.0,
+        "per_sample_color": 0.1,
+        "entropy": 0.01,
     }
 
 
 def test_the_config_says_what_the_code_defaults_to(paper):
     """Plain Lightning code that states nothing gets the paper's stages too."""
-    from devrf.fields.architecture import Architecture
-    from devrf.stages.settings import (
+    from devrf.methods.devrf.architecture import Architecture
+    from devrf.methods.devrf.settings import (
         DEFORMATION_LOSS,
         FINE_LOSS,
         SEARCH_LOSS,

@@ -55,8 +55,13 @@ def application(tmp_path: Path):
 
     def run(*arguments: str) -> dict:
         done = subprocess.run(
-            [sys.executable, "app.py", *arguments], cwd=tmp_path, text=True, capture_output=True,
-            env={**os.environ, "PYTHONPATH": path}, timeout=60, check=False,
+            [sys.executable, "app.py", *arguments],
+            cwd=tmp_path,
+            text=True,
+            capture_output=True,
+            env={**os.environ, "PYTHONPATH": path},
+            timeout=60,
+            check=False,
         )
         assert done.returncode == 0, done.stderr
         return json.loads(done.stdout)

@@ -13,14 +13,22 @@ from pathlib import Path
 
 import pytest
 
-from devrf.config import config_folder
+from devrf.cli.config import config_folder
 
 REPOSITORY = Path(__file__).parents[2]
 TINY = [
-    "data.width=24", "data.height=20", "data.static_views=6", "data.static_test_views=2",
-    "data.train_views=2", "data.frames=3", "data.supersample=1", "field.width=16",
-    "schedule.canonical.iterations=6", "schedule.canonical.side=16",
-    "schedule.canonical.search_side=16", "schedule.canonical.doublings=[2]",
+    "data.width=24",
+    "data.height=20",
+    "data.static_views=6",
+    "data.static_test_views=2",
+    "data.train_views=2",
+    "data.frames=3",
+    "data.supersample=1",
+    "field.width=16",
+    "schedule.canonical.iterations=6",
+    "schedule.canonical.side=16",
+    "schedule.canonical.search_side=16",
+    "schedule.canonical.doublings=[2]",
     "schedule.canonical.rays=64",
 ]
 
@@ -29,8 +37,13 @@ def run(*command: object, folder: Path) -> subprocess.CompletedProcess[str]:
     hidden = {"PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV"}
     environment = {key: value for key, value in os.environ.items() if key not in hidden}
     done = subprocess.run(
-        [str(part) for part in command], cwd=folder, env=environment, text=True,
-        capture_output=True, timeout=180, check=False,
+        [str(part) for part in command],
+        cwd=folder,
+        env=environment,
+        text=True,
+        capture_output=True,
+        timeout=180,
+        check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return done
@@ -62,8 +75,17 @@ def environment(tmp_path_factory, wheel) -> Path:
     theirs = {Path(path).resolve() for path in sys.path if path.endswith("site-packages")}
     (site / "dependencies.pth").write_text("".join(f"{path}\n" for path in sorted(theirs)))
     run(
-        sys.executable, "-m", "pip", "--python", folder / "bin" / "python", "install",
-        "--no-deps", "--no-index", "--quiet", wheel, folder=folder,
+        sys.executable,
+        "-m",
+        "pip",
+        "--python",
+        folder / "bin" / "python",
+        "install",
+        "--no-deps",
+        "--no-index",
+        "--quiet",
+        wheel,
+        folder=folder,
     )
     return folder
 
@@ -73,7 +95,7 @@ def test_the_wheel_has_code_configs_plugin_and_licence(wheel):
     configs = {p.relative_to(config_folder()) for p in config_folder().rglob("*.yaml")}
     assert {f"devrf/conf/{path.as_posix()}" for path in configs} <= names
     assert "devrf/__main__.py" in names and "devrf/py.typed" in names
-    assert "devrf/artifacts/report/published.toml" in names
+    assert "devrf/reporting/published.toml" in names
     assert "hydra_plugins/devrf_searchpath/__init__.py" in names
     # Other packages share the namespace.
     assert "hydra_plugins/__init__.py" not in names
@@ -89,13 +111,15 @@ def test_the_source_distribution_has_what_a_build_needs(built):
     (path,) = built.glob("*.tar.gz")
     with tarfile.open(path) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
-    assert {"pyproject.toml", "conf/config.yaml", "src/devrf/app.py", "LICENSE"} <= names
+    assert {"pyproject.toml", "conf/config.yaml", "src/devrf/cli/app.py", "LICENSE"} <= names
 
 
 def test_an_installed_devrf_learns_a_scene_from_any_folder(environment, tmp_path):
     python = environment / "bin" / "python"
     where = run(
-        python, "-c", "import devrf, devrf.config as c; print(devrf.__file__, c.config_folder())",
+        python,
+        "-c",
+        "import devrf, devrf.cli.config as c; print(devrf.__file__, c.config_folder())",
         folder=tmp_path,
     ).stdout
     assert str(REPOSITORY) not in where

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from devrf.geometry.rays import Rays
-from devrf.rendering import model as module
-from devrf.rendering import player
+from devrf.methods.devrf import model as module
+from devrf.methods.devrf import renderer
+from devrf.methods.devrf.renderer import Renderer
 from devrf.rendering.chunks import FEWEST, in_chunks
-from devrf.rendering.player import Player
 
 
 @pytest.fixture
@@ -30,8 +30,10 @@ def test_fewer_rays_at_once_when_memory_runs_out(
 ) -> None:
     def see(some: Rays) -> torch.Tensor:
         if len(some) > 600:
-            raise RuntimeError("[enforce fail at alloc_cpu.cpp] . DefaultCPUAllocator: can't "
-                               "allocate memory: you tried to allocate 10 bytes.")
+            raise RuntimeError(
+                "[enforce fail at alloc_cpu.cpp] . DefaultCPUAllocator: can't "
+                "allocate memory: you tried to allocate 10 bytes."
+            )
         return some.origins
 
     with caplog.at_level(logging.WARNING, logger="devrf"):
@@ -66,7 +68,7 @@ def test_a_picture_is_the_same_with_less_memory(
 ) -> None:
     rays = tiny_scene.static.test.cameras.image_rays(0)
     rays = rays[torch.arange(len(rays)).repeat(2)]
-    plain, quick = rest.model, Player(rest.model)
+    plain, quick = rest.model, Renderer(rest.model)
     whole = plain.picture(rays, 0.0, torch.ones(3))
     usual, tried = module.render, []
 
@@ -77,7 +79,7 @@ def test_a_picture_is_the_same_with_less_memory(
         return usual(some, *others)
 
     monkeypatch.setattr(module, "render", render)
-    monkeypatch.setattr(player, "render", render)
+    monkeypatch.setattr(renderer, "render", render)
     for divided in (plain.picture(rays, 0.0, torch.ones(3)), quick.picture(rays, 0.0, 1.0)):
         for name in ("color", "depth", "opacity"):
             torch.testing.assert_close(getattr(divided, name), getattr(whole, name))

@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from devrf.fields.occupancy import Occupancy
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
+from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.sampling import hits, march
 
 BOX = Box((-1.0, -0.5, 0.0), (1.0, 1.5, 1.0))

@@ -187,9 +187,7 @@ def test_single_folder_learns_the_static_scene_from_early_images(
 
 
 def test_single_folder_without_an_early_test_image_keeps_all_of_them(single_folder: Path) -> None:
-    scene = read_blender(
-        single_folder, static_until=0.05, box=[[-1, -1, -1], [1, 1, 1]]
-    )
+    scene = read_blender(single_folder, static_until=0.05, box=[[-1, -1, -1], [1, 1, 1]])
     assert len(scene.static.train) == 1 and len(scene.static.test) == 3
 
 

@@ -61,8 +61,8 @@ def test_points_of_the_exact_scene_fall_on_the_pixels_that_show_them(
         pixels = ours.cameras.pixel_grid().repeat(len(ours), 1)
         rays = ours.cameras.rays(camera, pixels)
         points = rays.at(torch.arange(len(rays)), ours.depth.flatten())
-        shown, depth = read.cameras.project(camera, points)
-        torch.testing.assert_close(shown, pixels, atol=1e-3, rtol=0)
+        abbreviated, depth = read.cameras.project(camera, points)
+        torch.testing.assert_close(abbreviated, pixels, atol=1e-3, rtol=0)
         assert bool((depth > 1.3).all())
 
 

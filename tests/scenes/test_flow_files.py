@@ -95,9 +95,7 @@ def test_some_missing_files_leave_their_images_without_flow(
         ({"flow": np.full((4, 6, 2), None), "mask": np.ones((4, 6))}, "not a readable npz"),
     ],
 )
-def test_wrong_arrays_are_named(
-    tmp_path: Path, arrays: dict[str, np.ndarray], said: str
-) -> None:
+def test_wrong_arrays_are_named(tmp_path: Path, arrays: dict[str, np.ndarray], said: str) -> None:
     path = tmp_path / "001_bwd.npz"
     np.savez(path, allow_pickle=True, **arrays)
     with pytest.raises(DevrfError) as caught:

@@ -96,12 +96,17 @@ def capture(folder: Path, orientation: int, **shared: float) -> None:
         angle = torch.tensor(0.7 * k)
         x, z = torch.sin(angle), torch.cos(angle)
         pose = torch.eye(4)
-        pose[:3, :3] = torch.stack([torch.stack([z, z * 0, -x]), torch.eye(3)[1],
-                                    torch.stack([x, z * 0, z])], dim=1)
+        pose[:3, :3] = torch.stack(
+            [torch.stack([z, z * 0, -x]), torch.eye(3)[1], torch.stack([x, z * 0, z])], dim=1
+        )
         pose[:3, 3] = torch.stack([4 * x, z * 0, 4 * z])
-        frames.append({
-            "file_path": f"{k}.jpg", "transform_matrix": pose.tolist(), "time": k / 8,
-        })
+        frames.append(
+            {
+                "file_path": f"{k}.jpg",
+                "transform_matrix": pose.tolist(),
+                "time": k / 8,
+            }
+        )
     content = {"fl_x": 20.0, "cx": 13.0, "cy": 8.0, **shared, "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(content))
 

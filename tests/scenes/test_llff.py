@@ -77,9 +77,9 @@ def test_dynamic_poses_are_taken_as_they_are(llff_folder: Any) -> None:
 
 def test_a_tilted_world_is_turned_back(llff_folder: Any) -> None:
     angle = 0.7
-    turn = np.array([
-        [np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]
-    ])
+    turn = np.array(
+        [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
+    )
     rows = llff_folder.static_rows()
     matrix = rows[:, :15].reshape(9, 3, 5)
     matrix[:, :, :4] = turn @ matrix[:, :, :4]

@@ -30,8 +30,17 @@ from devrf.scenes.visual_hull import visual_hull
 WIDTH, HEIGHT = 80, 60
 LENS = Lens((88.0, 84.0), (42.0, 28.0), Distortion((-0.3, 0.1, 0.01, 0.0), (0.006, -0.008)))
 SHARED = {
-    "fl_x": 88.0, "fl_y": 84.0, "cx": 42.0, "cy": 28.0, "w": WIDTH, "h": HEIGHT,
-    "k1": -0.3, "k2": 0.1, "k3": 0.01, "p1": 0.006, "p2": -0.008,
+    "fl_x": 88.0,
+    "fl_y": 84.0,
+    "cx": 42.0,
+    "cy": 28.0,
+    "w": WIDTH,
+    "h": HEIGHT,
+    "k1": -0.3,
+    "k2": 0.1,
+    "k3": 0.01,
+    "p1": 0.006,
+    "p2": -0.008,
 }
 
 
@@ -48,10 +57,14 @@ def root(tmp_path: Path, ring_cameras: Callable[..., Any], picture: Callable[...
         Image.fromarray(pixels).save(folder / f"cut_{k}.png")
         Image.fromarray(pixels[..., 3]).save(folder / f"masks/{k}.png")
         matrix = torch.cat([pose, torch.tensor([[0.0, 0.0, 0.0, 1.0]])]).tolist()
-        frames.append({
-            "file_path": f"{k}.png", "mask_path": f"masks/{k}.png", "transform_matrix": matrix,
-            "time": k / 8,
-        })
+        frames.append(
+            {
+                "file_path": f"{k}.png",
+                "mask_path": f"masks/{k}.png",
+                "transform_matrix": matrix,
+                "time": k / 8,
+            }
+        )
     (folder / "transforms.json").write_text(json.dumps({**SHARED, "frames": frames}))
     return folder
 
@@ -86,7 +99,7 @@ def test_mattes_are_those_of_images_that_were_cut_out(root: Path, downscale: int
     ours = read_nerfstudio(root, downscale=downscale, masks="matte").dynamic.train
     edit(root, lambda c: [f.update(file_path=f"cut_{f['file_path']}") for f in c["frames"]])
     theirs = read_nerfstudio(root, downscale=downscale, masks="none").dynamic.train
-    assert ours.counted is None and torch.equal(ours.pixels, theirs.pixels)
+    assert ours.valid_mask is None and torch.equal(ours.pixels, theirs.pixels)
 
 
 @pytest.mark.parametrize("downscale", [1, 2])
@@ -95,26 +108,28 @@ def test_a_pixel_counts_if_all_that_it_is_made_of_does(root: Path, downscale: in
         with Image.open(root / f"masks/{k}.png") as mask:
             sharp = np.where(np.asarray(mask) > 127, 255, 0).astype(np.uint8)
         paint(root, k, sharp)
-    counted = read_nerfstudio(root, downscale=downscale).dynamic.train.counted
+    valid_mask = read_nerfstudio(root, downscale=downscale).dynamic.train.valid_mask
     # Downscaling and undistortion blur the matte as they blur the picture.
     mattes = read_nerfstudio(root, downscale=downscale, masks="matte").dynamic.train
-    assert counted is not None and torch.equal(counted, mattes.pixels[..., 3] == 255)
-    assert 0 < int(counted.sum()) < counted.numel()
+    assert valid_mask is not None and torch.equal(valid_mask, mattes.pixels[..., 3] == 255)
+    assert 0 < int(valid_mask.sum()) < valid_mask.numel()
 
 
 def test_they_can_be_left_alone(root: Path) -> None:
     edit(root, lambda c: c["frames"][0].update(mask_path="nowhere.png"))
     train = read_nerfstudio(root, masks="none").dynamic.train
-    assert train.counted is None and not train.has_alpha
+    assert train.valid_mask is None and not train.has_alpha
 
 
 def test_only_some_images_have_one(root: Path) -> None:
     plain(root)
     edit(root, lambda c: [f.pop("mask_path") for f in c["frames"][2:]])
     train = read_nerfstudio(root).dynamic.train
-    counted = train.counted
-    assert counted is not None and torch.equal(counted[0, 0], torch.arange(WIDTH) < WIDTH // 2)
-    assert bool(counted[2:].all())
+    valid_mask = train.valid_mask
+    assert valid_mask is not None and torch.equal(
+        valid_mask[0, 0], torch.arange(WIDTH) < WIDTH // 2
+    )
+    assert bool(valid_mask[2:].all())
     with pytest.raises(DevrfError, match="2.png: has no mask_path although others have"):
         read_nerfstudio(root, masks="matte")
 
@@ -126,9 +141,11 @@ def test_whatever_is_grey_will_do(root: Path, kind: str) -> None:
         image = Image.fromarray(half({"labels": 1, "dull": 200}.get(kind, 255)))
         image = image if kind in ("labels", "dull") else image.convert(kind)
         image.save(root / f"masks/{k}.png")
-    counted = read_nerfstudio(root).dynamic.train.counted
-    assert counted is not None
-    assert bool(counted[:, :, : WIDTH // 2].all()) and not bool(counted[:, :, WIDTH // 2 :].any())
+    valid_mask = read_nerfstudio(root).dynamic.train.valid_mask
+    assert valid_mask is not None
+    assert bool(valid_mask[:, :, : WIDTH // 2].all()) and not bool(
+        valid_mask[:, :, WIDTH // 2 :].any()
+    )
 
 
 def test_a_mask_may_be_of_the_size_of_the_camera(root: Path) -> None:
@@ -138,7 +155,7 @@ def test_a_mask_may_be_of_the_size_of_the_camera(root: Path) -> None:
             image.resize((WIDTH // 2, HEIGHT // 2)).save(root / f"{k}.png")
     for masks in ("ignore", "matte"):
         train = read_nerfstudio(root, masks=masks).dynamic.train  # type: ignore[arg-type]
-        kept = train.pixels[..., 3] == 255 if train.counted is None else train.counted
+        kept = train.pixels[..., 3] == 255 if train.valid_mask is None else train.valid_mask
         assert torch.equal(kept[0, 0], torch.arange(WIDTH // 2) < WIDTH // 4)
 
 
@@ -150,24 +167,27 @@ def write_deep(root: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
-        (lambda r: edit(r, lambda c: c["frames"][1].update(mask_path="masks/x.png")),
-         "masks/x.png: no such mask; correct mask_path, or set data.masks=none"),
-        (lambda r: edit(r, lambda c: c["frames"][1].update(mask_path=3)),
-         "frames[1]: mask_path is 3, expected a file's path"),
+        (
+            lambda r: edit(r, lambda c: c["frames"][1].update(mask_path="masks/x.png")),
+            "masks/x.png: no such mask; correct mask_path, or set data.masks=none",
+        ),
+        (
+            lambda r: edit(r, lambda c: c["frames"][1].update(mask_path=3)),
+            "frames[1]: mask_path is 3, expected a file's path",
+        ),
         (lambda r: edit(r, lambda c: c["frames"][1].update(mask_path="../../m.png")), "m.png"),
         (lambda r: edit(r, lambda c: c["frames"][1].update(mask_path="masks")), "no such mask"),
-        (lambda r: paint(r, 1, half()[:, :40]),
-         "masks/1.png: 40x60 px, but its image"),
-        (lambda r: paint(r, 1, np.stack([half(), half(), 255 - half()], axis=2)),
-         "masks/1.png: a mask with colours or an alpha channel"),
+        (lambda r: paint(r, 1, half()[:, :40]), "masks/1.png: 40x60 px, but its image"),
+        (
+            lambda r: paint(r, 1, np.stack([half(), half(), 255 - half()], axis=2)),
+            "masks/1.png: a mask with colours or an alpha channel",
+        ),
         (lambda r: paint(r, 1, np.stack([half(), half()], axis=2)), "an alpha channel"),
         (write_deep, "masks/1.png: expected 8 bits a channel"),
         (lambda r: (r / "masks/1.png").write_text("nothing"), "masks/1.png: not a readable image"),
     ],
 )
-def test_wrong_masks(
-    root: Path, masks: str, spoil: Callable[[Path], object], said: str
-) -> None:
+def test_wrong_masks(root: Path, masks: str, spoil: Callable[[Path], object], said: str) -> None:
     spoil(root)
     with pytest.raises(DevrfError) as caught:
         read_nerfstudio(root, masks=masks)  # type: ignore[arg-type]
@@ -190,7 +210,7 @@ def test_an_option_that_is_none(root: Path) -> None:
 def test_only_pixels_that_count_are_drawn(root: Path) -> None:
     plain(root)
     train = NerfstudioDataModule(root, flow="none").scene.dynamic.train
-    assert train.counted is not None
+    assert train.valid_mask is not None
     pool = all_pixels(train, torch.tensor([2, 0]))
     assert len(pool) == 2 * WIDTH * HEIGHT // 2
     assert sorted(set(pool.image.tolist())) == [0, 2]
@@ -202,9 +222,9 @@ def test_masks_go_with_their_images(root: Path) -> None:
     masks = [half() if k % 2 else 255 - half() for k in range(9)]
     plain(root, masks)
     train = read_nerfstudio(root).dynamic.train
-    assert train.counted is not None
-    one = train[torch.tensor([3])].to("cpu").counted
-    assert one is not None and torch.equal(one[0], train.counted[3])
+    assert train.valid_mask is not None
+    one = train[torch.tensor([3])].to("cpu").valid_mask
+    assert one is not None and torch.equal(one[0], train.valid_mask[3])
 
 
 def test_flow_is_valid_at_pixels_that_count(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -213,9 +233,9 @@ def test_flow_is_valid_at_pixels_that_count(root: Path, monkeypatch: pytest.Monk
     everywhere = lambda now, before: torch.zeros(HEIGHT, WIDTH, 2)  # noqa: E731
     monkeypatch.setattr("devrf.scenes.optical_flow.estimator", lambda method: everywhere)
     flow = with_flow(scene, "dis", None).dynamic.train.flow
-    counted = scene.dynamic.train.counted
-    assert flow is not None and counted is not None
-    assert bool(flow.valid[1].any()) and not bool((flow.valid & ~counted).any())
+    valid_mask = scene.dynamic.train.valid_mask
+    assert flow is not None and valid_mask is not None
+    assert bool(flow.valid[1].any()) and not bool((flow.valid & ~valid_mask).any())
 
 
 def test_inspecting_says_how_much_they_cover(root: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -226,8 +246,8 @@ def test_inspecting_says_how_much_they_cover(root: Path, caplog: pytest.LogCaptu
     facts = inspect_scene(scene).sets[0]
     assert facts.mattes is None and facts.left_out == pytest.approx(0.5)
     assert not [advice for advice in image_advice(scene) if "masks" in advice.what]
-    shown = counted_pixels(scene.dynamic.train, 0)
-    assert shown.shape[2] == 4 and shown[0, :, 3].tolist() == [255] * 40 + [0] * 40
+    abbreviated = counted_pixels(scene.dynamic.train, 0)
+    assert abbreviated.shape[2] == 4 and abbreviated[0, :, 3].tolist() == [255] * 40 + [0] * 40
     matte = inspect_scene(read_nerfstudio(root, masks="matte")).sets[0]
     assert matte.mattes == pytest.approx(0.5) and matte.left_out is None
 
@@ -242,6 +262,6 @@ def test_where_pixels_do_not_count_nothing_is_carved_away(root: Path) -> None:
     views = read_nerfstudio(root, masks="matte").static.train
     box = Box.of((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
     whole = visual_hull(views, box, (12, 12, 12))
-    nothing = replace(views, counted=torch.zeros(views.pixels.shape[:3], dtype=torch.bool))
+    nothing = replace(views, valid_mask=torch.zeros(views.pixels.shape[:3], dtype=torch.bool))
     assert 0 < int(whole.sum()) < whole.numel()
     assert bool(visual_hull(nothing, box, (12, 12, 12)).all())

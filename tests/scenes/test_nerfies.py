@@ -43,9 +43,7 @@ class Folder:
 
 
 @pytest.fixture
-def folder(
-    tmp_path: Path, ring_cameras: Callable[..., Any], picture: Callable[..., Any]
-) -> Folder:
+def folder(tmp_path: Path, ring_cameras: Callable[..., Any], picture: Callable[..., Any]) -> Folder:
     """The scene of the balls, in a world that scene.json moves back to the origin."""
     made = Folder(tmp_path / "scene")
     ring = ring_cameras(COUNT, width=WIDTH, height=HEIGHT, angle=0.9)
@@ -53,21 +51,38 @@ def folder(
     for item, pose in zip(IDS, ring.camera_to_world, strict=True):
         iio.imwrite(made.root / f"rgb/1x/{item}.png", picture(pose, LENS, WIDTH, HEIGHT))
         axes = pose[:, :3] * torch.tensor([1.0, -1.0, -1.0])
-        made.write(f"camera/{item}.json", {
-            "orientation": axes.T.tolist(),
-            "position": (pose[:, 3] / SCALE + CENTER).tolist(),
-            "focal_length": 88.0, "pixel_aspect_ratio": 0.95, "skew": 3.0,
-            "principal_point": [42.0, 28.0], "image_size": [WIDTH, HEIGHT],
-            "radial_distortion": [-0.3, 0.1, 0.01], "tangential_distortion": [6e-3, -8e-3],
-        })
+        made.write(
+            f"camera/{item}.json",
+            {
+                "orientation": axes.T.tolist(),
+                "position": (pose[:, 3] / SCALE + CENTER).tolist(),
+                "focal_length": 88.0,
+                "pixel_aspect_ratio": 0.95,
+                "skew": 3.0,
+                "principal_point": [42.0, 28.0],
+                "image_size": [WIDTH, HEIGHT],
+                "radial_distortion": [-0.3, 0.1, 0.01],
+                "tangential_distortion": [6e-3, -8e-3],
+            },
+        )
     made.write("scene.json", {"center": CENTER.tolist(), "scale": SCALE, "near": 0.5, "far": 9.0})
-    made.write("metadata.json", {
-        item: {"warp_id": 10 + i, "appearance_id": i, "camera_id": 0} for i, item in enumerate(IDS)
-    })
-    made.write("dataset.json", {
-        "count": COUNT, "num_exemplars": 7, "ids": IDS, "train_ids": IDS[:3] + IDS[4:8],
-        "val_ids": [IDS[3], IDS[8]],
-    })
+    made.write(
+        "metadata.json",
+        {
+            item: {"warp_id": 10 + i, "appearance_id": i, "camera_id": 0}
+            for i, item in enumerate(IDS)
+        },
+    )
+    made.write(
+        "dataset.json",
+        {
+            "count": COUNT,
+            "num_exemplars": 7,
+            "ids": IDS,
+            "train_ids": IDS[:3] + IDS[4:8],
+            "val_ids": [IDS[3], IDS[8]],
+        },
+    )
     return made
 
 

@@ -22,9 +22,20 @@ WIDTH, HEIGHT = 80, 60
 BARREL = Distortion((-0.3, 0.1, 0.01, 0.0), (0.006, -0.008))
 LENS = Lens((88.0, 84.0), (42.0, 28.0), BARREL)
 SHARED = {
-    "camera_model": "OPENCV", "fl_x": 88.0, "fl_y": 84.0, "cx": 42.0, "cy": 28.0,
-    "w": WIDTH, "h": HEIGHT, "k1": -0.3, "k2": 0.1, "k3": 0.01, "p1": 0.006, "p2": -0.008,
-    "applied_transform": [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]], "applied_scale": 0.5,
+    "camera_model": "OPENCV",
+    "fl_x": 88.0,
+    "fl_y": 84.0,
+    "cx": 42.0,
+    "cy": 28.0,
+    "w": WIDTH,
+    "h": HEIGHT,
+    "k1": -0.3,
+    "k2": 0.1,
+    "k3": 0.01,
+    "p1": 0.006,
+    "p2": -0.008,
+    "applied_transform": [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]],
+    "applied_scale": 0.5,
 }
 Frames = list[dict[str, Any]]
 
@@ -51,9 +62,7 @@ def write(
         (folder / "images").mkdir(parents=True)
         frames: Frames = []
         for i, pose in enumerate(poses):
-            iio.imwrite(
-                folder / f"images/frame_{i:05d}.png", picture(pose, lens(i), WIDTH, HEIGHT)
-            )
+            iio.imwrite(folder / f"images/frame_{i:05d}.png", picture(pose, lens(i), WIDTH, HEIGHT))
             matrix = torch.cat([pose, torch.tensor([[0.0, 0.0, 0.0, 1.0]])]).tolist()
             frame = {"file_path": f"images/frame_{i:05d}.png", "transform_matrix": matrix}
             frames.append(frame if times is None else frame | {"time": times[i]})
@@ -127,7 +136,9 @@ def test_an_angle_stands_in_for_a_focal_length(
 ) -> None:
     # 2 atan(80 / 2 / 90): 90 pixels.
     write(
-        tmp_path / "scene", [i / 8 for i in range(9)], shared={"camera_angle_x": 0.8364488},
+        tmp_path / "scene",
+        [i / 8 for i in range(9)],
+        shared={"camera_angle_x": 0.8364488},
         lens=lambda index: Lens((90.0, 90.0), (40.0, 30.0)),
     )
     train = read_nerfstudio(tmp_path / "scene").dynamic.train
@@ -164,12 +175,18 @@ def test_a_moving_camera_without_a_static_set(
 @pytest.mark.parametrize(
     ("lists", "train", "test"),
     [
-        ({"train_filenames": listed(0, 2, 4, 6), "val_filenames": listed(1),
-          "test_filenames": listed(3, 5)}, [0, 2, 4, 6], [3, 5]),
+        (
+            {
+                "train_filenames": listed(0, 2, 4, 6),
+                "val_filenames": listed(1),
+                "test_filenames": listed(3, 5),
+            },
+            [0, 2, 4, 6],
+            [3, 5],
+        ),
         ({"val_filenames": listed(1, 8)}, [0, 2, 3, 4, 5, 6, 7], [1, 8]),
         ({"train_filenames": listed(0, 1, 2, 3, 4, 5)}, [0, 1, 2, 3, 4, 5], [6, 7, 8]),
-        ({"test_filenames": listed(4), "val_filenames": listed(4)},
-         [0, 1, 2, 3, 5, 6, 7, 8], [4]),
+        ({"test_filenames": listed(4), "val_filenames": listed(4)}, [0, 1, 2, 3, 5, 6, 7, 8], [4]),
     ],
 )
 def test_listed_splits(
@@ -250,8 +267,10 @@ def test_two_folders(
         (lambda c: c.update(frames=[]), '"frames"'),
         (lambda c: c.update(test_filenames=["images/frame_9.png"]), "no such image"),
         (lambda c: c.update(test_filenames=7), "list of file paths as test_filenames"),
-        (lambda c: c.update(train_filenames=listed(0, 1), test_filenames=listed(1)),
-         "2 images to learn from, 1 held out, 1 of them both"),
+        (
+            lambda c: c.update(train_filenames=listed(0, 1), test_filenames=listed(1)),
+            "2 images to learn from, 1 held out, 1 of them both",
+        ),
         (lambda c: c.update(frames=c["frames"][:1]), "1 images to learn from, 0 held out"),
         (lambda c: [f.update(time=0.5) for f in c["frames"]], "have one time"),
         (lambda c: [f.update(time=0.0) for f in c["frames"]], "at a time above 0"),

@@ -41,8 +41,7 @@ def shifting(height: int, width: int, alpha: bool = False) -> Views:
     canvas = texture(height + 20, width + 20)
     x, y = (int(v) for v in SHIFT)
     frames = [
-        canvas[10 - k * y : 10 - k * y + height, 10 - k * x : 10 - k * x + width]
-        for k in range(3)
+        canvas[10 - k * y : 10 - k * y + height, 10 - k * x : 10 - k * x + width] for k in range(3)
     ]
     pixels = torch.stack(frames)
     if alpha:

@@ -188,9 +188,14 @@ def test_the_same_recipe_gives_the_same_scene(scene: Scene) -> None:
 @pytest.mark.parametrize(
     ("key", "value", "said"),
     [
-        ("frames", 1, "at least 2"), ("frames", 2.5, "whole number"), ("width", 4, "at least 8"),
-        ("static_views", 0, "at least 1"), ("train_views", 0, "at least 1"),
-        ("speed", 3.0, "0 … 2"), ("speed", float("nan"), "0 … 2"), ("light", -0.1, "0 … 1"),
+        ("frames", 1, "at least 2"),
+        ("frames", 2.5, "whole number"),
+        ("width", 4, "at least 8"),
+        ("static_views", 0, "at least 1"),
+        ("train_views", 0, "at least 1"),
+        ("speed", 3.0, "0 … 2"),
+        ("speed", float("nan"), "0 … 2"),
+        ("light", -0.1, "0 … 1"),
         ("supersample", 17, "at most 16"),
     ],
 )

@@ -54,17 +54,17 @@ def test_a_ball_cut_off_by_one_image_is_kept_whole(ball_views: BallViews, unit_b
 def test_what_does_not_count_rules_nothing_out(ball_views: BallViews, unit_box: Box) -> None:
     views = ball_views(PLACES, RADIUS)
     box = motion_box(views, unit_box)
-    counted = torch.ones(views.pixels.shape[:3], dtype=torch.bool)
-    assert motion_box(replace(views, counted=counted), unit_box) == box
+    valid_mask = torch.ones(views.pixels.shape[:3], dtype=torch.bool)
+    assert motion_box(replace(views, valid_mask=valid_mask), unit_box) == box
     # Two of the four views see nothing that counts: the hull is that of the others, and larger.
-    counted[views.view < 2] = False
-    looser = motion_box(replace(views, counted=counted), unit_box)
+    valid_mask[views.view < 2] = False
+    looser = motion_box(replace(views, valid_mask=valid_mask), unit_box)
     assert box is not None and looser is not None
     assert all(a <= b for a, b in zip(looser.low, box.low, strict=True))
     assert all(a >= b for a, b in zip(looser.high, box.high, strict=True))
     assert looser != box
-    counted[:] = False
-    assert motion_box(replace(views, counted=counted), unit_box) is None
+    valid_mask[:] = False
+    assert motion_box(replace(views, valid_mask=valid_mask), unit_box) is None
 
 
 def test_nothing_is_imagined_beyond_images_that_hold_the_ball_whole(

@@ -44,7 +44,8 @@ def test_straight_lines_come_out_straight(distortion: Distortion, skew: float) -
 def test_a_pincushion_is_zoomed_until_nothing_is_missing() -> None:
     _, (plain,) = as_pinhole(
         torch.zeros(1, HEIGHT, WIDTH, 3, dtype=torch.uint8),
-        [Lens((70.0, 70.0), (48.0, 32.0), PINCUSHION)], ["image"],
+        [Lens((70.0, 70.0), (48.0, 32.0), PINCUSHION)],
+        ["image"],
     )
     corner = torch.tensor([47.5, 31.5]) / plain.focal[0]
     reached = PINCUSHION.distort(corner) * 70

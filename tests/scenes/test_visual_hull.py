@@ -44,8 +44,11 @@ def test_hull_holds_the_ball_and_little_more() -> None:
 def test_points_that_no_view_has_in_the_picture_stay() -> None:
     views = ball_views()
     away = Cameras.looking_at(
-        views.cameras.positions, 2 * views.cameras.positions, focal=70.0,
-        width=views.width, height=views.height,
+        views.cameras.positions,
+        2 * views.cameras.positions,
+        focal=70.0,
+        width=views.width,
+        height=views.height,
     )
     blind = Views(views.pixels, away, views.times, views.view, views.names)
     assert visual_hull(blind, BOX, (5, 5, 5)).all()

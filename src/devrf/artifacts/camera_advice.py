@@ -31,9 +31,7 @@ SAME = 1e-4
 
 def camera_advice(scene: Scene) -> list[Advice]:
     """Everything that the cameras alone tell."""
-    return [
-        *_held_out(scene), *_looking_away(scene), *_box_unknown(scene), *_one_side(scene)
-    ]
+    return [*_held_out(scene), *_looking_away(scene), *_box_unknown(scene), *_one_side(scene)]
 
 
 def box_points(scene: Scene, box: Box, shape: tuple[int, int, int]) -> Tensor:
@@ -102,18 +100,24 @@ def _held_out(scene: Scene) -> list[Advice]:
     for name in ("static", "dynamic"):
         capture = scene.static if name == "static" else scene.dynamic
         if len(capture.test) == 0:
-            found.append(Advice(
-                f"{name} test set", "holds no view, so nothing can be scored",
-                "hold out some images of the capture",
-            ))
+            found.append(
+                Advice(
+                    f"{name} test set",
+                    "holds no view, so nothing can be scored",
+                    "hold out some images of the capture",
+                )
+            )
             continue
         twins = _twins(capture.test, capture.train, box_middle(scene))
         if twins:
-            found.append(Advice(
-                f"{name} test set", f"{listed(twins)}: the same camera and time as a training "
-                "view, so the score says how well that view was learned by heart",
-                "hold out other views",
-            ))
+            found.append(
+                Advice(
+                    f"{name} test set",
+                    f"{listed(twins)}: the same camera and time as a training "
+                    "view, so the score says how well that view was learned by heart",
+                    "hold out other views",
+                )
+            )
     return found
 
 
@@ -168,10 +172,13 @@ def _box_unknown(scene: Scene) -> list[Advice]:
     guess = torch.tensor([*guessed.low, *guessed.high])
     if float((corners - guess).abs().max()) > 1e-4 * guessed.longest:
         return []
-    return [Advice(
-        "static training set", "has no mattes, and the box is only what the cameras all see",
-        "set data.box=[[x,y,z],[x,y,z]] around the object, or give the images mattes (RGBA)",
-    )]
+    return [
+        Advice(
+            "static training set",
+            "has no mattes, and the box is only what the cameras all see",
+            "set data.box=[[x,y,z],[x,y,z]] around the object, or give the images mattes (RGBA)",
+        )
+    ]
 
 
 def _one_side(scene: Scene) -> list[Advice]:
@@ -180,7 +187,11 @@ def _one_side(scene: Scene) -> list[Advice]:
     gap = widest_gap(scene.static.train.cameras, box_middle(scene))
     if gap is None or gap <= WIDEST_GAP:
         return []
-    return [Advice(
-        "static training set", f"no view from a sector of {gap:.0f} degrees, seen from above",
-        "expect fog on that side, or add views there (data=forward is for scenes from one side)",
-    )]
+    return [
+        Advice(
+            "static training set",
+            f"no view from a sector of {gap:.0f} degrees, seen from above",
+            "expect fog on that side, or add views there "
+            "(data=forward is for scenes from one side)",
+        )
+    ]

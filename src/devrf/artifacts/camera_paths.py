@@ -9,7 +9,7 @@ import torch
 from devrf.artifacts.film import FilmSettings
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
-from devrf.rendering.player import Player
+from devrf.methods.devrf.renderer import Renderer
 
 
 def orbit(cameras: Cameras, box: Box, settings: FilmSettings) -> Cameras:
@@ -55,11 +55,7 @@ def spiral(cameras: Cameras, focus: float, settings: FilmSettings) -> Cameras:
     offsets = (cameras.positions - middle) @ torch.stack([right, up], dim=1)
     across, along = (offsets.abs().quantile(0.8, dim=0) * 0.9).tolist()
     turn = torch.arange(settings.frames) * (2 * math.pi * settings.orbit_turns / settings.frames)
-    positions = (
-        middle
-        + across * turn.cos()[:, None] * right
-        + along * turn.sin()[:, None] * up
-    )
+    positions = middle + across * turn.cos()[:, None] * right + along * turn.sin()[:, None] * up
     return Cameras.looking_at(
         positions,
         (middle - focus * back).expand_as(positions),
@@ -70,7 +66,7 @@ def spiral(cameras: Cameras, focus: float, settings: FilmSettings) -> Cameras:
     )
 
 
-def focus_distance(player: Player, cameras: Cameras) -> float:
+def focus_distance(player: Renderer, cameras: Cameras) -> float:
     """Median depth along the optical axis, world units, of what the first camera sees at rest."""
     cameras, space = cameras.to(player.device), player.model.space
     rays = cameras.image_rays(0)

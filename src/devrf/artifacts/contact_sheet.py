@@ -10,7 +10,7 @@ from torch import Tensor
 
 from devrf.artifacts.colors import error_colors
 from devrf.artifacts.images import write_image
-from devrf.stages.held_out import HeldOutView
+from devrf.evaluation.held_out import HeldOutView
 
 GAP = 4
 

@@ -107,9 +107,7 @@ def draw(groups: Sequence[Lines], projection: Projection, paper: Color) -> Image
     far, near = (strokes[0][0], strokes[-1][0]) if strokes else (0.0, 1.0)
     for nearness_of, ends, group in strokes:
         share = FARTHEST + (1 - FARTHEST) * (nearness_of - far) / max(near - far, 1e-6)
-        color = tuple(
-            round(p + share * (c - p)) for c, p in zip(group.color, paper, strict=True)
-        )
+        color = tuple(round(p + share * (c - p)) for c, p in zip(group.color, paper, strict=True))
         path = [(x * SMOOTHING, y * SMOOTHING) for x, y in ends]
         pen.line(path, fill=color, width=max(1, round(group.width * SMOOTHING)))
     return image.resize((projection.width, projection.height), Image.Resampling.LANCZOS)

@@ -14,12 +14,12 @@ import torch
 from torch import Tensor
 
 from devrf.artifacts.colors import depth_colors, to_bytes
-from devrf.artifacts.files import whole_file
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
-from devrf.rendering.model import SceneModel
-from devrf.rendering.picture import Picture
-from devrf.rendering.player import Player
+from devrf.methods.devrf.model import SceneModel
+from devrf.methods.devrf.renderer import Renderer
+from devrf.rendering.rendered_image import RenderedImage
+from devrf.system.files import atomic_write
 
 # Small pictures are shown enlarged: a video of 100 pixels is too small to watch.
 WATCHABLE = 240
@@ -60,7 +60,7 @@ class FilmSettings:
         return cameras if self.height is None else cameras.of_height(self.height)
 
 
-def pictures(player: Player, cameras: Cameras, background: float) -> Iterator[Tensor]:
+def pictures(player: Renderer, cameras: Cameras, background: float) -> Iterator[Tensor]:
     """Colour beside depth (H, 2W, 3) from each of N cameras, while time runs from 0 to 1."""
     times = [k / max(len(cameras) - 1, 1) for k in range(len(cameras))]
     seen = player.stream(cameras, times, background)
@@ -69,7 +69,9 @@ def pictures(player: Player, cameras: Cameras, background: float) -> Iterator[Te
         yield torch.cat([picture.color.view(depth.shape).cpu(), depth], dim=1)
 
 
-def depth_picture(model: SceneModel, picture: Picture, position: Tensor, height: int) -> Tensor:
+def depth_picture(
+    model: SceneModel, picture: RenderedImage, position: Tensor, height: int
+) -> Tensor:
     """How far away things are (H, W, 3), of a whole image that a camera at ``position`` sees."""
     near, far = _depth_range(model, position)
     depth, opacity = picture.depth.view(height, -1), picture.opacity.view(height, -1)
@@ -94,7 +96,7 @@ def write_video(path: Path, images: Iterator[Tensor], fps: int, *, least: int = 
         fps: pictures a second.
         least: smaller pictures are enlarged by whole pixels to this height or more.
     """
-    with whole_file(path) as partial:
+    with atomic_write(path) as partial:
         writer = imageio.get_writer(
             partial, format="FFMPEG", fps=fps, codec="libx264", quality=8, macro_block_size=2
         )

@@ -25,7 +25,11 @@ MUCH_LEFT_OUT = 0.5
 def image_advice(scene: Scene) -> list[Advice]:
     """Everything that images, mattes, times and flow tell."""
     return [
-        *_blank(scene), *_turned(scene), *_mattes(scene), *_masks(scene), *_times(scene),
+        *_blank(scene),
+        *_turned(scene),
+        *_mattes(scene),
+        *_masks(scene),
+        *_times(scene),
         *_flow(scene.dynamic.train),
     ]
 
@@ -49,8 +53,8 @@ def _blank(scene: Scene) -> list[Advice]:
     flat, empty = [], []
     for _, views in _everyone(scene):
         for k, (image, name) in enumerate(zip(views.pixels, views.names, strict=True)):
-            if views.counted is not None:
-                image = image[views.counted[k]]
+            if views.valid_mask is not None:
+                image = image[views.valid_mask[k]]
             shown = image[..., :3].reshape(-1, 3)
             if views.has_alpha:
                 shown = shown[image[..., 3].reshape(-1) > MATTE]
@@ -63,33 +67,45 @@ def _blank(scene: Scene) -> list[Advice]:
                 flat.append(name)
     found = []
     if flat:
-        found.append(Advice(
-            listed(flat), "one colour all over", "look at the file, and leave it out if it is lost"
-        ))
+        found.append(
+            Advice(
+                listed(flat),
+                "one colour all over",
+                "look at the file, and leave it out if it is lost",
+            )
+        )
     if empty:
-        found.append(Advice(
-            listed(empty), "its matte is empty: it shows background only",
-            "look at the alpha channel, or leave the image out",
-        ))
+        found.append(
+            Advice(
+                listed(empty),
+                "its matte is empty: it shows background only",
+                "look at the alpha channel, or leave the image out",
+            )
+        )
     return found
 
 
 def _turned(scene: Scene) -> list[Advice]:
     names = [
         views.names[k]
-        for _, views in _everyone(scene) if views.turn_doubtful is not None
-        for k in views.turn_doubtful.nonzero()[:, 0].tolist()
+        for _, views in _everyone(scene)
+        if views.ambiguous_orientation is not None
+        for k in views.ambiguous_orientation.nonzero()[:, 0].tolist()
     ]
     if not names:
         return []
-    return [Advice(
-        # Without a static set the captures share files.
-        listed(list(dict.fromkeys(names))),
-        "its EXIF orientation says that it is to be seen turned; it is read as it is stored, since "
-        "its camera does not tell",
-        "if the cameras were found on turned images, turn the files too (mogrify -auto-orient); "
-        "else take the orientation out (exiftool -Orientation=)",
-    )]
+    return [
+        Advice(
+            # Without a static set the captures share files.
+            listed(list(dict.fromkeys(names))),
+            "its EXIF orientation says that it is to be seen turned; it is read as it is stored, "
+            "since "
+            "its camera does not tell",
+            "if the cameras were found on turned images, turn the files too "
+            "(mogrify -auto-orient); "
+            "else take the orientation out (exiftool -Orientation=)",
+        )
+    ]
 
 
 def _mattes(scene: Scene) -> list[Advice]:
@@ -97,43 +113,58 @@ def _mattes(scene: Scene) -> list[Advice]:
     with_alpha = {name: views.has_alpha for name, views in _everyone(scene) if len(views)}
     if len(set(with_alpha.values())) == 2:
         without = [name for name, alpha in with_alpha.items() if not alpha]
-        found.append(Advice(
-            listed(without, 4), "without mattes, while the other images have them",
-            "give mattes to all images or to none: else the background is learned from some only",
-        ))
+        found.append(
+            Advice(
+                listed(without, 4),
+                "without mattes, while the other images have them",
+                "give mattes to all images or to none: "
+                "else the background is learned from some only",
+            )
+        )
     for name, views in _everyone(scene):
         if len(views) and views.has_alpha and int(views.pixels[..., 3].amin()) > MATTE:
-            found.append(Advice(
-                name, "has an alpha channel that is opaque everywhere, which tells nothing",
-                "give real mattes, or write the images without alpha",
-            ))
+            found.append(
+                Advice(
+                    name,
+                    "has an alpha channel that is opaque everywhere, which tells nothing",
+                    "give real mattes, or write the images without alpha",
+                )
+            )
     return found
 
 
 def _masks(scene: Scene) -> list[Advice]:
     much = {}
     for name, views in _everyone(scene):
-        if views.counted is not None:
-            left_out = mean_share(~one for one in views.counted)
+        if views.valid_mask is not None:
+            left_out = mean_share(~one for one in views.valid_mask)
             if left_out > MUCH_LEFT_OUT:
                 much[name] = left_out
     if not much:
         return []
-    return [Advice(
-        listed(list(much), 4), f"masks leave out up to {100 * max(much.values()):.0f} % of the "
-        "pixels, of which nothing is learned",
-        "if they cut out the subject, set data.masks=matte: what they leave out is background then",
-    )]
+    return [
+        Advice(
+            listed(list(much), 4),
+            f"masks leave out up to {100 * max(much.values()):.0f} % of the "
+            "pixels, of which nothing is learned",
+            "if they cut out the subject, set data.masks=matte: "
+            "what they leave out is background then",
+        )
+    ]
 
 
 def _times(scene: Scene) -> list[Advice]:
     views, found = scene.dynamic.train, []
     first = float(views.times.min())
     if first > FrameClock.TOLERANCE:
-        found.append(Advice(
-            "dynamic training set", f"begins at time {first:g}; the rest state at time 0 is taken "
-            "from the static set alone", "let the first frame show the rest state, at time 0",
-        ))
+        found.append(
+            Advice(
+                "dynamic training set",
+                f"begins at time {first:g}; the rest state at time 0 is taken "
+                "from the static set alone",
+                "let the first frame show the rest state, at time 0",
+            )
+        )
     clock = scene.clock
     frames = clock.frames_of(views.times)
     numbers = set(views.view.tolist())
@@ -146,10 +177,13 @@ def _times(scene: Scene) -> list[Advice]:
             words = ", ".join(str(k) for k in sorted(missing))
             fewer.append(f"time {clock.times[frame]:.3g} without view {words}")
     if fewer:
-        found.append(Advice(
-            "dynamic training set", f"not all views at every time: {listed(fewer)}",
-            "add the images, or leave these times or views out: motion is less certain there",
-        ))
+        found.append(
+            Advice(
+                "dynamic training set",
+                f"not all views at every time: {listed(fewer)}",
+                "add the images, or leave these times or views out: motion is less certain there",
+            )
+        )
     return found
 
 
@@ -171,21 +205,30 @@ def _flow(views: Views) -> list[Advice]:
             long.append(views.names[k])
     found = []
     if long:
-        found.append(Advice(
-            f"flow of {listed(long)}", f"longer than the image ({longest} px)",
-            "flow is in pixels, x then y, from the frame to the one before it; check its unit, "
-            "or set data.flow=dis or data.flow=none",
-        ))
+        found.append(
+            Advice(
+                f"flow of {listed(long)}",
+                f"longer than the image ({longest} px)",
+                "flow is in pixels, x then y, from the frame to the one before it; check its unit, "
+                "or set data.flow=dis or data.flow=none",
+            )
+        )
     if broken:
-        found.append(Advice(
-            f"flow of {listed(broken)}", "valid where it is not a number",
-            "mask these pixels, or set data.flow=none",
-        ))
+        found.append(
+            Advice(
+                f"flow of {listed(broken)}",
+                "valid where it is not a number",
+                "mask these pixels, or set data.flow=none",
+            )
+        )
     if covered and sum(covered) / len(covered) < LEAST_FLOW:
         where = "the mattes" if views.has_alpha else "the pixels"
         share = 100 * sum(covered) / len(covered)
-        found.append(Advice(
-            "optical flow", f"valid on {share:.1f} % of {where}",
-            "check its masks, or set data.flow=dis to estimate it",
-        ))
+        found.append(
+            Advice(
+                "optical flow",
+                f"valid on {share:.1f} % of {where}",
+                "check its masks, or set data.flow=dis to estimate it",
+            )
+        )
     return found

@@ -8,10 +8,10 @@ import imageio.v3 as iio
 from torch import Tensor
 
 from devrf.artifacts.colors import to_bytes
-from devrf.artifacts.files import whole_file
+from devrf.system.files import atomic_write
 
 
 def write_image(path: Path, image: Tensor) -> None:
     """Write an image (H, W, 3) in [0, 1] as a PNG."""
-    with whole_file(path) as partial:
+    with atomic_write(path) as partial:
         iio.imwrite(partial, to_bytes(image).numpy(), extension=".png")

@@ -148,7 +148,7 @@ def _views_facts(name: str, views: Views, scene: Scene) -> ViewsFacts:
         width=views.width,
         height=views.height,
         mattes=mean_share(k[..., 3] > MATTE for k in views.pixels) if views.has_alpha else None,
-        left_out=None if views.counted is None else mean_share(~k for k in views.counted),
+        left_out=None if views.valid_mask is None else mean_share(~k for k in views.valid_mask),
         focal=(float(cameras.focal.min()), float(cameras.focal.max())),
         distance=(float(distance.min()), float(distance.mean()), float(distance.max())),
     )

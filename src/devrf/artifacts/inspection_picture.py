@@ -12,7 +12,6 @@ from torch import Tensor
 from devrf.artifacts import scene_sketch
 from devrf.artifacts.colors import flow_colors, flow_wheel
 from devrf.artifacts.drawing import Color
-from devrf.artifacts.files import whole_file
 from devrf.artifacts.scene_sketch import Sketch, fixed_cameras, grid_step, sketches
 from devrf.artifacts.tiles import (
     GAP,
@@ -30,6 +29,7 @@ from devrf.artifacts.tiles import (
 )
 from devrf.scenes.optical_flow import frame_pairs
 from devrf.scenes.scene import Scene, Views
+from devrf.system.files import atomic_write
 
 PANEL_HEIGHT = 540
 COLUMNS = 6
@@ -41,7 +41,7 @@ WHEEL = 76
 
 def write_inspection_picture(path: Path, scene: Scene) -> None:
     """Write the page of a scene as a PNG, 1600 pixels wide."""
-    with whole_file(path) as partial:
+    with atomic_write(path) as partial:
         inspection_picture(scene).save(partial, format="PNG")
 
 
@@ -60,10 +60,7 @@ def inspection_picture(scene: Scene) -> Image.Image:
         full = flow_scale(train)
         later = [i for i, _ in frame_pairs(train)]
         rows.append(_flow_title(full))
-        rows += [
-            strip(tiles)
-            for tiles in _moving_tiles(train, _chosen(train, set(later)), full)
-        ]
+        rows += [strip(tiles) for tiles in _moving_tiles(train, _chosen(train, set(later)), full)]
     page = Image.new("RGB", (WIDTH, sum(row.height for row in rows) + MARGIN), "white")
     top = 0
     for row in rows:
@@ -136,11 +133,13 @@ def _moving_tiles(
 def counted_pixels(views: Views, image: int) -> Tensor:
     """An image's pixels (H, W, 3 or 4); those that do not count are clear."""
     pixels = views.pixels[image]
-    if views.counted is None:
+    if views.valid_mask is None:
         return pixels
-    alpha = views.counted[image].to(torch.uint8)[..., None] * 255
-    return torch.cat([pixels[..., :3], torch.minimum(alpha, pixels[..., 3:]) if views.has_alpha
-                      else alpha], dim=-1)
+    alpha = views.valid_mask[image].to(torch.uint8)[..., None] * 255
+    return torch.cat(
+        [pixels[..., :3], torch.minimum(alpha, pixels[..., 3:]) if views.has_alpha else alpha],
+        dim=-1,
+    )
 
 
 def _tile_size(views: Views) -> tuple[int, int]:
@@ -219,6 +218,11 @@ def _number_cameras(sketch: Sketch, scene: Scene) -> None:
             pixel, _ = sketch.projection.pixels(views.cameras.positions[image])
             x, y = pixel.tolist()
             pen.text(
-                (x + 11, y - 11), f"{number}", fill=color, font=font(17), anchor="lm",
-                stroke_width=3, stroke_fill=scene_sketch.PAPER,
+                (x + 11, y - 11),
+                f"{number}",
+                fill=color,
+                font=font(17),
+                anchor="lm",
+                stroke_width=3,
+                stroke_fill=scene_sketch.PAPER,
             )

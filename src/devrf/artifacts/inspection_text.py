@@ -9,9 +9,9 @@ from rich.text import Text
 
 from devrf.artifacts.inspection import FlowFacts, Inspection, ViewsFacts
 from devrf.artifacts.sections import Section, as_lines, as_tables
+from devrf.cli.memory import Budget, StageMemory
 from devrf.geometry.box import Box
 from devrf.scenes.scene import Bounds
-from devrf.stages.memory import Budget, StageMemory
 
 
 def sections(found: Inspection, budget: Budget) -> list[Section]:
@@ -20,9 +20,19 @@ def sections(found: Inspection, budget: Budget) -> list[Section]:
         _scene(found),
         Section(
             "images",
-            (("set", "images", "views x times", "size", "mattes", "masks", "focal length",
-              "distance"),
-             *(_images(facts) for facts in found.sets)),
+            (
+                (
+                    "set",
+                    "images",
+                    "views x times",
+                    "size",
+                    "mattes",
+                    "masks",
+                    "focal length",
+                    "distance",
+                ),
+                *(_images(facts) for facts in found.sets),
+            ),
             heading=True,
         ),
         _memory(budget),
@@ -42,9 +52,11 @@ def tables(found: Inspection, budget: Budget) -> RenderableType:
     parts = as_tables(sections(found, budget))
     parts.append(Text(_verdict(found), style="bold yellow" if found.advice else "bold green"))
     for advice in found.advice:
-        parts.append(Text.assemble(
-            ("  " + advice.where, "yellow"), f": {advice.what}; ", (advice.remedy, "italic")
-        ))
+        parts.append(
+            Text.assemble(
+                ("  " + advice.where, "yellow"), f": {advice.what}; ", (advice.remedy, "italic")
+            )
+        )
     return Group(*parts)
 
 
@@ -110,8 +122,14 @@ def _images(facts: ViewsFacts) -> tuple[str, ...]:
     mattes = "no" if facts.mattes is None else f"cover {_percent(facts.mattes)}"
     masks = "no" if facts.left_out is None else f"leave out {_percent(facts.left_out)}"
     return (
-        facts.name, str(facts.images), f"{facts.views} x {facts.frames}",
-        f"{facts.width} x {facts.height}", mattes, masks, focal, distance,
+        facts.name,
+        str(facts.images),
+        f"{facts.views} x {facts.frames}",
+        f"{facts.width} x {facts.height}",
+        mattes,
+        masks,
+        focal,
+        distance,
     )
 
 

@@ -8,9 +8,9 @@ from torch import Tensor
 from devrf.artifacts.colors import error_colors
 from devrf.artifacts.contact_sheet import side_by_side
 from devrf.artifacts.film import depth_picture
-from devrf.rendering.model import SceneModel
+from devrf.evaluation.held_out import background_value, compare, truth_image
+from devrf.methods.devrf.model import SceneModel
 from devrf.scenes.scene import Background, Views
-from devrf.stages.held_out import background_value, compare, truth_image
 
 
 def preview(
@@ -32,7 +32,7 @@ def preview(
     seen = model.picture(rays, float(views.times[index]), behind)
     prediction = seen.color.view(views.height, views.width, 3).clamp(0, 1).cpu()
     truth = truth_image(views, index, background).cpu()
-    error = error_colors(compare(prediction, truth, views.counted_in(index)), truth)
+    error = error_colors(compare(prediction, truth, views.valid_mask_of(index)), truth)
     strip = side_by_side([prediction, truth, error])
     depth = depth_picture(model, seen, views.cameras.positions[index], strip.shape[0])
     return {"view": strip, "depth": depth}

@@ -16,9 +16,9 @@ import lightning
 import torch
 
 import devrf
-from devrf.artifacts.files import whole_file
-from devrf.rendering.model import SceneModel
-from devrf.stages.held_out import HeldOutView
+from devrf.evaluation.held_out import HeldOutView
+from devrf.methods.devrf.model import SceneModel
+from devrf.system.files import atomic_write
 
 
 def mean_scores(views: Sequence[HeldOutView]) -> dict[str, float | None]:
@@ -43,7 +43,7 @@ def write_frames(path: Path, captures: Mapping[str, Sequence[HeldOutView]]) -> N
         captures: images that were scored alike, by the capture they belong to.
     """
     rows = frame_rows(captures)
-    with whole_file(path) as partial, partial.open("w", newline="") as file:
+    with atomic_write(path) as partial, partial.open("w", newline="") as file:
         table = csv.DictWriter(file, list(dict.fromkeys(name for row in rows for name in row)))
         table.writeheader()
         for row in rows:
@@ -51,7 +51,7 @@ def write_frames(path: Path, captures: Mapping[str, Sequence[HeldOutView]]) -> N
 
 
 def frame_rows(
-    captures: Mapping[str, Sequence[HeldOutView]]
+    captures: Mapping[str, Sequence[HeldOutView]],
 ) -> list[dict[str, str | float | None]]:
     """A row for each held-out image: capture, name, time, every metric."""
     return [

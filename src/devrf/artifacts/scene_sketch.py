@@ -111,16 +111,18 @@ def _lines(scene: Scene) -> list[Lines]:
     depth = _frustum_depth(scene)
     groups = [Lines(box_edges(scene), BOX, 2.0), Lines(box_edges(scene, motion=True), MOTION, 1.6)]
     for views, color, line in (
-        (scene.static.train, STATIC, 1.2), (scene.static.test, STATIC_TEST, 1.2),
-        (scene.dynamic.train, DYNAMIC, 2.4), (scene.dynamic.test, DYNAMIC_TEST, 2.4),
+        (scene.static.train, STATIC, 1.2),
+        (scene.static.test, STATIC_TEST, 1.2),
+        (scene.dynamic.train, DYNAMIC, 2.4),
+        (scene.dynamic.test, DYNAMIC_TEST, 2.4),
     ):
         if len(views):
             # Fixed cameras once, not once a frame.
             images = [image for _, image in fixed_cameras(views.cameras, views.view)]
             moving = len(images) == len(views) and len(views) > 12
-            groups.append(Lines(
-                frusta(views.cameras[images], depth), color, 1.2 if moving else line
-            ))
+            groups.append(
+                Lines(frusta(views.cameras[images], depth), color, 1.2 if moving else line)
+            )
     return groups
 
 

@@ -44,8 +44,11 @@ def as_tables(sections: Iterable[Section]) -> list[RenderableType]:
     parts: list[RenderableType] = []
     for section in sections:
         table = Table(
-            title=section.title, title_justify="left", title_style="bold",
-            box=borders.SIMPLE_HEAD if section.heading else None, show_header=section.heading,
+            title=section.title,
+            title_justify="left",
+            title_style="bold",
+            box=borders.SIMPLE_HEAD if section.heading else None,
+            show_header=section.heading,
         )
         rows = section.rows
         for name in rows[0] if section.heading else [""] * len(rows[0]):

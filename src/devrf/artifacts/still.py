@@ -10,7 +10,7 @@ from torch import Tensor
 from devrf.artifacts.film import depth_picture
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
-from devrf.rendering.player import Player
+from devrf.methods.devrf.renderer import Renderer
 from devrf.scenes.scene import Scene
 
 
@@ -52,7 +52,9 @@ class StillSettings:
         return camera if self.height is None else camera.of_height(self.height)
 
 
-def still(player: Player, camera: Cameras, time: float, background: float) -> tuple[Tensor, Tensor]:
+def still(
+    player: Renderer, camera: Cameras, time: float, background: float
+) -> tuple[Tensor, Tensor]:
     """Colour (H, W, 3) and depth as colours (H, W, 3) of what one camera sees, in [0, 1].
 
     Args:
@@ -64,4 +66,3 @@ def still(player: Player, camera: Cameras, time: float, background: float) -> tu
     seen = player.view(camera, 0, time, background)
     depth = depth_picture(player.model, seen, camera.positions[0], camera.height)
     return seen.color.view(depth.shape).clamp(0, 1).cpu(), depth
-

@@ -64,9 +64,7 @@ def shown(pixels: Tensor, size: tuple[int, int]) -> Image.Image:
 def resized(image: Image.Image, size: tuple[int, int]) -> Image.Image:
     """Smoothly smaller; larger by pixels that can be seen, for they are what there is."""
     larger = size[0] > image.width
-    return image.resize(
-        size, Image.Resampling.NEAREST if larger else Image.Resampling.LANCZOS
-    )
+    return image.resize(size, Image.Resampling.NEAREST if larger else Image.Resampling.LANCZOS)
 
 
 def picture(colors: Tensor) -> Image.Image:

@@ -1,16 +1,24 @@
 """Callbacks: what watches a stage and acts on it from outside."""
 
-from devrf.callbacks.excerpts import Excerpts
-from devrf.callbacks.health import Health
+from devrf.callbacks.divergence_guard import DivergenceGuard
 from devrf.callbacks.meter import Meter
+from devrf.callbacks.periodic_checkpoint import PeriodicCheckpoint
 from devrf.callbacks.previews import Previews
 from devrf.callbacks.progress import Progress
-from devrf.callbacks.record import TrainingRecord
-from devrf.callbacks.saving import Saving
 from devrf.callbacks.schedule import GridUpscaling, LearningRateDecay
-from devrf.callbacks.stopping import StopOnSignal
+from devrf.callbacks.stop_on_signal import StopOnSignal
+from devrf.callbacks.training_record import TrainingRecord
+from devrf.cli.phase_benchmark import PhaseBenchmark
 
 __all__ = [
-    "Excerpts", "GridUpscaling", "Health", "LearningRateDecay", "Meter", "Previews", "Progress",
-    "Saving", "StopOnSignal", "TrainingRecord",
+    "PhaseBenchmark",
+    "GridUpscaling",
+    "DivergenceGuard",
+    "LearningRateDecay",
+    "Meter",
+    "Previews",
+    "Progress",
+    "PeriodicCheckpoint",
+    "StopOnSignal",
+    "TrainingRecord",
 ]

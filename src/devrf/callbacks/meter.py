@@ -1,4 +1,4 @@
-"""Curves beside those of the losses: learning rates, speed, resolution, memory."""
+"""ResumableCSVLogger beside those of the losses: learning rates, speed, resolution, memory."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 
 from devrf.artifacts.records import peak_host_memory
-from devrf.stages.schedules import DeformationPhase
-from devrf.stages.stage import ScheduledStage
+from devrf.engine.stage import ScheduledStage
+from devrf.methods.devrf.schedules import DeformationPhase
 
 
 class Meter(Callback):

@@ -9,7 +9,7 @@ from lightning import Callback, LightningModule, Trainer
 
 from devrf.artifacts.preview import preview
 from devrf.artifacts.tracking import trackers
-from devrf.stages.stage import ScheduledStage
+from devrf.engine.stage import ScheduledStage
 
 
 class Previews(Callback):
@@ -47,7 +47,10 @@ class Previews(Callback):
         if found := trackers(trainer.loggers):
             views = pl_module.scene.capture(pl_module.capture).test
             seen = preview(
-                pl_module.model, views, len(views) // 2, pl_module.scene.background,
+                pl_module.model,
+                views,
+                len(views) // 2,
+                pl_module.scene.background,
                 pl_module.device,
             )
             for tracker in found:

@@ -19,8 +19,8 @@ from rich.progress import (
     Progress as Bar,
 )
 
-from devrf.stages.schedules import DeformationPhase
-from devrf.stages.stage import ScheduledStage
+from devrf.engine.stage import ScheduledStage
+from devrf.methods.devrf.schedules import DeformationPhase
 
 log = logging.getLogger(__name__)
 
@@ -49,12 +49,18 @@ class Progress(Callback):
         console = Console()
         if console.is_terminal:
             self._bar = Bar(
-                TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
-                TextColumn("{task.fields[state]}"), TimeRemainingColumn(), console=console,
+                TextColumn("{task.description}"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TextColumn("{task.fields[state]}"),
+                TimeRemainingColumn(),
+                console=console,
             )
             self._bar.add_task(
-                type(pl_module).__name__, total=pl_module.total_iterations,
-                completed=pl_module.iteration, state="",
+                type(pl_module).__name__,
+                total=pl_module.total_iterations,
+                completed=pl_module.iteration,
+                state="",
             )
             self._bar.start()
 

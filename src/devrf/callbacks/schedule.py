@@ -7,7 +7,7 @@ from typing import Any
 from lightning import Callback, LightningModule, Trainer
 from torch.optim import Optimizer
 
-from devrf.stages.stage import ScheduledStage
+from devrf.engine.stage import ScheduledStage
 
 
 class GridUpscaling(Callback):
@@ -31,9 +31,9 @@ class LearningRateDecay(Callback):
     ) -> None:
         """Set ``lr`` to ``base_lr`` times the factor of the present iteration.
 
-        Lower still after the stage was taken back, by its ``caution``.
+        Lower still after the stage was taken back, by its ``lr_scale``.
         """
         assert isinstance(pl_module, ScheduledStage)
-        factor = pl_module.learning_rate_factor(pl_module.iteration) * pl_module.caution
+        factor = pl_module.learning_rate_factor(pl_module.iteration) * pl_module.lr_scale
         for group in optimizer.param_groups:
             group["lr"] = group["base_lr"] * factor

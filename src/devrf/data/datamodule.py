@@ -52,9 +52,7 @@ class SceneDataModule(LightningDataModule, ABC):
 
     def test_dataloader(self) -> DataLoader[Any]:
         """A loader of the positions of the held-out images, one at a time."""
-        return DataLoader(
-            _Positions(len(self.scene.capture(self._capture).test)), batch_size=None
-        )
+        return DataLoader(_Positions(len(self.scene.capture(self._capture).test)), batch_size=None)
 
     def transfer_batch_to_device(
         self, batch: Any, device: torch.device, dataloader_idx: int

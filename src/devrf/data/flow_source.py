@@ -54,7 +54,7 @@ def with_flow(scene: Scene, source: FlowSource, cache: Path | None) -> Scene:
     if method not in ("dis", "raft"):
         return scene
     flow = estimate_flow(train, method, cache)
-    if train.counted is not None:
-        flow = replace(flow, valid=flow.valid & train.counted)
+    if train.valid_mask is not None:
+        flow = replace(flow, valid=flow.valid & train.valid_mask)
     dynamic = replace(scene.dynamic, train=replace(train, flow=flow))
     return replace(scene, dynamic=dynamic)

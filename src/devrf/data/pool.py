@@ -32,9 +32,7 @@ class PixelPool:
             count: how many.
             generator: of the random choice, on the pool's device.
         """
-        pick = torch.randint(
-            len(self), (count,), device=self.image.device, generator=generator
-        )
+        pick = torch.randint(len(self), (count,), device=self.image.device, generator=generator)
         return self.image[pick].long(), self.flat[pick].long()
 
     def of_images(self, images: Tensor) -> PixelPool:
@@ -59,18 +57,16 @@ class PixelPool:
 def all_pixels(views: Views, images: Tensor) -> PixelPool:
     """Every pixel of ``images`` (K,) int64 that counts."""
     area = views.height * views.width
-    if views.counted is not None:
+    if views.valid_mask is not None:
         everything = torch.ones(len(images), area, dtype=torch.bool, device=images.device)
         return wanted_pixels(views, images, everything)
     flat = torch.arange(area, dtype=torch.int32, device=images.device)
-    return PixelPool(
-        images.to(torch.int32).repeat_interleave(area), flat.repeat(len(images))
-    )
+    return PixelPool(images.to(torch.int32).repeat_interleave(area), flat.repeat(len(images)))
 
 
 def wanted_pixels(views: Views, images: Tensor, wanted: Tensor) -> PixelPool:
     """The pixels of ``images`` (K,) int64 that are ``wanted``, (K, H·W) bool, and count."""
-    if views.counted is not None:
-        counted = views.counted[images.to(views.counted.device)]
-        wanted = wanted & counted.flatten(1).to(wanted.device)
+    if views.valid_mask is not None:
+        valid_mask = views.valid_mask[images.to(views.valid_mask.device)]
+        wanted = wanted & valid_mask.flatten(1).to(wanted.device)
     return PixelPool.of_mask(images, wanted)

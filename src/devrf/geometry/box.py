@@ -68,18 +68,24 @@ class Box:
         """The box grown about its centre by ``factor`` along every axis."""
         mid = [(a + b) / 2 for a, b in zip(self.low, self.high, strict=True)]
         half = [edge / 2 * factor for edge in self.size]
-        return Box.of([m - h for m, h in zip(mid, half, strict=True)],
-                      [m + h for m, h in zip(mid, half, strict=True)])
+        return Box.of(
+            [m - h for m, h in zip(mid, half, strict=True)],
+            [m + h for m, h in zip(mid, half, strict=True)],
+        )
 
     def union(self, other: Box) -> Box:
         """The smallest box that holds both."""
-        return Box.of([min(a, b) for a, b in zip(self.low, other.low, strict=True)],
-                      [max(a, b) for a, b in zip(self.high, other.high, strict=True)])
+        return Box.of(
+            [min(a, b) for a, b in zip(self.low, other.low, strict=True)],
+            [max(a, b) for a, b in zip(self.high, other.high, strict=True)],
+        )
 
     def clipped(self, other: Box) -> Box:
         """The part of this box inside ``other``."""
-        return Box.of([max(a, b) for a, b in zip(self.low, other.low, strict=True)],
-                      [min(a, b) for a, b in zip(self.high, other.high, strict=True)])
+        return Box.of(
+            [max(a, b) for a, b in zip(self.low, other.low, strict=True)],
+            [min(a, b) for a, b in zip(self.high, other.high, strict=True)],
+        )
 
     def contains(self, points: Tensor) -> Tensor:
         """Mask (...,) of the points (..., 3) inside the box, faces included."""
@@ -136,9 +142,7 @@ class Box:
 
 
 @lru_cache(maxsize=256)
-def _kept(
-    numbers: tuple[float, float, float], dtype: torch.dtype, device: torch.device
-) -> Tensor:
+def _kept(numbers: tuple[float, float, float], dtype: torch.dtype, device: torch.device) -> Tensor:
     # A tensor made in inference mode could not be used for training later.
     with torch.inference_mode(False):
         return torch.tensor(numbers, dtype=dtype, device=device)

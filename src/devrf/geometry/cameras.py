@@ -112,9 +112,7 @@ class Cameras:
     def resized(self, width: int, height: int) -> Cameras:
         """The same cameras with images of another size (each axis scaled by its own factor)."""
         scale = self.focal.new_tensor([width / self.width, height / self.height])
-        return Cameras(
-            self.camera_to_world, self.focal * scale, self.center * scale, width, height
-        )
+        return Cameras(self.camera_to_world, self.focal * scale, self.center * scale, width, height)
 
     def of_height(self, height: int) -> Cameras:
         """The same cameras with images ``height`` pixels high and as wide as they were for it."""

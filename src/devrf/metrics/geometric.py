@@ -19,10 +19,10 @@ def depth_error(depth: Tensor, opacity: Tensor, truth: Tensor) -> float | None:
         opacity: in [0, 1], how much of each ray is stopped.
         truth: true distance, +inf where the ray hits nothing.
     """
-    counted = truth.isfinite() & depth.isfinite() & (opacity > SOLID)
-    if not bool(counted.any()):
+    valid_mask = truth.isfinite() & depth.isfinite() & (opacity > SOLID)
+    if not bool(valid_mask.any()):
         return None
-    return float((depth[counted] - truth[counted]).abs().mean())
+    return float((depth[valid_mask] - truth[valid_mask]).abs().mean())
 
 
 def end_point_error(flow: Tensor, truth: Tensor) -> float | None:

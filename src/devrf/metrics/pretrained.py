@@ -42,7 +42,8 @@ def load_lpips(
         if not download:
             log.info(
                 "LPIPS is null: no weights in %s; give evaluation.lpips_weights=PATH or "
-                "evaluation.download=true", cached,
+                "evaluation.download=true",
+                cached,
             )
             return None
         if not _downloaded(trunk):
@@ -77,7 +78,10 @@ def read_lpips(network: Network, path: Path) -> Lpips:
 def _downloaded(trunk: Trunk) -> bool:
     try:
         torch.hub.load_state_dict_from_url(
-            f"{PUBLISHED_AT}/{trunk.file}", map_location="cpu", progress=False, check_hash=True,
+            f"{PUBLISHED_AT}/{trunk.file}",
+            map_location="cpu",
+            progress=False,
+            check_hash=True,
             weights_only=True,
         )
     except (OSError, RuntimeError) as error:  # no network; another file than expected

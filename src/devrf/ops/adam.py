@@ -43,8 +43,13 @@ class GridAdam(torch.optim.Optimizer):
         eps: float = 1e-8,
     ) -> None:
         defaults = {
-            "lr": lr, "betas": betas, "eps": eps, "skip_zero": False, "pace": None,
-            "smoothing": 0.0, "touched_only": False,
+            "lr": lr,
+            "betas": betas,
+            "eps": eps,
+            "skip_zero": False,
+            "pace": None,
+            "smoothing": 0.0,
+            "touched_only": False,
         }
         self.keeps_gradients = False
         self._rates: dict[int, Tensor] = {}
@@ -63,9 +68,7 @@ class GridAdam(torch.optim.Optimizer):
                 device = group["params"][0].device
                 rate = self._rates.get(number)
                 if rate is None or rate.device != device:
-                    rate = self._rates[number] = torch.zeros(
-                        (), dtype=torch.float64, device=device
-                    )
+                    rate = self._rates[number] = torch.zeros((), dtype=torch.float64, device=device)
                 # A fill, not a copy from the host: the device need not wait.
                 rate.fill_(group["lr"])
         with torch.enable_grad():

@@ -103,8 +103,14 @@ def smooth_adam_step(
         from devrf.ops.kernels.adam import step_in_one_pass
 
         step_in_one_pass(
-            values, into, gradient, mean, square, rule,
-            smoothing=smoothing, touched_only=touched_only,
+            values,
+            into,
+            gradient,
+            mean,
+            square,
+            rule,
+            smoothing=smoothing,
+            touched_only=touched_only,
         )
         return
     smooth = torch.zeros_like(gradient)

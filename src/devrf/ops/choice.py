@@ -105,7 +105,9 @@ def passes_check(device: torch.device) -> bool:
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
         log.warning(
             "kernels: plain PyTorch runs on %s, since the Triton kernels failed their check "
-            "there (%s)", device, reason,
+            "there (%s)",
+            device,
+            reason,
         )
         return False
     return True

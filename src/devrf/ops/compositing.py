@@ -122,9 +122,7 @@ class _Composite(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(
-        ctx: Any, grad_weights: Tensor, grad_end: Tensor
-    ) -> tuple[Tensor, None, None]:
+    def backward(ctx: Any, grad_weights: Tensor, grad_end: Tensor) -> tuple[Tensor, None, None]:
         depth, ray, first, last, transmittance, weights, end = ctx.saved_tensors
         shadowed = _running_sum(grad_weights * weights)
         behind = (shadowed[last][ray] - shadowed[1:]).to(depth.dtype)

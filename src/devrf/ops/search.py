@@ -35,7 +35,7 @@ class Thresholds:
 
 
 @dataclass(frozen=True)
-class Found:
+class PackedSamples:
     """Samples of R rays in lists of length C: ascending by ray, front to back, then padding.
 
     Attributes:
@@ -59,7 +59,7 @@ class Found:
 
 
 @dataclass(frozen=True)
-class Selected:
+class SampleSubset:
     """Some of the samples of a list, in a list of length K.
 
     Attributes:
@@ -95,7 +95,7 @@ def find_samples(
     shift: float,
     delta: float,
     thresholds: Thresholds,
-) -> Found:
+) -> PackedSamples:
     """Samples that can be seen (method §2, Rays), at ``entry + k·step``, k = 0 … count − 1.
 
     A sample is kept if the grid point nearest to it is occupied, its opacity is no less than
@@ -129,8 +129,22 @@ def find_samples(
         from devrf.ops.kernels.search import find_samples_on_device
 
         return find_samples_on_device(
-            origins, directions, entry, count, mask, density, slices, weight, step, longest,
-            capacity, mask_box, box, shift, delta, thresholds,
+            origins,
+            directions,
+            entry,
+            count,
+            mask,
+            density,
+            slices,
+            weight,
+            step,
+            longest,
+            capacity,
+            mask_box,
+            box,
+            shift,
+            delta,
+            thresholds,
         )
     rays = len(origins)
     samples = count.clamp(max=longest)
@@ -140,9 +154,7 @@ def find_samples(
     points = torch.addcmul(origins[ray], directions[ray], distance[:, None])
     kept = _occupied(mask, to_grid(points, mask_box, shape_of(mask))).nonzero()[:, 0]
     ray, distance, points = ray[kept], distance[kept], points[kept]
-    _, tau = warped_depth(
-        points, density, slices, weight, box=box, shift=shift, delta=delta
-    )
+    _, tau = warped_depth(points, density, slices, weight, box=box, shift=shift, delta=delta)
     alpha = -torch.expm1(-tau)
     kept = (alpha >= thresholds.alpha).nonzero()[:, 0]
     ray, distance, points = ray[kept], distance[kept], points[kept]
@@ -153,7 +165,7 @@ def find_samples(
     total = first[-1]
     kept = kept[:capacity]
     room = capacity - len(kept)
-    return Found(
+    return PackedSamples(
         pad(ray[kept], (0, room), value=rays),
         pad(distance[kept], (0, room)),
         pad(points[kept], (0, 0, 0, room)),
@@ -174,7 +186,7 @@ def _occupied(mask: Tensor, coords: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def select(flags: Tensor, first: Tensor, capacity: int) -> Selected:
+def select(flags: Tensor, first: Tensor, capacity: int) -> SampleSubset:
     """The samples with a flag, without waiting for the device; the same on any device.
 
     Padding repeats places of the list, each another one, so that a gradient that is gathered
@@ -193,6 +205,6 @@ def select(flags: Tensor, first: Tensor, capacity: int) -> Selected:
     # One place more takes all that is not wanted.
     target = torch.where(flags, running[:-1], capacity).clamp_(max=capacity)
     index = torch.arange(capacity + 1, device=flags.device).scatter_(0, target, place)
-    return Selected(
+    return SampleSubset(
         index[:capacity], running[first].clamp_(max=capacity), total, total > capacity
     )

@@ -103,13 +103,30 @@ def sample_search(draw: Draw, frames: Sequence[int] = (1, 2)) -> Results:
         count = (20 * draw(9)).clamp(min=0).long() * 2
         slices = [0.2 * draw(3, 4, 3, 3) for _ in range(moments)]
         found = find_samples(
-            origins, directions, -1 + 0.1 * draw(9), count, draw(5, 4, 6) > -0.3,
-            3 * draw(4, 3, 5, 1), slices, 0.3, step=0.05, longest=40, capacity=40,
-            mask_box=_Box(), box=_Box(), shift=-1.0, delta=0.5,
+            origins,
+            directions,
+            -1 + 0.1 * draw(9),
+            count,
+            draw(5, 4, 6) > -0.3,
+            3 * draw(4, 3, 5, 1),
+            slices,
+            0.3,
+            step=0.05,
+            longest=40,
+            capacity=40,
+            mask_box=_Box(),
+            box=_Box(),
+            shift=-1.0,
+            delta=0.5,
             thresholds=Thresholds(alpha=0.05, stop=0.05, weight=0.1),
         )
         results += [
-            found.ray, found.distance, found.points, found.heavy, found.first, found.total,
+            found.ray,
+            found.distance,
+            found.points,
+            found.heavy,
+            found.first,
+            found.total,
             found.overflow,
         ]
     return tuple(results)
@@ -140,8 +157,12 @@ def adam(draw: Draw) -> Results:
     results: list[Tensor] = []
     for skip_zero in (False, True):
         pace = draw(4, 3, 5, 1).abs()
-        rule = AdamRule(draw(1)[0].abs(), torch.full_like(pace[0, 0, 0, 0], 3.0),
-                        skip_zero=skip_zero, pace=pace if skip_zero else None)
+        rule = AdamRule(
+            draw(1)[0].abs(),
+            torch.full_like(pace[0, 0, 0, 0], 3.0),
+            skip_zero=skip_zero,
+            pace=pace if skip_zero else None,
+        )
         values, gradient, mean = draw(4, 3, 5, 3), draw(4, 3, 5, 3).clamp(min=0), draw(4, 3, 5, 3)
         square, smooth = draw(4, 3, 5, 3).square() + 0.1, torch.zeros_like(values)
         again = gradient.clone()
@@ -152,5 +173,10 @@ def adam(draw: Draw) -> Results:
 
 
 CASES: tuple[Callable[[Draw], Results], ...] = (
-    interpolation, warped_depths, sample_search, compositing, total_variation, adam,
+    interpolation,
+    warped_depths,
+    sample_search,
+    compositing,
+    total_variation,
+    adam,
 )

@@ -113,9 +113,7 @@ def _steps(shape: Shape, device: torch.device) -> Tensor:
 
     Kept on the device: made anew at every step, they would make the device wait for the host.
     """
-    steps = [
-        (a * shape[1] + b) * shape[2] + c for a in (0, 1) for b in (0, 1) for c in (0, 1)
-    ]
+    steps = [(a * shape[1] + b) * shape[2] + c for a in (0, 1) for b in (0, 1) for c in (0, 1)]
     # A tensor made in inference mode could not be used for training later.
     with torch.inference_mode(False):
         return torch.tensor(steps, dtype=torch.int32).to(device)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import TypeVar
 
 from devrf.geometry.rays import Rays
-from devrf.shortage import give_back, is_shortage
+from devrf.system.out_of_memory import free_cache, is_oom
 
 log = logging.getLogger(__name__)
 
@@ -33,7 +33,7 @@ def in_chunks(see: Callable[[Rays], Part], rays: Rays, chunk: int) -> list[Part]
     while first < len(rays) or not parts:
         part = _see(see, rays[first : first + chunk], chunk)
         if part is None:
-            give_back(rays.origins.device)
+            free_cache(rays.origins.device)
             chunk //= 2
             log.warning("out of memory: pictures are rendered %d rays at a time", chunk)
         else:
@@ -47,6 +47,6 @@ def _see(see: Callable[[Rays], Part], rays: Rays, chunk: int) -> Part | None:
     try:
         return see(rays)
     except (RuntimeError, MemoryError) as error:
-        if chunk // 2 < FEWEST or not is_shortage(error):
+        if chunk // 2 < FEWEST or not is_oom(error):
             raise
     return None

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from devrf.fields.occupancy import Occupancy
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
+from devrf.rendering.occupancy import Occupancy
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from devrf.scenes.decoding import decoding
 from devrf.scenes.paths import existing_file
-from devrf.scenes.validation import LARGEST, problem
+from devrf.scenes.validation import LARGEST, scene_error
 
 Numbers = npt.NDArray[np.float64]
 
@@ -64,16 +64,16 @@ def read_numbers(path: Path, expected: str) -> Numbers:
         shape, dtype = _header(stream)
         count = math.prod(shape)
         if dtype.kind not in "fiu":
-            raise problem(path, f"holds values of type {dtype}, expected {expected}")
+            raise scene_error(path, f"holds values of type {dtype}, expected {expected}")
         if stream.tell() + count * dtype.itemsize > size:
             raise ValueError(f"{shape} values of type {dtype} do not fit into {size} bytes")
         if count > MOST_NUMBERS:
-            raise problem(path, f"has shape {shape}, which is too large; expected {expected}")
+            raise scene_error(path, f"has shape {shape}, which is too large; expected {expected}")
         stream.seek(0)
         values = np.lib.format.read_array(stream, allow_pickle=False)
     # NaN compares false.
     if not bool((values < LARGEST).all() and (values > -LARGEST).all()):
-        raise problem(path, "holds NaN or infinity; write it again from valid camera poses")
+        raise scene_error(path, "holds NaN or infinity; write it again from valid camera poses")
     return values.astype(np.float64)
 
 
@@ -93,7 +93,7 @@ def read_archive(
     """
     most = SMALL_ARCHIVE + BYTES_PER_VALUE * sum(math.prod(f.shape) for f in forms.values())
     if existing_file(path, remedy) > most:
-        raise problem(path, f"larger than {most >> 20} MiB, which {explained_by}; {remedy}")
+        raise scene_error(path, f"larger than {most >> 20} MiB, which {explained_by}; {remedy}")
     with decoding(path, "npz", remedy), zipfile.ZipFile(path) as archive:
         return {
             name: _member(archive, name, form, path, explained_by, remedy)
@@ -107,17 +107,17 @@ def _member(
     found = [info for info in archive.infolist() if info.filename == f"{name}.npy"]
     if len(found) != 1:
         has = "has no" if not found else "has more than one"
-        raise problem(path, f'{has} array "{name}"; {remedy}')
+        raise scene_error(path, f'{has} array "{name}"; {remedy}')
     if found[0].compress_type not in _PLAIN:
         raise ValueError(f'"{name}" is compressed in a way that numpy does not write')
     with archive.open(found[0]) as member:
         shape, dtype = _header(member)
     if shape != form.shape:
-        raise problem(
+        raise scene_error(
             path, f'"{name}" has shape {shape}, expected {form.shape} as {explained_by}; {remedy}'
         )
     if dtype.kind not in form.kinds:
-        raise problem(path, f'"{name}" holds values of type {dtype}; {remedy}')
+        raise scene_error(path, f'"{name}" holds values of type {dtype}; {remedy}')
     with archive.open(found[0]) as member:
         values: npt.NDArray[Any] = np.lib.format.read_array(member, allow_pickle=False)
         if member.read(1):

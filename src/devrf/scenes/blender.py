@@ -17,7 +17,7 @@ from devrf.scenes.options import check_options
 from devrf.scenes.paths import existing_folder, scene_folder
 from devrf.scenes.scene import Background, Scene, Views
 from devrf.scenes.splits import Split, dynamic_split, static_split
-from devrf.scenes.validation import check_choice, problem
+from devrf.scenes.validation import check_choice, scene_error
 
 log = logging.getLogger(__name__)
 
@@ -66,8 +66,15 @@ def read_blender(
     """
     check_choice("data.flow", flow, get_args(FlowSource))
     given_box = check_options(
-        downscale=downscale, background=background, bound_scale=bound_scale, near=near, far=far,
-        box=box, frames=frames, static_until=static_until, train_views=train_views,
+        downscale=downscale,
+        background=background,
+        bound_scale=bound_scale,
+        near=near,
+        far=far,
+        box=box,
+        frames=frames,
+        static_until=static_until,
+        train_views=train_views,
     )
     folder = scene_folder(root)
 
@@ -80,12 +87,15 @@ def read_blender(
         train = _with_flow(dynamic_.train, layout.dynamic_train, flow_folder)
         dynamic_ = replace(dynamic_, train=train)
     bounds = inward_bounds(
-        static.train, dynamic_.train, [static.train, static.test, dynamic_.train, dynamic_.test],
-        bound_scale=bound_scale, near=near, far=far, box=given_box,
+        static.train,
+        dynamic_.train,
+        [static.train, static.test, dynamic_.train, dynamic_.test],
+        bound_scale=bound_scale,
+        near=near,
+        far=far,
+        box=given_box,
     )
-    return Scene(
-        name or folder.resolve().name, "inward", static, dynamic_, bounds, background
-    )
+    return Scene(name or folder.resolve().name, "inward", static, dynamic_, bounds, background)
 
 
 def _layout(root: Path, dynamic: str | None, static_until: float) -> tuple[Layout, Path]:
@@ -93,8 +103,9 @@ def _layout(root: Path, dynamic: str | None, static_until: float) -> tuple[Layou
     static = root / "static"
     if not os.path.isdir(static) and not dynamic_folders(root):
         if not os.path.isfile(root / "transforms_train.json"):
-            raise problem(
-                root, "expected static/ and dynamic_<V>views/, or transforms_train.json; "
+            raise scene_error(
+                root,
+                "expected static/ and dynamic_<V>views/, or transforms_train.json; "
                 "set data.root to the scene's folder",
             )
         train = dynamic_split(root / "transforms_train.json", root)

@@ -10,7 +10,7 @@ from devrf.geometry.cameras import Cameras
 from devrf.scenes.poses import FARTHEST
 from devrf.scenes.scene import Bounds, Views
 from devrf.scenes.silhouettes import motion_box
-from devrf.scenes.validation import check_bound_scale, problem
+from devrf.scenes.validation import check_bound_scale, scene_error
 
 # Room for motion where nothing else is known: the published scenes use 1.05 to 2.
 FALLBACK_BOUND_SCALE = 1.5
@@ -45,14 +45,16 @@ def axes_meet(cameras: Cameras) -> Tensor:
     across = torch.eye(3, dtype=torch.float64) - axis[:, :, None] * axis[:, None, :]
     normal = across.mean(dim=0)
     if float(torch.linalg.eigvalsh(normal)[0]) < NEARLY_PARALLEL:
-        raise problem(
-            "data.box", "the static cameras look in nearly one direction, so their axes do not "
+        raise scene_error(
+            "data.box",
+            "the static cameras look in nearly one direction, so their axes do not "
             "say where the scene is; set data.box=[[x,y,z],[x,y,z]], data.near and data.far",
         )
     point: Tensor = torch.linalg.solve(normal, (across @ origin[:, :, None])[..., 0].mean(dim=0))
     if float(((point - origin) * axis).sum(dim=1).median()) <= 0:
-        raise problem(
-            "data.box", "the static cameras look away from one another, expected cameras around "
+        raise scene_error(
+            "data.box",
+            "the static cameras look away from one another, expected cameras around "
             "the scene; set data.box=[[x,y,z],[x,y,z]], data.near and data.far",
         )
     return point.float()
@@ -92,8 +94,9 @@ def resolved_box(low: Tensor, high: Tensor) -> Box:
     least = max(LEAST_EDGE * reach, 1 / FARTHEST)
     # NaN compares false.
     if not (float((high - low).min()) > least and reach <= FARTHEST):
-        raise problem(
-            "data.box", f"the cameras say that the scene lies between {low.tolist()} and "
+        raise scene_error(
+            "data.box",
+            f"the cameras say that the scene lies between {low.tolist()} and "
             f"{high.tolist()}, which single precision cannot hold; bring the scene nearer to the "
             "origin, correct its unit, or set data.box=[[x,y,z],[x,y,z]]",
         )
@@ -163,8 +166,9 @@ def inward_bounds(
     near = min(r[0] for r in ranges) if near is None else float(near)
     far = max(r[1] for r in ranges) if far is None else float(far)
     if not 0 <= near < far <= 4 * FARTHEST:
-        raise problem(
-            "data.near, data.far", f"expected 0 <= near < far, not {near:g} and {far:g}; "
+        raise scene_error(
+            "data.near, data.far",
+            f"expected 0 <= near < far, not {near:g} and {far:g}; "
             "set both, in world units, or leave them null",
         )
     return Bounds(box, near, far, motion, scale, source)

@@ -7,13 +7,14 @@ import os
 from pathlib import Path
 
 from devrf.scenes.paths import entries
-from devrf.scenes.validation import problem
+from devrf.scenes.validation import scene_error
 
 
 def dynamic_folders(root: Path) -> list[Path]:
     """The folders ``dynamic_<V>views`` of ``root``, in order of their names."""
     return [
-        path for path in entries(root)
+        path
+        for path in entries(root)
         if fnmatch.fnmatch(path.name, "dynamic_*views") and os.path.isdir(path)
     ]
 
@@ -30,10 +31,10 @@ def chosen_dynamic(root: Path, chosen: str | None) -> Path:
         named = [folder for folder in folders if folder.name == chosen]
         if not named:
             found = names or "none"
-            raise problem(root, f"no folder {chosen!r} (found: {found}); correct data.dynamic")
+            raise scene_error(root, f"no folder {chosen!r} (found: {found}); correct data.dynamic")
         return named[0]
     if not folders:
-        raise problem(root, "no folder dynamic_<V>views; add the capture of the moving scene")
+        raise scene_error(root, "no folder dynamic_<V>views; add the capture of the moving scene")
     if len(folders) > 1:
-        raise problem(root, f"several captures ({names}); choose one with data.dynamic=NAME")
+        raise scene_error(root, f"several captures ({names}); choose one with data.dynamic=NAME")
     return folders[0]

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from devrf.errors import DevrfError
-from devrf.scenes.validation import problem
+from devrf.scenes.validation import scene_error
 
 
 @contextmanager
@@ -28,4 +28,4 @@ def decoding(path: Path, what: str, remedy: str) -> Iterator[None]:
     # Any exception: what decoders raise depends on the format and the damage.
     except Exception as error:
         reason = str(error) or type(error).__name__
-        raise problem(path, f"not a readable {what} ({reason}); {remedy}") from None
+        raise scene_error(path, f"not a readable {what} ({reason}); {remedy}") from None

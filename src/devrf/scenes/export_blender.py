@@ -15,7 +15,7 @@ from torch import Tensor
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.new_folder import time_major, whole_folder
 from devrf.scenes.scene import Capture, Scene, Views
-from devrf.scenes.validation import problem
+from devrf.scenes.validation import scene_error
 
 # The layout has a validation split, which nothing here learns from: a few test images again.
 _VALIDATION_VIEWS = 4
@@ -37,7 +37,7 @@ def export_blender(scene: Scene, folder: Path) -> None:
             scene.
     """
     if scene.kind != "inward":
-        raise problem(scene.name, "only inward-facing scenes fit the Blender layout")
+        raise scene_error(scene.name, "only inward-facing scenes fit the Blender layout")
     dynamic = Capture(time_major(scene.dynamic.train), time_major(scene.dynamic.test))
     count = len(set(dynamic.train.view.tolist()))
     with whole_folder(folder) as partial:
@@ -65,12 +65,14 @@ def _write_split(views: Views, split: str, folder: Path) -> None:
     ):
         name = f"r_{k:03d}"
         iio.imwrite(folder / split / f"{name}.png", _rgba(pixels))
-        frames.append({
-            "file_path": f"./{split}/{name}",
-            "time": time,
-            # A float32 becomes the float64 of the same value, which JSON keeps digit for digit.
-            "transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]],
-        })
+        frames.append(
+            {
+                "file_path": f"./{split}/{name}",
+                "time": time,
+                # A float32 becomes the float64 of the same value, which JSON keeps digit for digit.
+                "transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]],
+            }
+        )
     content = {"camera_angle_x": _field_of_view(views.cameras), "frames": frames}
     text = json.dumps(content, indent=1)
     (folder / f"transforms_{split}.json").write_text(text + "\n", encoding="utf-8")
@@ -90,9 +92,9 @@ def _field_of_view(cameras: Cameras) -> float:
     middle = center.new_tensor([cameras.width / 2, cameras.height / 2])
     shared = float(focal[0, 0])
     if not torch.allclose(focal, focal.new_tensor(shared), rtol=1e-6, atol=0.0):
-        raise problem("cameras", "one camera_angle_x cannot hold different focal lengths")
+        raise scene_error("cameras", "one camera_angle_x cannot hold different focal lengths")
     if not torch.allclose(center, middle.expand_as(center), rtol=0.0, atol=1e-4):
-        raise problem("cameras", "camera_angle_x needs principal points in the images' middle")
+        raise scene_error("cameras", "camera_angle_x needs principal points in the images' middle")
     return 2 * math.atan(cameras.width / 2 / shared)
 
 

@@ -14,7 +14,7 @@ from devrf.scenes.array_files import Numbers
 from devrf.scenes.llff_poses import BOUND_FACTOR
 from devrf.scenes.new_folder import time_major, whole_folder
 from devrf.scenes.scene import Capture, Scene, Views
-from devrf.scenes.validation import problem
+from devrf.scenes.validation import scene_error
 
 # The published scenes are read at this factor, from folders images_4; larger images need not
 # be there, and are not.
@@ -45,7 +45,7 @@ def export_llff(scene: Scene, folder: Path) -> None:
             scene.
     """
     if scene.kind != "forward":
-        raise problem(scene.name, "only forward-facing scenes fit LLFF's layout")
+        raise scene_error(scene.name, "only forward-facing scenes fit LLFF's layout")
     static = _interleaved(scene.static)
     views = [*_by_camera(scene.dynamic.train), *_by_camera(scene.dynamic.test)]
     _check_moving(scene.dynamic, views)
@@ -61,12 +61,13 @@ def _interleaved(static: Capture) -> Views:
     count = len(static.train) + len(static.test)
     held_out = torch.arange(count) % HOLDOUT == 0
     if int(held_out.sum()) != len(static.test):
-        raise problem(
-            "static", f"the layout holds out every {HOLDOUT}th image, {int(held_out.sum())} of "
+        raise scene_error(
+            "static",
+            f"the layout holds out every {HOLDOUT}th image, {int(held_out.sum())} of "
             f"{count}, but {len(static.test)} are held out here",
         )
     if static.train.pixels.shape[1:] != static.test.pixels.shape[1:]:
-        raise problem("static", "the layout needs static images of one size and channel count")
+        raise scene_error("static", "the layout needs static images of one size and channel count")
     order = torch.empty(count, dtype=torch.int64)
     order[~held_out] = torch.arange(len(static.train))
     order[held_out] = len(static.train) + torch.arange(len(static.test))
@@ -76,7 +77,8 @@ def _interleaved(static: Capture) -> Views:
         torch.zeros(count),
         torch.arange(count),
         static.train.names + static.test.names,
-        depth=None if static.train.depth is None or static.test.depth is None
+        depth=None
+        if static.train.depth is None or static.test.depth is None
         else torch.cat([static.train.depth, static.test.depth]),
     )
     return both[order]
@@ -85,8 +87,11 @@ def _interleaved(static: Capture) -> Views:
 def _joined(static: Capture) -> Cameras:
     a, b = static.train.cameras, static.test.cameras
     return Cameras(
-        torch.cat([a.camera_to_world, b.camera_to_world]), torch.cat([a.focal, b.focal]),
-        torch.cat([a.center, b.center]), a.width, a.height,
+        torch.cat([a.camera_to_world, b.camera_to_world]),
+        torch.cat([a.focal, b.focal]),
+        torch.cat([a.center, b.center]),
+        a.width,
+        a.height,
     )
 
 
@@ -102,18 +107,21 @@ def _by_camera(views: Views) -> list[Views]:
 def _check_moving(capture: Capture, views: list[Views]) -> None:
     held_out = len(set(capture.test.view.tolist()))
     if held_out != 1:
-        raise problem("dynamic", f"the layout holds one held-out view, but there are {held_out}")
+        raise scene_error(
+            "dynamic", f"the layout holds one held-out view, but there are {held_out}"
+        )
     frames = len(views[0])
     expected = torch.arange(frames) / max(frames - 1, 1)
     for view in views:
         if len(view) != frames or bool(((view.times - expected).abs() > _TIME_TOLERANCE).any()):
-            raise problem(
-                "dynamic", "the layout has no times: each view needs the same frames, evenly "
+            raise scene_error(
+                "dynamic",
+                "the layout has no times: each view needs the same frames, evenly "
                 "spread over [0, 1]",
             )
         poses = view.cameras.camera_to_world
         if not torch.equal(poses, poses[:1].expand_as(poses)):
-            raise problem("dynamic", "the layout needs cameras that stand still")
+            raise scene_error("dynamic", "the layout needs cameras that stand still")
 
 
 def _farthest(everyone: list[Views]) -> float:
@@ -127,9 +135,9 @@ def _intrinsics(views: Views, factor: int) -> Numbers:
     cameras = views.cameras
     middle = cameras.center.new_tensor([cameras.width / 2, cameras.height / 2])
     if not torch.allclose(cameras.focal[:, 0], cameras.focal[:, 1], rtol=1e-6, atol=0.0):
-        raise problem("cameras", "the layout has one focal length for both axes")
+        raise scene_error("cameras", "the layout has one focal length for both axes")
     if not torch.allclose(cameras.center, middle.expand_as(cameras.center), rtol=0.0, atol=1e-4):
-        raise problem("cameras", "the layout needs principal points in the images' middle")
+        raise scene_error("cameras", "the layout needs principal points in the images' middle")
     sides = np.tile([cameras.height, cameras.width], (len(views), 1))
     focal = cameras.focal[:, :1].double().cpu().numpy()
     return np.concatenate([sides, focal], axis=1) * factor

@@ -14,7 +14,7 @@ import torch
 from devrf.errors import DevrfError
 from devrf.scenes.array_files import Form, read_archive
 from devrf.scenes.scene import OpticalFlow, Views
-from devrf.scenes.validation import problem
+from devrf.scenes.validation import scene_error
 
 log = logging.getLogger(__name__)
 
@@ -74,7 +74,7 @@ def save_flow(path: Path, key: str, flow: OpticalFlow) -> None:
             )
         os.replace(temporary, path)
     except OSError as error:
-        raise problem(path, f"cannot write the flow ({error}); choose another folder") from None
+        raise scene_error(path, f"cannot write the flow ({error}); choose another folder") from None
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)

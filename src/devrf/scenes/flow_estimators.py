@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate, pad
 
-from devrf.scenes.validation import problem
+from devrf.scenes.validation import scene_error
 
 # Both methods work on coarse levels of an image pyramid and see nothing in smaller images.
 LEAST_SIDE = 128
@@ -40,9 +40,9 @@ def _library(name: str, method: str, package: str) -> ModuleType:
     try:
         return importlib.import_module(name)
     except ImportError:
-        raise problem(
-            f"data.flow={method}", f"{package} is not installed; run "
-            'pip install "devrf[flow]", or set data.flow=none',
+        raise scene_error(
+            f"data.flow={method}",
+            f'{package} is not installed; run pip install "devrf[flow]", or set data.flow=none',
         ) from None
 
 
@@ -69,8 +69,11 @@ def _resized(vectors: Tensor, width: int, height: int) -> Tensor:
     if (rows, columns) == (height, width):
         return vectors
     small = interpolate(
-        vectors.permute(2, 0, 1)[None], size=(height, width), mode="bilinear",
-        align_corners=False, antialias=True,
+        vectors.permute(2, 0, 1)[None],
+        size=(height, width),
+        mode="bilinear",
+        align_corners=False,
+        antialias=True,
     )[0].permute(1, 2, 0)
     return small * torch.tensor([width / columns, height / rows])
 
@@ -81,9 +84,9 @@ def _raft() -> Estimator:
     try:
         model = models.raft_large(weights=models.Raft_Large_Weights.DEFAULT, progress=False)
     except OSError as error:
-        raise problem(
-            "data.flow=raft", f"its weights cannot be downloaded ({error}); go online once, or "
-            "set data.flow=dis",
+        raise scene_error(
+            "data.flow=raft",
+            f"its weights cannot be downloaded ({error}); go online once, or set data.flow=dis",
         ) from None
     model = model.eval().requires_grad_(False).to(device)
 

@@ -44,8 +44,10 @@ def read_flow_file(
         DevrfError: not an npz, an array is missing, or an array is of another size.
     """
     arrays = read_archive(
-        path, {"flow": Form((height, width, 2)), "mask": Form((height, width), "bfiu")},
-        "the image has before downscaling", REMEDY,
+        path,
+        {"flow": Form((height, width, 2)), "mask": Form((height, width), "bfiu")},
+        "the image has before downscaling",
+        REMEDY,
     )
     with np.errstate(over="ignore"):  # infinite is as good as too long
         vectors = arrays["flow"].astype(np.float32)
@@ -88,7 +90,9 @@ def read_flow(
     if len(present) < len(files):
         log.warning(
             "%d of %d flow files are missing in %s; those images go without flow",
-            len(files) - len(present), len(files), folder,
+            len(files) - len(present),
+            len(files),
+            folder,
         )
     return stacked_flow(present, len(index), source_size, size)
 

@@ -9,7 +9,7 @@ from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.scenes.scene import Bounds, Views
-from devrf.scenes.validation import problem
+from devrf.scenes.validation import scene_error
 
 # Cosine of the steepest angle, about 84 degrees, to −z: beyond it the box gets out of hand.
 LEAST_COSINE = 0.1
@@ -59,8 +59,9 @@ def _seen(views: Views, space: NormalizedDevice) -> Tensor:
     rays = cameras.rays(image, corners)
     steep = (-rays.directions[:, 2] < LEAST_COSINE).nonzero().flatten()
     if len(steep):
-        raise problem(
-            views.names[int(image[steep[0]])], "its camera does not look along the common viewing "
+        raise scene_error(
+            views.names[int(image[steep[0]])],
+            "its camera does not look along the common viewing "
             "direction, so normalised device coordinates cannot hold what it sees; leave the "
             "image out, or use data=inward for cameras around a scene",
         )
@@ -69,8 +70,9 @@ def _seen(views: Views, space: NormalizedDevice) -> Tensor:
     # NaN compares false.
     away = (~(ends.abs() <= WIDEST).all(dim=-1).all(dim=0)).nonzero().flatten()
     if len(away):
-        raise problem(
-            views.names[int(image[away[0]])], "its camera is too far from the others for "
+        raise scene_error(
+            views.names[int(image[away[0]])],
+            "its camera is too far from the others for "
             "normalised device coordinates to hold what it sees; correct its position, or leave "
             "the image out",
         )

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from PIL import ExifTags, Image
 
 from devrf.scenes.decoding import decoding
-from devrf.scenes.validation import MAX_PIXELS, problem, same_shape
+from devrf.scenes.validation import MAX_PIXELS, same_shape, scene_error
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 # By content, not by name. Pillow reads many more formats, some by starting other programs.
@@ -69,7 +69,7 @@ def find_image(path: Path) -> Path:
     for candidate in candidates:
         if os.path.isfile(candidate):  # Path.is_file raises on names that are too long
             return candidate
-    raise problem(
+    raise scene_error(
         path, f"no such image (looked for {', '.join(SUFFIXES)}); correct file_path or add the file"
     )
 
@@ -81,10 +81,10 @@ def _open(path: Path) -> Image.Image:
         try:
             image = Image.open(path, formats=FORMATS)
         except (Image.DecompressionBombError, Image.DecompressionBombWarning):
-            raise problem(path, too_large) from None
+            raise scene_error(path, too_large) from None
     if image.width * image.height > MAX_PIXELS:
         image.close()
-        raise problem(path, too_large)
+        raise scene_error(path, too_large)
     return image
 
 
@@ -100,7 +100,7 @@ def read_header(path: Path, camera: Size | None = None) -> Header:
     """
     with _open(path) as image:
         if image.mode in DEEP_MODES:
-            raise problem(path, f"expected 8 bits a channel, not mode {image.mode}; convert it")
+            raise scene_error(path, f"expected 8 bits a channel, not mode {image.mode}; convert it")
         alpha = "A" in image.mode or "a" in image.mode or "transparency" in image.info
         turn, doubtful = _turn(_orientation(image), (image.width, image.height), camera)
         size = (image.width, image.height)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from devrf.scenes.image_files import SUFFIXES
 from devrf.scenes.paths import entries
-from devrf.scenes.validation import problem
+from devrf.scenes.validation import scene_error
 
 _DIGITS = re.compile(r"(\d+)")
 
@@ -59,8 +59,9 @@ def image_folder(
     if not fitting:
         wanted = full if downscale == 1 else f"{reduced.format(downscale)} or {full}"
         found = ", ".join(sorted(path.name for path in folders.values())) or "none"
-        raise problem(
-            parent, f"no folder {wanted} (found: {found}); add it, or set data.downscale to a "
+        raise scene_error(
+            parent,
+            f"no folder {wanted} (found: {found}); add it, or set data.downscale to a "
             "factor that is there",
         )
     best = max(fitting)
@@ -79,11 +80,12 @@ def listed_images(folder: Path, *, by_number: bool = False) -> list[Path]:
         DevrfError: it holds no image.
     """
     found = [
-        path for path in entries(folder)
+        path
+        for path in entries(folder)
         if path.suffix.lower() in SUFFIXES and path.name[0] != "." and os.path.isfile(path)
     ]
     if not found:
-        raise problem(folder, f"no images (looked for {', '.join(SUFFIXES)}); add them")
+        raise scene_error(folder, f"no images (looked for {', '.join(SUFFIXES)}); add them")
     return sorted(found, key=lambda path: _natural(path.name) if by_number else [path.name])
 
 

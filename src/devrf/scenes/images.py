@@ -19,7 +19,7 @@ from torch import Tensor
 from devrf.scenes.image_files import Header, Size, decode, read_header
 from devrf.scenes.memory import check_memory
 from devrf.scenes.resampling import shrink_pixels
-from devrf.scenes.validation import problem, reduced_size
+from devrf.scenes.validation import reduced_size, scene_error
 
 log = logging.getLogger(__name__)
 
@@ -104,7 +104,10 @@ def load_images(
             pass
     log.info(
         "read %d images of %dx%d px from %s in %.1f s",
-        len(paths), *size, paths[0].parent, time.perf_counter() - start,
+        len(paths),
+        *size,
+        paths[0].parent,
+        time.perf_counter() - start,
     )
     turned = sum(header.turn != 1 for header in headers)
     if turned:
@@ -116,14 +119,12 @@ def load_images(
     return Loaded(torch.from_numpy(pixels), first.width, first.height, doubtful)
 
 
-def _check_size(
-    needed: int, headers: Sequence[Header], what: str, paths: Sequence[Path]
-) -> None:
+def _check_size(needed: int, headers: Sequence[Header], what: str, paths: Sequence[Path]) -> None:
     """DevrfError when ``needed`` bytes are more than the files can hold, or than there is."""
     sizes = {path: header.file_size for path, header in zip(paths, headers, strict=True)}
     files = sum(sizes.values())
     if needed > max(_MUCH, _INFLATION * files):
-        raise problem(
+        raise scene_error(
             paths[0].parent, f"{what} cannot come from files of {files} bytes in all; replace them"
         )
     check_memory(needed, paths[0].parent, what)
@@ -136,7 +137,7 @@ def _headers(paths: Sequence[Path], cameras: Sequence[Size | None]) -> list[Head
     first = headers[0]
     for path, header in zip(paths, headers, strict=True):
         if (header.width, header.height) != (first.width, first.height):
-            raise problem(
+            raise scene_error(
                 path,
                 f"{header.width}x{header.height} px, but {paths[0]} of the same set has "
                 f"{first.width}x{first.height} px; bring all images to one size",

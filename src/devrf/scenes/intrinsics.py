@@ -8,13 +8,26 @@ from typing import Any, Literal
 
 from devrf.geometry.distortion import Distortion
 from devrf.scenes.lens import MOST_FOCAL, Lens
-from devrf.scenes.validation import number, problem, same_shape, shown
+from devrf.scenes.validation import abbreviated, number, same_shape, scene_error
 
 # Models of the one equation that Distortion states; the simpler ones leave coefficients out.
 CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
 KEYS = (
-    "fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_model", "is_fisheye",
-    "k1", "k2", "k3", "k4", "p1", "p2",
+    "fl_x",
+    "fl_y",
+    "cx",
+    "cy",
+    "w",
+    "h",
+    "camera_angle_x",
+    "camera_model",
+    "is_fisheye",
+    "k1",
+    "k2",
+    "k3",
+    "k4",
+    "p1",
+    "p2",
 )
 _LEAST_ANGLE = 1 / MOST_FOCAL
 
@@ -48,8 +61,9 @@ class Intrinsics:
         """
         w, h = (width, height) if self.size is None else self.size
         if not same_shape((width, height), (w, h)):
-            raise problem(
-                where, f"{width}x{height} px, but its camera is one for {w:g}x{h:g} px; crop or "
+            raise scene_error(
+                where,
+                f"{width}x{height} px, but its camera is one for {w:g}x{h:g} px; crop or "
                 "turn the image back, or correct the camera's size",
             )
         if self.focal is not None:
@@ -63,8 +77,9 @@ class Intrinsics:
         lens = Lens(focal, center, self.distortion, self.skew).scaled(width / w, height / h)
         if not lens.fits(width, height):
             (fx, fy), (x, y) = lens.focal, lens.center
-            raise problem(
-                where, f"its camera cannot be one of {width}x{height} px: focal lengths {fx:g} and "
+            raise scene_error(
+                where,
+                f"its camera cannot be one of {width}x{height} px: focal lengths {fx:g} and "
                 f"{fy:g} px, middle {x:g}, {y:g}, skew {lens.skew:g}; correct them",
             )
         return lens
@@ -85,13 +100,17 @@ def read_intrinsics(content: dict[str, Any], where: object) -> Intrinsics:
             return None
         value = number(content[key])
         if value is None or value <= 0:
-            raise problem(where, f"{key} is {shown(content[key])}, expected pixels > 0; correct it")
+            raise scene_error(
+                where, f"{key} is {abbreviated(content[key])}, expected pixels > 0; correct it"
+            )
         return value
 
     def coefficient(key: Literal["k1", "k2", "k3", "k4", "p1", "p2"]) -> float:
         value = number(content.get(key, 0.0))
         if value is None:
-            raise problem(where, f"{key} is {shown(content[key])}, expected a number; correct it")
+            raise scene_error(
+                where, f"{key} is {abbreviated(content[key])}, expected a number; correct it"
+            )
         return value
 
     _check_model(content, where)
@@ -105,11 +124,14 @@ def read_intrinsics(content: dict[str, Any], where: object) -> Intrinsics:
     if fx is not None:
         return Intrinsics(None, (fx, fx if fy is None else fy), center, size, distortion)
     if "camera_angle_x" not in content:
-        raise problem(where, 'has no "camera_angle_x" (radians) and no "fl_x" (pixels); add one')
+        raise scene_error(
+            where, 'has no "camera_angle_x" (radians) and no "fl_x" (pixels); add one'
+        )
     angle = number(content["camera_angle_x"])
     if angle is None or not _LEAST_ANGLE <= angle < math.pi:
-        raise problem(
-            where, f"camera_angle_x is {shown(content['camera_angle_x'])}, expected radians "
+        raise scene_error(
+            where,
+            f"camera_angle_x is {abbreviated(content['camera_angle_x'])}, expected radians "
             "between 0 and pi; correct it",
         )
     return Intrinsics(angle, None, center, size, distortion)
@@ -136,8 +158,9 @@ def frame_intrinsics(
 def _check_model(content: dict[str, Any], where: object) -> None:
     model = content.get("camera_model", "OPENCV")
     if model not in CAMERA_MODELS or content.get("is_fisheye"):
-        kind = "a fisheye" if content.get("is_fisheye") else shown(model)
-        raise problem(
-            where, f"camera model {kind} is not supported, only {', '.join(CAMERA_MODELS)}; "
+        kind = "a fisheye" if content.get("is_fisheye") else abbreviated(model)
+        raise scene_error(
+            where,
+            f"camera model {kind} is not supported, only {', '.join(CAMERA_MODELS)}; "
             "undistort the images and list them as PINHOLE",
         )

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from devrf.scenes.paths import existing_file
-from devrf.scenes.validation import number, problem, shown
+from devrf.scenes.validation import abbreviated, number, scene_error
 
 # Some 60,000 posed images with every number on a line of its own.
 MAX_BYTES = 64 * 2**20
@@ -28,27 +28,28 @@ def json_object(file: Path, purpose: str) -> dict[str, Any]:
             large that it cannot be a list of images.
     """
     if existing_file(file, purpose) > MAX_BYTES:
-        raise problem(
-            file, f"larger than {MAX_BYTES >> 20} MiB, expected a list of posed images; "
-            "write it again",
+        raise scene_error(
+            file,
+            f"larger than {MAX_BYTES >> 20} MiB, expected a list of posed images; write it again",
         )
     try:
         data = file.read_bytes()
     except OSError as error:
-        raise problem(file, f"cannot be read ({error.strerror}); {purpose}") from None
+        raise scene_error(file, f"cannot be read ({error.strerror}); {purpose}") from None
     # Counted before they are made: two bytes of text can become a hundred of memory.
     if sum(data.count(byte) for byte in _BEFORE_VALUES) > MAX_VALUES:
-        raise problem(
-            file, f"holds more than {MAX_VALUES // 10**6} million values, expected a list of "
+        raise scene_error(
+            file,
+            f"holds more than {MAX_VALUES // 10**6} million values, expected a list of "
             "posed images; write it again",
         )
     try:
         # Some editors begin a file with a byte order mark.
         content = json.loads(data.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:
-        raise problem(file, f"not valid JSON ({error}); write it again") from None
+        raise scene_error(file, f"not valid JSON ({error}); write it again") from None
     if not isinstance(content, dict):
-        raise problem(file, f"expected a JSON object, not {type(content).__name__}; {purpose}")
+        raise scene_error(file, f"expected a JSON object, not {type(content).__name__}; {purpose}")
     return content
 
 
@@ -56,9 +57,9 @@ def numbers(content: dict[str, Any], key: str, count: int, where: object) -> lis
     """The ``count`` finite numbers that ``content`` lists under ``key``; else DevrfError."""
     values = content.get(key)
     if not isinstance(values, list) or len(values) != count:
-        raise problem(where, f'expected {count} numbers as "{key}", not {shown(values)}')
+        raise scene_error(where, f'expected {count} numbers as "{key}", not {abbreviated(values)}')
     found = [number(value) for value in values]
     kept = [value for value in found if value is not None]
     if len(kept) < count:
-        raise problem(where, f'"{key}" holds NaN, inf or text; give {count} finite numbers')
+        raise scene_error(where, f'"{key}" holds NaN, inf or text; give {count} finite numbers')
     return kept

@@ -18,7 +18,7 @@ from devrf.scenes.splits import (
     first_views,
     load_views,
 )
-from devrf.scenes.validation import problem
+from devrf.scenes.validation import scene_error
 
 log = logging.getLogger(__name__)
 
@@ -53,8 +53,9 @@ def without_static_set(train: Split, test: Split, static_until: float) -> Layout
     """
     early = train.where(train.times <= static_until + 1e-6)
     if len(early.index) == 0:
-        raise problem(
-            train.transforms.file, f"no image at a time of data.static_until={static_until:g} or "
+        raise scene_error(
+            train.transforms.file,
+            f"no image at a time of data.static_until={static_until:g} or "
             "before to learn the static scene from; set it higher",
         )
     early_test = test.where(test.times <= static_until + 1e-6)
@@ -63,7 +64,11 @@ def without_static_set(train: Split, test: Split, static_until: float) -> Layout
     log.warning(
         "no static set: the canonical field is learned from %d of the %d training images "
         "(times up to %g), and tested on %d of %d",
-        len(early.index), len(train.index), static_until, len(early_test.index), len(test.index),
+        len(early.index),
+        len(train.index),
+        static_until,
+        len(early_test.index),
+        len(test.index),
     )
     return Layout(early, early_test, train, test)
 
@@ -81,8 +86,9 @@ def fewer(layout: Layout, train_views: int | None, frames: int | None) -> tuple[
     """
     train, test = first_views(layout.dynamic_train, train_views), layout.dynamic_test
     if len(distinct_times(train.used_times)) < 2:
-        raise problem(
-            train.transforms.file, "all dynamic images have one time, expected at least 2 "
+        raise scene_error(
+            train.transforms.file,
+            "all dynamic images have one time, expected at least 2 "
             "distinct times; give each frame its own",
         )
     kept = None if frames is None else evenly_spread(train.used_times, frames)
@@ -101,9 +107,7 @@ def load_layout(
     Raises:
         DevrfError: what :func:`devrf.scenes.splits.load_views` raises.
     """
-    splits = (
-        layout.static_train, layout.static_test, layout.dynamic_train, layout.dynamic_test
-    )
+    splits = (layout.static_train, layout.static_test, layout.dynamic_train, layout.dynamic_test)
     loaded: list[tuple[Split, Views]] = []
     for split in splits:
         # Without a static set the captures share files: read them once.

@@ -19,7 +19,7 @@ from devrf.scenes.images import load_images
 from devrf.scenes.llff_poses import PosedSet, read_dynamic_poses, read_static_poses
 from devrf.scenes.paths import existing_folder, scene_folder
 from devrf.scenes.scene import Background, Capture, Scene, Views
-from devrf.scenes.validation import check_choice, check_count, number, problem
+from devrf.scenes.validation import check_choice, check_count, number, scene_error
 from devrf.scenes.view_folders import ViewFolder, flow_files, view_folders
 
 log = logging.getLogger(__name__)
@@ -72,7 +72,7 @@ def read_llff(
     check_choice("data.flow", flow, get_args(FlowSource))
     plane = number(near)
     if plane is None or plane <= 0:
-        raise problem("data.near", f"expected a distance above 0, not {near!r}")
+        raise scene_error("data.near", f"expected a distance above 0, not {near!r}")
     folder = scene_folder(root)
 
     static = _static(existing_folder(folder / "static"), folder, downscale, holdout)
@@ -94,17 +94,22 @@ def _static(folder: Path, root: Path, downscale: int, holdout: int) -> Capture:
     source = image_folder(folder, downscale)
     images = listed_images(source.path)
     if len(images) != len(posed):
-        raise problem(
-            posed.file, f"has {len(posed)} cameras, but {source.path} has {len(images)} images; "
+        raise scene_error(
+            posed.file,
+            f"has {len(posed)} cameras, but {source.path} has {len(images)} images; "
             "remove the images without a camera, or write the cameras again",
         )
     if len(images) < 2:
-        raise problem(source.path, "holds one image, expected at least one more to hold out")
+        raise scene_error(source.path, "holds one image, expected at least one more to hold out")
     loaded = load_images(images, source.downscale, posed.sizes)
     count, height, width = loaded.pixels.shape[:3]
     views = Views(
-        loaded.pixels, posed.cameras(width, height), torch.zeros(count), torch.arange(count),
-        _names(images, root), turn_doubtful=loaded.doubtful,
+        loaded.pixels,
+        posed.cameras(width, height),
+        torch.zeros(count),
+        torch.arange(count),
+        _names(images, root),
+        ambiguous_orientation=loaded.doubtful,
     )
     order = torch.arange(count)
     train, test = views[order[order % holdout != 0]], views[order[order % holdout == 0]]
@@ -128,8 +133,9 @@ def _dynamic(
     views = view_folders(folder, downscale)
     posed = read_dynamic_poses(folder)
     if len(posed) < len(views):
-        raise problem(
-            posed.file, f"has {len(posed)} cameras, but there are {len(views)} folders view1 … "
+        raise scene_error(
+            posed.file,
+            f"has {len(posed)} cameras, but there are {len(views)} folders view1 … "
             f"view{len(views)}; the last rows are those of the fixed cameras",
         )
     posed = posed.last(len(views))
@@ -154,17 +160,19 @@ def _chosen_views(
     """Positions of the held-out view and of the views to learn from."""
     whole = isinstance(test_view, int) and not isinstance(test_view, bool)
     if not whole or test_view == 0 or not -count <= test_view <= count:
-        raise problem(
-            "data.test_view", f"{test_view!r} is none of the {count} views in {folder}; give 1 … "
+        raise scene_error(
+            "data.test_view",
+            f"{test_view!r} is none of the {count} views in {folder}; give 1 … "
             f"{count}, or -1 for the last one",
         )
     test = test_view - 1 if test_view > 0 else count + test_view
     train = [v for v in range(count) if v != test]
     if not train:
-        raise problem(folder, "has one view, expected at least one more to learn from")
+        raise scene_error(folder, "has one view, expected at least one more to learn from")
     if train_views is not None and train_views > len(train):
-        raise problem(
-            folder, f"data.train_views={train_views}, but there are {len(train)} views to learn "
+        raise scene_error(
+            folder,
+            f"data.train_views={train_views}, but there are {len(train)} views to learn "
             "from next to the held-out one; ask for fewer",
         )
     return test, train[:train_views]
@@ -182,8 +190,12 @@ def _moving(
     times = kept / (len(folders[0].images) - 1)
     cameras = posed.cameras(width, height)[torch.tensor(chosen)][view]
     return Views(
-        loaded.pixels, cameras, times.float().repeat_interleave(len(folders)), view,
-        _names(images, root), turn_doubtful=loaded.doubtful,
+        loaded.pixels,
+        cameras,
+        times.float().repeat_interleave(len(folders)),
+        view,
+        _names(images, root),
+        ambiguous_orientation=loaded.doubtful,
     )
 
 
@@ -194,9 +206,7 @@ def _with_flow(views: Views, folders: list[ViewFolder], camera: Size) -> Views:
         return views
     rows = {frame * len(folders) + view: path for (view, frame), path in sorted(files.items())}
     source = image_size(folders[0].images[0], camera)
-    return replace(
-        views, flow=stacked_flow(rows, len(views), source, (views.width, views.height))
-    )
+    return replace(views, flow=stacked_flow(rows, len(views), source, (views.width, views.height)))
 
 
 def _names(images: list[Path], root: Path) -> tuple[str, ...]:
@@ -210,5 +220,6 @@ def _warn_of_cameras_beyond(near: float, everyone: list[Views]) -> None:
         if len(beyond):
             log.warning(
                 "%d cameras are beyond the near plane, %s the first of them; set data.near higher",
-                len(beyond), views.names[int(beyond[0])],
+                len(beyond),
+                views.names[int(beyond[0])],
             )

@@ -18,7 +18,7 @@ from devrf.geometry.cameras import Cameras
 from devrf.scenes.array_files import Numbers, read_numbers
 from devrf.scenes.lens import LEAST_FOCAL, MOST_FOCAL, MOST_OFFSET
 from devrf.scenes.poses import FARTHEST, in_reach, is_rotation
-from devrf.scenes.validation import problem
+from devrf.scenes.validation import scene_error
 
 # Images made smaller lose a fraction of a pixel; images of another shape belong to other poses.
 ASPECT_TOLERANCE = 0.05
@@ -57,8 +57,12 @@ class PosedSet:
     def last(self, count: int) -> PosedSet:
         """The last ``count`` cameras."""
         return replace(
-            self, poses=self.poses[-count:], size=self.size[-count:],
-            focal=self.focal[-count:], center=self.center[-count:], bounds=self.bounds[-count:],
+            self,
+            poses=self.poses[-count:],
+            size=self.size[-count:],
+            focal=self.focal[-count:],
+            center=self.center[-count:],
+            bounds=self.bounds[-count:],
         )
 
     def normalised(self) -> PosedSet:
@@ -71,18 +75,21 @@ class PosedSet:
         scale = 1 / (BOUND_FACTOR * float(self.bounds[:, 0].min()))
         middle = average_pose(self.poses)
         # NaN compares false.
-        if not float(self.poses[:, :, 2].mean(dim=0).norm()) > 0.5 or not float(
-            torch.linalg.det(middle[:, :3])
-        ) > 0.99:
-            raise problem(
-                self.file, "the cameras look in different directions, expected all of them to "
+        if (
+            not float(self.poses[:, :, 2].mean(dim=0).norm()) > 0.5
+            or not float(torch.linalg.det(middle[:, :3])) > 0.99
+        ):
+            raise scene_error(
+                self.file,
+                "the cameras look in different directions, expected all of them to "
                 "face the scene from one side; use data=inward for cameras around a scene",
             )
         poses = relative_to(middle, self.poses)
         poses[:, :, 3] *= scale
         if not bool(in_reach(poses[:, :, 3]).all()):
-            raise problem(
-                self.file, f"the cameras are farther than {FARTHEST:g} times the least depth from "
+            raise scene_error(
+                self.file,
+                f"the cameras are farther than {FARTHEST:g} times the least depth from "
                 "one another; correct positions and depths",
             )
         return replace(self, poses=poses, bounds=self.bounds * scale)
@@ -97,13 +104,17 @@ class PosedSet:
         scale = size / self.size
         if float((scale[:, 0] / scale[:, 1] - 1).abs().max()) > ASPECT_TOLERANCE:
             w, h = self.size[0].tolist()
-            raise problem(
-                self.file, f"the poses are for images of {w:g}x{h:g} px (width x height), but "
+            raise scene_error(
+                self.file,
+                f"the poses are for images of {w:g}x{h:g} px (width x height), but "
                 f"these have {width}x{height} px, another shape; bring images or poses in line",
             )
         return Cameras(
-            self.poses.float(), (self.focal * scale).float(), (self.center * scale).float(),
-            width, height,
+            self.poses.float(),
+            (self.focal * scale).float(),
+            (self.center * scale).float(),
+            width,
+            height,
         )
 
 
@@ -120,8 +131,11 @@ def read_static_poses(folder: Path) -> PosedSet:
     file, inner = folder / "poses_bounds.npy", folder / "hwf_cxcy.npy"
     rows = read_numbers(file, "the static cameras, (N, 17) or (N, 14)")
     if rows.ndim != 2 or rows.shape[1] not in (14, 17) or len(rows) == 0:
-        raise problem(file, f"has shape {rows.shape}, expected (N, 17), or (N, 14) next to "
-                      f"{inner.name}; write it again with LLFF's imgs2poses")
+        raise scene_error(
+            file,
+            f"has shape {rows.shape}, expected (N, 17), or (N, 14) next to "
+            f"{inner.name}; write it again with LLFF's imgs2poses",
+        )
     if rows.shape[1] == 17:
         matrix = rows[:, :15].reshape(-1, 3, 5)
         intrinsics, where = _of_column(matrix[:, :, 4]), file
@@ -144,12 +158,18 @@ def read_dynamic_poses(folder: Path) -> PosedSet:
     file, depths = folder / "poses.npy", folder / "bds.npy"
     matrix = read_numbers(file, "the moving capture's cameras, (N, 3, 5)")
     if matrix.ndim != 3 or matrix.shape[1:] != (3, 5) or len(matrix) == 0:
-        raise problem(file, f"has shape {matrix.shape}, expected (N, 3, 5): axes [right, up, "
-                      "back], position and [H, W, focal]; write it again")
+        raise scene_error(
+            file,
+            f"has shape {matrix.shape}, expected (N, 3, 5): axes [right, up, "
+            "back], position and [H, W, focal]; write it again",
+        )
     bounds = read_numbers(depths, "least and largest depths, (N, 2)")
     if bounds.shape != (len(matrix), 2):
-        raise problem(depths, f"has shape {bounds.shape}, expected ({len(matrix)}, 2): a row for "
-                      f"each camera of {file.name}; write it again")
+        raise scene_error(
+            depths,
+            f"has shape {bounds.shape}, expected ({len(matrix)}, 2): a row for "
+            f"each camera of {file.name}; write it again",
+        )
     return _checked(file, matrix[:, :, :4], file, _of_column(matrix[:, :, 4]), depths, bounds)
 
 
@@ -170,8 +190,11 @@ def _shared(file: Path) -> Numbers:
         h, w, focal, cx, cy = given
         given = [h, w, focal, focal, cx, cy]
     if len(given) != 6:
-        raise problem(file, f"holds {values.size} numbers, expected H, W, focal, cx, cy, or H, W, "
-                      "fx, fy, cx, cy; write it again")
+        raise scene_error(
+            file,
+            f"holds {values.size} numbers, expected H, W, focal, cx, cy, or H, W, "
+            "fx, fy, cx, cy; write it again",
+        )
     h, w, fx, fy, cx, cy = given
     return np.array([w, h, fx, fy, cx, cy])
 
@@ -185,19 +208,34 @@ def _checked(
     size, focal, center = values[:, :2], values[:, 2:4], values[:, 4:]
     side = size.amax(dim=1, keepdim=True)
     for good, where, what in (
-        (is_rotation(matrices[:, :, :3]), file,
-         "its axes are no rotation (scaled, sheared, mirrored or of another convention)"),
+        (
+            is_rotation(matrices[:, :, :3]),
+            file,
+            "its axes are no rotation (scaled, sheared, mirrored or of another convention)",
+        ),
         (in_reach(matrices[:, :, 3]), file, f"it is farther than {FARTHEST:g} from the origin"),
         ((size >= 1).all(dim=1), inner, "height or width is under 1 px"),
         ((focal > 0).all(dim=1), inner, "the focal length is not above 0"),
-        (((focal >= LEAST_FOCAL * side) & (focal <= MOST_FOCAL * side)).all(dim=1), inner,
-         "the focal length cannot be that of an image of this height and width"),
-        ((center.abs() <= MOST_OFFSET * side).all(dim=1), inner,
-         "the principal point is far outside the image"),
-        ((depths[:, 0] > 0) & (depths[:, 0] < depths[:, 1]), outer,
-         "expected 0 < least depth < largest depth"),
+        (
+            ((focal >= LEAST_FOCAL * side) & (focal <= MOST_FOCAL * side)).all(dim=1),
+            inner,
+            "the focal length cannot be that of an image of this height and width",
+        ),
+        (
+            (center.abs() <= MOST_OFFSET * side).all(dim=1),
+            inner,
+            "the principal point is far outside the image",
+        ),
+        (
+            (depths[:, 0] > 0) & (depths[:, 0] < depths[:, 1]),
+            outer,
+            "expected 0 < least depth < largest depth",
+        ),
     ):
         if not bool(good.all()):
-            raise problem(where, f"camera {int((~good).nonzero()[0])}: {what}; correct or leave "
-                          "out the image and its row")
+            raise scene_error(
+                where,
+                f"camera {int((~good).nonzero()[0])}: {what}; correct or leave "
+                "out the image and its row",
+            )
     return PosedSet(file, matrices, size, focal, center, depths)

@@ -23,7 +23,7 @@ from devrf.scenes.lens import Lens
 from devrf.scenes.memory import check_memory
 from devrf.scenes.resampling import shrink_pixels
 from devrf.scenes.undistortion import as_pinhole
-from devrf.scenes.validation import problem
+from devrf.scenes.validation import scene_error
 
 log = logging.getLogger(__name__)
 
@@ -60,8 +60,9 @@ def read_mask(path: Path, image: tuple[int, int], camera: Size | None, name: obj
     pixels = decode(path, header, "RGBA")
     spread = pixels[..., :3].max(axis=2) - pixels[..., :3].min(axis=2)
     if int(spread.max()) > GREY_NOISE or int(pixels[..., 3].min()) < WHITE:
-        raise problem(
-            path, "a mask with colours or an alpha channel; give one channel, black where pixels "
+        raise scene_error(
+            path,
+            "a mask with colours or an alpha channel; give one channel, black where pixels "
             "are left out, white elsewhere",
         )
     grey = np.ascontiguousarray(pixels[..., :1])
@@ -78,8 +79,9 @@ def _check_size(
     size = (header.width, header.height)
     full = camera is not None and size == camera and size[0] >= image[0] and size[1] >= image[1]
     if size != image and not full:
-        raise problem(
-            path, f"{size[0]}x{size[1]} px, but its image {name} has {image[0]}x{image[1]} px; "
+        raise scene_error(
+            path,
+            f"{size[0]}x{size[1]} px, but its image {name} has {image[0]}x{image[1]} px; "
             "give the mask in the image's size",
         )
 
@@ -101,9 +103,9 @@ def cutting_out(
     if not masks:
         return None
     if len(masks) < len(paths):
-        raise problem(
-            names[list(paths).index(None)], "has no mask_path although others have; with "
-            "data.masks=matte give every image a mask",
+        raise scene_error(
+            names[list(paths).index(None)],
+            "has no mask_path although others have; with data.masks=matte give every image a mask",
         )
     log.info("masks of %d images are their mattes", len(masks))
 
@@ -161,13 +163,14 @@ def counted_pixels(
         for _ in pool.map(fill, masked):
             pass
     pixels, _ = as_pinhole(torch.from_numpy(kept), lenses, names)
-    counted = pixels[..., 0] == WHITE
+    valid_mask = pixels[..., 0] == WHITE
     for k in masked:
-        if not bool(counted[k].any()):
-            raise problem(
-                paths[k], f"leaves nothing of {names[k]} to learn from; leave the image out, or "
+        if not bool(valid_mask[k].any()):
+            raise scene_error(
+                paths[k],
+                f"leaves nothing of {names[k]} to learn from; leave the image out, or "
                 "set data.masks=none",
             )
-    share = 100 * float((~counted).float().mean())
+    share = 100 * float((~valid_mask).float().mean())
     log.info("masks of %d images leave out %.1f %% of the pixels of all", len(masked), share)
-    return counted
+    return valid_mask

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-from devrf.scenes.validation import problem
+from devrf.scenes.validation import scene_error
 
 
 def check_memory(needed: int, where: object, what: str) -> None:
@@ -17,8 +17,9 @@ def check_memory(needed: int, where: object, what: str) -> None:
     """
     there = _machine_memory()
     if there is not None and needed > there:
-        raise problem(
-            where, f"{what} take {needed / 2**30:.1f} GiB, but this machine has "
+        raise scene_error(
+            where,
+            f"{what} take {needed / 2**30:.1f} GiB, but this machine has "
             f"{there / 2**30:.1f} GiB of memory; set data.downscale higher, or data.frames",
         )
 

@@ -21,7 +21,7 @@ from devrf.scenes.poses import FARTHEST
 from devrf.scenes.scene import Background, Scene
 from devrf.scenes.splits import in_motion
 from devrf.scenes.transforms import Transforms, listed_image
-from devrf.scenes.validation import check_count, number, problem, shown
+from devrf.scenes.validation import abbreviated, check_count, number, scene_error
 
 log = logging.getLogger(__name__)
 
@@ -68,8 +68,14 @@ def read_nerfies(
         DevrfError: a file or an option is wrong; the message names it.
     """
     given_box = check_options(
-        downscale=downscale, background=background, bound_scale=bound_scale, near=near, far=far,
-        box=box, frames=frames, static_until=static_until,
+        downscale=downscale,
+        background=background,
+        bound_scale=bound_scale,
+        near=near,
+        far=far,
+        box=box,
+        frames=frames,
+        static_until=static_until,
     )
     check_count("data.holdout", holdout, 2)
     folder = scene_folder(root)
@@ -87,8 +93,13 @@ def read_nerfies(
         # Without mattes the backdrop is to be learned too.
         given_box = box_of_frusta(static.train.cameras, near, far)
     bounds = inward_bounds(
-        static.train, dynamic.train, [static.train, static.test, dynamic.train, dynamic.test],
-        bound_scale=bound_scale, near=near, far=far, box=given_box,
+        static.train,
+        dynamic.train,
+        [static.train, static.test, dynamic.train, dynamic.test],
+        bound_scale=bound_scale,
+        near=near,
+        far=far,
+        box=given_box,
     )
     return Scene(name or folder.resolve().name, "inward", static, dynamic, bounds, background)
 
@@ -109,8 +120,9 @@ def _world(file: Path) -> _World:
     for key in ("scale", "near", "far"):
         value = number(content.get(key))
         if value is None or not 0 < value <= FARTHEST:
-            raise problem(
-                file, f"{key} is {shown(content.get(key))}, expected a number above 0, and no "
+            raise scene_error(
+                file,
+                f"{key} is {abbreviated(content.get(key))}, expected a number above 0, and no "
                 f"more than {FARTHEST:g}; correct it",
             )
         found[key] = value
@@ -123,20 +135,24 @@ def _items(file: Path, holdout: int) -> tuple[list[str], list[int], list[int]]:
     ids, train, val = (_ids(content, key, file) for key in ("ids", "train_ids", "val_ids"))
     count = content.get("count", len(ids))
     if ids and count != len(ids):
-        raise problem(
-            file, f'"count" is {shown(count)}, but "ids" lists {len(ids)} images; correct it'
+        raise scene_error(
+            file, f'"count" is {abbreviated(count)}, but "ids" lists {len(ids)} images; correct it'
         )
     items = ids or list(dict.fromkeys(train + val))
     position = {item: i for i, item in enumerate(items)}
     unknown = [item for item in train + val if item not in position]
     if unknown:
-        raise problem(file, f'{shown(unknown[0])} is in train_ids or val_ids, but not in "ids"')
+        raise scene_error(
+            file, f'{abbreviated(unknown[0])} is in train_ids or val_ids, but not in "ids"'
+        )
     if len(items) < 2:
-        raise problem(file, f"lists {len(items)} images, expected at least two; correct its ids")
+        raise scene_error(
+            file, f"lists {len(items)} images, expected at least two; correct its ids"
+        )
     if not val:
         chosen = [position[item] for item in train] or list(range(len(items)))
         if len(chosen) < 2:
-            raise problem(file, "one image in train_ids and none in val_ids; list more")
+            raise scene_error(file, "one image in train_ids and none in val_ids; list more")
         learn, held_out = every_nth(len(chosen), holdout)
         return items, [chosen[i] for i in learn], [chosen[i] for i in held_out]
     held = set(val)
@@ -145,7 +161,7 @@ def _items(file: Path, holdout: int) -> tuple[list[str], list[int], list[int]]:
         log.warning("%s: %d images of val_ids are in train_ids too; held out", file, len(both))
     learned = [position[item] for item in train or items if item not in held]
     if not learned:
-        raise problem(file, "all images are held out by val_ids; list some in train_ids only")
+        raise scene_error(file, "all images are held out by val_ids; list some in train_ids only")
     return items, learned, [position[item] for item in val]
 
 
@@ -153,7 +169,7 @@ def _ids(content: dict[str, Any], key: str, file: Path) -> list[str]:
     values = content.get(key) or []
     known = isinstance(values, list) and all(isinstance(v, str | int) and v != "" for v in values)
     if not known or len(set(map(str, values))) < len(values):
-        raise problem(file, f'expected a list of distinct ids as "{key}"; correct it')
+        raise scene_error(file, f'expected a list of distinct ids as "{key}"; correct it')
     return [str(value) for value in values]
 
 
@@ -176,18 +192,20 @@ def _times(file: Path, items: list[str]) -> tuple[float, ...]:
     for item in items:
         entry = content.get(item)
         if not isinstance(entry, dict):
-            raise problem(file, f"says nothing of image {shown(item)}; add its warp_id")
+            raise scene_error(file, f"says nothing of image {abbreviated(item)}; add its warp_id")
         entries.append(entry)
     key = "time_id" if all("time_id" in entry for entry in entries) else "warp_id"
     ids = []
     for item, entry in zip(items, entries, strict=True):
         value = number(entry.get(key))
         if value is None:
-            raise problem(
-                file, f"{key} of image {shown(item)} is {shown(entry.get(key))}, expected a number"
+            raise scene_error(
+                file,
+                f"{key} of image {abbreviated(item)} is {abbreviated(entry.get(key))}, "
+                "expected a number",
             )
         ids.append(value)
     first, last = min(ids), max(ids)
     if first == last:
-        raise problem(file, f"all images have the {key} {first:g}, expected at least two times")
+        raise scene_error(file, f"all images have the {key} {first:g}, expected at least two times")
     return tuple((value - first) / (last - first) for value in ids)

@@ -14,7 +14,7 @@ from devrf.scenes.intrinsics import Intrinsics
 from devrf.scenes.json_files import json_object, numbers
 from devrf.scenes.paths import inside
 from devrf.scenes.poses import FARTHEST, in_reach, is_rotation
-from devrf.scenes.validation import number, problem, shown
+from devrf.scenes.validation import abbreviated, number, scene_error
 
 
 def read_camera(
@@ -43,18 +43,19 @@ def read_camera(
 def _pose(content: dict[str, Any], file: Path, center: Sequence[float], scale: float) -> Tensor:
     rows = content.get("orientation")
     if not isinstance(rows, list) or len(rows) != 3:
-        raise problem(file, 'expected 3 rows of 3 numbers as "orientation" (world to camera)')
+        raise scene_error(file, 'expected 3 rows of 3 numbers as "orientation" (world to camera)')
     listed = [numbers({"orientation": row}, "orientation", 3, file) for row in rows]
     world_to_camera = torch.tensor(listed, dtype=torch.float64)
     if not bool(is_rotation(world_to_camera)):
-        raise problem(file, "orientation is no rotation (scaled, sheared or mirrored axes)")
+        raise scene_error(file, "orientation is no rotation (scaled, sheared or mirrored axes)")
     position = numbers(content, "position", 3, file)
     # OpenCV's y points down and its z ahead; ours point up and back.
     axes = world_to_camera.T * world_to_camera.new_tensor([1, -1, -1])
     where = (axes.new_tensor(position) - axes.new_tensor(list(center))) * scale
     if not bool(in_reach(where)):
-        raise problem(
-            file, f"position is farther than {FARTHEST:g} from the scene's center, in units of "
+        raise scene_error(
+            file,
+            f"position is farther than {FARTHEST:g} from the scene's center, in units of "
             "scene.json; correct it, or center and scale there",
         )
     return torch.cat([axes, where[:, None]], dim=1).float()
@@ -65,25 +66,31 @@ def _intrinsics(content: dict[str, Any], file: Path) -> Intrinsics:
     aspect = _positive({"pixel_aspect_ratio": 1.0} | content, "pixel_aspect_ratio", file)
     skew = number(content.get("skew", 0.0))
     if skew is None:
-        raise problem(file, f"skew is {shown(content['skew'])}, expected pixels; correct it")
+        raise scene_error(
+            file, f"skew is {abbreviated(content['skew'])}, expected pixels; correct it"
+        )
     width, height = numbers(content, "image_size", 2, file)
     if min(width, height) <= 0:
-        raise problem(file, f"image_size is {width:g}, {height:g}, expected pixels > 0")
+        raise scene_error(file, f"image_size is {width:g}, {height:g}, expected pixels > 0")
     cx, cy = numbers(content, "principal_point", 2, file)
     # The example in Nerfies' own documentation says "tangential".
     tangential = "tangential" if "tangential" in content else "tangential_distortion"
     k1, k2, k3 = numbers({"radial_distortion": [0.0] * 3} | content, "radial_distortion", 3, file)
     p1, p2 = numbers({tangential: [0.0] * 2} | content, tangential, 2, file)
     return Intrinsics(
-        None, (focal, focal * aspect), (cx, cy), (width, height),
-        Distortion((k1, k2, k3, 0.0), (p1, p2)), skew,
+        None,
+        (focal, focal * aspect),
+        (cx, cy),
+        (width, height),
+        Distortion((k1, k2, k3, 0.0), (p1, p2)),
+        skew,
     )
 
 
 def _positive(content: dict[str, Any], key: str, file: Path) -> float:
     value = number(content.get(key))
     if value is None or value <= 0:
-        raise problem(
-            file, f"{key} is {shown(content.get(key))}, expected a number > 0; correct it"
+        raise scene_error(
+            file, f"{key} is {abbreviated(content.get(key))}, expected a number > 0; correct it"
         )
     return value

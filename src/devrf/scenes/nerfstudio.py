@@ -20,7 +20,7 @@ from devrf.scenes.paths import scene_folder
 from devrf.scenes.scene import Background, Scene
 from devrf.scenes.splits import at_rest, distinct_poses, in_motion
 from devrf.scenes.transforms import Transforms, listed_image, read_transforms
-from devrf.scenes.validation import check_choice, check_count, problem, shown
+from devrf.scenes.validation import abbreviated, check_choice, check_count, scene_error
 
 log = logging.getLogger(__name__)
 
@@ -81,8 +81,15 @@ def read_nerfstudio(
         DevrfError: a file or an option is wrong; the message names it.
     """
     given_box = check_options(
-        downscale=downscale, background=background, bound_scale=bound_scale, near=near, far=far,
-        box=box, frames=frames, static_until=static_until, train_views=train_views,
+        downscale=downscale,
+        background=background,
+        bound_scale=bound_scale,
+        near=near,
+        far=far,
+        box=box,
+        frames=frames,
+        static_until=static_until,
+        train_views=train_views,
     )
     check_count("data.holdout", holdout, 2)
     check_choice("data.masks", masks, get_args(Masks))
@@ -91,8 +98,13 @@ def read_nerfstudio(
     layout, _ = fewer(_layout(folder, holdout, static_until, masked), train_views, frames)
     static, dynamic = load_layout(layout, folder, downscale, masks)
     bounds = inward_bounds(
-        static.train, dynamic.train, [static.train, static.test, dynamic.train, dynamic.test],
-        bound_scale=bound_scale, near=near, far=far, box=given_box,
+        static.train,
+        dynamic.train,
+        [static.train, static.test, dynamic.train, dynamic.test],
+        bound_scale=bound_scale,
+        near=near,
+        far=far,
+        box=given_box,
     )
     return Scene(name or folder.resolve().name, "inward", static, dynamic, bounds, background)
 
@@ -103,8 +115,9 @@ def _layout(root: Path, holdout: int, static_until: float | None, masked: bool) 
         return _one_file(*_with_times(*both), static_until)
     still, moving = root / "static" / FILE, root / "dynamic" / FILE
     if not os.path.isfile(still) and not os.path.isfile(moving):
-        raise problem(
-            root, f"expected {FILE}, or static/{FILE} and dynamic/{FILE}; set data.root to the "
+        raise scene_error(
+            root,
+            f"expected {FILE}, or static/{FILE} and dynamic/{FILE}; set data.root to the "
             "scene's folder",
         )
     rest = _train_and_test(still, root, holdout, masked)
@@ -114,8 +127,9 @@ def _layout(root: Path, holdout: int, static_until: float | None, masked: bool) 
 
 def _with_times(train: Transforms, test: Transforms) -> tuple[Transforms, Transforms]:
     if train.times is None:
-        raise problem(
-            train.file, 'its frames have no "time", which a capture of a moving scene needs; '
+        raise scene_error(
+            train.file,
+            'its frames have no "time", which a capture of a moving scene needs; '
             "give every frame its time in [0, 1]",
         )
     return train, test
@@ -139,8 +153,9 @@ def _train_and_test(
     elif not test and count > 1:
         train, test = every_nth(count, holdout)
     if not train or not test or set(train) & set(test):
-        raise problem(
-            file, f"{len(train)} images to learn from, {len(test)} held out, "
+        raise scene_error(
+            file,
+            f"{len(train)} images to learn from, {len(test)} held out, "
             f"{len(set(train) & set(test))} of them both; expected at least one of each and none "
             "twice: correct train_filenames and test_filenames",
         )
@@ -151,15 +166,15 @@ def _listed(content: dict[str, Any], key: str, transforms: Transforms, root: Pat
     """Positions in the file, ascending, of the images that it lists under ``key``."""
     names = content.get(key) or []
     if not isinstance(names, list) or not all(isinstance(name, str) and name for name in names):
-        raise problem(transforms.file, f"expected a list of file paths as {key}; correct it")
+        raise scene_error(transforms.file, f"expected a list of file paths as {key}; correct it")
     position = {image: i for i, image in enumerate(transforms.images)}
     found = []
     for name in names:
         image = listed_image(name, transforms.file, root)
         if image not in position:
-            raise problem(
+            raise scene_error(
                 transforms.file,
-                f"{key} lists {shown(name)}, which is in none of the frames; correct it",
+                f"{key} lists {abbreviated(name)}, which is in none of the frames; correct it",
             )
         found.append(position[image])
     return sorted(set(found))
@@ -177,8 +192,9 @@ def _one_file(train: Transforms, test: Transforms, static_until: float | None) -
     still_test = (_times(test) <= _AT_REST).nonzero()[:, 0].tolist()
     moving, moving_test = _seen_moving(train), _seen_moving(test)
     if not moving or not moving_test:
-        raise problem(
-            train.file, f"{len(moving)} images to learn motion from and {len(moving_test)} held "
+        raise scene_error(
+            train.file,
+            f"{len(moving)} images to learn motion from and {len(moving_test)} held "
             "out, expected at least one of each at a time above 0; correct the times, or "
             "train_filenames and test_filenames",
         )
@@ -189,8 +205,10 @@ def _one_file(train: Transforms, test: Transforms, static_until: float | None) -
         rest_test = test
     log.info("%d images at time 0 are the static set of %d", len(still), len(times))
     return Layout(
-        at_rest(train[still]), at_rest(rest_test[still_test]),
-        in_motion(train[moving]), in_motion(test[moving_test]),
+        at_rest(train[still]),
+        at_rest(rest_test[still_test]),
+        in_motion(train[moving]),
+        in_motion(test[moving_test]),
     )
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 
 from devrf.scenes.scene import Views
-from devrf.scenes.validation import problem
+from devrf.scenes.validation import scene_error
 
 _WRITE_HINT = "give data.export another folder"
 
@@ -28,14 +28,14 @@ def whole_folder(folder: Path) -> Iterator[Path]:
     """
     folder = folder.expanduser().absolute()
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
-        raise problem(folder, f"is there already and not an empty folder; {_WRITE_HINT}")
+        raise scene_error(folder, f"is there already and not an empty folder; {_WRITE_HINT}")
     partial = folder.with_name(f".{folder.name}.partial-{os.getpid()}")
     try:
         partial.mkdir(parents=True)
         yield partial
         partial.rename(folder)
     except OSError as error:
-        raise problem(folder, f"cannot be written ({error}); {_WRITE_HINT}") from error
+        raise scene_error(folder, f"cannot be written ({error}); {_WRITE_HINT}") from error
     finally:
         # After the renaming there is nothing left to remove.
         shutil.rmtree(partial, ignore_errors=True)

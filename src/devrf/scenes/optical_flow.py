@@ -15,7 +15,7 @@ from devrf.geometry.clock import FrameClock
 from devrf.scenes.flow_cache import content_key, load_flow, save_flow
 from devrf.scenes.flow_estimators import estimator
 from devrf.scenes.scene import OpticalFlow, Views
-from devrf.scenes.validation import check_choice, problem
+from devrf.scenes.validation import check_choice, scene_error
 
 log = logging.getLogger(__name__)
 
@@ -48,7 +48,9 @@ def estimate_flow(views: Views, method: FlowMethod, cache: Path | None = None) -
     check_choice("data.flow", method, get_args(FlowMethod))
     pairs = frame_pairs(views)
     if not pairs:
-        raise problem("data.flow", "no view has two consecutive frames to estimate flow between")
+        raise scene_error(
+            "data.flow", "no view has two consecutive frames to estimate flow between"
+        )
     key = content_key(views, method)
     if cache is not None:
         stored = load_flow(cache, key, (len(views), views.height, views.width))
@@ -70,7 +72,9 @@ def estimate_flow(views: Views, method: FlowMethod, cache: Path | None = None) -
         if (done + 1) % 100 == 0:
             log.info("optical flow: %d of %d pairs", done + 1, len(pairs))
     log.info(
-        "estimated optical flow (%s) of %d pairs in %.1f s", method, len(pairs),
+        "estimated optical flow (%s) of %d pairs in %.1f s",
+        method,
+        len(pairs),
         time.perf_counter() - start,
     )
     if cache is not None:
@@ -118,7 +122,10 @@ def consistent(backward: Tensor, forward: Tensor) -> Tensor:
     inside = ((end >= 0) & (end <= size - 1)).all(dim=-1)
     grid = end / (size - 1) * 2 - 1
     back: Tensor = grid_sample(
-        forward.permute(2, 0, 1)[None], grid[None], mode="bilinear", padding_mode="border",
+        forward.permute(2, 0, 1)[None],
+        grid[None],
+        mode="bilinear",
+        padding_mode="border",
         align_corners=True,
     )[0].permute(1, 2, 0)
     miss: Tensor = torch.linalg.vector_norm(backward + back, dim=-1)

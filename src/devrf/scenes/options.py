@@ -12,7 +12,7 @@ from devrf.scenes.validation import (
     check_count,
     checked_box,
     number,
-    problem,
+    scene_error,
 )
 
 
@@ -36,8 +36,8 @@ def check_options(
     check_bound_scale(bound_scale)
     for key, value in (("data.near", near), ("data.far", far)):
         if value is not None and number(value) is None:
-            raise problem(key, f"expected a distance in world units or null, not {value!r}")
+            raise scene_error(key, f"expected a distance in world units or null, not {value!r}")
     until = 0.0 if static_until is None else number(static_until)
     if until is None or not 0 <= until <= 1:
-        raise problem("data.static_until", f"expected a time in [0, 1], not {static_until!r}")
+        raise scene_error("data.static_until", f"expected a time in [0, 1], not {static_until!r}")
     return None if box is None else checked_box(box)

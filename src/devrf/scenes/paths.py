@@ -6,7 +6,7 @@ import os
 import stat
 from pathlib import Path
 
-from devrf.scenes.validation import problem, shown
+from devrf.scenes.validation import abbreviated, scene_error
 
 
 def scene_folder(root: str | Path) -> Path:
@@ -14,13 +14,15 @@ def scene_folder(root: str | Path) -> Path:
     try:
         return existing_folder(Path(root).expanduser())
     except RuntimeError as error:  # nobody of that name has a home
-        raise problem("data.root", f"{shown(str(root))} is not a path ({error})") from None
+        raise scene_error(
+            "data.root", f"{abbreviated(str(root))} is not a path ({error})"
+        ) from None
 
 
 def existing_folder(folder: Path) -> Path:
     """``folder`` itself, or DevrfError when there is no such folder."""
     if not os.path.isdir(folder):  # unlike Path.is_dir it raises on nothing
-        raise problem(folder, "no such folder; set data.root to the scene's folder")
+        raise scene_error(folder, "no such folder; set data.root to the scene's folder")
     return folder
 
 
@@ -37,12 +39,12 @@ def existing_file(file: Path, purpose: str) -> int:
     try:
         status = os.stat(file)
     except (FileNotFoundError, NotADirectoryError):
-        raise problem(file, f"no such file; {purpose}") from None
+        raise scene_error(file, f"no such file; {purpose}") from None
     except OSError as error:
-        raise problem(file, f"cannot be read ({error.strerror}); {purpose}") from None
+        raise scene_error(file, f"cannot be read ({error.strerror}); {purpose}") from None
     # A pipe or a device could keep its reader waiting for ever.
     if not stat.S_ISREG(status.st_mode):
-        raise problem(file, f"no such file, but something else of that name; {purpose}")
+        raise scene_error(file, f"no such file, but something else of that name; {purpose}")
     return status.st_size
 
 
@@ -51,7 +53,7 @@ def entries(folder: Path) -> list[Path]:
     try:
         return sorted(folder.iterdir())
     except OSError as error:
-        raise problem(
+        raise scene_error(
             folder, f"cannot be listed ({error.strerror}); correct its permissions"
         ) from None
 
@@ -80,13 +82,15 @@ def inside(root: Path, folder: Path, name: str, file: Path) -> Path:
     except UnicodeEncodeError:
         encoded = b"\0"
     if b"\0" in encoded:
-        raise problem(file, f"{shown(name)} is not a path; correct it")
+        raise scene_error(file, f"{abbreviated(name)} is not a path; correct it")
     inner = (
-        os.path.relpath(name, root) if os.path.isabs(name)
+        os.path.relpath(name, root)
+        if os.path.isabs(name)
         else os.path.normpath(folder.relative_to(root) / name)
     )
     if inner == os.curdir or inner.split(os.sep)[0] == os.pardir:
-        raise problem(
-            file, f"{shown(name)} leads outside the scene's folder {root}; put the file into it",
+        raise scene_error(
+            file,
+            f"{abbreviated(name)} leads outside the scene's folder {root}; put the file into it",
         )
     return root / inner

@@ -41,9 +41,7 @@ def area_average(image: Array, width: int, height: int) -> Array:
     return _averaged(_averaged(image, height).swapaxes(0, 1), width).swapaxes(0, 1)
 
 
-def shrink_pixels(
-    image: npt.NDArray[np.uint8], width: int, height: int
-) -> npt.NDArray[np.uint8]:
+def shrink_pixels(image: npt.NDArray[np.uint8], width: int, height: int) -> npt.NDArray[np.uint8]:
     """An 8-bit image averaged over areas; colours count by their alpha.
 
     Args:

@@ -46,7 +46,7 @@ class Views:
         flow: backward optical flow, or None where there is none.
         depth: (N, H, W) float32 distance along each pixel's ray in world units, +inf where the
             ray hits nothing; None where it is unknown.
-        turn_doubtful: (N,) bool, files whose EXIF orientation says that they are to be seen
+        ambiguous_orientation: (N,) bool, files whose EXIF orientation says that they are to be seen
             turned, which nothing confirms or refutes: they are as they are stored. None: none.
         counted: (N, H, W) bool, the pixels that are learned from and scored; what the others
             show is nobody's business. None: all of them.
@@ -59,8 +59,8 @@ class Views:
     names: tuple[str, ...]
     flow: OpticalFlow | None = None
     depth: Tensor | None = None
-    turn_doubtful: Tensor | None = None
-    counted: Tensor | None = None
+    ambiguous_orientation: Tensor | None = None
+    valid_mask: Tensor | None = None
 
     def __len__(self) -> int:
         return self.pixels.shape[0]
@@ -92,13 +92,13 @@ class Views:
             if self.flow is None
             else OpticalFlow(self.flow.vectors[index], self.flow.valid[index]),
             None if self.depth is None else self.depth[index],
-            None if self.turn_doubtful is None else self.turn_doubtful[index],
-            None if self.counted is None else self.counted[index],
+            None if self.ambiguous_orientation is None else self.ambiguous_orientation[index],
+            None if self.valid_mask is None else self.valid_mask[index],
         )
 
-    def counted_in(self, image: int) -> Tensor | None:
+    def valid_mask_of(self, image: int) -> Tensor | None:
         """(H, W) bool on the host, the pixels of an image that count; None: all of them."""
-        return None if self.counted is None else self.counted[image].cpu()
+        return None if self.valid_mask is None else self.valid_mask[image].cpu()
 
     def to(self, device: torch.device | str) -> Views:
         """The same views on ``device``; images stay uint8."""
@@ -112,7 +112,7 @@ class Views:
             if self.flow is None
             else OpticalFlow(self.flow.vectors.to(device), self.flow.valid.to(device)),
             depth=None if self.depth is None else self.depth.to(device),
-            counted=None if self.counted is None else self.counted.to(device),
+            valid_mask=None if self.valid_mask is None else self.valid_mask.to(device),
         )
 
 

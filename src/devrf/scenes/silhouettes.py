@@ -25,9 +25,7 @@ OUTSIDE, INSIDE, UNSEEN = 0, 1, 2
 MATTE_THRESHOLD = 127
 
 
-def motion_box(
-    views: Views, box: Box, *, resolution: int = 64, search: float = 1.5
-) -> Box | None:
+def motion_box(views: Views, box: Box, *, resolution: int = 64, search: float = 1.5) -> Box | None:
     """The box of the union over all frames of the visual hulls.
 
     A point belongs to a frame's hull when at least two views see it inside their silhouettes
@@ -108,7 +106,7 @@ def _silhouettes(views: Views, reach: int) -> Array:
     """
     matte = views.pixels[..., 3].cpu().numpy() > MATTE_THRESHOLD
     count, height, width = matte.shape
-    unknown = np.zeros_like(matte) if views.counted is None else ~views.counted.cpu().numpy()
+    unknown = np.zeros_like(matte) if views.valid_mask is None else ~views.valid_mask.cpu().numpy()
     matte &= ~unknown
     perhaps = matte | unknown
     at_border = perhaps[:, [0, -1]].any(axis=(1, 2)) | perhaps[:, :, [0, -1]].any(axis=(1, 2))

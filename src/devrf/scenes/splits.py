@@ -18,7 +18,7 @@ from devrf.scenes.masks import Masks, counted_pixels, cutting_out
 from devrf.scenes.scene import Views
 from devrf.scenes.transforms import Transforms, read_transforms
 from devrf.scenes.undistortion import as_pinhole
-from devrf.scenes.validation import problem
+from devrf.scenes.validation import scene_error
 
 log = logging.getLogger(__name__)
 
@@ -117,8 +117,9 @@ def in_motion(transforms: Transforms) -> Split:
     else:
         step = views if fixed else 1
         if fixed and (len(order) % views or bool((camera != order % views).any())):
-            raise problem(
-                transforms.file, f"no times, and its {views} fixed views do not take turns; add "
+            raise scene_error(
+                transforms.file,
+                f"no times, and its {views} fixed views do not take turns; add "
                 "a time to every frame, or list all views of frame 0, then all of frame 1 …",
             )
         frames = order // step
@@ -132,10 +133,12 @@ def first_views(split: Split, count: int | None) -> Split:
         return split
     file = split.transforms.file
     if not split.fixed:
-        raise problem(file, "data.train_views needs fixed cameras, and these move; leave it null")
+        raise scene_error(
+            file, "data.train_views needs fixed cameras, and these move; leave it null"
+        )
     views = int(split.view.max()) + 1
     if count > views:
-        raise problem(
+        raise scene_error(
             file, f"data.train_views={count}, but the set has {views} views; ask for fewer"
         )
     return split.where(split.view < count)
@@ -197,9 +200,9 @@ def load_views(split: Split, root: Path, downscale: int, masks: Masks = "none") 
         )
         for inner, file in zip(known, files, strict=True)
     ]
-    counted = None
+    valid_mask = None
     if masks == "ignore":
-        counted = counted_pixels(
+        valid_mask = counted_pixels(
             listed, (loaded.width, loaded.height), (width, height), sizes, distorted, files
         )
     # Undistorted after the images are made smaller: a tenth of the work for the same picture.
@@ -213,6 +216,11 @@ def load_views(split: Split, root: Path, downscale: int, masks: Masks = "none") 
     )
     names = tuple(str(file.relative_to(root)) for file in files)
     return Views(
-        pixels, cameras, split.times[used], split.view[used], names,
-        turn_doubtful=loaded.doubtful, counted=counted,
+        pixels,
+        cameras,
+        split.times[used],
+        split.view[used],
+        names,
+        ambiguous_orientation=loaded.doubtful,
+        valid_mask=valid_mask,
     )

@@ -20,7 +20,7 @@ from devrf.scenes.intrinsics import Intrinsics, frame_intrinsics, read_intrinsic
 from devrf.scenes.json_files import json_object
 from devrf.scenes.paths import inside
 from devrf.scenes.poses import FARTHEST, in_reach, is_rotation
-from devrf.scenes.validation import number, problem, shown
+from devrf.scenes.validation import abbreviated, number, scene_error
 
 TIME_TOLERANCE = 1e-6
 
@@ -73,10 +73,10 @@ def read_transforms(file: Path, root: Path, *, masked: bool = False) -> Transfor
     content = json_object(file, "every capture needs its posed images")
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
-        raise problem(file, 'expected a non-empty list "frames"; add the posed images')
+        raise scene_error(file, 'expected a non-empty list "frames"; add the posed images')
     for index, frame in enumerate(frames):
         if not isinstance(frame, dict):
-            raise problem(
+            raise scene_error(
                 f"{file}: frames[{index}]",
                 f"expected an object, not {type(frame).__name__}; correct it",
             )
@@ -84,7 +84,7 @@ def read_transforms(file: Path, root: Path, *, masked: bool = False) -> Transfor
     times = [_time(frame, place) for frame, place in zip(frames, where, strict=True)]
     known = [t for t in times if t is not None]
     if known and len(known) < len(times):
-        raise problem(
+        raise scene_error(
             where[times.index(None)],
             'has no "time" although others have; give every frame its time, or none',
         )
@@ -96,7 +96,8 @@ def read_transforms(file: Path, root: Path, *, masked: bool = False) -> Transfor
         poses.float(),
         tuple(known) or None,
         tuple(_mask(f, place, file, root) for f, place in zip(frames, where, strict=True))
-        if masked else None,
+        if masked
+        else None,
     )
 
 
@@ -113,7 +114,7 @@ def _intrinsics(
 def _image(frame: dict[str, Any], where: str, file: Path, root: Path) -> Path:
     name = frame.get("file_path")
     if not isinstance(name, str) or not name:
-        raise problem(where, 'has no "file_path"; add the image\'s path')
+        raise scene_error(where, 'has no "file_path"; add the image\'s path')
     return listed_image(name, file, root)
 
 
@@ -122,10 +123,12 @@ def _mask(frame: dict[str, Any], where: str, file: Path, root: Path) -> Path | N
     if name is None:
         return None
     if not isinstance(name, str) or not name:
-        raise problem(where, f"mask_path is {shown(name)}, expected a file's path; correct it")
+        raise scene_error(
+            where, f"mask_path is {abbreviated(name)}, expected a file's path; correct it"
+        )
     path = inside(root, file.parent, name, file)
     if not os.path.isfile(path):
-        raise problem(path, "no such mask; correct mask_path, or set data.masks=none")
+        raise scene_error(path, "no such mask; correct mask_path, or set data.masks=none")
     return path
 
 
@@ -139,27 +142,32 @@ def _poses(frames: list[dict[str, Any]], where: list[str]) -> Tensor:
     rows = [_pose(frame, place) for frame, place in zip(frames, where, strict=True)]
     poses = torch.tensor(rows, dtype=torch.float64)
     for bad, what in (
-        (~is_rotation(poses[:, :, :3]), "is no rigid transform (scaled, sheared or mirrored axes); "
-         "give a rotation and a translation"),
-        (~in_reach(poses[:, :, 3]), f"is farther than {FARTHEST:g} from the origin; give smaller "
-         "world units"),
+        (
+            ~is_rotation(poses[:, :, :3]),
+            "is no rigid transform (scaled, sheared or mirrored axes); "
+            "give a rotation and a translation",
+        ),
+        (
+            ~in_reach(poses[:, :, 3]),
+            f"is farther than {FARTHEST:g} from the origin; give smaller world units",
+        ),
     ):
         if bool(bad.any()):
-            raise problem(where[int(bad.nonzero()[0])], f"transform_matrix {what}")
+            raise scene_error(where[int(bad.nonzero()[0])], f"transform_matrix {what}")
     return poses
 
 
 def _pose(frame: dict[str, Any], where: str) -> list[list[float]]:
     if "transform_matrix" not in frame:
-        raise problem(where, 'has no "transform_matrix"; add the 4x4 camera-to-world matrix')
+        raise scene_error(where, 'has no "transform_matrix"; add the 4x4 camera-to-world matrix')
     matrix = frame["transform_matrix"]
     sized = isinstance(matrix, list) and len(matrix) in (3, 4)
     if not sized or not all(isinstance(row, list) and len(row) == 4 for row in matrix):
-        raise problem(where, "transform_matrix is not 4x4 or 3x4; give camera-to-world rows")
+        raise scene_error(where, "transform_matrix is not 4x4 or 3x4; give camera-to-world rows")
     rows = [[number(value) for value in row] for row in matrix[:3]]
     pose = [[value for value in row if value is not None] for row in rows]
     if any(len(row) < 4 for row in pose):
-        raise problem(where, "transform_matrix holds NaN, inf or text; give finite numbers")
+        raise scene_error(where, "transform_matrix holds NaN, inf or text; give finite numbers")
     return pose
 
 
@@ -168,5 +176,7 @@ def _time(frame: dict[str, Any], where: str) -> float | None:
         return None
     time = number(frame["time"])
     if time is None or not -TIME_TOLERANCE <= time <= 1 + TIME_TOLERANCE:
-        raise problem(where, f"time is {shown(frame['time'])}, outside [0, 1]; rescale the times")
+        raise scene_error(
+            where, f"time is {abbreviated(frame['time'])}, outside [0, 1]; rescale the times"
+        )
     return min(max(time, 0.0), 1.0)

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from devrf.scenes.lens import Lens
-from devrf.scenes.validation import problem
+from devrf.scenes.validation import scene_error
 
 # A lens that needs a longer focal length than this to fill its image is no such lens.
 _LONGEST = 2.0
@@ -43,8 +43,9 @@ def as_pinhole(
             continue
         view = _pinhole_view(lens, width, height)
         if view is None:
-            raise problem(
-                names[row], "the distortion (k1, k2, k3, p1, p2) is so strong that the image "
+            raise scene_error(
+                names[row],
+                "the distortion (k1, k2, k3, p1, p2) is so strong that the image "
                 "folds over; correct it, or undistort the images first",
             )
         plain[row], source = view
@@ -70,8 +71,11 @@ def resample(image: Tensor, source: Tensor) -> Tensor:
         values[..., :3] *= values[..., 3:]
     grid = source * (2 / source.new_tensor([width, height])) - 1
     taken = grid_sample(
-        values.permute(2, 0, 1)[None], grid.float()[None], mode="bilinear",
-        padding_mode="border", align_corners=False,
+        values.permute(2, 0, 1)[None],
+        grid.float()[None],
+        mode="bilinear",
+        padding_mode="border",
+        align_corners=False,
     )[0].permute(1, 2, 0)
     if channels == 4:
         alpha = taken[..., 3:]
@@ -100,12 +104,14 @@ def _pinhole_view(lens: Lens, width: int, height: int) -> tuple[Lens, Tensor] | 
 def _zoom(lens: Lens, width: int, height: int) -> float | None:
     """The least factor ≥ 1 of the focal lengths at which the lens saw the whole border."""
     x, y = torch.arange(width) + 0.5, torch.arange(height) + 0.5
-    border = torch.cat([
-        torch.stack([x, torch.full_like(x, 0.5)], dim=-1),
-        torch.stack([x, torch.full_like(x, height - 0.5)], dim=-1),
-        torch.stack([torch.full_like(y, 0.5), y], dim=-1),
-        torch.stack([torch.full_like(y, width - 0.5), y], dim=-1),
-    ]).double()
+    border = torch.cat(
+        [
+            torch.stack([x, torch.full_like(x, 0.5)], dim=-1),
+            torch.stack([x, torch.full_like(x, height - 0.5)], dim=-1),
+            torch.stack([torch.full_like(y, 0.5), y], dim=-1),
+            torch.stack([torch.full_like(y, width - 0.5), y], dim=-1),
+        ]
+    ).double()
     directions = _directions(Lens(lens.focal, lens.center), border)
     size = border.new_tensor([width, height])
 

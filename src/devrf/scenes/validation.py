@@ -25,7 +25,7 @@ _brief = reprlib.Repr()
 _brief.maxlevel = 2
 
 
-def problem(where: object, what: str) -> DevrfError:
+def scene_error(where: object, what: str) -> DevrfError:
     """The error ``where: what``, made one short printable line whatever its parts contain."""
     line = " ".join(_shortened(f"{where}: {what}", LONGEST_MESSAGE).split())
     # Names may hold what a terminal takes for a command, or what no file can be written with.
@@ -35,7 +35,7 @@ def problem(where: object, what: str) -> DevrfError:
     return DevrfError(_shortened(printable, LONGEST_MESSAGE))
 
 
-def shown(value: object) -> str:
+def abbreviated(value: object) -> str:
     """A value from a file as a message shows it: however large or deep, in a few words."""
     return _shortened(_brief.repr(value), LONGEST_VALUE)
 
@@ -61,7 +61,7 @@ def reduced_size(width: int, height: int, downscale: int, where: object) -> tupl
     """(width, height) // downscale, or DevrfError when a side falls under 8 px."""
     w, h = width // downscale, height // downscale
     if min(w, h) < MIN_SIDE:
-        raise problem(
+        raise scene_error(
             where,
             f"{width}x{height} px at data.downscale={downscale} leaves {w}x{h} px, at least "
             f"{MIN_SIDE} px a side are needed; use a smaller data.downscale",
@@ -78,7 +78,7 @@ def check_choice(key: str, value: object, choices: Iterable[str]) -> None:
     """DevrfError unless ``value`` is one of ``choices``."""
     allowed = tuple(choices)
     if value not in allowed:
-        raise problem(key, f"expected one of {', '.join(allowed)}, not {value!r}")
+        raise scene_error(key, f"expected one of {', '.join(allowed)}, not {value!r}")
 
 
 def check_count(key: str, value: object, least: int) -> None:
@@ -86,14 +86,14 @@ def check_count(key: str, value: object, least: int) -> None:
     if value is None:
         return
     if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise problem(key, f"expected a whole number of at least {least}, not {value!r}")
+        raise scene_error(key, f"expected a whole number of at least {least}, not {value!r}")
 
 
 def check_bound_scale(value: object) -> None:
     """DevrfError unless ``value`` is "auto" or a number ≥ 1."""
     scale = number(value)
     if value != "auto" and (scale is None or scale < 1):
-        raise problem(
+        raise scene_error(
             "data.bound_scale", f'expected "auto" or a number of at least 1, not {value!r}'
         )
 
@@ -106,6 +106,6 @@ def checked_box(value: object) -> Box:
             raise ValueError
         return Box.of(low, high)
     except (TypeError, ValueError):
-        raise problem(
+        raise scene_error(
             "data.box", f"expected [[x, y, z], [x, y, z]] with low < high, not {value!r}"
         ) from None

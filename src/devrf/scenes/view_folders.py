@@ -11,7 +11,7 @@ from pathlib import Path
 
 from devrf.scenes.image_folders import image_folder, listed_images
 from devrf.scenes.paths import entries
-from devrf.scenes.validation import problem
+from devrf.scenes.validation import scene_error
 
 log = logging.getLogger(__name__)
 
@@ -48,11 +48,12 @@ def view_folders(folder: Path, downscale: int) -> list[ViewFolder]:
         if match and os.path.isdir(path):
             numbered[int(match[1])] = path
     if not numbered:
-        raise problem(folder, "no folders view1, view2, …; add one for each fixed camera")
+        raise scene_error(folder, "no folders view1, view2, …; add one for each fixed camera")
     for number in range(1, len(numbered) + 1):
         if number not in numbered:
-            raise problem(
-                folder, f"no folder view{number} although there is view{max(numbered)}; number "
+            raise scene_error(
+                folder,
+                f"no folder view{number} although there is view{max(numbered)}; number "
                 "the fixed cameras' folders from 1 on",
             )
     views: list[ViewFolder] = []
@@ -60,17 +61,18 @@ def view_folders(folder: Path, downscale: int) -> list[ViewFolder]:
         source = image_folder(path, downscale)
         images = listed_images(source.path, by_number=True)
         if views and len(images) != len(views[0].images):
-            raise problem(
-                source.path, f"has {len(images)} images, but {views[0].images[0].parent} has "
+            raise scene_error(
+                source.path,
+                f"has {len(images)} images, but {views[0].images[0].parent} has "
                 f"{len(views[0].images)}; each fixed camera needs one image a frame",
             )
         if views and source.downscale != views[0].downscale:
-            raise problem(
+            raise scene_error(
                 path, f"no folder {views[0].images[0].parent.name} as the other views have; add it"
             )
         views.append(ViewFolder(images, source.downscale, source.flow))
     if len(views[0].images) < 2:
-        raise problem(folder, "its views have one image each, expected at least 2 frames")
+        raise scene_error(folder, "its views have one image each, expected at least 2 frames")
     return views
 
 
@@ -108,7 +110,9 @@ def flow_files(views: list[ViewFolder]) -> dict[tuple[int, int], Path]:
     if 0 < len(best) < expected:
         log.warning(
             "%d of %d flow files are missing in %s and its like; those images go without flow",
-            expected - len(best), expected, views[0].flow,
+            expected - len(best),
+            expected,
+            views[0].flow,
         )
     return best
 

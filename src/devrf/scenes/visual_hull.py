@@ -34,8 +34,8 @@ def visual_hull(views: Views, box: Box, shape: tuple[int, int, int]) -> Tensor:
         pixel, depth = views.cameras.project_into(k, points[left])
         reach = _reach(views, k, cell, box)
         matte = views.pixels[k, :, :, 3][None].float()
-        if views.counted is not None:
-            matte = matte.masked_fill(~views.counted[k], 255.0)
+        if views.valid_mask is not None:
+            matte = matte.masked_fill(~views.valid_mask[k], 255.0)
         grown = torch.nn.functional.max_pool2d(matte, 2 * reach + 1, 1, reach)[0]
         x, y = pixel.floor().long().unbind(-1)
         seen = (depth > 0) & (x >= 0) & (x < views.width) & (y >= 0) & (y < views.height)

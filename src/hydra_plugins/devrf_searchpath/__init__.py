@@ -3,7 +3,7 @@
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 
-from devrf.config import config_folder, register_resolvers
+from devrf.cli.config import config_folder, register_resolvers
 
 
 class DevrfSearchPath(SearchPathPlugin):

@@ -25,7 +25,10 @@ from devrf.ops import choice
 from devrf.ops.selfcheck import CASES, Draw, interpolation, sample_search, warped_depths
 
 POINTERS = {
-    torch.float32: "*fp32", torch.float64: "*fp64", torch.int32: "*i32", torch.int64: "*i64",
+    torch.float32: "*fp32",
+    torch.float64: "*fp64",
+    torch.int32: "*i32",
+    torch.int64: "*i64",
     torch.uint8: "*u8",
 }
 recorded: dict[tuple[Any, ...], tuple[ASTSource, dict[str, Any]]] = {}
@@ -60,11 +63,14 @@ def type_of(value: Any) -> str:
 
 def kernel_names() -> set[str]:
     """Every kernel of the package, as opposed to the functions that kernels call."""
-    modules = [import_module(m.name) for m in iter_modules(
-        devrf.ops.kernels.__path__, "devrf.ops.kernels."
-    )]
+    modules = [
+        import_module(m.name)
+        for m in iter_modules(devrf.ops.kernels.__path__, "devrf.ops.kernels.")
+    ]
     return {
-        name for module in modules for name, value in vars(module).items()
+        name
+        for module in modules
+        for name, value in vars(module).items()
         if isinstance(value, JITFunction) and name.endswith("_kernel")
     }
 
@@ -89,10 +95,14 @@ def main(capabilities: list[int]) -> None:
             done.add(name)
             compiled = triton.compile(source, GPUTarget("cuda", capability, 32), options)
             ptx, cubin = compiled.asm["ptx"], compiled.asm["cubin"]
-            found.append({
-                "kernel": name, "capability": capability,
-                "ptx": f".target sm_{capability}" in ptx, "cubin": cubin[:4] == b"\x7fELF",
-            })
+            found.append(
+                {
+                    "kernel": name,
+                    "capability": capability,
+                    "ptx": f".target sm_{capability}" in ptx,
+                    "cubin": cubin[:4] == b"\x7fELF",
+                }
+            )
     print(json.dumps({"kernels": sorted(names), "compiled": found}))
 
 

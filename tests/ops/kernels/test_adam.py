@@ -27,8 +27,13 @@ def rule(device: torch.device, step: int, **options: object) -> AdamRule:
 @pytest.mark.parametrize("smooth", [None, "everywhere", "touched"])
 @pytest.mark.parametrize("shape", [(3, 2, 4, 1), (2, 3, 50, 3)])
 def test_steps(
-    draw: Draw, agree: Both, device: torch.device, shape: tuple[int, ...],
-    smooth: str | None, skip_zero: bool, paced: bool,
+    draw: Draw,
+    agree: Both,
+    device: torch.device,
+    shape: tuple[int, ...],
+    smooth: str | None,
+    skip_zero: bool,
+    paced: bool,
 ) -> None:
     start, pace = 2 * draw(*shape), draw(*shape[:3], 1).abs() if paced else None
     # About half of the entries without a gradient, others in each step.
@@ -44,7 +49,13 @@ def test_steps(
                 adam_step(values, grad, mean, square, how)
             else:
                 smooth_adam_step(
-                    values, other, grad, mean, square, how, smoothing=0.3,
+                    values,
+                    other,
+                    grad,
+                    mean,
+                    square,
+                    how,
+                    smoothing=0.3,
                     touched_only=smooth == "touched",
                 )
                 values, other = other, values
@@ -67,9 +78,7 @@ def test_the_gradient_may_be_kept(draw: Draw, agree: Both, device: torch.device)
 
 
 @pytest.mark.parametrize("shape", [(4, 3, 5, 3), (2, 2, 2, 1), (2, 2, 400, 3)])
-def test_gradient_of_the_total_variation(
-    draw: Draw, agree: Both, shape: tuple[int, ...]
-) -> None:
+def test_gradient_of_the_total_variation(draw: Draw, agree: Both, shape: tuple[int, ...]) -> None:
     grid, gradient = 2 * draw(*shape), draw(*shape).clamp(min=0)
 
     def work() -> tuple[Tensor, ...]:

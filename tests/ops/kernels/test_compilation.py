@@ -17,13 +17,18 @@ HERE = Path(__file__).parent
 def test_every_launch_compiles_without_a_gpu(tmp_path: Path) -> None:
     pytest.importorskip("triton", reason="Triton is not installed")
     environment = {
-        **os.environ, "PYTHONPATH": str(HERE.parents[2] / "src"),
+        **os.environ,
+        "PYTHONPATH": str(HERE.parents[2] / "src"),
         # Nothing from an earlier run, and nothing left behind.
-        "TRITON_CACHE_DIR": str(tmp_path), "TRITON_INTERPRET": "0",
+        "TRITON_CACHE_DIR": str(tmp_path),
+        "TRITON_INTERPRET": "0",
     }
     done = subprocess.run(
         [sys.executable, str(HERE / "compile_launches.py"), "80", "90"],
-        env=environment, capture_output=True, text=True, check=False,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stderr[-3000:]
     report = json.loads(done.stdout.splitlines()[-1])

@@ -29,9 +29,7 @@ def opaque_and_faint(draw: Draw, samples: int) -> Tensor:
 
 
 @pytest.mark.parametrize("padding", [0, 5])
-def test_weights_and_gradients(
-    draw: Draw, agree: Both, device: torch.device, padding: int
-) -> None:
+def test_weights_and_gradients(draw: Draw, agree: Both, device: torch.device, padding: int) -> None:
     first = segments(device)
     samples = int(first[-1]) + padding
     depth, to_weights, to_end = opaque_and_faint(draw, samples), draw(samples), draw(9)
@@ -46,9 +44,7 @@ def test_weights_and_gradients(
 
 
 @pytest.mark.parametrize("channels", [1, 3, 12])
-def test_sums_and_gradients(
-    draw: Draw, agree: Both, device: torch.device, channels: int
-) -> None:
+def test_sums_and_gradients(draw: Draw, agree: Both, device: torch.device, channels: int) -> None:
     first = segments(device)
     samples = int(first[-1]) + 4
     weights, values, upstream = draw(samples), draw(samples, channels), draw(9, channels)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from devrf.geometry.box import Box
 from devrf.ops.choice import using
-from devrf.ops.search import Found, Thresholds, find_samples
+from devrf.ops.search import PackedSamples, Thresholds, find_samples
 
 Draw = Callable[..., Tensor]
 Both = Callable[[Callable[[], tuple[Tensor, ...]]], None]
@@ -21,7 +21,9 @@ BOX = Box((-1.0, -0.8, -0.9), (0.9, 1.0, 0.7))
 SMALLER = Box((-0.7, -0.8, -0.9), (0.9, 0.9, 0.5))
 
 
-def search(draw: Draw, frames: int = 1, rays: int = 6, **changed: Any) -> Callable[[], Found]:
+def search(
+    draw: Draw, frames: int = 1, rays: int = 6, **changed: Any
+) -> Callable[[], PackedSamples]:
     """A search along rays of up to 70 samples: none to three rounds of lanes."""
     arguments: dict[str, Any] = {
         "origins": 0.4 * draw(rays, 3),
@@ -31,8 +33,14 @@ def search(draw: Draw, frames: int = 1, rays: int = 6, **changed: Any) -> Callab
         "mask": draw(5, 4, 6) > -0.3,
         "density": 3 * draw(4, 3, 5, 1),
         "slices": [0.2 * draw(3, 4, 3, 3) for _ in range(frames)],
-        "weight": 0.3, "step": 0.03, "longest": 70, "capacity": 200,
-        "mask_box": SMALLER, "box": BOX, "shift": -1.0, "delta": 0.5,
+        "weight": 0.3,
+        "step": 0.03,
+        "longest": 70,
+        "capacity": 200,
+        "mask_box": SMALLER,
+        "box": BOX,
+        "shift": -1.0,
+        "delta": 0.5,
         "thresholds": Thresholds(alpha=0.05, stop=1e-2, weight=0.1),
     }
     return lambda: find_samples(**(arguments | changed))
@@ -86,10 +94,17 @@ def test_points_halfway_between_grid_points(draw: Draw, agree: Both, device: tor
     # On a grid of unit cells the samples at 0.5, 1.5, … belong to the even grid point.
     cube = Box((0.0, 0.0, 0.0), (4.0, 4.0, 4.0))
     look = search(
-        draw, 0, 1, mask_box=cube, box=cube, step=0.5, entry=torch.zeros(1, device=device),
+        draw,
+        0,
+        1,
+        mask_box=cube,
+        box=cube,
+        step=0.5,
+        entry=torch.zeros(1, device=device),
         origins=torch.tensor([[0.5, 1.5, -1.0]], device=device),
         directions=torch.tensor([[0.0, 0.0, 1.0]], device=device),
-        count=torch.tensor([14], device=device), mask=draw(5, 5, 5) > -0.2,
+        count=torch.tensor([14], device=device),
+        mask=draw(5, 5, 5) > -0.2,
         thresholds=Thresholds(alpha=0.0, stop=0.0, weight=0.0),
     )
     agree(lambda: astuple(look()))

@@ -60,8 +60,14 @@ def test_gradients_may_be_added_to_buffers(draw: Draw, agree: Both) -> None:
         into = [buffer.clone() for buffer in buffers]
         leaves = [raw.clone().requires_grad_(), frame.clone().requires_grad_()]
         q, tau = warped_depth(
-            x, leaves[0], leaves[1:], box=BOX, shift=-1.0, delta=0.5,
-            density_gradient=into[0], slice_gradients=into[1:],
+            x,
+            leaves[0],
+            leaves[1:],
+            box=BOX,
+            shift=-1.0,
+            delta=0.5,
+            density_gradient=into[0],
+            slice_gradients=into[1:],
         )
         (tau.sum() + q.square().sum()).backward()
         assert all(leaf.grad is None for leaf in leaves)

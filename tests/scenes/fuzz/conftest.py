@@ -20,24 +20,66 @@ from devrf.errors import DevrfError
 from devrf.scenes.scene import Scene
 
 NUMBERS = [
-    0, -1, 1, 2, 0.5, -0.0, 1e-3, 5e-324, 1e-30, 1e5, 1e9, 1e20, 1e38, 1e300, 2**31, 2**63, 10**400,
-    float("nan"), float("inf"), float("-inf"),
+    0,
+    -1,
+    1,
+    2,
+    0.5,
+    -0.0,
+    1e-3,
+    5e-324,
+    1e-30,
+    1e5,
+    1e9,
+    1e20,
+    1e38,
+    1e300,
+    2**31,
+    2**63,
+    10**400,
+    float("nan"),
+    float("inf"),
+    float("-inf"),
 ]
 TEXTS = [
-    "", "a", ".", "..", "/", "../../secret", "/etc/passwd", "~", "a\0b", "\ud800", "\x1b[2J\r\n",
-    "train/r_000", "./train/r_000.png", "images/0.png", "000001", "OPENCV", "\U0001f916",
+    "",
+    "a",
+    ".",
+    "..",
+    "/",
+    "../../secret",
+    "/etc/passwd",
+    "~",
+    "a\0b",
+    "\ud800",
+    "\x1b[2J\r\n",
+    "train/r_000",
+    "./train/r_000.png",
+    "images/0.png",
+    "000001",
+    "OPENCV",
+    "\U0001f916",
     "x" * 5000,
 ]
 # Texts, so that every draw is a value of its own.
 CONTAINERS = [
-    "[]", "{}", "[[]]", '{"": {}}', "[0, 0, 0, 0]", str([[0] * 4] * 4), str(list(range(50))),
+    "[]",
+    "{}",
+    "[[]]",
+    '{"": {}}',
+    "[0, 0, 0, 0]",
+    str([[0] * 4] * 4),
+    str(list(range(50))),
     "[" * 300 + "]" * 300,
 ]
 
 JSON_VALUES: SearchStrategy[Any] = st.one_of(
-    st.sampled_from(NUMBERS), st.sampled_from(TEXTS), st.sampled_from([None, True, False]),
+    st.sampled_from(NUMBERS),
+    st.sampled_from(TEXTS),
+    st.sampled_from([None, True, False]),
     st.sampled_from(CONTAINERS).map(json.loads),
-    st.floats(), st.integers(-3, 3),
+    st.floats(),
+    st.integers(-3, 3),
 )
 
 
@@ -84,10 +126,13 @@ def damaged_bytes(draw: DrawFn, data: bytes) -> bytes:
     """``data`` after one to four changes; both ends, where headers are, are hit more often."""
     for _ in range(draw(st.integers(1, 4))):
         size = len(data)
-        at = draw(st.one_of(
-            st.integers(0, size), st.integers(0, min(size, 64)),
-            st.integers(max(0, size - 96), size),
-        ))
+        at = draw(
+            st.one_of(
+                st.integers(0, size),
+                st.integers(0, min(size, 64)),
+                st.integers(max(0, size - 96), size),
+            )
+        )
         change = draw(st.sampled_from(["flip", "write", "insert", "cut", "delete", "repeat"]))
         if change == "flip" and at < size:
             data = data[:at] + bytes([data[at] ^ 1 << draw(st.integers(0, 7))]) + data[at + 1 :]
@@ -105,29 +150,68 @@ def damaged_bytes(draw: DrawFn, data: bytes) -> bytes:
 
 
 LENGTHS = st.sampled_from([-1, 0, 1, 2, 3, 5, 14, 17, 2**31, 2**63, 10**15, 10**30])
-DESCRIPTIONS = st.sampled_from([
-    "<f8", ">f4", "<f2", "|b1", "|u1", "<i8", "<c16", "|O", "<U5", "|S0", "|V8", "<M8[s]", "f", "",
-    "<f16", "|S1000000000", None, 3, [], [("a", "<f8")], [("a", "|O")], ("<f8", (2,)), {"a": 1},
-])
+DESCRIPTIONS = st.sampled_from(
+    [
+        "<f8",
+        ">f4",
+        "<f2",
+        "|b1",
+        "|u1",
+        "<i8",
+        "<c16",
+        "|O",
+        "<U5",
+        "|S0",
+        "|V8",
+        "<M8[s]",
+        "f",
+        "",
+        "<f16",
+        "|S1000000000",
+        None,
+        3,
+        [],
+        [("a", "<f8")],
+        [("a", "|O")],
+        ("<f8", (2,)),
+        {"a": 1},
+    ]
+)
 
 
 @st.composite
 def headed_npy(draw: DrawFn, values: np.ndarray) -> bytes:
     """``values`` behind an npy header that claims something else."""
     header: Any = {
-        "descr": values.dtype.str, "fortran_order": draw(st.booleans()), "shape": values.shape,
+        "descr": values.dtype.str,
+        "fortran_order": draw(st.booleans()),
+        "shape": values.shape,
     }
     for _ in range(draw(st.integers(1, 2))):
         key = draw(st.sampled_from(["shape", "shape", "descr", "descr", "fortran_order", "extra"]))
-        header[key] = draw({
-            "shape": st.one_of(
-                st.lists(LENGTHS, max_size=4).map(tuple), st.sampled_from([None, "x", 3, [2, 2]])
-            ),
-            "descr": DESCRIPTIONS,
-        }.get(key, JSON_VALUES))
-    text = draw(st.sampled_from([
-        *[repr(header)] * 4, repr(header)[:-1], "(" * 150, "-" * 5000 + "1", "\t{",
-    ])).encode("latin-1", "replace")[:65000] + b"\n"
+        header[key] = draw(
+            {
+                "shape": st.one_of(
+                    st.lists(LENGTHS, max_size=4).map(tuple),
+                    st.sampled_from([None, "x", 3, [2, 2]]),
+                ),
+                "descr": DESCRIPTIONS,
+            }.get(key, JSON_VALUES)
+        )
+    text = (
+        draw(
+            st.sampled_from(
+                [
+                    *[repr(header)] * 4,
+                    repr(header)[:-1],
+                    "(" * 150,
+                    "-" * 5000 + "1",
+                    "\t{",
+                ]
+            )
+        ).encode("latin-1", "replace")[:65000]
+        + b"\n"
+    )
     version = draw(st.sampled_from([b"\1\0"] * 8 + [b"\2\0", b"\3\0", b"\0\0", b"\xff\xff"]))
     size = len(text).to_bytes(2 if version == b"\1\0" else 4, "little")
     return b"\x93NUMPY" + version + size + text + values.tobytes()

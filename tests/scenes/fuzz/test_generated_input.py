@@ -171,7 +171,8 @@ def flow(fixture: Fixture) -> Prepared:
 def cached_flow(fixture: Fixture) -> Prepared:
     file = fixture("tmp_path") / "cache.npz"
     arrays = {
-        "key": np.array("0" * 64), "vectors": np.ones((2, 4, 6, 2), np.float32),
+        "key": np.array("0" * 64),
+        "vectors": np.ones((2, 4, 6, 2), np.float32),
         "valid": np.ones((2, 4, 6), bool),
     }
     return archives(fixture("damage"), arrays), lambda data: load_flow(
@@ -243,12 +244,21 @@ def nerfies_folder(fixture: Fixture) -> Path:
     for i, (item, pose) in enumerate(zip(ids, poses, strict=True)):
         (root / f"rgb/1x/r_{i:03d}.png").rename(root / f"rgb/1x/{item}.png")
         axes = pose[:, :3] * pose.new_tensor([1.0, -1.0, -1.0])
-        (root / f"camera/{item}.json").write_text(json.dumps({
-            "orientation": axes.T.tolist(), "position": pose[:, 3].tolist(),
-            "focal_length": 38.0, "pixel_aspect_ratio": 1.0, "skew": 0.0,
-            "principal_point": [16.0, 12.0], "image_size": [WIDTH, HEIGHT],
-            "radial_distortion": [0.0, 0.0, 0.0], "tangential_distortion": [0.0, 0.0],
-        }))
+        (root / f"camera/{item}.json").write_text(
+            json.dumps(
+                {
+                    "orientation": axes.T.tolist(),
+                    "position": pose[:, 3].tolist(),
+                    "focal_length": 38.0,
+                    "pixel_aspect_ratio": 1.0,
+                    "skew": 0.0,
+                    "principal_point": [16.0, 12.0],
+                    "image_size": [WIDTH, HEIGHT],
+                    "radial_distortion": [0.0, 0.0, 0.0],
+                    "tangential_distortion": [0.0, 0.0],
+                }
+            )
+        )
     for name, content in {
         "scene": {"center": [0.0, 0, 0], "scale": 1.0, "near": 0.5, "far": 9.0},
         "metadata": {item: {"warp_id": i, "camera_id": 0} for i, item in enumerate(ids)},
@@ -273,13 +283,15 @@ def nerfies_camera(fixture: Fixture) -> Prepared:
 
 def nerfies_lists(fixture: Fixture) -> Prepared:
     root = nerfies_folder(fixture)
-    whole = {name: (root / name).read_text() for name in (
-        "dataset.json", "metadata.json", "scene.json"
-    )}
-    inputs = st.one_of([
-        st.tuples(st.just(name), fixture("damage").json(json.loads(text)))
-        for name, text in whole.items()
-    ])
+    whole = {
+        name: (root / name).read_text() for name in ("dataset.json", "metadata.json", "scene.json")
+    }
+    inputs = st.one_of(
+        [
+            st.tuples(st.just(name), fixture("damage").json(json.loads(text)))
+            for name, text in whole.items()
+        ]
+    )
 
     def read(drawn: tuple[str, str]) -> Any:
         for name, text in whole.items():
@@ -317,7 +329,16 @@ def nerfstudio(fixture: Fixture) -> Prepared:
 
 
 CHANGES = [
-    "gone", "empty", "folder", "loop", "dangling", "pipe", "half", "rubbish", "damaged", "swapped"
+    "gone",
+    "empty",
+    "folder",
+    "loop",
+    "dangling",
+    "pipe",
+    "half",
+    "rubbish",
+    "damaged",
+    "swapped",
 ]
 
 
@@ -393,7 +414,8 @@ def with_flow(fixture: Fixture) -> Path:
     for k in range(2, 6):
         np.savez(
             folder.dynamic / f"train_flow/{k:03d}_bwd.npz",
-            flow=np.ones((HEIGHT, WIDTH, 2), np.float32), mask=np.ones((HEIGHT, WIDTH), bool),
+            flow=np.ones((HEIGHT, WIDTH, 2), np.float32),
+            mask=np.ones((HEIGHT, WIDTH), bool),
         )
     root: Path = folder.root
     return root
@@ -432,25 +454,48 @@ PARSERS = (
     Parser("camera of nerfies", 800, 650, nerfies_camera),
     Parser("lists of nerfies", 400, 280, nerfies_lists),
     Parser("nerfstudio", 300, 220, nerfstudio),
-    Parser("files of an inward-facing scene", 120, 80, scene_files(
-        with_flow,
-        lambda root: InwardFacingDataModule(root, flow="files", bound_scale=1.5).load(),
-    )),
-    Parser("files of D-NeRF's layout", 80, 55, scene_files(
-        lambda fixture: fixture("single_folder"),
-        lambda root: InwardFacingDataModule(root, flow="files", bound_scale=1.5).load(),
-    )),
-    Parser("files of a forward-facing scene", 120, 80, scene_files(
-        forward, lambda root: ForwardFacingDataModule(root, flow="files").load()
-    )),
-    Parser("files of nerfstudio", 80, 30, scene_files(
-        nerfstudio_folder,
-        lambda root: NerfstudioDataModule(root, flow="none", bound_scale=1.5).load(),
-    )),
-    Parser("files of nerfies", 80, 50, scene_files(
-        nerfies_folder,
-        lambda root: NerfiesDataModule(root, downscale=1, flow="none", bound_scale=1.5).load(),
-    )),
+    Parser(
+        "files of an inward-facing scene",
+        120,
+        80,
+        scene_files(
+            with_flow,
+            lambda root: InwardFacingDataModule(root, flow="files", bound_scale=1.5).load(),
+        ),
+    ),
+    Parser(
+        "files of D-NeRF's layout",
+        80,
+        55,
+        scene_files(
+            lambda fixture: fixture("single_folder"),
+            lambda root: InwardFacingDataModule(root, flow="files", bound_scale=1.5).load(),
+        ),
+    ),
+    Parser(
+        "files of a forward-facing scene",
+        120,
+        80,
+        scene_files(forward, lambda root: ForwardFacingDataModule(root, flow="files").load()),
+    ),
+    Parser(
+        "files of nerfstudio",
+        80,
+        30,
+        scene_files(
+            nerfstudio_folder,
+            lambda root: NerfstudioDataModule(root, flow="none", bound_scale=1.5).load(),
+        ),
+    ),
+    Parser(
+        "files of nerfies",
+        80,
+        50,
+        scene_files(
+            nerfies_folder,
+            lambda root: NerfiesDataModule(root, downscale=1, flow="none", bound_scale=1.5).load(),
+        ),
+    ),
 )
 
 

@@ -103,57 +103,83 @@ DENSEST = '{"a":[' + ",".join(["[" * 200 + "]" * 200] * 19_000) + "]}"
 CASES: dict[str, tuple[str, str | None, Callable[[Path], Path]]] = {
     "json of 100 GB": ("json", "larger than 64 MiB", lambda p: sparse(p, 10**11, b'{"a": 1}')),
     "json of too many values": (
-        "json", "more than 4 million values", lambda p: text(p, "[" + "[]," * 2_500_000 + "0]")
+        "json",
+        "more than 4 million values",
+        lambda p: text(p, "[" + "[]," * 2_500_000 + "0]"),
     ),
     "json that is as dense as it may be": ("json", None, lambda p: text(p, DENSEST)),
     "json of a million levels": ("json", "not valid JSON", lambda p: text(p, "[" * 1_000_000)),
     "a number of 50 million digits": (
-        "json", "expected a JSON object", lambda p: text(p, "0." + "1" * 50_000_000)
+        "json",
+        "expected a JSON object",
+        lambda p: text(p, "0." + "1" * 50_000_000),
     ),
     "90,000 images that are not there": (
-        "transforms", "none.png: no such image", lambda p: listing(p, 90_000)
+        "transforms",
+        "none.png: no such image",
+        lambda p: listing(p, 90_000),
     ),
     "npy of a petabyte": ("npy", "do not fit", lambda p: sparse(p, 4096, npy((10**14, 17)))),
     "npy of a terabyte that is there": (
-        "npy", "which is too large", lambda p: sparse(p, 2**40, npy((2**30, 17)))
+        "npy",
+        "which is too large",
+        lambda p: sparse(p, 2**40, npy((2**30, 17))),
     ),
     "npy with a header of 4 GB": (
-        "npy", "format version", lambda p: sparse(p, 2**33, b"\x93NUMPY\2\0\xff\xff\xff\xff")
+        "npy",
+        "format version",
+        lambda p: sparse(p, 2**33, b"\x93NUMPY\2\0\xff\xff\xff\xff"),
     ),
     "flow of a petabyte": (
-        "flow", "expected (4, 6, 2)", lambda p: npz(p, {"flow": npy((10**14, 17)), "mask": MASK})
+        "flow",
+        "expected (4, 6, 2)",
+        lambda p: npz(p, {"flow": npy((10**14, 17)), "mask": MASK}),
     ),
     "flow of wide values": (
-        "flow", "in the shape",
+        "flow",
+        "in the shape",
         lambda p: npz(p, {"flow": npy((4, 6, 2), "|S1000000000"), "mask": MASK}),
     ),
     "flow that unpacks to a gigabyte": (
-        "flow", "goes on after its end", lambda p: npz(p, {"flow": VECTORS, "mask": MASK}, BLOCKS)
+        "flow",
+        "goes on after its end",
+        lambda p: npz(p, {"flow": VECTORS, "mask": MASK}, BLOCKS),
     ),
     "flow whose header unpacks to a gigabyte": (
-        "flow", "format version",
+        "flow",
+        "format version",
         lambda p: npz(p, {"flow": b"\x93NUMPY\2\0\xff\xff\xff\xff", "mask": MASK}, BLOCKS),
     ),
     "flow of 100 GB": ("flow", "larger than 1 MiB", lambda p: sparse(p, 10**11, b"PK\3\4")),
-    "cache of a petabyte": ("cache", "no cache", lambda p: npz(
-        p, {"key": KEY, "vectors": npy((10**14, 17), "<f4"), "valid": MASK}
-    )),
-    "cache whose key unpacks to a gigabyte": ("cache", "no cache", lambda p: npz(
-        p, {"key": KEY, "vectors": VECTORS, "valid": MASK}, BLOCKS
-    )),
+    "cache of a petabyte": (
+        "cache",
+        "no cache",
+        lambda p: npz(p, {"key": KEY, "vectors": npy((10**14, 17), "<f4"), "valid": MASK}),
+    ),
+    "cache whose key unpacks to a gigabyte": (
+        "cache",
+        "no cache",
+        lambda p: npz(p, {"key": KEY, "vectors": VECTORS, "valid": MASK}, BLOCKS),
+    ),
     "images of 2³¹ pixels a side": (
-        "images", "100 megapixels", lambda p: png(p / "a.png", 2**31 - 1).parent
+        "images",
+        "100 megapixels",
+        lambda p: png(p / "a.png", 2**31 - 1).parent,
     ),
     "8 images of 99 megapixels whose files end early": (
-        "images", "not a readable image",
+        "images",
+        "not a readable image",
         lambda p: eight_of(png(p / "0.png", 9950, 9000, whole=False)),
     ),
     "8 images of 99 megapixels whose data end early": (
-        "images", "cannot come from files",
+        "images",
+        "cannot come from files",
         lambda p: eight_of(png(p / "0.png", 9950, 800)),
     ),
     "10,000 images of 99 megapixels": (
-        "many images", "cannot come from files", lambda p: png(p, 9950)
+        "many images",
+        "cannot come from files",
+        lambda p: png(p, 9950),
     ),
 }
 
@@ -169,8 +195,11 @@ def verdicts(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any
     script = Path(__file__).with_name("read_hostile.py")
     source = Path(__file__).parents[3] / "src"
     done = subprocess.run(
-        [sys.executable, "-W", "ignore", str(script)], input=json.dumps(listed), text=True,
-        capture_output=True, timeout=MOST_SECONDS,
+        [sys.executable, "-W", "ignore", str(script)],
+        input=json.dumps(listed),
+        text=True,
+        capture_output=True,
+        timeout=MOST_SECONDS,
         env={**os.environ, "PYTHONPATH": str(source), "OMP_NUM_THREADS": "1"},
     )
     assert done.returncode == 0, done.stderr

@@ -106,8 +106,10 @@ ROWS = "static/poses_bounds.npy"
 @pytest.mark.parametrize(
     ("place", "value", "said"),
     [
-        ((slice(None), 15), 1e-300, "farther than"), ((2, 3), 1e30, "farther than"),
-        ((2, 14), 1e30, "focal length"), ((2, 14), 1e-30, "focal length"),
+        ((slice(None), 15), 1e-300, "farther than"),
+        ((2, 3), 1e30, "farther than"),
+        ((2, 14), 1e30, "focal length"),
+        ((2, 14), 1e-30, "focal length"),
         # Not far enough to overflow, too far for a box in normalised device coordinates.
         ((2, 3), 1e8, "too far from the others"),
     ],
@@ -231,9 +233,7 @@ def test_a_home_that_is_not_there() -> None:
     assert refused(lambda: read_blender("~nobody-of-that-name/x")).startswith("data.root: ")
 
 
-def test_a_folder_that_may_not_be_listed(
-    llff_folder: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_that_may_not_be_listed(llff_folder: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     closed, listed = llff_folder.static / "images_4", Path.iterdir
 
     def iterdir(path: Path) -> Any:
@@ -247,9 +247,7 @@ def test_a_folder_that_may_not_be_listed(
     )
 
 
-def test_more_than_fits_into_memory(
-    scene_folder: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_more_than_fits_into_memory(scene_folder: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.rmtree(scene_folder.static)
     monkeypatch.setattr("devrf.scenes.memory._machine_memory", lambda: 2**10)
     images = sorted((scene_folder.dynamic / "train").iterdir())

@@ -52,8 +52,13 @@ class WandbTracker(WandbLogger):
             # Read when wandb is first imported. It reports on itself even when offline.
             os.environ.setdefault("WANDB_ERROR_REPORTING", "false")
         super().__init__(
-            name=name and name[:LONGEST_NAME], save_dir=save_dir, project=project, group=group,
-            tags=list(tags), entity=entity, offline=offline,
+            name=name and name[:LONGEST_NAME],
+            save_dir=save_dir,
+            project=project,
+            group=group,
+            tags=list(tags),
+            entity=entity,
+            offline=offline,
         )
         # Of no use any more; wandb warns when it is given.
         self._wandb_init.pop("anonymous", None)

@@ -23,23 +23,49 @@ LARGEST = 1024
 
 
 def step_in_one_pass(
-    values: Tensor, into: Tensor, gradient: Tensor, mean: Tensor, square: Tensor, rule: AdamRule,
-    *, clear: bool = True, smoothing: float = 0.0, touched_only: bool = False,
+    values: Tensor,
+    into: Tensor,
+    gradient: Tensor,
+    mean: Tensor,
+    square: Tensor,
+    rule: AdamRule,
+    *,
+    clear: bool = True,
+    smoothing: float = 0.0,
+    touched_only: bool = False,
 ) -> None:
     """As devrf.ops.adam_step: adam_step if ``into`` is ``values``, else smooth_adam_step."""
     smooth = into is not values
     length = _row(values) if smooth else values.numel()
     beta1, beta2 = rule.betas
     launch(
-        adam_kernel, _programs(values, length), values,
-        values, into, gradient, mean, square,
-        values if rule.pace is None else rule.pace.contiguous(), rule.rate, rule.step, length,
+        adam_kernel,
+        _programs(values, length),
+        values,
+        values,
+        into,
+        gradient,
+        mean,
+        square,
+        values if rule.pace is None else rule.pace.contiguous(),
+        rule.rate,
+        rule.step,
+        length,
         *(values.shape[:2] if smooth else (1, 1)),
-        1 - beta1, 1 - beta2, -math.log(beta1), -math.log(beta2), rule.eps, smoothing,
-        PACED=rule.pace is not None, SKIP_ZERO=rule.skip_zero, CLEAR=clear, SMOOTH=smooth,
+        1 - beta1,
+        1 - beta2,
+        -math.log(beta1),
+        -math.log(beta2),
+        rule.eps,
+        smoothing,
+        PACED=rule.pace is not None,
+        SKIP_ZERO=rule.skip_zero,
+        CLEAR=clear,
+        SMOOTH=smooth,
         TOUCHED_ONLY=touched_only or rule.skip_zero,
         CHANNELS=values.shape[-1] if smooth or rule.pace is not None else 1,
-        WIDE=_is_wide(values), BLOCK=_block(length),
+        WIDE=_is_wide(values),
+        BLOCK=_block(length),
     )
 
 
@@ -49,9 +75,18 @@ def add_gradient_in_one_pass(
     """As devrf.ops.total_variation.add_total_variation_gradient."""
     length = _row(grid)
     launch(
-        total_variation_kernel, _programs(grid, length), grid,
-        grid, gradient, length, *grid.shape[:2], weight, TOUCHED_ONLY=touched_only,
-        CHANNELS=grid.shape[3], WIDE=_is_wide(grid), BLOCK=_block(length),
+        total_variation_kernel,
+        _programs(grid, length),
+        grid,
+        grid,
+        gradient,
+        length,
+        *grid.shape[:2],
+        weight,
+        TOUCHED_ONLY=touched_only,
+        CHANNELS=grid.shape[3],
+        WIDE=_is_wide(grid),
+        BLOCK=_block(length),
     )
 
 
@@ -110,8 +145,16 @@ def slope_of_variation(values, at, own, here, row, number, length, x, y, CHANNEL
 
 @triton.jit(do_not_specialize=["x", "y"])
 def total_variation_kernel(
-    values, gradient, length, x, y, weight,
-    TOUCHED_ONLY: tl.constexpr, CHANNELS: tl.constexpr, WIDE: tl.constexpr, BLOCK: tl.constexpr,
+    values,
+    gradient,
+    length,
+    x,
+    y,
+    weight,
+    TOUCHED_ONLY: tl.constexpr,
+    CHANNELS: tl.constexpr,
+    WIDE: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):
     """gradient += weight · Σ clamp(v − v', −1, 1)."""
     row, number = piece(length, WIDE, BLOCK)
@@ -127,10 +170,31 @@ def total_variation_kernel(
 
 @triton.jit(do_not_specialize=["x", "y"])
 def adam_kernel(
-    values, into, gradient, mean, square, pace, rate, step, length, x, y,
-    share1, share2, decay1, decay2, eps, smoothing,
-    PACED: tl.constexpr, SKIP_ZERO: tl.constexpr, CLEAR: tl.constexpr, SMOOTH: tl.constexpr,
-    TOUCHED_ONLY: tl.constexpr, CHANNELS: tl.constexpr, WIDE: tl.constexpr, BLOCK: tl.constexpr,
+    values,
+    into,
+    gradient,
+    mean,
+    square,
+    pace,
+    rate,
+    step,
+    length,
+    x,
+    y,
+    share1,
+    share2,
+    decay1,
+    decay2,
+    eps,
+    smoothing,
+    PACED: tl.constexpr,
+    SKIP_ZERO: tl.constexpr,
+    CLEAR: tl.constexpr,
+    SMOOTH: tl.constexpr,
+    TOUCHED_ONLY: tl.constexpr,
+    CHANNELS: tl.constexpr,
+    WIDE: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):
     """One step; share = 1 − β, decay = −log β, so that 1 − βᵗ = opacity(t·decay)."""
     row, number = piece(length, WIDE, BLOCK)

@@ -31,8 +31,16 @@ class Composite(torch.autograd.Function):
         weights, transmittance = torch.zeros_like(depth), torch.zeros_like(depth)
         end = torch.empty(rays, dtype=depth.dtype, device=depth.device)
         launch(
-            composite_kernel, rays, depth,
-            depth, first, weights, transmittance, end, BLOCK=BLOCK, num_warps=1,
+            composite_kernel,
+            rays,
+            depth,
+            depth,
+            first,
+            weights,
+            transmittance,
+            end,
+            BLOCK=BLOCK,
+            num_warps=1,
         )
         ctx.save_for_backward(first, weights, transmittance, end)
         return weights, end
@@ -43,9 +51,18 @@ class Composite(torch.autograd.Function):
         first, weights, transmittance, end = ctx.saved_tensors
         into = torch.zeros_like(weights)
         launch(
-            composite_backward_kernel, len(end), into,
-            first, weights, transmittance, end, weights_gradient.contiguous(),
-            end_gradient.contiguous(), into, BLOCK=BLOCK, num_warps=1,
+            composite_backward_kernel,
+            len(end),
+            into,
+            first,
+            weights,
+            transmittance,
+            end,
+            weights_gradient.contiguous(),
+            end_gradient.contiguous(),
+            into,
+            BLOCK=BLOCK,
+            num_warps=1,
         )
         return into, None
 
@@ -59,9 +76,17 @@ class SumSegments(torch.autograd.Function):
         ctx.save_for_backward(weights, values, first)
         sums = torch.empty(rays, channels, dtype=values.dtype, device=values.device)
         launch(
-            sum_kernel, rays, values,
-            weights, values, first, sums, CHANNELS=channels,
-            PADDED=triton.next_power_of_2(channels), BLOCK=BLOCK, num_warps=1,
+            sum_kernel,
+            rays,
+            values,
+            weights,
+            values,
+            first,
+            sums,
+            CHANNELS=channels,
+            PADDED=triton.next_power_of_2(channels),
+            BLOCK=BLOCK,
+            num_warps=1,
         )
         return sums
 
@@ -72,9 +97,19 @@ class SumSegments(torch.autograd.Function):
         into_weights, into_values = torch.zeros_like(weights), torch.zeros_like(values)
         rays, channels = len(first) - 1, values.shape[1]
         launch(
-            sum_backward_kernel, rays, values,
-            weights, values, first, upstream.contiguous(), into_weights, into_values,
-            CHANNELS=channels, PADDED=triton.next_power_of_2(channels), BLOCK=BLOCK, num_warps=1,
+            sum_backward_kernel,
+            rays,
+            values,
+            weights,
+            values,
+            first,
+            upstream.contiguous(),
+            into_weights,
+            into_values,
+            CHANNELS=channels,
+            PADDED=triton.next_power_of_2(channels),
+            BLOCK=BLOCK,
+            num_warps=1,
         )
         return into_weights, into_values, None
 
@@ -129,8 +164,13 @@ def composite_backward_kernel(
 
 @triton.jit
 def sum_kernel(
-    weights, values, first, sums,
-    CHANNELS: tl.constexpr, PADDED: tl.constexpr, BLOCK: tl.constexpr,
+    weights,
+    values,
+    first,
+    sums,
+    CHANNELS: tl.constexpr,
+    PADDED: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):
     """Σ w_i·c_i along a ray."""
     ray = tl.program_id(0).to(tl.int64)
@@ -144,9 +184,7 @@ def sum_kernel(
         at = start + lane
         here = at < stop
         wanted = here[:, None] & (channel < CHANNELS)[None, :]
-        value = tl.load(
-            values + at[:, None] * CHANNELS + channel[None, :], mask=wanted, other=0.0
-        )
+        value = tl.load(values + at[:, None] * CHANNELS + channel[None, :], mask=wanted, other=0.0)
         weight = tl.load(weights + at, mask=here, other=0.0)
         total += tl.sum(weight[:, None] * value, axis=0)
         start += BLOCK
@@ -155,8 +193,15 @@ def sum_kernel(
 
 @triton.jit
 def sum_backward_kernel(
-    weights, values, first, upstream, into_weights, into_values,
-    CHANNELS: tl.constexpr, PADDED: tl.constexpr, BLOCK: tl.constexpr,
+    weights,
+    values,
+    first,
+    upstream,
+    into_weights,
+    into_values,
+    CHANNELS: tl.constexpr,
+    PADDED: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):
     """g·c to the weights, g·w to the values."""
     ray = tl.program_id(0).to(tl.int64)

@@ -19,7 +19,7 @@ from devrf.ops.kernels.cells import cell, scalar_at
 from devrf.ops.kernels.launch import launch
 from devrf.ops.kernels.numbers import opacity, softplus
 from devrf.ops.kernels.warped_depth import displaced
-from devrf.ops.search import Found, Thresholds
+from devrf.ops.search import PackedSamples, Thresholds
 
 # Samples that a program looks at together: one for each thread of its only warp.
 LANES = 32
@@ -27,11 +27,23 @@ PADDING_BLOCK = 1024
 
 
 def find_samples_on_device(
-    origins: Tensor, directions: Tensor, entry: Tensor, count: Tensor, mask: Tensor,
-    density: Tensor, slices: Sequence[Tensor], weight: float, step: float, longest: int,
-    capacity: int, mask_box: Corners, box: Corners, shift: float, delta: float,
+    origins: Tensor,
+    directions: Tensor,
+    entry: Tensor,
+    count: Tensor,
+    mask: Tensor,
+    density: Tensor,
+    slices: Sequence[Tensor],
+    weight: float,
+    step: float,
+    longest: int,
+    capacity: int,
+    mask_box: Corners,
+    box: Corners,
+    shift: float,
+    delta: float,
     thresholds: Thresholds,
-) -> Found:
+) -> PackedSamples:
     """As devrf.ops.search.find_samples, with nothing that waits for the device."""
     device, rays = origins.device, len(origins)
     origins, directions = origins.contiguous(), directions.contiguous()
@@ -47,29 +59,79 @@ def find_samples_on_device(
     heavy = torch.empty(capacity, dtype=torch.uint8, device=device)
     ends = torch.zeros(rays + 1, dtype=torch.int64, device=device)
     launch(
-        march_kernel, rays, origins,
-        origins, directions, entry, count.contiguous(), mask.contiguous().view(torch.uint8),
-        density, before, after, marks, kept, reached, longest, stride, step, weight, shift, delta,
-        thresholds.alpha, thresholds.weight, thresholds.stop,
-        *mask_box.low, *scales(mask_box, shape_of(mask)),
-        *box.low, *scales(box, shape_of(before)), *scales(box, shape_of(density)),
-        *shape_of(mask), *shape_of(before), *shape_of(density),
-        SLICES=len(slices), LANES=LANES, num_warps=1,
+        march_kernel,
+        rays,
+        origins,
+        origins,
+        directions,
+        entry,
+        count.contiguous(),
+        mask.contiguous().view(torch.uint8),
+        density,
+        before,
+        after,
+        marks,
+        kept,
+        reached,
+        longest,
+        stride,
+        step,
+        weight,
+        shift,
+        delta,
+        thresholds.alpha,
+        thresholds.weight,
+        thresholds.stop,
+        *mask_box.low,
+        *scales(mask_box, shape_of(mask)),
+        *box.low,
+        *scales(box, shape_of(before)),
+        *scales(box, shape_of(density)),
+        *shape_of(mask),
+        *shape_of(before),
+        *shape_of(density),
+        SLICES=len(slices),
+        LANES=LANES,
+        num_warps=1,
     )
     torch.cumsum(kept, 0, out=ends[1:])
     first = ends.clamp(max=capacity)
     launch(
-        list_kernel, rays, origins,
-        origins, directions, entry, marks, reached, first, ray, distance, points, heavy,
-        stride, capacity, step, LANES=LANES, num_warps=1,
+        list_kernel,
+        rays,
+        origins,
+        origins,
+        directions,
+        entry,
+        marks,
+        reached,
+        first,
+        ray,
+        distance,
+        points,
+        heavy,
+        stride,
+        capacity,
+        step,
+        LANES=LANES,
+        num_warps=1,
     )
     launch(
-        pad_kernel, triton.cdiv(capacity, PADDING_BLOCK), origins,
-        first, ray, distance, points, heavy, rays, capacity, BLOCK=PADDING_BLOCK,
+        pad_kernel,
+        triton.cdiv(capacity, PADDING_BLOCK),
+        origins,
+        first,
+        ray,
+        distance,
+        points,
+        heavy,
+        rays,
+        capacity,
+        BLOCK=PADDING_BLOCK,
     )
     total = ends[-1]
     overflow = (total > capacity) | (count > longest).any()
-    return Found(ray, distance, points, heavy.view(torch.bool), first, total, overflow)
+    return PackedSamples(ray, distance, points, heavy.view(torch.bool), first, total, overflow)
 
 
 @triton.jit
@@ -96,18 +158,68 @@ def occupied(mask, cx, cy, cz, x, y, z, here):
     return tl.load(mask + (i * y + j) * z + k, mask=here, other=0) != 0
 
 
-@triton.jit(do_not_specialize=[
-    "longest", "stride", "mask_x", "mask_y", "mask_z", "slice_x", "slice_y", "slice_z",
-    "density_x", "density_y", "density_z",
-])
+@triton.jit(
+    do_not_specialize=[
+        "longest",
+        "stride",
+        "mask_x",
+        "mask_y",
+        "mask_z",
+        "slice_x",
+        "slice_y",
+        "slice_z",
+        "density_x",
+        "density_y",
+        "density_z",
+    ]
+)
 def march_kernel(
-    origins, directions, entry, count, mask, density, before, after, marks, kept, reached,
-    longest, stride, step, weight, shift, delta, alpha_threshold, weight_threshold, stop,
-    mask_low_x, mask_low_y, mask_low_z, mask_scale_x, mask_scale_y, mask_scale_z,
-    low_x, low_y, low_z, slice_scale_x, slice_scale_y, slice_scale_z,
-    density_scale_x, density_scale_y, density_scale_z, mask_x, mask_y, mask_z,
-    slice_x, slice_y, slice_z, density_x, density_y, density_z,
-    SLICES: tl.constexpr, LANES: tl.constexpr,
+    origins,
+    directions,
+    entry,
+    count,
+    mask,
+    density,
+    before,
+    after,
+    marks,
+    kept,
+    reached,
+    longest,
+    stride,
+    step,
+    weight,
+    shift,
+    delta,
+    alpha_threshold,
+    weight_threshold,
+    stop,
+    mask_low_x,
+    mask_low_y,
+    mask_low_z,
+    mask_scale_x,
+    mask_scale_y,
+    mask_scale_z,
+    low_x,
+    low_y,
+    low_z,
+    slice_scale_x,
+    slice_scale_y,
+    slice_scale_z,
+    density_scale_x,
+    density_scale_y,
+    density_scale_z,
+    mask_x,
+    mask_y,
+    mask_z,
+    slice_x,
+    slice_y,
+    slice_z,
+    density_x,
+    density_y,
+    density_z,
+    SLICES: tl.constexpr,
+    LANES: tl.constexpr,
 ):
     """Marks a ray's samples: 0 dropped, 1 kept, 2 heavy; counts them; says how far it looked."""
     ray = tl.program_id(0)
@@ -131,16 +243,33 @@ def march_kernel(
         py = oy + dy * at
         pz = oz + dz * at
         there = occupied(
-            mask, (px - mask_low_x) * mask_scale_x, (py - mask_low_y) * mask_scale_y,
-            (pz - mask_low_z) * mask_scale_z, mask_x, mask_y, mask_z, sample < samples,
+            mask,
+            (px - mask_low_x) * mask_scale_x,
+            (py - mask_low_y) * mask_scale_y,
+            (pz - mask_low_z) * mask_scale_z,
+            mask_x,
+            mask_y,
+            mask_z,
+            sample < samples,
         )
         mark = tl.zeros((LANES,), dtype=tl.uint8)
         if tl.max(there.to(tl.int32), 0) > 0:
             if SLICES > 0:
                 px, py, pz = displaced(
-                    before, after, weight, px, py, pz, (px - low_x) * slice_scale_x,
-                    (py - low_y) * slice_scale_y, (pz - low_z) * slice_scale_z,
-                    slice_x, slice_y, slice_z, there, SLICES,
+                    before,
+                    after,
+                    weight,
+                    px,
+                    py,
+                    pz,
+                    (px - low_x) * slice_scale_x,
+                    (py - low_y) * slice_scale_y,
+                    (pz - low_z) * slice_scale_z,
+                    slice_x,
+                    slice_y,
+                    slice_z,
+                    there,
+                    SLICES,
                 )
             i, fx = cell((px - low_x) * density_scale_x, density_x)
             j, fy = cell((py - low_y) * density_scale_y, density_y)
@@ -165,8 +294,20 @@ def march_kernel(
 
 @triton.jit(do_not_specialize=["stride", "capacity"])
 def list_kernel(
-    origins, directions, entry, marks, reached, first, rays, distances, points, heavy,
-    stride, capacity, step, LANES: tl.constexpr,
+    origins,
+    directions,
+    entry,
+    marks,
+    reached,
+    first,
+    rays,
+    distances,
+    points,
+    heavy,
+    stride,
+    capacity,
+    step,
+    LANES: tl.constexpr,
 ):
     """Writes a ray's marked samples one after another, from ``first`` on."""
     ray = tl.program_id(0)

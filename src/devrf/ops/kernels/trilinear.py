@@ -32,9 +32,17 @@ class Interpolate(torch.autograd.Function):
         out = torch.empty(len(coords), channels, dtype=grid.dtype, device=grid.device)
         padded, block = _tile(channels)
         launch(
-            interpolate_kernel, triton.cdiv(len(coords), block), grid,
-            grid, coords, out, len(coords), *grid.shape[:3],
-            CHANNELS=channels, PADDED=padded, BLOCK=block,
+            interpolate_kernel,
+            triton.cdiv(len(coords), block),
+            grid,
+            grid,
+            coords,
+            out,
+            len(coords),
+            *grid.shape[:3],
+            CHANNELS=channels,
+            PADDED=padded,
+            BLOCK=block,
         )
         return out
 
@@ -51,13 +59,21 @@ class Interpolate(torch.autograd.Function):
         channels = grid.shape[3]
         padded, block = _tile(channels)
         launch(
-            interpolate_backward_kernel, triton.cdiv(len(coords), block), grid,
-            grid, coords, upstream.contiguous(),
+            interpolate_backward_kernel,
+            triton.cdiv(len(coords), block),
+            grid,
+            grid,
+            coords,
+            upstream.contiguous(),
             grid if into is None else into,
             coords if coords_gradient is None else coords_gradient,
-            len(coords), *grid.shape[:3],
-            NEEDS_GRID=needs_grid, NEEDS_COORDS=needs_coords,
-            CHANNELS=channels, PADDED=padded, BLOCK=block,
+            len(coords),
+            *grid.shape[:3],
+            NEEDS_GRID=needs_grid,
+            NEEDS_COORDS=needs_coords,
+            CHANNELS=channels,
+            PADDED=padded,
+            BLOCK=block,
         )
         return into if ctx.gradient is None else None, coords_gradient, None
 
@@ -71,8 +87,16 @@ def _tile(channels: int) -> tuple[int, int]:
 
 @triton.jit(do_not_specialize=["count", "x", "y", "z"])
 def interpolate_kernel(
-    grid, coords, out, count, x, y, z,
-    CHANNELS: tl.constexpr, PADDED: tl.constexpr, BLOCK: tl.constexpr,
+    grid,
+    coords,
+    out,
+    count,
+    x,
+    y,
+    z,
+    CHANNELS: tl.constexpr,
+    PADDED: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):
     """out[m] = Σ_corners weight · grid[corner]."""
     point = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -95,9 +119,20 @@ def interpolate_kernel(
 
 @triton.jit(do_not_specialize=["count", "x", "y", "z"])
 def interpolate_backward_kernel(
-    grid, coords, upstream, grid_gradient, coords_gradient, count, x, y, z,
-    NEEDS_GRID: tl.constexpr, NEEDS_COORDS: tl.constexpr,
-    CHANNELS: tl.constexpr, PADDED: tl.constexpr, BLOCK: tl.constexpr,
+    grid,
+    coords,
+    upstream,
+    grid_gradient,
+    coords_gradient,
+    count,
+    x,
+    y,
+    z,
+    NEEDS_GRID: tl.constexpr,
+    NEEDS_COORDS: tl.constexpr,
+    CHANNELS: tl.constexpr,
+    PADDED: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):
     """Scatter weight · upstream to the corners; slopes along the axes to the coordinates."""
     point = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -126,8 +161,10 @@ def interpolate_backward_kernel(
         place = row[:, None] * CHANNELS + channel[None, :]
         if NEEDS_GRID:
             tl.atomic_add(
-                grid_gradient + place, (wx * wy * wz)[:, None] * change,
-                mask=changed, sem="relaxed",
+                grid_gradient + place,
+                (wx * wy * wz)[:, None] * change,
+                mask=changed,
+                sem="relaxed",
             )
         if NEEDS_COORDS:
             value = tl.load(grid + place, mask=wanted, other=0.0)

@@ -24,8 +24,14 @@ BLOCK = 128
 
 
 def warped_depth_in_one_pass(
-    points: Tensor, density: Tensor, slices: Sequence[Tensor], weight: float, box: Corners,
-    shift: float, delta: float, density_gradient: Tensor | None,
+    points: Tensor,
+    density: Tensor,
+    slices: Sequence[Tensor],
+    weight: float,
+    box: Corners,
+    shift: float,
+    delta: float,
+    density_gradient: Tensor | None,
     slice_gradients: Sequence[Tensor | None],
 ) -> tuple[Tensor, Tensor]:
     """As devrf.ops.warped_depth.warped_depth; a gradient buffer for each slice, or None."""
@@ -34,9 +40,14 @@ def warped_depth_in_one_pass(
     before, after = (frame.contiguous() for frame in ([*slices, density, density])[:2])
     buffers = (density_gradient, *([*slice_gradients, None, None])[:2])
     numbers = (
-        weight, shift, delta, *box.low,
-        *scales(box, shape_of(before)), *scales(box, shape_of(density)),
-        *shape_of(before), *shape_of(density),
+        weight,
+        shift,
+        delta,
+        *box.low,
+        *scales(box, shape_of(before)),
+        *scales(box, shape_of(density)),
+        *shape_of(before),
+        *shape_of(density),
     )
     q, tau = WarpedDepth.apply(
         points.detach().contiguous(), density, before, after, len(slices), numbers, buffers
@@ -49,16 +60,32 @@ class WarpedDepth(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, points: Tensor, density: Tensor, before: Tensor, after: Tensor, slices: int,
-        numbers: tuple[float, ...], buffers: tuple[Tensor | None, ...],
+        ctx: Any,
+        points: Tensor,
+        density: Tensor,
+        before: Tensor,
+        after: Tensor,
+        slices: int,
+        numbers: tuple[float, ...],
+        buffers: tuple[Tensor | None, ...],
     ) -> tuple[Tensor, Tensor]:
         count = len(points)
         warped = torch.empty_like(points)
         tau = torch.empty(count, dtype=points.dtype, device=points.device)
         launch(
-            warped_depth_kernel, triton.cdiv(count, BLOCK), points,
-            points, density, before, after, warped, tau, count, *numbers,
-            SLICES=slices, BLOCK=BLOCK,
+            warped_depth_kernel,
+            triton.cdiv(count, BLOCK),
+            points,
+            points,
+            density,
+            before,
+            after,
+            warped,
+            tau,
+            count,
+            *numbers,
+            SLICES=slices,
+            BLOCK=BLOCK,
         )
         ctx.save_for_backward(points, density, before, after, warped)
         ctx.slices, ctx.numbers, ctx.buffers = slices, numbers, buffers
@@ -85,11 +112,22 @@ class WarpedDepth(torch.autograd.Function):
             for grid, need, buffer, fresh in zip(grids, needs, ctx.buffers, own, strict=True)
         ]
         launch(
-            warped_depth_backward_kernel, triton.cdiv(len(points), BLOCK), points,
-            points, density, warped, warped_gradient.contiguous(), tau_gradient.contiguous(),
-            *into, len(points), *ctx.numbers,
-            NEEDS_DENSITY=needs[0], NEEDS_BEFORE=needs[1], NEEDS_AFTER=needs[2],
-            TWO=ctx.slices > 1, BLOCK=BLOCK,
+            warped_depth_backward_kernel,
+            triton.cdiv(len(points), BLOCK),
+            points,
+            points,
+            density,
+            warped,
+            warped_gradient.contiguous(),
+            tau_gradient.contiguous(),
+            *into,
+            len(points),
+            *ctx.numbers,
+            NEEDS_DENSITY=needs[0],
+            NEEDS_BEFORE=needs[1],
+            NEEDS_AFTER=needs[2],
+            TWO=ctx.slices > 1,
+            BLOCK=BLOCK,
         )
         return None, *own, None, None, None
 
@@ -121,11 +159,33 @@ _SIZES = ["count", "slice_x", "slice_y", "slice_z", "density_x", "density_y", "d
 
 @triton.jit(do_not_specialize=_SIZES)
 def warped_depth_kernel(
-    points, density, before, after, warped, tau, count, weight, shift, delta,
-    low_x, low_y, low_z, slice_scale_x, slice_scale_y, slice_scale_z,
-    density_scale_x, density_scale_y, density_scale_z,
-    slice_x, slice_y, slice_z, density_x, density_y, density_z,
-    SLICES: tl.constexpr, BLOCK: tl.constexpr,
+    points,
+    density,
+    before,
+    after,
+    warped,
+    tau,
+    count,
+    weight,
+    shift,
+    delta,
+    low_x,
+    low_y,
+    low_z,
+    slice_scale_x,
+    slice_scale_y,
+    slice_scale_z,
+    density_scale_x,
+    density_scale_y,
+    density_scale_z,
+    slice_x,
+    slice_y,
+    slice_z,
+    density_x,
+    density_y,
+    density_z,
+    SLICES: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):
     """q = x + Δ(x), τ = softplus(v(q) + b)·δ."""
     point = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -136,9 +196,20 @@ def warped_depth_kernel(
     qz = tl.load(points + at + 2, mask=here, other=0.0)
     if SLICES > 0:
         qx, qy, qz = displaced(
-            before, after, weight, qx, qy, qz,
-            (qx - low_x) * slice_scale_x, (qy - low_y) * slice_scale_y,
-            (qz - low_z) * slice_scale_z, slice_x, slice_y, slice_z, here, SLICES,
+            before,
+            after,
+            weight,
+            qx,
+            qy,
+            qz,
+            (qx - low_x) * slice_scale_x,
+            (qy - low_y) * slice_scale_y,
+            (qz - low_z) * slice_scale_z,
+            slice_x,
+            slice_y,
+            slice_z,
+            here,
+            SLICES,
         )
     tl.store(warped + at, qx, mask=here)
     tl.store(warped + at + 1, qy, mask=here)
@@ -152,13 +223,38 @@ def warped_depth_kernel(
 
 @triton.jit(do_not_specialize=_SIZES)
 def warped_depth_backward_kernel(
-    points, density, warped, warped_gradient, tau_gradient,
-    density_into, before_into, after_into, count, weight, shift, delta,
-    low_x, low_y, low_z, slice_scale_x, slice_scale_y, slice_scale_z,
-    density_scale_x, density_scale_y, density_scale_z,
-    slice_x, slice_y, slice_z, density_x, density_y, density_z,
-    NEEDS_DENSITY: tl.constexpr, NEEDS_BEFORE: tl.constexpr, NEEDS_AFTER: tl.constexpr,
-    TWO: tl.constexpr, BLOCK: tl.constexpr,
+    points,
+    density,
+    warped,
+    warped_gradient,
+    tau_gradient,
+    density_into,
+    before_into,
+    after_into,
+    count,
+    weight,
+    shift,
+    delta,
+    low_x,
+    low_y,
+    low_z,
+    slice_scale_x,
+    slice_scale_y,
+    slice_scale_z,
+    density_scale_x,
+    density_scale_y,
+    density_scale_z,
+    slice_x,
+    slice_y,
+    slice_z,
+    density_x,
+    density_y,
+    density_z,
+    NEEDS_DENSITY: tl.constexpr,
+    NEEDS_BEFORE: tl.constexpr,
+    NEEDS_AFTER: tl.constexpr,
+    TWO: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):
     """Gradients of q and τ, scattered to the density grid and to the slices."""
     point = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -195,13 +291,31 @@ def warped_depth_backward_kernel(
         if NEEDS_BEFORE:
             own = 1.0 - weight if TWO else 1.0
             scatter_displacement(
-                before_into, px, py, pz, gx * own, gy * own, gz * own,
-                slice_x, slice_y, slice_z, here,
+                before_into,
+                px,
+                py,
+                pz,
+                gx * own,
+                gy * own,
+                gz * own,
+                slice_x,
+                slice_y,
+                slice_z,
+                here,
             )
         if NEEDS_AFTER:
             scatter_displacement(
-                after_into, px, py, pz, gx * weight, gy * weight, gz * weight,
-                slice_x, slice_y, slice_z, here,
+                after_into,
+                px,
+                py,
+                pz,
+                gx * weight,
+                gy * weight,
+                gz * weight,
+                slice_x,
+                slice_y,
+                slice_z,
+                here,
             )
 
 

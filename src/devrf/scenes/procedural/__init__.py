@@ -9,6 +9,12 @@ from devrf.scenes.procedural.shape import Material, Shape
 from devrf.scenes.procedural.truth import moved
 
 __all__ = [
-    "Flower", "Material", "Plush", "ProceduralForwardScene", "ProceduralScene", "Robot", "Shape",
+    "Flower",
+    "Material",
+    "Plush",
+    "ProceduralForwardScene",
+    "ProceduralScene",
+    "Robot",
+    "Shape",
     "moved",
 ]

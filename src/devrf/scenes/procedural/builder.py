@@ -64,8 +64,11 @@ class ProceduralScene:
         shape = self.model()
         where = extent(shape)
         static_train, static_test = static_rig(
-            self.static_views, self.static_test_views,
-            width=self.width, height=self.height, reach=where.reach,
+            self.static_views,
+            self.static_test_views,
+            width=self.width,
+            height=self.height,
+            reach=where.reach,
         )
         dynamic_train, dynamic_test = dynamic_rig(
             self.train_views, width=self.width, height=self.height, reach=where.reach

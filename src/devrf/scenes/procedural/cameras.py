@@ -44,9 +44,7 @@ def static_rig(
     return cameras[~mask], cameras[mask]
 
 
-def dynamic_rig(
-    train: int, *, width: int, height: int, reach: float
-) -> tuple[Cameras, Cameras]:
+def dynamic_rig(train: int, *, width: int, height: int, reach: float) -> tuple[Cameras, Cameras]:
     """``train`` fixed cameras all around, and one held out between the first two of them."""
     step = 2 * math.pi / train
     index = torch.arange(train, dtype=torch.float64)

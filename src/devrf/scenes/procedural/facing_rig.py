@@ -32,11 +32,16 @@ def static_rig(count: int, *, width: int, height: int) -> Cameras:
     index = torch.arange(count, dtype=torch.float64)
     radius = ((index + 0.5) / count).sqrt()
     angle = math.pi * (3 - math.sqrt(5)) * index
-    poses = _facing(torch.stack([
-        _STATIC[0] * radius * angle.cos(),
-        _STATIC[1] * radius * angle.sin(),
-        _UNEVEN * (2.0 * index).sin(),
-    ], dim=-1))
+    poses = _facing(
+        torch.stack(
+            [
+                _STATIC[0] * radius * angle.cos(),
+                _STATIC[1] * radius * angle.sin(),
+                _UNEVEN * (2.0 * index).sin(),
+            ],
+            dim=-1,
+        )
+    )
     return _cameras(recentred(poses), width, height)
 
 

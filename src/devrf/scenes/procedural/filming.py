@@ -81,8 +81,13 @@ class Filming:
     def pictures(self, cameras: Cameras, time: float) -> Pictures:
         """One image from each of N ``cameras`` at ``time``."""
         return render(
-            self.shape, cameras, time, reach=self.reach, supersample=self.supersample,
-            light=self.light, steps=self.steps,
+            self.shape,
+            cameras,
+            time,
+            reach=self.reach,
+            supersample=self.supersample,
+            light=self.light,
+            steps=self.steps,
         )
 
 

@@ -146,8 +146,12 @@ class Flower:
     def _distances(self, points: Tensor, unbent: Tensor, time: float) -> Tensor:
         """(kinds, M) safe distances: pot, stem, heart, the leaves, the whorls."""
         pot = rounded_cylinder(
-            points[:, 0], points[:, 1], points[:, 2] - parts.POT_CENTER,
-            parts.POT_RADIUS, parts.POT_HALF_HEIGHT, parts.POT_ROUNDING,
+            points[:, 0],
+            points[:, 1],
+            points[:, 2] - parts.POT_CENTER,
+            parts.POT_RADIUS,
+            parts.POT_HALF_HEIGHT,
+            parts.POT_ROUNDING,
         )
         x, y, z = unbent.unbind(-1)
         r, length = parts.STEM_RADIUS, (parts.HEAD - parts.BASE) / 2
@@ -156,10 +160,16 @@ class Flower:
         leaves = []
         for leaf, (axes, origin) in zip(LEAVES, self._leaf_frames, strict=True):
             u, v, w = ((unbent - origin.to(unbent)) @ axes.to(unbent)).unbind(-1)
-            leaves.append(blade(
-                u - leaf.half_length, v, w, leaf.half_length, leaf.half_width,
-                parts.LEAF_THICKNESS,
-            ))
+            leaves.append(
+                blade(
+                    u - leaf.half_length,
+                    v,
+                    w,
+                    leaf.half_length,
+                    leaf.half_width,
+                    parts.LEAF_THICKNESS,
+                )
+            )
         opening = self._opening(time)
         petals = [whorl.distance(unbent, opening) for whorl in self._whorls]
         bending = torch.stack([stem, heart, *leaves, *petals])
@@ -186,9 +196,7 @@ def _leaf_frame(leaf: parts.Leaf) -> tuple[Tensor, Tensor]:
     return axes, torch.tensor([0, 0, leaf.height], dtype=torch.float64)
 
 
-def _paints(
-    leaves: tuple[tuple[Tensor, Tensor], ...], whorls: list[PetalWhorl]
-) -> PaintedParts:
+def _paints(leaves: tuple[tuple[Tensor, Tensor], ...], whorls: list[PetalWhorl]) -> PaintedParts:
     """The paints of all parts in the order of their numbers."""
     upright = torch.eye(3, dtype=torch.float64)
     middle = (parts.HEAD + parts.BASE) / 2

@@ -79,12 +79,22 @@ BLUE: Rgb = (0.13, 0.35, 0.62)
 
 # A petal's paint starts at its hinge: cos is 1 there, so that the accent glows at the heart.
 OUTER = Whorl(
-    count=8, hinge=0.10, elevation=0.62, opening=0.8, half_length=0.3, half_width=0.145,
+    count=8,
+    hinge=0.10,
+    elevation=0.62,
+    opening=0.8,
+    half_length=0.3,
+    half_width=0.145,
     thickness=0.022,
     paints=(Paint(MAGENTA, ROSE, (0.3, 0, 0), 0.1, 5), Paint(VIOLET, LILAC, (0.3, 0, 0), 0.1, 5)),
 )
 INNER = Whorl(
-    count=6, hinge=0.07, elevation=1.05, opening=0.5, half_length=0.19, half_width=0.095,
+    count=6,
+    hinge=0.07,
+    elevation=1.05,
+    opening=0.5,
+    half_length=0.19,
+    half_width=0.095,
     thickness=0.02,
     paints=(Paint(AMBER, CREAM, (0.34, 0, 0), 0.2, 4), Paint(GOLD, CREAM, (0.34, 0, 0), 0.2, 4)),
 )

@@ -72,9 +72,7 @@ class ProceduralForwardScene:
         return OnStage(Plush(float(self.speed)))
 
     def _rendered(self) -> Scene:
-        filming = Filming(
-            self.model(), _REACH, self.supersample, self.light, steps=_STEPS
-        )
+        filming = Filming(self.model(), _REACH, self.supersample, self.light, steps=_STEPS)
         size = {"width": self.width, "height": self.height}
         # Of each eight views seven are learned from.
         held_out = -(-self.static_views // (HOLDOUT - 1))

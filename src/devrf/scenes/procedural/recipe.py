@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from devrf.scenes.validation import MIN_SIDE, number, problem
+from devrf.scenes.validation import MIN_SIDE, number, scene_error
 
 _LARGEST_SIDE = 4096
 _MOST = 10_000
@@ -30,12 +30,12 @@ def check_recipe(recipe: object, *, fastest: float) -> None:
             continue
         value = getattr(recipe, key)
         if isinstance(value, bool) or not isinstance(value, int):
-            raise problem(f"data.{key}", f"must be a whole number, not {value!r}")
+            raise scene_error(f"data.{key}", f"must be a whole number, not {value!r}")
         if not least <= value <= most:
             bound = f"at least {least}" if value < least else f"at most {most}"
-            raise problem(f"data.{key}", f"must be {bound}, not {value}")
+            raise scene_error(f"data.{key}", f"must be {bound}, not {value}")
     for key, highest in (("speed", fastest), ("light", 1.0)):
         given = getattr(recipe, key)
         amount = number(given)
         if amount is None or not 0 <= amount <= highest:
-            raise problem(f"data.{key}", f"must be a number in 0 … {highest:g}, not {given!r}")
+            raise scene_error(f"data.{key}", f"must be a number in 0 … {highest:g}, not {given!r}")

@@ -129,9 +129,19 @@ SOLIDS = (
     *_BODY,
     *_HEAD,
     *_arm(1, "left", Paint(YELLOW, RED, (0.2, 0, 0)), Paint(SKY, NAVY, (0.22, 0, 0)), _plain(RED)),
-    *_arm(-1, "right", Paint(CREAM, GREEN, (0.2, 0, 0)), Paint(PINK, PURPLE, (0.22, 0, 0)),
-          _plain(GREEN)),
+    *_arm(
+        -1,
+        "right",
+        Paint(CREAM, GREEN, (0.2, 0, 0)),
+        Paint(PINK, PURPLE, (0.22, 0, 0)),
+        _plain(GREEN),
+    ),
     *_leg(1, "", "", Paint(SKY, TEAL, (0, 0, 0.22)), Paint(ORANGE, RED, (0, 0.3, 0))),
-    *_leg(-1, "right hip", "right knee", Paint(LIME, GREEN, (0, 0, 0.22)),
-          Paint(YELLOW, PURPLE, (0, 0.3, 0))),
+    *_leg(
+        -1,
+        "right hip",
+        "right knee",
+        Paint(LIME, GREEN, (0, 0, 0.22)),
+        Paint(YELLOW, PURPLE, (0, 0.3, 0)),
+    ),
 )

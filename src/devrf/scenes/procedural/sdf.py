@@ -31,9 +31,7 @@ def rounded_box(
 
     A rounding equal to the two smaller half edges makes a capsule, to all three a ball.
     """
-    qx, qy, qz = (
-        c.abs() - (h - rounding) for c, h in zip((x, y, z), half, strict=True)
-    )
+    qx, qy, qz = (c.abs() - (h - rounding) for c, h in zip((x, y, z), half, strict=True))
     px, py, pz = qx.clamp_min(0), qy.clamp_min(0), qz.clamp_min(0)
     outside = (px * px + py * py + pz * pz).sqrt()
     inside = torch.maximum(torch.maximum(qx, qy), qz).clamp_max(0)

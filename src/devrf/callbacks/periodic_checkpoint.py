@@ -1,0 +1,121 @@
+"""Writes down, now and then, all that it takes to go on exactly."""
+
+from __future__ import annotations
+
+import logging
+import time
+from itertools import takewhile
+from pathlib import Path
+from typing import Any
+
+from lightning import Callback, LightningModule, Trainer
+
+from devrf.callbacks.divergence_guard import DivergenceGuard
+from devrf.checkpoints.checkpoint import save_checkpoint
+from devrf.checkpoints.progress import progress_file, progress_files
+from devrf.engine.stage import ScheduledStage
+from devrf.errors import DevrfError
+
+log = logging.getLogger(__name__)
+
+
+class PeriodicCheckpoint(Callback):
+    """Keeps a stage's last progress files; stops the stage, saved, when it is asked to.
+
+    A file that cannot be written (a full disk) does not end the training: the ones before it
+    stay, a line says so, and the next one is tried when it is due.
+
+    Attributes:
+        saved: the iteration of the last file written or gone on from; None before the first.
+    """
+
+    KEPT = 2
+
+    def __init__(
+        self, folder: str | Path = "checkpoints", every_seconds: float = 120.0, share: float = 0.05
+    ) -> None:
+        """Say where and how often.
+
+        Args:
+            folder: gets ``<stage>-progress-<iteration>.ckpt``, the last two of them.
+            every_seconds: between files.
+            share: the most of the time, 0 to 1, that writing may take: large files are written
+                less often.
+        """
+        if every_seconds < 0 or not 0 < share <= 1:
+            raise DevrfError(
+                "callbacks.saving: expected every_seconds of 0 or more and a share above 0, at "
+                f"most 1, not {every_seconds} and {share}"
+            )
+        self.folder = Path(folder)
+        self.every_seconds = every_seconds
+        self.share = share
+        self.saved: int | None = None
+        self._asked = False
+        self._failing = False
+        self._due = 0.0
+
+    def ask_to_stop(self) -> None:
+        """End the training after the present Lightning step, with a progress file written."""
+        self._asked = True
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start the clock, and forget half-written files of a process that was killed."""
+        assert isinstance(pl_module, ScheduledStage)
+        self._failing = False
+        self.saved = pl_module.iteration or None
+        self._due = time.monotonic() + self.every_seconds
+        if trainer.is_global_zero:
+            for path in self.folder.glob(f".partial-{pl_module.name}*.ckpt"):
+                path.unlink(missing_ok=True)
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Write a file when it is time, or the last chance; stop if somebody asked."""
+        assert isinstance(pl_module, ScheduledStage)
+        asked, due = self._asked, time.monotonic() >= self._due
+        if trainer.world_size > 1:  # what one process is asked, all must do
+            agreed = trainer.strategy.reduce_boolean_decision
+            asked, due = agreed(asked, all=False), agreed(due and trainer.is_global_zero, all=False)
+        if pl_module.iteration >= pl_module.total_iterations:
+            return  # the stage is done: its checkpoint is next
+        # This step's line of the curves, if it has one, is only written after this: a file
+        # written now would make a run that is killed in between go on without it.
+        every: int = trainer.log_every_n_steps  # type: ignore[attr-defined]
+        logged_next = every > 1 and (batch_idx + 1) % every == 0
+        last = trainer.should_stop or 0 < trainer.max_steps <= trainer.global_step
+        if asked or last or due and not logged_next:
+            callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
+            for one in callbacks:
+                if isinstance(one, DivergenceGuard):
+                    one.look(pl_module)  # what has gone wrong is not worth going on from
+            if trainer.is_global_zero:
+                self._write(trainer, pl_module)
+        if asked:
+            self._asked, trainer.should_stop = False, True
+
+    def _write(self, trainer: Trainer, stage: ScheduledStage) -> None:
+        began, path = time.monotonic(), progress_file(self.folder, stage.name, stage.iteration)
+        try:
+            save_checkpoint(trainer, path, weights_only=False)
+        except OSError as error:
+            if not self._failing:
+                good = "there is none yet" if self.saved is None else f"iteration {self.saved}"
+                log.warning(
+                    "%s: %s; training goes on, the last good progress file stays (%s)",
+                    path,
+                    error.strerror,
+                    good,
+                )
+            self._failing = True
+        else:
+            self.saved, self._failing = stage.iteration, False
+            files = progress_files(self.folder, stage.name)
+            # Those further on are of a course that was taken back.
+            ahead = list(takewhile(lambda file: file != path, files))
+            for old in [*ahead, *files[len(ahead) + self.KEPT :]]:
+                old.unlink(missing_ok=True)
+        now = time.monotonic()
+        rest = (now - began) * (1 / self.share - 1)
+        self._due = now + max(self.every_seconds, rest)

@@ -1,0 +1,50 @@
+"""Ends a stage between two steps when a signal asks for it."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable
+from contextlib import ExitStack
+
+from lightning import Callback, LightningModule, Trainer
+
+from devrf.callbacks.periodic_checkpoint import PeriodicCheckpoint
+from devrf.system.signals import Interrupted, answered_by
+
+
+class StopOnSignal(Callback):
+    """Lets the first signal stop the stage, saved; after it Ctrl-C ends the run at once.
+
+    Launchers may send theirs more than once: those change nothing any more.
+
+    As a context it answers signals within its block; as a callback it takes them back from
+    Lightning, whose own handler would end the run between two steps with nothing written.
+
+    Attributes:
+        number: the signal that asked; None if none did.
+    """
+
+    def __init__(self, saving: PeriodicCheckpoint) -> None:
+        self.number: int | None = None
+        self._saving = saving
+        self._block = ExitStack()
+        self._take: Callable[[], None] | None = None
+
+    def __enter__(self) -> StopOnSignal:
+        self._take = self._block.enter_context(answered_by(self._answer))
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._block.close()
+
+    def _answer(self, number: int) -> None:
+        if self.number is None:
+            self.number = number
+            self._saving.ask_to_stop()
+        elif number == signal.SIGINT:
+            raise Interrupted(number, "ended at once; run the same command again to go on")
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Take the signals back from Lightning."""
+        if self._take is not None:
+            self._take()

@@ -1,0 +1,94 @@
+"""Grids at rest: in half precision, and in full detail only where something ever is.
+
+Most of a field's voxels lie in empty space. What a grid says there is not seen, but it is not
+without meaning: a deformation field has to lead points of empty space to empty space, also
+between frames. So a smooth grid is kept twice: thinned out everywhere, in detail near matter.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from devrf.checkpoints.bits import pack_bits, unpack_bits
+from devrf.methods.devrf.voxel_grid import resample
+
+# Grid points of the detailed grid to one of the thinned-out grid.
+THINNING = 4
+
+# Packing makes grids smaller by this factor at most, whatever is in them: whoever claims more
+# wants memory.
+MOST = 1000
+
+Packed = dict[str, Any]
+
+
+def pack(grids: Tensor, keep: Tensor, *, smooth: bool) -> Packed:
+    """Store grids in about 2·C bytes a kept voxel.
+
+    Args:
+        grids: (N, X, Y, Z, C) of finite values.
+        keep: (N, X, Y, Z) bool, where detail is kept; (1, X, Y, Z) serves all N.
+        smooth: what stands elsewhere: True, a trilinear interpolation of every fourth grid
+            point; False, each channel's mean over the voxels that are left out.
+
+    Returns:
+        Tensors and numbers by name, for :func:`unpack`.
+
+    Raises:
+        ValueError: a value that half precision cannot hold.
+    """
+    if float(grids.abs().amax()) > torch.finfo(torch.float16).max:
+        raise ValueError("a value of the grids is too large for half precision")
+    thin = _thinned(grids.shape[1:4])
+    kept, elsewhere = [], []
+    for n, grid in enumerate(grids):
+        here = keep[min(n, len(keep) - 1)]
+        kept.append(grid[here].half())
+        if smooth:
+            elsewhere.append(resample(grid, thin).half())
+        else:
+            left_out = grid[~here]
+            mean = left_out.mean(dim=0) if len(left_out) else grid.new_zeros(grid.shape[-1])
+            elsewhere.append(mean.half())
+    return {
+        "shape": list(grids.shape[1:4]),
+        "keep": torch.stack([pack_bits(one) for one in keep]),
+        "kept": torch.cat(kept),
+        "elsewhere": torch.stack(elsewhere),
+    }
+
+
+def unpack(packed: Packed) -> Tensor:
+    """The grids (N, X, Y, Z, C) in single precision that :func:`pack` stored.
+
+    Raises:
+        ValueError: the parts do not fit together.
+    """
+    x, y, z = (int(points) for points in packed["shape"])
+    shape = (x, y, z)
+    elsewhere, kept = packed["elsewhere"].float(), packed["kept"]
+    stored = sum(packed[name].nbytes for name in ("keep", "kept", "elsewhere"))
+    if 4 * len(elsewhere) * elsewhere.shape[-1] * x * y * z > MOST * stored:
+        raise ValueError("the stored grids claim to be larger than they can be")
+    keep = [unpack_bits(bits, shape) for bits in packed["keep"]]
+    counts = [int(one.sum()) for one in keep]
+    if len(keep) == 1:
+        keep, counts = keep * len(elsewhere), counts * len(elsewhere)
+    if len(keep) != len(elsewhere) or sum(counts) != len(kept):
+        raise ValueError("the stored grids are not as long as they should be")
+    grids: Tensor = elsewhere.new_empty(len(elsewhere), *shape, elsewhere.shape[-1])
+    values = kept.split(counts)
+    for grid, rest, here, detail in zip(grids, elsewhere, keep, values, strict=True):
+        grid.copy_(rest if rest.ndim == 1 else resample(rest, shape))
+        grid[here] = detail.float()
+    return grids
+
+
+def _thinned(shape: Sequence[int]) -> tuple[int, int, int]:
+    x, y, z = (max(2, math.ceil((points - 1) / THINNING) + 1) for points in shape)
+    return x, y, z

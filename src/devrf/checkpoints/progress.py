@@ -1,0 +1,74 @@
+"""What it takes to go on exactly where a stage was left, and where that is kept.
+
+How a run survives being killed, from end to end:
+
+* ``callbacks.PeriodicCheckpoint`` writes a progress file every so often, between two
+  Lightning steps, and when it is asked to stop. It is a Lightning checkpoint: the fields at
+  their present resolution (state_dict), the optimiser (moments, step counts, rates, which
+  entries it skips), Lightning's loop (so that curves go on in step), and what the callbacks
+  remember (seconds, memory).
+* ``ScheduledStage.on_save_checkpoint`` adds the rest: the iteration, the phase that the grids
+  are ready for, every random state, and what the phase has at hand that the
+  schedule alone does not tell (:meth:`ScheduledStage.phase_state`): the pixels to draw from, and
+  the visited frames' occupancy as it is now, as bits.
+* ``checkpoints.checkpoint_file`` writes it whole or not at all, with a checksum.
+* ``Trainer.fit(ckpt_path=…)`` reads it. The stage is set up as at its beginning and takes its
+  fields' shapes from the file; the optimiser is given the grids, then its state; the random
+  states are set last, when nothing but the next iteration can draw from them.
+* ``cli.resume`` finds the file, and checks that it was made with the settings of today.
+
+A finished stage leaves one checkpoint without any of this, and its progress files go.
+"""
+
+from __future__ import annotations
+
+import random
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+
+def progress_file(folder: Path, stage: str, iteration: int) -> Path:
+    """Where the progress of a stage at an iteration is kept."""
+    return folder / f"{stage}-progress-{iteration}.ckpt"
+
+
+def progress_files(folder: Path, stage: str) -> list[Path]:
+    """The progress files of a stage, the furthest first."""
+    found = {
+        int(match.group(1)): path
+        for path in folder.glob(f"{stage}-progress-*.ckpt")
+        if (match := re.fullmatch(rf"{stage}-progress-(\d+)\.ckpt", path.name))
+    }
+    return [found[iteration] for iteration in sorted(found, reverse=True)]
+
+
+def rng_state(device: torch.device) -> dict[str, Any]:
+    """The state of everything that a run on ``device`` draws random numbers from, as plain data."""
+    version, words, gauss = random.getstate()
+    numpy = np.random.get_state(legacy=False)
+    assert isinstance(numpy, dict)
+    key = torch.from_numpy(numpy["state"]["key"].astype(np.int64))
+    states: dict[str, Any] = {
+        "python": [version, list(words), gauss],
+        "numpy": {**numpy, "state": {"key": key, "pos": int(numpy["state"]["pos"])}},
+        "torch": torch.get_rng_state(),
+    }
+    if device.type == "cuda":
+        states["cuda"] = torch.cuda.get_rng_state(device)
+    return states
+
+
+def set_rng_state(states: dict[str, Any], device: torch.device) -> None:
+    """Draw on from where :func:`rng_state` was asked."""
+    version, words, gauss = states["python"]
+    random.setstate((version, tuple(words), gauss))
+    numpy = states["numpy"]
+    key = numpy["state"]["key"].numpy().astype(np.uint32)
+    np.random.set_state({**numpy, "state": {**numpy["state"], "key": key}})
+    torch.set_rng_state(states["torch"])
+    if device.type == "cuda" and "cuda" in states:
+        torch.cuda.set_rng_state(states["cuda"], device)

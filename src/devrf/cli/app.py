@@ -1,0 +1,51 @@
+"""The door: composes the config, checks it, and runs the asked stage."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from devrf.cli import job
+from devrf.cli.config import config_folder, register_resolvers
+from devrf.cli.config_check import check_config
+from devrf.cli.messages import report_user_errors
+from devrf.cli.run_folder import nothing_left_of_mistakes
+from devrf.cli.run_lock import alone_in
+from devrf.cli.sweep import forget_failure, run_job
+
+register_resolvers()
+
+
+def run(config: DictConfig) -> float | None:
+    """Run ``stage=…`` in the folder that Hydra made for it; return the objective, if measured."""
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    if job.in_sweep():
+        return run_job(lambda: _job(config, folder), config, folder)
+    with (
+        report_user_errors(),
+        alone_in(folder, config, "hydra.run.dir"),
+        nothing_left_of_mistakes(folder),
+    ):
+        value = _checked(config, folder)
+        forget_failure(folder)
+        return value
+
+
+def _job(config: DictConfig, folder: Path) -> float | None:
+    with alone_in(folder, config, "hydra.sweep.dir"):
+        return _checked(config, folder)
+
+
+def _checked(config: DictConfig, folder: Path) -> float | None:
+    check_config(config)
+    # Imported here: --help and a misspelt key are answered before torch has loaded.
+    from devrf.cli.steps import run_stage
+
+    return run_stage(config, folder)
+
+
+# Kept apart from `run`, which other processes find by its name.
+main = hydra.main(config_path=str(config_folder()), config_name="config", version_base="1.3")(run)

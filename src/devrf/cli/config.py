@@ -1,0 +1,74 @@
+"""Where the configuration lives, and the words it may use (OmegaConf resolvers)."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+from devrf.reporting.write import ReportSettings
+
+
+def config_folder() -> Path:
+    """The folder ``conf/``: inside an installed package, else beside ``src/`` in a checkout."""
+    installed = Path(__file__).parents[1] / "conf"
+    return installed if installed.is_dir() else Path(__file__).resolve().parents[3] / "conf"
+
+
+def scene_name(data: Any) -> str:
+    """The scene's short name, told from its data config alone: for folders and tables.
+
+    The name that was given, else the embedded scene's shape, else the folder's name.
+    """
+    from omegaconf import OmegaConf
+
+    if OmegaConf.is_missing(data, "root"):
+        return "scene"
+    chosen = data.get("name") or data.get("shape") or Path(str(data.get("root"))).resolve().name
+    return re.sub(r"[^\w.-]+", "_", str(chosen)) or "scene"
+
+
+def run_name(experiment: str | None, ablation: str | None) -> str:
+    """The run's folder name: the experiment, and the ablation unless it is the full method."""
+    parts = [experiment or "default"]
+    if ablation not in (None, "full"):
+        parts.append(str(ablation))
+    return "-".join(parts)
+
+
+def run_folder(stage: str, report: Any, scene: str, name: str) -> str:
+    """Where a run lives: told from scene and experiment; a report lives where it is written."""
+    if stage != "report":
+        return f"outputs/{scene}/{name}"
+    settings = ReportSettings(report.runs, report.into)
+    # A folder that was misspelt is not made: the step says that there is none.
+    there = Path(settings.runs).is_dir() or report.into is not None
+    return str(settings.folder) if there else "outputs/report"
+
+
+def config_record(stage: str) -> str | None:
+    """The folder in a run's own for its composed config; a report may lie beside another's."""
+    return None if stage == "report" else ".hydra"
+
+
+def tracked_name(scene: str, mode: Any, folder: str, overrides: str) -> str:
+    """What a tracker calls a run: the scene; a sweep's job by its folder and what was asked."""
+    return f"{Path(folder).name} {overrides}" if _of_sweep(mode) else scene
+
+
+def tracked_group(mode: Any, folder: str) -> str | None:
+    """The group that a tracker puts a run into: the sweep's folder's name, None outside one."""
+    return Path(folder).name if _of_sweep(mode) else None
+
+
+def _of_sweep(mode: Any) -> bool:
+    return str(getattr(mode, "name", mode)) == "MULTIRUN"
+
+
+def register_resolvers() -> None:
+    """Make ``${devrf.scene_name:…}`` and the other words known to OmegaConf."""
+    from omegaconf import OmegaConf
+
+    words = (scene_name, run_name, run_folder, config_record, tracked_name, tracked_group)
+    for word in words:
+        OmegaConf.register_new_resolver(f"devrf.{word.__name__}", word, replace=True)

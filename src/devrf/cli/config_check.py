@@ -1,0 +1,143 @@
+"""Checks a composed config against the parts that it names, before anything is built.
+
+A config says of each part what it is (``_target_``) and what it is given. The part's own
+signature says which settings there are and of which type; nothing is written down twice.
+"""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, Literal, get_type_hints
+
+from hydra.utils import get_object
+from omegaconf import DictConfig, OmegaConf
+
+from devrf.cli.value_types import described, fits, held
+from devrf.errors import DevrfError
+
+# What the run itself reads, beside the parts.
+ROOT: dict[str, Any] = {
+    "stage": str,
+    "seed": int,
+    "resume": bool,
+    "memory_check": bool,
+    "ckpt": str | Path | None,
+    "objective": str,
+    "scene": str,
+    "kernels": Literal["auto", "torch", "triton"],
+    "graphs": Literal["auto", "off"],
+    "decoder_precision": Literal["auto", "float32", "bfloat16"],
+}
+# Hydra's own keys in a part's config.
+RESERVED = {"_target_", "_partial_", "_convert_", "_recursive_", "_args_"}
+REFERENCE = re.compile(r"\$\{([\w.]+)\}")
+
+
+def check_config(config: DictConfig) -> None:
+    """Check that every value is set, is read by someone, and is of the type its part expects.
+
+    Args:
+        config: a composed config, as ``conf/config.yaml`` describes it.
+
+    Raises:
+        DevrfError: naming the key at fault and what was expected.
+    """
+    raw = OmegaConf.to_container(config, resolve=False)
+    assert isinstance(raw, dict)
+    for key, value in _leaves(raw):
+        if value == "???":
+            value = "PATH" if key.endswith("root") else "VALUE"
+            raise DevrfError(f"{key}: required; give {key}={value}")
+    resolved = OmegaConf.to_container(config, resolve=True)
+    assert isinstance(resolved, dict)
+    for key, hint in ROOT.items():
+        _check_value(key, resolved.get(key), hint)
+    if not 0 <= resolved["seed"] < 2**32:
+        raise DevrfError(f"seed: expected 0 to {2**32 - 1}, not {resolved['seed']}")
+    # A value outside any part counts as read when some part refers to it: ${loss.search}.
+    read = {ref for _, v in _leaves(raw) if isinstance(v, str) for ref in REFERENCE.findall(v)}
+    _check_group(raw, resolved, "", {*ROOT, *read})
+
+
+def _leaves(raw: Mapping[Any, Any], path: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in raw.items():
+        where = f"{path}{key}"
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{where}.")
+        else:
+            yield where, value
+
+
+def _check_group(
+    raw: Mapping[Any, Any], resolved: Mapping[Any, Any], path: str, read: set[str]
+) -> None:
+    """Check what is no part itself: parts below it, and values that parts refer to."""
+    for key, value in raw.items():
+        where = f"{path}{key}"
+        if isinstance(value, Mapping):
+            check = _check_part if "_target_" in value else _check_group
+            check(value, resolved[key], f"{where}.", read)
+        elif value is not None and not any(f"{where}.".startswith(f"{ref}.") for ref in read):
+            known = {ref.removeprefix(path).split(".")[0] for ref in read if ref.startswith(path)}
+            raise unknown_key(where, {*map(str, raw), *known} - {str(key)})
+
+
+def _check_part(
+    raw: Mapping[Any, Any], resolved: Mapping[Any, Any], path: str, read: set[str]
+) -> None:
+    settings = _settings(str(resolved["_target_"]), path)
+    for key, value in raw.items():
+        if key in RESERVED:
+            continue
+        where = f"{path}{key}"
+        if key not in settings and "**" not in settings:
+            raise unknown_key(where, settings)
+        reference = REFERENCE.fullmatch(value) if isinstance(value, str) else None
+        if isinstance(value, Mapping) and "_target_" in value:
+            _check_part(value, resolved[key], f"{where}.", read)
+        elif not (isinstance(resolved[key], Mapping) and "_target_" in resolved[key]):
+            # The key to blame is the one where the value stands.
+            blamed = reference.group(1) if reference else where
+            hint, default = settings.get(key, (Any, None))
+            if resolved[key] != default:
+                _check_value(blamed, resolved[key], hint)
+
+
+def _settings(target: str, path: str) -> dict[str, tuple[Any, Any]]:
+    """Type and default of each setting of a part, by name; ``**`` when it takes any name."""
+    try:
+        part = get_object(target)
+        parameters = inspect.signature(part).parameters
+    except Exception as error:
+        why = " ".join(str(error).split())
+        raise DevrfError(f"{path}_target_: cannot load {target!r} ({why})") from None
+    try:
+        hints = get_type_hints(part.__init__ if inspect.isclass(part) else part)
+    except (NameError, TypeError):  # names that are only there for a type checker
+        hints = {}
+    return {
+        "**" if p.kind is p.VAR_KEYWORD else p.name: (hints.get(p.name, Any), p.default)
+        for p in parameters.values()
+    }
+
+
+def _check_value(where: str, value: object, hint: Any) -> None:
+    inner = held(hint)
+    if isinstance(value, Mapping) and inner is not None:
+        for key, one in value.items():
+            _check_value(f"{where}.{key}", one, inner)
+    elif not fits(value, hint):
+        raise DevrfError(f"{where}: expected {described(hint)}, not {value!r}")
+
+
+def unknown_key(where: str, known: Iterable[object]) -> DevrfError:
+    """The error for a key that nobody knows, with the known one it may have been meant for."""
+    name = where.rpartition(".")[2]
+    close = difflib.get_close_matches(name, [str(k) for k in known if k != "**"], n=1)
+    meant = where[: -len(name)] + close[0] if close else ""
+    hint = f"did you mean {meant}?" if close else "--cfg job shows every key there is"
+    return DevrfError(f"{where}: no such key; {hint}")

@@ -1,0 +1,116 @@
+"""The user's mistakes, said in one line."""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from omegaconf.errors import OmegaConfBaseException
+
+from devrf.cli.config_check import unknown_key
+from devrf.errors import DevrfError
+
+# Read once: the entry point sets the variable for Hydra's sake.
+FULL_ERRORS = os.environ.get("HYDRA_FULL_ERROR", "0") != "0"
+
+# What a disk refuses, whatever the program does. A file that is not there may be our own fault.
+REFUSED = {
+    errno.EACCES,
+    errno.EPERM,
+    errno.EROFS,
+    errno.ENOSPC,
+    errno.EDQUOT,
+    errno.ENOTDIR,
+    errno.EEXIST,
+}
+
+# What Hydra's plugins for sweeps add to its groups.
+PLUGINS = {
+    "hydra/launcher": ("joblib", "submitit_local", "submitit_slurm"),
+    "hydra/sweeper": ("optuna",),
+    "hydra/sweeper/sampler": ("tpe",),
+}
+
+
+@contextmanager
+def report_user_errors() -> Iterator[None]:
+    """Turn a mistake in config or input into one line on stderr and exit status 2.
+
+    With HYDRA_FULL_ERROR=1 in the environment it is raised with its traceback instead. Other
+    errors are faults of the program and pass through.
+    """
+    try:
+        yield
+    except Exception as error:
+        if FULL_ERRORS or not is_user_error(error):
+            raise
+        print(f"devrf: {one_line(error)}", file=sys.stderr)
+        raise SystemExit(2) from None
+
+
+def is_user_error(error: Exception) -> bool:
+    """Whether the user can put it right: input, config, or a disk that refuses."""
+    if own_error(error) is not None:
+        return True
+    if isinstance(error, OSError) and not isinstance(error, HydraException):
+        return error.errno in REFUSED
+    # What one of our parts did not foresee when it was built is a fault of ours.
+    ours = "Error in call to target 'devrf." in str(error)
+    return isinstance(error, HydraException | OmegaConfBaseException) and not ours
+
+
+def own_error(error: BaseException) -> DevrfError | None:
+    """The project's own error in a chain of causes, if there is one."""
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, DevrfError):
+        cause = cause.__cause__
+    return cause
+
+
+def one_line(error: BaseException) -> str:
+    """What an error says, on one line that begins with the key or file at fault."""
+    own = own_error(error)
+    if own is not None:
+        text = str(own)
+    elif isinstance(error, MissingConfigException) and _plugin(error):
+        text = f'{_plugin(error)}: not installed; pip install "devrf[sweeps]"'
+    elif isinstance(error, MissingConfigException) and error.options:
+        group, _, option = str(error.missing_cfg_file).rpartition("/")
+        text = f"{group}={option}: no such option; choose one of {', '.join(error.options)}"
+    elif isinstance(error, OverrideParseException):
+        text = f"{error.override}: not understood; write KEY=VALUE, in quotes where needed"
+    elif isinstance(error, OSError) and not isinstance(error, HydraException):
+        text = f"{error.filename or 'output'}: {error.strerror}"
+    else:
+        text = _of_hydra(error)
+    return " ".join(text.split())
+
+
+def _plugin(error: MissingConfigException) -> str | None:
+    """``group=option`` where what is missing would come with a plugin."""
+    group, _, option = str(error.missing_cfg_file).rpartition("/")
+    return f"{group}={option}" if option in PLUGINS.get(group, ()) else None
+
+
+def _of_hydra(error: BaseException) -> str:
+    text = str(error)
+    unknown = re.match(r"Could not override '([^']+)'", text)
+    if unknown:
+        # OmegaConf keeps the mapping that does not have the key.
+        near = getattr(error.__cause__, "parent_node", None)
+        return str(unknown_key(unknown.group(1), near or ()))
+    # `full_key` names the key at fault; the rest of OmegaConf's bookkeeping helps nobody.
+    key = re.search(r"^\s*full_key: (\S+)$", text, re.MULTILINE)
+    kept = [
+        line
+        for line in text.splitlines()
+        if not line.strip().startswith(("full_key:", "object_type=", "reference_type="))
+    ]
+    if text.startswith("Error in call to target") and error.__cause__ is not None:
+        kept = [str(error.__cause__)]
+    return f"{key.group(1)}: {' '.join(kept)}" if key else " ".join(kept)

@@ -1,0 +1,20 @@
+"""The step that compares finished runs: ``stage=report``."""
+
+from __future__ import annotations
+
+import logging
+
+from hydra.utils import instantiate
+
+from devrf.cli.context import RunContext
+from devrf.reporting.markdown import plain
+from devrf.reporting.write import write_report
+
+log = logging.getLogger(__name__)
+
+
+def report(run: RunContext) -> None:
+    """Write tables and plots of the runs below ``report.runs``; needs no scene."""
+    written = write_report(instantiate(run.config.report))
+    log.info("%s", plain(written.table, written.remarks))
+    log.info("report written to %s", written.path)

@@ -1,0 +1,194 @@
+"""Whether a stage is finished, goes on where it was left, or begins; and what belongs together.
+
+A run is repeated by the same command in the same folder. Each stage's checkpoints say which
+settings decided what was learned, so that nothing is taken for what it is not:
+
+* a finished checkpoint with the settings of today: the stage is skipped;
+* a progress file with the settings of today: the stage goes on from there;
+* either with other settings: the run is refused, naming the first that differs;
+* a deformation on top of another canonical field than the run's: it is learned anew.
+
+How the run is watched, tracked, scored and filmed, on which device, and where its data lies,
+decides nothing: such settings may differ.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import shutil
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from devrf.checkpoints.checkpoint import CheckpointMetadata, metadata_in
+from devrf.checkpoints.checkpoint_file import digest_of, read_checkpoint_file
+from devrf.checkpoints.progress import progress_files
+from devrf.cli.config_check import REFERENCE
+from devrf.cli.context import GIVEN_REST, OWN_REST, RunContext
+from devrf.cli.run_folder import AT_FIRST
+from devrf.errors import DevrfError
+
+log = logging.getLogger(__name__)
+
+# Settings of a datamodule or a stage that change nothing that is learned.
+ELSEWHERE = {"root", "name", "flow_cache", "export", "graphs", "store"}
+
+
+@dataclass(frozen=True)
+class ResumePoint:
+    """Where a stage begins.
+
+    Attributes:
+        training_config: the settings of today that decide what is learned.
+        finished: there is nothing left to learn.
+        progress: the file to go on from; None begins at the beginning.
+        iteration: how far that file is.
+    """
+
+    training_config: dict[str, Any]
+    finished: bool = False
+    progress: Path | None = None
+    iteration: int = 0
+
+
+def deciding_settings(config: DictConfig, stage: str) -> dict[str, Any]:
+    """The settings that decide what a stage learns, by the key at which the user sets them.
+
+    Args:
+        config: a composed config.
+        stage: ``canonical`` or ``deformation``.
+    """
+    parts = {key: OmegaConf.to_container(config[key], resolve=False) for key in ("data", stage)}
+    found = dict(_values(config, parts, ""))
+    found["seed"] = config.seed
+    return {key: found[key] for key in sorted(found)}
+
+
+def _values(config: DictConfig, raw: Mapping[Any, Any], path: str) -> Iterator[tuple[str, Any]]:
+    for key, value in raw.items():
+        where = f"{path}{key}"
+        reference = REFERENCE.fullmatch(value) if isinstance(value, str) else None
+        if reference:  # the key to name is the one where the value stands
+            where = reference.group(1)
+            value = OmegaConf.select(config, where)
+            if isinstance(value, DictConfig):
+                value = OmegaConf.to_container(value, resolve=False)
+        if isinstance(value, Mapping):
+            yield from _values(config, value, f"{where}.")
+        elif key not in ELSEWHERE:
+            plain = OmegaConf.select(config, where)
+            yield where, plain if isinstance(plain, str) else json.loads(_as_json(plain))
+
+
+def _as_json(value: object) -> str:
+    if OmegaConf.is_config(value):
+        value = OmegaConf.to_container(value, resolve=True)
+    return json.dumps(value)
+
+
+def beginning(run: RunContext, stage: str) -> ResumePoint:
+    """Find where ``stage`` begins in the run's folder.
+
+    Raises:
+        DevrfError: the folder holds what was learned with other settings, or a finished
+            checkpoint that is damaged.
+    """
+    training_config = deciding_settings(run.config, stage)
+    if stage == "deformation":
+        rest = run.checkpoint("canonical")
+        training_config[OWN_REST if run.config.ckpt is None else GIVEN_REST] = digest_of(rest)
+    path = run.own_checkpoint(stage)
+    if path.is_file():
+        metadata = metadata_in(path, read_checkpoint_file(path))
+        if _agrees(path, metadata, training_config) and metadata.complete:
+            log.info("%s: learned already (%s); resume=false learns it anew", stage, path)
+            remove_progress(path.parent, stage)
+            return ResumePoint(training_config, finished=True)
+    for progress in progress_files(path.parent, stage):
+        try:
+            content = read_checkpoint_file(progress)
+            metadata, iteration = metadata_in(progress, content), content["progress"]["iteration"]
+        except DevrfError as error:
+            log.warning("%s; the file before it is taken", error)
+            progress.unlink()
+            continue
+        if _agrees(progress, metadata, training_config):
+            log.info("%s: goes on at iteration %d", stage, iteration)
+            return ResumePoint(training_config, progress=progress, iteration=iteration)
+        break
+    remove_progress(path.parent, stage)
+    return ResumePoint(training_config)
+
+
+def _agrees(path: Path, metadata: CheckpointMetadata, training_config: Mapping[str, Any]) -> bool:
+    """Whether a checkpoint was made with the settings of today; False if on another rest state.
+
+    Raises:
+        DevrfError: with other settings.
+    """
+    old = metadata.training_config
+    if old == training_config:
+        return True
+    if OWN_REST in old and {**training_config, OWN_REST: old[OWN_REST]} == old:
+        log.info("%s: belongs to another canonical field; learned anew", path)
+        return False
+    key = next(k for k in [*training_config, *old] if old.get(k) != training_config.get(k))
+    before, now = (_shown(settings, key) for settings in (old, training_config))
+    raise DevrfError(
+        f"{key}: {path} was made with {before}, now it is {now}; give resume=false to begin "
+        "afresh (what is there is kept in previous-<n>/), or hydra.run.dir=FOLDER for another run"
+    )
+
+
+def _shown(settings: Mapping[str, Any], key: str) -> str:
+    if key not in settings:
+        return "nothing"
+    text = json.dumps(settings[key])
+    return text if len(text) <= 40 else f"{text[:37]}..."
+
+
+def remove_progress(folder: Path, stage: str) -> None:
+    """Remove the progress files of a stage that is finished, or that begins anew."""
+    for path in progress_files(folder, stage):
+        path.unlink(missing_ok=True)
+
+
+def archive_previous(folder: Path, *kept: Path) -> None:
+    """Move what earlier commands left in a run's folder into ``previous-<n>/`` within it.
+
+    Moving it back undoes it. ``.hydra`` and the lock are the present command's and stay;
+    ``checkpoints/`` has the config that was learned with.
+
+    Args:
+        folder: the run's folder.
+        kept: files that the present command needs: they are found in both places.
+    """
+    old = [
+        path
+        for path in folder.iterdir()
+        if path.name not in AT_FIRST and not path.name.startswith("previous-")
+    ]
+    if not old:
+        return
+    for handler in logging.getLogger().handlers:
+        if isinstance(handler, logging.FileHandler):
+            handler.close()  # it opens a new file when there is something to say
+    taken = [int(p.name[9:]) for p in folder.glob("previous-*") if p.name[9:].isdigit()]
+    previous = folder / f"previous-{max(taken, default=0) + 1}"
+    previous.mkdir()
+    for path in old:
+        path.rename(previous / path.name)
+    for path in kept:
+        moved = previous / path.relative_to(folder)
+        if moved.is_file():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                os.link(moved, path)
+            except OSError:
+                shutil.copy2(moved, path)
+    log.info("what was in %s is kept in %s", folder, previous)

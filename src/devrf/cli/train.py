@@ -1,0 +1,114 @@
+"""The steps that learn: ``stage=canonical`` and ``stage=deformation``."""
+
+from __future__ import annotations
+
+import logging
+import math
+import signal
+
+from hydra.utils import instantiate
+from lightning import Trainer
+from omegaconf import OmegaConf
+
+from devrf.artifacts.records import in_words
+from devrf.callbacks import PeriodicCheckpoint, StopOnSignal, TrainingRecord
+from devrf.callbacks.csv_logger import ResumableCSVLogger
+from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, save_checkpoint
+from devrf.checkpoints.progress import progress_files
+from devrf.cli.context import RunContext
+from devrf.cli.resume import ResumePoint, beginning, remove_progress
+from devrf.engine.stage import ScheduledStage
+from devrf.errors import DevrfError
+from devrf.system.files import atomic_write
+from devrf.system.signals import Interrupted
+
+log = logging.getLogger(__name__)
+
+
+def canonical(run: RunContext) -> None:
+    """Learn the scene at rest, or what is left to learn of it."""
+    begin = _begin(run, "canonical")
+    if not begin.finished:
+        _fit(run, instantiate(run.config.canonical, _convert_="all"), begin)
+
+
+def deformation(run: RunContext) -> None:
+    """Learn how the scene moves, on top of a canonical checkpoint, or what is left of that."""
+    begin = _begin(run, "deformation")
+    if begin.finished:
+        return
+    rest = run.load("canonical")
+    if rest.model.deformation is not None:
+        raise DevrfError(
+            "ckpt: stage=deformation needs a canonical checkpoint, not a deformation's"
+        )
+    build = instantiate(run.config.deformation, _partial_=True, _convert_="all")
+    _fit(run, build(rest=rest), begin)
+
+
+def _begin(run: RunContext, stage: str) -> ResumePoint:
+    """Where the stage begins, as the leading process finds it: all must begin there."""
+    agreed = run.strategy.broadcast(beginning(run, stage) if run.leads else None)
+    assert isinstance(agreed, ResumePoint)
+    return agreed
+
+
+def _fit(run: RunContext, stage: ScheduledStage, begin: ResumePoint) -> None:
+    if run.leads:
+        _ = run.scene  # what is wrong with it is said before a logger writes files
+    stage.training_config = begin.training_config
+    callbacks = [*instantiate(run.config.callbacks).values(), TrainingRecord()]
+    saving = next((one for one in callbacks if isinstance(one, PeriodicCheckpoint)), None)
+    if saving is None:  # nothing now and then, but still something when a signal asks
+        saving = PeriodicCheckpoint(run.folder / "checkpoints", every_seconds=math.inf)
+        callbacks.append(saving)
+    with StopOnSignal(saving) as stop:
+        trainer: Trainer = instantiate(
+            run.config.trainer,
+            callbacks=[*callbacks, stop],
+            logger=run.logger,
+            default_root_dir=str(run.folder),
+        )
+        trainer.strategy.checkpoint_io = ChecksummedCheckpointIO()
+        if isinstance(run.logger, ResumableCSVLogger):
+            run.logger.go_on(stage.capture, begin.iteration)
+        path = begin.progress and str(begin.progress)
+        trainer.fit(stage, datamodule=run.datamodule, ckpt_path=path)
+        strategy = trainer.strategy
+        asked = strategy.reduce_boolean_decision(stop.number is not None, all=False)
+        if run.leads and (not asked or stage.iteration >= stage.total_iterations):
+            _keep(run, trainer, stage)
+        strategy.barrier("the checkpoint is written")
+    if asked:  # of several processes the first is, and ends for all
+        raise Interrupted(stop.number or signal.SIGTERM, _where(stage, saving))
+
+
+def _keep(run: RunContext, trainer: Trainer, stage: ScheduledStage) -> None:
+    """Write what the stage has learned, and the config that it was learned with."""
+    path = run.own_checkpoint(stage.name)
+    # The checkpoint carries it to whoever scores the run, hence without its own writing.
+    stage.record["wall_seconds"] = run.step_seconds
+    try:
+        save_checkpoint(trainer, path)
+        with atomic_write(path.with_name("config.yaml")) as partial:
+            OmegaConf.save(run.config, partial, resolve=True)
+    except OSError as error:
+        left = progress_files(path.parent, stage.name)
+        kept = f"the last good progress file stays ({left[0].name}); " if left else ""
+        raise DevrfError(
+            f"{error.filename or path}: {error.strerror}; {kept}make it possible to write there, "
+            "and run the same command again"
+        ) from error
+    if stage.iteration >= stage.total_iterations:
+        remove_progress(path.parent, stage.name)
+    log.info("%s: %s; written to %s", stage.name, in_words(stage.record), path)
+
+
+def _where(stage: ScheduledStage, saving: PeriodicCheckpoint) -> str:
+    """Where a signal has ended the run, on one line."""
+    done, total = stage.iteration, stage.total_iterations
+    where = f"interrupted at iteration {done} of {total} of the {stage.name} stage"
+    if done < total and saving.saved != done:
+        last = "there is none" if saving.saved is None else f"the last is of {saving.saved}"
+        where += f" (its progress could not be written; {last})"
+    return f"{where}; run the same command again to go on"

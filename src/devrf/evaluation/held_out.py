@@ -1,0 +1,161 @@
+"""Held-out views: rendered, compared with the truth, scored."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from devrf.evaluation.suite import MetricInput, MetricSuite
+from devrf.methods.devrf.model import SceneModel
+from devrf.methods.devrf.renderer import Renderer
+from devrf.metrics.image import psnr, ssim
+from devrf.metrics.masked import psnr_masked, ssim_masked, ssim_within
+from devrf.rendering.rendered_image import RenderedImage
+from devrf.scenes.scene import Background, Views
+
+
+@dataclass(frozen=True)
+class HeldOutView:
+    """A held-out image, what the model sees there, and how alike they are where pixels count.
+
+    Attributes:
+        name: the image's name.
+        time: its time in [0, 1].
+        truth: (H, W, 3) RGB in [0, 1].
+        prediction: (H, W, 3) RGB in [0, 1].
+        psnr: dB.
+        ssim: in [−1, 1].
+        rest_pose_psnr: dB that the canonical field alone reaches there.
+        further: what else was measured, by name; None where there is nothing to compare with.
+        compared: (H, W, 3) RGB in [0, 1], the prediction where pixels count, else the truth.
+    """
+
+    name: str
+    time: float
+    truth: Tensor
+    prediction: Tensor
+    psnr: float
+    ssim: float
+    rest_pose_psnr: float
+    further: dict[str, float | None] = field(default_factory=dict)
+    compared: Tensor = field(kw_only=True)
+
+    @property
+    def scores(self) -> dict[str, float | None]:
+        """Every metric by name."""
+        own = {"psnr": self.psnr, "ssim": self.ssim, "rest_pose_psnr": self.rest_pose_psnr}
+        return {**own, **self.further}
+
+
+def score(
+    player: Renderer,
+    views: Views,
+    index: int,
+    background: Background,
+    judge: MetricSuite | None = None,
+) -> HeldOutView:
+    """Render image ``index`` of held-out ``views`` and compare it with the truth.
+
+    Only pixels that count are compared: by PSNR each for itself, by SSIM in windows that lie
+    among them. Other metrics that look at neighbourhoods find the truth beyond them.
+
+    Args:
+        player: shows what was learned.
+        views: the held-out views, on the host.
+        index: which of them.
+        background: what is behind the matte.
+        judge: measures more than PSNR and SSIM.
+    """
+    time = float(views.times[index])
+    truth = truth_image(views, index, background)
+    behind = background_value(background)
+    seen = player.view(views.cameras, index, time, behind)
+    prediction = _image(seen, views)
+    rest = prediction
+    if player.ready(time).warp is not None:
+        rest = _image(player.view(views.cameras, index, 0.0, behind), views)
+    valid_mask = views.valid_mask_of(index)
+    compared, rest = (compare(image, truth, valid_mask) for image in (prediction, rest))
+    further: dict[str, float | None] = {}
+    if judge is not None and judge.metrics:
+        shape = (views.height, views.width)
+        distance = _world_distance(player.model, views, index, seen)
+        further = judge.scores(
+            MetricInput(
+                player,
+                views,
+                index,
+                compared,
+                truth,
+                distance.view(shape),
+                seen.opacity.cpu().view(shape),
+                judge.lpips,
+            )
+        )
+    return HeldOutView(
+        name=views.names[index],
+        time=time,
+        truth=truth,
+        prediction=prediction,
+        psnr=_psnr(compared, truth, valid_mask),
+        ssim=_ssim(compared, truth, valid_mask),
+        rest_pose_psnr=_psnr(rest, truth, valid_mask),
+        further=further,
+        compared=compared,
+    )
+
+
+def compare(prediction: Tensor, truth: Tensor, valid_mask: Tensor | None) -> Tensor:
+    """The prediction (H, W, 3) of a held-out image; the truth where its pixels do not count."""
+    return (
+        prediction if valid_mask is None else torch.where(valid_mask[..., None], prediction, truth)
+    )
+
+
+def _psnr(compared: Tensor, truth: Tensor, valid_mask: Tensor | None) -> float:
+    if valid_mask is None:
+        return psnr(compared, truth)
+    inside = psnr_masked(compared, truth, valid_mask)
+    assert inside is not None  # readers refuse a mask that leaves nothing
+    return inside
+
+
+def _ssim(compared: Tensor, truth: Tensor, valid_mask: Tensor | None) -> float:
+    if valid_mask is None:
+        return ssim(compared, truth)
+    # Where nothing counts that is as wide as a window, windows about what counts have to do,
+    # and where that is the image's rim, all of them.
+    for measure in (ssim_within, ssim_masked):
+        found = measure(compared, truth, valid_mask)
+        if found is not None:
+            return found
+    return ssim(compared, truth)
+
+
+def truth_image(views: Views, index: int, background: Background) -> Tensor:
+    """A held-out image (H, W, 3) in [0, 1] on the background (white where that is random)."""
+    value = views.pixels[index].float() / 255
+    if not views.has_alpha:
+        return value
+    behind = background_value(background)
+    return behind + value[..., 3:] * (value[..., :3] - behind)
+
+
+def background_value(background: Background) -> float:
+    """The grey level in [0, 1] behind held-out views."""
+    return 0.0 if background == "black" else 1.0
+
+
+def _image(seen: RenderedImage, views: Views) -> Tensor:
+    return seen.color.view(views.height, views.width, 3).clamp(0, 1).cpu()
+
+
+def _world_distance(model: SceneModel, views: Views, index: int, seen: RenderedImage) -> Tensor:
+    """Depths (H·W,) of a picture as distances from the camera in world units."""
+    rays = views.cameras.image_rays(index)
+    own = model.space.rays(rays)
+    points = model.space.to_world(own.at(torch.arange(len(own)), seen.depth.cpu()))
+    distance: Tensor = torch.linalg.vector_norm(points - rays.origins, dim=1)
+    return distance

@@ -1,0 +1,49 @@
+"""The sizes of a canonical field, and the two fields that are built from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from devrf.geometry.box import Box
+from devrf.methods.devrf.canonical_field import CanonicalField
+from devrf.methods.devrf.color_decoder import ColorDecoder, SigmoidColor
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """Sizes of the canonical field (method §2); the defaults are the paper's, inward-facing.
+
+    Attributes:
+        channels: features per voxel.
+        width: units of each of the colour decoder's two hidden layers.
+        frequencies: octaves of the viewing direction that the decoder sees; 0 for the
+            direction alone.
+        alpha_init: opacity of a voxel of the radiance field before anything is learned.
+        search_alpha_init: the same in the coarse geometry search.
+        planes: planes of an NDC grid, one behind another; None for cubic voxels.
+    """
+
+    channels: int = 12
+    width: int = 128
+    frequencies: int = 4
+    alpha_init: float = 1e-2
+    search_alpha_init: float = 1e-6
+    planes: int | None = None
+
+    def search_field(self, box: Box, voxels: int) -> CanonicalField:
+        """The field of the coarse geometry search: colours straight from three channels."""
+        return CanonicalField(
+            box, SigmoidColor(), channels=3, voxels=voxels, alpha_init=self.search_alpha_init
+        )
+
+    def radiance_field(self, box: Box, voxels: int, base_voxels: int) -> CanonicalField:
+        """The radiance field: features and a shallow decoder."""
+        return CanonicalField(
+            box,
+            ColorDecoder(self.channels, self.width, self.frequencies),
+            channels=self.channels,
+            voxels=voxels,
+            base_voxels=base_voxels,
+            alpha_init=self.alpha_init,
+            planes=self.planes,
+        )

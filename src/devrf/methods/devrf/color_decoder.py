@@ -1,0 +1,76 @@
+"""From interpolated features and a viewing direction to a colour."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+
+class SigmoidColor(nn.Module):
+    """Three channels are the colour itself, before a sigmoid: no network, no view dependence."""
+
+    def forward(
+        self,
+        features: Tensor,
+        viewdirs: Tensor,
+        ray: Tensor,
+        precision: torch.dtype = torch.float32,
+    ) -> Tensor:
+        """RGB (S, 3) in [0, 1] of ``features`` (S, 3), all else aside: there is no network."""
+        return torch.sigmoid(features)
+
+
+class ColorDecoder(nn.Module):
+    """A shallow network: feature ⊕ d ⊕ sin(2^k d), cos(2^k d) → RGB (method §2, Colour).
+
+    The first layer is split: what depends on the direction alone is computed once a ray, not
+    once a sample.
+    """
+
+    octaves: Tensor
+
+    def __init__(self, channels: int, width: int, frequencies: int = 4) -> None:
+        """Build the network.
+
+        Args:
+            channels: length of the feature vectors.
+            width: units of each of the two hidden layers.
+            frequencies: octaves k = 0 … frequencies − 1 of the direction; 0 gives it alone.
+        """
+        super().__init__()
+        self.register_buffer("octaves", 2.0 ** torch.arange(frequencies), persistent=False)
+        self.from_feature = nn.Linear(channels, width)
+        self.from_direction = nn.Linear(3 + 6 * frequencies, width, bias=False)
+        self.hidden = nn.Linear(width, width)
+        self.output = nn.Linear(width, 3)
+        nn.init.zeros_(self.output.bias)
+
+    def forward(
+        self,
+        features: Tensor,
+        viewdirs: Tensor,
+        ray: Tensor,
+        precision: torch.dtype = torch.float32,
+    ) -> Tensor:
+        """Colours of samples.
+
+        Args:
+            features: (S, C) interpolated features.
+            viewdirs: (R, 3) unit directions of the rays, in world space.
+            ray: (S,) int64, the ray of each sample.
+            precision: what the hidden layers and their gradients are computed in. Weights,
+                sums, and the last layer stay in single precision: colours keep all their shades.
+
+        Returns:
+            RGB (S, 3) in [0, 1].
+        """
+        reduced = precision != torch.float32
+        with torch.autocast(features.device.type, precision, enabled=reduced):
+            by_ray = self.from_direction(self._encode(viewdirs))
+            x = torch.relu(self.from_feature(features) + by_ray.index_select(0, ray))
+            x = torch.relu(self.hidden(x))
+        return torch.sigmoid(self.output(x.to(self.output.weight.dtype)))
+
+    def _encode(self, viewdirs: Tensor) -> Tensor:
+        angles = (viewdirs[:, None, :] * self.octaves[:, None]).flatten(1)
+        return torch.cat([viewdirs, angles.sin(), angles.cos()], dim=-1)

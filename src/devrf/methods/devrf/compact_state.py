@@ -1,0 +1,79 @@
+"""The state of a finished scene as its checkpoint holds it: small, and as good to look at.
+
+Grids are packed (devrf.checkpoints.packing): in half precision, in detail only near what is ever
+occupied. Files to go on learning from hold everything as it is.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from devrf.checkpoints.packing import pack, unpack
+from devrf.geometry.box import Box
+from devrf.methods.devrf.model import SceneModel
+from devrf.rendering.occupancy import Occupancy, dilate
+
+Shape = tuple[int, int, int]
+
+
+@torch.no_grad()
+def compact_state(model: SceneModel) -> dict[str, Any]:
+    """The model's state with its grids packed; what no half can hold stays as it is.
+
+    Args:
+        model: a finished scene: what was never occupied has been emptied.
+    """
+    state: dict[str, Any] = dict(model.state_dict())
+    canonical, deformation, box = model.canonical, model.deformation, model.canonical.box
+    at_rest = _near(model.occupancy, canonical.density.shape, box)[None]
+    for name in ("canonical.density.values", "canonical.color.values"):
+        state[name] = _packed(state[name][None], at_rest, smooth=False, many=False)
+    if deformation is not None:
+        shape = deformation.shape
+        moments = [_near(model.occupancy_at(time), shape, box) for time in deformation.clock.times]
+        # Between two frames what is seen is a mixture of both.
+        moving = torch.stack(
+            [torch.stack(moments[max(k - 1, 0) : k + 2]).any(dim=0) for k in range(len(moments))]
+        )
+        state["deformation.to_canonical"] = _packed(deformation.to_canonical, moving, smooth=True)
+        at_rest = _near(model.occupancy, shape, box)[None]
+        state["deformation.to_time"] = _packed(deformation.to_time, at_rest, smooth=True)
+    return state
+
+
+def expanded_state(state: dict[str, Any]) -> dict[str, Any]:
+    """A model's state from what :func:`compact_state` gave; a full state passes through.
+
+    Raises:
+        KeyError: a packed grid lacks a part.
+        ValueError: its parts do not fit together.
+    """
+    return {
+        name: _unpacked(value) if isinstance(value, dict) and "kept" in value else value
+        for name, value in state.items()
+    }
+
+
+def _packed(grids: Tensor, keep: Tensor, *, smooth: bool, many: bool = True) -> Any:
+    try:
+        return {**pack(grids.cpu(), keep.cpu(), smooth=smooth), "many": many}
+    except ValueError:
+        return grids if many else grids[0]
+
+
+def _unpacked(packed: dict[str, Any]) -> Tensor:
+    grids = unpack(packed)
+    return grids if packed["many"] else grids[0]
+
+
+def _near(occupancy: Occupancy, shape: Shape, box: Box) -> Tensor:
+    """The points of a grid (X, Y, Z) over ``box`` that a look-up near anything occupied reads."""
+    cells = zip(occupancy.mask.shape, shape, strict=True)
+    # So that a cell of the grid, which may be the larger one, is not between two looks.
+    reach = max(1, *(-(-(theirs - 1) // max(ours - 1, 1)) for theirs, ours in cells))
+    grown = Occupancy(dilate(occupancy.mask, reach), occupancy.box)
+    points = box.grid_points(shape, torch.empty(0, device=occupancy.mask.device))
+    return dilate(grown.at(points.view(-1, 3)).view(shape), 1)

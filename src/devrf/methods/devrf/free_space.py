@@ -1,0 +1,53 @@
+"""What the static cameras say of space before anything is learned."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from devrf.geometry.box import Box
+from devrf.geometry.cameras import Cameras
+from devrf.geometry.clock import FrameClock
+from devrf.scenes.scene import Scene
+from devrf.scenes.visual_hull import visual_hull
+
+
+def possible_matter(scene: Scene, shape: tuple[int, int, int], *, carve: bool) -> Tensor:
+    """Where matter can be at rest, on a grid over the scene's box.
+
+    Not nearer to a camera than its near plane: a cloud before a lens would explain its picture
+    perfectly. And, to carve, inside the visual hull, where the images have mattes and all show
+    the rest state.
+
+    Returns:
+        (X, Y, Z) bool on the host.
+    """
+    views, box = scene.static.train, scene.bounds.box
+    possible = torch.ones(shape, dtype=torch.bool)
+    near_lenses = [p for p in views.cameras.positions if _distance(box, p) < scene.bounds.near]
+    if near_lenses:
+        points = box.grid_points(shape, views.cameras.focal)
+        for position in near_lenses:
+            possible &= (points - position).norm(dim=-1) > scene.bounds.near
+    at_rest = float(views.times.max() - views.times.min()) <= FrameClock.TOLERANCE
+    if carve and views.has_alpha and at_rest:
+        possible &= visual_hull(views, box, shape)
+    return possible
+
+
+def _distance(box: Box, point: Tensor) -> float:
+    return float((box.nearest(point) - point).norm())
+
+
+def view_count_weight(cameras: Cameras, points: Tensor) -> Tensor:
+    """Share (X, Y, Z) in (0, 1] of the cameras that have each point (X, Y, Z, 3) in the picture.
+
+    Relative to the best-seen point; a point that no camera sees gets the share of one camera.
+    """
+    flat = points.view(-1, 3)
+    seen = torch.zeros(len(flat), device=flat.device)
+    for k in range(len(cameras)):
+        pixel, depth = cameras.project_into(k, flat)
+        x, y = pixel.unbind(-1)
+        seen += (depth > 0) & (x >= 0) & (x <= cameras.width) & (y >= 0) & (y <= cameras.height)
+    return (seen.clamp(min=1) / seen.max().clamp(min=1)).view(points.shape[:-1])

@@ -1,0 +1,111 @@
+"""Rendering in a handful of launches, on lists of a fixed length: for devices that Triton runs on.
+
+It shows what :func:`devrf.methods.devrf.volume_rendering.render` shows, without gradients.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from devrf.geometry.rays import Rays
+from devrf.methods.devrf.canonical_field import CanonicalField
+from devrf.methods.devrf.sample_search import search
+from devrf.methods.devrf.volume_rendering import RenderSettings
+from devrf.ops.compositing import composite_segments, sum_segments
+from devrf.ops.search import PackedSamples, select
+from devrf.ops.warped_depth import warped_depth
+from devrf.rendering.occupancy import Occupancy
+from devrf.rendering.rendered_image import RenderedImage
+from devrf.rendering.sampling import steps_through
+
+# Lists are this much longer than the last one had to be.
+SPARE = 1.25
+
+
+class ListRenderer:
+    """Renders a field, moved or at rest; its lists grow to the length that pictures need.
+
+    Attributes:
+        field: the canonical field.
+        settings: step length and thresholds.
+        half: whether the colour network works in half precision (CUDA only).
+    """
+
+    def __init__(
+        self, field: CanonicalField, settings: RenderSettings, *, half: bool = False
+    ) -> None:
+        self.field = field
+        self.settings = settings
+        self.half = half
+        self._capacity = 0
+
+    @torch.no_grad()
+    def picture(
+        self, rays: Rays, occupancy: Occupancy, displacement: Tensor | None, background: Tensor
+    ) -> RenderedImage:
+        """What rays see.
+
+        Args:
+            rays: R rays in the field's space.
+            occupancy: where something is at their time.
+            displacement: (X, Y, Z, 3) over the field's box, their time's points → canonical
+                space; None at rest.
+            background: (3,) or (R, 3) RGB.
+        """
+        field, settings = self.field, self.settings
+        slices = () if displacement is None else (displacement,)
+        found, count = self._search(rays, occupancy, slices)
+        canonical, depth = warped_depth(
+            found.points[:count],
+            field.density.values,
+            slices,
+            box=field.box,
+            shift=field.shift,
+            delta=field.step_in_base_voxels(settings.step),
+        )
+        weight, left = composite_segments(depth, found.first)
+        chosen = select(found.heavy[:count], found.first, count)
+        heavy = chosen.index[: int(chosen.total)]
+        precision = torch.float16 if self.half and depth.is_cuda else torch.float32
+        color = field.rgb(canonical[heavy], rays.viewdirs, found.ray[heavy], precision)
+        distance = found.distance[heavy, None]
+        seen = sum_segments(
+            weight[heavy],
+            torch.cat([color, distance, torch.ones_like(distance)], dim=1),
+            chosen.first,
+        )
+        return RenderedImage(
+            color=seen[:, :3] + left[:, None] * background,
+            depth=seen[:, 3] / seen[:, 4].clamp(min=1e-6),
+            opacity=1 - left,
+        )
+
+    def _search(
+        self, rays: Rays, occupancy: Occupancy, slices: tuple[Tensor, ...]
+    ) -> tuple[PackedSamples, int]:
+        """The samples that can be seen, and how many they are, in lists that are long enough."""
+        field, settings = self.field, self.settings
+        begins = steps_through(
+            rays,
+            field.box,
+            step=field.step_length(settings.step),
+            near=settings.near,
+            far=settings.far,
+        )
+        longest = int(begins[1].amax()) if len(rays) else 0
+        while True:
+            found = search(
+                rays,
+                begins,
+                field,
+                occupancy,
+                settings,
+                slices,
+                longest=longest,
+                capacity=self._capacity,
+            )
+            total = int(found.total)
+            if total <= self._capacity:
+                return found, total
+            self._capacity = int(SPARE * total)

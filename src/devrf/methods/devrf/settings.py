@@ -1,0 +1,97 @@
+"""Settings of both stages; the defaults are the paper's for inward-facing scenes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from devrf.errors import DevrfError
+
+# What the colour network computes in.
+Precision = Literal["auto", "float32", "bfloat16"]
+
+SEARCH_LOSS = {"color": 1.0, "per_sample_color": 0.1, "entropy": 0.01}
+FINE_LOSS = {"color": 1.0, "per_sample_color": 0.01, "entropy": 0.001}
+DEFORMATION_LOSS = {
+    "render": 1.0,
+    "cycle": 100.0,
+    "flow": 0.005,
+    "tv": 1.0,
+    "per_sample_color": 0.1,
+    "entropy": 0.01,
+}
+
+
+@dataclass(frozen=True)
+class CanonicalRates:
+    """Base learning rates of the canonical stage (method §2, Optimiser).
+
+    Attributes:
+        density: of the density grid.
+        color: of the feature grid.
+        decoder: of the colour decoder.
+    """
+
+    density: float = 0.1
+    color: float = 0.1
+    decoder: float = 1e-3
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How rays are sampled.
+
+    Attributes:
+        step: distance between samples in voxels.
+        alpha_threshold: opacity, and weight, under which a sample is not worth its colour.
+        search_alpha_threshold: the same during the coarse geometry search, which begins with
+            next to nothing everywhere.
+        occupancy_threshold: opacity of a step under which a cell counts as empty.
+    """
+
+    step: float = 0.5
+    alpha_threshold: float = 1e-4
+    search_alpha_threshold: float = 1e-7
+    occupancy_threshold: float = 1e-3
+
+
+@dataclass(frozen=True)
+class MotionSettings:
+    """How the deformation field is learned, beside its schedule.
+
+    Attributes:
+        learning_rate: base rate, in ``unit`` per step: how far a voxel moves at most.
+        unit: ``world`` for world units; ``box`` for the longest edge of the fields' box, so
+            that one value serves scenes of any scale.
+        views: ``one`` draws a batch from one view of the frame, the views taking turns;
+            ``all`` draws it from all of them.
+        pixels: ``all`` draws from whole images; ``useful`` from the pixels that show the matte
+            or whose rays meet what the present field has moved there.
+        occupancy_every: iterations after which the frame's occupancy is looked up anew.
+        start: where a frame starts from at the coarsest level: ``previous`` is the result of
+            the frame before it; ``flow`` moves that along the observed optical flow, so that
+            parts that move far are not lost (without flow it is the same as ``previous``).
+        store: where the displacements of all frames rest while one is visited: ``device``,
+            ``host``, or ``auto``: on the device if they fit there beside all else. Of several
+            processes each keeps them on its device.
+        store_half: whether they rest in half precision; what is visited never does.
+        min_rel_improvement: a visit ends early when two Lightning steps have taken less than
+            this share off its loss; None goes through the whole schedule.
+    """
+
+    learning_rate: float = 1e-3
+    unit: Literal["world", "box"] = "world"
+    views: Literal["one", "all"] = "one"
+    pixels: Literal["all", "useful"] = "all"
+    occupancy_every: int = 25
+    start: Literal["previous", "flow"] = "previous"
+    store: Literal["auto", "device", "host"] = "auto"
+    store_half: bool = False
+    min_rel_improvement: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.min_rel_improvement is not None and not 0 < self.min_rel_improvement <= 1:
+            raise DevrfError(
+                "schedule.motion.min_rel_improvement: expected above 0, at most 1, or null, not "
+                f"{self.min_rel_improvement}"
+            )

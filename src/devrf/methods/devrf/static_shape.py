@@ -1,0 +1,132 @@
+"""Rendering for training in a few launches, on lists of fixed length: nothing waits for the device.
+
+It sees what :func:`devrf.methods.devrf.volume_rendering.render` sees. Triton's kernels make it
+fast; with plain PyTorch it gives the same, more slowly.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from devrf.geometry.rays import Rays
+from devrf.methods.devrf.canonical_field import CanonicalField
+from devrf.methods.devrf.grid_warp import GridWarp
+from devrf.methods.devrf.sample_search import search
+from devrf.methods.devrf.volume_rendering import RenderOutput, RenderSettings
+from devrf.ops.compositing import composite_segments, sum_segments
+from devrf.ops.search import PackedSamples, SampleSubset, select
+from devrf.ops.trilinear import kept_gradient
+from devrf.ops.warped_depth import warped_depth
+from devrf.rendering.occupancy import Occupancy
+from devrf.rendering.sample_capacity import SampleCapacity
+from devrf.rendering.sampling import Samples, march, most_steps, steps_through
+from devrf.system.profiling import measured, span, tally
+
+
+def render_in_lists(
+    rays: Rays,
+    field: CanonicalField,
+    occupancy: Occupancy,
+    settings: RenderSettings,
+    background: Tensor,
+    warp: GridWarp | None,
+    room: SampleCapacity,
+    precision: torch.dtype = torch.float32,
+) -> RenderOutput:
+    """What ``render`` gives, in lists of ``room.heavy`` places (method §2).
+
+    Gradients of grids that have one already (``grad``) are added to it in place.
+
+    Args:
+        rays: R rays.
+        field: the canonical field.
+        occupancy: where something may be, in the space of the rays.
+        settings: step length and thresholds.
+        background: (3,) or (R, 3) RGB behind everything.
+        warp: maps the rays' points into canonical space, over the field's own box; None leaves
+            them.
+        room: how long the lists are; it is told how long they would have to be.
+        precision: what the colour network works in.
+
+    Returns:
+        What the rays see; ``samples.present`` tells samples from padding.
+    """
+    warp = warp or GridWarp((), field.box)
+    delta, density = field.step_in_base_voxels(settings.step), field.density.values
+    with span("sampling"):
+        found = _search(rays, field, occupancy, settings, warp, room.visible)
+    with span("density"):
+        canonical, tau = warped_depth(
+            found.points,
+            density,
+            warp.slices,
+            warp.weight,
+            box=field.box,
+            shift=field.shift,
+            delta=delta,
+            density_gradient=kept_gradient(density),
+            slice_gradients=[kept_gradient(frame) for frame in warp.slices],
+        )
+    with span("compositing"):
+        weight, transmittance = composite_segments(tau, found.first)
+    with span("sampling"):
+        chosen = select(found.heavy, found.first, room.heavy)
+        room.note(found.total, chosen.total)
+        tally("reached", found.total)
+        tally("heavy", chosen.total)
+        samples, present = _listed(found, chosen, len(rays))
+        canonical = canonical.index_select(0, chosen.index)
+        weight = torch.where(present, weight.index_select(0, chosen.index), 0.0)
+    with span("decoder"):
+        color = field.rgb(canonical, rays.viewdirs, samples.ray, precision)
+    with span("compositing"), torch.no_grad():
+        distance = torch.stack([samples.distance, torch.ones_like(samples.distance)], dim=1)
+        reached, mass = sum_segments(weight, distance, chosen.first).unbind(1)
+    with span("compositing"):
+        seen = sum_segments(weight, color, chosen.first)
+    return RenderOutput(
+        color=seen + transmittance[:, None] * background,
+        depth=reached / mass.clamp(min=1e-6),
+        transmittance=transmittance,
+        samples=samples,
+        canonical=canonical,
+        weight=weight,
+        sample_color=color,
+    )
+
+
+def _search(
+    rays: Rays,
+    field: CanonicalField,
+    occupancy: Occupancy,
+    settings: RenderSettings,
+    warp: GridWarp,
+    capacity: int,
+) -> PackedSamples:
+    """The samples that can be seen, in lists of ``capacity`` places."""
+    stretch = {"step": field.step_length(settings.step), "near": settings.near, "far": settings.far}
+    if measured():
+        # The kernel looks at these at most: it ends with the ray. It does not say at how many.
+        tally("tested", len(march(rays, field.box, occupancy, **stretch)))
+    return search(
+        rays,
+        steps_through(rays, field.box, **stretch),
+        field,
+        occupancy,
+        settings,
+        warp.slices,
+        warp.weight,
+        longest=most_steps(field.box, **stretch),
+        capacity=capacity,
+    )
+
+
+def _listed(found: PackedSamples, chosen: SampleSubset, rays: int) -> tuple[Samples, Tensor]:
+    """The chosen samples, and which they are; the padding's rays are spread over all."""
+    place = torch.arange(len(chosen.index), device=chosen.index.device)
+    present = place < chosen.first[-1]
+    ray = torch.where(present, found.ray.index_select(0, chosen.index), place % max(rays, 1))
+    distance = found.distance.index_select(0, chosen.index)
+    points = found.points.index_select(0, chosen.index)
+    return Samples(ray, distance, points, rays, present), present

@@ -1,0 +1,78 @@
+"""ResumableCSVLogger as CSV: continued, cut back, whole after a kill, patient on a full disk."""
+
+from __future__ import annotations
+
+import csv
+import errno
+import logging
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from devrf.callbacks import csv_logger as module
+from devrf.callbacks.csv_logger import ResumableCSVLogger
+
+
+def table(curves: ResumableCSVLogger) -> list[dict[str, str]]:
+    with curves.path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture
+def curves(tmp_path: Path) -> ResumableCSVLogger:
+    """Three rows of the static part and two of the dynamic one, written and closed."""
+    written = ResumableCSVLogger(tmp_path, "logs", "pipeline")
+    for step in (10, 20, 30):
+        written.log_metrics({"static/loss": 1 / step}, step)
+    for step in (10, 20):
+        written.log_metrics({"dynamic/loss": 2.0, "dynamic/flow": 0.5}, step)
+    return ResumableCSVLogger(tmp_path, "logs", "pipeline")
+
+
+def test_a_row_is_on_the_disk_at_once(curves: ResumableCSVLogger) -> None:
+    rows = table(curves)
+    assert curves.path.parts[-3:] == ("logs", "pipeline", "metrics.csv")
+    assert list(rows[0]) == ["dynamic/flow", "dynamic/loss", "static/loss", "step"]
+    assert [row["step"] for row in rows] == ["10", "20", "30", "10", "20"]
+    assert rows[1]["static/loss"] == "0.05" and rows[1]["dynamic/loss"] == ""
+    assert rows[4]["dynamic/flow"] == "0.5"
+
+
+def test_a_table_is_continued(curves: ResumableCSVLogger) -> None:
+    before = curves.path.read_text()
+    curves.log_metrics({"dynamic/loss": 3.0}, 30)
+    assert curves.path.read_text().startswith(before)
+    assert [row["step"] for row in table(curves)] == ["10", "20", "30", "10", "20", "30"]
+
+
+def test_what_lies_beyond_the_point_to_go_on_from_goes(curves: ResumableCSVLogger) -> None:
+    curves.go_on("dynamic", 10)
+    assert [row["step"] for row in table(curves)] == ["10", "20", "30", "10"]
+    curves.go_on("static", 0)
+    assert [row["dynamic/loss"] for row in table(curves)] == ["2.0"]
+
+
+def test_a_line_that_was_cut_off_is_no_row(curves: ResumableCSVLogger) -> None:
+    whole = curves.path.read_text()
+    curves.path.write_text(whole[:-3])  # the last row's step, 20, has become 2
+    curves.log_metrics({"dynamic/loss": 2.0, "dynamic/flow": 0.5}, 20)
+    assert curves.path.read_text().split() == whole.split()
+
+
+def test_on_a_full_disk_rows_wait(
+    curves: ResumableCSVLogger, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    before = curves.path.read_text()
+    with monkeypatch.context() as patch, caplog.at_level(logging.WARNING, logger="devrf"):
+        patch.setattr(module, "atomic_write", full)
+        for step in (30, 40):
+            curves.log_metrics({"dynamic/loss": 1.0}, step)
+        assert curves.path.read_text() == before
+    (said,) = caplog.messages
+    assert said == f"{curves.path}: No space left on device; its rows wait in memory"
+    curves.log_metrics({"dynamic/loss": 1.0}, 50)
+    assert [row["step"] for row in table(curves)][-4:] == ["20", "30", "40", "50"]

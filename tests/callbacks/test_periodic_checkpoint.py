@@ -1,0 +1,188 @@
+"""Progress files: when they are written, how many are kept, and what a full disk does."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from lightning import Callback, Trainer
+
+from devrf.callbacks import PeriodicCheckpoint, StopOnSignal, TrainingRecord
+from devrf.callbacks import periodic_checkpoint as module
+from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO
+from devrf.checkpoints.checkpoint_file import read_checkpoint_file
+from devrf.checkpoints.progress import progress_files
+from devrf.data.datamodule import SceneDataModule
+from devrf.errors import DevrfError
+from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.devrf.schedules import CanonicalSchedule
+
+SMALL = Architecture(channels=4, width=8, frequencies=1)
+SCHEDULE = CanonicalSchedule(
+    search_iterations=0,
+    search_side=12,
+    carve=True,
+    iterations=12,
+    side=12,
+    doublings=(5,),
+    decay_iterations=6,
+    rays=32,
+)
+
+
+class At(Callback):
+    """Does something after an iteration, before the callbacks that come later."""
+
+    def __init__(self, iteration: int, act: Callable[[], object]) -> None:
+        self.iteration = iteration
+        self.act = act
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, *_: Any) -> None:
+        if pl_module.iteration == self.iteration:
+            self.act()
+
+
+@pytest.fixture
+def fit(
+    datamodule: SceneDataModule, trainer: Callable[..., Trainer]
+) -> Callable[..., CanonicalStage]:
+    """Learn with callbacks; a step is an iteration, and no curve is due before the end."""
+
+    def learn(*callbacks: Callback, ckpt_path: Path | None = None) -> CanonicalStage:
+        stage = CanonicalStage(SCHEDULE, SMALL, iterations_per_step=1)
+        made = trainer(*callbacks, max_epochs=1, log_every_n_steps=100)
+        made.strategy.checkpoint_io = ChecksummedCheckpointIO()
+        made.fit(stage, datamodule=datamodule, ckpt_path=ckpt_path and str(ckpt_path))
+        return stage
+
+    return learn
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_the_last_two_are_kept(fit, tmp_path: Path) -> None:
+    saving = PeriodicCheckpoint(tmp_path, every_seconds=0, share=1.0)
+    fit(saving)
+    # The stage's last iteration is its checkpoint's.
+    assert names(tmp_path) == ["canonical-progress-10.ckpt", "canonical-progress-11.ckpt"]
+    assert saving.saved == 11
+
+
+def test_none_is_written_before_its_time(fit, tmp_path: Path) -> None:
+    fit(PeriodicCheckpoint(tmp_path, every_seconds=1000))
+    assert names(tmp_path) == []
+
+
+def test_writing_takes_its_share_of_the_time(
+    fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = [100.0]
+    monkeypatch.setattr(module.time, "monotonic", lambda: clock[0])
+    written: list[int] = []
+
+    def write(trainer: Trainer, path: Path, **_: Any) -> None:
+        written.append(trainer.lightning_module.iteration)
+        clock[0] += 2.0  # a file takes two seconds, an iteration one
+
+    monkeypatch.setattr(module, "save_checkpoint", write)
+
+    class Tick(Callback):
+        def on_train_batch_end(self, *_: Any) -> None:
+            clock[0] += 1.0
+
+    fit(Tick(), PeriodicCheckpoint(tmp_path, every_seconds=0, share=0.4))
+    # Two seconds are 40% of five: three iterations to wait.
+    assert written == [1, 4, 7, 10]
+
+
+def test_a_line_of_the_curves_that_is_due_is_waited_for(
+    datamodule: SceneDataModule, trainer: Callable[..., Trainer], tmp_path: Path
+) -> None:
+    seen: list[list[str]] = []
+    saving = PeriodicCheckpoint(tmp_path, every_seconds=0, share=1.0)
+    stage = CanonicalStage(SCHEDULE, SMALL, iterations_per_step=1)
+    watch = At(6, lambda: seen.append(names(tmp_path)))
+    trainer(saving, watch, max_epochs=1, log_every_n_steps=3).fit(stage, datamodule=datamodule)
+    # Lines are written after iterations 3, 6, 9, once the callbacks are done.
+    assert seen == [["canonical-progress-4.ckpt", "canonical-progress-5.ckpt"]]
+
+
+def test_a_full_disk_does_not_end_the_training(
+    fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    usual = module.save_checkpoint
+
+    def full(trainer: Trainer, path: Path, **how: Any) -> None:
+        if 4 <= trainer.lightning_module.iteration <= 7:
+            raise OSError(28, "No space left on device", str(path))
+        usual(trainer, path, **how)
+
+    monkeypatch.setattr(module, "save_checkpoint", full)
+    lost: list[list[str]] = []
+    with caplog.at_level(logging.WARNING, logger="devrf"):
+        watch = At(7, lambda: lost.append(names(tmp_path)))
+        stage = fit(PeriodicCheckpoint(tmp_path, every_seconds=0, share=1.0), watch)
+    assert stage.iteration == 12
+    assert lost == [["canonical-progress-2.ckpt", "canonical-progress-3.ckpt"]]
+    (said,) = caplog.messages
+    assert said.startswith(f"{tmp_path}/canonical-progress-4.ckpt: No space left on device; ")
+    assert "the last good progress file stays (iteration 3)" in said
+    assert names(tmp_path) == ["canonical-progress-10.ckpt", "canonical-progress-11.ckpt"]
+
+
+def test_half_written_files_of_a_killed_process_go(fit, tmp_path: Path) -> None:
+    (tmp_path / ".partial-canonical-progress-3.ckpt").write_bytes(b"half")
+    (tmp_path / ".partial-deformation.ckpt").write_bytes(b"not of this stage")
+    fit(PeriodicCheckpoint(tmp_path, every_seconds=1000))
+    assert names(tmp_path) == [".partial-deformation.ckpt"]
+
+
+@pytest.mark.parametrize(("seconds", "share"), [(-1.0, 0.1), (1.0, 0.0), (1.0, 1.5)])
+def test_senseless_times_are_refused(tmp_path: Path, seconds: float, share: float) -> None:
+    with pytest.raises(DevrfError, match="callbacks.saving: expected"):
+        PeriodicCheckpoint(tmp_path, seconds, share)
+
+
+def test_a_signal_stops_the_stage_saved(fit, tmp_path: Path) -> None:
+    saving = PeriodicCheckpoint(tmp_path, every_seconds=1000)
+    with StopOnSignal(saving) as stop:
+        stage = fit(At(5, lambda: os.kill(os.getpid(), signal.SIGTERM)), saving, stop)
+    assert stop.number == signal.SIGTERM
+    assert stage.iteration == 5
+    assert names(tmp_path) == ["canonical-progress-5.ckpt"]
+
+
+def test_a_signal_after_the_last_iteration_lets_the_stage_end(fit, tmp_path: Path) -> None:
+    saving = PeriodicCheckpoint(tmp_path, every_seconds=1000)
+    with StopOnSignal(saving) as stop:
+        stage = fit(At(12, lambda: os.kill(os.getpid(), signal.SIGTERM)), saving, stop)
+    assert (stop.number, stage.iteration, names(tmp_path)) == (signal.SIGTERM, 12, [])
+
+
+def test_seconds_add_up_over_interruptions(fit, tmp_path: Path) -> None:
+    saving = PeriodicCheckpoint(tmp_path, every_seconds=1000)
+    with StopOnSignal(saving) as stop:
+        pause = At(3, lambda: time.sleep(0.3))
+        ask = At(5, lambda: os.kill(os.getpid(), signal.SIGTERM))
+        first = fit(pause, ask, TrainingRecord(), saving, stop)
+    before = first.record["seconds"]
+    assert before is not None and before >= 0.3
+    (left,) = progress_files(tmp_path, "canonical")
+    (kept,) = (
+        state["seconds"]
+        for name, state in read_checkpoint_file(left)["callbacks"].items()
+        if name.startswith("TrainingRecord")
+    )
+    assert 0.3 <= kept <= before + 0.01
+    second = fit(TrainingRecord(), ckpt_path=left)
+    assert second.record["iterations"] == 12
+    assert second.record["seconds"] > kept

@@ -1,0 +1,170 @@
+"""Checkpoints: whole, bit-equal, and honest about what they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from lightning import Trainer
+
+from devrf.checkpoints.checkpoint import LoadedCheckpoint, load_checkpoint, save_checkpoint
+from devrf.checkpoints.checkpoint_file import read_checkpoint_file, write_checkpoint_file
+from devrf.data.datamodule import SceneDataModule
+from devrf.errors import DevrfError
+from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.devrf.deformation_stage import DeformationStage
+from devrf.methods.devrf.model import SceneModel
+from devrf.methods.devrf.schedules import CanonicalSchedule, DeformationSchedule
+from devrf.metrics.image import psnr
+from devrf.scenes.scene import Scene
+
+
+@pytest.fixture
+def canonical(learned: tuple[CanonicalStage, Trainer], tmp_path: Path) -> Path:
+    """A checkpoint of the canonical stage."""
+    path = tmp_path / "run" / "canonical.ckpt"
+    save_checkpoint(learned[1], path)
+    return path
+
+
+def assert_alike(one: SceneModel, other: SceneModel, scene: Scene) -> None:
+    """Pictures differ by what half precision loses: 0.05 dB of one that is at 40 dB."""
+    cameras = scene.dynamic.test.cameras
+    shape = (cameras.height, cameras.width, 3)
+    for time in (0.0, 0.3, 0.5, 1.0):
+        a, b = (model.picture(cameras.image_rays(0), time, torch.ones(3)) for model in (one, other))
+        assert psnr(a.color.view(shape), b.color.view(shape)) > 60, f"at {time}"
+        torch.testing.assert_close(a.opacity, b.opacity, atol=0.01, rtol=0)
+
+
+def refusal(path: Path, scene: Scene | None = None) -> str:
+    """The message of the error that loading ``path`` raises: one line that names the file."""
+    with pytest.raises(DevrfError) as caught:
+        load_checkpoint(path, scene)
+    message = str(caught.value)
+    assert message.startswith(str(path)) and "\n" not in message
+    return message
+
+
+def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> Path:
+    """The same file with other content, well sealed."""
+    data = read_checkpoint_file(path)
+    change(data)
+    write_checkpoint_file(path, data)
+    return path
+
+
+def test_the_canonical_stage_comes_back(
+    canonical: Path, learned: tuple[CanonicalStage, Trainer], tiny_scene: Scene
+) -> None:
+    stored = load_checkpoint(canonical, tiny_scene)
+    assert_alike(stored.model, learned[0].model, tiny_scene)
+    assert stored.metadata == learned[0].metadata()
+    assert stored.model.deformation is None
+    assert [p.name for p in canonical.parent.iterdir()] == ["canonical.ckpt"]
+
+
+def test_the_deformation_stage_comes_back_and_alone_suffices(
+    rest: LoadedCheckpoint,
+    datamodule: SceneDataModule,
+    tiny_scene: Scene,
+    tmp_path: Path,
+    trainer: Callable[..., Trainer],
+) -> None:
+    schedule = DeformationSchedule(sides=(4, 6), iterations_per_frame=(4, 2), rays=128)
+    stage, fit = DeformationStage(rest, schedule), trainer(max_epochs=1)
+    fit.fit(stage, datamodule=datamodule)
+    save_checkpoint(fit, tmp_path / "deformation.ckpt")
+    stored = load_checkpoint(tmp_path / "deformation.ckpt", tiny_scene)
+    assert_alike(stored.model, stage.model, tiny_scene)
+    assert stored.model.deformation is not None
+    assert stored.model.deformation.clock == tiny_scene.clock
+    assert set(stored.metadata.records) == {"canonical", "deformation"}
+    # It moves: otherwise equal pictures would say nothing of the deformation.
+    rays = tiny_scene.dynamic.test.cameras.image_rays(0)
+    black = torch.zeros(3)
+    still = stored.model.picture(rays, 0.0, black).color
+    assert not torch.equal(stored.model.picture(rays, 1.0, black).color, still)
+
+
+def test_a_deformation_can_be_learned_on_a_loaded_checkpoint(
+    canonical: Path, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
+) -> None:
+    schedule = DeformationSchedule(sides=(4,), iterations_per_frame=(2,), rays=64)
+    stage = DeformationStage(load_checkpoint(canonical), schedule)
+    trainer(max_epochs=1).fit(stage, datamodule=datamodule)
+    assert stage.iteration == 6
+
+
+def test_another_scene_is_refused(canonical: Path, tiny_scene: Scene) -> None:
+    views = tiny_scene.static.train
+    fewer = replace(views[torch.arange(7)])
+    other = replace(tiny_scene, name="cat", static=replace(tiny_scene.static, train=fewer))
+    message = refusal(canonical, other)
+    assert "another scene" in message and "robot" in message and "cat" in message
+    assert load_checkpoint(canonical, None).metadata.scene == "robot"
+
+
+def test_a_missing_file_says_which_stage_to_run(tmp_path: Path) -> None:
+    assert "no such checkpoint" in refusal(tmp_path / "nothing.ckpt")
+    assert "no such checkpoint" in refusal(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "foreign",
+    [{"state_dict": {}}, {"devrf": "yes", "state_dict": {}}],
+    ids=["other project", "other type"],
+)
+def test_checkpoints_of_others_are_refused(tmp_path: Path, foreign: dict[str, Any]) -> None:
+    path = tmp_path / "foreign.ckpt"
+    write_checkpoint_file(path, foreign)
+    assert "not a devrf checkpoint" in refusal(path)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda data: data["devrf"].pop("scene"),
+        lambda data: data["devrf"]["architecture"].update(depth=3),
+        lambda data: data["devrf"]["architecture"].update(channels=5),
+        lambda data: data.pop("state_dict"),
+        lambda data: data.update(state_dict=[1]),
+        lambda data: data["state_dict"].update({"scene_model.occupancy.mask": "all"}),
+        lambda data: data["state_dict"].pop("scene_model.occupancy.mask"),
+        lambda data: data["state_dict"]["scene_model.canonical._extra_state"].pop("voxels"),
+        lambda data: data["state_dict"]["scene_model.canonical._extra_state"].update(low=[9, 9, 9]),
+    ],
+    ids=[
+        "no scene",
+        "unknown size",
+        "other size",
+        "no state",
+        "list for state",
+        "text for mask",
+        "no mask",
+        "no voxels",
+        "no box",
+    ],
+)
+def test_a_checkpoint_that_contradicts_itself_is_refused(
+    canonical: Path, change: Callable[[dict[str, Any]], object]
+) -> None:
+    refusal(edit(canonical, change))
+
+
+def test_a_stage_stopped_in_its_search_comes_back(
+    datamodule: SceneDataModule,
+    tiny_scene: Scene,
+    tmp_path: Path,
+    trainer: Callable[..., Trainer],
+) -> None:
+    schedule = CanonicalSchedule(10, 8, False, 10, 8, (), rays=64)
+    stage, fit = CanonicalStage(schedule), trainer(max_steps=2)
+    fit.fit(stage, datamodule=datamodule)
+    save_checkpoint(fit, tmp_path / "search.ckpt")
+    stored = load_checkpoint(tmp_path / "search.ckpt", tiny_scene)
+    assert_alike(stored.model, stage.model, tiny_scene)

@@ -1,0 +1,243 @@
+"""A stage that is left and taken up again comes to the same numbers, to the last bit."""
+
+from __future__ import annotations
+
+import copy
+import random
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lightning import Callback, Trainer
+
+from devrf.checkpoints.checkpoint import (
+    ChecksummedCheckpointIO,
+    LoadedCheckpoint,
+    load_checkpoint,
+    save_checkpoint,
+)
+from devrf.checkpoints.checkpoint_file import read_checkpoint_file
+from devrf.checkpoints.progress import progress_files
+from devrf.data.datamodule import SceneDataModule
+from devrf.engine.stage import ScheduledStage
+from devrf.errors import DevrfError
+from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.devrf.deformation_stage import DeformationStage
+from devrf.methods.devrf.schedules import CanonicalSchedule, DeformationSchedule
+from devrf.methods.devrf.settings import MotionSettings
+from devrf.scenes.scene import Scene
+
+SMALL = Architecture(channels=4, width=8, frequencies=1, search_alpha_init=1e-2)
+# Search 0–7, then fine 8–19 with doublings after 4 and 8 of its iterations.
+SEARCHING = CanonicalSchedule(
+    search_iterations=8,
+    search_side=12,
+    carve=True,
+    iterations=12,
+    side=14,
+    doublings=(4, 8),
+    decay_iterations=6,
+    rays=64,
+)
+# Three frames. Level 0: frame 1 in 0–11, frame 2 in 12–17; level 1: 18–25 and 26–29.
+MOVING = DeformationSchedule(sides=(4, 6), iterations_per_frame=(6, 4), rays=64)
+# The occupancy is looked up anew in iterations 3, 6, 9 of a visit; frames start along the flow.
+ALONG_FLOW = MotionSettings(
+    learning_rate=2e-3, unit="box", views="all", pixels="useful", occupancy_every=3, start="flow"
+)
+# Four frames. Level 0 in 0–15; level 1: frame 2 in 16–21, frames 1 and 3 in 22–27.
+TOGETHER = DeformationSchedule(
+    sides=(4, 6), iterations_per_frame=(4, 6), rays=64, parallel_frames=(1, 2)
+)
+BY_TURNS = MotionSettings(occupancy_every=3)
+# The field would not keep exactly what a visit has learned.
+ROUNDED = MotionSettings(occupancy_every=3, store="host", store_half=True)
+
+
+class Leave(Callback):
+    """Leaves the run after an iteration, with a file to go on from."""
+
+    def __init__(self, path: Path, iteration: int) -> None:
+        self.path = path
+        self.iteration = iteration
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        if pl_module.iteration == self.iteration:
+            save_checkpoint(trainer, self.path, weights_only=False)
+            trainer.should_stop = True
+
+
+def canonical() -> ScheduledStage:
+    return CanonicalStage(SEARCHING, SMALL, iterations_per_step=1)
+
+
+def everything(stage: ScheduledStage) -> dict[str, Any]:
+    """All that was learned, with the optimiser's state and the next random numbers."""
+    return {
+        "fields": copy.deepcopy(stage.state_dict()),
+        "optimizer": copy.deepcopy(stage.optimizer.state_dict()),
+        "metadata": stage.metadata(),
+        "iteration": stage.iteration,
+        "next": [torch.rand(4), np.random.rand(2).tolist(), random.random()],
+    }
+
+
+def assert_same(one: Any, other: Any, where: str = "") -> None:
+    assert type(one) is type(other), where
+    if isinstance(one, torch.Tensor):
+        assert torch.equal(one, other), where
+    elif isinstance(one, dict):
+        assert list(one) == list(other), where
+        for key in one:
+            assert_same(one[key], other[key], f"{where}/{key}")
+    elif isinstance(one, list | tuple):
+        assert len(one) == len(other), where
+        for k, (a, b) in enumerate(zip(one, other, strict=True)):
+            assert_same(a, b, f"{where}/{k}")
+    else:
+        assert one == other, where
+
+
+def begin_at(seed: int) -> None:
+    """Set every generator that anything may draw from."""
+    torch.manual_seed(seed)
+    np.random.seed(seed)
+    random.seed(seed)
+
+
+@pytest.fixture
+def learn(
+    datamodule: SceneDataModule, trainer: Callable[..., Trainer], tmp_path: Path
+) -> Callable[..., dict[str, Any]]:
+    """Learn, leaving after each of some iterations and going on with a new stage each time."""
+
+    def run(
+        build: Callable[[], ScheduledStage], *leaves: int, data: SceneDataModule = datamodule
+    ) -> dict[str, Any]:
+        begin_at(3)
+        left: str | None = None
+        for at in [*leaves, None]:
+            stage, path = build(), tmp_path / f"{at}.ckpt"
+            fit = trainer(*([] if at is None else [Leave(path, at)]), max_epochs=1)
+            fit.strategy.checkpoint_io = ChecksummedCheckpointIO()
+            fit.fit(stage, datamodule=data, ckpt_path=left)
+            if at is not None:
+                assert stage.iteration == at
+                # Another process would draw other numbers if it were not told where to go on.
+                left = str(path)
+                begin_at(99)
+        return everything(stage)
+
+    return run
+
+
+def test_the_canonical_stage_goes_on_exactly(learn) -> None:
+    # In the search, before, at and after its end, mid-level, around both doublings, at last.
+    leaves = (1, 7, 8, 9, 11, 12, 13, 16, 19)
+    assert_same(learn(canonical, *leaves), learn(canonical))
+
+
+@pytest.mark.parametrize(
+    "motion", [ALONG_FLOW, BY_TURNS, ROUNDED], ids=["all views", "by turns", "in half precision"]
+)
+def test_the_deformation_stage_goes_on_exactly(
+    learn, rest: LoadedCheckpoint, motion: MotionSettings
+) -> None:
+    def build() -> ScheduledStage:
+        return DeformationStage(copy.deepcopy(rest), MOVING, motion, iterations_per_step=1)
+
+    # Mid-frame, around a look at the occupancy, around a frame's end, around a level's, at last.
+    leaves = (1, 2, 3, 4, 11, 12, 13, 17, 18, 19, 26, 29)
+    assert_same(learn(build, *leaves), learn(build))
+
+
+@pytest.mark.parametrize(
+    ("motion", "leaves"),
+    [
+        # Around each visit of level 1, and mid-visit.
+        (ALONG_FLOW, (15, 16, 17, 21, 22, 23, 24, 26, 27)),
+        # A visit ends after three steps, as their losses tell.
+        (replace(ROUNDED, min_rel_improvement=1.0), (14, 16, 17, 18, 22, 23, 24)),
+    ],
+    ids=["all views", "in half precision"],
+)
+def test_frames_that_are_visited_together_go_on_exactly(
+    learn,
+    rest: LoadedCheckpoint,
+    motion: MotionSettings,
+    leaves: tuple[int, ...],
+    four_frames: SceneDataModule,
+) -> None:
+    def build() -> ScheduledStage:
+        return DeformationStage(copy.deepcopy(rest), TOGETHER, motion, iterations_per_step=1)
+
+    whole = learn(build, data=four_frames)
+    assert_same(learn(build, *leaves, data=four_frames), whole)
+    assert len(whole["optimizer"]["param_groups"][0]["params"]) == 4
+
+
+def test_a_step_of_many_iterations_goes_on_exactly(learn, rest: LoadedCheckpoint) -> None:
+    def build() -> ScheduledStage:
+        return DeformationStage(copy.deepcopy(rest), MOVING, ALONG_FLOW, iterations_per_step=4)
+
+    assert_same(learn(build, 4, 12, 16, 22, 26), learn(build))
+
+
+def test_only_what_is_to_be_gone_on_from_holds_the_way_there(
+    datamodule: SceneDataModule, trainer: Callable[..., Trainer], tmp_path: Path, tiny_scene: Scene
+) -> None:
+    stage, path = canonical(), tmp_path / "left.ckpt"
+    fit = trainer(Leave(path, 10), max_epochs=1)
+    fit.fit(stage, datamodule=datamodule)
+    save_checkpoint(fit, tmp_path / "shown.ckpt")
+    assert read_checkpoint_file(path)["progress"]["iteration"] == 10
+    assert "progress" not in read_checkpoint_file(tmp_path / "shown.ckpt")
+    # What is left half-way can be looked at all the same.
+    assert not load_checkpoint(path, tiny_scene).metadata.complete
+
+
+@pytest.fixture
+def left(datamodule: SceneDataModule, trainer: Callable[..., Trainer], tmp_path: Path) -> Path:
+    """A file to go on from at the canonical stage's iteration 2."""
+    path = tmp_path / "left.ckpt"
+    trainer(Leave(path, 2), max_epochs=1).fit(canonical(), datamodule=datamodule)
+    return path
+
+
+def refused(fit: Trainer, stage: ScheduledStage, datamodule: SceneDataModule, path: Path) -> str:
+    fit.strategy.checkpoint_io = ChecksummedCheckpointIO()
+    with pytest.raises(DevrfError) as caught:
+        fit.fit(stage, datamodule=datamodule, ckpt_path=str(path))
+    assert str(caught.value).startswith(str(path))
+    return str(caught.value)
+
+
+def test_another_schedule_is_refused(
+    left: Path, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
+) -> None:
+    longer = CanonicalStage(replace(SEARCHING, iterations=13), SMALL)
+    message = refused(trainer(max_epochs=1), longer, datamodule, left)
+    assert "a schedule of 20 iterations, this is the canonical stage on one of 21" in message
+
+
+def test_another_scene_is_refused(
+    left: Path, datamodule: SceneDataModule, trainer: Callable[..., Trainer], tiny_scene: Scene
+) -> None:
+    fewer = replace(tiny_scene.static, train=tiny_scene.static.train[torch.arange(7)])
+    other = type(datamodule)(replace(tiny_scene, static=fewer))  # type: ignore[call-arg]
+    assert "another scene" in refused(trainer(max_epochs=1), canonical(), other, left)
+
+
+def test_the_furthest_progress_comes_first(tmp_path: Path) -> None:
+    for name in ("9", "10", "100", "1x", ""):
+        (tmp_path / f"canonical-progress-{name}.ckpt").write_text("")
+    (tmp_path / "deformation-progress-7.ckpt").write_text("")
+    found = [path.name for path in progress_files(tmp_path, "canonical")]
+    assert found == [f"canonical-progress-{n}.ckpt" for n in (100, 10, 9)]

@@ -1,0 +1,92 @@
+"""Grids in half precision, in full detail only near matter."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+import torch
+
+from devrf.checkpoints.packing import pack, unpack
+
+
+@pytest.fixture
+def keep() -> torch.Tensor:
+    mask = torch.zeros(2, 9, 7, 6, dtype=torch.bool)
+    mask[0, 2:5, 1:4, 3] = True
+    mask[1, 8, 6, 5] = True
+    return mask
+
+
+def test_what_is_kept_comes_back_in_half_precision(keep):
+    torch.manual_seed(0)
+    grids = torch.randn(2, 9, 7, 6, 3)
+    back = unpack(pack(grids, keep, smooth=True))
+    assert back.shape == grids.shape and back.dtype == torch.float32
+    assert torch.equal(back[keep], grids[keep].half().float())
+
+
+def test_elsewhere_a_smooth_grid_is_interpolated(keep):
+    # A linear ramp is what trilinear interpolation reproduces, however thin it was stored.
+    x, y, z = torch.meshgrid(*[torch.linspace(0, 1, n) for n in (9, 7, 6)], indexing="ij")
+    ramp = torch.stack([x, 2 * y, x - z], dim=-1)
+    back = unpack(pack(torch.stack([ramp, -ramp]), keep, smooth=True))
+    torch.testing.assert_close(back[0], ramp, atol=2e-3, rtol=0)
+    torch.testing.assert_close(back[1], -ramp, atol=2e-3, rtol=0)
+
+
+def test_elsewhere_the_mean_of_what_is_left_out(keep):
+    grids = torch.full((2, 9, 7, 6, 2), -4.0)
+    grids[keep] = torch.tensor([100.0, 7.0])
+    assert torch.equal(unpack(pack(grids, keep, smooth=False)), grids)
+
+
+def test_one_mask_serves_all_grids(keep):
+    grids = torch.randn(5, 9, 7, 6, 1, generator=torch.Generator().manual_seed(1))
+    back = unpack(pack(grids, keep[:1], smooth=False))
+    assert torch.equal(back[:, keep[0]], grids[:, keep[0]].half().float())
+
+
+@pytest.mark.parametrize("everything", [True, False])
+def test_everything_or_nothing_may_be_kept(everything):
+    grids = torch.ones(1, 3, 3, 3, 2)
+    keep = torch.full((1, 3, 3, 3), everything)
+    assert torch.equal(unpack(pack(grids, keep, smooth=False)), grids)
+
+
+def test_the_size_is_two_bytes_a_kept_value():
+    grids = torch.zeros(4, 40, 40, 40, 3)
+    keep = torch.zeros(4, 40, 40, 40, dtype=torch.bool)
+    keep[:, 10:20, 10:20, 10:20] = True
+    file = io.BytesIO()
+    torch.save(pack(grids, keep, smooth=True), file)
+    detail, thin, bits = 4 * 1000 * 6, 4 * 11**3 * 6, 4 * 40**3 // 8
+    assert file.tell() == pytest.approx(detail + thin + bits, abs=3000)
+
+
+def test_a_value_beyond_half_precision_is_refused():
+    with pytest.raises(ValueError, match="half precision"):
+        pack(
+            torch.full((1, 2, 2, 2, 1), 7e4), torch.ones(1, 2, 2, 2, dtype=torch.bool), smooth=False
+        )
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"kept": torch.zeros(3, 3).half()},
+        {"shape": [10**6, 10**6, 10**6]},
+        {
+            "shape": [20, 20, 20],
+            "keep": torch.zeros(1, 1000, dtype=torch.uint8),
+            "elsewhere": torch.zeros(10**6, 3).half(),
+            "kept": torch.zeros(0, 3).half(),
+        },
+        {"keep": torch.zeros(2, 5, dtype=torch.uint8)},
+        {"elsewhere": torch.zeros(3, 4, 3, 3, 3).half()},
+    ],
+)
+def test_parts_that_do_not_fit_are_refused(keep, damage):
+    packed = pack(torch.zeros(2, 9, 7, 6, 3), keep, smooth=True)
+    with pytest.raises(ValueError, match="as long|larger than"):
+        unpack({**packed, **damage})

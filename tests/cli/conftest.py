@@ -1,0 +1,170 @@
+"""The command line, called in this process as a user would call it."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import logging
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+import devrf as package
+from devrf.__main__ import entry
+
+# A scene of 24 x 20 pixels and schedules of a few iterations: seconds, and no quality.
+TINY = (
+    "data.width=24",
+    "data.height=20",
+    "data.static_views=6",
+    "data.static_test_views=2",
+    "data.train_views=2",
+    "data.frames=3",
+    "data.supersample=1",
+)
+SHORT = (
+    "field=small",
+    "field.width=16",
+    "schedule.canonical.iterations=6",
+    "schedule.canonical.side=16",
+    "schedule.canonical.search_side=16",
+    "schedule.canonical.doublings=[2]",
+    "schedule.canonical.rays=64",
+    "schedule.deformation.sides=[4,8]",
+    "schedule.deformation.iterations_per_frame=[2,2]",
+    "schedule.deformation.rays=64",
+    "video.frames=4",
+    "trainer=cpu",
+)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a command came to: its exit status and what it said."""
+
+    status: int
+    out: str
+    err: str
+
+
+Devrf = Callable[..., Outcome]
+
+
+def call(folder: Path, *arguments: str) -> Outcome:
+    """``devrf ARGUMENTS`` with ``folder`` as the working folder."""
+    said, complained = io.StringIO(), io.StringIO()
+    root = logging.getLogger()
+    handlers, level = root.handlers[:], root.level
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setattr(sys, "argv", ["devrf", *arguments])
+        patch.setenv("HYDRA_FULL_ERROR", "0")  # restored afterwards: the entry point changes it
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(complained):
+            try:
+                entry()
+                status = 0
+            except SystemExit as stop:
+                status = stop.code if isinstance(stop.code, int) else int(stop.code is not None)
+            finally:
+                os.environ.pop("PL_GLOBAL_SEED", None)
+                for handler in set(root.handlers) - set(handlers):
+                    handler.close()
+                root.handlers[:] = handlers
+                root.setLevel(level)
+    return Outcome(status, said.getvalue(), complained.getvalue())
+
+
+@pytest.fixture(scope="session")
+def tiny() -> tuple[str, ...]:
+    """Overrides that make the embedded scene and the schedules tiny."""
+    return (*TINY, *SHORT)
+
+
+@pytest.fixture(scope="session")
+def short() -> tuple[str, ...]:
+    """Overrides that make the schedules tiny, for a scene of any kind."""
+    return SHORT
+
+
+@pytest.fixture(scope="session")
+def devrf_in() -> Devrf:
+    """``devrf_in(folder, *arguments)``: the command with that working folder."""
+    return call
+
+
+@pytest.fixture
+def devrf(tmp_path: Path) -> Devrf:
+    """``devrf(*arguments)``: the command in a folder of the test's own."""
+    return lambda *arguments: call(tmp_path, *arguments)
+
+
+@pytest.fixture(scope="session")
+def trained(
+    tmp_path_factory: pytest.TempPathFactory, tiny: tuple[str, ...]
+) -> Iterator[tuple[Path, Outcome]]:
+    """The folder of a whole tiny run and what the command said; to be read only."""
+    folder = tmp_path_factory.mktemp("trained")
+    outcome = call(folder, *tiny)
+    yield folder / "outputs" / "robot" / "default", outcome
+
+
+class Warm:
+    """Runs commands in processes of their own, without waiting for their imports."""
+
+    def __init__(self, process: subprocess.Popen[str]) -> None:
+        self._process = process
+
+    def __call__(
+        self,
+        folder: Path,
+        *arguments: str,
+        after: tuple[str, int] | None = None,
+        delay: float = 0.0,
+        signals: tuple[int, ...] = (),
+        most_bytes: int = 0,
+        most_memory: int = 0,
+    ) -> Outcome:
+        """``devrf ARGUMENTS`` in ``folder``; ``warm_process.py`` says what the others do."""
+        assert self._process.stdin is not None and self._process.stdout is not None
+        said = folder / "said.txt"
+        before = said.stat().st_size if said.exists() else 0
+        asked = {
+            "folder": str(folder),
+            "arguments": arguments,
+            "after": after,
+            "delay": delay,
+            "signals": signals,
+            "most_bytes": most_bytes,
+            "most_memory": most_memory,
+        }
+        self._process.stdin.write(json.dumps(asked) + "\n")
+        self._process.stdin.flush()
+        status = int(json.loads(self._process.stdout.readline()))
+        return Outcome(status, said.read_text()[before:], "")
+
+
+@pytest.fixture(scope="session")
+def warm() -> Iterator[Warm]:
+    """Runs commands in processes of their own, at the cost of a fork each."""
+    if not hasattr(os, "fork"):
+        pytest.skip("needs fork")
+    source = str(Path(package.__file__).parents[1])
+    environment = {**os.environ, "PYTHONPATH": source, "OMP_NUM_THREADS": "1"}
+    environment.pop("HYDRA_FULL_ERROR", None)
+    with subprocess.Popen(
+        [sys.executable, str(Path(__file__).with_name("warm_process.py"))],
+        env=environment,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as process:
+        assert process.stdin is not None and process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        yield Warm(process)
+        process.stdin.close()

@@ -1,0 +1,95 @@
+"""The composed config is checked against the parts it names."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import pytest
+from omegaconf import OmegaConf
+
+from devrf.cli.config_check import check_config
+from devrf.errors import DevrfError
+
+
+@dataclass
+class Inner:
+    size: int = 1
+
+
+@dataclass
+class Outer:
+    root: str
+    inner: Inner | None = None
+    weights: Mapping[str, float] = field(default_factory=dict)
+
+
+def forwarding(**anything: object) -> None:
+    """A part that takes any setting."""
+
+
+def config(**changes: object):
+    """A config whose ``outer`` takes ``inner`` and ``weights`` from elsewhere."""
+    here = f"{__name__}."
+    base = {
+        "stage": "pipeline",
+        "seed": 0,
+        "resume": True,
+        "memory_check": True,
+        "ckpt": None,
+        "scene": "robot",
+        "objective": "deformation.psnr",
+        "kernels": "auto",
+        "graphs": "auto",
+        "decoder_precision": "auto",
+        "sizes": {"inner": {"_target_": f"{here}Inner", "size": 2}},
+        "loss": {"fine": {"color": 1.0}},
+        "outer": {
+            "_target_": f"{here}Outer",
+            "root": "there",
+            "inner": "${sizes.inner}",
+            "weights": "${loss.fine}",
+        },
+    }
+    made = OmegaConf.create(base)
+    for key, value in changes.items():
+        OmegaConf.update(made, key.replace("__", "."), value, force_add=True)
+    return made
+
+
+@pytest.fixture(autouse=True)
+def importable(monkeypatch, request):
+    """Tests are no package; their module is put where Hydra looks for parts."""
+    import sys
+
+    monkeypatch.setitem(sys.modules, __name__, request.module)
+
+
+def test_a_sound_config_passes():
+    check_config(config())
+
+
+def test_a_part_may_take_anything():
+    check_config(config(more={"_target_": f"{__name__}.forwarding", "whatever": 1}))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"outer__root": "???"}, "outer.root: required; give outer.root=PATH"),
+        ({"outer__rot": 1}, "outer.rot: no such key; did you mean outer.root?"),
+        ({"sizes__inner__siez": 1}, "did you mean sizes.inner.size?"),
+        ({"sizes__innr": {"size": 3}}, "sizes.innr.size: no such key"),
+        ({"loss__fien": {"color": 3.0}}, "loss.fien.color: no such key"),
+        ({"sizes__inner__size": "big"}, "sizes.inner.size: expected a whole number, not 'big'"),
+        ({"loss__fine__color": "high"}, "loss.fine.color: expected a number, not 'high'"),
+        ({"seed": None}, "seed: expected a whole number, not None"),
+        ({"outer__root": "${nowhere}"}, "nowhere"),
+    ],
+)
+def test_the_key_at_fault_is_named(changes, message):
+    with pytest.raises(Exception) as caught:  # noqa: PT011 - OmegaConf's own for the last one
+        check_config(config(**changes))
+    assert message in str(caught.value)
+    if message != "nowhere":
+        assert isinstance(caught.value, DevrfError)

@@ -1,0 +1,58 @@
+"""``stage=inspect``: what a scene holds, said and drawn before anything is learned."""
+
+from __future__ import annotations
+
+import imageio.v3 as iio
+import pytest
+
+
+def test_a_scene_is_described_and_drawn(devrf, tmp_path, tiny):
+    outcome = devrf(*tiny, "stage=inspect", "data.static_views=16", "hydra.run.dir=run")
+    assert (outcome.status, outcome.err) == (0, "")
+    for words in (
+        "robot, inward-facing",
+        "static train",
+        "24 x 20",
+        "optical flow",
+        "3 from 0 to 1",
+        "GPU, deformation stage",
+        "checkpoint",
+        "no problems found",
+        "inspect.png",
+    ):
+        assert words in outcome.out
+    page = iio.imread(tmp_path / "run" / "images" / "inspect.png")
+    assert page.shape[1:] == (1600, 3)
+    assert "inward-facing" in (tmp_path / "run" / "run.log").read_text()
+    assert not (tmp_path / "run" / "checkpoints").exists()
+
+
+def test_problems_are_advice(devrf, tiny):
+    # Two views leave more than half of the circle unseen.
+    outcome = devrf(*tiny, "stage=inspect", "data.static_views=2")
+    assert (outcome.status, outcome.err) == (0, "")
+    assert "problems found: 1" in outcome.out
+    assert "static training set: no view from a sector of" in outcome.out
+
+
+def test_more_of_the_schedule_needs_more_memory(devrf, tiny):
+    def checkpoint(*more: str) -> str:
+        lines = devrf(*tiny, "stage=inspect", *more).out.splitlines()
+        return next(line for line in lines if line.strip().startswith("checkpoint"))
+
+    assert " kB" in checkpoint()
+    assert " MB" in checkpoint("schedule.deformation.sides=[4,64]")
+
+
+@pytest.mark.parametrize(
+    ("argument", "expected"),
+    [
+        ("ckpt=no.ckpt", "ckpt: stage=inspect starts from nothing"),
+        ("data.frames=1", "data.frames"),
+    ],
+)
+def test_a_scene_that_cannot_be_read_is_a_mistake(devrf, tmp_path, tiny, argument, expected):
+    outcome = devrf(*tiny, "stage=inspect", argument)
+    assert outcome.status == 2
+    assert outcome.err.startswith("devrf: ") and expected in outcome.err
+    assert not list(tmp_path.iterdir())

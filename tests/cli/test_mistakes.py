@@ -1,0 +1,156 @@
+"""A wrong command is answered in one line that names the mistake; nothing is left behind."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import devrf as package
+from devrf.cli.steps import STEPS
+
+# Arguments, and what the one line must name.
+MISTAKES = {
+    "misspelt key": (["data.widht=3"], "data.widht: no such key; did you mean data.width?"),
+    "unknown key": (["nonsense=3"], "nonsense: no such key"),
+    "appended unknown key": (["+data.widht=3"], "did you mean data.width?"),
+    "appended unknown section": (["+loss.deform.flow=1"], "loss.deform.flow: no such key"),
+    "appended unknown root key": (["+sede=3"], "sede: no such key; did you mean seed?"),
+    "unknown option": (["data=legoo"], "data=legoo: no such option; choose one of"),
+    "unknown experiment": (["experiment=paper"], "experiment=paper: no such option"),
+    "unreadable override": (["data.box=[[1"], "data.box=[[1: not understood"),
+    "missing root": (["data=inward"], "data.root: required; give data.root=PATH"),
+    "missing folder": (["data=inward", "data.root=nowhere"], "nowhere: no such folder"),
+    "unknown stage": (["stage=train"], "stage: expected one of prepare, inspect"),
+    "too few frames": (["data.frames=1"], "data.frames"),
+    "word for a number": (["data.width=abc"], "data.width: expected a whole number, not 'abc'"),
+    "fraction for a count": (["seed=1.5"], "seed: expected a whole number, not 1.5"),
+    "seed out of range": (["seed=-1"], "seed: expected 0 to"),
+    "unknown choice": (
+        ["data=inward", "data.root=.", "data.flow=farneback"],
+        "data.flow: expected one of auto",
+    ),
+    "descending doublings": (
+        ["schedule.canonical.doublings=[5,3]"],
+        "schedule.canonical.doublings",
+    ),
+    "levels that do not match": (["schedule.deformation.sides=[4]"], "schedule.deformation.sides"),
+    "words for frames at once": (
+        ["schedule.deformation.parallel_frames=[1,many]"],
+        "schedule.deformation.parallel_frames: expected a list of which each is a whole number or "
+        "null, not",
+    ),
+    "frames at once where they start from one another": (
+        ["schedule.deformation.parallel_frames=[2,2]"],
+        "schedule.deformation.parallel_frames: expected 1 at the first level",
+    ),
+    "unknown loss term": (["+loss.deformation.foo=1"], "unknown term 'foo'"),
+    "word for a weight": (["loss.fine.color=high"], "loss.fine.color: expected a number"),
+    "unknown trainer setting": (["+trainer.max_step=3"], "did you mean trainer.max_steps?"),
+    "unknown accelerator": (["trainer.accelerator=abacus"], "trainer: "),
+    "several devices, each for itself": (
+        ["trainer.devices=2"],
+        "trainer.devices: 2 processes need trainer=ddp",
+    ),
+    "part that is not there": (["data._target_=devrf.nothing"], "data._target_: cannot load"),
+    "unknown objective": (["objective=deformation.pnsr"], "objective: deformation has no 'pnsr'"),
+    "scoring before training": (["stage=evaluate"], "canonical.ckpt: no such checkpoint"),
+    "moving before the rest state": (["stage=deformation"], "canonical.ckpt: no such checkpoint"),
+    "missing checkpoint": (["stage=render", "ckpt=no.ckpt"], "no.ckpt: no such checkpoint"),
+    "checkpoint where none is used": (["ckpt=no.ckpt"], "ckpt: stage=pipeline starts from nothing"),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_one_line_and_nothing_left(devrf, tmp_path, tiny, short, name):
+    arguments, expected = MISTAKES[name]
+    inward = "data=inward" in arguments
+    outcome = devrf(*(short if inward else tiny), *arguments)
+    assert outcome.status == 2
+    assert outcome.err.count("\n") == 1
+    assert outcome.err.startswith("devrf: ")
+    assert expected in outcome.err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_checkpoint_of_another_scene(devrf, tmp_path, tiny, trained):
+    checkpoint = trained[0] / "checkpoints" / "canonical.ckpt"
+    outcome = devrf(*tiny, "stage=deformation", "data.frames=4", f"ckpt={checkpoint}")
+    assert outcome.status == 2
+    assert outcome.err.startswith(f"devrf: {checkpoint}: belongs to another scene")
+    assert outcome.err.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_deformation_on_top_of_a_deformation(devrf, tmp_path, tiny, trained):
+    checkpoint = trained[0] / "checkpoints" / "deformation.ckpt"
+    outcome = devrf(*tiny, "stage=deformation", f"ckpt={checkpoint}")
+    assert outcome.status == 2
+    assert "needs a canonical checkpoint" in outcome.err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_file_where_the_run_folder_should_be(devrf, tmp_path, tiny):
+    (tmp_path / "taken").write_text("mine")
+    outcome = devrf(*tiny, "hydra.run.dir=taken/run")
+    assert (outcome.status, outcome.err) == (2, f"devrf: {Path('taken/run')}: Not a directory\n")
+
+
+def test_results_of_an_earlier_run_survive_a_mistake(devrf, tmp_path, tiny):
+    assert devrf(*tiny, "stage=canonical", "hydra.run.dir=run").status == 0
+    before = (tmp_path / "run" / "checkpoints" / "canonical.ckpt").read_bytes()
+    assert devrf(*tiny, "stage=deformation", "hydra.run.dir=run", "data.frames=1").status == 2
+    assert (tmp_path / "run" / "checkpoints" / "canonical.ckpt").read_bytes() == before
+
+
+def test_a_fault_of_the_program_keeps_its_traceback(devrf, tiny, monkeypatch):
+    def boom(run: object) -> None:
+        raise RuntimeError("ours")
+
+    monkeypatch.setitem(STEPS, "canonical", (boom,))
+    with pytest.raises(RuntimeError, match="ours"):
+        devrf(*tiny, "stage=canonical")
+
+
+def test_help_names_stages_groups_and_examples(devrf):
+    outcome = devrf("--help")
+    assert outcome.status == 0
+    for words in ("stage=deformation", "data=inward data.root=PATH", "experiment: ", "ablation: "):
+        assert words in outcome.out
+
+
+def command(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    source = str(Path(package.__file__).parents[1])
+    path = os.pathsep.join(filter(None, [source, os.environ.get("PYTHONPATH")]))
+    environment = {**os.environ, "PYTHONPATH": path, "HYDRA_FULL_ERROR": "0"}
+    return subprocess.run(
+        [sys.executable, *arguments],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+def test_as_a_process_of_its_own(tmp_path):
+    done = command("-m", "devrf", "data=inward", "data.root=nowhere", folder=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr == "devrf: nowhere: no such folder; set data.root to the scene's folder\n"
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_fault_as_a_process_of_its_own(tmp_path):
+    script = (
+        "import devrf.cli.steps, devrf.__main__\n"
+        "devrf.cli.steps.STEPS['prepare'] = (lambda run: 1 / 0,)\n"
+        "devrf.__main__.entry()\n"
+    )
+    done = command("-c", script, "stage=prepare", folder=tmp_path)
+    assert done.returncode == 1
+    assert "Traceback" in done.stderr
+    assert done.stderr.strip().endswith("ZeroDivisionError: division by zero")

@@ -1,0 +1,219 @@
+"""The main job, stage by stage and all at once, on a tiny embedded scene."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from pathlib import Path
+
+import imageio.v3 as iio
+import pytest
+
+FURTHER = {
+    "ms_ssim",
+    "lpips",
+    "psnr_masked",
+    "ssim_masked",
+    "lpips_masked",
+    "depth_error",
+    "flow_error",
+}
+CANONICAL_KEYS = {
+    "psnr",
+    "ssim",
+    "seconds",
+    "iterations",
+    "iterations_per_second",
+    "peak_gpu_gb",
+    "num_rollbacks",
+} | FURTHER
+DEFORMATION_KEYS = CANONICAL_KEYS | {"rest_pose_psnr", "checkpoint_mb"}
+
+
+def metrics(folder: Path) -> dict:
+    return json.loads((folder / "metrics.json").read_text())
+
+
+def test_the_whole_run_succeeds_and_says_nothing_on_stderr(trained):
+    _, outcome = trained
+    assert outcome.status == 0
+    assert outcome.err == ""
+
+
+def test_metrics_have_the_documented_keys(trained):
+    folder, _ = trained
+    found = metrics(folder)
+    assert list(found) == ["scene", "canonical", "deformation", "run"]
+    assert found["scene"] == "robot"
+    assert set(found["canonical"]) == CANONICAL_KEYS
+    assert set(found["deformation"]) == DEFORMATION_KEYS
+    assert found["canonical"]["iterations"] == 6
+    assert found["deformation"]["iterations"] == 12  # (2 + 2) for each of 3 frames
+    assert found["deformation"]["checkpoint_mb"] == pytest.approx(
+        (folder / "checkpoints" / "deformation.ckpt").stat().st_size / 1e6, abs=1e-3
+    )
+
+
+def test_what_is_known_of_an_embedded_scene_is_measured(trained):
+    found = metrics(trained[0])
+    for section in (found["canonical"], found["deformation"]):
+        # 24 x 20 pixels are too few for MS-SSIM's scales.
+        assert section["ms_ssim"] is None
+        assert section["psnr_masked"] > 0 and section["ssim_masked"] < 1
+        assert section["depth_error"] is None or section["depth_error"] > 0
+    assert found["canonical"]["flow_error"] is None
+    assert found["deformation"]["flow_error"] > 0
+
+
+def test_a_run_says_how_it_came_about(trained):
+    ran = metrics(trained[0])["run"]
+    assert ran["parameters"] > 1000 and ran["device"] and ran["torch"]
+    assert ran["choices"]["data"] == "procedural" and ran["choices"]["ablation"] == "full"
+    assert ran["choices"]["experiment"] is None and "hydra/launcher" not in ran["choices"]
+    assert "data.frames=3" in ran["overrides"]
+    assert (ran["seed"], ran["train_views"], ran["test_frames"]) == (0, 2, 3)
+    found = metrics(trained[0])
+    for stage in ("canonical", "deformation"):
+        assert ran["wall_seconds"][stage] >= found[stage]["seconds"] > 0
+        took = found[stage]["iterations"] / found[stage]["iterations_per_second"]
+        assert took == pytest.approx(found[stage]["seconds"], abs=0.01)
+    assert ran["wall_seconds"]["evaluate"] > 0
+
+
+def test_every_frame_has_a_row(trained):
+    with (trained[0] / "frames.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["capture"] for row in rows] == ["static"] * 2 + ["dynamic"] * 3
+    assert [float(row["time"]) for row in rows[2:]] == [0, 0.5, 1]
+    found = metrics(trained[0])["deformation"]
+    for name in ("psnr", "ssim", "psnr_masked", "rest_pose_psnr"):
+        mean = sum(float(row[name]) for row in rows[2:]) / 3
+        assert mean == pytest.approx(found[name], rel=1e-4)
+    assert rows[2]["flow_error"] == ""  # nothing comes before the first frame
+
+
+def test_fewer_metrics_may_be_asked_for(devrf, tmp_path, tiny, trained):
+    checkpoint = trained[0] / "checkpoints" / "deformation.ckpt"
+    outcome = devrf(
+        *tiny,
+        "stage=evaluate",
+        f"ckpt={checkpoint}",
+        "hydra.run.dir=few",
+        "evaluation.metrics=[psnr_masked]",
+    )
+    assert (outcome.status, outcome.err) == (0, "")
+    assert "LPIPS" not in outcome.out
+    found = metrics(tmp_path / "few")["canonical"]
+    assert set(found) == CANONICAL_KEYS - FURTHER | {"psnr_masked"}
+
+
+@pytest.mark.parametrize(
+    ("argument", "expected"),
+    [
+        ("evaluation.metrics=[lpisp]", "evaluation.metrics: no metric 'lpisp'"),
+        ("evaluation.lpips_weights=no.pth", "evaluation.lpips_weights: no file no.pth"),
+    ],
+)
+def test_a_metric_that_cannot_be_is_a_mistake(devrf, tmp_path, tiny, argument, expected):
+    outcome = devrf(*tiny, argument)
+    assert outcome.status == 2
+    assert expected in outcome.err
+    assert not list(tmp_path.iterdir())
+
+
+def test_everything_lies_in_the_run_folder(trained):
+    folder, _ = trained
+    made = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
+    assert {
+        ".hydra/config.yaml",
+        "run.log",
+        "metrics.json",
+        "frames.csv",
+        "checkpoints/canonical.ckpt",
+        "checkpoints/deformation.ckpt",
+        "images/static.png",
+        "images/dynamic.png",
+        "videos/held_out.mp4",
+        "videos/orbit.mp4",
+    } <= made
+    assert not [name for name in made if "partial" in name]
+
+
+def test_pictures_and_videos_can_be_read(trained):
+    folder, _ = trained
+    sheet = iio.imread(folder / "images" / "dynamic.png")
+    assert sheet.ndim == 3 and sheet.shape[2] == 3
+    video = iio.imread(folder / "videos" / "held_out.mp4")
+    assert len(video) == 4
+    # Colour beside depth, 24 x 20 px each, enlarged alike.
+    assert video.shape[2] / video.shape[1] == pytest.approx(2 * 24 / 20, rel=0.02)
+
+
+def test_stages_one_by_one_find_the_checkpoints_and_come_to_the_same(
+    devrf, tmp_path, tiny, trained
+):
+    folder = tmp_path / "run"
+    for stage in ("canonical", "deformation", "evaluate", "render"):
+        outcome = devrf(*tiny, f"stage={stage}", f"hydra.run.dir={folder}")
+        assert (outcome.status, outcome.err) == (0, "")
+    assert (folder / "videos" / "orbit.mp4").is_file()
+    ours, whole = metrics(folder), metrics(trained[0])
+    # Each step ran by itself; the checkpoints say how long the earlier ones took.
+    assert all(seconds > 0 for seconds in ours["run"]["wall_seconds"].values())
+    for section in ("canonical", "deformation"):
+        assert ours[section]["psnr"] == pytest.approx(whole[section]["psnr"], abs=0.01)
+
+
+def test_the_canonical_stage_alone_can_be_scored(devrf, tmp_path, tiny):
+    for stage in ("canonical", "evaluate"):
+        outcome = devrf(*tiny, f"stage={stage}", "hydra.run.dir=run")
+        assert (outcome.status, outcome.err) == (0, "")
+    found = metrics(tmp_path / "run")
+    assert list(found) == ["scene", "canonical", "run"]
+    assert found["run"]["wall_seconds"]["deformation"] is None
+
+
+def test_a_checkpoint_from_elsewhere_is_taken_as_given(devrf, tmp_path, tiny, trained):
+    checkpoint = trained[0] / "checkpoints" / "deformation.ckpt"
+    outcome = devrf(*tiny, "stage=evaluate", f"ckpt={checkpoint}", "hydra.run.dir=scores")
+    assert (outcome.status, outcome.err) == (0, "")
+    scores, whole = metrics(tmp_path / "scores"), metrics(trained[0])
+    assert {**scores, "run": None} == {**whole, "run": None}
+
+
+def test_the_deformation_stage_starts_from_a_checkpoint_elsewhere(devrf, tmp_path, tiny, trained):
+    checkpoint = trained[0] / "checkpoints" / "canonical.ckpt"
+    outcome = devrf(*tiny, "stage=deformation", f"ckpt={checkpoint}", "hydra.run.dir=moved")
+    assert (outcome.status, outcome.err) == (0, "")
+    assert (tmp_path / "moved" / "checkpoints" / "deformation.ckpt").is_file()
+
+
+def test_the_folder_tells_scene_experiment_and_ablation(devrf, tmp_path, tiny):
+    outcome = devrf(
+        *tiny, "stage=canonical", "data.shape=flower", "experiment=quickstart", "ablation=c2f"
+    )
+    assert (outcome.status, outcome.err) == (0, "")
+    assert (tmp_path / "outputs/flower/quickstart-c2f/checkpoints/canonical.ckpt").is_file()
+
+
+def test_a_sweep_runs_every_combination(devrf, tmp_path, tiny):
+    outcome = devrf(
+        "--multirun", *tiny, "stage=canonical", "ablation=base,full", "hydra.sweep.dir=sweep"
+    )
+    assert (outcome.status, outcome.err) == (0, "")
+    assert len(list((tmp_path / "sweep").glob("*/checkpoints/canonical.ckpt"))) == 2
+
+
+def test_a_deformation_of_another_canonical_field_is_not_passed_off_as_its_own(
+    devrf, tmp_path, tiny, trained
+):
+    folder = tmp_path / "retrained"
+    shutil.copytree(trained[0], folder)
+    assert devrf(*tiny, "stage=canonical", "seed=1", "hydra.run.dir=other").status == 0
+    other = tmp_path / "other" / "checkpoints" / "canonical.ckpt"
+    other.replace(folder / "checkpoints" / "canonical.ckpt")
+    outcome = devrf(*tiny, "stage=evaluate", f"hydra.run.dir={folder}")
+    assert outcome.status == 0
+    assert "deformation.ckpt: left out, it belongs to another canonical field" in outcome.out
+    assert "deformation" not in metrics(folder)

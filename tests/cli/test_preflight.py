@@ -1,0 +1,178 @@
+"""A run says what it needs, refuses what cannot be, and lives with little memory."""
+
+from __future__ import annotations
+
+import csv
+import re
+import sys
+
+import pytest
+import torch
+
+from devrf.checkpoints.checkpoint_file import read_checkpoint_file
+from devrf.cli import preflight as room
+
+NEEDS = re.compile(
+    r"needs about ([\d.]+) of [\d.]+ GiB of host memory, ([\d.]+) of [\d.]+ GiB of disk"
+)
+
+
+def test_the_budget_is_told_first(trained) -> None:
+    lines = trained[1].out.splitlines()
+    said = [k for k, line in enumerate(lines) if NEEDS.search(line)]
+    assert len(said) == 1
+    assert said[0] < next(k for k, line in enumerate(lines) if "fields live in" in line)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "key"),
+    [
+        (["schedule.deformation.sides=[4,2000]"], "schedule.deformation.sides"),
+        (["schedule.canonical.side=3000"], "schedule.canonical.side"),
+        (["schedule.canonical.rays=1000000000"], "schedule.canonical.rays"),
+        (["stage=canonical", "schedule.canonical.side=3000"], "schedule.canonical.side"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_it_begins(devrf, tiny, tmp_path, arguments, key) -> None:
+    outcome = devrf(*tiny, *arguments, "hydra.run.dir=run")
+    assert outcome.status == 2
+    assert outcome.err.startswith(f"devrf: {key}: the run needs about ")
+    assert outcome.err.count("\n") == 1 and "memory_check=false" in outcome.err
+    assert not (tmp_path / "run" / "checkpoints").exists()
+
+
+def test_a_full_disk_is_noticed_before_it_begins(devrf, tiny, monkeypatch) -> None:
+    monkeypatch.setattr(room, "free_disk", lambda folder: 1000)
+    outcome = devrf(*tiny)
+    assert outcome.status == 2
+    assert re.search(r" of 9.3e-07 GiB of disk; it would end for lack of disk", outcome.err)
+
+
+def test_the_estimate_may_be_overruled(devrf, tiny, monkeypatch) -> None:
+    monkeypatch.setattr(room, "free_host_memory", lambda: -(10**12))
+    outcome = devrf(*tiny, "stage=canonical", "hydra.run.dir=run")
+    assert outcome.status == 2 and "lack of host memory" in outcome.err
+    assert devrf(*tiny, "stage=canonical", "hydra.run.dir=run", "memory_check=false").status == 0
+
+
+def test_what_is_learned_needs_nothing(devrf, tiny, monkeypatch) -> None:
+    command = (*tiny, "stage=canonical", "hydra.run.dir=run")
+    assert devrf(*command).status == 0
+    monkeypatch.setattr(room, "free_host_memory", lambda: -(10**12))
+    assert devrf(*command).status == 0
+
+
+def test_nothing_is_set_aside_for_a_run_that_cannot_be(devrf, tiny, monkeypatch, tmp_path) -> None:
+    command = (*tiny, "stage=canonical", "hydra.run.dir=run")
+    assert devrf(*command).status == 0
+    monkeypatch.setattr(room, "free_host_memory", lambda: -(10**12))
+    assert devrf(*command, "resume=false").status == 2
+    assert (tmp_path / "run" / "checkpoints" / "canonical.ckpt").is_file()
+    assert not (tmp_path / "run" / "previous-1").exists()
+
+
+def test_a_lack_of_memory_that_nothing_helps_against_is_told_in_a_line(
+    devrf, tiny, monkeypatch
+) -> None:
+    def enter(stage: object, phase: object) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 3.00 GiB.")
+
+    monkeypatch.setattr("devrf.methods.devrf.canonical_stage.CanonicalStage.enter", enter)
+    outcome = devrf(*tiny)
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert outcome.err.startswith("devrf: stage=canonical: out of memory (3.0 GiB more asked, ")
+    assert "lower schedule.canonical.side or schedule.canonical.rays" in outcome.err
+
+
+# Half of the fields and a small part of a batch fit into what is left of the program.
+LARGE = (
+    "schedule.canonical.rays=60000",
+    "schedule.canonical.iterations=2",
+    "schedule.canonical.doublings=[]",
+    "stage=canonical",
+    "hydra.run.dir=run",
+)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits as Linux knows them")
+def test_a_stage_learns_in_parts_where_memory_is_short(warm, tiny, tmp_path) -> None:
+    command = (*tiny, *LARGE)
+    outcome = warm(tmp_path, *command, most_memory=300 * 2**20)
+    assert outcome.status == 0, outcome.out
+    assert re.search(r"out of memory \(.*: batches are taken in \d parts from now on", outcome.out)
+    limited = read_checkpoint_file(tmp_path / "run" / "checkpoints" / "canonical.ckpt")[
+        "state_dict"
+    ]
+    outcome = warm(tmp_path / "free", *command)
+    assert outcome.status == 0 and "out of memory" not in outcome.out
+    free = read_checkpoint_file(tmp_path / "free" / "run" / "checkpoints" / "canonical.ckpt")[
+        "state_dict"
+    ]
+    name = "scene_model.canonical.color.values"
+    torch.testing.assert_close(limited[name], free[name], rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits as Linux knows them")
+def test_a_stage_that_not_even_parts_fit_for_ends_saved(warm, tiny, tmp_path) -> None:
+    command = (*tiny, *LARGE, "schedule.canonical.rays=400000")
+    outcome = warm(tmp_path, *command, most_memory=200 * 2**20)
+    assert outcome.status == 2, outcome.out
+    said = outcome.out.splitlines()[-1]
+    assert said.startswith("devrf: canonical stage: out of memory (") and " GiB free on cpu" in said
+    assert "schedule.canonical.rays" in said and "the same command goes on" in said
+    assert list((tmp_path / "run" / "checkpoints").glob("canonical-progress-*.ckpt"))
+
+
+# The sizes of stages, and how many pixels their images have.
+SIZES = {
+    "small": (
+        "data.width=48",
+        "data.height=48",
+        "schedule.canonical.side=32",
+        "schedule.canonical.rays=1024",
+        "schedule.canonical.iterations=4",
+        "schedule.canonical.doublings=[1]",
+        "schedule.deformation.sides=[8,24]",
+        "schedule.deformation.rays=1024",
+        "schedule.deformation.iterations_per_frame=[1,1]",
+    ),
+    "large": (
+        "data.width=96",
+        "data.height=96",
+        "data.frames=2",
+        "schedule.canonical.side=80",
+        "schedule.canonical.rays=4096",
+        "schedule.canonical.iterations=2",
+        "schedule.canonical.doublings=[1]",
+        "schedule.deformation.sides=[56]",
+        "schedule.deformation.rays=4096",
+        "schedule.deformation.iterations_per_frame=[1]",
+    ),
+}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="peaks as Linux counts them")
+@pytest.mark.parametrize("size", SIZES)
+def test_the_estimate_is_near_what_is_taken(warm, tiny, tmp_path, size) -> None:
+    command = (
+        *tiny,
+        "field.width=128",
+        *SIZES[size],
+        "hydra.run.dir=run",
+        "video.frames=1",
+        "evaluation.metrics=[]",
+        "callbacks.saving.every_seconds=0",
+        "callbacks.saving.share=1.0",
+        "trainer.log_every_n_steps=1",
+    )
+    for stage in ("canonical", "deformation"):
+        outcome = warm(tmp_path, *command, f"stage={stage}")
+        assert outcome.status == 0, outcome.out
+        found = NEEDS.search(outcome.out)
+        assert found is not None
+        path = tmp_path / "run" / "logs" / stage / "metrics.csv"
+        with path.open(newline="") as file:
+            rows = [row for row in csv.DictReader(file)]
+        column = next(name for name in rows[0] if name.endswith("/peak_host_gb"))
+        taken = max(float(row[column]) for row in rows)
+        assert 0.7 < float(found.group(1)) / taken < 1.5, (stage, found.group(1), taken)

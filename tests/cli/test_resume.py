@@ -1,0 +1,224 @@
+"""The same command again goes on; another config is refused; ``resume=false`` begins afresh."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from devrf.checkpoints.checkpoint import load_checkpoint
+from devrf.checkpoints.checkpoint_file import read_checkpoint_file, write_checkpoint_file
+from devrf.cli.resume import archive_previous
+
+
+@pytest.fixture
+def run(trained, tmp_path) -> Path:
+    """A copy of the folder of a whole tiny run."""
+    folder = tmp_path / "run"
+    shutil.copytree(trained[0], folder)
+    return folder
+
+
+@pytest.fixture
+def again(devrf, tiny, run):
+    """``again(*arguments)``: the command of that run, with more arguments."""
+    return lambda *arguments: devrf(*tiny, f"hydra.run.dir={run}", *arguments)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+
+
+def test_what_is_finished_is_not_learned_again(again, run):
+    before = {path.name: path.read_bytes() for path in (run / "checkpoints").glob("*.ckpt")}
+    scores = json.loads((run / "metrics.json").read_text())
+    outcome = again()
+    assert (outcome.status, outcome.err) == (0, "")
+    for stage in ("canonical", "deformation"):
+        assert f"{stage}: learned already ({run}/checkpoints/{stage}.ckpt)" in outcome.out
+        assert (run / "checkpoints" / f"{stage}.ckpt").read_bytes() == before[f"{stage}.ckpt"]
+    now = json.loads((run / "metrics.json").read_text())
+    assert {**now, "run": None} == {**scores, "run": None}
+
+
+def test_what_decides_nothing_may_change(again):
+    outcome = again(
+        "stage=canonical",
+        "video.frames=9",
+        "evaluation.metrics=[]",
+        "callbacks.saving.share=0.5",
+        "trainer.log_every_n_steps=2",
+        "logger.name=curves",
+        "data.export=elsewhere",
+    )
+    assert outcome.status == 0
+    assert "canonical: learned already" in outcome.out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "key", "before", "now"),
+    [
+        (["loss.fine.color=2"], "loss.fine.color", "1.0", "2"),
+        (["schedule.canonical.doublings=[3]"], "schedule.canonical.doublings", "[2]", "[3]"),
+        (["seed=1"], "seed", "0", "1"),
+        (["schedule.motion.start=previous"], "schedule.motion.start", '"flow"', '"previous"'),
+    ],
+)
+def test_another_config_is_refused_by_the_name_of_the_key(again, run, arguments, key, before, now):
+    kept = contents(run / "checkpoints")
+    outcome = again(*arguments)
+    assert outcome.status == 2
+    assert outcome.err.count("\n") == 1 and outcome.err.startswith(f"devrf: {key}: ")
+    assert f"was made with {before}, now it is {now}; give resume=false" in outcome.err
+    assert "hydra.run.dir=FOLDER" in outcome.err
+    assert contents(run / "checkpoints") == kept
+
+
+def test_a_deformation_cares_for_its_own_settings_only(again):
+    outcome = again("stage=deformation", "schedule.canonical.iterations=7")
+    assert outcome.status == 0
+    assert "deformation: learned already" in outcome.out
+
+
+def test_beginning_afresh_keeps_the_old_run_whole(again, run):
+    before = contents(run)
+    outcome = again("resume=false", "seed=1")
+    assert (outcome.status, outcome.err) == (0, "")
+    assert f"what was in {run} is kept in {run}/previous-1" in outcome.out
+    kept = contents(run / "previous-1")
+    assert kept == {k: v for k, v in before.items() if not k.startswith((".hydra", ".devrf"))}
+    # What it was learned with lies beside what was learned.
+    assert OmegaConf.load(run / "previous-1" / "checkpoints" / "config.yaml").seed == 0
+    assert OmegaConf.load(run / "checkpoints" / "config.yaml").seed == 1
+    assert (run / "metrics.json").is_file()
+    assert "previous" not in (run / "run.log").read_text().replace(str(run / "previous-1"), "")
+    assert again("resume=false", "seed=2", "stage=canonical").status == 0
+    assert contents(run / "previous-1") == kept
+    assert (run / "previous-2" / "metrics.json").is_file()
+
+
+def test_a_deformation_learned_afresh_keeps_its_canonical_field(again, run):
+    before = contents(run)
+    outcome = again("resume=false", "stage=deformation", "schedule.motion.start=previous")
+    assert (outcome.status, outcome.err) == (0, "")
+    now, kept = contents(run), contents(run / "previous-1")
+    for name in ("canonical", "deformation"):
+        assert kept[f"checkpoints/{name}.ckpt"] == before[f"checkpoints/{name}.ckpt"]
+    assert now["checkpoints/canonical.ckpt"] == before["checkpoints/canonical.ckpt"]
+    assert now["checkpoints/deformation.ckpt"] != before["checkpoints/deformation.ckpt"]
+
+
+@pytest.mark.parametrize("stage", ["evaluate", "render"])
+def test_where_nothing_is_learned_nothing_is_set_aside(again, run, stage):
+    assert again("resume=false", f"stage={stage}").status == 0
+    assert not (run / "previous-1").exists()
+
+
+def test_a_mistake_sets_nothing_aside(again, run):
+    assert again("resume=false", "loss.deformation.cycle=high").status == 2
+    assert again("resume=false", "schedule.canonical.doublings=[9]").status == 2
+    assert not (run / "previous-1").exists()
+
+
+def test_setting_aside_finds_a_free_name(tmp_path):
+    for name in ("previous-1", "previous-12", "previous-x", ".hydra", ".devrf"):
+        (tmp_path / name).mkdir()
+    archive_previous(tmp_path)
+    assert not (tmp_path / "previous-13").exists()
+    (tmp_path / "metrics.json").write_text("{}")
+    archive_previous(tmp_path)
+    assert [path.name for path in (tmp_path / "previous-13").iterdir()] == ["metrics.json"]
+
+
+def test_a_deformation_is_learned_anew_on_another_canonical_field(again, run, devrf, tiny):
+    path = run / "checkpoints" / "canonical.ckpt"
+    content = read_checkpoint_file(path)
+    content["devrf"]["records"] = {}  # as if learned on another day
+    write_checkpoint_file(path, content)
+    outcome = again("stage=deformation")
+    assert outcome.status == 0
+    assert "deformation.ckpt: belongs to another canonical field; learned anew" in outcome.out
+    assert "deformation: seconds" in outcome.out
+
+
+def test_a_canonical_field_that_is_given_belongs_to_the_deformation(devrf, tiny, trained, tmp_path):
+    given = trained[0] / "checkpoints" / "canonical.ckpt"
+    command = (*tiny, "stage=deformation", "hydra.run.dir=moved")
+    assert devrf(*command, f"ckpt={given}").status == 0
+    copied = shutil.copy(given, tmp_path / "same.ckpt")
+    assert "learned already" in devrf(*command, f"ckpt={copied}").out
+    content = read_checkpoint_file(given)
+    write_checkpoint_file(
+        tmp_path / "other.ckpt", {**content, "devrf": {**content["devrf"], "records": {}}}
+    )
+    outcome = devrf(*command, "ckpt=other.ckpt")
+    assert outcome.status == 2
+    assert outcome.err.startswith("devrf: ckpt: ")
+    # What it was learned on is no field of this folder: it is scored as it is.
+    assert devrf(*tiny, "stage=evaluate", "hydra.run.dir=moved").status == 0
+
+
+def test_a_finished_checkpoint_that_is_damaged_is_refused(again, run):
+    path = run / "checkpoints" / "canonical.ckpt"
+    altered = bytearray(path.read_bytes())
+    altered[len(altered) // 2] ^= 1
+    path.write_bytes(altered)
+    outcome = again()
+    assert outcome.status == 2
+    assert outcome.err.startswith(f"devrf: {path}: damaged: altered since it was written")
+
+
+OFTEN = (
+    "callbacks.saving.every_seconds=0",
+    "callbacks.saving.share=1.0",
+    "canonical.iterations_per_step=1",
+    "deformation.iterations_per_step=1",
+    "trainer.log_every_n_steps=100",
+)
+
+
+def test_a_run_that_was_cut_short_goes_on(devrf, tiny, tmp_path):
+    command = (*tiny, *OFTEN, "hydra.run.dir=run", "stage=canonical")
+    checkpoints = tmp_path / "run" / "checkpoints"
+    assert devrf(*command, "trainer.max_steps=3").status == 0
+    left = {path.name for path in checkpoints.glob("*.ckpt")}
+    assert left == {"canonical-progress-2.ckpt", "canonical-progress-3.ckpt", "canonical.ckpt"}
+    outcome = devrf(*command)
+    assert outcome.status == 0
+    assert "canonical: goes on at iteration 3" in outcome.out
+    assert {path.name for path in checkpoints.glob("*.ckpt")} == {"canonical.ckpt"}
+    assert devrf(*command, "hydra.run.dir=whole").status == 0
+    ours, whole = (
+        load_checkpoint(tmp_path / folder / "checkpoints" / "canonical.ckpt").model.canonical
+        for folder in ("run", "whole")
+    )
+    assert (ours.density.values == whole.density.values).all()
+
+
+def test_a_damaged_progress_file_gives_way_to_the_one_before(devrf, tiny, tmp_path):
+    command = (*tiny, *OFTEN, "hydra.run.dir=run", "stage=canonical")
+    assert devrf(*command, "trainer.max_steps=4").status == 0
+    newest = tmp_path / "run" / "checkpoints" / "canonical-progress-4.ckpt"
+    newest.write_bytes(newest.read_bytes()[:-100])
+    outcome = devrf(*command)
+    assert (outcome.status, outcome.err) == (0, "")
+    assert f"{newest}: damaged: truncated" in outcome.out
+    assert "the file before it is taken" in outcome.out
+    assert "canonical: goes on at iteration 3" in outcome.out
+
+
+def test_a_run_left_with_another_config_is_refused(devrf, tiny, tmp_path):
+    command = (*tiny, *OFTEN, "hydra.run.dir=run", "stage=canonical")
+    assert devrf(*command, "trainer.max_steps=4").status == 0
+    (tmp_path / "run" / "checkpoints" / "canonical.ckpt").unlink()
+    outcome = devrf(*command, "sampling.step=0.4")
+    assert outcome.status == 2
+    assert outcome.err.startswith("devrf: sampling.step: ")
+    assert "canonical-progress-4.ckpt was made with 0.5, now it is 0.4" in outcome.err

@@ -1,0 +1,49 @@
+"""``stage=still`` and videos of any size."""
+
+from __future__ import annotations
+
+import shutil
+
+import imageio.v3 as iio
+import pytest
+
+
+def test_a_still_in_any_size(devrf, tmp_path, tiny, trained):
+    checkpoint = trained[0] / "checkpoints" / "deformation.ckpt"
+    outcome = devrf(
+        *tiny,
+        "stage=still",
+        f"ckpt={checkpoint}",
+        "still.time=0.3",
+        "still.height=70",
+        "hydra.run.dir=run",
+    )
+    assert (outcome.status, outcome.err) == (0, "")
+    for name in ("still", "still_depth"):
+        assert f"{name}.png" in outcome.out
+        assert iio.imread(tmp_path / "run" / "images" / f"{name}.png").shape == (70, 84, 3)
+
+
+def test_videos_in_any_size_are_not_enlarged(devrf, tmp_path, tiny, trained):
+    shutil.copytree(trained[0] / "checkpoints", tmp_path / "run" / "checkpoints")
+    outcome = devrf(*tiny, "stage=render", "video.height=30", "hydra.run.dir=run")
+    assert (outcome.status, outcome.err) == (0, "")
+    for name in ("held_out", "orbit"):
+        video = iio.imread(tmp_path / "run" / "videos" / f"{name}.mp4")
+        assert video.shape == (4, 30, 72, 3)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["still.view=6"], "still.view: expected held_out or 0 to 5, not 6"),
+        (["still.view=front"], "still.view: expected one of held_out or a whole number"),
+        (["still.time=2"], "still.time: expected 0 to 1, not 2"),
+    ],
+)
+def test_no_such_still(devrf, tmp_path, tiny, trained, arguments, expected):
+    checkpoint = trained[0] / "checkpoints" / "deformation.ckpt"
+    outcome = devrf(*tiny, "stage=still", f"ckpt={checkpoint}", *arguments)
+    assert outcome.status == 2
+    assert outcome.err.count("\n") == 1 and expected in outcome.err
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,201 @@
+"""Sweeps: what fails is recorded, the rest goes on, and the end says so."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from hydra.core.config_store import ConfigStore
+
+import devrf as package
+from devrf.cli.context import RunContext
+from devrf.cli.steps import STEPS
+
+LEARN = ("stage=canonical", "hydra.sweep.dir=sweep")
+
+
+def installed(plugin: str) -> pytest.MarkDecorator:
+    missing = importlib.util.find_spec(f"hydra_plugins.{plugin}") is None
+    return pytest.mark.skipif(missing, reason=f"{plugin} is not installed")
+
+
+def failure(folder: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((folder / "failure.json").read_text())
+    return found
+
+
+@pytest.fixture
+def steps(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[RunContext], None]], None]:
+    """Replaces what stage=canonical does."""
+    return lambda step: monkeypatch.setitem(STEPS, "canonical", (step,))
+
+
+def test_a_mistake_in_one_job_is_recorded_and_the_others_go_on(devrf, tmp_path, tiny):
+    outcome = devrf("-m", *tiny, *LEARN, "data.frames=1,3,4", "seed=7")
+    assert outcome.status == 3
+    assert outcome.err.splitlines() == [
+        "devrf: job 0_robot: data.frames: must be at least 2, not 1",
+        "devrf: 1 of 3 jobs failed: 0_robot; failure.json in each folder below sweep says why",
+    ]
+    found = failure(tmp_path / "sweep" / "0_robot")
+    assert found["scene"] == "robot" and found["seed"] == 7 and found["mistake"] is True
+    assert found["error"] == "data.frames: must be at least 2, not 1"
+    assert found["choices"]["schedule"] == "quick" and "data.frames=1" in found["overrides"]
+    assert found["date"].endswith("+00:00")
+    assert (tmp_path / "sweep" / "0_robot" / ".hydra" / "config.yaml").is_file()
+    for job in ("1_robot", "2_robot"):
+        assert (tmp_path / "sweep" / job / "checkpoints" / "canonical.ckpt").is_file()
+        assert not (tmp_path / "sweep" / job / "failure.json").exists()
+
+
+def test_so_is_a_fault_of_the_program_with_its_traceback_in_the_log(devrf, tmp_path, tiny, steps):
+    def boom(run: RunContext) -> None:
+        (run.folder / "done").write_text(str(1 / (run.config.seed - 1)))
+
+    steps(boom)
+    outcome = devrf("-m", *tiny, *LEARN, "seed=0,1,2")
+    assert outcome.status == 3
+    said, summary = outcome.err.splitlines()
+    assert said.startswith("devrf: job 1_robot: ZeroDivisionError: division by zero; the traceback")
+    assert "1 of 3 jobs failed: 1_robot" in summary
+    assert "Traceback" not in outcome.out
+    found = failure(tmp_path / "sweep" / "1_robot")
+    assert found["mistake"] is False and found["error"] == "ZeroDivisionError: division by zero"
+    assert "Traceback" in (tmp_path / "sweep" / "1_robot" / "run.log").read_text()
+    assert sorted(p.parent.name for p in tmp_path.glob("sweep/*/done")) == ["0_robot", "2_robot"]
+
+
+def test_a_later_success_in_the_folder_removes_the_record(devrf, tmp_path, tiny, steps):
+    assert devrf("-m", *tiny, *LEARN, "data.frames=3,1").status == 3
+    other = tmp_path / "sweep" / "9_robot"
+    other.mkdir()
+    (other / "failure.json").write_text("{}")
+    steps(lambda run: None)
+    # The failure of another job, of an earlier sweep in the same folder, is not this one's.
+    assert devrf("-m", *tiny, *LEARN, "data.frames=3,4").status == 0
+    assert list(tmp_path.glob("sweep/*/failure.json")) == [other / "failure.json"]
+    assert devrf(*tiny, "stage=canonical", "hydra.run.dir=sweep/9_robot").status == 0
+    assert not (other / "failure.json").exists()
+
+
+def test_an_interruption_ends_the_sweep(devrf, tmp_path, tiny, steps):
+    def interrupted(run: RunContext) -> None:
+        raise KeyboardInterrupt
+
+    steps(interrupted)
+    outcome = devrf("-m", *tiny, *LEARN, "seed=0,1")
+    assert (outcome.status, outcome.err) == (130, "devrf: interrupted\n")
+    assert not (tmp_path / "sweep" / "1_robot").exists()
+
+
+@pytest.mark.parametrize("wrong", ["data.widht=3,4", "ablation=base,nonsense"])
+def test_what_is_wrong_before_the_first_job_ends_it_at_once(devrf, tmp_path, tiny, wrong):
+    outcome = devrf("-m", *tiny, wrong)
+    assert outcome.status == 2
+    assert outcome.err.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("argument", "group", "name"),
+    [
+        ("hydra/launcher=joblib", "launcher", "joblib"),
+        ("hydra/launcher=slurm", "launcher", "submitit_slurm"),
+        ("hparams_search=loss_weights", "sweeper", "optuna"),
+    ],
+)
+def test_a_plugin_that_is_missing_is_named_with_the_remedy(
+    devrf, tmp_path, tiny, monkeypatch, argument, group, name
+):
+    devrf("--info", "searchpath")  # Hydra has looked for its plugins
+    monkeypatch.delitem(ConfigStore.instance().repo["hydra"][group], f"{name}.yaml", raising=False)
+    outcome = devrf("-m", *tiny, argument, "seed=0,1")
+    expected = f'devrf: hydra/{group}={name}: not installed; pip install "devrf[sweeps]"\n'
+    assert (outcome.status, outcome.err) == (2, expected)
+    assert not list(tmp_path.iterdir())
+
+
+@installed("hydra_submitit_launcher")
+def test_a_slurm_job_has_a_gpu(devrf, tiny):
+    outcome = devrf("hydra/launcher=slurm", "--cfg", "hydra")
+    launcher = yaml.safe_load(outcome.out)["hydra"]["launcher"]
+    assert launcher["_target_"].endswith("SlurmLauncher") and launcher["gpus_per_node"] == 1
+
+
+@installed("hydra_joblib_launcher")
+def test_jobs_in_processes_of_their_own(tmp_path, tiny):
+    source = str(Path(package.__file__).parents[1])
+    path = os.pathsep.join(filter(None, [source, os.environ.get("PYTHONPATH")]))
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "devrf",
+            "-m",
+            *tiny,
+            *LEARN,
+            "hydra/launcher=joblib",
+            "hydra.launcher.n_jobs=2",
+            "data.frames=3,1",
+        ],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=180,
+        check=False,
+    )
+    assert done.returncode == 3
+    assert "devrf: job 1_robot: data.frames: must be at least 2, not 1\n" in done.stderr
+    assert "1 of 2 jobs failed: 1_robot" in done.stderr and "Traceback" not in done.stderr
+    assert (tmp_path / "sweep" / "0_robot" / "checkpoints" / "canonical.ckpt").is_file()
+    assert failure(tmp_path / "sweep" / "1_robot")["mistake"] is True
+
+
+@installed("hydra_optuna_sweeper")
+def test_a_search_maximises_the_objective(devrf, tmp_path, tiny):
+    outcome = devrf(
+        "-m",
+        *tiny,
+        "hparams_search=loss_weights",
+        "hydra.sweeper.n_trials=2",
+        "hydra.sweep.dir=sweep",
+        "video.frames=1",
+    )
+    assert outcome.status == 0
+    found = {
+        job: json.loads((tmp_path / "sweep" / job / "metrics.json").read_text())
+        for job in ("0_robot", "1_robot")
+    }
+    best = max(found.values(), key=lambda metrics: metrics["deformation"]["psnr"])
+    said = yaml.safe_load((tmp_path / "sweep" / "optimization_results.yaml").read_text())
+    assert said["best_value"] == best["deformation"]["psnr"]
+    for name, value in said["best_params"].items():
+        assert f"{name}={value}" in best["run"]["overrides"]
+
+
+@installed("hydra_optuna_sweeper")
+@pytest.mark.parametrize(
+    ("argument", "why"),
+    [
+        ("data.frames=1", "data.frames: must be at least 2, not 1"),
+        ("stage=canonical", "stage: a search needs the objective"),
+    ],
+)
+def test_a_search_of_which_every_job_fails_says_so(devrf, tiny, argument, why):
+    outcome = devrf(
+        "-m", *tiny, "hparams_search=loss_weights", "hydra.sweeper.n_trials=2", argument
+    )
+    assert outcome.status == 3
+    lines = [line for line in outcome.err.splitlines() if line.startswith("devrf: ")]
+    assert [f"job {k}_robot: {why}" in lines[k] for k in (0, 1)] == [True, True]
+    assert "2 of 2 jobs failed: 0_robot, 1_robot" in lines[2]
+    assert "Traceback" not in outcome.err

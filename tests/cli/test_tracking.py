@@ -1,0 +1,259 @@
+"""One run is one tracked run, and holds what whoever watches wants to see; all on this machine."""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+import json
+import os
+import socket
+import subprocess
+import sys
+import threading
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import devrf as package
+
+BLOCK, HEADER = 32768, 7
+
+
+def records(path: Path) -> Iterator[Any]:
+    """The records of a ``.wandb`` file: after seven bytes of its own, LevelDB's log format."""
+    from wandb.proto.wandb_internal_pb2 import Record
+
+    data, at, parts = path.read_bytes(), HEADER, b""
+    assert data.startswith(b":W&B")
+    while at + HEADER <= len(data):
+        if BLOCK - at % BLOCK < HEADER:  # too little left of the block for a record
+            at += BLOCK - at % BLOCK
+            continue
+        length, kind = int.from_bytes(data[at + 4 : at + 6], "little"), data[at + 6]
+        parts += data[at + HEADER : at + HEADER + length]
+        at += HEADER + length
+        if kind in (1, 4):  # whole, or the last part
+            yield Record.FromString(parts)
+            parts = b""
+
+
+class Tracked:
+    """What an offline run of wandb has written."""
+
+    def __init__(self, path: Path) -> None:
+        self.config: dict[str, Any] = {}
+        self.history: dict[str, list[Any]] = defaultdict(list)
+        self.summary: dict[str, Any] = {}
+        self.run: Any = None
+        for record in records(path):
+            if record.HasField("run"):
+                self.run = record.run
+                updates = list(record.run.config.update)
+            else:
+                updates = list(record.config.update)
+            self.config |= {u.key: json.loads(u.value_json) for u in updates if u.key}
+            for item in record.history.item:
+                self.history[_name(item)].append(json.loads(item.value_json))
+            for item in record.summary.update:
+                self.summary[_name(item)] = json.loads(item.value_json)
+
+
+def _name(item: Any) -> str:
+    return item.key or "/".join(item.nested_key)
+
+
+def offline_runs(folder: Path) -> list[Path]:
+    import wandb
+
+    wandb.teardown()  # its process has written everything when it has ended
+    return sorted(folder.glob("wandb/offline-run-*/run-*.wandb"))
+
+
+@pytest.fixture(scope="module")
+def caller() -> Iterator[tuple[str, list[bytes]]]:
+    """The address of a server that answers nothing, and what was sent to it."""
+    sent: list[bytes] = []
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def listen() -> None:
+            while True:
+                try:
+                    connection, _ = server.accept()
+                except OSError:
+                    return
+                with connection:
+                    connection.settimeout(1)
+                    sent.append(connection.recv(1000))
+
+        threading.Thread(target=listen, daemon=True).start()
+        yield f"http://127.0.0.1:{server.getsockname()[1]}", sent
+
+
+@pytest.fixture(scope="module")
+def watched(
+    tmp_path_factory: pytest.TempPathFactory, tiny: tuple[str, ...], caller: Any
+) -> tuple[Path, list[bytes]]:
+    """The folder of a run with logger=wandb, scored again by a later one, and what was sent."""
+    pytest.importorskip("wandb")
+    folder = tmp_path_factory.mktemp("watched")
+    address, sent = caller
+    source = str(Path(package.__file__).parents[1])
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("WANDB_")} | {
+        "PYTHONPATH": os.pathsep.join(filter(None, [source, os.environ.get("PYTHONPATH")])),
+        "OMP_NUM_THREADS": "1",
+        "WANDB_BASE_URL": address,
+        "NO_PROXY": "",
+        "no_proxy": "",
+        **dict.fromkeys(("HTTP_PROXY", "HTTPS_PROXY", "http_proxy", "https_proxy"), address),
+    }
+    for stage in ("pipeline", "evaluate"):
+        done = subprocess.run(
+            [
+                sys.executable,
+                "-m",
+                "devrf",
+                *tiny,
+                "logger=wandb",
+                "hydra.run.dir=run",
+                "callbacks.previews.times=3",
+                f"stage={stage}",
+            ],
+            cwd=folder,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=180,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+    return folder / "run", sent
+
+
+def test_offline_nothing_is_sent(watched):
+    assert watched[1] == []
+
+
+def test_wandb_holds_config_and_name(watched):
+    tracked = Tracked(offline_runs(watched[0])[0])
+    assert tracked.config["data"]["shape"] == "robot"
+    assert tracked.config["schedule"]["deformation"]["sides"] == [4, 8]
+    assert (tracked.run.project, tracked.run.display_name) == ("devrf", "robot")
+    assert list(tracked.run.tags) == ["robot", "full"] and tracked.run.run_group == ""
+
+
+def test_wandb_holds_the_curves_of_both_stages(watched):
+    history = Tracked(offline_runs(watched[0])[0]).history
+    for stage, last, losses, groups in (
+        ("static", 6, ("color", "entropy"), ("density", "color", "decoder")),
+        ("dynamic", 12, ("render", "cycle", "flow"), ("motion",)),
+    ):
+        for name in ("loss", "iterations_per_second", "voxels", "peak_host_gb", *losses):
+            assert history[f"{stage}/{name}"][-1] > 0
+        assert all(history[f"{stage}/lr/{group}"][-1] > 0 for group in groups)
+        assert last in history["trainer/global_step"]
+    assert history["dynamic/frame"][-1] == 2
+
+
+def test_wandb_holds_pictures_videos_and_tables(watched):
+    path = offline_runs(watched[0])[0]
+    history = Tracked(path).history
+    files = path.parent / "files"
+    # Lightning steps end after 2 and 6 iterations, and after 4, 6, 10 and 12.
+    for stage, times in (("static", 2), ("dynamic", 3)):
+        for name in ("view", "depth"):
+            shown = history[f"{stage}/{name}/filenames"]
+            assert len(shown) == times
+            assert all((files / image).is_file() for (image,) in shown)
+        ((image,),) = history[f"held_out/{stage}/filenames"]
+        assert (files / image).is_file()
+    for name in ("held_out", "orbit"):
+        ((video,),) = history[f"videos/{name}/videos"]
+        assert (files / video["path"]).is_file()
+    frames, metrics = (
+        json.loads((files / history[f"{k}/path"][0]).read_text()) for k in ("frames", "metrics")
+    )
+    assert frames["columns"][:4] == ["capture", "name", "time", "psnr"]
+    assert [row[0] for row in frames["data"]] == ["static"] * 2 + ["dynamic"] * 3
+    assert [row[0] for row in metrics["data"]] == ["canonical", "deformation"]
+
+
+def test_wandb_holds_what_the_run_came_to(watched):
+    found = json.loads((watched[0] / "metrics.json").read_text())
+    summary = Tracked(offline_runs(watched[0])[0]).summary
+    for section in ("canonical", "deformation"):
+        assert summary[f"{section}/psnr"] == pytest.approx(found[section]["psnr"])
+
+
+def test_a_later_command_goes_on_with_the_run(watched):
+    first, second = (Tracked(path) for path in offline_runs(watched[0]))
+    assert first.run.run_id == second.run.run_id
+    assert "deformation/psnr" in second.summary
+    assert "static/loss" in first.history and "static/loss" not in second.history
+
+
+def test_jobs_of_a_sweep_are_grouped_and_named(devrf, tmp_path, tiny, monkeypatch):
+    pytest.importorskip("wandb")
+    monkeypatch.delenv("WANDB_MODE", raising=False)
+    outcome = devrf(
+        "-m", *tiny, "stage=canonical", "logger=wandb", "hydra.sweep.dir=mine", "seed=0,1"
+    )
+    assert outcome.status == 0
+    jobs = ("0_robot", "1_robot")
+    runs = [Tracked(offline_runs(tmp_path / "mine" / job)[0]).run for job in jobs]
+    assert {run.run_group for run in runs} == {"mine"}
+    assert len({run.run_id for run in runs}) == 2
+    for job, run in zip(jobs, runs, strict=True):
+        assert len(run.display_name) <= 128
+        assert run.display_name.startswith(f"{job} data.frames=3,data.height=20")
+
+
+def test_a_run_that_begins_anew_is_another_run(devrf, tmp_path, tiny):
+    pytest.importorskip("wandb")
+    arguments = ("stage=canonical", "logger=wandb", "hydra.run.dir=run")
+    for resume in ("true", "false"):
+        assert devrf(*tiny, *arguments, f"resume={resume}").status == 0
+    (first,), (second,) = (
+        [Tracked(path).run.run_id for path in offline_runs(folder)]
+        for folder in (tmp_path / "run" / "previous-1", tmp_path / "run")
+    )
+    assert first != second
+
+
+def test_tensorboard_holds_both_stages_and_what_came_of_them(devrf, tmp_path, tiny):
+    if importlib.util.find_spec("tensorboard") is None:
+        pytest.skip("tensorboard is not installed")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    def read() -> EventAccumulator:
+        events = EventAccumulator(str(tmp_path / "run" / "tensorboard"))
+        return events.Reload()
+
+    common = (*tiny, "logger=tensorboard", "hydra.run.dir=run", "callbacks.previews.times=2")
+    assert devrf(*common).status == 0
+    assert devrf(*common, "stage=evaluate").status == 0
+    events = read()
+    assert [event.step for event in events.Scalars("static/color")][-1] == 6
+    assert [event.step for event in events.Scalars("dynamic/lr/motion")][-1] == 12
+    assert [event.step for event in events.Images("static/view")][-1] == 6
+    assert {"dynamic/depth", "held_out/static", "held_out/dynamic"} <= set(events.Tags()["images"])
+    found = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    scored = events.Scalars("deformation/psnr")
+    assert [event.value for event in scored] == pytest.approx([found["deformation"]["psnr"]] * 2)
+    # A run that begins anew in the folder has curves of its own.
+    assert devrf(*common, "stage=canonical", "resume=false").status == 0
+    events = read()
+    assert [event.step for event in events.Scalars("static/color")][-1] == 6
+    assert "dynamic/lr/motion" not in events.Tags()["scalars"]
+
+
+def test_csv_holds_the_curves_of_both_stages(trained):
+    with (trained[0] / "logs" / "pipeline" / "metrics.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    for stage, last in (("static", 6), ("dynamic", 12)):
+        own = [row for row in rows if row[f"{stage}/loss"]]
+        assert int(own[-1]["step"]) == last
+        assert float(own[-1][f"{stage}/iterations_per_second"]) > 0
+    assert float(own[-1]["dynamic/lr/motion"]) > 0

@@ -1,0 +1,140 @@
+"""Runs devrf commands in processes of their own that need not import anything first.
+
+A script, not a test: it loads the program once, without using it, and then forks for each
+command. It reads a JSON object a line and answers with the command's exit status, negative for
+the signal that ended it:
+
+* ``folder``, ``arguments``: where to run what. What the command says is added to ``said.txt``,
+  and how many steps and file operations it took is in ``counts.json`` if it got to its end.
+* ``after``: ``[kind, count]``, the moment of the signal. The kind is ``step`` (an optimiser step
+  begins) or ``file`` (a write, fsync or rename; of a write, half is still done).
+* ``delay``: seconds from that moment to the signal.
+* ``signals``: the numbers of the signals to send.
+* ``most_bytes``: how large a file may become, as on a disk that is full.
+* ``most_memory``: bytes that the process may take beside what it has already.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import os
+import resource
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra.core.plugins import Plugins
+
+import devrf.artifacts.film
+import devrf.callbacks
+import devrf.cli.steps  # noqa: F401
+from devrf.__main__ import entry
+from devrf.checkpoints import checkpoint_file as sealed_file
+from devrf.ops.adam import GridAdam
+
+
+class Fuse:
+    """Counts what happens, and sends this process its signals when it is time."""
+
+    def __init__(self, asked: dict[str, Any]) -> None:
+        self.counts = {"step": 0, "file": 0}
+        self._asked = asked
+
+    def tick(self, kind: str) -> bool:
+        """Count; say whether this is the moment."""
+        self.counts[kind] += 1
+        return [kind, self.counts[kind]] == self._asked["after"]
+
+    def burn(self) -> None:
+        """Send the signals: now, or from another thread a little later."""
+        if self._asked["delay"]:
+            threading.Thread(target=self._send).start()
+        else:
+            self._send()
+
+    def _send(self) -> None:
+        time.sleep(self._asked["delay"])
+        for number in self._asked["signals"]:
+            os.kill(os.getpid(), number)
+
+    def install(self) -> None:
+        """Count from now on."""
+        step, write = GridAdam.step, sealed_file._Sealing.write
+
+        def counted_step(optimizer: Any, closure: Any = None) -> Any:
+            if self.tick("step"):
+                self.burn()
+            return step(optimizer, closure)
+
+        def counted_write(sealing: Any, data: Any) -> int:
+            if self.tick("file"):
+                view = memoryview(data).cast("B")
+                sealing._file.write(view[: len(view) // 2])
+                sealing._file.flush()
+                self.burn()
+            return write(sealing, data)
+
+        GridAdam.step = counted_step  # type: ignore[method-assign]
+        sealed_file._Sealing.write = counted_write  # type: ignore[method-assign]
+        os.fsync, os.replace = self._valid_mask(os.fsync), self._valid_mask(os.replace)
+
+    def _valid_mask(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*arguments: Any) -> Any:
+            if self.tick("file"):
+                self.burn()
+            return function(*arguments)
+
+        return call
+
+
+def run(asked: dict[str, Any]) -> int:
+    """The life of a child; its status."""
+    folder = Path(asked["folder"])
+    folder.mkdir(parents=True, exist_ok=True)
+    os.chdir(folder)
+    with open("said.txt", "a") as said:
+        os.dup2(said.fileno(), 1)
+        os.dup2(said.fileno(), 2)
+    if asked["most_bytes"]:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (asked["most_bytes"],) * 2)
+    if asked["most_memory"]:
+        taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (taken + asked["most_memory"],) * 2)
+    fuse = Fuse(asked)
+    fuse.install()
+    sys.argv = ["devrf", *asked["arguments"]]
+    status = 0
+    try:
+        entry()
+    except SystemExit as stop:
+        status = stop.code if isinstance(stop.code, int) else 1
+    sys.stdout.flush()
+    sys.stderr.flush()
+    Path("counts.json").write_text(json.dumps(fuse.counts))
+    return status
+
+
+def main() -> None:
+    """Fork for each command that is asked for."""
+    torch.set_num_threads(1)
+    Plugins.instance()
+    gc.freeze()  # what is there stays shared with the children
+    print("ready", flush=True)
+    for line in sys.stdin:
+        child = os.fork()
+        if child == 0:
+            status = 99
+            try:
+                status = run(json.loads(line))
+            finally:
+                os._exit(status)
+        _, how = os.waitpid(child, 0)
+        print(json.dumps(os.waitstatus_to_exitcode(how)), flush=True)
+
+
+main()

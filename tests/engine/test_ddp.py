@@ -1,0 +1,157 @@
+"""Several processes: what they exchange, by hand, in a group of two."""
+
+from __future__ import annotations
+
+import multiprocessing
+import socket
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from torch import distributed
+
+from devrf.data.datamodule import SceneDataModule
+from devrf.engine.ddp import (
+    assert_replicas_equal,
+    average,
+    average_gradients,
+    broadcast,
+    rank,
+    share,
+    world_size,
+)
+from devrf.errors import DevrfError
+from devrf.methods.devrf.canonical_stage import CanonicalStage
+
+
+def conversation(number: int, port: int, answer: Connection) -> None:
+    """What process ``number`` of two finds."""
+    torch.set_num_threads(1)
+    address = f"tcp://127.0.0.1:{port}"
+    distributed.init_process_group("gloo", init_method=address, rank=number, world_size=2)
+    found: dict[str, Any] = {"rank": rank(), "size": world_size(), "share": share(7)}
+
+    # The first has met nothing with its second parameter, neither with the third.
+    parameters = [torch.zeros(2), torch.zeros(3, 1), torch.zeros(1)]
+    parameters[0].grad = torch.tensor([1.0, 4.0]) * (number + 1)
+    if number == 1:
+        parameters[1].grad = torch.tensor([[2.0], [0.0], [-8.0]])
+    average_gradients(parameters)
+    found["gradients"] = [p.grad.flatten().tolist() for p in parameters]
+
+    found["means"] = average(torch.tensor([[3.0 * number, 1.0]])).tolist()
+
+    mask = torch.tensor([number == 0, number == 1, True])
+    crossed = torch.arange(6.0).view(2, 3).t() + number  # not contiguous
+    scalar = torch.tensor(5 + number)
+    broadcast([mask, crossed, scalar])
+    found["first"] = [mask.tolist(), crossed.tolist(), int(scalar)]
+
+    same = torch.tensor([0.1, 0.2])
+    assert_replicas_equal({"same": same})
+    for case, own in {
+        "value": {"same": same, "other": same + number * 1e-8},
+        "order": {"other": same if number else same.flip(0)},
+        "shape": {"other": same.view(2, 1) if number else same},
+        "missing": {"same": same} if number else {"same": same, "other": same},
+    }.items():
+        try:
+            assert_replicas_equal(own)
+        except DevrfError as error:
+            found[case] = str(error)
+    answer.send(found)
+    distributed.destroy_process_group()
+
+
+@pytest.fixture(scope="module")
+def found() -> list[dict[str, Any]]:
+    """What each of two processes found."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    # A fork has loaded everything already.
+    fork = multiprocessing.get_context("fork")
+    pipes = [fork.Pipe(duplex=False) for _ in range(2)]
+    processes = [
+        fork.Process(target=conversation, args=(k, port, pipes[k][1]), daemon=True)
+        for k in range(2)
+    ]
+    for process in processes:
+        process.start()
+    try:
+        for here, _ in pipes:
+            assert here.poll(60), "no answer"
+        return [here.recv() for here, _ in pipes]
+    finally:
+        for process in processes:
+            process.join(10)
+            process.kill()
+
+
+def test_each_has_its_number_and_its_share_rounded_up(found: list[dict[str, Any]]) -> None:
+    assert [(one["rank"], one["size"], one["share"]) for one in found] == [(0, 2, 4), (1, 2, 4)]
+
+
+def test_a_missing_gradient_counts_as_zero(found: list[dict[str, Any]]) -> None:
+    for one in found:
+        assert one["gradients"] == [[1.5, 6.0], [1.0, 0.0, -4.0], [0.0]]
+
+
+def test_logged_values_are_means(found: list[dict[str, Any]]) -> None:
+    assert [one["means"] for one in found] == [[[1.5, 1.0]]] * 2
+
+
+def test_what_the_first_has_is_taken_whatever_its_type_and_layout(
+    found: list[dict[str, Any]],
+) -> None:
+    for one in found:
+        assert one["first"] == [[True, False, True], [[0, 3], [1, 4], [2, 5]], 5]
+
+
+@pytest.mark.parametrize("case", ["value", "order", "shape", "missing"])
+def test_fields_that_differ_are_named_by_all(found: list[dict[str, Any]], case: str) -> None:
+    for one in found:
+        assert "the processes have learned different fields (other)" in one[case]
+
+
+def test_one_process_gives_back_what_it_is_given() -> None:
+    parameter = torch.zeros(2, requires_grad=True)
+    average_gradients([parameter])
+    assert parameter.grad is None
+    assert (rank(), world_size(), share(7)) == (0, 1, 7)
+    value = torch.tensor(2.0)
+    assert average(value) is value
+    broadcast([parameter])
+    assert_replicas_equal({"parameter": parameter})
+
+
+def test_each_process_and_step_draws_pixels_of_its_own(
+    datamodule: SceneDataModule, trainer: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn = {}
+    for number, iteration, seed in [(0, 0, 0), (1, 0, 0), (0, 10, 0), (0, 0, 1), (0, 0, 0)]:
+        torch.manual_seed(seed)
+        monkeypatch.setattr("devrf.engine.stage.rank", lambda number=number: number)
+        stage = CanonicalStage()
+        stage.iteration = iteration
+        stage.trainer = trainer()
+        stage.trainer.datamodule = SimpleNamespace(scene=datamodule.scene)
+        stage.setup("fit")
+        stage.on_train_start()
+        numbers = tuple(torch.randint(10**6, (4,), generator=stage.generator).tolist())
+        drawn.setdefault((number, iteration, seed), set()).add(numbers)
+    assert all(len(found) == 1 for found in drawn.values())
+    assert len(set.union(*drawn.values())) == 4
+
+
+def test_a_strategy_that_cannot_follow_growing_grids_is_refused(
+    monkeypatch: pytest.MonkeyPatch, trainer: Callable[..., Any]
+) -> None:
+    stage = CanonicalStage()
+    stage.trainer = trainer()
+    monkeypatch.setattr(type(stage.trainer), "world_size", 2)
+    with pytest.raises(DevrfError, match="2 processes need trainer=ddp"):
+        stage.setup("fit")

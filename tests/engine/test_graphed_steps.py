@@ -1,0 +1,335 @@
+"""Steady iterations: nothing waits, nothing is replaced, and a replay learns what Python learns.
+
+The kernels run in Triton's interpreter. In place of CUDA a stand-in captures: it does the work
+again at each replay, and compares everything that a graph would have written down for good.
+"""
+
+from __future__ import annotations
+
+import copy
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from lightning import Trainer
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from devrf.checkpoints.checkpoint import LoadedCheckpoint
+from devrf.data.datamodule import SceneDataModule
+from devrf.engine.graphs import Graph, GraphedStep, Work
+from devrf.engine.stage import ScheduledStage
+from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.devrf.deformation_stage import DeformationStage
+from devrf.methods.devrf.schedules import CanonicalSchedule, DeformationSchedule
+from devrf.methods.devrf.settings import MotionSettings
+from devrf.ops.choice import Kind, using
+from devrf.ops.kernels import adam, compositing, search, trilinear, warped_depth
+from devrf.rendering.occupancy import Occupancy
+from devrf.rendering.sample_capacity import SampleCapacity
+
+pytest.importorskip("triton")
+
+SMALL = Architecture(channels=4, width=8, frequencies=1, search_alpha_init=1e-2)
+# Few rays through coarse grids: the interpreter is slow. Total variation of the fine grids, so
+# that every kernel has work.
+SCHEDULE = CanonicalSchedule(
+    search_iterations=3,
+    search_side=5,
+    carve=True,
+    iterations=6,
+    side=5,
+    doublings=(3,),
+    decay_iterations=6,
+    rays=5,
+)
+LOSS = {"color": 1.0, "per_sample_color": 0.1, "entropy": 0.01}
+MOVING = DeformationSchedule(sides=(3, 4), iterations_per_frame=(2, 1), rays=5)
+MOTION = MotionSettings(learning_rate=2e-3, views="one", occupancy_every=2)
+
+
+def canonical() -> ScheduledStage:
+    return CanonicalStage(
+        SCHEDULE, SMALL, search_loss=LOSS, fine_loss={**LOSS, "tv": 1e-3}, iterations_per_step=2
+    )
+
+
+def moving(rest: LoadedCheckpoint) -> ScheduledStage:
+    # Coarse, for the interpreter's sake.
+    rest = copy.deepcopy(rest)
+    model = rest.model
+    model.canonical.resize(6**3)
+    model.occupancy = Occupancy.full((5, 6, 4), model.canonical.box)
+    model.settings = replace(model.settings, step=1.0, alpha_threshold=1e-2)
+    return DeformationStage(rest, MOVING, MOTION, iterations_per_step=2)
+
+
+@pytest.fixture(params=["canonical", "deformation"])
+def build(request: pytest.FixtureRequest, rest: LoadedCheckpoint) -> Callable[[], ScheduledStage]:
+    """Makes a stage."""
+    return canonical if request.param == "canonical" else lambda: moving(rest)
+
+
+@pytest.fixture(autouse=True)
+def short_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The interpreter takes its time over padding, too."""
+    monkeypatch.setattr(SampleCapacity, "VISIBLE", 32)
+    monkeypatch.setattr(SampleCapacity, "GRAIN", 64)
+    monkeypatch.setattr(GraphedStep, "WARM_UP", 1)
+
+
+# What waits for the device, or has a shape that depends on data.
+WAITING = {
+    "aten::nonzero",
+    "aten::_local_scalar_dense",
+    "aten::item",
+    "aten::masked_select",
+    "aten::unique_consecutive",
+    "aten::_unique2",
+    "aten::is_nonzero",
+    "aten::equal",
+    # A tensor of Python's numbers is copied from the host.
+    "aten::lift_fresh",
+}
+
+
+class SweepMonitor(TorchDispatchMode):
+    """Writes down what is done, and on which memory that was there before."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.done: list[Any] = []
+        self._made: dict[int, Tensor] = {}
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        name = func.name().split(".")[0]
+        assert name not in WAITING, f"{name} waits for the device"
+        tensors = [a for a in args if isinstance(a, Tensor)]
+        if name in {"aten::index", "aten::index_put", "aten::index_put_"}:
+            for index in args[1]:
+                assert index is None or index.dtype not in (torch.bool, torch.uint8), "a mask"
+        if name == "aten::repeat_interleave":
+            assert (kwargs or {}).get("output_size") is not None
+        self.note(name, args, kwargs)
+        result = func(*args, **(kwargs or {}))
+        given = {t.untyped_storage().data_ptr() for t in tensors}
+        for tensor in result if isinstance(result, tuple | list) else (result,):
+            if isinstance(tensor, Tensor) and tensor.untyped_storage().data_ptr() not in given:
+                # Held, so that its memory is not given to another.
+                self._made[tensor.untyped_storage().data_ptr()] = tensor
+        return result
+
+    def note(self, name: str, args: Any, kwargs: Any) -> None:
+        """An operation with all that a graph keeps of it: shapes, numbers, and old memory."""
+        self.done.append((name, [self._kept(a) for a in args], sorted(kwargs or {})))
+
+    def _kept(self, value: Any) -> Any:
+        if isinstance(value, Tensor):
+            place = value.data_ptr()
+            old = value.untyped_storage().data_ptr() not in self._made
+            return tuple(value.shape), value.dtype, place if old else "made here"
+        if isinstance(value, list | tuple):
+            return [self._kept(one) for one in value]
+        return value if isinstance(value, int | float | bool | str | None) else type(value)
+
+
+@contextmanager
+def watching() -> Iterator[SweepMonitor]:
+    """Watch what torch does and which kernels are launched; not what a kernel does itself."""
+    usual, watch = adam.launch, SweepMonitor()
+
+    def launch(kernel: Any, programs: int, on: Tensor, *args: Any, **constants: Any) -> None:
+        watch.note(str(kernel), [programs, *args, *constants.values()], constants)
+        with torch.utils._python_dispatch._disable_current_modes():
+            usual(kernel, programs, on, *args, **constants)
+
+    with pytest.MonkeyPatch.context() as patch, watch:
+        for module in (adam, compositing, search, trilinear, warped_depth):
+            patch.setattr(module, "launch", launch)
+        yield watch
+
+
+class Again:
+    """A stand-in for a CUDA graph: does the work again, which must be the same each time."""
+
+    def __init__(self, work: Work) -> None:
+        self.work = work
+        self.first: list[Any] | None = None
+
+    def replay(self) -> None:
+        with watching() as watch:
+            self.work()
+        if self.first is None:
+            self.first = watch.done
+        assert len(watch.done) == len(self.first)
+        for now, then in zip(watch.done, self.first, strict=True):
+            assert now == then, "a graph would do something else"
+
+
+class StandIn:
+    """Captures with :class:`Again`."""
+
+    def __init__(self) -> None:
+        self.graphs: list[Again] = []
+
+    def warm_up(self, work: Work) -> None:
+        work()
+
+    def capture(self, work: Work) -> Graph:
+        self.graphs.append(Again(work))
+        return self.graphs[-1]
+
+
+def watched(work: Callable[[], Any]) -> Any:
+    """What ``work`` gives, if it does not wait."""
+    with watching():
+        return work()
+
+
+def learn(
+    build: Callable[[], ScheduledStage],
+    trainer: Callable[..., Trainer],
+    datamodule: SceneDataModule,
+    kernels: Kind,
+    capturer: Any = None,
+) -> ScheduledStage:
+    torch.manual_seed(3)
+    stage = build()
+    stage.loop._capturer = lambda: capturer  # type: ignore[method-assign]
+    if capturer is not None:
+        draw, prepare = stage.draw, stage.prepare
+        stage.draw = lambda lane: watched(lambda: draw(lane))  # type: ignore[method-assign]
+        stage.prepare = lambda: watched(prepare)  # type: ignore[method-assign]
+    with using(kernels):
+        trainer(max_epochs=1).fit(stage, datamodule=datamodule)
+    return stage
+
+
+def test_a_replay_is_the_same_work_on_the_same_memory_and_learns_the_same(
+    build: Callable[[], ScheduledStage],
+    trainer: Callable[..., Trainer],
+    datamodule: SceneDataModule,
+) -> None:
+    capturer = StandIn()
+    replayed = learn(build, trainer, datamodule, "triton", capturer)
+    # Once a phase, or once a level: the frames of a level are the same work.
+    assert len(capturer.graphs) == (3 if isinstance(replayed, CanonicalStage) else 2)
+    assert all(graph.first for graph in capturer.graphs)
+    steady = learn(build, trainer, datamodule, "triton")
+    exact = learn(build, trainer, datamodule, "torch")
+    assert steady.optimizer.keeps_gradients and not exact.optimizer.keeps_gradients
+    for name, value in steady.state_dict().items():
+        if isinstance(value, Tensor):
+            assert torch.equal(replayed.state_dict()[name], value), name
+    # Lists of another length, sums in another order. Where a gradient is rounding alone Adam's
+    # first steps still have the rate's length.
+    for name, value in exact.state_dict().items():
+        if isinstance(value, Tensor) and value.is_floating_point():
+            off = (steady.state_dict()[name] - value).abs()
+            assert off.mean() <= 0.02 * value.abs().mean() + 1e-6, name
+
+
+def test_one_graph_is_of_all_frames_that_are_visited_together(
+    rest: LoadedCheckpoint, trainer: Callable[..., Trainer], four_frames: SceneDataModule
+) -> None:
+    def build() -> ScheduledStage:
+        stage = moving(rest)
+        # Frame 2 in three iterations, which are left out, then frames 1 and 3.
+        stage.schedule = DeformationSchedule(
+            sides=(3,),
+            iterations_per_frame=(3,),
+            rays=5,
+            coarse_to_fine=False,
+            parallel_frames=(2,),
+        )
+        stage.iteration = 3
+        return stage
+
+    capturer = StandIn()
+    stage = learn(build, trainer, four_frames, "triton", capturer)
+    # Captured in the second iteration, and the same in the third.
+    (graph,) = capturer.graphs
+    assert graph.first is not None and stage.iteration == 6
+    assert stage.model.deformation is not None
+    assert [bool(frame.any()) for frame in stage.model.deformation.to_canonical] == [
+        False,
+        True,
+        False,
+        True,
+    ]
+
+
+@pytest.mark.parametrize(
+    "work",
+    [
+        lambda x: x[x > 0.5],
+        lambda x: x.nonzero(),
+        lambda x: float(x.sum()),
+        lambda x: bool(x.any()),
+        lambda x: x.new_tensor([1.0]),
+        lambda x: torch.arange(2).repeat_interleave(x.long()),
+        lambda x: torch.repeat_interleave(x.long()),
+    ],
+)
+def test_waiting_is_noticed(work: Callable[[Tensor], Any]) -> None:
+    with pytest.raises(AssertionError), watching():
+        work(torch.ones(2))
+
+
+def test_what_a_graph_would_not_follow_is_noticed() -> None:
+    state: dict[str, Any] = {"x": torch.ones(2), "rate": 0.5, "shape": 3}
+    again = Again(lambda: state["x"].add_(torch.full((state["shape"],), 2.0).sum() * state["rate"]))
+    again.replay()
+    again.replay()
+    for name, other in (("x", torch.ones(2)), ("rate", 0.25), ("shape", 4)):
+        usual, state[name] = state[name], other
+        with pytest.raises(AssertionError, match="something else"):
+            again.replay()
+        state[name] = usual
+    again.replay()
+
+
+def test_what_cannot_be_captured_is_said_and_done_one_by_one(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    done: list[str] = []
+
+    class Refusing(StandIn):
+        def capture(self, work: Work) -> Graph:
+            raise RuntimeError("operation not permitted when stream is capturing\nmore")
+
+    repeated = GraphedStep(lambda: done.append("work"), Refusing())
+    with caplog.at_level(logging.WARNING, logger="devrf"):
+        for _ in range(5):
+            repeated()
+    assert done == ["work"] * 5 and repeated.failed
+    (said,) = caplog.messages
+    assert said.startswith("graphs:") and said.endswith("stream is capturing)")
+
+
+def test_work_is_captured_after_it_has_been_done_a_few_times() -> None:
+    done: list[str] = []
+
+    class Noting:
+        def warm_up(self, work: Work) -> None:
+            done.append("warm")
+            work()
+
+        def capture(self, work: Work) -> Graph:
+            done.append("captured")
+            return self
+
+        def replay(self) -> None:
+            done.append("replayed")
+
+    repeated = GraphedStep(lambda: done.append("work"), Noting())
+    for call in range(5):
+        repeated()
+        assert repeated.is_warm == (call == GraphedStep.WARM_UP - 1)
+    assert done == ["warm", "work", "captured", *["replayed"] * 4]
+    assert not repeated.failed

@@ -1,0 +1,240 @@
+"""A batch that is taken in parts teaches the same; memory that never suffices ends the stage."""
+
+from __future__ import annotations
+
+import copy
+import logging
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from lightning import Trainer
+
+from devrf.callbacks import DivergenceGuard, PeriodicCheckpoint
+from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, LoadedCheckpoint
+from devrf.data.batch import Pixels
+from devrf.data.datamodule import SceneDataModule
+from devrf.engine import micro_batching as parts_module
+from devrf.engine import stage as stage_module
+from devrf.engine.micro_batching import MicroBatching
+from devrf.engine.stage import ScheduledStage
+from devrf.errors import DevrfError
+from devrf.methods.devrf import volume_rendering as rendering
+from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.devrf.deformation_stage import DeformationStage
+from devrf.methods.devrf.schedules import CanonicalSchedule, DeformationSchedule
+
+SMALL = Architecture(channels=4, width=8, frequencies=1)
+SCHEDULE = CanonicalSchedule(
+    search_iterations=0,
+    search_side=12,
+    carve=True,
+    iterations=8,
+    side=12,
+    doublings=(),
+    decay_iterations=100,
+    rays=64,
+)
+MOVING = DeformationSchedule(sides=(4,), iterations_per_frame=(4,), rays=64)
+# Of four frames number 2 in iterations 0 to 3, then 1 and 3.
+TOGETHER = replace(MOVING, coarse_to_fine=False, parallel_frames=(2,))
+# Without the terms that are means over what rays have met.
+BY_RAY = {"render": 1.0, "per_sample_color": 0.1, "entropy": 0.01}
+
+
+@pytest.fixture
+def room(monkeypatch: pytest.MonkeyPatch) -> Callable[[int, int], list[int]]:
+    """``room(rays, from_call)``: rendering more rays at once fails from a call on; rays seen."""
+
+    def limit(rays: int, from_call: int = 0) -> list[int]:
+        calls: list[int] = []
+
+        def render(some: Any, *others: Any) -> Any:
+            calls.append(len(some))
+            if len(calls) > from_call and len(some) > rays:
+                raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.50 GiB.")
+            return rendering.render(some, *others)
+
+        monkeypatch.setattr(stage_module, "render", render)
+        return calls
+
+    return limit
+
+
+@pytest.fixture
+def fit(
+    datamodule: SceneDataModule, trainer: Callable[..., Trainer]
+) -> Callable[..., ScheduledStage]:
+    def learn(stage: ScheduledStage, *callbacks: Any, **how: Any) -> ScheduledStage:
+        torch.manual_seed(2)
+        made = trainer(*callbacks, max_epochs=1, log_every_n_steps=1000)
+        made.strategy.checkpoint_io = ChecksummedCheckpointIO()
+        made.fit(stage, datamodule=how.pop("data", datamodule), **how)
+        return stage
+
+    return learn
+
+
+def canonical() -> CanonicalStage:
+    return CanonicalStage(SCHEDULE, SMALL, iterations_per_step=4)
+
+
+def moving(rest: LoadedCheckpoint, schedule: DeformationSchedule = MOVING) -> DeformationStage:
+    return DeformationStage(copy.deepcopy(rest), schedule, loss=BY_RAY)
+
+
+def assert_alike(one: ScheduledStage, other: ScheduledStage) -> None:
+    """Equal up to rounding; Adam's first steps make much of little, but not in eight of them."""
+    for name, value in one.state_dict().items():
+        if isinstance(value, torch.Tensor) and value.is_floating_point():
+            torch.testing.assert_close(value, other.state_dict()[name], rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize(("rays", "parts"), [(32, 2), (16, 4), (8, 8)])
+def test_the_canonical_stage_learns_the_same_in_parts(
+    fit, room, caplog: pytest.LogCaptureFixture, rays: int, parts: int
+) -> None:
+    whole = fit(canonical())
+    calls = room(rays)
+    with caplog.at_level(logging.WARNING, logger="devrf"):
+        divided = fit(canonical())
+    assert divided.loop.parts.count == parts
+    assert calls[-parts:] == [rays] * parts
+    assert_alike(divided, whole)
+    said = [line for line in caplog.messages if "out of memory" in line]
+    assert len(said) == {2: 1, 4: 2, 8: 3}[parts]  # once for each division
+    assert "2.5 GiB more asked" in said[0] and "GiB free on cpu" in said[0]
+    assert said[-1].endswith(f"batches are taken in {parts} parts from now on")
+
+
+def test_the_deformation_stage_learns_the_same_in_parts(fit, room, rest: LoadedCheckpoint) -> None:
+    whole = fit(moving(rest))
+    room(16, from_call=5)
+    divided = fit(moving(rest))
+    assert divided.loop.parts.count == 4
+    assert_alike(divided, whole)
+
+
+def test_a_frame_that_runs_short_takes_nothing_from_the_one_beside_it(
+    fit, room, rest: LoadedCheckpoint, four_frames: SceneDataModule
+) -> None:
+    whole = fit(moving(rest, TOGETHER), data=four_frames)
+    # Four iterations of one frame, one of two; then the second of them runs short.
+    calls = room(32, from_call=4 + 2 + 1)
+    divided = fit(moving(rest, TOGETHER), data=four_frames)
+    assert divided.loop.parts.count == 2 and calls == [64] * 8 + [32] * 2 + [32] * 2 * 2 * 2
+    assert_alike(divided, whole)
+
+
+def test_a_frame_that_never_has_room_ends_the_stage(
+    fit, room, rest: LoadedCheckpoint, four_frames: SceneDataModule
+) -> None:
+    room(4, from_call=4 + 2 + 1)
+    stage = moving(rest, TOGETHER)
+    with pytest.raises(DevrfError, match=r"at iteration 5 of 8 \(frames 1, 3, ") as caught:
+        fit(stage, data=four_frames)
+    assert "schedule.deformation.rays or schedule.deformation.parallel_frames, or" in str(
+        caught.value
+    )
+    # What the first frame's batch would have taught is gone with the other's.
+    gradients = [p.grad for group in stage.optimizer.param_groups for p in group["params"]]
+    assert gradients == [None] * 4 and stage.iteration == 5
+
+
+def test_memory_that_runs_out_at_the_backward_pass_does_no_harm(
+    fit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole, failing = fit(canonical()), canonical()
+    usual, calls = failing.manual_backward, [0]
+
+    def backward(loss: torch.Tensor) -> None:
+        calls[0] += 1
+        usual(loss)
+        if calls[0] == 3:
+            raise torch.OutOfMemoryError("CUDA out of memory.")
+
+    monkeypatch.setattr(failing, "manual_backward", backward)
+    fit(failing)
+    assert failing.loop.parts.count == 2
+    assert_alike(failing, whole)
+
+
+def test_the_parts_are_remembered(fit, room, tmp_path: Path) -> None:
+    room(32)
+    saving = PeriodicCheckpoint(tmp_path, every_seconds=0, share=1.0)
+    fit(canonical(), saving)
+    calls = room(64)
+    again = canonical()
+    fit(again, ckpt_path=str(tmp_path / "canonical-progress-4.ckpt"))
+    assert again.loop.parts.count == 2 and set(calls) == {32}
+
+
+def test_memory_that_never_suffices_ends_the_stage_saved(fit, room, tmp_path: Path) -> None:
+    calls = room(4, from_call=6)  # enough for the first six iterations
+    stage = canonical()
+    with pytest.raises(DevrfError) as caught:
+        fit(stage, DivergenceGuard(), PeriodicCheckpoint(tmp_path, every_seconds=1000))
+    said = str(caught.value)
+    assert said.startswith("canonical stage: out of memory (2.5 GiB more asked, ")
+    assert "at iteration 6 of 8 (13x8x13)" in said and "\n" not in said
+    assert "lower schedule.canonical.side or schedule.canonical.rays, or higher data." in said
+    assert calls[6:] == [64, 32, 16, 8]
+    assert [path.name for path in tmp_path.iterdir()] == ["canonical-progress-6.ckpt"]
+    # Where there is more memory it goes on.
+    room(64)
+    again = canonical()
+    fit(again, ckpt_path=str(tmp_path / "canonical-progress-6.ckpt"))
+    assert again.iteration == 8 and again.abort_reason is None
+
+
+def test_before_the_first_iteration_nothing_is_logged(fit, room, tmp_path: Path) -> None:
+    room(4)
+    with pytest.raises(DevrfError, match="at iteration 0 of 8"):
+        fit(canonical(), DivergenceGuard(), PeriodicCheckpoint(tmp_path, every_seconds=1000))
+
+
+def test_other_errors_pass_through(fit, monkeypatch: pytest.MonkeyPatch) -> None:
+    stage = canonical()
+
+    def broken(lane: Any, views: Any, pixels: Any) -> Any:
+        raise RuntimeError("shapes cannot be multiplied")
+
+    monkeypatch.setattr(stage, "loss", broken)
+    with pytest.raises(RuntimeError, match="cannot be multiplied"):
+        fit(stage)
+
+
+def test_one_of_several_processes_says_so_and_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parts_module, "world_size", lambda: 2)
+
+    def loss(pixels: Pixels) -> Any:
+        raise MemoryError
+
+    pixels = Pixels(torch.zeros(8), torch.zeros(8), torch.ones(3))
+    with pytest.raises(DevrfError, match="one of 2 processes is out of memory .* fewer rays"):
+        MicroBatching().gradients(loss, pixels, lambda total: None, lambda: None)
+
+
+def test_parts_are_the_batch_in_order(rng: torch.Generator) -> None:
+    pixels = Pixels(
+        torch.randint(6, (7,), generator=rng), torch.arange(7) * 5, torch.rand(7, 3, generator=rng)
+    )
+    parts, seen = MicroBatching(), []
+    parts.count = 3
+
+    def loss(part: Pixels) -> Any:
+        seen.append(part)
+        return torch.ones(()), {"rays": torch.tensor(float(len(part)))}
+
+    total, terms = parts.gradients(loss, pixels, lambda total: None, lambda: None)
+    assert [len(part) for part in seen] == [2, 2, 3]
+    assert total == pytest.approx(1.0)
+    assert terms["rays"] == pytest.approx((2 * 2 + 2 * 2 + 3 * 3) / 7)
+    for name in ("image", "flat", "background"):
+        assert torch.equal(torch.cat([getattr(p, name) for p in seen]), getattr(pixels, name))
+    white = Pixels(pixels.image, pixels.flat, torch.ones(3))
+    assert white.between(1, 3).background.shape == (3,)

@@ -1,0 +1,246 @@
+"""Frames that are visited together learn as if each were alone; a GPU is told to do so at once."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+
+import pytest
+import torch
+from lightning import Callback, Trainer
+
+from devrf.checkpoints.checkpoint import LoadedCheckpoint
+from devrf.data.batch import Pixels
+from devrf.data.datamodule import SceneDataModule
+from devrf.engine.parallel_batch import ParallelBatch
+from devrf.engine.streams import StreamParallel
+from devrf.methods.devrf.deformation_stage import DeformationStage
+from devrf.methods.devrf.schedules import DeformationPhase, DeformationSchedule
+from devrf.methods.devrf.settings import MotionSettings
+from devrf.system.profiling import measuring
+
+GPU, CPU = torch.device("cuda"), torch.device("cpu")
+
+
+@dataclass
+class Stream:
+    """A stand-in for a CUDA stream."""
+
+    name: str
+    noted: list[str]
+
+    def wait_stream(self, other: Stream) -> None:
+        self.noted.append(f"{self.name} waits for {other.name}")
+
+
+class Streams:
+    """Stands in for CUDA's streams: writes down who waits for whom, and where work is done."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.noted: list[str] = []
+        self.made = 0
+        self.present = Stream("present", self.noted)
+        monkeypatch.setattr(torch.cuda, "current_stream", lambda device: self.present)
+        monkeypatch.setattr(torch.cuda, "Stream", self.make)
+        monkeypatch.setattr(torch.cuda, "stream", self.on)
+
+    def make(self, device: torch.device) -> Stream:
+        self.made += 1
+        return Stream(f"stream {self.made}", self.noted)
+
+    @contextmanager
+    def on(self, stream: Stream) -> Iterator[None]:
+        usual, self.present = self.present, stream
+        yield
+        self.present = usual
+
+    def piece(self, name: str) -> Callable[[], str]:
+        def work() -> str:
+            self.noted.append(f"{name} on {self.present.name}")
+            return name
+
+        return work
+
+
+@pytest.fixture
+def streams(monkeypatch: pytest.MonkeyPatch) -> Streams:
+    return Streams(monkeypatch)
+
+
+def test_all_wait_before_the_first_piece_and_are_waited_for_after_the_last(
+    streams: Streams,
+) -> None:
+    together, expected = (
+        StreamParallel(),
+        [
+            "stream 1 waits for present",
+            "stream 2 waits for present",
+            "a on present",
+            "b on stream 1",
+            "c on stream 2",
+            "present waits for stream 1",
+            "present waits for stream 2",
+        ],
+    )
+    assert together([streams.piece(name) for name in "abc"], GPU) == ["a", "b", "c"]
+    assert streams.noted == expected
+    # The same streams each time.
+    together([streams.piece(name) for name in "abc"], GPU)
+    assert streams.noted == 2 * expected and streams.made == 2
+
+
+def test_streams_come_together_again_after_a_piece_has_failed(streams: Streams) -> None:
+    def failing() -> str:
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        StreamParallel()([streams.piece("a"), failing, streams.piece("c")], GPU)
+    assert streams.noted[2:] == [
+        "a on present",
+        "present waits for stream 1",
+        "present waits for stream 2",
+    ]
+
+
+@pytest.mark.parametrize(("count", "device"), [(1, GPU), (3, CPU)])
+def test_one_alone_and_those_on_a_cpu_need_no_streams(
+    streams: Streams, count: int, device: torch.device
+) -> None:
+    StreamParallel()([streams.piece(str(k)) for k in range(count)], device)
+    assert streams.noted == [f"{k} on present" for k in range(count)]
+
+
+def test_what_is_measured_is_done_one_by_one(streams: Streams) -> None:
+    with measuring(CPU):
+        StreamParallel()([streams.piece(name) for name in "ab"], GPU)
+    assert streams.noted == ["a on present", "b on present"]
+
+
+@dataclass(frozen=True)
+class Alone(DeformationSchedule):
+    """Visits one frame alone where it would be visited together with another."""
+
+    frame: int = 0
+
+    def phase(self, iteration: int, frames: int) -> DeformationPhase:
+        phase = super().phase(iteration, frames)
+        return replace(phase, frames=(self.frame,)) if self.frame in phase.frames else phase
+
+
+# Of four frames number 2 first, then 1 and 3.
+TOGETHER = Alone(
+    sides=(5,), iterations_per_frame=(8,), rays=64, coarse_to_fine=False, parallel_frames=(2,)
+)
+
+
+@pytest.mark.parametrize(
+    "motion",
+    [
+        MotionSettings(occupancy_every=3),
+        MotionSettings(learning_rate=3e-3, unit="box", views="all", pixels="useful"),
+    ],
+    ids=["views by turns", "useful pixels"],
+)
+def test_a_frame_learns_beside_another_what_it_learns_alone(
+    rest: LoadedCheckpoint,
+    four_frames: SceneDataModule,
+    trainer: Callable[..., Trainer],
+    motion: MotionSettings,
+) -> None:
+    drawn: dict[tuple[int, int], Pixels] = {}
+
+    def learn(schedule: Alone) -> DeformationStage:
+        stage = DeformationStage(copy.deepcopy(rest), schedule, motion, iterations_per_step=3)
+        usual = stage.draw
+
+        def draw(lane: ParallelBatch) -> Pixels:
+            place = (stage.visits[lane.number].frame, stage.iteration)
+            if not schedule.frame:
+                drawn[place] = usual(lane)
+            return drawn[place]
+
+        stage.draw = draw  # type: ignore[method-assign]
+        trainer(max_epochs=1).fit(stage, datamodule=four_frames)
+        return stage
+
+    both = learn(TOGETHER)
+    assert both.iteration == 16 and not torch.equal(drawn[1, 8].flat, drawn[3, 8].flat)
+    for frame, other in ((1, 3), (3, 1)):
+        alone = learn(replace(TOGETHER, frame=frame))
+        for name in ("to_canonical", "to_time"):
+            learned, expected = getattr(both.field, name), getattr(alone.field, name)
+            assert learned[frame].any() and torch.equal(learned[frame], expected[frame])
+            assert not expected[other].any()
+
+
+class Before(Callback):
+    """Notes level and frames of each visit, and sees what each frame knows of the one before."""
+
+    def __init__(self) -> None:
+        self.visited: list[tuple[int, ...]] = []
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: Any, *_: Any) -> None:
+        visit = (pl_module.phase.level, *(visit.frame for visit in pl_module.visits))
+        if self.visited[-1:] != [visit]:
+            self.visited.append(visit)
+        for visit in pl_module.visits:
+            neighbour = pl_module.field.to_time[visit.frame - 1]
+            assert torch.equal(visit.before, neighbour)
+            assert bool(neighbour.any()) == (visit.frame > 1)
+
+
+def test_what_a_frame_knows_of_the_one_before_it(
+    rest: LoadedCheckpoint, four_frames: SceneDataModule, trainer: Callable[..., Trainer]
+) -> None:
+    schedule = DeformationSchedule(
+        sides=(4, 5), iterations_per_frame=(3, 2), rays=64, parallel_frames=(1, 2)
+    )
+    stage, before = DeformationStage(rest, schedule), Before()
+    trainer(before, max_epochs=1).fit(stage, datamodule=four_frames)
+    # One by one; then in two visits, that to the second stretch alone first.
+    assert before.visited == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 1, 3)]
+    assert stage.iteration == stage.total_iterations == 12 + 4
+
+
+def test_from_rest_the_first_of_a_stretch_follows_no_flow(
+    rest: LoadedCheckpoint,
+    four_frames: SceneDataModule,
+    trainer: Callable[..., Trainer],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    followed: list[int] = []
+    monkeypatch.setattr(
+        DeformationStage, "_follow_flow", lambda stage, views, frame: followed.append(frame)
+    )
+    stage = DeformationStage(rest, TOGETHER, MotionSettings(start="flow"))
+    trainer(max_epochs=1).fit(stage, datamodule=four_frames)
+    # Frame 1, which nobody had learned yet, could not tell where its parts have gone in frame 2.
+    assert followed == [1, 3]
+
+
+def test_a_visit_goes_on_while_one_of_its_frames_has_something_to_gain(
+    rest: LoadedCheckpoint,
+    four_frames: SceneDataModule,
+    trainer: Callable[..., Trainer],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[list[float]] = []
+    # Frame 2 at once. Of the others nobody; the first, but not the second; both.
+    answers = iter([True, False, True, False, True, True])
+
+    def settled(losses: list[float], gain: float) -> bool:
+        asked.append(list(losses))
+        return next(answers)
+
+    monkeypatch.setattr("devrf.methods.devrf.deformation_stage.settled", settled)
+    stage = DeformationStage(
+        rest, TOGETHER, MotionSettings(min_rel_improvement=0.01), iterations_per_step=2
+    )
+    trainer(max_epochs=1).fit(stage, datamodule=four_frames)
+    assert (stage.iteration, stage.skipped) == (16, 6 + 2)
+    # Each with its own frame's losses.
+    assert [len(losses) for losses in asked] == [1, 1, 2, 2, 3, 3]
+    assert asked[2] == asked[4][:2] != asked[3] == asked[5][:2]

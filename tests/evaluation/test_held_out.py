@@ -1,0 +1,101 @@
+"""Held-out views: what their truth is, and that scores compare like with like."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import pytest
+import torch
+from lightning import Trainer
+from torch import Tensor
+
+from devrf.checkpoints.checkpoint import LoadedCheckpoint
+from devrf.evaluation.held_out import background_value, score, truth_image
+from devrf.evaluation.suite import MetricSuite
+from devrf.geometry.clock import FrameClock
+from devrf.methods.devrf import renderer as player_module
+from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.devrf.deformation_field import DeformationField
+from devrf.methods.devrf.model import SceneModel, occupancy_through
+from devrf.methods.devrf.renderer import Renderer
+from devrf.metrics.image import psnr, ssim
+from devrf.rendering.occupancy import Occupancy
+from devrf.scenes.scene import Scene
+
+
+@pytest.mark.parametrize(("name", "value"), [("white", 1.0), ("black", 0.0), ("random", 1.0)])
+def test_backgrounds_of_held_out_views(
+    name: Literal["white", "black", "random"], value: float
+) -> None:
+    assert background_value(name) == value
+
+
+def test_truth_by_hand(tiny_scene: Scene) -> None:
+    pixels = torch.tensor([[[[255, 0, 102, 51], [7, 7, 7, 0]]]], dtype=torch.uint8)
+    views = replace(tiny_scene.dynamic.test, pixels=pixels)
+    # alpha 0.2 on white: 0.8 + 0.2 · colour.
+    expected = torch.tensor([[[1.0, 0.8, 0.88], [1.0, 1.0, 1.0]]])
+    torch.testing.assert_close(truth_image(views, 0, "white"), expected)
+    expected = torch.tensor([[[0.2, 0.0, 0.08], [0.0, 0.0, 0.0]]])
+    torch.testing.assert_close(truth_image(views, 0, "black"), expected)
+    opaque = replace(views, pixels=pixels[..., :3])
+    torch.testing.assert_close(truth_image(opaque, 0, "white")[0, 0, 2], torch.tensor(0.4))
+
+
+def test_only_pixels_that_count_are_scored(
+    learned: tuple[CanonicalStage, Trainer], tiny_scene: Scene
+) -> None:
+    views, player = tiny_scene.dynamic.test, Renderer(learned[0].model)
+    valid_mask = torch.ones(len(views), 18, 24, dtype=torch.bool)
+    whole = score(player, views, 1, "white")
+    same = score(player, replace(views, valid_mask=valid_mask), 1, "white")
+    assert same.scores == pytest.approx(whole.scores)
+    valid_mask[:, :, 16:] = False
+    some = score(player, replace(views, valid_mask=valid_mask), 1, "white")
+    seen, truth = whole.prediction[:, :16], whole.truth[:, :16]
+    assert some.psnr == some.rest_pose_psnr == pytest.approx(psnr(seen, truth))
+    assert some.ssim == pytest.approx(ssim(seen, truth), abs=1e-6)
+    # What is shown is what was seen; what it is compared by is right where nothing counts.
+    assert torch.equal(some.prediction, whole.prediction)
+    assert torch.equal(some.compared[:, 16:], whole.truth[:, 16:])
+    # Too narrow for a window, or only the image's rim.
+    valid_mask[:, :, 8:] = False
+    assert -1 <= score(player, replace(views, valid_mask=valid_mask), 1, "white").ssim <= 1
+    valid_mask[:, 1:] = False
+    rim = score(player, replace(views, valid_mask=valid_mask), 1, "white")
+    assert rim.psnr == pytest.approx(psnr(whole.prediction[:1, :8], whole.truth[:1, :8]))
+
+
+def test_a_score_is_that_of_the_picture_at_the_views_time(
+    learned: tuple[CanonicalStage, Trainer], tiny_scene: Scene
+) -> None:
+    views, model = tiny_scene.dynamic.test, learned[0].model
+    scored = score(Renderer(model), views, 2, "white")
+    assert scored.name == views.names[2] and scored.time == 1.0
+    assert scored.prediction.shape == scored.truth.shape == (18, 24, 3)
+    seen = model.picture(views.cameras.image_rays(2), 1.0, torch.ones(3)).color.clamp(0, 1)
+    torch.testing.assert_close(scored.prediction, seen.view(18, 24, 3))
+    assert scored.psnr == pytest.approx(psnr(scored.prediction, scored.truth))
+    assert scored.ssim == pytest.approx(ssim(scored.prediction, scored.truth))
+    # Without a deformation the rest pose is all that can be shown.
+    assert scored.rest_pose_psnr == scored.psnr
+
+
+def test_where_a_frame_s_matter_is_is_looked_for_once(
+    rest: LoadedCheckpoint, tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, looked = rest.model, []
+    model.deformation = DeformationField(model.canonical.box, FrameClock((0.0, 0.5, 1.0)), voxels=8)
+
+    def valid_mask(model: SceneModel, canonical: Tensor) -> Occupancy:
+        looked.append(1)
+        return occupancy_through(model, canonical)
+
+    monkeypatch.setattr(player_module, "occupancy_through", valid_mask)
+    player, judge = Renderer(model), MetricSuite(("psnr_masked", "flow_error"))
+    view = score(player, tiny_scene.dynamic.test, 1, "white", judge)
+    # The picture, the rest pose and the flow: the field is at rest, so all flow is missed.
+    assert view.further["flow_error"] is not None
+    assert view.psnr == pytest.approx(view.rest_pose_psnr, abs=1e-3)
+    assert len(looked) == 1

@@ -1,0 +1,151 @@
+"""What is measured beside PSNR and SSIM: where each comes from, and when it is unknown."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from lightning import Trainer
+
+from devrf.errors import DevrfError
+from devrf.evaluation.held_out import score
+from devrf.evaluation.suite import MEASURES, Evaluation
+from devrf.geometry.box import Box
+from devrf.geometry.cameras import Cameras
+from devrf.geometry.ndc import NormalizedDevice
+from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.devrf.model import SceneModel
+from devrf.methods.devrf.renderer import Renderer
+from devrf.methods.devrf.volume_rendering import RenderSettings
+from devrf.metrics.masked import psnr_masked, ssim_masked
+from devrf.metrics.perceptual import TRUNKS
+from devrf.rendering.occupancy import Occupancy
+from devrf.scenes.scene import Scene, Views
+
+HOST = torch.device("cpu")
+SIDE = 41
+
+
+@pytest.fixture
+def alex(tmp_path: Path) -> Path:
+    """Some weights of the smaller network."""
+    state = TRUNKS["alex"].build().state_dict()
+    path = tmp_path / "alex.pth"
+    torch.save({f"features.{name}": value for name, value in state.items()}, path)
+    return path
+
+
+def slab(box: Box, settings: RenderSettings, space=None) -> SceneModel:
+    """All of the box below z = −0.025, halfway between two grid points, is solid."""
+    field = Architecture().search_field(box, SIDE**3)
+    with torch.no_grad():
+        field.density.values.fill_(-400.0)
+        field.density.values[:, :, : SIDE // 2] = 400.0
+    model = SceneModel(field, Occupancy.full((SIDE,) * 3, box), settings)
+    if space is not None:
+        model.space = space
+    return model
+
+
+def views(depth: torch.Tensor, z: float) -> Views:
+    """One 8×8 image taken at height z, looking down."""
+    pose = torch.eye(3, 4)
+    pose[2, 3] = z
+    cameras = Cameras(pose[None], torch.full((1, 2), 40.0), torch.full((1, 2), 4.0), 8, 8)
+    pixels = torch.full((1, 8, 8, 4), 255, dtype=torch.uint8)
+    return Views(
+        pixels, cameras, torch.zeros(1), torch.zeros(1, dtype=torch.long), ("a",), depth=depth
+    )
+
+
+def test_depth_of_a_slab_by_hand(cube: Box) -> None:
+    model = slab(cube, RenderSettings(step=0.1, alpha_threshold=1e-4, near=0.0, far=9.0))
+    images = views(torch.zeros(1, 8, 8), z=3.975)
+    # A ray meets the face after 4 / cos of its angle.
+    truth = 4 / -images.cameras.image_rays(0).directions[:, 2].view(8, 8)
+    assert float(truth.max() - truth.min()) > 0.01
+    judge = Evaluation(metrics=["depth_error"]).judge(HOST)
+    for off in (0.0, 0.25, -0.5):
+        known = replace(images, depth=truth[None] + off)
+        found = score(Renderer(model), known, 0, "black", judge).further["depth_error"]
+        # A step is 0.005 long.
+        assert found == pytest.approx(abs(off), abs=0.01)
+
+
+def test_depth_of_a_scene_in_ndc_is_in_world_units() -> None:
+    box = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+    # The mirrored slab is solid from z' = 0.025 on: 1 + 2·near/z, so from z = −4 / 0.975 on.
+    space = NormalizedDevice(8, 8, (40.0, 40.0), near=2.0)
+    model = slab(box, RenderSettings(step=0.02, alpha_threshold=1e-4, near=0.0, far=1.0), space)
+    with torch.no_grad():
+        values = model.canonical.density.values
+        values.copy_(values.flip(2))
+    images = views(torch.zeros(1, 8, 8), z=0.0)
+    truth = 4 / 0.975 / -images.cameras.image_rays(0).directions[:, 2].view(8, 8)
+    images = replace(images, depth=truth[None] + 0.5)
+    judge = Evaluation(metrics=["depth_error"]).judge(HOST)
+    found = score(Renderer(model), images, 0, "black", judge).further["depth_error"]
+    assert found == pytest.approx(0.5, abs=0.03)
+
+
+def test_every_metric_of_a_learned_scene(
+    learned: tuple[CanonicalStage, Trainer], tiny_scene: Scene, alex: Path
+) -> None:
+    judge = Evaluation(lpips_network="alex", lpips_weights=alex).judge(HOST)
+    held_out, model = tiny_scene.dynamic.test, learned[0].model
+    view = score(Renderer(model), held_out, 2, "white", judge)
+    assert list(view.further) == list(MEASURES)
+    assert list(view.scores)[:3] == ["psnr", "ssim", "rest_pose_psnr"]
+    mask = held_out.pixels[2, ..., 3] > 127
+    assert 0 < int(mask.sum()) < mask.numel()
+    assert view.further["psnr_masked"] == psnr_masked(view.prediction, view.truth, mask)
+    assert view.further["ssim_masked"] == ssim_masked(view.prediction, view.truth, mask)
+    depth, flow = view.further["depth_error"], view.further["flow_error"]
+    assert depth is not None and 0 < depth < 1
+    assert flow is not None and 0 < flow < 20
+    # 24×18 pixels: too few for five scales, and for the network.
+    assert view.further["ms_ssim"] is None and view.further["lpips"] is None
+
+
+def test_what_a_scene_does_not_know_is_none(
+    learned: tuple[CanonicalStage, Trainer], tiny_scene: Scene
+) -> None:
+    held_out = tiny_scene.dynamic.test
+    bare = replace(held_out, pixels=held_out.pixels[..., :3], flow=None, depth=None)
+    names = [name for name in MEASURES if not name.startswith("lpips")]
+    judge = Evaluation(metrics=names).judge(HOST)
+    found = score(Renderer(learned[0].model), bare, 1, "white", judge).further
+    assert found == dict.fromkeys(names)
+
+
+def test_without_weights_lpips_is_none_and_a_line_says_why(
+    learned: tuple[CanonicalStage, Trainer],
+    tiny_scene: Scene,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    with caplog.at_level(logging.INFO):
+        judge = Evaluation(metrics=["lpips", "lpips_masked"]).judge(HOST)
+        for index in range(2):
+            view = score(Renderer(learned[0].model), tiny_scene.static.test, index, "white", judge)
+            assert view.further == {"lpips": None, "lpips_masked": None}
+        Evaluation(metrics=["ms_ssim"]).judge(HOST)
+    assert len(caplog.messages) == 1 and "LPIPS is null" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"metrics": ["lpisp"]}, "evaluation.metrics: no metric 'lpisp'"),
+        ({"lpips_weights": "no.pth"}, "evaluation.lpips_weights: no file no.pth"),
+    ],
+)
+def test_mistakes_are_named(wrong: dict, message: str) -> None:
+    with pytest.raises(DevrfError, match=message):
+        Evaluation(**wrong).check()

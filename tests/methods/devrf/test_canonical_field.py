@@ -1,0 +1,143 @@
+"""The canonical field: densities by the paper's formulas, resizing, emptying, checkpoints."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from devrf.geometry.box import Box
+from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.canonical_field import CanonicalField
+from devrf.methods.devrf.color_decoder import ColorDecoder, SigmoidColor
+
+SMALL = Architecture(channels=4, width=8, frequencies=2)
+
+
+def opacity(field: CanonicalField, delta: float) -> torch.Tensor:
+    return -torch.expm1(-field.optical_depth(torch.zeros(1, 3), delta))
+
+
+@pytest.mark.parametrize("alpha", [1e-6, 1e-2, 0.5])
+def test_an_untrained_field_has_its_initial_opacity_a_base_voxel(cube: Box, alpha: float) -> None:
+    field = CanonicalField(cube, SigmoidColor(), channels=3, voxels=64, alpha_init=alpha)
+    assert opacity(field, 1.0).item() == pytest.approx(alpha, rel=1e-3)
+
+
+def test_the_same_length_has_the_same_opacity_at_every_resolution(cube: Box) -> None:
+    # 512 voxels at full size, 64 now: a voxel is twice a base voxel, half a voxel is one.
+    field = SMALL.radiance_field(cube, 64, 512)
+    assert field.step_length(1.0) == pytest.approx(0.5)
+    assert field.step_in_base_voxels(0.5) == pytest.approx(1.0)
+    assert field.voxel_alpha(0.5).max().item() == pytest.approx(1e-2, rel=1e-4)
+    field.resize(512)
+    assert field.density.shape == field.color.shape == (8, 8, 8)
+    assert field.step_in_base_voxels(0.5) == pytest.approx(0.5)
+    assert field.voxel_alpha(0.5).max().item() == pytest.approx(1 - math.sqrt(0.99), rel=1e-4)
+
+
+def test_optical_depth_by_hand(cube: Box) -> None:
+    field = SMALL.radiance_field(cube, 8, 8)
+    with torch.no_grad():
+        field.density.values.fill_(2.0)
+        field.density.values[1] = 4.0
+    # Interpolated first: 3 in the middle; then softplus(3 + b) · δ.
+    expected = math.log1p(math.exp(3 + field.shift)) * 0.5
+    assert field.optical_depth(torch.zeros(1, 3), 0.5).item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_clearing_leaves_almost_nothing_there_and_all_elsewhere(cube: Box) -> None:
+    field = SMALL.radiance_field(cube, 64, 64)
+    with torch.no_grad():
+        field.density.values.normal_(3.0)
+        field.density.values[3, 3, 3] = -60.0
+    before = field.density.values.detach().clone()
+    where = torch.zeros(4, 4, 4, dtype=torch.bool)
+    where[1:, 2:] = True
+    field.clear(where, 1e-6)
+    # A step of one voxel is one base voxel here.
+    assert field.voxel_alpha(1.0)[where].max().item() == pytest.approx(1e-6, rel=1e-2)
+    assert torch.equal(field.density.values[~where], before[~where])
+    # What was emptier already stays as it was.
+    assert field.density.values[3, 3, 3].item() == -60.0
+
+
+def test_a_stored_field_of_any_size_and_box_loads_bit_equal(
+    cube: Box, rng: torch.Generator
+) -> None:
+    stored = SMALL.radiance_field(Box((-1.0, -2.0, 0.0), (1.0, 0.0, 1.0)), 500, 4000)
+    torch.nn.init.normal_(stored.density.values, generator=rng)
+    torch.nn.init.normal_(stored.color.values, generator=rng)
+    fresh = SMALL.radiance_field(cube, 8, 8)
+    fresh.load_state_dict(stored.state_dict())
+    points, ray = torch.rand(20, 3, generator=rng) - 0.5, torch.arange(20)
+    dirs = torch.nn.functional.normalize(torch.randn(20, 3, generator=rng), dim=1)
+    assert torch.equal(fresh.rgb(points, dirs, ray), stored.rgb(points, dirs, ray))
+    assert torch.equal(fresh.optical_depth(points, 0.3), stored.optical_depth(points, 0.3))
+    assert fresh.box == stored.box
+    assert fresh.step_in_base_voxels(0.5) == stored.step_in_base_voxels(0.5)
+
+
+def test_the_decoder_is_the_network_of_the_concatenated_input(rng: torch.Generator) -> None:
+    decoder = ColorDecoder(channels=3, width=6, frequencies=4)
+    features, ray = torch.randn(5, 3, generator=rng), torch.tensor([0, 0, 1, 1, 1])
+    dirs = torch.nn.functional.normalize(torch.randn(2, 3, generator=rng), dim=1)
+    waves = [f(2**k * dirs) for f in (torch.sin, torch.cos) for k in range(4)]
+    encoded = torch.cat([dirs, *waves], dim=1)[ray]
+    weight = torch.cat([decoder.from_feature.weight, decoder.from_direction.weight], dim=1)
+    x = torch.relu(torch.cat([features, encoded], 1) @ weight.T + decoder.from_feature.bias)
+    expected = torch.sigmoid(decoder.output(torch.relu(decoder.hidden(x))))
+    torch.testing.assert_close(decoder(features, dirs, ray), expected)
+
+
+def test_hidden_layers_may_work_in_fewer_digits(rng: torch.Generator) -> None:
+    decoder = ColorDecoder(channels=3, width=16, frequencies=2)
+    features, ray = torch.randn(50, 3, generator=rng), torch.arange(50) % 2
+    dirs = torch.nn.functional.normalize(torch.randn(2, 3, generator=rng), dim=1)
+    found = []
+    for precision in (torch.float32, torch.bfloat16):
+        leaf = features.clone().requires_grad_()
+        decoder.zero_grad()
+        seen = decoder(leaf, dirs, ray, precision)
+        seen.square().sum().backward()
+        assert decoder.hidden.weight.grad is not None and leaf.grad is not None
+        found.append((seen.detach(), leaf.grad, decoder.hidden.weight.grad.clone()))
+    for exact, rounded in zip(*found, strict=True):
+        assert rounded.dtype == torch.float32 and not torch.equal(exact, rounded)
+        # The median: a unit that was just on may be off, and changes single gradients by more.
+        assert (rounded - exact).abs().median() < 2**-7 * exact.abs().mean()
+    assert (found[1][0] - found[0][0]).abs().max() < 2**-8
+    # More shades than eight digits have between a half and one.
+    assert len(found[1][0].unique()) == found[1][0].numel()
+
+
+def test_without_frequencies_the_decoder_sees_the_direction_alone() -> None:
+    decoder = ColorDecoder(channels=3, width=4, frequencies=0)
+    assert decoder.from_direction.in_features == 3
+    dirs = torch.eye(3)
+    assert decoder(torch.zeros(3, 3), dirs, torch.arange(3)).unique(dim=0).shape[0] == 3
+
+
+def test_the_search_field_shows_its_channels_through_a_sigmoid(cube: Box) -> None:
+    field = SMALL.search_field(cube, 64)
+    with torch.no_grad():
+        field.color.values.copy_(torch.tensor([0.0, 1.0, -1.0]).expand(4, 4, 4, 3))
+    seen = field.rgb(torch.zeros(1, 3), torch.eye(3)[:1], torch.zeros(1, dtype=torch.long))
+    torch.testing.assert_close(seen, torch.tensor([[0.5, 0.7310586, 0.2689414]]))
+    assert list(field.decoder.parameters()) == []
+    assert opacity(field, 1.0).item() == pytest.approx(1e-6, rel=1e-3)
+
+
+def test_the_default_architecture_is_the_papers(cube: Box) -> None:
+    field = Architecture().radiance_field(cube, 64, 64)
+    assert field.color.values.shape[-1] == 12
+    assert [p.shape for p in field.decoder.parameters()] == [
+        (128, 12),
+        (128,),
+        (128, 27),
+        (128, 128),
+        (128,),
+        (3, 128),
+        (3,),
+    ]

@@ -1,0 +1,205 @@
+"""The canonical stage, trained for moments from plain Lightning code, without Hydra."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from lightning import Callback, Trainer
+
+from devrf.data.datamodule import SceneDataModule
+from devrf.errors import DevrfError
+from devrf.geometry.box import Box
+from devrf.geometry.cameras import Cameras
+from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.devrf.color_decoder import ColorDecoder, SigmoidColor
+from devrf.methods.devrf.free_space import view_count_weight
+from devrf.methods.devrf.schedules import CanonicalSchedule
+from devrf.methods.devrf.settings import Precision
+from devrf.scenes.scene import Scene
+
+SMALL = Architecture(channels=4, width=16, frequencies=2)
+CARVED = CanonicalSchedule(
+    search_iterations=0,
+    search_side=16,
+    carve=True,
+    iterations=60,
+    side=16,
+    doublings=(20,),
+    rays=256,
+)
+SEARCHED = CanonicalSchedule(
+    search_iterations=300, search_side=12, iterations=20, side=16, doublings=(), rays=256
+)
+
+
+class SweepMonitor(Callback):
+    """Keeps what was logged and which grids there were after each Lightning step."""
+
+    def __init__(self) -> None:
+        self.loss: list[float] = []
+        self.seen: list[tuple[str, tuple[int, int, int], str]] = []
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, *_: Any) -> None:
+        self.loss.append(float(trainer.callback_metrics[f"{pl_module.capture}/loss"]))
+        decoder = type(pl_module.model.canonical.decoder).__name__
+        self.seen.append((pl_module.phase.kind, pl_module.resolution, decoder))
+
+
+def test_two_steps_learn_something(
+    datamodule: SceneDataModule, trainer: Callable[..., Trainer]
+) -> None:
+    stage, fit = CanonicalStage(CARVED, SMALL), trainer(max_steps=2)
+    fit.fit(stage, datamodule=datamodule)
+    assert stage.iteration == fit.global_step == 2
+    assert stage.model.canonical.density.values.abs().max() > 0
+    assert stage.model.canonical.color.values.abs().max() > 0
+
+
+@pytest.mark.parametrize(
+    ("asked", "made_for_it", "expected"),
+    [
+        ("auto", True, torch.bfloat16),
+        ("auto", False, torch.float32),
+        ("float32", True, torch.float32),
+        ("bfloat16", False, torch.bfloat16),
+    ],
+)
+def test_the_color_network_learns_in_the_chosen_precision(
+    asked: Precision,
+    made_for_it: bool,
+    expected: torch.dtype,
+    datamodule: SceneDataModule,
+    trainer: Callable[..., Trainer],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    used, forward = set(), ColorDecoder.forward
+
+    def watched(self: ColorDecoder, *args: Any) -> torch.Tensor:
+        used.add(args[3])
+        return forward(self, *args)
+
+    monkeypatch.setattr(ColorDecoder, "forward", watched)
+    monkeypatch.setattr("devrf.engine.stage.multiplies_bfloat16", lambda device: made_for_it)
+    stage = CanonicalStage(CARVED, SMALL, decoder_precision=asked)
+    trainer(max_steps=2).fit(stage, datamodule=datamodule)
+    assert used == {expected}
+    assert {value.dtype for value in stage.model.canonical.parameters()} == {torch.float32}
+    assert stage.model.canonical.color.values.abs().max() > 0
+
+
+def test_all_in_reduced_precision_is_refused(
+    datamodule: SceneDataModule, trainer: Callable[..., Trainer]
+) -> None:
+    with pytest.raises(DevrfError, match="trainer.precision: .*decoder_precision=bfloat16"):
+        fit = trainer(max_steps=1, precision="bf16-mixed")
+        fit.fit(CanonicalStage(CARVED, SMALL), datamodule=datamodule)
+
+
+def test_the_whole_schedule_is_run_and_the_loss_falls(
+    datamodule: SceneDataModule, trainer: Callable[..., Trainer]
+) -> None:
+    watch, stage = SweepMonitor(), CanonicalStage(CARVED, SMALL, iterations_per_step=7)
+    fit = trainer(watch, max_epochs=1)
+    fit.fit(stage, datamodule=datamodule)
+    # Seven at a time, never across the growth at 20: 7 + 7 + 6, then 5 · 7 + 5.
+    assert len(watch.seen) == 9 and stage.iteration == fit.global_step == 60
+    coarse, fine = {seen[1] for seen in watch.seen[:3]}, {seen[1] for seen in watch.seen[3:]}
+    box = stage.model.canonical.box
+    assert coarse == {box.grid_shape(16**3 // 2)} and fine == {box.grid_shape(16**3)}
+    assert sum(watch.loss[-2:]) / 2 < 0.6 * watch.loss[0]
+
+
+def test_the_search_hands_over_to_a_radiance_field_with_room_for_motion(
+    datamodule: SceneDataModule, tiny_scene: Scene, trainer: Callable[..., Trainer]
+) -> None:
+    watch, stage = SweepMonitor(), CanonicalStage(SEARCHED, SMALL)
+    trainer(watch, max_epochs=1).fit(stage, datamodule=datamodule)
+    kinds = [(kind, decoder) for kind, _, decoder in watch.seen]
+    assert kinds == [("search", SigmoidColor.__name__)] * 30 + [("fine", ColorDecoder.__name__)] * 2
+    assert watch.loss[29] < 0.6 * watch.loss[0]
+    motion, box = tiny_scene.bounds.motion, stage.model.canonical.box
+    assert motion is not None and box.union(motion) == box
+    # The search's box was the whole rest box: it has been tightened.
+    assert box.volume < tiny_scene.bounds.box.scaled(1.05).union(motion).volume
+
+
+def test_a_search_that_finds_nothing_says_what_to_check(
+    datamodule: SceneDataModule, trainer: Callable[..., Trainer]
+) -> None:
+    schedule = CanonicalSchedule(1, 8, False, 10, 8, (), rays=16)
+    with pytest.raises(DevrfError, match="found nothing opaque.*data.box.*search_iterations"):
+        trainer(max_epochs=1).fit(CanonicalStage(schedule, SMALL), datamodule=datamodule)
+
+
+def test_afterwards_what_is_not_occupied_is_empty(learned: tuple[CanonicalStage, Trainer]) -> None:
+    model = learned[0].model
+    alpha = model.canonical.voxel_alpha(1.0)
+    assert model.occupancy.mask.shape == alpha.shape
+    assert alpha[~model.occupancy.mask].max() < 1.1e-6
+    assert alpha[model.occupancy.mask].max() > 0.1
+    assert 0.01 < model.occupancy.share < 0.6
+
+
+def test_held_out_views_are_seen_and_scored(
+    learned: tuple[CanonicalStage, Trainer],
+    datamodule: SceneDataModule,
+    trainer: Callable[..., Trainer],
+) -> None:
+    stage = learned[0]
+    (scores,) = trainer().test(stage, datamodule=datamodule, verbose=False)
+    # An all-white guess reaches about 10 dB here.
+    assert scores["test/static/psnr"] > 14
+    assert 0 < scores["test/static/ssim"] < 1
+
+
+def test_an_unknown_loss_term_is_named() -> None:
+    with pytest.raises(DevrfError, match="unknown term 'colour'"):
+        CanonicalStage(fine_loss={"colour": 1.0})
+
+
+def test_share_of_views_by_hand() -> None:
+    # Two cameras at the origin, along −z and along +x, with a right angle of view.
+    poses = torch.eye(3, 4).repeat(2, 1, 1)
+    poses[1, :, :3] = torch.tensor([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+    cameras = Cameras(poses, torch.full((2, 2), 4.0), torch.full((2, 2), 4.0), 8, 8)
+    points = torch.tensor([[0.1, 0.0, -2.0], [3.0, 0.5, 0.0], [1.0, 0.0, -1.0], [-1.0, 0.0, 2.0]])
+    assert cameras.forwards.tolist() == [[0, 0, -1], [1, 0, 0]]
+    share = view_count_weight(cameras, points.view(2, 2, 1, 3))
+    # Seen by one, one, both (on their edges), none: none counts as one.
+    assert share.flatten().tolist() == [0.5, 0.5, 1.0, 0.5]
+
+
+def test_the_default_stage_is_the_papers() -> None:
+    stage = CanonicalStage()
+    assert stage.total_iterations == 25000
+    assert (stage.rates.density, stage.rates.color, stage.rates.decoder) == (0.1, 0.1, 1e-3)
+    assert stage.sampling.step == 0.5 and stage.sampling.alpha_threshold == 1e-4
+    assert stage.losses["search"].weights == {
+        "color": 1.0,
+        "per_sample_color": 0.1,
+        "entropy": 0.01,
+    }
+    assert stage.losses["fine"].weights == {
+        "color": 1.0,
+        "per_sample_color": 0.01,
+        "entropy": 0.001,
+    }
+
+
+def test_no_matter_is_possible_before_a_lens(
+    datamodule: SceneDataModule, tiny_scene: Scene, trainer: Callable[..., Trainer]
+) -> None:
+    bounds = replace(tiny_scene.bounds, box=Box((-3.0, -3.0, -3.0), (3.0, 3.0, 3.0)), near=3.0)
+    datamodule._scene = replace(tiny_scene, bounds=bounds)
+    stage = CanonicalStage(CanonicalSchedule(2, 16, False, 2, 8, (), rays=16), SMALL)
+    trainer(max_steps=1).fit(stage, datamodule=datamodule)
+    occupancy = stage.model.occupancy
+    points = bounds.box.grid_points((16, 16, 16), torch.zeros(())).reshape(-1, 3)
+    nearest = torch.cdist(points, tiny_scene.static.train.cameras.positions).amin(dim=1)
+    assert torch.equal(occupancy.mask.flatten(), nearest > 3.0)
+    assert 0 < occupancy.share < 1

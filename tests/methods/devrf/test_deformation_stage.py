@@ -1,0 +1,176 @@
+"""The deformation stage, trained for moments from plain Lightning code, without Hydra."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from lightning import Callback, Trainer
+from torch import Tensor
+
+from devrf.checkpoints.checkpoint import LoadedCheckpoint
+from devrf.data.datamodule import SceneDataModule
+from devrf.errors import DevrfError
+from devrf.evaluation.held_out import score
+from devrf.methods.devrf.compact_state import compact_state, expanded_state
+from devrf.methods.devrf.deformation_stage import DeformationStage
+from devrf.methods.devrf.renderer import Renderer
+from devrf.methods.devrf.schedules import DeformationSchedule
+from devrf.methods.devrf.settings import DEFORMATION_LOSS, MotionSettings
+from devrf.ops.total_variation import total_variation
+from devrf.scenes.scene import Scene
+
+SHORT = DeformationSchedule(sides=(4, 8), iterations_per_frame=(20, 10), rays=256)
+FAST = MotionSettings(learning_rate=5e-3, views="all", pixels="useful")
+
+
+def test_two_steps_move_the_first_frame_only(
+    rest: LoadedCheckpoint, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
+) -> None:
+    before = {k: v.clone() for k, v in rest.model.canonical.named_parameters()}
+    stage, fit = DeformationStage(rest, SHORT), trainer(max_steps=2)
+    fit.fit(stage, datamodule=datamodule)
+    assert stage.iteration == fit.global_step == 2
+    assert stage.field.to_canonical[1].abs().max() > 0
+    # Two steps of Adam move no voxel further than twice the rate, or little more.
+    assert stage.field.to_canonical[1].abs().max() < 2.5e-3
+    for frames in (stage.field.to_canonical, stage.field.to_time):
+        assert not frames[0].any() and not frames[2].any()
+    for name, value in stage.model.canonical.named_parameters():
+        assert torch.equal(value, before[name])
+
+
+def test_a_whole_schedule_sees_the_motion_better_than_the_rest_pose(
+    rest: LoadedCheckpoint,
+    datamodule: SceneDataModule,
+    tiny_scene: Scene,
+    trainer: Callable[..., Trainer],
+) -> None:
+    schedule = DeformationSchedule(sides=(4, 8), iterations_per_frame=(40, 20), rays=256)
+    stage = DeformationStage(rest, schedule, FAST)
+    fit = trainer(max_epochs=1)
+    fit.fit(stage, datamodule=datamodule)
+    assert stage.iteration == stage.total_iterations == 180
+    assert stage.resolution == stage.model.canonical.box.grid_shape(8**3)
+    for frames in (stage.field.to_canonical, stage.field.to_time):
+        assert not frames[0].any()
+        assert (frames[1:].abs().amax(dim=(1, 2, 3, 4)) > 1e-3).all()
+    # Two views of three frames: at rest there is nothing to win.
+    player, train = Renderer(stage.model), tiny_scene.dynamic.train
+    views = [score(player, train, k, "white") for k in range(6)]
+    gains = [view.psnr - view.rest_pose_psnr for view in views]
+    assert gains[:2] == [0.0, 0.0]
+    assert min(gains[2:]) > 0.5 and sum(gains[2:]) / 4 > 1
+
+
+class Peak(Callback):
+    """Puts a peak into Δ_f before the first step, and looks at the moments behind it."""
+
+    mean: Tensor
+    values: Tensor
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: Any, *args: Any) -> None:
+        pl_module.visits[0].forward.data[1, 1, 1] = 0.5
+        self.values = pl_module.visits[0].forward.detach().clone().requires_grad_()
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, *args: Any) -> None:
+        self.mean = pl_module.optimizer.state[pl_module.visits[0].forward]["mean"].clone()
+
+
+def test_total_variation_alone_smooths_both_directions(
+    rest: LoadedCheckpoint, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
+) -> None:
+    # With "render" at a vanishing weight only the closed-form gradient moves Δ_f.
+    stage, peak = DeformationStage(rest, SHORT, loss={"render": 1e-20, "tv": 1.0}), Peak()
+    trainer(peak, max_steps=1).fit(stage, datamodule=datamodule)
+    forward = stage.field.to_time[1]
+    assert forward[1, 1, 1, 0] < 0.5 and forward[0, 1, 1, 0] > 0
+    (slope,) = torch.autograd.grad(total_variation(peak.values), peak.values)
+    # The first step's mean is a tenth of the gradient.
+    expected = 0.1 * slope * (max(stage.field.shape) / 128 / 256 / 6)
+    torch.testing.assert_close(peak.mean, expected)
+
+
+class Look(Callback):
+    """Notes the frame's slices, and what others see of them, in the midst of a visit."""
+
+    def __init__(self) -> None:
+        self.seen: list[tuple[Tensor, Tensor, Tensor]] = []
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, *args: Any) -> None:
+        name = "scene_model.deformation.to_time"
+        frame, learned = pl_module.visits[0].frame, pl_module.visits[0].forward.detach().clone()
+        stored = pl_module.state_dict()[name][frame].clone()
+        field = pl_module.model.deformation
+        self.seen.append((learned, stored, field.to_time[frame].clone()))
+
+
+def test_whoever_looks_in_the_midst_of_a_visit_sees_what_it_has_learned(
+    rest: LoadedCheckpoint, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
+) -> None:
+    stage, look = DeformationStage(rest, SHORT, FAST, iterations_per_step=7), Look()
+    trainer(look, max_steps=50).fit(stage, datamodule=datamodule)
+    assert len(look.seen) > 6
+    for learned, stored, seen in look.seen:
+        assert learned.any()
+        assert torch.equal(stored, learned) and torch.equal(seen, learned)
+    # The last visit is put back, and what happens to the field later is its own affair.
+    assert torch.equal(stage.field.to_time[2], look.seen[-1][0])
+    stage.field.to_time[2] += 1
+    assert torch.equal(stage.model.deformation.to_time[2], look.seen[-1][0] + 1)
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_where_the_field_rests_changes_what_is_learned_by_its_rounding_alone(
+    rest: LoadedCheckpoint,
+    datamodule: SceneDataModule,
+    trainer: Callable[..., Trainer],
+    half: bool,
+    tiny_scene: Scene,
+) -> None:
+    fields = []
+    for store, rounded in (("device", False), ("host", half)):
+        torch.manual_seed(0)
+        motion = replace(FAST, store=store, store_half=rounded)
+        stage = DeformationStage(rest, SHORT, motion)
+        trainer(max_epochs=1).fit(stage, datamodule=datamodule)
+        assert stage.field.to_time.dtype == (torch.float16 if rounded else torch.float32)
+        fields.append(stage.field.to_canonical.float())
+        # What is kept of it, and pictures of it, do not depend on how it rests.
+        model = expanded_state(compact_state(stage.model))
+        assert model["deformation.to_time"].dtype == torch.float32
+        assert score(Renderer(stage.model), tiny_scene.dynamic.train, 5, "white").psnr > 10
+    if half:
+        assert not torch.equal(*fields)
+        torch.testing.assert_close(*fields, atol=0.05, rtol=0)
+    else:
+        assert torch.equal(*fields)
+
+
+def test_stages_built_on_one_rest_do_not_meet(
+    rest: LoadedCheckpoint, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
+) -> None:
+    # An ablation in a notebook: the same canonical scene, two deformations.
+    first = DeformationStage(rest, SHORT)
+    trainer(max_steps=2).fit(first, datamodule=datamodule)
+    second = DeformationStage(rest, SHORT)
+    trainer(max_steps=1).fit(second, datamodule=datamodule)
+    assert first.field is not second.field
+    assert not second.field.to_time[2].any()
+    assert first.field.to_canonical[1].abs().max() > 1e-3
+
+
+def test_defaults_are_the_papers(rest: LoadedCheckpoint) -> None:
+    stage = DeformationStage(rest)
+    assert stage.motion.learning_rate == 1e-3 and stage.motion.unit == "world"
+    assert stage.tv == 1.0
+    weights = {"render": 1.0, "cycle": 100.0, "flow": 0.005, "tv": 1.0}
+    assert {name: DEFORMATION_LOSS[name] for name in weights} == weights
+
+
+def test_an_unknown_loss_term_is_named(rest: LoadedCheckpoint) -> None:
+    with pytest.raises(DevrfError, match="unknown term 'floww'"):
+        DeformationStage(rest, loss={"floww": 1.0})

@@ -1,0 +1,136 @@
+"""The photometric terms on four samples of three rays, by hand; and their composer."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from devrf.data.batch import RayBatch
+from devrf.errors import DevrfError
+from devrf.geometry.rays import Rays
+from devrf.methods.devrf.photometric_losses import (
+    PHOTOMETRIC_TERMS,
+    Prediction,
+    background_entropy,
+    color_error,
+    matte,
+    per_sample_color,
+)
+from devrf.methods.devrf.volume_rendering import RenderOutput
+from devrf.methods.weighted_loss import WeightedLoss
+from devrf.rendering.sampling import Samples
+
+RAY = torch.tensor([0, 0, 2])
+
+
+@pytest.fixture
+def prediction() -> Prediction:
+    """Rays 0 and 2 see two samples and one, ray 1 sees none."""
+    weight = torch.tensor([0.5, 0.25, 0.8], requires_grad=True)
+    sample_color = torch.tensor(
+        [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.5, 0.5, 0.5]], requires_grad=True
+    )
+    output = RenderOutput(
+        color=torch.tensor([[0.5, 0.25, 0.0], [0.0, 0.0, 0.0], [0.4, 0.4, 0.4]]),
+        depth=torch.zeros(3),
+        transmittance=torch.tensor([0.25, 1.0, 0.2]),
+        samples=Samples(RAY, torch.ones(3), torch.zeros(3, 3), 3),
+        canonical=torch.zeros(3, 3),
+        weight=weight,
+        sample_color=sample_color,
+    )
+    batch = RayBatch(
+        rays=Rays(*[torch.zeros(3, 3)] * 3),
+        color=torch.tensor([[1.0, 0.25, 0.0], [0.0, 0.0, 0.6], [0.4, 0.4, 0.1]]),
+        alpha=torch.tensor([1.0, 0.0, 0.5]),
+        background=torch.zeros(3),
+        image=torch.zeros(3, dtype=torch.long),
+        pixel=torch.zeros(3, 2),
+        flow=None,
+        flow_valid=None,
+    )
+    return Prediction(output, batch)
+
+
+def test_color_is_the_mean_square_over_rays_and_channels(prediction: Prediction) -> None:
+    assert color_error(prediction).item() == pytest.approx((0.25 + 0.36 + 0.09) / 9)
+
+
+def test_per_sample_color_by_hand(prediction: Prediction) -> None:
+    # |c − C|²: (0, .25, 0)² = .0625; (1, .75, 0)² = 1.5625; (.1, .1, .4)² = .18; three rays.
+    expected = (0.5 * 0.0625 + 0.25 * 1.5625 + 0.8 * 0.18) / 3
+    assert per_sample_color(prediction).item() == pytest.approx(expected)
+
+
+def test_per_sample_color_stops_at_the_weights(prediction: Prediction) -> None:
+    per_sample_color(prediction).backward()
+    assert prediction.output.weight.grad is None
+    # 2 · w · (c − C) / R of the first sample's green.
+    assert prediction.output.sample_color.grad is not None
+    assert prediction.output.sample_color.grad[0, 1].item() == pytest.approx(2 * 0.5 * -0.25 / 3)
+
+
+def test_entropy_by_hand(prediction: Prediction) -> None:
+    def entropy(p: float) -> float:
+        return -(p * math.log(p) + (1 - p) * math.log(1 - p))
+
+    expected = (entropy(0.25) + 0 + entropy(0.2)) / 3
+    assert background_entropy(prediction).item() == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.parametrize("p", [0.0, 1.0])
+def test_entropy_has_finite_gradients_at_its_ends(prediction: Prediction, p: float) -> None:
+    end = torch.full((3,), p, requires_grad=True)
+    output = replace(prediction.output, transmittance=end)
+    background_entropy(replace(prediction, output=output)).backward()
+    assert end.grad is not None and end.grad.isfinite().all()
+
+
+def test_matte_by_hand_and_without_one(prediction: Prediction) -> None:
+    # T − (1 − alpha) = 0.25, 0, −0.3.
+    assert matte(prediction).item() == pytest.approx((0.0625 + 0.09) / 3)
+    without = replace(prediction, batch=replace(prediction.batch, alpha=None))
+    assert matte(without).item() == 0
+
+
+def test_composer_weighs_and_reports_unweighted(prediction: Prediction) -> None:
+    loss = WeightedLoss(PHOTOMETRIC_TERMS, {"color": 2.0, "entropy": 0.5})
+    total, terms = loss(prediction)
+    assert set(terms) == {"color", "entropy"}
+    assert terms["color"].item() == pytest.approx(color_error(prediction).item())
+    expected = 2 * color_error(prediction) + 0.5 * background_entropy(prediction)
+    assert total.item() == pytest.approx(expected.item())
+
+
+def test_composer_reports_detached_terms() -> None:
+    x = torch.tensor(3.0, requires_grad=True)
+    total, terms = WeightedLoss({"square": lambda v: v * v}, {"square": 0.5})(x)
+    assert total.requires_grad and not terms["square"].requires_grad
+
+
+def test_composer_does_not_compute_what_does_not_count() -> None:
+    def expensive(_: Tensor) -> Tensor:
+        raise AssertionError("computed")
+
+    def cheap(values: Tensor) -> Tensor:
+        return values.sum()
+
+    loss: WeightedLoss[Tensor] = WeightedLoss(
+        {"cheap": cheap, "expensive": expensive}, {"cheap": 1.0, "expensive": 0.0}
+    )
+    total, terms = loss(torch.ones(4))
+    assert total.item() == 4 and set(terms) == {"cheap"}
+
+
+def test_composer_names_an_unknown_term_and_the_known_ones() -> None:
+    with pytest.raises(DevrfError, match=r"'colour'.*color, entropy, matte, per_sample_color"):
+        WeightedLoss(PHOTOMETRIC_TERMS, {"colour": 1.0})
+
+
+def test_composer_refuses_to_learn_nothing(prediction: Prediction) -> None:
+    with pytest.raises(DevrfError, match="every weight is zero"):
+        WeightedLoss(PHOTOMETRIC_TERMS, {"color": 0.0})(prediction)

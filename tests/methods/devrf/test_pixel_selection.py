@@ -1,0 +1,38 @@
+"""Pixels worth learning from."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from devrf.geometry.box import Box
+from devrf.geometry.cameras import Cameras
+from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.model import SceneModel
+from devrf.methods.devrf.pixel_selection import rays_hit_occupied
+from devrf.methods.devrf.volume_rendering import RenderSettings
+from devrf.rendering.occupancy import Occupancy, dilate
+from devrf.rendering.sampling import march
+
+
+@pytest.mark.parametrize(("width", "height"), [(40, 28), (37, 25)])
+def test_no_pixel_that_meets_matter_is_left_out(cube: Box, width: int, height: int) -> None:
+    mask = torch.zeros(20, 20, 20, dtype=torch.bool)
+    mask[3, 14, 9] = mask[12:14, 5, 5:8] = True
+    occupancy = Occupancy(dilate(mask, 1), cube)
+    model = SceneModel(
+        Architecture().search_field(cube, 20**3),
+        occupancy,
+        RenderSettings(step=0.5, alpha_threshold=1e-3, near=0.1, far=9.0),
+    )
+    cameras = Cameras.looking_at(
+        torch.tensor([[2.5, 1.0, 1.0]]), torch.zeros(1, 3), focal=30.0, width=width, height=height
+    )
+    found = rays_hit_occupied(cameras, 0, model, occupancy)
+    samples = march(cameras.image_rays(0), cube, occupancy, step=0.03, near=0.1, far=9.0)
+    seen = torch.zeros(width * height, dtype=torch.bool)
+    seen[samples.ray] = True
+    assert found.shape == seen.shape
+    assert 40 < seen.sum() and found[seen].all()
+    # A rim of a few pixels around them, no more.
+    assert found.sum() < 6 * seen.sum() and not found.all()

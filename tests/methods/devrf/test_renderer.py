@@ -1,0 +1,93 @@
+"""A player shows what the model shows, and does nothing twice."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+
+from devrf.methods.devrf import renderer as module
+from devrf.methods.devrf.model import SceneModel
+from devrf.methods.devrf.renderer import Renderer
+from devrf.rendering.rendered_image import RenderedImage
+from devrf.scenes.scene import Scene
+
+WHITE = torch.ones(3)
+Same = Callable[[RenderedImage, RenderedImage], None]
+
+
+@pytest.fixture
+def looks(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Grows by one wherever a moment's occupancy is looked for."""
+    found: list[int] = []
+    inner: Callable[..., object] = module.occupancy_through
+
+    def valid_mask(*arguments: object) -> object:
+        found.append(1)
+        return inner(*arguments)
+
+    monkeypatch.setattr(module, "occupancy_through", valid_mask)
+    return found
+
+
+@pytest.mark.parametrize("time", [0.0, 0.4, 0.55, 1.0])
+def test_it_shows_what_the_model_shows(
+    moving: SceneModel, tiny_scene: Scene, time: float, same: Same
+) -> None:
+    cameras = tiny_scene.dynamic.test.cameras
+    seen = Renderer(moving).view(cameras, 1, time, 1.0)
+    same(seen, moving.picture(cameras.image_rays(1), time, WHITE))
+    assert 20 < int((seen.opacity > 0.5).sum()) < 24 * 18 / 2
+    assert not seen.color.requires_grad
+
+
+def test_a_moment_is_where_the_model_says(moving: SceneModel) -> None:
+    ready = Renderer(moving).ready(0.4)
+    assert torch.equal(ready.occupancy.mask, moving.occupancy_at(0.4).mask)
+    points = torch.rand(50, 3) * 2 - 1
+    warp = moving.warp(0.4)
+    assert ready.warp is not None and warp is not None
+    torch.testing.assert_close(ready.warp(points), warp(points))
+    rest = Renderer(moving).ready(0.0)
+    assert rest.occupancy is moving.occupancy and rest.warp is rest.displacement is None
+
+
+def test_the_times_asked_for_last_are_kept(moving: SceneModel, looks: list[int]) -> None:
+    player = Renderer(moving, times=2)
+    for time in (0.4, 0.7, 0.4, 0.7, 0.4):
+        player.ready(time)
+    assert len(looks) == 2
+    player.ready(0.9)
+    player.ready(0.4)
+    assert len(looks) == 3
+    player.ready(0.7)  # had to make room for 0.9
+    assert len(looks) == 4
+
+
+def test_a_stream_is_made_picture_by_picture(
+    moving: SceneModel, tiny_scene: Scene, looks: list[int], same: Same
+) -> None:
+    cameras, player = tiny_scene.dynamic.test.cameras, Renderer(moving)
+    stream = player.stream(cameras, [0.4, 0.4, 1.0], 0.0)
+    assert len(looks) == 0
+    first = next(stream)
+    assert len(looks) == 1
+    same(first, moving.picture(cameras.image_rays(0), 0.4, torch.zeros(3)))
+    _, last = stream
+    same(last, player.view(cameras, 2, 1.0, torch.zeros(3)))
+    assert len(looks) == 2
+
+
+def test_any_size_and_any_background(moving: SceneModel, tiny_scene: Scene) -> None:
+    cameras = tiny_scene.dynamic.test.cameras.resized(60, 45)
+    seen = Renderer(moving).view(cameras, 0, 1.0, torch.tensor([0.0, 1.0, 0.0]))
+    assert seen.color.shape == (60 * 45, 3) and seen.depth.shape == (60 * 45,)
+    empty = seen.opacity == 0
+    assert empty.any()
+    assert torch.equal(seen.color[empty][0], torch.tensor([0.0, 1.0, 0.0]))
+
+
+def test_no_rays(moving: SceneModel, tiny_scene: Scene) -> None:
+    rays = tiny_scene.dynamic.test.cameras.image_rays(0)[:0]
+    assert Renderer(moving).picture(rays, 0.4, 1.0).color.shape == (0, 3)

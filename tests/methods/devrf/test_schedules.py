@@ -1,0 +1,271 @@
+"""Schedules: the paper's tables, and what holds for every schedule."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from devrf.errors import DevrfError
+from devrf.methods.devrf.schedules import (
+    CanonicalPhase,
+    CanonicalSchedule,
+    DeformationPhase,
+    DeformationSchedule,
+)
+
+
+def canonical_phases(schedule: CanonicalSchedule) -> list[CanonicalPhase]:
+    """The phases in order, found as a stage finds them: each at the end of the one before."""
+    phases, at = [], 0
+    while at < schedule.total:
+        phases.append(schedule.phase(at))
+        assert phases[-1].stop > at
+        at = phases[-1].stop
+    return phases
+
+
+def deformation_phases(schedule: DeformationSchedule, frames: int) -> list[DeformationPhase]:
+    phases, at = [], 0
+    while at < schedule.total(frames):
+        phases.append(schedule.phase(at, frames))
+        assert phases[-1].stop > at
+        at = phases[-1].stop
+    return phases
+
+
+def test_canonical_defaults_are_the_papers() -> None:
+    schedule = CanonicalSchedule()
+    assert schedule.total == 25000
+    found = [(p.kind, p.start, p.stop, p.voxels) for p in canonical_phases(schedule)]
+    full = 160**3
+    assert found == [
+        ("search", 0, 5000, 100**3),
+        ("fine", 5000, 6000, full // 16),
+        ("fine", 6000, 7000, full // 8),
+        ("fine", 7000, 8000, full // 4),
+        ("fine", 8000, 9000, full // 2),
+        ("fine", 9000, 25000, full),
+    ]
+    assert schedule.rays == 8192
+
+
+def test_canonical_rates_fall_to_a_tenth_in_each_part() -> None:
+    factor = CanonicalSchedule().learning_rate_factor
+    assert factor(0) == factor(5000) == 1.0
+    assert factor(4999) == pytest.approx(0.1 ** (4999 / 20000))
+    assert factor(15000) == pytest.approx(0.1**0.5)
+    assert factor(25000) == pytest.approx(0.1)
+
+
+def test_deformation_defaults_are_the_papers_inward() -> None:
+    schedule, frames = DeformationSchedule(), 50
+    assert schedule.total(frames) == 25000
+    assert schedule.growths(frames) == [10000, 15000, 20000, 22500]
+    phases = deformation_phases(schedule, frames)
+    assert len(phases) == 5 * 49
+    assert [p.side for p in phases[::49]] == [10, 20, 40, 80, 160]
+    for level, share in enumerate((200, 100, 100, 50, 50)):
+        of_level = phases[49 * level : 49 * (level + 1)]
+        # Frame 0 is the identity: its share goes to frame 1.
+        assert [p.stop - p.start for p in of_level] == [2 * share] + [share] * 48
+        for phase in of_level:
+            assert phase.learning_rate_factor == pytest.approx(10 ** (-level / 4))
+    assert 1e-3 * phases[-1].learning_rate_factor == pytest.approx(1e-4)
+    assert schedule.rays == 8192
+
+
+def test_deformation_forward_facing_is_the_papers() -> None:
+    schedule = DeformationSchedule(iterations_per_frame=(200, 200, 100, 50, 50), rays=4096)
+    assert schedule.total(40) == 24000
+    assert schedule.growths(40) == [8000, 16000, 20000, 22000]
+
+
+def test_frames_are_carried_at_the_coarsest_level_only() -> None:
+    for phase in deformation_phases(DeformationSchedule(), 6):
+        assert phase.carries == (phase.level == 0 and phase.frames[0] >= 2)
+
+
+def test_without_coarse_to_fine_every_share_goes_to_the_finest_grid() -> None:
+    schedule = DeformationSchedule(coarse_to_fine=False)
+    phases = deformation_phases(schedule, 50)
+    assert schedule.total(50) == 25000 and schedule.growths(50) == []
+    assert {(p.side, p.level, p.learning_rate_factor) for p in phases} == {(160, 0, 1.0)}
+    assert [p.frames for p in phases] == [(k,) for k in range(1, 50)]
+
+
+def course(schedule: DeformationSchedule, frames: int) -> list[tuple[Any, ...]]:
+    """Level, frames and iterations of each visit."""
+    phases = deformation_phases(schedule, frames)
+    return [(p.level, p.frames, p.start, p.stop) for p in phases]
+
+
+def test_frames_of_two_stretches_are_visited_together() -> None:
+    schedule = DeformationSchedule(
+        sides=(4, 6), iterations_per_frame=(6, 4), parallel_frames=(1, 2)
+    )
+    # Frames 0 to 6 and 7 to 13.
+    assert course(schedule, 14) == [
+        (0, (1,), 0, 12),
+        *((0, (k,), 6 * k, 6 * k + 6) for k in range(2, 14)),
+        (1, (7,), 84, 88),
+        (1, (1, 8), 88, 92),
+        (1, (2, 9), 92, 96),
+        (1, (3, 10), 96, 100),
+        (1, (4, 11), 100, 104),
+        (1, (5, 12), 104, 108),
+        (1, (6, 13), 108, 112),
+    ]
+    assert schedule.total(14) == 112 and schedule.growths(14) == [84]
+    phases = deformation_phases(schedule, 14)
+    assert [p.carries for p in phases] == [False] + [True] * 12 + [False] * 7
+    # Nobody has learned frame 6 at level 1 when frame 7 is.
+    assert [p.follows for p in phases] == [True] * 13 + [False] + [True] * 6
+    assert (schedule.beside(0, 14), schedule.beside(1, 14)) == (1, 2)
+    assert (phases[0].in_words, phases[14].in_words) == ("frame 1", "frames 1, 8")
+
+
+@pytest.mark.parametrize(
+    ("frames", "at_once", "visits"),
+    [
+        (5, 4, [(2, 4), (1, 3)]),  # two frames a stretch: three are enough
+        (6, 4, [(2, 4), (1, 3, 5)]),
+        (7, 3, [(3, 6), (1, 4), (2, 5)]),  # the last stretch is frame 6 alone
+        (4, 4, [(2,), (1, 3)]),  # never neighbours
+        (4, 9, [(2,), (1, 3)]),
+        (3, 2, [(2,), (1,)]),
+        (2, 2, [(1,)]),  # one stretch, in which frame 0 idles
+        (2, 1, [(1,)]),
+    ],
+)
+def test_stretches_of_all_kinds(frames: int, at_once: int, visits: list[tuple[int, ...]]) -> None:
+    schedule = DeformationSchedule(
+        sides=(4, 6), iterations_per_frame=(1, 3), parallel_frames=(1, at_once)
+    )
+    found = [visit for visit in course(schedule, frames) if visit[0] == 1]
+    assert [visited for _, visited, _, _ in found] == visits
+    assert schedule.beside(1, frames) == max(len(visit) for visit in visits)
+    assert schedule.total(frames) - frames == 3 * max(2, -(-frames // at_once))
+
+
+def test_one_at_once_is_one_after_another() -> None:
+    levels = {"sides": (4, 6), "iterations_per_frame": (6, 4)}
+    by_hand = [(0, (1,), 0, 12), (0, (2,), 12, 18), (1, (1,), 18, 26), (1, (2,), 26, 30)]
+    for at_once in (None, (1, 1)):
+        assert course(DeformationSchedule(**levels, parallel_frames=at_once), 3) == by_hand
+    for schedule in (DeformationSchedule(), DeformationSchedule(coarse_to_fine=False)):
+        ones = replace(schedule, parallel_frames=(1,) * len(schedule.sides))
+        assert deformation_phases(ones, 50) == deformation_phases(schedule, 50)
+
+
+def test_without_coarse_to_fine_the_finest_level_says_how_many() -> None:
+    schedule = DeformationSchedule(
+        sides=(4, 6), iterations_per_frame=(2, 1), coarse_to_fine=False, parallel_frames=(1, 2)
+    )
+    assert course(schedule, 4) == [(0, (2,), 0, 3), (0, (1, 3), 3, 6)]
+    assert not any(phase.carries for phase in deformation_phases(schedule, 4))
+    # From rest, several may begin at once.
+    assert replace(schedule, rays=9).parallel_frames == (2,)
+
+
+@given(
+    st.integers(0, 50),
+    st.lists(st.integers(1, 199), max_size=5, unique=True).map(sorted),
+    st.integers(7, 60),
+)
+def test_canonical_phases_tile_every_schedule(search: int, doublings: list[int], side: int) -> None:
+    schedule = CanonicalSchedule(search, 10, False, 200, side, doublings)
+    phases = canonical_phases(schedule)
+    edges = [0, *([search] if search else []), *(search + d for d in doublings), search + 200]
+    assert [(p.start, p.stop) for p in phases] == list(zip(edges, edges[1:], strict=False))
+    for phase in phases:
+        for at in (phase.start, phase.stop - 1):
+            assert schedule.phase(at) == phase
+    assert phases[-1].voxels == side**3
+    assert schedule.phase(schedule.total + 7) == phases[-1]
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(2, 99), st.integers(1, 9), st.integers(1, 15)),
+        min_size=1,
+        max_size=5,
+    ),
+    st.integers(2, 12),
+    st.booleans(),
+    st.booleans(),
+)
+def test_deformation_phases_tile_every_schedule(
+    levels: list[tuple[int, int, int]], frames: int, coarse_to_fine: bool, together: bool
+) -> None:
+    sides, shares, at_once = zip(*levels, strict=True)
+    schedule = DeformationSchedule(
+        sorted(sides),
+        shares,
+        coarse_to_fine,
+        parallel_frames=(1 if coarse_to_fine else 3, *at_once[1:]) if together else None,
+    )
+    phases = deformation_phases(schedule, frames)
+    assert phases[0].start == 0 and phases[-1].stop == schedule.total(frames)
+    for phase, after in zip(phases, phases[1:], strict=False):
+        assert phase.stop == after.start
+    for phase in phases:
+        assert {schedule.phase(k, frames) for k in range(phase.start, phase.stop)} == {phase}
+    depth = len(levels) if coarse_to_fine else 1
+    visits = [(level, frame) for level in range(depth) for frame in range(1, frames)]
+    visited = [(p.level, frame) for p in phases for frame in p.frames]
+    assert sorted(visited) == visits  # each exactly once
+    assert not any(frame + 1 in p.frames for p in phases for frame in p.frames)
+    assert together or visited == visits
+    begun = [[p.start for p in phases if p.level == level][0] for level in range(depth)]
+    assert begun == [0, *schedule.growths(frames)]
+    for level in range(depth):
+        most = max(len(p.frames) for p in phases if p.level == level)
+        assert most == schedule.beside(level, frames)
+    assert schedule.phase(schedule.total(frames) + 3, frames) == phases[-1]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"doublings": (1000, 1000)},
+        {"doublings": (2000, 1000)},
+        {"doublings": (0, 1000)},
+        {"doublings": (1000, 30000)},
+        {"iterations": 0, "doublings": ()},
+        {"search_iterations": -1},
+        {"side": 2},  # 8 voxels cannot be halved four times
+        {"decay_iterations": 0},
+        {"rays": 0},
+    ],
+    ids=str,
+)
+def test_a_wrong_canonical_schedule_is_an_error(wrong: dict[str, Any]) -> None:
+    with pytest.raises(DevrfError, match="schedule.canonical"):
+        CanonicalSchedule(**wrong)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"sides": (10, 20)},
+        {"sides": (), "iterations_per_frame": ()},
+        {"iterations_per_frame": (200, 100, 100, 50, 0)},
+        {"iterations_per_frame": (200, 100, -100, 50, 50)},
+        {"sides": (10, 20, 40, 80, 1)},
+        {"decay": 0.0},
+        {"rays": 0},
+        {"parallel_frames": (1, 8, 8, 4)},
+        {"parallel_frames": ()},
+        {"parallel_frames": (1, 8, 8, 4, 0)},
+        {"parallel_frames": (2, 8, 8, 4, 2)},
+        {"parallel_frames": (2, 0, 8, 4, 2), "coarse_to_fine": False},
+    ],
+    ids=str,
+)
+def test_a_wrong_deformation_schedule_is_an_error(wrong: dict[str, Any]) -> None:
+    with pytest.raises(DevrfError, match="schedule.deformation"):
+        DeformationSchedule(**wrong)

@@ -1,0 +1,226 @@
+"""Lists of fixed length see and learn what exact lists do: colours, losses, gradients."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from devrf.geometry.box import Box
+from devrf.geometry.rays import Rays
+from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.canonical_field import CanonicalField
+from devrf.methods.devrf.grid_warp import GridWarp
+from devrf.methods.devrf.static_shape import render_in_lists
+from devrf.methods.devrf.volume_rendering import RenderOutput, RenderSettings, render
+from devrf.ops.choice import Kind, using
+from devrf.rendering.occupancy import Occupancy
+from devrf.rendering.sample_capacity import SampleCapacity
+from devrf.rendering.sampling import most_steps, steps_through
+
+RAYS = 24
+SETTINGS = RenderSettings(step=0.5, alpha_threshold=0.02, near=0.2, far=9.0)
+# How many slices the warp has: at rest, at a frame, between two.
+MOMENTS = (0, 1, 2)
+
+
+class World:
+    """A random field in a box, partly occupied, that is seen through a warp."""
+
+    def __init__(self, dtype: torch.dtype, frames: int, planes: int | None = None) -> None:
+        rng = torch.Generator().manual_seed(2)
+
+        def draw(*shape: int) -> Tensor:
+            return 2 * torch.rand(*shape, generator=rng, dtype=torch.float64) - 1
+
+        box = Box((-1.0, -0.9, -0.8), (0.9, 1.0, 0.7))
+        sizes = Architecture(channels=4, width=8, frequencies=1, alpha_init=0.1, planes=planes)
+        self.field = sizes.radiance_field(box, 7**3, 9**3).to(dtype)
+        with torch.no_grad():
+            values = self.field.density.values
+            values.copy_(4 * draw(*values.shape))
+            self.field.color.values.copy_(draw(*self.field.color.values.shape))
+        self.occupancy = Occupancy(draw(6, 7, 5) > -0.4, box)
+        self.slices = tuple(
+            (0.1 * draw(4, 3, 5, 3)).to(dtype).requires_grad_() for _ in range(frames)
+        )
+        self.warp = GridWarp(self.slices, box, 0.3 if frames == 2 else 0.0)
+        origins = torch.tensor([[-3.0, 0.0, 0.0]]) + 0.3 * draw(RAYS, 3)
+        directions = torch.nn.functional.normalize(
+            torch.tensor([[1.0, 0.0, 0.0]]) + 0.25 * draw(RAYS, 3), dim=1
+        )
+        self.rays = Rays(origins.to(dtype), directions.to(dtype), directions.to(dtype))
+        self.behind = draw(RAYS, 3).abs().to(dtype)
+
+    @property
+    def leaves(self) -> list[Tensor]:
+        return [*self.field.parameters(), *self.slices]
+
+    def exactly(self) -> RenderOutput:
+        return render(self.rays, self.field, self.occupancy, SETTINGS, self.behind, self.warp)
+
+    def listed(self, room: SampleCapacity) -> RenderOutput:
+        return render_in_lists(
+            self.rays,
+            self.field,
+            self.occupancy,
+            SETTINGS,
+            self.behind,
+            self.warp if self.slices else None,
+            room,
+        )
+
+
+def spacious() -> SampleCapacity:
+    return SampleCapacity(RAYS, torch.device("cpu"))
+
+
+def fitting() -> SampleCapacity:
+    """Just enough: the interpreter takes its time over padding, too."""
+    room = spacious()
+    room.visible = room.heavy = 240
+    return room
+
+
+def learn(output: RenderOutput, leaves: list[Tensor]) -> list[Tensor]:
+    """Gradients of :func:`worth`."""
+    return list(torch.autograd.grad(worth(output), leaves))
+
+
+def worth(output: RenderOutput) -> Tensor:
+    """Something that every part of the output has a share in."""
+    tilt = torch.linspace(-1, 1, RAYS, dtype=output.color.dtype)
+    by_sample = output.weight * (output.sample_color.sum(1) + output.canonical.sum(1).square())
+    return (output.color.sum(1) * tilt + output.transmittance * tilt).sum() + by_sample.sum()
+
+
+def kept(output: RenderOutput) -> slice | Tensor:
+    present = output.samples.present
+    return slice(None) if present is None else present.nonzero()[:, 0]
+
+
+@pytest.mark.parametrize("frames", MOMENTS)
+@pytest.mark.parametrize("planes", [None, 9])
+def test_lists_of_fixed_length_see_and_learn_the_same(frames: int, planes: int | None) -> None:
+    world = World(torch.float64, frames, planes)
+    with using("torch"):
+        exact, listed = world.exactly(), world.listed(spacious())
+    assert 50 < len(exact.samples) < len(listed.samples)
+    chosen = kept(listed)
+    close = {"atol": 1e-12, "rtol": 1e-10}
+    for name in ("color", "depth", "transmittance"):
+        torch.testing.assert_close(getattr(listed, name), getattr(exact, name), **close)
+    for name in ("canonical", "weight", "sample_color"):
+        torch.testing.assert_close(getattr(listed, name)[chosen], getattr(exact, name), **close)
+    assert torch.equal(listed.samples.ray[chosen], exact.samples.ray)
+    torch.testing.assert_close(listed.samples.points[chosen], exact.samples.points, **close)
+    expected = learn(exact, world.leaves)
+    for ours, theirs in zip(learn(listed, world.leaves), expected, strict=True):
+        torch.testing.assert_close(ours, theirs, **close)
+
+
+@pytest.mark.parametrize("frames", MOMENTS)
+def test_the_kernels_see_and_learn_the_same(frames: int) -> None:
+    pytest.importorskip("triton")
+    world = World(torch.float32, frames)
+    with using("torch"):
+        exact = world.exactly()
+    with using("triton"):
+        listed = world.listed(fitting())
+        found = learn(listed, world.leaves)
+    for name in ("color", "depth", "transmittance"):
+        torch.testing.assert_close(getattr(listed, name), getattr(exact, name))
+    for ours, theirs in zip(found, learn(exact, world.leaves), strict=True):
+        torch.testing.assert_close(ours, theirs, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["torch", "triton"])
+def test_gradients_that_are_there_are_added_to_in_place(kind: Kind) -> None:
+    pytest.importorskip("triton")
+    world = World(torch.float32, 1)
+    with using(kind):
+        expected = learn(world.listed(fitting()), world.leaves)
+        for leaf in world.leaves:
+            leaf.grad = torch.ones_like(leaf)
+        before = [leaf.grad for leaf in world.leaves]
+        worth(world.listed(fitting())).backward()
+    for leaf, there, change in zip(world.leaves, before, expected, strict=True):
+        assert leaf.grad is there
+        torch.testing.assert_close(there, 1 + change, atol=1e-5, rtol=1e-4)
+
+
+def test_padding_is_no_sample_and_the_room_is_told() -> None:
+    world, room = World(torch.float64, 1), spacious()
+    with using("torch"):
+        exact, listed = world.exactly(), world.listed(room)
+    present = listed.samples.present
+    assert present is not None and len(present) == room.heavy
+    assert int(present.sum()) == len(exact.samples)
+    assert not listed.weight[~present].any()
+    assert bool(torch.isfinite(listed.canonical).all() & torch.isfinite(listed.sample_color).all())
+    assert int(listed.samples.ray.min()) >= 0 and int(listed.samples.ray.max()) < RAYS
+    # The most that was needed, until somebody looks.
+    room.note(torch.tensor(3), torch.tensor(2))
+    room.visible = room.heavy = 4096
+    assert room.measure()
+    spare = SampleCapacity.SPARE * len(exact.samples)
+    assert spare <= room.heavy < spare + SampleCapacity.GRAIN
+
+
+def test_lists_that_are_too_short_lose_the_last_rays_alone_and_grow(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    world, room = World(torch.float64, 1), spacious()
+    with using("torch"), caplog.at_level("INFO", logger="devrf"):
+        exact = world.exactly()
+        room.heavy = half = len(exact.samples) // 2
+        cut = world.listed(room)
+        whole = exact.samples.ray[half - 1]
+        torch.testing.assert_close(cut.color[:whole], exact.color[:whole])
+        assert not torch.allclose(cut.color, exact.color)
+        assert not room.look() and room.look()  # asked, then answered
+        again = world.listed(room)
+        torch.testing.assert_close(again.color, exact.color)
+        assert torch.equal(cut.transmittance, exact.transmittance)
+        room.visible = room.heavy = half
+        cut = world.listed(room)
+        assert torch.equal(cut.color[0], exact.color[0])
+        assert torch.equal(cut.color[-1], world.behind[-1])
+    assert sum("lists grow" in line for line in caplog.messages) == 1
+
+
+def test_room_grows_by_half_at_least_and_shrinks_only_from_great_waste() -> None:
+    room = SampleCapacity(64, torch.device("cpu"))
+    room.visible, room.heavy = 4096, 1024
+
+    def needing(visible: int, heavy: int) -> tuple[int, int]:
+        room.note(torch.tensor(visible), torch.tensor(heavy))
+        room.look(), room.look()
+        return room.visible, room.heavy
+
+    assert needing(4097, 800) == (6144, 1024)
+    assert needing(20000, 1024) == (25088, 1024)  # 1.25 times what was needed, in 256s
+    assert needing(6000, 512) == (25088, 1024)
+    assert needing(1000, 100) == (5120, 512)
+    room.note(torch.tensor(900), torch.tensor(400))
+    assert room.measure() and (room.visible, room.heavy) == (1280, 512)
+    assert needing(4000, 4000) == (5120, 5120)
+
+
+@pytest.mark.parametrize("planes", [None, 9])
+def test_no_ray_has_more_samples_than_is_said(planes: int | None) -> None:
+    field: CanonicalField = World(torch.float64, 0, planes).field
+    rng = torch.Generator().manual_seed(0)
+    directions = torch.nn.functional.normalize(torch.randn(500, 3, generator=rng), dim=1)
+    low, high = field.box.corners(directions)
+    rays = Rays(-3 * directions + (low + high) / 2, directions, directions)
+
+    def longest(step: float) -> int:
+        return most_steps(field.box, step=step, near=0.0, far=9.0)
+
+    for step in (0.3, 0.01):
+        _, count = steps_through(rays, field.box, step=step, near=0.0, far=9.0)
+        assert 0.5 * longest(step) < int(count.max()) <= longest(step)
+    through = Rays(low[None], (high - low)[None] / (high - low).norm(), directions[:1])
+    _, count = steps_through(through, field.box, step=0.01, near=0.0, far=9.0)
+    assert longest(0.01) - 2 <= int(count) <= longest(0.01)

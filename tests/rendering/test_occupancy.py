@@ -1,0 +1,98 @@
+"""Occupancy: look-up, growth, bounding boxes, checkpoints."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from devrf.geometry.box import Box
+from devrf.rendering.occupancy import Occupancy, bounding_box, dilate
+
+
+def single(shape: tuple[int, int, int], at: tuple[int, int, int]) -> torch.Tensor:
+    mask = torch.zeros(shape, dtype=torch.bool)
+    mask[at] = True
+    return mask
+
+
+def test_a_point_is_looked_up_at_its_nearest_grid_point() -> None:
+    box = Box((0.0, 0.0, 0.0), (4.0, 3.0, 2.0))
+    occupancy = Occupancy(single((5, 4, 3), (1, 2, 0)), box)
+    points = torch.tensor(
+        [[1.0, 2.0, 0.0], [1.45, 1.55, 0.45], [1.55, 2.0, 0.0], [1.0, 1.4, 0.0], [1.0, 2.0, 0.6]]
+    )
+    assert occupancy.at(points).tolist() == [True, True, False, False, False]
+
+
+def test_everything_outside_the_box_is_empty(cube: Box) -> None:
+    full = Occupancy.full((3, 3, 3), cube)
+    points = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [1.6, 0.0, 0.0], [0.0, -9.0, 0.0]])
+    assert full.at(points).tolist() == [True, True, False, False]
+    assert full.share == 1.0
+
+
+def test_dilate_grows_a_cube_and_stops_at_the_border() -> None:
+    grown = dilate(single((7, 6, 5), (3, 1, 4)), 2)
+    expected = torch.zeros(7, 6, 5, dtype=torch.bool)
+    expected[1:6, 0:4, 2:5] = True
+    assert torch.equal(grown, expected)
+    assert torch.equal(dilate(expected, 0), expected)
+
+
+def test_nothing_within_reach_of_a_point_means_no_occupied_cell_is(rng: torch.Generator) -> None:
+    # What strides along a ray rely on; a grid with cells of unequal sides, points outside too.
+    box = Box((0.0, 0.0, 0.0), (1.0, 2.0, 4.0))
+    occupancy = Occupancy(torch.rand(9, 9, 9, generator=rng) < 0.02, box)
+    points = torch.rand(400, 3, generator=rng) * torch.tensor([1.6, 2.6, 4.6]) - 0.3
+    around = torch.nn.functional.normalize(torch.randn(400, 300, 3, generator=rng), dim=2)
+    length = occupancy.reach * torch.rand(400, 300, 1, generator=rng)
+    probes = points[:, None] + around * length
+    found = occupancy.at(probes.view(-1, 3)).view(400, 300).any(dim=1)
+    assert found.any() and not found.all()
+    assert occupancy.near(points)[found].all()
+
+
+def test_bounding_box_by_hand(cube: Box) -> None:
+    mask = torch.zeros(5, 5, 9, dtype=torch.bool)
+    mask[1, 2, 3] = mask[3, 3, 6] = True
+    # Cells are 0.5, 0.5 and 0.25 wide.
+    assert bounding_box(mask, cube) == Box((-0.5, 0.0, -0.25), (0.5, 0.5, 0.5))
+
+
+@pytest.mark.parametrize(("at", "low", "high"), [(2, -0.5, 0.5), (0, -1.0, -0.5), (4, 0.5, 1.0)])
+def test_a_single_cell_gets_a_box_with_room(cube: Box, at: int, low: float, high: float) -> None:
+    box = bounding_box(single((5, 5, 5), (at, at, at)), cube)
+    assert box == Box((low,) * 3, (high,) * 3)
+
+
+def test_an_empty_mask_has_no_bounding_box(cube: Box) -> None:
+    assert bounding_box(torch.zeros(4, 4, 4, dtype=torch.bool), cube) is None
+
+
+def test_a_stored_mask_of_other_shape_and_box_loads_with_its_vicinity(
+    cube: Box, rng: torch.Generator
+) -> None:
+    box = Box((-2.0, 0.0, 0.0), (2.0, 1.0, 3.0))
+    stored = Occupancy(torch.rand(6, 4, 5, generator=rng) < 0.1, box)
+    fresh = Occupancy.full((2, 2, 2), cube)
+    fresh.load_state_dict(stored.state_dict())
+    assert fresh.box == box
+    assert torch.equal(fresh.mask, stored.mask)
+    assert torch.equal(fresh.vicinity, stored.vicinity)
+    points = torch.rand(200, 3, generator=rng) * 5 - 2.5
+    assert torch.equal(fresh.at(points), stored.at(points))
+
+
+def test_replacing_the_mask_keeps_the_box_unless_another_is_given(cube: Box) -> None:
+    occupancy = Occupancy.full((3, 3, 3), cube)
+    occupancy.replace(single((5, 5, 5), (0, 0, 0)))
+    assert occupancy.box == cube and occupancy.share == pytest.approx(1 / 125)
+    assert occupancy.near(torch.tensor([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]])).tolist() == [
+        True,
+        False,
+    ]
+    occupancy.replace(occupancy.mask, Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)))
+    assert occupancy.at(torch.tensor([[0.0, 0.0, 0.0], [-1.0, -1.0, -1.0]])).tolist() == [
+        True,
+        False,
+    ]

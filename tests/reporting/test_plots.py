@@ -1,0 +1,89 @@
+"""Plots show what was measured, and only that."""
+
+from __future__ import annotations
+
+import pytest
+
+pytest.importorskip("matplotlib", reason="needs devrf[plots]")
+
+from devrf.reporting.plots import against_views, plots, psnr_against_seconds, psnr_over_time
+from devrf.reporting.runs import collect
+from devrf.reporting.table import tabulate
+
+
+@pytest.fixture
+def table(runs):
+    """``table()``: the table of what lies in the folder."""
+    return lambda: tabulate(collect(runs))
+
+
+def curves(axes):
+    """The points of each labelled curve."""
+    return {
+        line.get_label(): list(zip(line.get_xdata(), line.get_ydata(), strict=True))
+        for line in axes.get_lines()
+    }
+
+
+def test_psnr_over_time_is_the_mean_over_seeds(table, ran):
+    ran("a", seed=0, frames=[(0.0, 30.0), (1.0, 20.0)])
+    ran("b", seed=1, frames=[(0.0, 32.0), (1.0, 22.0)])
+    ran("c", ablation="base", frames=[(0.0, 15.0), (1.0, 14.0)])
+    ran("d", "flower", frames=[(0.0, 1.0)])
+    (axes,) = psnr_over_time(table(), "robot").axes
+    assert curves(axes) == {
+        "Ours (base)": [(0, 15), (1, 14)],
+        "Ours w/ c2f, tv, cycle, flow": [(0, 31), (1, 21)],
+    }
+    assert axes.get_title() == "robot"
+
+
+def test_psnr_against_seconds_has_a_panel_a_scene_and_the_published_rows(table, ran):
+    ran("a", "lego", scores={"psnr": 30.0}, seconds=(100, 200))
+    ran("b", "robot", scores={"psnr": 25.0}, seconds=(10, 20))
+    ran("c", "flower", seconds=(None, 20))
+    lego, robot = psnr_against_seconds(table()).axes
+    assert [axes.get_title() for axes in (lego, robot)] == ["lego", "robot"]
+    assert curves(robot) == {"Ours w/ c2f, tv, cycle, flow": [(30, 25)]}
+    points = [(x, y) for line in lego.get_lines() for x, y in zip(*line.get_data(), strict=True)]
+    assert len(points) == 1 + 17
+    assert points[0] == (300, 30) and (540, 29.25) in points
+    assert {line.get_label() for line in lego.get_lines()[1:]} == {
+        f"{name}, published"
+        for name in ("Neural Volumes", "D-NeRF", "Nerfies", "HyperNeRF", "NSFF", "DeVRF")
+    }
+    assert lego.get_xscale() == "log"
+
+
+def test_metrics_against_views_need_several_numbers_of_them(table, ran):
+    ran("1", train_views=1, scores={"psnr": 20.0, "ssim": 0.8})
+    ran("base", ablation="base", train_views=1)
+    assert against_views(table()) is None
+    ran("3", train_views=3, scores={"psnr": 26.0, "ssim": 0.9})
+    psnr, ssim = against_views(table()).axes
+    assert curves(psnr) == {"robot": [(1, 20), (3, 26)]}
+    assert curves(ssim) == {"robot": [(1, 0.8), (3, 0.9)]}
+    ran("lpips", train_views=2, scores={"lpips": 0.1})
+    _, lpips = against_views(table()).axes
+    assert lpips.get_ylabel() == "LPIPS ↓" and curves(lpips) == {"robot": [(2, 0.1)]}
+
+
+def test_no_plot_of_what_is_not_there(table, ran):
+    ran("a", seconds=(None, None))
+    assert plots(table()) == []
+    ran("b", "a scene/of mine", frames=[(0.0, 20.0)], seconds=(1, 2))
+    assert [plot.name for plot in plots(table())] == [
+        "psnr_against_seconds",
+        "psnr_over_time_a_scene_of_mine",
+    ]
+
+
+def test_a_row_has_one_colour_in_all_plots(table, ran):
+    for name, ablation in (("a", "base"), ("b", "full")):
+        ran(name, ablation=ablation, frames=[(0.0, 20.0)])
+    found = table()
+    looks = [
+        {line.get_label(): line.get_color() for line in figure.axes[0].get_lines()}
+        for figure in (psnr_over_time(found, "robot"), psnr_against_seconds(found))
+    ]
+    assert looks[0] == looks[1] and len(set(looks[0].values())) == 2

@@ -1,0 +1,38 @@
+"""Files that are written whole or not at all."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from devrf.system.files import atomic_write, write_json
+
+
+def test_a_finished_file_stands_under_its_name_alone(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "folder" / "picture.png"
+    with atomic_write(path) as partial:
+        # Writers tell the format by the suffix.
+        assert partial.suffix == ".png" and partial != path
+        partial.write_text("whole")
+        assert not path.exists()
+    assert path.read_text() == "whole"
+    assert [p.name for p in path.parent.iterdir()] == ["picture.png"]
+
+
+def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.json"
+    path.write_text("old")
+    with pytest.raises(RuntimeError, match="disk"), atomic_write(path) as partial:
+        partial.write_text("half")
+        raise RuntimeError("disk full")
+    assert path.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["metrics.json"]
+
+
+def test_json_takes_the_place_of_what_was_there(tmp_path: Path) -> None:
+    path = tmp_path / "metrics.json"
+    path.write_text("{ damaged")
+    write_json(path, {"a": 1, "b": {"c": None}})
+    assert json.loads(path.read_text()) == {"a": 1, "b": {"c": None}}
