@@ -23,6 +23,7 @@ from devrf.errors import DevrfError
 ROOT: dict[str, Any] = {
     "stage": str,
     "method": str,
+    "profile": str | None,
     "seed": int,
     "resume": bool,
     "memory_check": bool,
