@@ -20,9 +20,9 @@ from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.renderer import Renderer
 from devrf.methods.devrf.settings import RenderSettings
 from devrf.rendering.occupancy import Occupancy
+from devrf.rendering.renderer import Renderer
 
 
 def flat(height: int, width: int, color: tuple[float, float, float]) -> Tensor:

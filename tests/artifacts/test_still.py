@@ -12,7 +12,7 @@ from devrf.artifacts.film import FilmSettings
 from devrf.artifacts.still import StillSettings, still
 from devrf.errors import DevrfError
 from devrf.methods.devrf.canonical_stage import CanonicalStage
-from devrf.methods.devrf.renderer import Renderer
+from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene
 
 
@@ -48,7 +48,7 @@ def test_a_film_too_small_for_its_format() -> None:
 def test_colour_and_depth_of_any_size(
     learned: tuple[CanonicalStage, Trainer], tiny_scene: Scene
 ) -> None:
-    model, camera = learned[0].model, StillSettings(view=2, height=31).camera(tiny_scene)
+    model, camera = learned[0].scene_model, StillSettings(view=2, height=31).camera(tiny_scene)
     color, depth = still(Renderer(model), camera, 0.0, 0.0)
     assert color.shape == depth.shape == (31, 41, 3)
     seen = model.picture(camera.image_rays(0), 0.0, torch.zeros(3))

@@ -15,10 +15,11 @@ from devrf.checkpoints.checkpoint import LoadedCheckpoint, load_checkpoint, save
 from devrf.checkpoints.checkpoint_file import read_checkpoint_file, write_checkpoint_file
 from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
+from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.schedules import CanonicalSchedule, DeformationSchedule
 from devrf.metrics.image import psnr
 from devrf.scenes.scene import Scene
 
@@ -62,7 +63,7 @@ def test_the_canonical_stage_comes_back(
     canonical: Path, learned: tuple[CanonicalStage, Trainer], tiny_scene: Scene
 ) -> None:
     stored = load_checkpoint(canonical, tiny_scene)
-    assert_alike(stored.model, learned[0].model, tiny_scene)
+    assert_alike(stored.model, learned[0].scene_model, tiny_scene)
     assert stored.metadata == learned[0].metadata()
     assert stored.model.deformation is None
     assert [p.name for p in canonical.parent.iterdir()] == ["canonical.ckpt"]
@@ -80,7 +81,7 @@ def test_the_deformation_stage_comes_back_and_alone_suffices(
     fit.fit(stage, datamodule=datamodule)
     save_checkpoint(fit, tmp_path / "deformation.ckpt")
     stored = load_checkpoint(tmp_path / "deformation.ckpt", tiny_scene)
-    assert_alike(stored.model, stage.model, tiny_scene)
+    assert_alike(stored.model, stage.scene_model, tiny_scene)
     assert stored.model.deformation is not None
     assert stored.model.deformation.clock == tiny_scene.clock
     assert set(stored.metadata.records) == {"canonical", "deformation"}
@@ -167,4 +168,4 @@ def test_a_stage_stopped_in_its_search_comes_back(
     fit.fit(stage, datamodule=datamodule)
     save_checkpoint(fit, tmp_path / "search.ckpt")
     stored = load_checkpoint(tmp_path / "search.ckpt", tiny_scene)
-    assert_alike(stored.model, stage.model, tiny_scene)
+    assert_alike(stored.model, stage.scene_model, tiny_scene)

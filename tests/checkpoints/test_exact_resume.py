@@ -26,9 +26,10 @@ from devrf.data.datamodule import SceneDataModule
 from devrf.engine.stage import ScheduledStage
 from devrf.errors import DevrfError
 from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
-from devrf.methods.devrf.schedules import CanonicalSchedule, DeformationSchedule
 from devrf.methods.devrf.settings import MotionSettings
 from devrf.scenes.scene import Scene
 

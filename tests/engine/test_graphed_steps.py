@@ -24,9 +24,10 @@ from devrf.data.datamodule import SceneDataModule
 from devrf.engine.graphs import Graph, GraphedStep, Work
 from devrf.engine.stage import ScheduledStage
 from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
-from devrf.methods.devrf.schedules import CanonicalSchedule, DeformationSchedule
 from devrf.methods.devrf.settings import MotionSettings
 from devrf.ops.choice import Kind, using
 from devrf.ops.kernels import adam, compositing, search, trilinear, warped_depth
@@ -255,8 +256,8 @@ def test_one_graph_is_of_all_frames_that_are_visited_together(
     # Captured in the second iteration, and the same in the third.
     (graph,) = capturer.graphs
     assert graph.first is not None and stage.iteration == 6
-    assert stage.model.deformation is not None
-    assert [bool(frame.any()) for frame in stage.model.deformation.to_canonical] == [
+    assert stage.scene_model.deformation is not None
+    assert [bool(frame.any()) for frame in stage.scene_model.deformation.to_canonical] == [
         False,
         True,
         False,

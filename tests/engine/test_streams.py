@@ -17,8 +17,8 @@ from devrf.data.batch import Pixels
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.parallel_batch import ParallelBatch
 from devrf.engine.streams import StreamParallel
+from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
-from devrf.methods.devrf.schedules import DeformationPhase, DeformationSchedule
 from devrf.methods.devrf.settings import MotionSettings
 from devrf.system.profiling import measuring
 
@@ -157,7 +157,7 @@ def test_a_frame_learns_beside_another_what_it_learns_alone(
         usual = stage.draw
 
         def draw(lane: ParallelBatch) -> Pixels:
-            place = (stage.visits[lane.number].frame, stage.iteration)
+            place = (stage.active[lane.number].frame, stage.iteration)
             if not schedule.frame:
                 drawn[place] = usual(lane)
             return drawn[place]

@@ -18,9 +18,9 @@ from devrf.methods.devrf import renderer as player_module
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.model import DeVRFModel, occupancy_through
-from devrf.methods.devrf.renderer import Renderer
 from devrf.metrics.image import psnr, ssim
 from devrf.rendering.occupancy import Occupancy
+from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene
 
 
@@ -46,7 +46,7 @@ def test_truth_by_hand(tiny_scene: Scene) -> None:
 def test_only_pixels_that_count_are_scored(
     learned: tuple[CanonicalStage, Trainer], tiny_scene: Scene
 ) -> None:
-    views, player = tiny_scene.dynamic.test, Renderer(learned[0].model)
+    views, player = tiny_scene.dynamic.test, Renderer(learned[0].scene_model)
     valid_mask = torch.ones(len(views), 18, 24, dtype=torch.bool)
     whole = score(player, views, 1, "white")
     same = score(player, replace(views, valid_mask=valid_mask), 1, "white")
@@ -70,7 +70,7 @@ def test_only_pixels_that_count_are_scored(
 def test_a_score_is_that_of_the_picture_at_the_views_time(
     learned: tuple[CanonicalStage, Trainer], tiny_scene: Scene
 ) -> None:
-    views, model = tiny_scene.dynamic.test, learned[0].model
+    views, model = tiny_scene.dynamic.test, learned[0].scene_model
     scored = score(Renderer(model), views, 2, "white")
     assert scored.name == views.names[2] and scored.time == 1.0
     assert scored.prediction.shape == scored.truth.shape == (18, 24, 3)

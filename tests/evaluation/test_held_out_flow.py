@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from devrf.methods.devrf.renderer import Ready, Renderer
 from torch import Tensor
 
 from devrf.evaluation.held_out_flow import flow_error, seen_flow
@@ -18,7 +19,6 @@ from devrf.geometry.space import WORLD
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.renderer import Ready, Renderer
 from devrf.methods.devrf.settings import RenderSettings
 from devrf.rendering.occupancy import Occupancy
 from devrf.scenes.procedural import Material, ProceduralScene

@@ -15,8 +15,8 @@ from devrf.cli.config import config_folder
 from devrf.cli.config_check import check_config
 from devrf.data.datamodule import SceneDataModule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
-from devrf.methods.devrf.schedules import DeformationSchedule
 
 GROUPS = sorted({path.name for path in config_folder().iterdir() if path.is_dir()} - {"hydra"})
 FILES = [

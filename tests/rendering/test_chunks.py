@@ -10,8 +10,8 @@ import torch
 from devrf.geometry.rays import Rays
 from devrf.methods.devrf import model as module
 from devrf.methods.devrf import renderer
-from devrf.methods.devrf.renderer import Renderer
 from devrf.rendering.chunks import FEWEST, in_chunks
+from devrf.rendering.renderer import Renderer
 
 
 @pytest.fixture
