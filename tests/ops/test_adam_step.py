@@ -77,8 +77,8 @@ def test_smoothing_of_what_is_touched_leaves_the_rest(skip_zero: bool) -> None:
 
 def test_is_the_two_steps_it_stands_for(rng: torch.Generator) -> None:
     values, gradient, mean = (torch.randn(3, 4, 2, 3, generator=rng) for _ in range(3))
-    square, pace = torch.rand(3, 4, 2, 3, generator=rng), torch.rand(3, 4, 2, 1, generator=rng)
-    into, how = torch.empty_like(values), rule(4, pace=pace)
+    square, factors = (torch.rand(3, 4, 2, c, generator=rng) for c in (3, 1))
+    into, how = torch.empty_like(values), rule(4, per_voxel_lr=factors)
     expected = [t.clone() for t in (values, gradient, mean, square)]
     add_total_variation_gradient(expected[0].clone(), expected[1], 0.3)
     adam_step(expected[0], expected[1], expected[2], expected[3], how)

@@ -30,7 +30,7 @@ from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.model import SceneModel
 from devrf.methods.devrf.renderer import Renderer
-from devrf.ops.choice import Kind, passes_check, using
+from devrf.ops.dispatch import Kind, passes_check, using
 from devrf.scenes.scene import Views
 from devrf.system.files import write_json
 from devrf.system.speed import copy_speed, product_speed, wait

@@ -27,7 +27,7 @@ from devrf.cli.workers import together
 from devrf.errors import DevrfError
 from devrf.methods.devrf.motion_losses import MOTION_TERMS
 from devrf.methods.weighted_loss import WeightedLoss
-from devrf.ops.choice import using
+from devrf.ops.dispatch import using
 
 log = logging.getLogger(__name__)
 

@@ -17,7 +17,7 @@ from devrf.engine.micro_batching import MicroBatching
 from devrf.engine.parallel_batch import MetricAccumulator, ParallelBatch
 from devrf.engine.streams import StreamParallel
 from devrf.ops.adam import GridAdam
-from devrf.ops.choice import triton_runs
+from devrf.ops.dispatch import triton_runs
 from devrf.rendering.sample_capacity import SampleCapacity
 from devrf.scenes.scene import Views
 from devrf.system.out_of_memory import OutOfMemoryError

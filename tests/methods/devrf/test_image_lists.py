@@ -16,7 +16,7 @@ from devrf.methods.devrf.image_lists import ListRenderer
 from devrf.methods.devrf.model import SceneModel
 from devrf.methods.devrf.renderer import Renderer
 from devrf.methods.devrf.volume_rendering import RenderSettings, render
-from devrf.ops.choice import using
+from devrf.ops.dispatch import using
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.rendered_image import RenderedImage
 from devrf.scenes.scene import Scene

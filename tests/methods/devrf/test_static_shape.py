@@ -13,7 +13,7 @@ from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.grid_warp import GridWarp
 from devrf.methods.devrf.static_shape import render_in_lists
 from devrf.methods.devrf.volume_rendering import RenderOutput, RenderSettings, render
-from devrf.ops.choice import Kind, using
+from devrf.ops.dispatch import Kind, using
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.sample_capacity import SampleCapacity
 from devrf.rendering.sampling import most_steps, steps_through

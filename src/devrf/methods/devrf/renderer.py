@@ -16,8 +16,8 @@ from devrf.methods.devrf.image_lists import ListRenderer
 from devrf.methods.devrf.model import SceneModel, occupancy_points, occupancy_through
 from devrf.methods.devrf.volume_rendering import Warp, render
 from devrf.methods.devrf.voxel_grid import resample
-from devrf.ops.choice import triton_runs
 from devrf.ops.corners import shape_of
+from devrf.ops.dispatch import triton_runs
 from devrf.rendering.chunks import in_chunks
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.rendered_image import RenderedImage
