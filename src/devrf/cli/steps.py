@@ -13,7 +13,6 @@ from lightning import seed_everything
 from omegaconf import DictConfig
 
 from devrf.cli import job
-from devrf.cli.benchmark import benchmark
 from devrf.cli.context import FROM_NOTHING, RunContext
 from devrf.cli.evaluate import evaluate
 from devrf.cli.inspect_scene import inspect, prepare
@@ -40,7 +39,6 @@ STEPS: dict[str, tuple[Callable[[RunContext], None], ...]] = {
     "render": (render,),
     "still": (picture,),
     "pipeline": (canonical, deformation, evaluate, render),
-    "benchmark": (benchmark,),
     "report": (report,),
 }
 
@@ -76,6 +74,11 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
         DevrfError: an unknown stage, or whatever is wrong with the input.
     """
     stage = config.stage
+    if stage == "benchmark":
+        raise DevrfError(
+            "stage=benchmark: moved; run python benchmarks/training.py with the other overrides "
+            "(benchmarks/README.md lists all benchmarks)"
+        )
     if stage not in STEPS:
         raise DevrfError(f"stage: expected one of {', '.join(STEPS)}, not {stage!r}")
     run = RunContext(config, folder)
@@ -136,7 +139,7 @@ def _check(run: RunContext, stage: str) -> None:
     if config.ckpt is not None and stage in FROM_NOTHING:
         raise DevrfError(
             f"ckpt: stage={stage} starts from nothing; with ckpt=PATH give stage=deformation, "
-            "stage=evaluate, stage=render, stage=still or stage=benchmark"
+            "stage=evaluate, stage=render or stage=still"
         )
     if stage in OF_NO_SCENE:
         return
@@ -151,4 +154,3 @@ def _check(run: RunContext, stage: str) -> None:
         raise DevrfError(f"stage: a search needs the objective, which stage={stage} does not score")
     instantiate(config.video)
     instantiate(config.still)
-    instantiate(config.benchmark)

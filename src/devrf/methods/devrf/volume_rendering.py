@@ -13,7 +13,7 @@ from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.ops.compositing import composite, sum_by_ray, transmittances
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.sampling import Samples, march
-from devrf.system.profiling import span, tally
+from devrf.system.profiling import span
 
 Warp = Callable[[Tensor], Tensor]
 
@@ -109,7 +109,6 @@ def render(
         heavy = _at_least(weight.detach(), settings.alpha_threshold)
         samples, canonical = samples[heavy], canonical.index_select(0, heavy)
         weight = weight.index_select(0, heavy)
-        tally("heavy", len(samples))
     with span("decoder"):
         color = field.rgb(canonical, rays.viewdirs, samples.ray, precision)
     with span("compositing"):
@@ -132,20 +131,17 @@ def _visible(
     samples: Samples, field: CanonicalField, delta: float, threshold: float, warp: Warp | None
 ) -> tuple[Samples, Tensor, Tensor]:
     """The samples that are neither empty nor hidden, their canonical positions, and their τ."""
-    tally("tested", len(samples))
     canonical = _warped(samples, warp)
     with span("density"):
         tau = field.optical_depth(canonical, delta)
     with span("sampling"):
         opaque = _at_least(-torch.expm1(-tau), threshold)
         ray, tau = samples.ray.index_select(0, opaque), tau.index_select(0, opaque)
-        tally("opaque", len(opaque))
     with span("compositing"):
         left = transmittances(tau, ray, samples.rays)
     with span("sampling"):
         reached = _at_least(left, STOP)
         kept = opaque.index_select(0, reached)
-        tally("reached", len(kept))
         return samples[kept], canonical.index_select(0, kept), tau.index_select(0, reached)
 
 
