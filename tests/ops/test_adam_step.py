@@ -31,15 +31,6 @@ def test_a_step_clears_the_gradient_unless_told_otherwise() -> None:
         assert gradient.any() != clear
 
 
-def test_second_step_by_hand() -> None:
-    values, mean, square = torch.zeros(1), torch.tensor([0.2]), torch.tensor([0.04])
-    adam_step(values, torch.tensor([3.0]), mean, square, rule(2))
-    # m = 0.9·0.2 + 0.1·3, s = 0.99·0.04 + 0.01·9.
-    assert mean.item() == pytest.approx(0.48) and square.item() == pytest.approx(0.1296)
-    move = 0.1 * (0.48 / (1 - 0.81)) / (0.1296 / (1 - 0.9801)) ** 0.5
-    assert values.item() == pytest.approx(-move, rel=1e-5)
-
-
 def test_smoothing_pulls_at_a_peak_and_its_neighbours_by_their_old_values() -> None:
     values, into, gradient = peak(), torch.empty(2, 2, 2, 1), torch.zeros(2, 2, 2, 1)
     mean, square = torch.zeros_like(values), torch.zeros_like(values)

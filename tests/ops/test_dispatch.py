@@ -87,25 +87,24 @@ def test_what_was_asked_for_holds_inside_and_not_after(monkeypatch: pytest.Monke
     assert not triton_runs(CPU)
 
 
-def test_triton_on_a_cpu_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dispatch, "find_spec", lambda name: True)
-    with using("triton"), pytest.raises(DevrfError) as refusal:
-        triton_runs(CPU)
-    assert str(refusal.value) == (
-        "kernels: triton needs a CUDA device, and these tensors are on the cpu: choose kernels=auto"
-    )
-
-
-def test_triton_refuses_other_numbers_than_float32(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dispatch, "find_spec", lambda name: True)
-    with using("triton"), pytest.raises(DevrfError, match="float32, not on torch.float64"):
-        triton_runs(OnGpu(torch.float64))  # type: ignore[arg-type]
-
-
-def test_triton_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dispatch, "find_spec", lambda name: None)
-    with using("triton"), pytest.raises(DevrfError, match="pip install triton"):
-        triton_runs(CPU)
+@pytest.mark.parametrize(
+    ("tensor", "installed", "expected"),
+    [
+        (
+            CPU,
+            True,
+            "triton needs a CUDA device, and these tensors are on the cpu: choose kernels=auto",
+        ),
+        (OnGpu(torch.float64), True, "float32, not on torch.float64"),
+        (CPU, None, "triton is not installed: pip install triton"),
+    ],
+)
+def test_triton_that_cannot_run_is_refused_with_the_reason(
+    monkeypatch: pytest.MonkeyPatch, tensor: torch.Tensor, installed: bool | None, expected: str
+) -> None:
+    monkeypatch.setattr(dispatch, "find_spec", lambda name: installed)
+    with using("triton"), pytest.raises(DevrfError, match=f"kernels: .*{expected}"):
+        triton_runs(tensor)
 
 
 def test_nothing_loads_triton_before_it_is_needed() -> None:

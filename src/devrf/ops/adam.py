@@ -79,8 +79,8 @@ class GridAdam(torch.optim.Optimizer):
     def stepping_by(self, work: Callable[[], None]) -> Iterator[None]:
         """Within, :meth:`step` does ``work`` in place of :meth:`apply`, which is part of it.
 
-        For work that is done as a whole, like a captured iteration: whoever must be asked before
-        a step, and sets learning rates, is asked before it.
+        For work that is done as a whole, like a captured iteration: callbacks that run before
+        a step, and set learning rates, run before all of it.
         """
         usual, self._work = self._work, work
         try:

@@ -50,7 +50,7 @@ def find_samples_on_device(
     device, rays = origins.device, len(origins)
     origins, directions = origins.contiguous(), directions.contiguous()
     entry, density = entry.contiguous(), density.contiguous()
-    # What is not there is stood in for by what is: the kernel does not look at it.
+    # The kernel takes two slices; with fewer the density fills in, and is not read as a slice.
     before, after = (frame.contiguous() for frame in ([*slices, density, density])[:2])
     stride = triton.cdiv(longest, LANES) * LANES
     marks = torch.empty(rays, stride, dtype=torch.uint8, device=device)
