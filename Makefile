@@ -17,7 +17,7 @@ quickstart: $(VENV)/.installed
 	$(BIN)/python -m devrf experiment=quickstart
 
 test: $(VENV)/.installed-dev
-	$(BIN)/ruff check src tests notebooks
+	$(BIN)/ruff check src tests benchmarks notebooks
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from devrf.methods.devrf.schedules import CanonicalSchedule
 from lightning import Callback, Trainer
 
 from devrf.callbacks import PeriodicCheckpoint, StopOnSignal, TrainingRecord
@@ -22,7 +23,6 @@ from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_stage import CanonicalStage
-from devrf.methods.devrf.schedules import CanonicalSchedule
 
 SMALL = Architecture(channels=4, width=8, frequencies=1)
 SCHEDULE = CanonicalSchedule(

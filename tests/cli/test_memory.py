@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from devrf.methods.devrf.schedules import CanonicalSchedule, DeformationSchedule
 
 from devrf.cli.memory import (
     BATCH,
@@ -20,7 +21,6 @@ from devrf.cli.memory import (
 )
 from devrf.geometry.box import Box
 from devrf.methods.devrf.architecture import Architecture
-from devrf.methods.devrf.schedules import CanonicalSchedule, DeformationSchedule
 from devrf.scenes.scene import Scene
 
 SMALL = Architecture(channels=4, width=16, frequencies=2)

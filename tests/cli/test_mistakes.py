@@ -25,6 +25,10 @@ MISTAKES = {
     "missing root": (["data=inward"], "data.root: required; give data.root=PATH"),
     "missing folder": (["data=inward", "data.root=nowhere"], "nowhere: no such folder"),
     "unknown stage": (["stage=train"], "stage: expected one of prepare, inspect"),
+    "moved stage": (
+        ["stage=benchmark"],
+        "stage=benchmark: moved; run python benchmarks/training.py",
+    ),
     "too few frames": (["data.frames=1"], "data.frames"),
     "word for a number": (["data.width=abc"], "data.width: expected a whole number, not 'abc'"),
     "fraction for a count": (["seed=1.5"], "seed: expected a whole number, not 1.5"),

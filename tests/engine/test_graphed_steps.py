@@ -29,7 +29,7 @@ from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.settings import MotionSettings
-from devrf.ops.choice import Kind, using
+from devrf.ops.dispatch import Kind, using
 from devrf.ops.kernels import adam, compositing, search, trilinear, warped_depth
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.sample_capacity import SampleCapacity

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import torch
 from lightning import Callback, Trainer
+from torch.profiler import ProfilerActivity, profile
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import Pixels
@@ -20,7 +21,6 @@ from devrf.engine.streams import StreamParallel
 from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.settings import MotionSettings
-from devrf.system.profiling import measuring
 
 GPU, CPU = torch.device("cuda"), torch.device("cpu")
 
@@ -114,7 +114,7 @@ def test_one_alone_and_those_on_a_cpu_need_no_streams(
 
 
 def test_what_is_measured_is_done_one_by_one(streams: Streams) -> None:
-    with measuring(CPU):
+    with profile(activities=[ProfilerActivity.CPU]):
         StreamParallel()([streams.piece(name) for name in "ab"], GPU)
     assert streams.noted == ["a on present", "b on present"]
 

@@ -133,7 +133,9 @@ def test_without_weights_lpips_is_none_and_a_line_says_why(
     with caplog.at_level(logging.INFO):
         judge = Evaluation(metrics=["lpips", "lpips_masked"]).suite(HOST)
         for index in range(2):
-            view = score(Renderer(learned[0].scene_model), tiny_scene.static.test, index, "white", judge)
+            view = score(
+                Renderer(learned[0].scene_model), tiny_scene.static.test, index, "white", judge
+            )
             assert view.further == {"lpips": None, "lpips_masked": None}
         Evaluation(metrics=["ms_ssim"]).suite(HOST)
     assert len(caplog.messages) == 1 and "LPIPS is null" in caplog.text

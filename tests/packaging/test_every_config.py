@@ -47,7 +47,6 @@ def test_the_groups_are_the_documented_ones():
         "logger",
         "loss",
         "report",
-        "benchmark",
         "sampling",
         "schedule",
         "stages",

@@ -28,7 +28,7 @@ from devrf.cli.workers import launch_workers
 from devrf.errors import DevrfError
 from devrf.methods.devrf.motion_losses import MOTION_TERMS
 from devrf.methods.weighted_loss import WeightedLoss
-from devrf.ops.choice import using
+from devrf.ops.dispatch import using
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +44,7 @@ STEPS: dict[str, Step] = {
     "report": report,
 }
 PIPELINE = ("evaluate", "render")
-MOVED = {"benchmark": "run python benchmarks/training.py instead"}
+MOVED = {"benchmark": "run python benchmarks/training.py with the other overrides"}
 
 # What Lightning says of every run (accelerators it looked for, tips, how many workers a loader
 # might have) is of no use to someone who watches a scene being learned.

@@ -1,4 +1,4 @@
-"""Adam for grids: entries without gradient stand still, each voxel may have its own pace."""
+"""Adam for grids: entries without gradient stand still, each voxel may have its own rate."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ import torch
 from torch import Tensor
 
 from devrf.ops.adam_step import AdamRule, adam_step, smooth_adam_step
-from devrf.ops.choice import triton_runs
+from devrf.ops.dispatch import triton_runs
 from devrf.ops.total_variation import add_total_variation_gradient
 
 
 class GridAdam(torch.optim.Optimizer):
-    """Adam (Kingma & Ba 2015) with additions for voxel grids (method §2, Optimiser; §3, TV).
+    """Adam (Kingma & Ba 2015) with additions for voxel grids.
 
     Each parameter group takes, beside ``lr``, ``betas`` and ``eps``:
 
     * ``skip_zero``: an entry whose gradient is exactly zero keeps its value *and its moments*:
       a voxel that no sample of this batch touched is not moved by what was seen before.
-    * ``pace``: None, or a tensor (X, Y, Z, 1) that multiplies the learning rate voxel by voxel.
+    * ``pace``: None, or a tensor (X, Y, Z, 1) of factors of the learning rate, voxel by voxel.
     * ``smoothing``: weight of the total variation of each grid, whose gradient is added to what
       the backward pass gave.
     * ``touched_only``: add it to entries alone that have a gradient.
@@ -79,8 +79,8 @@ class GridAdam(torch.optim.Optimizer):
     def stepping_by(self, work: Callable[[], None]) -> Iterator[None]:
         """Within, :meth:`step` does ``work`` in place of :meth:`apply`, which is part of it.
 
-        For work that is done as a whole, like a captured iteration: whoever must be asked before
-        a step, and sets learning rates, is asked before it.
+        For work that is done as a whole, like a captured iteration: callbacks that run before
+        a step, and set learning rates, run before all of it.
         """
         usual, self._work = self._work, work
         try:

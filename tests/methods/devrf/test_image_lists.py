@@ -16,7 +16,7 @@ from devrf.methods.devrf.image_lists import ListRenderer
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import RenderSettings
 from devrf.methods.devrf.volume_rendering import render
-from devrf.ops.choice import using
+from devrf.ops.dispatch import using
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.rendered_image import RenderedImage
 from devrf.rendering.renderer import Renderer

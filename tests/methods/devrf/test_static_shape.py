@@ -14,7 +14,7 @@ from devrf.methods.devrf.grid_warp import GridWarp
 from devrf.methods.devrf.settings import RenderSettings
 from devrf.methods.devrf.static_shape import render_static
 from devrf.methods.devrf.volume_rendering import VoxelOutput, render
-from devrf.ops.choice import Kind, using
+from devrf.ops.dispatch import Kind, using
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.sample_capacity import SampleCapacity
 from devrf.rendering.sampling import most_steps, steps_through

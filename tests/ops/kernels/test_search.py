@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from devrf.geometry.box import Box
-from devrf.ops.choice import using
+from devrf.ops.dispatch import using
 from devrf.ops.search import PackedSamples, Thresholds, find_samples
 
 Draw = Callable[..., Tensor]

@@ -39,7 +39,7 @@ from devrf.methods.devrf.smoothing import total_variation_weight
 from devrf.methods.devrf.voxel_stage import VoxelStage
 from devrf.methods.weighted_loss import WeightedLoss
 from devrf.ops.adam import GridAdam
-from devrf.ops.choice import triton_runs
+from devrf.ops.dispatch import triton_runs
 from devrf.rendering.occupancy import Occupancy, bounding_box, dilate
 from devrf.scenes.scene import CaptureName, Views
 from devrf.system.profiling import span
