@@ -6,43 +6,36 @@ from collections.abc import Mapping
 from typing import get_args
 
 from rich.console import Group, RenderableType
+from rich.filesize import decimal
 from rich.text import Text
 
-from devrf.artifacts.inspection_text import size
-from devrf.artifacts.sections import Section, as_lines, as_tables
+from devrf.artifacts.tables import as_text, titled_table
 from devrf.cli.benchmark_record import Benchmark
 from devrf.cli.timing import Spread, Timing
 from devrf.system.profiling import OVERHEAD, Count, Part
 
 
-def sections(found: Benchmark) -> list[Section]:
-    """The device, what an iteration takes, what it looks at, and what a picture takes."""
-    copies, products = found.copy_speed / 1e9, found.product_speed / 1e9
-    return [
-        Section(
-            "what was measured",
-            (
-                ("scene", found.scene),
-                ("fields", found.state),
-                ("device", f"copies {copies:.3g} GB/s, multiplies at {products:.3g} GFLOP/s"),
-            ),
-        ),
-        Section("milliseconds an iteration", tuple(_times(found)), heading=True),
-        Section(
-            "samples an iteration, and the least it has to do", tuple(_work(found)), heading=True
-        ),
-        Section("held-out views", tuple(_pictures(found)), heading=True),
-    ]
-
-
 def plain(found: Benchmark) -> str:
     """The report as plain text, columns aligned."""
-    return "\n".join([*as_lines(sections(found)), *found.notes])
+    return as_text(tables(found))
 
 
 def tables(found: Benchmark) -> RenderableType:
-    """The report as tables for a terminal."""
-    return Group(*as_tables(sections(found)), *(Text(note, style="italic") for note in found.notes))
+    """What was measured: the device, the time of an iteration, its work, and held-out views."""
+    copies, products = found.copy_speed / 1e9, found.product_speed / 1e9
+    measured = [
+        ("scene", found.scene),
+        ("fields", found.state),
+        ("device", f"copies {copies:.3g} GB/s, multiplies at {products:.3g} GFLOP/s"),
+    ]
+    times, work, pictures = _times(found), _work(found), _pictures(found)
+    return Group(
+        titled_table("what was measured", measured),
+        titled_table("milliseconds an iteration", times[1:], times[0]),
+        titled_table("samples an iteration, and the least it has to do", work[1:], work[0]),
+        titled_table("held-out views", pictures[1:], pictures[0]),
+        *(Text(note, style="italic") for note in found.notes),
+    )
 
 
 def _times(found: Benchmark) -> list[tuple[str, ...]]:
@@ -100,7 +93,7 @@ def _floor(found: Benchmark, timing: Timing) -> tuple[str, str, str]:
     if timing.work is None or floor is None:
         return "-", "-", "-"
     moved = timing.work.bytes
-    return size(moved), f"{moved / 1e9 / seconds:.3g}", f"{100 * floor / seconds:.0f} %"
+    return decimal(round(moved)), f"{moved / 1e9 / seconds:.3g}", f"{100 * floor / seconds:.0f} %"
 
 
 def _pictures(found: Benchmark) -> list[tuple[str, ...]]:
@@ -148,4 +141,4 @@ def _count(counts: Mapping[str, float], name: str) -> str:
 
 
 def _bytes(count: int | None) -> str:
-    return "-" if count is None else size(count)
+    return "-" if count is None else decimal(count)

@@ -1,4 +1,4 @@
-"""What may be wrong with a scene that can be read, each with its place and its remedy."""
+"""What may be wrong with a scene that can be read: where, what, and the remedy."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ class Advice:
 
 
 def listed(names: Sequence[str], most: int = 3) -> str:
-    """The first ``most`` of some names, and how many more there are."""
-    shown = ", ".join(names[:most])
+    """The first ``most`` names, and how many more there are."""
     more = len(names) - most
-    return shown if more <= 0 else f"{shown} and {more} more"
+    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
