@@ -6,7 +6,7 @@ import math
 from typing import Any, NamedTuple
 
 import torch
-from matplotlib.figure import Figure, SubFigure
+from matplotlib.axes import Axes
 from matplotlib.patheffects import withStroke
 from torch import Tensor
 
@@ -33,39 +33,37 @@ class Lines(NamedTuple):
     width: float
 
 
-def draw_cameras(figure: Figure | SubFigure, scene: Scene) -> None:
-    """Draw cameras and boxes into a figure, with a legend below.
+def draw_cameras(scene: Scene, side: Any, plan: Axes) -> None:
+    """Draw cameras and boxes, in perspective (an Axes3D) and from above.
 
     Axes are in world units, counted from the middle of the box, along east, north and up of
     the cameras.
     """
     axes, middle = compass(scene), box_middle(scene)
-    side, plan = figure.add_subplot(1, 2, 1, projection="3d"), figure.add_subplot(1, 2, 2)
     groups = scene_lines(scene)
     shown = [(group.ends - middle) @ axes.T for group in groups]
     for group, ends in zip(groups, shown, strict=True):
         # One curve with a break after each segment.
         path = torch.cat([ends, torch.full_like(ends[:, :1], math.nan)], dim=1).reshape(-1, 3)
         x, y, z = path.T.tolist()
-        side.plot(x, y, z, color=group.color, linewidth=group.width)
+        side.plot(x, y, z, color=group.color, linewidth=group.width, clip_on=False)
         plan.plot(x, y, color=group.color, linewidth=group.width, label=group.label)
     for name, number, position, color in _fixed_views(scene):
         x, y, z = ((position - middle) @ axes.T).tolist()
         style: dict[str, Any] = {"color": color, "fontweight": "bold", "path_effects": HALO}
         side.text(x, y, z, f"  {number}", **style)
-        plan.annotate(
-            f"{name} {number}", (x, y), xytext=(9, 9), textcoords="offset points", **style
-        )
+        if scene.kind == "inward":  # forward-facing cameras stand above one another
+            outward = 26 / max(math.hypot(x, y), 1e-6)  # points
+            style |= {"textcoords": "offset points", "ha": "center", "va": "center"}
+            plan.annotate(f"{name} {number}", (x, y), xytext=(x * outward, y * outward), **style)
     points = torch.cat([ends.reshape(-1, 3) for ends in shown])
     low, high = points.amin(dim=0).tolist(), points.amax(dim=0).tolist()
     side.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    side.set_box_aspect([b - a for a, b in zip(low, high, strict=True)], zoom=1.2)
+    side.set_box_aspect([b - a for a, b in zip(low, high, strict=True)], zoom=1.15)
+    side.locator_params(nbins=5)
     side.view_init(elev=20, azim=-55)
-    side.set_title("in perspective", loc="left")
     plan.set_aspect("equal")
-    plan.set_title("from above, in world units from the middle of the box", loc="left")
     plan.grid(color="0.92")
-    figure.legend(loc="outside lower center", ncols=6, frameon=False)
 
 
 def compass(scene: Scene) -> Tensor:
@@ -84,10 +82,10 @@ def scene_lines(scene: Scene) -> list[Lines]:
     if bounds.motion is not None:
         lines.append(Lines("room for motion", box_edges(scene, bounds.motion), "#1f9e6b", 2))
     for label, views, color, width in (
-        ("static", scene.static.train, "#4f7fd0", 1.0),
-        ("static, held out", scene.static.test, "#7cc4ea", 1.0),
-        ("dynamic", scene.dynamic.train, TRAIN_COLOR, 2.0),
-        ("dynamic, held out", scene.dynamic.test, TEST_COLOR, 2.0),
+        ("static views", scene.static.train, "#4f7fd0", 1.0),
+        ("held-out static", scene.static.test, "#7cc4ea", 1.0),
+        ("dynamic views", scene.dynamic.train, TRAIN_COLOR, 2.0),
+        ("held-out dynamic", scene.dynamic.test, TEST_COLOR, 2.0),
     ):
         images = list(first_images(views).values())
         ends = frusta(views.cameras[images], size)

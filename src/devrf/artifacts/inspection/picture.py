@@ -9,25 +9,23 @@ from typing import Any
 import matplotlib
 import numpy as np
 import torch
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 from torch import Tensor
 
 from devrf.artifacts.colors import flow_colors, flow_wheel, to_bytes
+from devrf.artifacts.images import short_name
 from devrf.artifacts.inspection.camera_plot import draw_cameras, first_images
 from devrf.scenes.optical_flow import frame_pairs
 from devrf.scenes.scene import Scene, Views
 from devrf.system.files import atomic_write
 
 # Sizes in inches, of which each is 100 pixels.
-WIDTH, TITLE, CAMERAS, HEADING, CAPTION = 16.0, 0.6, 6.6, 0.5, 0.35
+WIDTH, TITLE, CAMERAS, HEADING, CAPTION, GAP = 16.0, 0.7, 6.6, 0.6, 0.4, 0.15
 # No image is higher, so that portrait images do not fill a page each.
 TALLEST = 2.8
 COLUMNS = 6
 MOST_VIEWS = 4
-# Longest name below an image, in characters.
-LONGEST_NAME = 28
 STYLE: dict[Any, Any] = {
     "font.size": 13,
     "text.color": "0.15",
@@ -38,7 +36,12 @@ STYLE: dict[Any, Any] = {
     "axes3d.yaxis.panecolor": "0.98",
     "axes3d.zaxis.panecolor": "0.95",
     "grid.color": "0.85",
+    "xtick.labelsize": 11,
+    "ytick.labelsize": 11,
 }
+
+
+Rectangle = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,12 @@ class Section:
 
     heading: str
     rows: list[list[Tile | None]]
-    height: float
+    tile_height: float
+
+    @property
+    def height(self) -> float:
+        """Of the whole section, in inches."""
+        return HEADING + len(self.rows) * (self.tile_height + CAPTION)
 
 
 def write_inspection_picture(path: Path, scene: Scene) -> None:
@@ -67,34 +75,54 @@ def write_inspection_picture(path: Path, scene: Scene) -> None:
 def inspection_figure(scene: Scene) -> Figure:
     """The page of a scene: 16 inches wide, 100 pixels each."""
     sections = [_static_section(scene.static.train), *_dynamic_sections(scene.dynamic.train)]
-    heights = [
-        CAMERAS,
-        *(HEADING + len(section.rows) * (section.height + CAPTION) for section in sections),
-    ]
+    height = TITLE + CAMERAS + sum(section.height for section in sections)
     with matplotlib.rc_context(STYLE):
-        figure = Figure((WIDTH, TITLE + sum(heights)), dpi=100, layout="constrained")
-        figure.suptitle(f"{scene.name}, {scene.kind}-facing", fontsize=24, fontweight="bold")
-        parts = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]
-        draw_cameras(parts[0], scene)
-        for part, section in zip(parts[1:], sections, strict=True):
-            part.suptitle(section.heading, fontsize=17, x=0.005, ha="left")
-            places = part.subplots(len(section.rows), COLUMNS, squeeze=False)
-            for row, axes in zip(section.rows, places, strict=True):
-                for k, place in enumerate(axes):
-                    _draw_tile(place, row[k] if k < len(row) else None)
+        figure = Figure((WIDTH, height), dpi=100)
+        _write(figure, 0.45, f"{scene.name}, {scene.kind}-facing", fontsize=24, fontweight="bold")
+        _draw_cameras(figure, scene)
+        top = TITLE + CAMERAS
+        for section in sections:
+            _draw_section(figure, section, top)
+            top += section.height
     return figure
 
 
-def _draw_tile(axes: Axes, tile: Tile | None) -> None:
-    if tile is None:
-        axes.set_axis_off()
-        return
-    axes.imshow(tile.image)
-    axes.set(xticks=[], yticks=[], xlabel=tile.label)
+def _draw_cameras(figure: Figure, scene: Scene) -> None:
+    half, below = (WIDTH - GAP) / 2, TITLE + 0.3
+    side = figure.add_axes(_place(figure, 0, below, half, 5.6), projection="3d")
+    plan = figure.add_axes(_place(figure, half + 0.6, below, half - 1, 5.4))
+    draw_cameras(scene, side, plan)
+    _write(figure, below - 0.05, "in perspective")
+    _write(figure, below - 0.05, "from above, in world units from the middle of the box", half)
+    at = (0.5, 1 - (TITLE + CAMERAS - 0.2) / figure.get_figheight())
+    figure.legend(loc="center", bbox_to_anchor=at, ncols=6, frameon=False)
+
+
+def _draw_section(figure: Figure, section: Section, top: float) -> None:
+    _write(figure, top + HEADING - 0.15, section.heading, fontsize=17)
+    width = (WIDTH - (COLUMNS + 1) * GAP) / COLUMNS
+    for i, row in enumerate(section.rows):
+        below = top + HEADING + i * (section.tile_height + CAPTION)
+        for k, tile in enumerate(row):
+            if tile is not None:
+                left = GAP + k * (width + GAP)
+                axes = figure.add_axes(_place(figure, left, below, width, section.tile_height))
+                axes.imshow(tile.image)
+                axes.set(xticks=[], yticks=[], xlabel=tile.label, anchor="N")
+
+
+def _place(figure: Figure, left: float, top: float, width: float, height: float) -> Rectangle:
+    """Shares of a figure of a rectangle in inches, counted from its top left corner."""
+    page = figure.get_figheight()
+    return left / WIDTH, 1 - (top + height) / page, width / WIDTH, height / page
+
+
+def _write(figure: Figure, top: float, text: str, left: float = 0.0, **style: Any) -> None:
+    figure.text((left + GAP) / WIDTH, 1 - top / figure.get_figheight(), text, **style)
 
 
 def _static_section(views: Views) -> Section:
-    tiles = [Tile(shown(views, k), _short(views.names[k])) for k in evenly(len(views), COLUMNS)]
+    tiles = [Tile(shown(views, k), short_name(views.names[k])) for k in evenly(len(views), COLUMNS)]
     heading = f"At rest: {_count(len(views), 'static view')} to learn from"
     return Section(heading, [[*tiles]], _tile_height(views))
 
@@ -197,7 +225,7 @@ def _smaller(pixels: np.ndarray) -> Image.Image:
 
 
 def _tile_height(views: Views) -> float:
-    return min(TALLEST, (WIDTH / COLUMNS - 0.15) * views.height / views.width)
+    return min(TALLEST, (WIDTH / COLUMNS - GAP) * views.height / views.width)
 
 
 def _motion(views: Views) -> str:
@@ -209,9 +237,3 @@ def _motion(views: Views) -> str:
 
 def _count(number: int, word: str) -> str:
     return f"{number} {word}" + "s" * (number != 1)
-
-
-def _short(name: str) -> str:
-    """The end of a file's name."""
-    name = Path(name).name
-    return name if len(name) <= LONGEST_NAME else f"…{name[1 - LONGEST_NAME :]}"
