@@ -31,7 +31,7 @@ def prepare(run: RunContext) -> None:
 
 def inspect(run: RunContext) -> None:
     """Report and draw what the scene holds and what may be wrong with it; learn nothing."""
-    # Matplotlib takes a while to load, and only this step needs it.
+    # Only this step draws with matplotlib.
     from devrf.artifacts.inspection.picture import write_inspection_picture
 
     report = inspection_text(inspect_scene(run.scene), _requirements(estimated(run)))
