@@ -15,7 +15,7 @@ import torch
 from PIL import Image
 
 from devrf.artifacts.inspection.image_advice import image_advice
-from devrf.artifacts.inspection.picture import visible_pixels
+from devrf.artifacts.inspection.picture import shown
 from devrf.artifacts.inspection.report import inspect_scene
 from devrf.data.flow_source import with_flow
 from devrf.data.nerfstudio import NerfstudioDataModule
@@ -246,8 +246,8 @@ def test_inspecting_says_how_much_they_cover(root: Path, caplog: pytest.LogCaptu
     facts = inspect_scene(scene).sets[0]
     assert facts.alpha_share is None and facts.masked_share == pytest.approx(0.5)
     assert not [advice for advice in image_advice(scene) if "masks" in advice.what]
-    abbreviated = visible_pixels(scene.dynamic.train, 0)
-    assert abbreviated.shape[2] == 4 and abbreviated[0, :, 3].tolist() == [255] * 40 + [0] * 40
+    image, pixels = shown(scene.dynamic.train, 0), scene.dynamic.train.pixels[0].numpy()
+    assert (image[:, :40] == pixels[:, :40]).all() and (image[:, 40:] >= 232).all()
     matte = inspect_scene(read_nerfstudio(root, masks="matte")).sets[0]
     assert matte.alpha_share == pytest.approx(0.5) and matte.masked_share is None
 

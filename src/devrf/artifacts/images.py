@@ -11,7 +11,7 @@ from devrf.artifacts.colors import to_bytes
 from devrf.system.files import atomic_write
 
 # Longest name that fits below a small image, in characters.
-LONGEST_NAME = 24
+LONGEST_NAME = 30
 
 
 def write_image(path: Path, image: Tensor) -> None:

@@ -55,20 +55,16 @@ def _blank(scene: Scene) -> Iterator[Advice]:
     flat, empty = [], []
     for views in _image_sets(scene).values():
         for k, name in enumerate(views.names):
+            pixels = views.pixels[k]
+            if views.valid_mask is not None:
+                pixels = pixels[views.valid_mask[k]]
             if views.has_alpha:
                 # A subject of one colour still has an outline: only an empty mask tells nothing.
-                in_mask = views.pixels[k, ..., 3] > OPAQUE
-                if views.valid_mask is not None:
-                    in_mask = in_mask & views.valid_mask[k]
-                if not bool(in_mask.any()):
+                if int(pixels[..., 3].amax()) <= OPAQUE:
                     empty.append(name)
             else:
-                image = views.pixels[k]
-                shown = image.reshape(-1, 3)
-                if views.valid_mask is not None:
-                    shown = image[views.valid_mask[k]]
-                low, high = shown.amin(dim=0).int(), shown.amax(dim=0).int()
-                if int((high - low).max()) <= FLAT:
+                values = pixels.reshape(-1, 3).int()
+                if int((values.amax(dim=0) - values.amin(dim=0)).max()) <= FLAT:
                     flat.append(name)
     if flat:
         remedy = "look at the file, and leave it out if it is lost"

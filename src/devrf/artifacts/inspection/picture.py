@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from devrf.artifacts.colors import flow_colors, flow_wheel, to_bytes
 from devrf.artifacts.images import short_name
 from devrf.artifacts.inspection.camera_plot import draw_cameras, first_images
 from devrf.scenes.optical_flow import frame_pairs
-from devrf.scenes.scene import Scene, Views
+from devrf.scenes.scene import OpticalFlow, Scene, Views
 from devrf.system.files import atomic_write
 
 # Sizes in inches, of which each is 100 pixels.
@@ -42,14 +43,8 @@ STYLE: dict[Any, Any] = {
 
 
 Rectangle = tuple[float, float, float, float]
-
-
-@dataclass(frozen=True)
-class Tile:
-    """An image (H, W, 3) uint8 with its label."""
-
-    image: np.ndarray
-    label: str
+# An image (H, W, 3) uint8 and its label.
+Tile = tuple[np.ndarray, str]
 
 
 @dataclass(frozen=True)
@@ -57,7 +52,7 @@ class Section:
     """Rows of tiles below a heading; None leaves a place empty."""
 
     heading: str
-    rows: list[list[Tile | None]]
+    rows: Sequence[Sequence[Tile | None]]
     tile_height: float
 
     @property
@@ -107,8 +102,8 @@ def _draw_section(figure: Figure, section: Section, top: float) -> None:
             if tile is not None:
                 left = GAP + k * (width + GAP)
                 axes = figure.add_axes(_place(figure, left, below, width, section.tile_height))
-                axes.imshow(tile.image)
-                axes.set(xticks=[], yticks=[], xlabel=tile.label, anchor="N")
+                axes.imshow(tile[0])
+                axes.set(xticks=[], yticks=[], xlabel=tile[1], anchor="N")
 
 
 def _place(figure: Figure, left: float, top: float, width: float, height: float) -> Rectangle:
@@ -122,31 +117,33 @@ def _write(figure: Figure, top: float, text: str, left: float = 0.0, **style: An
 
 
 def _static_section(views: Views) -> Section:
-    tiles = [Tile(shown(views, k), short_name(views.names[k])) for k in evenly(len(views), COLUMNS)]
-    heading = f"At rest: {_count(len(views), 'static view')} to learn from"
-    return Section(heading, [[*tiles]], _tile_height(views))
+    tiles = [(shown(views, k), short_name(views.names[k])) for k in evenly(len(views), COLUMNS)]
+    return Section(f"Static training set: {len(views)} images", [tiles], _tile_height(views))
 
 
 def _dynamic_sections(views: Views) -> list[Section]:
     """Sample images of the dynamic views, and below the flow of the same images."""
     rows, height = sample_images(views), _tile_height(views)
-    labels = {
+    label = {
         k: f"view {int(views.view[k])}, time {float(views.times[k]):.2f}"
         for row in rows
         for k in row
     }
-    images = [[Tile(shown(views, k), labels[k]) for k in row] for row in rows]
-    sections = [Section(f"In motion: {_motion(views)}", [[*row] for row in images], height)]
+    numbers, times = len(set(views.view.tolist())), len(set(views.times.tolist()))
+    motion = "a moving camera" if numbers == len(views) else f"{numbers} fixed views"
+    heading = f"Dynamic training set: {motion}, {times} times"
+    sections = [
+        Section(heading, [[(shown(views, k), label[k]) for k in row] for row in rows], height)
+    ]
     if views.flow is None:
         return sections
-    longest, flowing = flow_scale(views), {image for image, _ in frame_pairs(views)}
-    tiles: list[list[Tile | None]] = [
-        [Tile(_flow_image(views, k, longest), labels[k]) if k in flowing else None for k in row]
+    longest, flowing = flow_scale(views.flow), {image for image, _ in frame_pairs(views)}
+    tiles = [
+        [(_flow_image(views.flow, k, longest), label[k]) if k in flowing else None for k in row]
         for row in rows
     ]
     # The first image of a view has no frame before it.
-    wheel = to_bytes(flow_wheel(300)).numpy()
-    tiles[0][0] = Tile(wheel, f"rim: {longest:.3g} px or more")
+    tiles[0][0] = (to_bytes(flow_wheel(300)).numpy(), f"rim: {longest:.3g} px or more")
     heading = (
         "Optical flow: where each pixel was one frame earlier; the wheel shows the direction, "
         "grey is unknown"
@@ -176,64 +173,35 @@ def evenly(count: int, most: int) -> list[int]:
     return [round(k) for k in np.linspace(0, count - 1, min(count, most))]
 
 
-def flow_scale(views: Views) -> float:
+def flow_scale(flow: OpticalFlow) -> float:
     """The length in pixels that is shown saturated: 99 % of the valid flow is shorter."""
-    assert views.flow is not None
-    lengths = torch.cat(
-        [
-            vectors[valid].norm(dim=-1)[::7]  # a sample of the pixels is enough
-            for vectors, valid in zip(views.flow.vectors, views.flow.valid, strict=True)
-        ]
-    )
+    # Every ninth pixel is enough; all of a large scene's flow at once would be copied.
+    vectors, valid = flow.vectors[:, ::3, ::3], flow.valid[:, ::3, ::3]
+    lengths = vectors[valid].norm(dim=-1)
     lengths = lengths[torch.isfinite(lengths)]
     return max(float(np.quantile(lengths.numpy(), 0.99)), 1e-3) if len(lengths) else 1.0
 
 
 def shown(views: Views, image: int) -> np.ndarray:
-    """An image as RGB (H', W', 3); what masks or alpha leave out is chequered."""
-    picture = np.asarray(_smaller(visible_pixels(views, image).cpu().numpy()))
-    if picture.shape[2] == 3:
-        return picture
-    height, width = picture.shape[:2]
-    y, x = np.indices((height, width)) // max(1, round(width / 24))
-    squares = np.where((x + y) % 2, 232.0, 255.0)[..., None]
-    alpha = picture[..., 3:] / 255
-    blended: np.ndarray = (squares + alpha * (picture[..., :3] - squares)).astype(np.uint8)
-    return blended
+    """An image as RGB (H', W', 3) uint8; what its alpha or mask leaves out is chequered."""
+    pixels = views.pixels[image].cpu().float() / 255
+    opacity = pixels[..., 3:] if views.has_alpha else torch.ones(*pixels.shape[:2], 1)
+    if views.valid_mask is not None:
+        opacity = opacity * views.valid_mask[image].cpu()[..., None]
+    y, x = np.indices(pixels.shape[:2]) // max(1, views.width // 24)
+    squares = torch.from_numpy(np.where((x + y) % 2, 0.91, 1.0)).float()[..., None]
+    return _smaller(squares + opacity * (pixels[..., :3] - squares))
 
 
-def visible_pixels(views: Views, image: int) -> Tensor:
-    """An image's pixels (H, W, 3 or 4); those that do not count are transparent."""
-    pixels = views.pixels[image]
-    if views.valid_mask is None:
-        return pixels
-    alpha = views.valid_mask[image].to(torch.uint8)[..., None] * 255
-    alpha = torch.minimum(alpha, pixels[..., 3:]) if views.has_alpha else alpha
-    return torch.cat([pixels[..., :3], alpha], dim=-1)
+def _flow_image(flow: OpticalFlow, image: int, longest: float) -> np.ndarray:
+    return _smaller(flow_colors(flow.vectors[image], flow.valid[image], longest))
 
 
-def _flow_image(views: Views, image: int, longest: float) -> np.ndarray:
-    assert views.flow is not None
-    colors = flow_colors(views.flow.vectors[image], views.flow.valid[image], longest)
-    return np.asarray(_smaller(to_bytes(colors).numpy()))
-
-
-def _smaller(pixels: np.ndarray) -> Image.Image:
+def _smaller(colors: Tensor) -> np.ndarray:
     """Reduced by a whole factor to little more than is shown: a page of full images is large."""
-    image = Image.fromarray(np.ascontiguousarray(pixels))
-    return image.reduce(max(1, image.width // 300))
+    image = Image.fromarray(to_bytes(colors).numpy())
+    return np.asarray(image.reduce(max(1, image.width // 300)))
 
 
 def _tile_height(views: Views) -> float:
     return min(TALLEST, (WIDTH / COLUMNS - GAP) * views.height / views.width)
-
-
-def _motion(views: Views) -> str:
-    numbers, times = len(set(views.view.tolist())), len(set(views.times.tolist()))
-    if numbers == len(views):
-        return f"a moving camera, {_count(len(views), 'image')}"
-    return f"{_count(numbers, 'fixed view')} to learn from, {_count(times, 'time')}"
-
-
-def _count(number: int, word: str) -> str:
-    return f"{number} {word}" + "s" * (number != 1)
