@@ -21,10 +21,10 @@ def test_the_sets_of_a_scene(tiny_scene: Scene) -> None:
     found = inspect_scene(tiny_scene)
     counts = [(f.name, f.images, f.views, f.frames) for f in found.sets]
     assert counts == [
-        ("static train", 8, 8, 1),
-        ("static test", 2, 2, 1),
-        ("dynamic train", 6, 2, 3),
-        ("dynamic test", 3, 1, 3),
+        ("static training set", 8, 8, 1),
+        ("static test set", 2, 2, 1),
+        ("dynamic training set", 6, 2, 3),
+        ("dynamic test set", 3, 1, 3),
     ]
     assert {(f.width, f.height, f.masked_share) for f in found.sets} == {(24, 18, None)}
     alpha = tiny_scene.static.test.pixels[..., 3]

@@ -1,9 +1,11 @@
-"""What may be wrong with a scene that can be read: where, what, and the remedy."""
+"""Advice on a scene that can be read, and names for the sets of images that it is about."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+
+from devrf.scenes.scene import Scene, Views
 
 
 @dataclass(frozen=True)
@@ -22,6 +24,17 @@ class Advice:
 
     def __str__(self) -> str:
         return f"{self.where}: {self.what}; {self.remedy}"
+
+
+def image_sets(scene: Scene) -> dict[str, Views]:
+    """The four sets of images by the names that a report gives them; empty ones are left out."""
+    sets = {
+        "static training set": scene.static.train,
+        "static test set": scene.static.test,
+        "dynamic training set": scene.dynamic.train,
+        "dynamic test set": scene.dynamic.test,
+    }
+    return {name: views for name, views in sets.items() if len(views)}
 
 
 def listed(names: Sequence[str], most: int = 3) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from devrf.artifacts.inspection.advice import Advice, listed
+from devrf.artifacts.inspection.advice import Advice, image_sets, listed
 from devrf.artifacts.inspection.layout import box_middle, box_points, widest_gap
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
@@ -61,22 +61,17 @@ def _twins(test: Views, train: Views, middle: Tensor) -> list[str]:
 def _looking_away(scene: Scene) -> Iterator[Advice]:
     points = box_points(scene, scene.bounds.box, (9, 9, 9))
     away, beside = [], []
-    for capture in (scene.static, scene.dynamic):
-        for views in (capture.train, capture.test):
-            for k, name in enumerate(views.names):
-                if _depth(views.cameras, k, points[4, 4, 4]) <= 0:
-                    away.append(name)
-                elif not _sees_any(views.cameras, k, points.reshape(-1, 3)):
-                    beside.append(name)
+    for views in image_sets(scene).values():
+        for k, name in enumerate(views.names):
+            if float(views.cameras.project_into(k, points[4, 4, 4:5])[1]) <= 0:
+                away.append(name)
+            elif not _sees_any(views.cameras, k, points.reshape(-1, 3)):
+                beside.append(name)
     remedy = "check the pose (camera-to-world, x right, y up, looking along -z), or set data.box"
     if away:
         yield Advice(listed(away), "looks away from the middle of the box", remedy)
     if beside:
         yield Advice(listed(beside), "does not have the box in the picture", remedy)
-
-
-def _depth(cameras: Cameras, camera: int, point: Tensor) -> float:
-    return float(cameras.project_into(camera, point[None])[1])
 
 
 def _sees_any(cameras: Cameras, camera: int, points: Tensor) -> bool:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 import torch
 from torch import Tensor
 
-from devrf.artifacts.inspection.advice import Advice, listed
+from devrf.artifacts.inspection.advice import Advice, image_sets, listed
 from devrf.geometry.clock import FrameClock
 from devrf.scenes.optical_flow import frame_pairs
 from devrf.scenes.scene import Scene, Views
@@ -40,20 +40,9 @@ def mean_share(masks: Iterable[Tensor]) -> float:
     return sum(shares) / len(shares)
 
 
-def _image_sets(scene: Scene) -> dict[str, Views]:
-    """The four sets by name, without empty ones."""
-    sets = {
-        "static training set": scene.static.train,
-        "static test set": scene.static.test,
-        "dynamic training set": scene.dynamic.train,
-        "dynamic test set": scene.dynamic.test,
-    }
-    return {name: views for name, views in sets.items() if len(views)}
-
-
 def _blank(scene: Scene) -> Iterator[Advice]:
     flat, empty = [], []
-    for views in _image_sets(scene).values():
+    for views in image_sets(scene).values():
         for k, name in enumerate(views.names):
             pixels = views.pixels[k]
             if views.valid_mask is not None:
@@ -77,7 +66,7 @@ def _blank(scene: Scene) -> Iterator[Advice]:
 def _turned(scene: Scene) -> Iterator[Advice]:
     names = [
         views.names[k]
-        for views in _image_sets(scene).values()
+        for views in image_sets(scene).values()
         if views.ambiguous_orientation is not None
         for k in views.ambiguous_orientation.nonzero()[:, 0].tolist()
     ]
@@ -93,7 +82,7 @@ def _turned(scene: Scene) -> Iterator[Advice]:
 
 
 def _alpha(scene: Scene) -> Iterator[Advice]:
-    sets = _image_sets(scene)
+    sets = image_sets(scene)
     without = [name for name, views in sets.items() if not views.has_alpha]
     if 0 < len(without) < len(sets):
         yield Advice(
@@ -113,7 +102,7 @@ def _alpha(scene: Scene) -> Iterator[Advice]:
 def _masks(scene: Scene) -> Iterator[Advice]:
     masked = {
         name: mean_share(~mask for mask in views.valid_mask)
-        for name, views in _image_sets(scene).items()
+        for name, views in image_sets(scene).items()
         if views.valid_mask is not None
     }
     much = {name: share for name, share in masked.items() if share > MUCH_MASKED}

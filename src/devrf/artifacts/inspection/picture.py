@@ -64,7 +64,7 @@ class Section:
 def write_inspection_picture(path: Path, scene: Scene) -> None:
     """Write the page of a scene as a PNG, 1600 pixels wide and as high as it needs to be."""
     with atomic_write(path) as partial:
-        inspection_figure(scene).savefig(partial, format="png")
+        inspection_figure(scene).savefig(partial, format="png", dpi="figure")
 
 
 def inspection_figure(scene: Scene) -> Figure:

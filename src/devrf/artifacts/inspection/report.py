@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from devrf.artifacts.inspection.advice import Advice
+from torch import Tensor
+
+from devrf.artifacts.inspection.advice import Advice, image_sets
 from devrf.artifacts.inspection.camera_advice import camera_advice
 from devrf.artifacts.inspection.image_advice import OPAQUE, image_advice, mean_share
 from devrf.artifacts.inspection.layout import box_middle, widest_gap
@@ -18,7 +20,7 @@ class ViewsFacts:
     """Facts of one set of images.
 
     Attributes:
-        name: ``static train``, ``static test``, ``dynamic train`` or ``dynamic test``.
+        name: as in :func:`devrf.artifacts.inspection.advice.image_sets`.
         images: number of images.
         views: number of cameras that took them.
         frames: number of distinct times.
@@ -103,16 +105,10 @@ class Inspection:
 
 def inspect_scene(scene: Scene) -> Inspection:
     """Find counts, sizes, times, cameras and flow of a scene, and what may be wrong with it."""
-    sets = {
-        "static train": scene.static.train,
-        "static test": scene.static.test,
-        "dynamic train": scene.dynamic.train,
-        "dynamic test": scene.dynamic.test,
-    }
     cameras, middle = scene.static.train.cameras, box_middle(scene)
     return Inspection(
         scene,
-        sets=tuple(_views_facts(name, views, scene) for name, views in sets.items() if len(views)),
+        sets=tuple(_views_facts(*named, middle) for named in image_sets(scene).items()),
         times=_times_facts(scene.dynamic.train),
         gap=widest_gap(cameras, middle) if scene.kind == "inward" else None,
         flow=_flow_facts(scene.dynamic.train),
@@ -120,9 +116,9 @@ def inspect_scene(scene: Scene) -> Inspection:
     )
 
 
-def _views_facts(name: str, views: Views, scene: Scene) -> ViewsFacts:
+def _views_facts(name: str, views: Views, middle: Tensor) -> ViewsFacts:
     focal = views.cameras.focal
-    distance = (views.cameras.positions - box_middle(scene)).norm(dim=1)
+    distance = (views.cameras.positions - middle).norm(dim=1)
     alpha = (image[..., 3] > OPAQUE for image in views.pixels) if views.has_alpha else None
     masked = None if views.valid_mask is None else (~mask for mask in views.valid_mask)
     return ViewsFacts(
