@@ -7,12 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from devrf.artifacts.inspection.layout import (
-    box_points,
-    common_up,
-    horizontal_axes,
-    widest_gap,
-)
+from devrf.artifacts.inspection.layout import box_points, common_up, widest_gap
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.ndc import NormalizedDevice
@@ -47,14 +42,6 @@ def test_up_of_level_cameras() -> None:
     poses = cameras.camera_to_world.clone()
     poses[:2, :, :2] = poses[:2, :, [1, 0]] * torch.tensor([1.0, -1.0])
     assert common_up(replace(cameras, camera_to_world=poses)) is None
-
-
-def test_horizontal_axes_are_right_handed() -> None:
-    up = torch.tensor([0.0, 0.6, 0.8])
-    east, north = horizontal_axes(up, torch.tensor([3.0, 1.0, 0.0]))
-    axes = torch.stack([east, north, up])
-    torch.testing.assert_close(axes @ axes.T, torch.eye(3), atol=1e-6, rtol=0)
-    assert float(torch.linalg.det(axes)) == pytest.approx(1)
 
 
 def test_an_endless_box_is_cut_off_at_twice_the_near_plane(tiny_scene: Scene) -> None:

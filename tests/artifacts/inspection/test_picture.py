@@ -123,8 +123,13 @@ def test_fixed_cameras_are_drawn_once(tiny_scene: Scene) -> None:
 
 
 def test_forward_facing_cameras_look_north(forward_scene: Scene) -> None:
-    north = compass(forward_scene)[1]
-    torch.testing.assert_close(north, torch.tensor([0.0, 0.0, -1.0]), atol=1e-5, rtol=0)
+    east, north, up = compass(forward_scene)
+    torch.testing.assert_close(
+        torch.stack([east, north, up]),
+        torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+        atol=1e-5,
+        rtol=0,
+    )
 
 
 def test_the_longest_hundredth_of_the_flow_does_not_count() -> None:
