@@ -14,9 +14,9 @@ import pytest
 import torch
 from PIL import Image
 
-from devrf.artifacts.image_advice import image_advice
-from devrf.artifacts.inspection import inspect_scene
-from devrf.artifacts.inspection_picture import counted_pixels
+from devrf.artifacts.inspection.image_advice import image_advice
+from devrf.artifacts.inspection.picture import shown
+from devrf.artifacts.inspection.report import inspect_scene
 from devrf.data.flow_source import with_flow
 from devrf.data.nerfstudio import NerfstudioDataModule
 from devrf.data.pool import all_pixels
@@ -244,12 +244,12 @@ def test_inspecting_says_how_much_they_cover(root: Path, caplog: pytest.LogCaptu
         scene = read_nerfstudio(root)
     assert "masks of 8 images leave out 50.0 % of the pixels of all" in caplog.text
     facts = inspect_scene(scene).sets[0]
-    assert facts.mattes is None and facts.left_out == pytest.approx(0.5)
+    assert facts.alpha_share is None and facts.masked_share == pytest.approx(0.5)
     assert not [advice for advice in image_advice(scene) if "masks" in advice.what]
-    abbreviated = counted_pixels(scene.dynamic.train, 0)
-    assert abbreviated.shape[2] == 4 and abbreviated[0, :, 3].tolist() == [255] * 40 + [0] * 40
+    image, pixels = shown(scene.dynamic.train, 0), scene.dynamic.train.pixels[0].numpy()
+    assert (image[:, :40] == pixels[:, :40]).all() and (image[:, 40:] >= 232).all()
     matte = inspect_scene(read_nerfstudio(root, masks="matte")).sets[0]
-    assert matte.mattes == pytest.approx(0.5) and matte.left_out is None
+    assert matte.alpha_share == pytest.approx(0.5) and matte.masked_share is None
 
 
 def test_masks_that_cut_out_the_subject_are_told_from_others(root: Path) -> None:
