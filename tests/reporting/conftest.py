@@ -39,23 +39,19 @@ def ran(runs):
         frames=(),
         **of_run,
     ):
-        dynamic = {"psnr": 29.0, "ssim": 0.95, "lpips": None, **(scores or {})}
-        new = {"method": method, "protocol": protocol}
-        sections = ("static", "dynamic") if method else ("canonical", "deformation")
+        # Without a method: as earlier versions wrote it.
+        new = {"method": method, "protocol": protocol} if method else {}
+        static, dynamic = ("static", "dynamic") if method else ("canonical", "deformation")
+        scored = {"psnr": 29.0, "ssim": 0.95, "lpips": None, **(scores or {})}
         record = {
             "scene": scene,
-            **(new if method else {}),
-            sections[0]: {"psnr": 33.0, "seconds": seconds[0], "peak_gpu_gb": gpu[0]},
-            sections[1]: {**dynamic, "seconds": seconds[1], "peak_gpu_gb": gpu[1]},
+            **new,
+            static: {"psnr": 33.0, "seconds": seconds[0], "peak_gpu_gb": gpu[0]},
+            dynamic: {**scored, "seconds": seconds[1], "peak_gpu_gb": gpu[1]},
             "run": {
                 "device": "a processor",
                 "git": "0123456789abcdef",
-                "choices": {
-                    "ablation": ablation,
-                    "logger": "csv",
-                    **(new if method else {}),
-                    **(choices or {}),
-                },
+                "choices": {"ablation": ablation, "logger": "csv", **new, **(choices or {})},
                 "overrides": list(overrides),
                 "seed": seed,
                 **of_run,

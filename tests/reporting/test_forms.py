@@ -58,7 +58,8 @@ def test_methods_and_protocols_have_columns_where_they_differ(table, ran):
     assert head == ["", "Protocol", *METRICS]
     assert [row[:3] for row in rows[:2]] == [["D-NeRF", p, "29.00"] for p in ("dynamic", "joint")]
     assert rows[3][:2] == ["† Neural Volumes", ""]
-    assert "D-NeRF  dynamic " in plain(table()) and "D-NeRF & dynamic & 29.00" in latex(table())
+    assert re.search("^D-NeRF +dynamic +29.00", plain(table()), flags=re.MULTILINE)
+    assert "D-NeRF & dynamic & 29.00" in latex(table())
     ran("c", "lego", method="devrf", protocol="joint", scores={"psnr": 31.0})
     head, *rows = rows_below(markdown(table(), {}), "lego")
     assert head == ["Method", "Protocol", *METRICS]
@@ -112,34 +113,19 @@ def test_plots_are_linked(pig_and_robot):
 
 
 @pytest.mark.parametrize(
-    ("text", "expected"),
+    ("escaped", "text", "expected"),
     [
-        ("pig_toy", "pig_toy"),
-        ("_a_ b", r"\_a\_ b"),
-        ("a|b", r"a\|b"),
-        ("2*3*4", r"2\*3\*4"),
-        ("<b> `x` [y]", r"\<b\> \`x\` \[y\]"),
-        ("a\\b", r"a\\b"),
+        (markdown_form.escaped, "pig_toy _a_ a|b 2*3*4", r"pig_toy \_a\_ a\|b 2\*3\*4"),
+        (markdown_form.escaped, "<b> `x` [y] a\\b", r"\<b\> \`x\` \[y\] a\\b"),
+        (latex_form.escaped, "pig_toy 100 % & more", r"pig\_toy 100 \% \& more"),
+        (latex_form.escaped, "$x^2$ #{1}", r"\$x\textasciicircum{}2\$ \#\{1\}"),
+        (latex_form.escaped, "C:\\x~", r"C:\textbackslash{}x\textasciitilde{}"),
+        (latex_form.escaped, "29 ± 1 ↑ ↓", r"29 $\pm$ 1 $\uparrow$ $\downarrow$"),
+        (latex_form.escaped, "– † <|>", r"-- $\dagger$ \textless{}\textbar{}\textgreater{}"),
     ],
 )
-def test_markdown_escapes(text, expected):
-    assert markdown_form.escaped(text) == expected
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("pig_toy", r"pig\_toy"),
-        ("100 % & more", r"100 \% \& more"),
-        ("$x^2$", r"\$x\textasciicircum{}2\$"),
-        ("C:\\x~#{1}", r"C:\textbackslash{}x\textasciitilde{}\#\{1\}"),
-        ("29.00 ± 0.11", r"29.00 $\pm$ 0.11"),
-        ("PSNR ↑ LPIPS ↓", r"PSNR $\uparrow$ LPIPS $\downarrow$"),
-        ("– † <a|b>", r"-- $\dagger$ \textless{}a\textbar{}b\textgreater{}"),
-    ],
-)
-def test_latex_escapes(text, expected):
-    assert latex_form.escaped(text) == expected
+def test_nothing_in_a_text_is_taken_for_markup(escaped, text, expected):
+    assert escaped(text) == expected
 
 
 def test_latex_has_the_scenes_side_by_side(pig_and_robot):

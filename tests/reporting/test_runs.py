@@ -29,12 +29,6 @@ def test_runs_are_found_at_any_depth_in_the_order_of_their_jobs(runs, ran):
     assert found == ["2_robot", "10_robot", "lego/paper/x", "sweeps/monday/0_robot"]
 
 
-def test_the_folder_may_be_a_run_itself(ran):
-    folder = ran("one")
-    run = one(folder)
-    assert (run["folder"], run["path"], run["scene"]) == ("one", folder, "robot")
-
-
 def test_only_finished_runs_are_found_and_hidden_folders_passed_over(runs, ran):
     ran("finished")
     (runs / "under_way" / "checkpoints").mkdir(parents=True)
@@ -46,17 +40,10 @@ def test_only_finished_runs_are_found_and_hidden_folders_passed_over(runs, ran):
 
 
 def test_a_record_is_read_back(ran):
-    run = one(
-        ran(
-            "a",
-            scores={"psnr": 30.5, "lpips": None},
-            seconds=(17.5, 38.0),
-            gpu=(2.0, 3.25),
-            overrides=["ablation=full", "seed=3"],
-            seed=3,
-            wall_seconds={"evaluate": 7},
-        )
-    )
+    typed = {"overrides": ["ablation=full", "seed=3"], "seed": 3, "wall_seconds": {"evaluate": 7}}
+    folder = ran("a", scores={"psnr": 30.5}, seconds=(17.5, 38.0), gpu=(2.0, 3.25), **typed)
+    run = one(folder)
+    assert (run["folder"], run["path"], run["scene"]) == ("a", folder, "robot")
     assert run["dynamic.psnr"] == run["deformation.psnr"] == 30.5 and run["dynamic.lpips"] is None
     assert (run["train_seconds"], run["peak_gpu_gb"]) == (55.5, 3.25)
     assert run["run.wall_seconds.evaluate"] == 7 and run["run.device"] == "a processor"

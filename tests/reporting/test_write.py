@@ -36,13 +36,6 @@ def test_it_lies_beside_the_runs_and_is_none(runs, ran):
     assert len(again.runs) == len(collect(runs).runs) == 1 and not again.skipped
 
 
-def test_it_can_be_written_elsewhere(runs, ran, tmp_path):
-    ran("a")
-    written = write_report(ReportSettings(runs, into=tmp_path / "some" / "where"))
-    assert written.path == tmp_path / "some" / "where" / "report.md"
-    assert not (runs / "report").exists()
-
-
 def test_csv_has_a_row_for_each_run_and_failure_and_every_number(runs, ran, failed):
     ran("a", scores={"psnr": 31.0}, seconds=(3, 20), seed=1, overrides=["seed=1"])
     ran("at_rest", scores={"psnr": None})

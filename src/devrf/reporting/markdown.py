@@ -67,6 +67,7 @@ def _block(table: Table, block: Block) -> str:
 def _plain_block(table: Table, block: Block) -> str:
     frame = printed(table, [block], PLAIN).droplevel(0, axis=1)
     heads, cells = frame.iloc[:, : -len(COLUMNS)], frame.iloc[:, -len(COLUMNS) :]
+    heads = heads.apply(lambda column: column.str.ljust(column.str.len().max()))
     cells.index = heads.agg("  ".join, axis=1)
     cells.columns = [f"{heading} " for heading in cells.columns]
     cells.columns.name = block.title

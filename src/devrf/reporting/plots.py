@@ -35,14 +35,8 @@ STYLE: dict[Any, Any] = {
     "lines.markersize": 4,
 }
 # Markers of the paper's methods; what follows a name is a variant.
-MARKERS = {
-    "DeVRF": "s",
-    "D-NeRF": "^",
-    "Nerfies": "v",
-    "HyperNeRF": "D",
-    "NSFF": "P",
-    "Neural Volumes": "X",
-}
+METHODS = ("DeVRF", "D-NeRF", "Nerfies", "HyperNeRF", "NSFF", "Neural Volumes")
+MARKERS = dict(zip(METHODS, "s^vDPX", strict=True))
 VARIANT = r"-2 ?stage$|-dynamic$| \(base\)$| w/ .*$"
 # Seconds to label on an axis, where it spans more than a factor of a hundred and where less.
 FEW_TICKS = (1, 10, 60, 600, 3600, 36000, 360000)

@@ -4,38 +4,26 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from devrf.errors import DevrfError
 
-# The columns of every collection; the further ones are what the files hold, by dotted name.
+# What every run has; further columns are what its file holds, by dotted name.
 COLUMNS = (
-    "folder",
-    "status",
-    "scene",
-    "method",
-    "protocol",
-    "error",
-    "mistake",
-    "train_seconds",
-    "peak_gpu_gb",
-    "dynamic.psnr",
-    "dynamic.ssim",
-    "dynamic.lpips",
-    "run.device",
-    "run.overrides",
-    "run.seed",
-    "path",
+    *("folder", "status", "scene", "method", "protocol", "error", "mistake"),
+    *("train_seconds", "peak_gpu_gb", "dynamic.psnr", "dynamic.ssim", "dynamic.lpips"),
+    *("run.device", "run.overrides", "run.seed", "path"),
 )
-# Names of earlier versions, which knew one method and one protocol.
+# Earlier versions knew one method and one protocol, and named sections after its stages.
 DEFAULT_METHOD, DEFAULT_PROTOCOL = "devrf", "two_stage"
 EARLIER_SECTIONS = {"static": "canonical", "dynamic": "deformation"}
+Section = dict[str, Any]
 
 
 class _Setup(BaseModel):
@@ -52,13 +40,13 @@ class _Metrics(BaseModel):
 
     model_config = ConfigDict(strict=True, extra="allow")
     scene: str
-    method: str | None = None
-    protocol: str | None = None
-    run: _Setup = Field(default_factory=_Setup)
-    static: dict[str, Any] = Field(default_factory=dict)
-    dynamic: dict[str, Any] = Field(default_factory=dict)
-    canonical: dict[str, Any] = Field(default_factory=dict)
-    deformation: dict[str, Any] = Field(default_factory=dict)
+    method: str = DEFAULT_METHOD
+    protocol: str = DEFAULT_PROTOCOL
+    run: _Setup = _Setup()
+    static: Section = {}
+    dynamic: Section = {}
+    canonical: Section = {}
+    deformation: Section = {}
 
 
 class _Failure(_Setup):
@@ -75,12 +63,10 @@ class Collection:
 
     Attributes:
         folder: the folder that was searched.
-        runs: a row for each scored run, with ``COLUMNS`` and everything in its ``metrics.json``
-            by dotted name (``dynamic.psnr``). ``folder`` is relative to the one searched,
-            ``train_seconds`` and ``peak_gpu_gb`` are of the whole run, NaN unless every stage
-            recorded its own.
-        failures: a row for each failed job, with the same columns; ``mistake`` says whether the
-            user can correct it.
+        runs: a row for each scored run: ``COLUMNS`` and everything in its ``metrics.json``.
+            ``folder`` is relative to the one searched; ``train_seconds`` and ``peak_gpu_gb`` (GiB)
+            are of the whole run, NaN unless every stage recorded its own.
+        failures: a row for each failed job; ``mistake``: whether the user can correct it.
         skipped: a line for each file that could not be read, with the reason.
     """
 
@@ -105,15 +91,18 @@ def collect(folder: Path) -> Collection:
     skipped: list[str] = []
     for place in _folders(folder):
         name = folder.resolve().name if place == folder else place.relative_to(folder).as_posix()
-        for file, status, read in FILES:
-            if not (place / file).is_file():
-                continue
+        for file, status, read in (
+            (place / "failure.json", "failed", _failed),
+            (place / "metrics.json", "finished", _finished),
+        ):
             try:
-                record = {**read((place / file).read_bytes()), "status": status}
+                record = read(file.read_bytes()) if file.is_file() else {}
             except (OSError, ValidationError) as error:
-                skipped.append(f"{place / file}: skipped; {_reason(error)}")
-            else:
-                records[status].append({"folder": name, "path": place, **record})
+                skipped.append(f"{file}: skipped; {_reason(error)}")
+                continue
+            if record:
+                found = {"folder": name, "path": place, "status": status, **record}
+                records[status].append(found)
     runs, failures = _frame(records["finished"]), _frame(records["failed"])
     return Collection(folder, runs, failures, tuple(skipped))
 
@@ -154,45 +143,29 @@ def _natural(name: str) -> tuple[int, int, str]:
 
 
 def _finished(content: bytes) -> dict[str, Any]:
-    values = _Metrics.model_validate_json(content).model_dump(exclude_unset=True)
+    metrics = _Metrics.model_validate_json(content)
+    values = metrics.model_dump(exclude_unset=True)
     for section in filter(None, map(values.get, EARLIER_SECTIONS.values())):
         if "back_offs" in section:
             section.setdefault("num_rollbacks", section.pop("back_offs"))
     for name, earlier in EARLIER_SECTIONS.items():
         values[name] = {**values.get(earlier, {}), **values.get(name, {})}
-    choices = values.get("run", {}).get("choices") or {}
-    for key, default in (("method", DEFAULT_METHOD), ("protocol", DEFAULT_PROTOCOL)):
-        values[key] = choices.get(key) or values.get(key) or default
+    values |= {"method": metrics.method, "protocol": metrics.protocol}
     # Other protocols may have no stage of their own for the static capture.
     stages = [values["dynamic"]]
-    if values["protocol"] == DEFAULT_PROTOCOL or values["static"].get("seconds") is not None:
+    if metrics.protocol == DEFAULT_PROTOCOL or values["static"].get("seconds") is not None:
         stages.append(values["static"])
-    for key, stage_key, total in (
-        ("train_seconds", "seconds", sum),
-        ("peak_gpu_gb", "peak_gpu_gb", max),
-    ):
-        known = [number(stage.get(stage_key)) for stage in stages]
-        values[key] = math.nan if any(map(math.isnan, known)) else total(known)
+    frame = pd.DataFrame(stages, columns=["seconds", "peak_gpu_gb"], dtype=object).map(number)
+    values["train_seconds"] = frame["seconds"].sum(skipna=False)
+    values["peak_gpu_gb"] = frame["peak_gpu_gb"].max(skipna=False)
     return values
 
 
 def _failed(content: bytes) -> dict[str, Any]:
-    values = _Failure.model_validate_json(content).model_dump()
-    choices = values["choices"] or {}
-    return {
-        "scene": values["scene"],
-        "method": choices.get("method"),
-        "protocol": choices.get("protocol"),
-        "error": " ".join(values["error"].split()),
-        "mistake": values["mistake"],
-        "run": {"choices": choices, "overrides": values["overrides"], "seed": values["seed"]},
-    }
-
-
-FILES: tuple[tuple[str, str, Callable[[bytes], dict[str, Any]]], ...] = (
-    ("failure.json", "failed", _failed),
-    ("metrics.json", "finished", _finished),
-)
+    failure = _Failure.model_validate_json(content)
+    setup = failure.model_dump(include={"choices", "overrides", "seed"}, exclude_none=True)
+    error = " ".join(failure.error.split())
+    return {"scene": failure.scene, "error": error, "mistake": failure.mistake, "run": setup}
 
 
 def _reason(error: OSError | ValidationError) -> str:
@@ -207,4 +180,5 @@ def _frame(records: list[dict[str, Any]]) -> pd.DataFrame:
     flat = [pd.json_normalize(record).to_dict("records")[0] for record in records]
     names = dict.fromkeys([*COLUMNS, *(name for record in flat for name in record)])
     # Of type object, so that numbers are written as they were read.
-    return pd.DataFrame(flat, columns=list(names), dtype=object)
+    frame = pd.DataFrame(flat, columns=list(names), dtype=object)
+    return frame.assign(**{"run.overrides": [row.get("run.overrides") or [] for row in flat]})

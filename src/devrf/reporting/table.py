@@ -58,9 +58,9 @@ TITLES = [column.title for column in COLUMNS]
 class Block:
     """The rows of one scene, or of an average over scenes.
 
-    Both frames are indexed by label. Their columns have two levels: ``head`` (``name``,
-    ``protocol``, ``counts``: the numbers of runs averaged, as a frozenset), then ``value`` (NaN
-    where unknown), ``text`` and ``rank`` (1, 2, 3 for the best, else 0), each of every title.
+    Both frames are indexed by label. Their columns have two levels: ``head`` has ``name``,
+    ``protocol`` and ``counts`` (a set of numbers of runs averaged); ``value`` (NaN where unknown),
+    ``text`` and ``rank`` (1, 2, 3 for the best, else 0) have every title.
 
     Attributes:
         title: the scene's name, or what was averaged.
@@ -117,17 +117,19 @@ def tabulate(found: Collection, published_scenes: PublishedScenes = "matching") 
     spread = groups[TITLES].std().where(complete)
 
     ours, known = list(runs["scene"].unique()), list(published().tables)
-    theirs = {"none": [], "all": known, "matching": [s for s in ours if s in known]}
+    beside = {"none": [], "all": known, "matching": [scene for scene in ours if scene in known]}
+    theirs = beside[published_scenes]
     blocks: list[Block] = []
-    for scene in dict.fromkeys([*ours, *theirs[published_scenes]]):
-        of_scene = rows.index.get_level_values("scene") == scene
-        means, spreads = (frame[of_scene].droplevel("scene") for frame in (rows, spread))
-        counts = [frozenset({count}) for count in means["count"]]
-        devices = runs.loc[runs["scene"] == scene, "run.device"]
-        measured = _measured(means.assign(counts=counts), spreads, devices)
-        blocks.append(Block(scene, measured, _published(scene, theirs[published_scenes])))
+    for scene in dict.fromkeys([*ours, *theirs]):
+        measured = _cells(
+            _of(rows, [scene]).assign(counts=lambda found: found["count"].map(lambda n: {n})),
+            _of(spread, [scene]),
+            runs.loc[runs["scene"] == scene, "run.device"],
+        )
+        blocks.append(Block(scene, measured, _published([scene], theirs)))
     if len(ours) > 1:
-        average = _average(runs, rows, ours, theirs[published_scenes])
+        title = f"average over {len(ours)} scenes"
+        average = Block(title, _average(runs, rows, ours), _published(ours, theirs))
         blocks += [average] if len(average.measured) else []
     notes = _notes(runs, found.runs.loc[~scored, "folder"])
     return Table(found, runs, rows, tuple(blocks), tuple(notes))
@@ -164,70 +166,57 @@ def ranked(values: pd.Series, column: Column) -> pd.Series:
     return ranks.where(ranks <= 3, 0).astype(int)
 
 
-def _measured(means: pd.DataFrame, spread: pd.DataFrame, devices: pd.Series) -> pd.DataFrame:
-    """Cells of measured rows; memory and time are ranked only if all are of one device."""
-    one_device = devices.nunique(dropna=False) == 1
-    texts, ranks = means[TITLES].astype(object), means[TITLES].astype(object)
+def _of(frame: pd.DataFrame, scenes: list[str]) -> pd.DataFrame:
+    """The rows of some scenes, by label."""
+    return frame[frame.index.get_level_values("scene").isin(scenes)].droplevel("scene")
+
+
+def _cells(rows: pd.DataFrame, spread: pd.DataFrame, devices: pd.Series | None) -> pd.DataFrame:
+    """Cells as a block holds them.
+
+    Args:
+        rows: ``name``, ``protocol``, ``counts`` and every title, by label.
+        spread: standard deviations, NaN where there is none to show.
+        devices: of the runs; memory and time are ranked if they agree. None: nothing is.
+    """
+    texts, ranks = rows[TITLES].astype(object), rows[TITLES].mul(0).fillna(0).astype(int)
     for column in COLUMNS:
-        values, spreads = means[column.title], spread[column.title]
-        texts[column.title] = [
-            shown(value, column, deviation)
-            for value, deviation in zip(values, spreads, strict=True)
-        ]
-        comparable = one_device or not column.of_hardware
-        ranks[column.title] = ranked(values, column) if comparable else 0
-    return _cells(means[["name", "protocol", "counts"]], means[TITLES], texts, ranks)
+        both = zip(rows[column.title], spread[column.title], strict=True)
+        texts[column.title] = [shown(value, column, deviation) for value, deviation in both]
+        if devices is not None and (devices.nunique(dropna=False) == 1 or not column.of_hardware):
+            ranks[column.title] = ranked(rows[column.title], column)
+    heads = rows[["name", "protocol", "counts"]]
+    parts = {"head": heads, "value": rows[TITLES], "text": texts, "rank": ranks}
+    return pd.concat(parts, axis=1)
 
 
-def _published(scene: str, theirs: list[str]) -> pd.DataFrame:
-    paper = published()
-    scenes = [scene] if scene in theirs else []
-    texts, values = (
-        frame[frame.index.get_level_values("scene").isin(scenes)].droplevel("scene")
-        for frame in (paper.texts[TITLES], paper.values)
-    )
-    return _of_paper(values, texts)
-
-
-def _average(runs: pd.DataFrame, rows: pd.DataFrame, ours: list[str], theirs: list[str]) -> Block:
+def _average(runs: pd.DataFrame, rows: pd.DataFrame, scenes: list[str]) -> pd.DataFrame:
     """Means over all scenes of the configurations that were run on all of them.
 
     Without a spread: what scenes differ in is no uncertainty of a measurement.
     """
     groups = rows.groupby("label", sort=False)
-    means = groups[["name", "protocol"]].first().join(_over_scenes(rows[TITLES], ours))
-    means["counts"] = groups["count"].agg(frozenset)
-    means = means[groups.size() == len(ours)]
+    means = _over_scenes(rows[TITLES], scenes).join(groups[["name", "protocol"]].first())
+    means = means.assign(counts=groups["count"].agg(set))[groups.size() == len(scenes)]
     devices = runs.loc[runs["label"].isin(means.index), "run.device"]
-    measured = _measured(means, means[TITLES] * math.nan, devices)
+    return _cells(means, means[TITLES] * math.nan, devices)
 
-    values = published().values
-    shared = values[values.index.get_level_values("scene").isin(ours)]
-    if not set(ours) <= set(theirs):
-        shared = shared[:0]
-    paper = _over_scenes(shared, ours).dropna()
-    texts = paper.astype(object)
-    for column in COLUMNS:
-        texts[column.title] = [shown(value, column) for value in paper[column.title]]
-    return Block(f"average over {len(ours)} scenes", measured, _of_paper(paper, texts))
+
+def _published(scenes: list[str], theirs: list[str]) -> pd.DataFrame:
+    """The paper's rows of a scene, or their means over several; none unless it has them all."""
+    asked = scenes if set(scenes) <= set(theirs) else []
+    values = _over_scenes(_of(published().values, asked), scenes).dropna()
+    rows = values.assign(name=values.index, protocol="", counts=[{1} for _ in values.index])
+    cells = _cells(rows, values * math.nan, devices=None)
+    if len(scenes) == 1:
+        cells["text"] = _of(published().texts[TITLES], asked)
+    return cells
 
 
 def _over_scenes(values: pd.DataFrame, scenes: list[str]) -> pd.DataFrame:
     """Means by label; NaN unless every scene has the value."""
     groups = values.groupby("label", sort=False)
     return groups.mean().where(groups.count() == len(scenes))
-
-
-def _of_paper(values: pd.DataFrame, texts: pd.DataFrame) -> pd.DataFrame:
-    heads = pd.DataFrame({"name": values.index, "protocol": ""}, index=values.index, dtype=object)
-    heads["counts"] = [frozenset({1})] * len(values)
-    return _cells(heads, values, texts, texts.map(lambda text: 0))
-
-
-def _cells(
-    heads: pd.DataFrame, values: pd.DataFrame, texts: pd.DataFrame, ranks: pd.DataFrame
-) -> pd.DataFrame:
-    return pd.concat({"head": heads, "value": values, "text": texts, "rank": ranks}, axis=1)
 
 
 def _notes(runs: pd.DataFrame, at_rest: pd.Series) -> list[str]:

@@ -55,7 +55,7 @@ def _rows(
     titles = [style.escape(block.title) for block in blocks]
     found = pd.concat(cells, axis=1, keys=titles, sort=False)
     heads = pd.concat([frame["head"] for frame in frames]).groupby(level=0)
-    counts = heads["counts"].agg(lambda sets: frozenset().union(*sets))
+    counts = heads["counts"].agg(lambda sets: set().union(*sets))
     names = heads["name"].first() + counts.map(_repeats)
     lead = {("", _methods(table)): names.map(lambda name: style.escape(label.format(name)))}
     if table.rows["protocol"].nunique() > 1:
@@ -84,7 +84,7 @@ def _methods(table: Table) -> str:
     return "Method" if table.runs["method"].nunique() > 1 else ""
 
 
-def _repeats(counts: frozenset[int]) -> str:
+def _repeats(counts: set[int]) -> str:
     """How many runs a row's values are means of, in parentheses; nothing where it is one."""
     return "" if counts == {1} else f" (n = {', '.join(map(str, sorted(counts)))})"
 
@@ -114,12 +114,13 @@ def credit() -> str:
 
 def reasons(found: Collection) -> list[str]:
     """Which runs failed, and why, a line each; overrides that all runs share are left out."""
-    typed = pd.concat([found.runs["run.overrides"], found.failures["run.overrides"]])
-    told = [set(one) if isinstance(one, list) else set() for one in typed]
+    told = [
+        set(typed) for frame in (found.runs, found.failures) for typed in frame["run.overrides"]
+    ]
     shared = set.intersection(*told) if len(told) > 1 else set()
     lines: list[str] = []
     for failure in found.failures.to_dict("records"):
-        own = [text for text in failure["run.overrides"] or () if text not in shared]
+        own = [text for text in failure["run.overrides"] if text not in shared]
         what = " ".join([failure["scene"] or "unknown scene", *own])
         bug = " (a fault of the program: see its run.log)" * (failure["mistake"] is False)
         lines.append(f"{failure['folder']} ({what}): {failure['error']}{bug}")
