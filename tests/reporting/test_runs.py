@@ -103,6 +103,7 @@ def test_a_failure_is_told_in_one_line(runs, failed):
         (b'{"scene": "robot", "run": {"choices": ["full"]}}', "run.choices|error"),
         (b'{"scene": "robot", "run": {"overrides": [1]}}', "run.overrides.0|error"),
         (b'{"scene": "robot", "run": {"seed": "one"}}', "run.seed|error"),
+        (b'{"scene": "robot", "run": {"device": 3}}', "run.device|error"),
     ],
 )
 def test_damaged_records_are_skipped_with_a_line_that_says_where(runs, ran, content, reason):

@@ -18,7 +18,7 @@ def files(folder):
     return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
 
 
-def test_it_lies_beside_the_runs_and_is_none(runs, ran):
+def test_a_report_is_written_beside_the_runs_and_not_taken_for_one(runs, ran):
     ran("a", frames=[(0.0, 20.0), (1.0, 21.0)])
     written = write_report(ReportSettings(runs))
     assert written.path == runs / "report" / "report.md"

@@ -27,12 +27,13 @@ Section = dict[str, Any]
 
 
 class _Setup(BaseModel):
-    """How a run was configured: chosen options, command line, seed."""
+    """How a run was configured, and where it ran."""
 
     model_config = ConfigDict(strict=True, extra="allow")
     choices: dict[str, str | None] | None = None
     overrides: list[str] | None = None
     seed: int | None = None
+    device: str | None = None
 
 
 class _Metrics(BaseModel):
@@ -101,8 +102,8 @@ def collect(folder: Path) -> Collection:
                 skipped.append(f"{file}: skipped; {_reason(error)}")
                 continue
             if record:
-                found = {"folder": name, "path": place, "status": status, **record}
-                records[status].append(found)
+                own = {"folder": name, "path": place, "status": status}
+                records[status].append({**record, **own})
     runs, failures = _frame(records["finished"]), _frame(records["failed"])
     return Collection(folder, runs, failures, tuple(skipped))
 

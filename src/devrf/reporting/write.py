@@ -59,9 +59,10 @@ def csv(table: Table) -> str:
     ``train_seconds`` and ``peak_gpu_gb`` are the tables' Time and GPU; further columns are what
     ``metrics.json`` holds, by dotted name. What is not known is empty.
     """
-    found = table.found
-    runs = found.runs.assign(row=table.runs["label"])
-    rows = pd.concat([runs, found.failures], ignore_index=True).drop(columns="path")
+    runs = table.found.runs.drop(columns="path")
+    runs.insert(3, "row", table.runs["label"])
+    failures = table.found.failures.drop(columns="path")
+    rows = pd.concat([runs, failures], ignore_index=True)
     return str(rows.map(_csv_cell).to_csv(index=False, lineterminator="\n"))
 
 
