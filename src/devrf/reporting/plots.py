@@ -21,12 +21,13 @@ COLORS = "#0072B2 #D55E00 #009E73 #CC79A7 #E69F00 #56B4E9 #000000 #8C6D31".split
 DASHES = ("-", "--", ":", "-.")
 PUBLISHED, GREY = ", published", "#9a9a9a"
 STYLE: dict[Any, Any] = {
-    "savefig.dpi": 160,
+    "figure.dpi": 160,
     "font.size": 9,
     "axes.titlesize": 10,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
+    "axes.formatter.useoffset": False,
     "grid.color": "#e6e6e6",
     "axes.axisbelow": True,
     "legend.frameon": False,
@@ -39,8 +40,12 @@ METHODS = ("DeVRF", "D-NeRF", "Nerfies", "HyperNeRF", "NSFF", "Neural Volumes")
 MARKERS = dict(zip(METHODS, "s^vDPX", strict=True))
 VARIANT = r"-2 ?stage$|-dynamic$| \(base\)$| w/ .*$"
 # Seconds to label on an axis, where it spans more than a factor of a hundred and where less.
-FEW_TICKS = (1, 10, 60, 600, 3600, 36000, 360000)
-TICKS = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200, 18000, 36000, 86400)
+FEW_TICKS = (0.1, 1, 10, 60, 600, 3600, 36000, 360000)
+TICKS = (
+    *(0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 30),
+    *(60 * minutes for minutes in (1, 2, 5, 10, 20, 30)),
+    *(3600 * hours for hours in (1, 2, 5, 10, 24)),
+)
 
 
 @dataclass(frozen=True)
