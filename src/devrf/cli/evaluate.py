@@ -39,11 +39,12 @@ def evaluate(run: RunContext) -> None:
     last = loaded.metadata.stage
     # What one stage learned at once is told of the dynamic section, where there is one.
     rest = next((step.name for step in run.protocol.steps if step.capture == "static"), None)
+    moved = model.moves and last != rest
     static = mean_scores(frames["static"])
     sections: dict[str, Any] = {"static": static}
-    if rest is not None or not model.moves:
+    if rest is not None or not moved:
         sections["static"] = sections[rest or last] = {**static, **_training(records, rest or last)}
-    if model.moves:
+    if moved:
         frames["dynamic"] = _score(run, model, "dynamic", suite)
         dynamic = sections["dynamic"] = {
             **mean_scores(frames["dynamic"]),

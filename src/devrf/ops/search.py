@@ -42,7 +42,7 @@ class PackedSamples:
         ray: (C,) int64, the ray of each sample; R in the padding.
         distance: (C,) along the ray, in units of its direction; 0 in the padding.
         points: (C, 3) positions; 0 in the padding.
-        heavy: (C,) bool, whether the sample weighs enough for its colour to matter.
+        significant: (C,) bool, whether the sample weighs enough for its colour to matter.
         first: (R + 1,) int64, where each ray's samples begin; the last entry is how many of the
             C places are used.
         total: () int64, how many samples there were to find; more than C if some were dropped.
@@ -52,7 +52,7 @@ class PackedSamples:
     ray: Tensor
     distance: Tensor
     points: Tensor
-    heavy: Tensor
+    significant: Tensor
     first: Tensor
     total: Tensor
     overflow: Tensor

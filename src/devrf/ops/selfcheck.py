@@ -124,7 +124,7 @@ def sample_search(draw: Draw, frames: Sequence[int] = (1, 2)) -> Results:
             found.ray,
             found.distance,
             found.points,
-            found.heavy,
+            found.significant,
             found.first,
             found.total,
             found.overflow,

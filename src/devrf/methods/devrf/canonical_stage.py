@@ -239,7 +239,7 @@ class CanonicalStage(VoxelStage):
             self.optimizer.replace(
                 group,
                 list(grid.parameters()),
-                pace=per_voxel_lr,
+                per_voxel_lr=per_voxel_lr,
                 skip_zero=not searching,
                 smoothing=smoothing,
                 touched_only=True,

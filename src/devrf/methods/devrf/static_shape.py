@@ -72,7 +72,7 @@ def render_static(
     with span("compositing"):
         weight, transmittance = composite_segments(tau, found.first)
     with span("sampling"):
-        chosen = select(found.heavy, found.first, capacity.significant)
+        chosen = select(found.significant, found.first, capacity.significant)
         capacity.note(found.total, chosen.total)
         samples, present = _listed(found, chosen, len(rays))
         canonical = canonical.index_select(0, chosen.index)
