@@ -21,7 +21,7 @@ class GridAdam(torch.optim.Optimizer):
 
     * ``skip_zero``: an entry whose gradient is exactly zero keeps its value *and its moments*:
       a voxel that no sample of this batch touched is not moved by what was seen before.
-    * ``per_voxel_lr``: None, or a tensor (X, Y, Z, 1) of factors of the learning rate, voxel by voxel.
+    * ``per_voxel_lr``: None, or a tensor (X, Y, Z, 1) of factors of the learning rate.
     * ``smoothing``: weight of the total variation of each grid, whose gradient is added to what
       the backward pass gave.
     * ``touched_only``: add it to entries alone that have a gradient.
@@ -176,8 +176,8 @@ class GridAdam(torch.optim.Optimizer):
         Args:
             group: its number.
             parameters: what it is to step on.
-            settings: settings of the group that change with them; a per_voxel_lr that is not given is
-                None.
+            settings: settings of the group that change with them; ``per_voxel_lr`` is None
+                unless it is given.
         """
         for old in self.param_groups[group]["params"]:
             self.state.pop(old, None)
