@@ -24,7 +24,7 @@ DEFORMATION_LOSS = {
 
 @dataclass(frozen=True)
 class CanonicalRates:
-    """Base learning rates of the canonical stage (method §2, Optimiser).
+    """Base learning rates of the canonical stage (docs/method.md#optimiser).
 
     Attributes:
         density: of the density grid.

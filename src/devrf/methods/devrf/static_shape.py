@@ -35,7 +35,7 @@ def render_static(
     capacity: SampleCapacity,
     precision: torch.dtype = torch.float32,
 ) -> VoxelOutput:
-    """What ``render`` gives, in lists of ``capacity.significant`` places (method §2).
+    """What ``render`` gives, in lists of ``capacity.significant`` places.
 
     Gradients of grids that have one already (``grad``) are added to it in place.
 

@@ -121,7 +121,9 @@ def render(
     warp: Warp | None = None,
     precision: torch.dtype = torch.float32,
 ) -> VoxelOutput:
-    """Colours and depths of rays: C = Σ w_i c_i + T_end · background (method §2).
+    """Colours and depths of rays: C = Σ w_i c_i + T_end · background.
+
+    See docs/method.md#compositing.
 
     Args:
         rays: R rays.
