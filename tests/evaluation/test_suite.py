@@ -131,10 +131,9 @@ def test_without_weights_lpips_is_none_and_a_line_says_why(
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     with caplog.at_level(logging.INFO):
         suite = Evaluation(metrics=["lpips", "lpips_masked"]).suite(HOST)
+        renderer, views = Renderer(learned[0].scene_model), tiny_scene.static.test
         for index in range(2):
-            view = score(
-                Renderer(learned[0].scene_model), tiny_scene.static.test, index, "white", suite
-            )
+            view = score(renderer, views, index, "white", suite)
             assert view.further == {"lpips": None, "lpips_masked": None}
         Evaluation(metrics=["ms_ssim"]).suite(HOST)
     assert len(caplog.messages) == 1 and "LPIPS is null" in caplog.text
