@@ -163,12 +163,13 @@ def test_an_orbit_circles_the_box_at_the_cameras_distance(cube: Box) -> None:
 
 
 def test_pictures_show_colour_beside_depth_while_time_runs(cube: Box) -> None:
-    canonical = Architecture().search_field(cube, 5**3)
+    build = Architecture()
+    canonical = build.search_field(cube, 5**3)
     with torch.no_grad():
         canonical.density.values[2, 2, 2] = 60.0
         canonical.color.values.copy_(torch.tensor([9.0, -9.0, -9.0]).expand(5, 5, 5, 3))
     settings = RenderSettings(0.5, 1e-4, 0.0, 9.0)
-    model = DeVRFModel(canonical, Occupancy.full((5, 5, 5), cube), settings)
+    model = DeVRFModel(build, canonical, Occupancy.full((5, 5, 5), cube), settings)
     shown = list(pictures(Renderer(model), ring(3), 1.0))
     assert len(shown) == 3
     for image in shown:

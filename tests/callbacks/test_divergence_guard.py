@@ -288,7 +288,8 @@ def test_a_frame_whose_loss_stands_out_is_told(
     health = DivergenceGuard()
     schedule = DeformationSchedule(sides=(4,), iterations_per_frame=(20,), rays=64)
     stage = DeformationStage(copy.deepcopy(rest), schedule, iterations_per_step=1)
-    health.load_state_dict({**health.state_dict(), "visited": [0.01, 0.011, 0.012, 0.01]})
+    seen = {"kind": "level 0", "visited": [0.01, 0.011, 0.012, 0.01]}
+    health.load_state_dict({**health.state_dict(), **seen})
     monkeypatch.setattr(health, "_forget", lambda: None)
     with caplog.at_level(logging.WARNING, logger="devrf"):
         fit(stage, health)

@@ -21,6 +21,7 @@ from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.metrics.image import psnr
+from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene
 
 
@@ -37,7 +38,7 @@ def assert_alike(one: DeVRFModel, other: DeVRFModel, scene: Scene) -> None:
     cameras = scene.dynamic.test.cameras
     shape = (cameras.height, cameras.width, 3)
     for time in (0.0, 0.3, 0.5, 1.0):
-        a, b = (model.picture(cameras.image_rays(0), time, torch.ones(3)) for model in (one, other))
+        a, b = (Renderer(model).view(cameras, 0, time, 1.0) for model in (one, other))
         assert psnr(a.color.view(shape), b.color.view(shape)) > 60, f"at {time}"
         torch.testing.assert_close(a.opacity, b.opacity, atol=0.01, rtol=0)
 
@@ -86,10 +87,9 @@ def test_the_deformation_stage_comes_back_and_alone_suffices(
     assert stored.model.deformation.clock == tiny_scene.clock
     assert set(stored.metadata.records) == {"canonical", "deformation"}
     # It moves: otherwise equal pictures would say nothing of the deformation.
-    rays = tiny_scene.dynamic.test.cameras.image_rays(0)
-    black = torch.zeros(3)
-    still = stored.model.picture(rays, 0.0, black).color
-    assert not torch.equal(stored.model.picture(rays, 1.0, black).color, still)
+    renderer, cameras = Renderer(stored.model), tiny_scene.dynamic.test.cameras
+    still, moved = (renderer.view(cameras, 0, time, 0.0).color for time in (0.0, 1.0))
+    assert not torch.equal(moved, still)
 
 
 def test_a_deformation_can_be_learned_on_a_loaded_checkpoint(
@@ -130,8 +130,8 @@ def test_checkpoints_of_others_are_refused(tmp_path: Path, foreign: dict[str, An
     "change",
     [
         lambda data: data["devrf"].pop("scene"),
-        lambda data: data["devrf"]["architecture"].update(depth=3),
-        lambda data: data["devrf"]["architecture"].update(channels=5),
+        lambda data: data["devrf"]["model"]["architecture"].update(depth=3),
+        lambda data: data["devrf"]["model"]["architecture"].update(channels=5),
         lambda data: data.pop("state_dict"),
         lambda data: data.update(state_dict=[1]),
         lambda data: data["state_dict"].update({"scene_model.occupancy.mask": "all"}),
@@ -155,6 +155,20 @@ def test_a_checkpoint_that_contradicts_itself_is_refused(
     canonical: Path, change: Callable[[dict[str, Any]], object]
 ) -> None:
     refusal(edit(canonical, change))
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        "os.system",
+        "devrf.methods.devrf.model.Architecture",
+        "devrf.methods.unheard_of.Model",
+        None,
+    ],
+)
+def test_a_file_may_not_choose_which_code_is_run(canonical: Path, target: str | None) -> None:
+    path = edit(canonical, lambda data: data["devrf"]["model"].update(_target_=target))
+    assert "which is not known here" in refusal(path)
 
 
 def test_a_stage_stopped_in_its_search_comes_back(

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from devrf.data.batch import background_color, gather_batch, pixel_positions
+from devrf.data.batch import background_color, concatenated, gather_batch, pixel_positions
 from devrf.data.pool import PixelPool, all_pixels, wanted_pixels
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.scene import OpticalFlow, Views
@@ -34,10 +34,11 @@ def views(channels: int = 4, flow: bool = True) -> Views:
     return Views(
         pixels.to(torch.uint8),
         cameras,
-        torch.tensor([0.0, 1.0]),
+        torch.tensor([0.25, 1.0]),
         torch.tensor([0, 0]),
         ("a", "b"),
         OpticalFlow(vectors, column > row) if flow else None,
+        frames=torch.tensor([1, 4]),
     )
 
 
@@ -53,9 +54,10 @@ def test_a_batch_holds_the_right_pixels_with_their_flow() -> None:
     batch = gather_batch(views(), IMAGE, FLAT, torch.zeros(3))
     assert batch.pixel.tolist() == [[1.5, 2.5], [3.5, 0.5]]
     assert batch.flow is not None and batch.flow_valid is not None
-    assert batch.flow.tolist() == [[1.5, -2.5], [3.5, -0.5]]
     assert batch.flow_valid.tolist() == [False, True]
+    assert batch.flow.tolist() == [[0, 0], [3.5, -0.5]]  # nothing where it is not valid
     assert batch.image.tolist() == [1, 0]
+    assert batch.time.tolist() == [1.0, 0.25] and batch.frame.tolist() == [4, 1]
     # On black, colour times alpha 51/255.
     torch.testing.assert_close(batch.color[:, 0], torch.tensor([121, 3]) / 255 * 0.2)
 
@@ -85,6 +87,26 @@ def test_images_without_matte_or_flow() -> None:
     batch = gather_batch(views(channels=3, flow=False), IMAGE, FLAT, torch.zeros(3))
     assert batch.alpha is None and batch.flow is None and batch.flow_valid is None
     torch.testing.assert_close(batch.color[0], torch.tensor([121 / 255, 0.0, 1.0]))
+
+
+def test_flow_that_is_not_valid_may_be_anything() -> None:
+    data = views()
+    assert data.flow is not None
+    data.flow.vectors[~data.flow.valid] = torch.nan
+    flow = gather_batch(data, IMAGE, FLAT, torch.zeros(3)).flow
+    assert flow is not None and flow.tolist() == [[0, 0], [3.5, -0.5]]
+
+
+def test_batches_become_one(rng: torch.Generator) -> None:
+    opaque = gather_batch(views(channels=3), IMAGE, FLAT, torch.zeros(3))
+    behind = torch.rand(2, 3, generator=rng)
+    both = concatenated([opaque, gather_batch(views(), IMAGE, FLAT, behind)])
+    assert both.alpha is not None
+    torch.testing.assert_close(both.alpha, torch.tensor([1.0, 1.0, 0.2, 0.2]))
+    assert torch.equal(both.background, torch.cat([torch.zeros(2, 3), behind]))
+    assert both.frame.tolist() == [4, 1] * 2 and both.time.tolist() == [1.0, 0.25] * 2
+    assert torch.equal(both.rays.origins[2:], opaque.rays.origins) and len(both.rays) == 4
+    assert both.flow is None and both.flow_valid is None
 
 
 def test_backgrounds(rng: torch.Generator) -> None:

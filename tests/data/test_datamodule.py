@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -42,6 +44,23 @@ def test_training_views_move_to_the_device_once_for_each_capture(tiny_scene: Sce
     dynamic = module.training_views("dynamic", cpu)
     assert torch.equal(dynamic.times, tiny_scene.dynamic.train.times)
     assert dynamic.flow is not None and len(dynamic) == 6
+
+
+@pytest.mark.parametrize(
+    ("capture", "images", "held_out"), [("static", (8,), 2), ("both", (8, 6), 3)]
+)
+def test_a_stage_is_served_what_it_learns_from(
+    tiny_scene: Scene, capture: str, images: tuple[int, ...], held_out: int
+) -> None:
+    module, cpu = Given(tiny_scene), torch.device("cpu")
+    learner: Any = SimpleNamespace(lightning_module=SimpleNamespace(capture=capture))
+    module.trainer = learner
+    served = module.transfer_batch_to_device(None, cpu, 0)
+    views = served if isinstance(served, tuple) else (served,)
+    assert tuple(len(one) for one in views) == images
+    assert all(one.frames is not None for one in views)
+    assert len(module.test_dataloader()) == held_out
+    assert module.transfer_batch_to_device(1, cpu, 0) == 1
 
 
 def test_the_training_loader_never_ends(tiny_scene: Scene) -> None:

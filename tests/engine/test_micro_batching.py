@@ -18,11 +18,11 @@ from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, LoadedCheckpoi
 from devrf.data.batch import Pixels
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine import micro_batching as parts_module
-from devrf.engine import stage as stage_module
 from devrf.engine.micro_batching import MicroBatching
 from devrf.engine.stage import ScheduledStage
 from devrf.errors import DevrfError
 from devrf.methods.devrf import volume_rendering as rendering
+from devrf.methods.devrf import voxel_stage
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
@@ -60,7 +60,7 @@ def room(monkeypatch: pytest.MonkeyPatch) -> Callable[[int, int], list[int]]:
                 raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.50 GiB.")
             return rendering.render(some, *others)
 
-        monkeypatch.setattr(stage_module, "render", render)
+        monkeypatch.setattr(voxel_stage, "render", render)
         return calls
 
     return limit
@@ -203,7 +203,7 @@ def test_before_the_first_iteration_nothing_is_logged(fit, room, tmp_path: Path)
 def test_other_errors_pass_through(fit, monkeypatch: pytest.MonkeyPatch) -> None:
     stage = canonical()
 
-    def broken(lane: Any, views: Any, pixels: Any) -> Any:
+    def broken(batch: Any, views: Any, pixels: Any) -> Any:
         raise RuntimeError("shapes cannot be multiplied")
 
     monkeypatch.setattr(stage, "loss", broken)

@@ -178,6 +178,11 @@ class CanonicalStage(VoxelStage):
             model.canonical.resize(phase.voxels)
             self.update_occupancy()
         self.pool = canonical_pool(views, model, everywhere=phase.kind == "search")
+        if not len(self.pool):
+            raise DevrfError(
+                f"the field has become empty by iteration {self.iteration}: check data.background, "
+                "data.box and data.near, or lower schedule.rates.density"
+            )
         self.setup_optimizer(views.cameras)
 
     def _begin_fine(self, phase: CanonicalPhase) -> None:
