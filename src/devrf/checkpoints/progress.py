@@ -48,12 +48,11 @@ def progress_files(folder: Path, stage: str) -> list[Path]:
 
 def rng_state(device: torch.device) -> dict[str, Any]:
     """The state of everything that a run on ``device`` draws random numbers from, as plain data."""
-    version, words, gauss = random.getstate()
     numpy = np.random.get_state(legacy=False)
     assert isinstance(numpy, dict)
     key = torch.from_numpy(numpy["state"]["key"].astype(np.int64))
     states: dict[str, Any] = {
-        "python": [version, list(words), gauss],
+        "python": random.getstate(),
         "numpy": {**numpy, "state": {"key": key, "pos": int(numpy["state"]["pos"])}},
         "torch": torch.get_rng_state(),
     }
@@ -64,8 +63,7 @@ def rng_state(device: torch.device) -> dict[str, Any]:
 
 def set_rng_state(states: dict[str, Any], device: torch.device) -> None:
     """Draw on from where :func:`rng_state` was asked."""
-    version, words, gauss = states["python"]
-    random.setstate((version, tuple(words), gauss))
+    random.setstate(states["python"])
     numpy = states["numpy"]
     key = numpy["state"]["key"].numpy().astype(np.uint32)
     np.random.set_state({**numpy, "state": {**numpy["state"], "key": key}})
