@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
-from devrf.system.signals import ASKING, Interrupted, answered_by, end_at_once
+from devrf.system.signals import STOP_SIGNALS, Interrupted, answered_by, end_at_once
 
 
 @pytest.fixture(autouse=True)
 def as_before() -> Iterator[None]:
-    before = {number: signal.getsignal(number) for number in ASKING}
+    before = {number: signal.getsignal(number) for number in STOP_SIGNALS}
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
@@ -25,7 +25,7 @@ def send(number: int) -> None:
     os.kill(os.getpid(), number)
 
 
-@pytest.mark.parametrize("number", ASKING)
+@pytest.mark.parametrize("number", STOP_SIGNALS)
 def test_the_block_answers_and_gives_back(number: int) -> None:
     before, heard = signal.getsignal(number), []
     with answered_by(heard.append):
