@@ -41,6 +41,17 @@ DTYPES |= {getattr(torch, f"int{bits}"): f"I{bits}" for bits in (8, 16, 32, 64)}
 DTYPES |= {torch.bfloat16: "BF16", torch.uint8: "U8", torch.bool: "BOOL"}
 
 
+class OtherFormatError(DevrfError):
+    """A file is whole, but of a format that this version does not read."""
+
+    def __init__(self, path: Path, version: int) -> None:
+        age = "newer" if version > FORMAT else "older"
+        super().__init__(
+            f"{path}: has format {version}, {age} than the {FORMAT} that this version reads; use "
+            "the version of devrf that wrote it, or train again"
+        )
+
+
 class _Seal(NamedTuple):
     """What the beginning of a file says of it; ``place`` is where the digest stands."""
 
@@ -148,7 +159,7 @@ def _check(path: Path) -> None:
         if seal is None:
             file.seek(max(0, size - 52))
             if file.read(len(END_OF_2)) == END_OF_2:
-                raise _other_format(path, 2)
+                raise OtherFormatError(path, 2)
             raise DevrfError(
                 f"{path}: not a devrf checkpoint, or only the first bytes of one; expected a file "
                 "that devrf wrote"
@@ -165,12 +176,4 @@ def _check(path: Path) -> None:
     if actual.hexdigest() != seal.digest:
         raise DevrfError(f"{path}: damaged: {damage}; take a copy that is whole, or train again")
     if seal.version != FORMAT:
-        raise _other_format(path, seal.version)
-
-
-def _other_format(path: Path, version: int) -> DevrfError:
-    age = "newer" if version > FORMAT else "older"
-    return DevrfError(
-        f"{path}: has format {version}, {age} than the {FORMAT} that this version reads; use the "
-        "version of devrf that wrote it, or train again"
-    )
+        raise OtherFormatError(path, seal.version)

@@ -108,8 +108,10 @@ def _lock(folder: Path, key: str) -> bool:
         with warnings.catch_warnings(action="ignore"):
             lock.acquire(timeout=0)
     except Timeout:
-        # It has the lock a moment before it has written its record.
-        which = f" ({owner.read_text()})" if owner.is_file() else ""
+        try:
+            which = f" ({owner.read_text()})"
+        except OSError:  # it has the lock, but has not written its record yet
+            which = ""
         raise DevrfError(
             f"{folder}: another devrf process{which} works in this folder; wait for it, or use "
             f"{key}=FOLDER"
