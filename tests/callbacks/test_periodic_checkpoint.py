@@ -91,6 +91,7 @@ def test_writing_takes_its_share_of_the_time(
 
     def write(trainer: Trainer, path: Path, **_: Any) -> None:
         written.append(trainer.lightning_module.iteration)
+        path.touch()
         clock[0] += 2.0  # a file takes two seconds, an iteration one
 
     monkeypatch.setattr(module, "save_checkpoint", write)

@@ -23,10 +23,10 @@ def atomic_write(path: Path) -> Iterator[Path]:
     Raises:
         OSError: naming ``path``: it cannot be written.
     """
+    path.parent.mkdir(parents=True, exist_ok=True)
     # The suffix stays last: writers tell the format by it.
     partial = path.with_name(f".partial-{path.name}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         yield partial
         with partial.open("rb+") as file:
             os.fsync(file.fileno())
