@@ -1,4 +1,4 @@
-"""Who answers signals: a block of ours, unless somebody else already does."""
+"""Signals are answered by a block of ours, unless another program's handler does."""
 
 from __future__ import annotations
 
@@ -82,4 +82,4 @@ def test_ending_at_once_has_the_status_of_a_shell() -> None:
     with pytest.raises(Interrupted) as caught, answered_by(end_at_once):
         send(signal.SIGTERM)
     assert caught.value.code == 143
-    assert not isinstance(caught.value, Exception)  # nobody takes it for a fault or a mistake
+    assert not isinstance(caught.value, Exception)  # so no handler of faults or mistakes catches it
