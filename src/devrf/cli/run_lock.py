@@ -102,7 +102,8 @@ def _lock(folder: Path, key: str) -> bool:
     if folder.resolve() in _held:
         return True
     place = folder / PLACE
-    place.mkdir(parents=True, exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
+    place.mkdir(exist_ok=True)
     lock, owner = FileLock(place / LOCK), place / OWNER
     try:
         with warnings.catch_warnings(action="ignore"):
