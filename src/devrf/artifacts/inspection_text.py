@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable
 
 from rich.console import Group, RenderableType
 from rich.text import Text
 
 from devrf.artifacts.inspection import FlowFacts, Inspection, ViewsFacts
 from devrf.artifacts.sections import Section, as_lines, as_tables
-from devrf.cli.memory import Budget, StageMemory
 from devrf.geometry.box import Box
 from devrf.scenes.scene import Bounds
 
 
-def sections(found: Inspection, budget: Budget) -> list[Section]:
+def sections(found: Inspection, needs: Iterable[tuple[str, int]]) -> list[Section]:
     """The whole report: the scene, its images, where it is, and what a run will need."""
     return [
         _scene(found),
@@ -35,21 +34,21 @@ def sections(found: Inspection, budget: Budget) -> list[Section]:
             ),
             heading=True,
         ),
-        _memory(budget),
+        _memory(needs),
     ]
 
 
-def plain(found: Inspection, budget: Budget) -> str:
+def plain(found: Inspection, needs: Iterable[tuple[str, int]]) -> str:
     """The report as plain text, columns aligned."""
-    lines = as_lines(sections(found, budget))
+    lines = as_lines(sections(found, needs))
     lines.append(_verdict(found))
     lines += [f"  {advice}" for advice in found.advice]
     return "\n".join(lines)
 
 
-def tables(found: Inspection, budget: Budget) -> RenderableType:
+def tables(found: Inspection, needs: Iterable[tuple[str, int]]) -> RenderableType:
     """The report as tables for a terminal."""
-    parts = as_tables(sections(found, budget))
+    parts = as_tables(sections(found, needs))
     parts.append(Text(_verdict(found), style="bold yellow" if found.advice else "bold green"))
     for advice in found.advice:
         parts.append(
@@ -137,23 +136,6 @@ def _percent(share: float) -> str:
     return f"{100 * share:.0f} %"
 
 
-def _memory(budget: Budget) -> Section:
-    rows = [
-        ("GPU, canonical stage", size(budget.canonical.peak), _largest(budget.canonical)),
-        ("GPU, deformation stage", size(budget.deformation.peak), _largest(budget.deformation)),
-        ("host, beside a GPU", size(budget.host), "the scene: " + _parts(budget.scene)),
-        ("host, without a GPU", size(budget.host_alone), "the scene and the larger stage"),
-        ("checkpoint", size(sum(budget.checkpoint.values())), _parts(budget.checkpoint, 2)),
-    ]
-    return Section("what a run will need, estimated", tuple(rows))
-
-
-def _largest(stage: StageMemory) -> str:
-    worst = max(stage.passing, key=lambda name: stage.passing[name])
-    return _parts({**stage.held, worst: stage.passing[worst]}, 3)
-
-
-def _parts(parts: Mapping[str, int], most: int = 3) -> str:
-    """The largest parts, by name."""
-    ordered = sorted(parts.items(), key=lambda part: -part[1])
-    return ", ".join(f"{name} {size(count)}" for name, count in ordered[:most])
+def _memory(needs: Iterable[tuple[str, int]]) -> Section:
+    rows = tuple((name, size(count)) for name, count in needs)
+    return Section("what a run will need, estimated", rows)

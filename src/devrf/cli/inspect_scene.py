@@ -10,7 +10,8 @@ from devrf.artifacts.inspection import inspect_scene
 from devrf.artifacts.inspection_picture import write_inspection_picture
 from devrf.artifacts.inspection_text import plain, tables
 from devrf.cli.context import RunContext
-from devrf.cli.preflight import estimated
+from devrf.cli.memory import budget_rows
+from devrf.cli.preflight import requirements
 from devrf.errors import DevrfError
 from devrf.scenes.export import export
 
@@ -28,13 +29,13 @@ def prepare(run: RunContext) -> None:
 
 def inspect(run: RunContext) -> None:
     """Say and draw what the scene holds and what may be wrong with it; learn nothing."""
-    budget = estimated(run)
+    rows = budget_rows(requirements(run))
     found = inspect_scene(run.scene)
     console = Console()
     if console.is_terminal:
-        console.print(tables(found, budget))
+        console.print(tables(found, rows))
     else:
-        log.info("%s", plain(found, budget))
+        log.info("%s", plain(found, rows))
     path = run.folder / "images" / "inspect.png"
     write_inspection_picture(path, run.scene)
     log.info("picture written to %s", path)

@@ -83,8 +83,7 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
     learns = [step.__name__ for step in STEPS[stage] if step in LEARNING]
     needs = None
     if learns and config.memory_check and run.leads:
-        further = {evaluate, render} & set(STEPS[stage])
-        needs = preflight(run, learns, scores=bool(further), films=render in further)
+        needs = preflight(run, learns, films=render in STEPS[stage])
     if not config.resume and not {canonical, deformation}.isdisjoint(STEPS[stage]):
         needed = () if canonical in STEPS[stage] else (run.own_checkpoint("canonical"),)
         archive_previous(folder, *needed)

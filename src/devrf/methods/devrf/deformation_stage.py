@@ -11,7 +11,6 @@ from torch import Tensor
 
 from devrf.checkpoints.bits import pack_bits, unpack_bits
 from devrf.checkpoints.checkpoint import CheckpointMetadata, LoadedCheckpoint
-from devrf.cli.memory import StageMemory, motion_memory
 from devrf.data.batch import Pixels, background_color, gather_batch
 from devrf.data.correspondence import previous_images
 from devrf.data.pool import PixelPool, all_pixels, wanted_pixels
@@ -24,6 +23,7 @@ from devrf.methods.devrf.active_frame import ActiveFrame
 from devrf.methods.devrf.convergence import settled
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.flow_initialisation import follow, start_from_tracks
+from devrf.methods.devrf.frame_memory import fits_on_device
 from devrf.methods.devrf.model import SceneModel, deformed_occupancy
 from devrf.methods.devrf.motion_losses import MOTION_TERMS, MotionPrediction, total_variation_weight
 from devrf.methods.devrf.photometric_losses import visibility
@@ -126,17 +126,6 @@ class DeformationStage(ScheduledStage):
         assert self.scene_model.deformation is not None, "the stage has not been set up"
         return self.scene_model.deformation
 
-    def _memory(self, on_host: bool) -> StageMemory:
-        model = self.scene_model
-        return motion_memory(
-            self.scene,
-            model.canonical,
-            self.schedule,
-            model.settings.step,
-            on_host=on_host,
-            half=self.motion.store_half,
-        )
-
     @property
     def optimizer(self) -> GridAdam:
         """Adam over the two slices of each visited frame."""
@@ -178,10 +167,17 @@ class DeformationStage(ScheduledStage):
         if device.type != "cuda":
             return False
         free, _ = torch.cuda.mem_get_info(device)
-        too_much = self._memory(on_host=False).peak > free
-        if too_much:
+        frames = len(self.field.clock)
+        fits = fits_on_device(
+            free,
+            frames,
+            self.field.box.grid_shape(self.schedule.sides[-1] ** 3),
+            half=self.motion.store_half,
+            parallel=self.schedule.beside(-1, frames),
+        )
+        if not fits:
             log.info("motion: %.1f GB are free on the GPU; the frames rest on the host", free / 1e9)
-        return too_much
+        return not fits
 
     def enter(self, phase: Phase) -> None:
         """Go to the phase's frames: grow the grids if a level begins, fresh Adam."""
