@@ -279,7 +279,7 @@ class DeformationStage(ScheduledStage):
         images = self._images(views, visit.frame)
         if len(images) == 0:
             raise DevrfError(f"dynamic training set: no image at frame {visit.frame}")
-        if self.motion.pixels == "useful":
+        if self.motion.pixels == "occupied":
             pools = [self._useful(views, image, visit.occupancy) for image in images]
         else:
             pools = [all_pixels(views, image[None]) for image in images]
