@@ -23,7 +23,7 @@ from devrf.cli.render import picture, render
 from devrf.cli.report import report
 from devrf.cli.resume import archive_previous
 from devrf.cli.train import canonical, deformation
-from devrf.cli.workers import together
+from devrf.cli.workers import launch_workers
 from devrf.errors import DevrfError
 from devrf.methods.devrf.motion_losses import MOTION_TERMS
 from devrf.methods.weighted_loss import WeightedLoss
@@ -94,7 +94,7 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
     ended = False
     try:
         if learning:
-            with together(run, learn):
+            with launch_workers(run, learn):
                 _take(learning, run)
         if not learning or run.leads:
             _take(others, run)
@@ -114,7 +114,7 @@ def learn(config: DictConfig, folder: Path) -> None:
         folder: the run's folder; rank 0 writes into it.
     """
     run = RunContext(config, folder)
-    with together(run, learn):
+    with launch_workers(run, learn):
         _take([step for step in STEPS[config.stage] if step in LEARNING], run)
 
 
