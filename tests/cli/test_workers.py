@@ -71,7 +71,9 @@ class Trip(Callback):
         if trainer.global_rank == self.rank:
             if self.how == "killed":
                 os.kill(os.getpid(), signal.SIGKILL)
-            raise DevrfError("data.root: gone") if self.how == "mistake" else ZeroDivisionError("ours")
+            if self.how == "mistake":
+                raise DevrfError("data.root: gone")
+            raise ZeroDivisionError("ours")
 
 
 class Stray(Callback):

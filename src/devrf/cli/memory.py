@@ -12,7 +12,6 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 import torch
 from torch import Tensor, nn
 
-from devrf.engine.micro_batching import MicroBatching
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.frame_memory import active_bytes, resident_bytes
@@ -68,11 +67,6 @@ class StageNeeds:
     def peak(self, pieces: int = 1) -> int:
         """Bytes on the device at the worst moment, each batch taken in so many pieces."""
         return self.views + sum(self.held.values()) + max(self.batch // pieces, self.temporary)
-
-    @property
-    def least(self) -> int:
-        """Bytes on the device with batches in as many pieces as training tries."""
-        return self.peak(MicroBatching.MOST)
 
     @property
     def on_host(self) -> int:

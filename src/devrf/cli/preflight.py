@@ -14,6 +14,7 @@ from devrf.artifacts.film import film_bytes
 from devrf.callbacks import PeriodicCheckpoint
 from devrf.cli.context import RunContext
 from devrf.cli.memory import IMAGES, Budget, Parts, estimate
+from devrf.engine.micro_batching import MicroBatching
 from devrf.errors import DevrfError
 from devrf.system.machine import free_disk, free_host_memory, free_memory, own_memory
 from devrf.system.out_of_memory import gib, is_oom, numbers
@@ -99,8 +100,8 @@ def preflight(run: RunContext, learns: Sequence[str], *, films: bool) -> str | N
     parts = {**stage.held, (stage.rays,): stage.batch}
     needs, on_gpu = [], run.device.type == "cuda"
     if on_gpu:
-        there = free_memory(run.device)
-        needs.append(Requirement("GPU memory", stage.peak(), there, parts, stage.least))
+        there, least = free_memory(run.device), stage.peak(MicroBatching.MOST)
+        needs.append(Requirement("GPU memory", stage.peak(), there, parts, least))
     host = budget.host(alone=not on_gpu, processes=getattr(run.strategy, "num_processes", 1))
     on_host = Counter(stage.held if on_gpu else parts) + Counter({IMAGES: budget.scene})
     needs.append(Requirement("host memory", host, free_host_memory() + own_memory(), on_host))
