@@ -83,6 +83,10 @@ def test_a_part_may_take_anything():
         ({"loss__fien": {"color": 3.0}}, "loss.fien.color: no such key"),
         ({"sizes__inner__size": "big"}, "sizes.inner.size: expected a whole number, not 'big'"),
         ({"loss__fine__color": "high"}, "loss.fine.color: expected a number, not 'high'"),
+        (
+            {"schedule": {"motion": {"_target_": f"{__name__}.Inner", "least_gain": 0.1}}},
+            "schedule.motion.least_gain: renamed; write schedule.motion.min_rel_improvement=",
+        ),
         ({"seed": None}, "seed: expected a whole number, not None"),
         ({"outer__root": "${nowhere}"}, "nowhere"),
     ],

@@ -140,7 +140,7 @@ TOGETHER = Alone(
     "motion",
     [
         MotionSettings(occupancy_every=3),
-        MotionSettings(learning_rate=3e-3, unit="box", views="all", pixels="useful"),
+        MotionSettings(learning_rate=3e-3, unit="box", views="all", pixels="occupied"),
     ],
     ids=["views by turns", "useful pixels"],
 )

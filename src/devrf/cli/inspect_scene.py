@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
 
 from rich.console import Console
 from rich.filesize import decimal
@@ -12,8 +11,8 @@ from devrf.artifacts.inspection.report import inspect_scene
 from devrf.artifacts.inspection.text import inspection_text
 from devrf.artifacts.tables import as_text
 from devrf.cli.context import RunContext
-from devrf.cli.memory import Budget, StageMemory
-from devrf.cli.preflight import estimated
+from devrf.cli.memory import budget_rows
+from devrf.cli.preflight import requirements
 from devrf.errors import DevrfError
 from devrf.scenes.export import export
 
@@ -34,7 +33,8 @@ def inspect(run: RunContext) -> None:
     # Only this step draws with matplotlib.
     from devrf.artifacts.inspection.picture import write_inspection_picture
 
-    report = inspection_text(inspect_scene(run.scene), _requirements(estimated(run)))
+    needs = [(name, decimal(size)) for name, size in budget_rows(requirements(run))]
+    report = inspection_text(inspect_scene(run.scene), needs)
     console = Console()
     if console.is_terminal:
         console.print(report)
@@ -43,26 +43,3 @@ def inspect(run: RunContext) -> None:
     path = run.folder / "images" / "inspect.png"
     write_inspection_picture(path, run.scene)
     log.info("picture written to %s", path)
-
-
-def _requirements(budget: Budget) -> list[tuple[str, str, str]]:
-    """Rows of what is needed, how much of it, and its largest parts."""
-    alone = "the scene and the larger stage"
-    return [
-        ("GPU, canonical stage", decimal(budget.canonical.peak), _largest(budget.canonical)),
-        ("GPU, deformation stage", decimal(budget.deformation.peak), _largest(budget.deformation)),
-        ("host, beside a GPU", decimal(budget.host), "the scene: " + _parts(budget.scene)),
-        ("host, without a GPU", decimal(budget.host_alone), alone),
-        ("checkpoint", decimal(sum(budget.checkpoint.values())), _parts(budget.checkpoint, 2)),
-    ]
-
-
-def _largest(stage: StageMemory) -> str:
-    worst = max(stage.passing, key=lambda name: stage.passing[name])
-    return _parts({**stage.held, worst: stage.passing[worst]})
-
-
-def _parts(parts: Mapping[str, int], most: int = 3) -> str:
-    """The largest parts, by name."""
-    ordered = sorted(parts.items(), key=lambda part: -part[1])
-    return ", ".join(f"{name} {decimal(count)}" for name, count in ordered[:most])

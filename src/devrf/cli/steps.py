@@ -108,8 +108,7 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
     _check(run, asked)
     needs = None
     if asked.learning and config.memory_check and run.leads:
-        scores = not set(PIPELINE).isdisjoint(asked.further)
-        needs = preflight(run, asked.learning, scores=scores, films="render" in asked.further)
+        needs = preflight(run, asked.learning, films="render" in asked.further)
     if asked.learning and not config.resume:
         below = run.protocol[asked.learning[0]].builds_on
         archive_previous(folder, *([] if below is None else [run.own_checkpoint(below)]))

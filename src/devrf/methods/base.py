@@ -140,6 +140,14 @@ class DynamicModel(nn.Module, ABC):
         """How many numbers are learned."""
         return sum(parameter.numel() for parameter in self.parameters())
 
+    def batch_bytes(self, rays: int) -> int:
+        """About what learning from a batch of rays takes, the graph of its gradients included.
+
+        Three single-precision values are kept for each output of each layer, for 128 samples a ray.
+        """
+        layers = [module for module in self.modules() if isinstance(module, nn.Linear)]
+        return 128 * rays * 12 * sum(layer.out_features for layer in layers)
+
     def stored_state(self) -> dict[str, Any]:
         """The state for a finished checkpoint: tensors and plain data, as small as can be."""
         return self.state_dict()

@@ -24,7 +24,7 @@ from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene
 
 SHORT = DeformationSchedule(sides=(4, 8), iterations_per_frame=(20, 10), rays=256)
-FAST = MotionSettings(learning_rate=5e-3, views="all", pixels="useful")
+FAST = MotionSettings(learning_rate=5e-3, views="all", pixels="occupied")
 
 
 def test_two_steps_move_the_first_frame_only(

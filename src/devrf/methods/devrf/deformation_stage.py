@@ -159,7 +159,7 @@ class DeformationStage(VoxelStage):
                 frame.number,
                 self.scene_model,
                 frame.occupancy,
-                occupied_only=self.motion.pixels == "useful",
+                occupied_only=self.motion.pixels == "occupied",
                 join_views=self.motion.views == "all",
             )
 
