@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from devrf.methods.devrf.schedules import CanonicalSchedule
 from lightning import Callback, Trainer
 
 from devrf.callbacks import PeriodicCheckpoint, StopOnSignal, TrainingRecord
@@ -22,6 +21,7 @@ from devrf.checkpoints.progress import progress_files
 from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
 from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 
 SMALL = Architecture(channels=4, width=8, frequencies=1)

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from devrf.methods.devrf.schedules import CanonicalSchedule, DeformationSchedule
 from torch import nn
 
 from devrf.cli.memory import (
@@ -25,6 +24,8 @@ from devrf.cli.memory import (
 )
 from devrf.geometry.box import Box
 from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.settings import MotionSettings
 from devrf.scenes.scene import Scene
 

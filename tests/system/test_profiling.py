@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import get_args
 
-from devrf.methods.devrf.schedules import DeformationSchedule
 from lightning import Trainer
 from torch.profiler import ProfilerActivity, profile
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.system.profiling import Part, measured, span
 
