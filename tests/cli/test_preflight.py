@@ -82,24 +82,17 @@ def test_a_full_disk_is_noticed_before_it_begins(devrf, tiny, monkeypatch) -> No
     assert re.search(r" of 9.3e-07 GiB of disk; it would end for lack of disk", outcome.err)
 
 
-def test_the_estimate_may_be_overruled(devrf, tiny, monkeypatch) -> None:
+def test_little_memory_refuses_what_is_to_be_learned_and_touches_nothing(
+    devrf, tiny, monkeypatch, tmp_path
+) -> None:
+    command = (*tiny, "stage=canonical", "hydra.run.dir=run")
     monkeypatch.setattr(preflight, "free_host_memory", lambda: -(10**12))
-    outcome = devrf(*tiny, "stage=canonical", "hydra.run.dir=run")
+    outcome = devrf(*command)
     assert outcome.status == 2 and "lack of host memory" in outcome.err
-    assert devrf(*tiny, "stage=canonical", "hydra.run.dir=run", "memory_check=false").status == 0
-
-
-def test_what_is_learned_needs_nothing(devrf, tiny, monkeypatch) -> None:
-    command = (*tiny, "stage=canonical", "hydra.run.dir=run")
+    assert not (tmp_path / "run").exists()
+    assert devrf(*command, "memory_check=false").status == 0
+    # What is learned already needs nothing.
     assert devrf(*command).status == 0
-    monkeypatch.setattr(preflight, "free_host_memory", lambda: -(10**12))
-    assert devrf(*command).status == 0
-
-
-def test_nothing_is_set_aside_for_a_run_that_cannot_be(devrf, tiny, monkeypatch, tmp_path) -> None:
-    command = (*tiny, "stage=canonical", "hydra.run.dir=run")
-    assert devrf(*command).status == 0
-    monkeypatch.setattr(preflight, "free_host_memory", lambda: -(10**12))
     assert devrf(*command, "resume=false").status == 2
     assert (tmp_path / "run" / "checkpoints" / "canonical.ckpt").is_file()
     assert not (tmp_path / "run" / "previous-1").exists()

@@ -77,11 +77,8 @@ def one_line(error: BaseException) -> str:
     own = own_error(error)
     if own is not None:
         text = str(own)
-    elif isinstance(error, MissingConfigException) and _plugin(error):
-        text = f'{_plugin(error)}: not installed; pip install "devrf[sweeps]"'
-    elif isinstance(error, MissingConfigException) and error.options:
-        group, _, option = str(error.missing_cfg_file).rpartition("/")
-        text = f"{group}={option}: no such option; choose one of {', '.join(error.options)}"
+    elif isinstance(error, MissingConfigException):
+        text = _missing_option(error)
     elif isinstance(error, OverrideParseException):
         text = f"{error.override}: not understood; write KEY=VALUE, in quotes where needed"
     elif isinstance(error, OSError) and not isinstance(error, HydraException):
@@ -91,10 +88,13 @@ def one_line(error: BaseException) -> str:
     return " ".join(text.split())
 
 
-def _plugin(error: MissingConfigException) -> str | None:
-    """``group=option`` where a plugin that is not installed has the missing option."""
+def _missing_option(error: MissingConfigException) -> str:
     group, _, option = str(error.missing_cfg_file).rpartition("/")
-    return f"{group}={option}" if option in PLUGINS.get(group, ()) else None
+    if option in PLUGINS.get(group, ()):
+        return f'{group}={option}: not installed; pip install "devrf[sweeps]"'
+    if error.options:
+        return f"{group}={option}: no such option; choose one of {', '.join(error.options)}"
+    return _of_hydra(error)
 
 
 def _of_hydra(error: BaseException) -> str:
