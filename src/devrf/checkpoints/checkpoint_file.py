@@ -70,7 +70,7 @@ def write_checkpoint_file(path: Path, content: dict[str, Any]) -> None:
 
     Raises:
         OSError: naming ``path``; nothing of the attempt is left.
-        TypeError: something in ``content`` cannot be stored.
+        TypeError, KeyError: a value, or the dtype of a tensor, cannot be stored.
     """
     tensors: dict[str, Tensor] = {}
     nested = json.dumps(flatten(content, tensors))
