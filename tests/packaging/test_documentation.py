@@ -19,7 +19,8 @@ SPAN = re.compile(r"`([^`\n]+)`")
 TEST = re.compile(r"(tests/[\w/]+\.py)(?:::(\w+))?")
 LINK = re.compile(r"\]\((?!https?:)([^)#\s]+)")
 COMMAND = re.compile(r"python -m devrf ((?:-m )?[\w./]+=[^\s`]+(?: [\w./]+=[^\s`]+)*)")
-KEY = re.compile(r"([a-z_]+(?:\.[a-z_]+)+)=")
+GROUPS = "callbacks|data|evaluation|field|sampling|schedule|still|video"
+KEY = re.compile(rf"([a-z_]+(?:\.[a-z_]+)+)=|^((?:{GROUPS})(?:\.[a-z_]+)+)$")
 ROOTS = ("src/", "conf/", "tests/", "docs/", "notebooks/", "benchmarks/")
 PACKAGE = REPOSITORY / "src" / "devrf"
 CHOICES = [f"data={name}" for name in ("procedural", "procedural_forward", "inward", "forward")]
@@ -84,7 +85,7 @@ def test_keys_exist(composed):
     configs = [OmegaConf.to_container(composed(choice), resolve=False) for choice in CHOICES]
     known = {key for config in configs for key in dotted(config)}
     for page in PAGES:
-        keys = {key for span in spans(page) for key in KEY.findall(span)}
+        keys = {a or b for span in spans(page) for a, b in KEY.findall(span)}
         assert {key for key in keys if not key.startswith("hydra.")} <= known, page.name
 
 
