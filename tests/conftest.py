@@ -27,7 +27,7 @@ from devrf.geometry.clock import FrameClock
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_field import DeformationField
-from devrf.methods.devrf.model import SceneModel
+from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.schedules import CanonicalSchedule
 from devrf.rendering.rendered_image import RenderedImage
 from devrf.scenes.procedural import ProceduralScene
@@ -168,7 +168,7 @@ def rest(learned: tuple[CanonicalStage, Trainer]) -> LoadedCheckpoint:
 
 
 @pytest.fixture
-def moving(learned: tuple[CanonicalStage, Trainer], rng: torch.Generator) -> SceneModel:
+def moving(learned: tuple[CanonicalStage, Trainer], rng: torch.Generator) -> DeVRFModel:
     """The tiny scene; at the times 0.4 and 1 every point has moved by up to 5 % of its box."""
     model = copy.deepcopy(learned[0].model)
     box = model.canonical.box

@@ -19,9 +19,9 @@ from devrf.evaluation.held_out import HeldOutView
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.methods.devrf.architecture import Architecture
-from devrf.methods.devrf.model import SceneModel
+from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.renderer import Renderer
-from devrf.methods.devrf.volume_rendering import RenderSettings
+from devrf.methods.devrf.settings import RenderSettings
 from devrf.rendering.occupancy import Occupancy
 
 
@@ -140,7 +140,7 @@ def test_pictures_show_colour_beside_depth_while_time_runs(cube: Box) -> None:
         canonical.density.values[2, 2, 2] = 60.0
         canonical.color.values.copy_(torch.tensor([9.0, -9.0, -9.0]).expand(5, 5, 5, 3))
     settings = RenderSettings(0.5, 1e-4, 0.0, 9.0)
-    model = SceneModel(canonical, Occupancy.full((5, 5, 5), cube), settings)
+    model = DeVRFModel(canonical, Occupancy.full((5, 5, 5), cube), settings)
     shown = list(pictures(Renderer(model), ring(3), 1.0))
     assert len(shown) == 3
     for image in shown:

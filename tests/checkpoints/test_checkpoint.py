@@ -17,7 +17,7 @@ from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_stage import DeformationStage
-from devrf.methods.devrf.model import SceneModel
+from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.schedules import CanonicalSchedule, DeformationSchedule
 from devrf.metrics.image import psnr
 from devrf.scenes.scene import Scene
@@ -31,7 +31,7 @@ def canonical(learned: tuple[CanonicalStage, Trainer], tmp_path: Path) -> Path:
     return path
 
 
-def assert_alike(one: SceneModel, other: SceneModel, scene: Scene) -> None:
+def assert_alike(one: DeVRFModel, other: DeVRFModel, scene: Scene) -> None:
     """Pictures differ by what half precision loses: 0.05 dB of one that is at 40 dB."""
     cameras = scene.dynamic.test.cameras
     shape = (cameras.height, cameras.width, 3)

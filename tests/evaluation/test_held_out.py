@@ -17,7 +17,7 @@ from devrf.geometry.clock import FrameClock
 from devrf.methods.devrf import renderer as player_module
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_field import DeformationField
-from devrf.methods.devrf.model import SceneModel, occupancy_through
+from devrf.methods.devrf.model import DeVRFModel, occupancy_through
 from devrf.methods.devrf.renderer import Renderer
 from devrf.metrics.image import psnr, ssim
 from devrf.rendering.occupancy import Occupancy
@@ -88,7 +88,7 @@ def test_where_a_frame_s_matter_is_is_looked_for_once(
     model, looked = rest.model, []
     model.deformation = DeformationField(model.canonical.box, FrameClock((0.0, 0.5, 1.0)), voxels=8)
 
-    def valid_mask(model: SceneModel, canonical: Tensor) -> Occupancy:
+    def valid_mask(model: DeVRFModel, canonical: Tensor) -> Occupancy:
         looked.append(1)
         return occupancy_through(model, canonical)
 

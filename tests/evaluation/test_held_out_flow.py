@@ -17,9 +17,9 @@ from devrf.geometry.clock import FrameClock
 from devrf.geometry.space import WORLD
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.deformation_field import DeformationField
-from devrf.methods.devrf.model import SceneModel
+from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.renderer import Ready, Renderer
-from devrf.methods.devrf.volume_rendering import RenderSettings
+from devrf.methods.devrf.settings import RenderSettings
 from devrf.rendering.occupancy import Occupancy
 from devrf.scenes.procedural import Material, ProceduralScene
 from devrf.scenes.scene import OpticalFlow, Scene, Views
@@ -110,7 +110,7 @@ SIDE = 21
 
 
 @pytest.fixture
-def block(cube: Box) -> SceneModel:
+def block(cube: Box) -> DeVRFModel:
     """All below z = −0.05, halfway between two grid points, is solid.
 
     It moves by +0.2 along x until t = 0.5 and by +0.5 until t = 1.
@@ -125,7 +125,7 @@ def block(cube: Box) -> SceneModel:
     for frame, way in ((1, 0.2), (2, 0.5)):
         deformation.to_canonical[frame, ..., 0] = -way
         deformation.to_time[frame, ..., 0] = way
-    return SceneModel(canonical, Occupancy.full((SIDE,) * 3, cube), SETTINGS, deformation)
+    return DeVRFModel(canonical, Occupancy.full((SIDE,) * 3, cube), SETTINGS, deformation)
 
 
 def filmed_from_above(flow: tuple[float, float]) -> Views:
@@ -146,7 +146,7 @@ def filmed_from_above(flow: tuple[float, float]) -> Views:
     )
 
 
-def test_a_moving_block_by_hand(block: SceneModel) -> None:
+def test_a_moving_block_by_hand(block: DeVRFModel) -> None:
     # The face is 4 away, the lens has 40 px: 0.3 units along x are 3 px, and came from the left.
     views = filmed_from_above((-3.0, 1.0))
     seen = seen_flow(Renderer(block), views, 2, 1, torch.arange(64), chunk=10)
@@ -157,7 +157,7 @@ def test_a_moving_block_by_hand(block: SceneModel) -> None:
     assert flow_error(Renderer(block), views, 1) == pytest.approx(0, abs=0.015)
 
 
-def test_a_scene_without_motion_or_matter_shows_none(block: SceneModel) -> None:
+def test_a_scene_without_motion_or_matter_shows_none(block: DeVRFModel) -> None:
     views = filmed_from_above((-3.0, 4.0))
     block.deformation = None
     assert flow_error(Renderer(block), views, 2) == pytest.approx(5.0, abs=1e-3)

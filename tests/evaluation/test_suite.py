@@ -18,9 +18,9 @@ from devrf.geometry.cameras import Cameras
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_stage import CanonicalStage
-from devrf.methods.devrf.model import SceneModel
+from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.renderer import Renderer
-from devrf.methods.devrf.volume_rendering import RenderSettings
+from devrf.methods.devrf.settings import RenderSettings
 from devrf.metrics.masked import psnr_masked, ssim_masked
 from devrf.metrics.perceptual import TRUNKS
 from devrf.rendering.occupancy import Occupancy
@@ -39,13 +39,13 @@ def alex(tmp_path: Path) -> Path:
     return path
 
 
-def slab(box: Box, settings: RenderSettings, space=None) -> SceneModel:
+def slab(box: Box, settings: RenderSettings, space=None) -> DeVRFModel:
     """All of the box below z = −0.025, halfway between two grid points, is solid."""
     field = Architecture().search_field(box, SIDE**3)
     with torch.no_grad():
         field.density.values.fill_(-400.0)
         field.density.values[:, :, : SIDE // 2] = 400.0
-    model = SceneModel(field, Occupancy.full((SIDE,) * 3, box), settings)
+    model = DeVRFModel(field, Occupancy.full((SIDE,) * 3, box), settings)
     if space is not None:
         model.space = space
     return model

@@ -11,7 +11,8 @@ import torch
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
 from devrf.methods.devrf.architecture import Architecture
-from devrf.methods.devrf.volume_rendering import STOP, RenderSettings, render
+from devrf.methods.devrf.settings import RenderSettings
+from devrf.methods.devrf.volume_rendering import STOP, render
 from devrf.ops.search import PackedSamples, Thresholds, find_samples, select
 from devrf.rendering.occupancy import Occupancy
 

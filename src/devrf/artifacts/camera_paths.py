@@ -9,7 +9,7 @@ import torch
 from devrf.artifacts.film import FilmSettings
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
-from devrf.methods.devrf.renderer import Renderer
+from devrf.rendering.renderer import Renderer
 
 
 def orbit(cameras: Cameras, box: Box, settings: FilmSettings) -> Cameras:

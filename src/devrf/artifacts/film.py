@@ -16,9 +16,9 @@ from torch import Tensor
 from devrf.artifacts.colors import depth_colors, to_bytes
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
-from devrf.methods.devrf.model import SceneModel
-from devrf.methods.devrf.renderer import Renderer
 from devrf.rendering.rendered_image import RenderedImage
+from devrf.rendering.renderer import Renderer
+from devrf.rendering.view import Viewable
 from devrf.system.files import atomic_write
 
 # Small pictures are shown enlarged: a video of 100 pixels is too small to watch.
@@ -69,22 +69,11 @@ def pictures(player: Renderer, cameras: Cameras, background: float) -> Iterator[
         yield torch.cat([picture.color.view(depth.shape).cpu(), depth], dim=1)
 
 
-def depth_picture(
-    model: SceneModel, picture: RenderedImage, position: Tensor, height: int
-) -> Tensor:
+def depth_picture(model: Viewable, picture: RenderedImage, position: Tensor, height: int) -> Tensor:
     """How far away things are (H, W, 3), of a whole image that a camera at ``position`` sees."""
-    near, far = _depth_range(model, position)
+    near, far = model.space.depth_range(model.box, model.depth_limits, position)
     depth, opacity = picture.depth.view(height, -1), picture.opacity.view(height, -1)
     return depth_colors(depth.cpu(), opacity.cpu(), near, far)
-
-
-def _depth_range(model: SceneModel, position: Tensor) -> tuple[float, float]:
-    """Depths shown brightest and darkest: about where the scene is, seen from ``position``."""
-    if model.canonical.planes is not None:
-        return model.settings.near, model.settings.far
-    box = model.canonical.box
-    distance, reach = math.dist(position.tolist(), box.middle), math.dist(box.low, box.high) / 3
-    return max(distance - reach, 0.0), distance + reach
 
 
 def write_video(path: Path, images: Iterator[Tensor], fps: int, *, least: int = WATCHABLE) -> None:

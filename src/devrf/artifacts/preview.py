@@ -2,34 +2,31 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
 from devrf.artifacts.colors import error_colors
 from devrf.artifacts.contact_sheet import side_by_side
 from devrf.artifacts.film import depth_picture
 from devrf.evaluation.held_out import background_value, compare, truth_image
-from devrf.methods.devrf.model import SceneModel
+from devrf.rendering.renderer import Renderer
+from devrf.rendering.view import Viewable
 from devrf.scenes.scene import Background, Views
 
 
-def preview(
-    model: SceneModel, views: Views, index: int, background: Background, device: torch.device
-) -> dict[str, Tensor]:
+def preview(model: Viewable, views: Views, index: int, background: Background) -> dict[str, Tensor]:
     """Pictures (H, W', 3) in [0, 1] by name.
 
     ``view`` is what the model sees beside the truth and the error, ``depth`` how far away.
 
     Args:
-        model: what has been learned so far, on ``device``.
+        model: what has been learned so far.
         views: the held-out views, on the host.
         index: which of them.
         background: what is behind the matte.
-        device: where to render.
     """
-    behind = torch.full((3,), background_value(background), device=device)
-    rays = views.cameras.image_rays(index).to(device)
-    seen = model.picture(rays, float(views.times[index]), behind)
+    renderer = Renderer(model, times=1)
+    behind = background_value(background)
+    seen = renderer.view(views.cameras, index, float(views.times[index]), behind)
     prediction = seen.color.view(views.height, views.width, 3).clamp(0, 1).cpu()
     truth = truth_image(views, index, background).cpu()
     error = error_colors(compare(prediction, truth, views.valid_mask_of(index)), truth)

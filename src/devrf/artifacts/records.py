@@ -17,7 +17,6 @@ import torch
 
 import devrf
 from devrf.evaluation.held_out import HeldOutView
-from devrf.methods.devrf.model import SceneModel
 from devrf.system.files import atomic_write
 
 
@@ -61,7 +60,7 @@ def frame_rows(
     ]
 
 
-def provenance(model: SceneModel, device: torch.device) -> dict[str, Any]:
+def provenance(size: int, device: torch.device) -> dict[str, Any]:
     """What it takes, beside the composed config, to tell how numbers came about.
 
     Returns:
@@ -75,18 +74,10 @@ def provenance(model: SceneModel, device: torch.device) -> dict[str, Any]:
         "lightning": lightning.__version__,
         "device": device_name(device),
         "git": git_revision(),
-        "parameters": parameter_count(model),
+        "parameters": size,
         "peak_host_gb": peak_host_memory(),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
     }
-
-
-def parameter_count(model: SceneModel) -> int:
-    """How many numbers were learned: canonical field and, where there is one, deformation."""
-    learned: list[torch.Tensor] = list(model.parameters())
-    if model.deformation is not None:
-        learned += [model.deformation.to_canonical, model.deformation.to_time]
-    return sum(tensor.numel() for tensor in learned)
 
 
 def device_name(device: torch.device) -> str:

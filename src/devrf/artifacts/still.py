@@ -10,7 +10,7 @@ from torch import Tensor
 from devrf.artifacts.film import depth_picture
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
-from devrf.methods.devrf.renderer import Renderer
+from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene
 
 

@@ -8,10 +8,8 @@ from devrf.callbacks.progress import Progress
 from devrf.callbacks.schedule import GridUpscaling, LearningRateDecay
 from devrf.callbacks.stop_on_signal import StopOnSignal
 from devrf.callbacks.training_record import TrainingRecord
-from devrf.cli.phase_benchmark import PhaseBenchmark
 
 __all__ = [
-    "PhaseBenchmark",
     "GridUpscaling",
     "DivergenceGuard",
     "LearningRateDecay",

@@ -10,7 +10,8 @@ from statistics import median
 import torch
 from torch import Tensor
 
-from devrf.engine.stage import Phase, ScheduledStage
+from devrf.engine.phase import Phase
+from devrf.engine.stage import ScheduledStage
 
 # Where less than this should be seen, nothing is said of what is.
 FAINT = 0.02

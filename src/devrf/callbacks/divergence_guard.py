@@ -20,15 +20,9 @@ from devrf.callbacks.divergence import (
 )
 from devrf.engine.stage import ScheduledStage
 from devrf.errors import DevrfError
-from devrf.methods.devrf.schedules import CanonicalPhase, DeformationPhase
 
 log = logging.getLogger(__name__)
 
-# What is worth changing, by stage.
-SETTINGS = {
-    "canonical": "schedule.rates or the weights of loss.fine",
-    "deformation": "schedule.motion.learning_rate or the weights of loss.deformation",
-}
 BACKGROUND = "is data.background that of the images, data.box around what they show?"
 # Iterations between copies of what is trained, in a phase without end.
 COPIED_EVERY = 1000
@@ -68,10 +62,9 @@ class DivergenceGuard(Callback):
     def _forget(self) -> None:
         self._steps: list[tuple[int, dict[str, Tensor]]] = []
         self._good: Snapshot | None = None
-        self._looked = 0
+        self._checked = 0
         self._kind = ""
         self._range = [1.0, 0.0]
-        self._level = 0
         self._visited: list[float] = []
         self._told = False
 
@@ -84,7 +77,6 @@ class DivergenceGuard(Callback):
         return {
             "kind": self._kind,
             "range": list(self._range),
-            "level": self._level,
             "visited": list(self._visited),
             "told": self._told,
         }
@@ -92,13 +84,12 @@ class DivergenceGuard(Callback):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Compare with what :meth:`state_dict` gave."""
         self._kind, self._range = state_dict["kind"], list(state_dict["range"])
-        self._level, self._visited = state_dict["level"], list(state_dict["visited"])
-        self._told = state_dict["told"]
+        self._visited, self._told = list(state_dict["visited"]), state_dict["told"]
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Count from here."""
         assert isinstance(pl_module, ScheduledStage)
-        self._looked = pl_module.iteration
+        self._checked = pl_module.iteration
 
     def on_train_batch_start(
         self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int
@@ -110,11 +101,12 @@ class DivergenceGuard(Callback):
             return
         self._good = None  # gone before the next is made
         self._good = Snapshot.of(pl_module)
-        if isinstance(phase, CanonicalPhase) and phase.kind != self._kind:
-            # A new field begins as fog.
-            self._kind, self._range = phase.kind, [1.0, 0.0]
-        if isinstance(phase, DeformationPhase) and phase.level != self._level:
-            self._level, self._visited = phase.level, []
+        if phase.kind != self._kind:
+            self._kind = phase.kind
+            if phase.frames:
+                self._visited = []  # losses differ from level to level
+            else:
+                self._range = [1.0, 0.0]  # a new field begins as fog
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -125,10 +117,10 @@ class DivergenceGuard(Callback):
             self._steps.append((pl_module.iteration, outputs))
         done = pl_module.iteration
         ends = done >= min(pl_module.phase.stop, pl_module.total_iterations)
-        if ends or done - self._looked >= self.every_iterations:
-            self.look(pl_module)
+        if ends or done - self._checked >= self.every_iterations:
+            self.check(pl_module)
 
-    def look(self, stage: ScheduledStage) -> None:
+    def check(self, stage: ScheduledStage) -> None:
         """See whether all is well; go back if not, or give up.
 
         Nothing is done where nothing was learned since the last look.
@@ -137,13 +129,13 @@ class DivergenceGuard(Callback):
             return
         *steps, fields = read(stage, [means for _, means in self._steps])
         iterations = [iteration for iteration, _ in self._steps]
-        since, self._looked = stage.iteration - self._looked, stage.iteration
+        since, self._checked = stage.iteration - self._checked, stage.iteration
         self._steps = []
         wrong = self._not_finite(stage, iterations, steps, fields)
         if wrong is None:
             wrong = self._collapsed(stage, steps, since)
         if wrong is not None:
-            self._go_back(stage, wrong)
+            self._rollback(stage, wrong)
             return
         assert self._good is not None and stage.phase is not None
         if stage.iteration >= stage.phase.stop:
@@ -165,12 +157,12 @@ class DivergenceGuard(Callback):
             name = not_finite(means)
             if name is not None:
                 kind = "the loss" if name == "loss" else f"the loss term {name}"
-                return f"{kind} is {means[name]} by {stage.where(iteration)}"
+                return f"{kind} is {means[name]} by {stage.describe(iteration)}"
         name = not_finite(fields)
         return (
             None
             if name is None
-            else (f"values of {name} are not finite by {stage.where(stage.iteration)}")
+            else (f"values of {name} are not finite by {stage.describe(stage.iteration)}")
         )
 
     def _collapsed(
@@ -182,7 +174,7 @@ class DivergenceGuard(Callback):
         mattes = "coverage" in late[0]
         covered = sum(means["coverage"] for means in late) / len(late) if mattes else None
         least, most = self._range
-        where = stage.where(stage.iteration)
+        where = stage.describe(stage.iteration)
         if since >= TELLING:
             self._range = [min(least, seen), max(most, seen)]
             # Without mattes a scene may fill every picture, and what moves may leave it.
@@ -203,13 +195,13 @@ class DivergenceGuard(Callback):
             log.warning("%s: %s", stage.name, words)
         self._told = True
 
-    def _go_back(self, stage: ScheduledStage, wrong: str) -> None:
+    def _rollback(self, stage: ScheduledStage, wrong: str) -> None:
         """Put back what was well; the second time, end there."""
         assert self._good is not None
         again = stage.num_rollbacks > 0
         cautious = stage.lr_scale
         self._good.put_back(stage, self.rate_factor)
-        self._looked = stage.iteration
+        self._checked = stage.iteration
         if not again:
             log.warning(
                 "%s: %s: back to iteration %d, learning rates at %g of the schedule's",
@@ -221,13 +213,13 @@ class DivergenceGuard(Callback):
             return
         stage.abort(
             f"{wrong}, again after learning rates were cut to {cautious:g}; what it was at "
-            f"iteration {stage.iteration} is kept; lower {SETTINGS[stage.name]}, and begin afresh "
+            f"iteration {stage.iteration} is kept; lower {stage.rate_keys}, and begin afresh "
             "with resume=false"
         )
 
     def _compare(self, stage: ScheduledStage, loss: float) -> None:
         """Tell of a frame that ends with a loss out of its neighbours' range."""
-        if not isinstance(stage.phase, DeformationPhase):
+        if stage.phase is None or not stage.phase.frames:
             return
         factor = stands_out(loss, self._visited)
         if factor is not None:
@@ -236,7 +228,7 @@ class DivergenceGuard(Callback):
                 "its images and its flow as they should be?",
                 stage.name,
                 loss,
-                stage.where(stage.iteration),
+                stage.describe(stage.iteration),
                 factor,
             )
         self._visited.append(loss)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from typing import Any
 
@@ -10,7 +11,6 @@ from lightning import Callback, LightningModule, Trainer
 
 from devrf.artifacts.records import peak_host_memory
 from devrf.engine.stage import ScheduledStage
-from devrf.methods.devrf.schedules import DeformationPhase
 
 
 class Meter(Callback):
@@ -35,15 +35,15 @@ class Meter(Callback):
         now, done = time.perf_counter(), pl_module.iteration
         since, before = self._last
         self._last = (now, done)
-        x, y, z = pl_module.resolution
         values: dict[str, float | None] = {
             "iterations_per_second": (done - before) / (now - since),
-            "voxels": x * y * z,
             "peak_host_gb": peak_host_memory(),
         }
+        if pl_module.resolution:
+            values["voxels"] = math.prod(pl_module.resolution)
         for group in pl_module.optimizer.param_groups:
             values[f"lr/{group['name']}"] = group["lr"]
-        if isinstance(pl_module.phase, DeformationPhase):
+        if pl_module.phase is not None and pl_module.phase.frames:
             values["frame"] = pl_module.phase.frames[0]  # a column has one number
         if pl_module.device.type == "cuda":
             values["peak_gpu_gb"] = torch.cuda.max_memory_allocated(pl_module.device) / 2**30

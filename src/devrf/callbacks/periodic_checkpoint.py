@@ -89,7 +89,7 @@ class PeriodicCheckpoint(Callback):
             callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
             for one in callbacks:
                 if isinstance(one, DivergenceGuard):
-                    one.look(pl_module)  # what has gone wrong is not worth going on from
+                    one.check(pl_module)  # what has gone wrong is not worth going on from
             if trainer.is_global_zero:
                 self._write(trainer, pl_module)
         if asked:

@@ -45,13 +45,9 @@ class Previews(Callback):
         self._shown = due
         started = time.perf_counter()
         if found := trackers(trainer.loggers):
-            views = pl_module.scene.capture(pl_module.capture).test
+            views = pl_module.scene.capture(pl_module.scored_capture).test
             seen = preview(
-                pl_module.model,
-                views,
-                len(views) // 2,
-                pl_module.scene.background,
-                pl_module.device,
+                pl_module.current_model(), views, len(views) // 2, pl_module.scene.background
             )
             for tracker in found:
                 for name, image in seen.items():

@@ -19,8 +19,8 @@ from rich.progress import (
     Progress as Bar,
 )
 
+from devrf.engine.phase import in_words
 from devrf.engine.stage import ScheduledStage
-from devrf.methods.devrf.schedules import DeformationPhase
 
 log = logging.getLogger(__name__)
 
@@ -102,7 +102,9 @@ def describe(trainer: Trainer, stage: ScheduledStage, speed: float) -> str:
     means = trainer.callback_metrics
     error = means.get(f"{stage.capture}/color", means.get(f"{stage.capture}/render"))
     parts = [] if error is None else [f"{-10 * math.log10(max(float(error), 1e-12)):.1f} dB"]
-    parts += [f"{speed:.0f} it/s", "x".join(str(n) for n in stage.resolution)]
-    if isinstance(stage.phase, DeformationPhase):
-        parts.append(stage.phase.in_words)
+    parts.append(f"{speed:.0f} it/s")
+    if stage.resolution:
+        parts.append("x".join(str(n) for n in stage.resolution))
+    if stage.phase is not None and stage.phase.frames:
+        parts.append(in_words(stage.phase.frames))
     return "  ".join(parts)

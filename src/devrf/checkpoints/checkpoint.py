@@ -1,27 +1,33 @@
-"""Checkpoints that know what they are: sealed, and read without running code."""
+"""Checkpoints that say what they are, checksummed, and read without running code."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import importlib
+import sys
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from lightning import Trainer
 from lightning.fabric.plugins import CheckpointIO
+from torch import nn
 
 from devrf.checkpoints.checkpoint_file import read_checkpoint_file, write_checkpoint_file
 from devrf.errors import DevrfError
-from devrf.geometry.box import Box
-from devrf.geometry.clock import FrameClock
-from devrf.geometry.ndc import NormalizedDevice
-from devrf.geometry.space import WORLD, Space
-from devrf.methods.devrf.architecture import Architecture
-from devrf.methods.devrf.compact_state import expanded_state
-from devrf.methods.devrf.deformation_field import DeformationField
-from devrf.methods.devrf.model import SceneModel
-from devrf.methods.devrf.volume_rendering import RenderSettings
-from devrf.rendering.occupancy import Occupancy
 from devrf.scenes.scene import Scene
+
+# The stage's attribute that holds the model: what its entries of a state begin with.
+MODEL = "scene_model."
+
+
+class StoredModel(Protocol):
+    """What a model's class offers: a :class:`~devrf.methods.base.DynamicModel`."""
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> Any:
+        """A model that takes the state of the one that was described."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -31,23 +37,27 @@ class CheckpointMetadata:
     Attributes:
         scene: the scene's name.
         fingerprint: the scene's cameras, times and image sizes, hashed.
-        architecture: sizes of the canonical field.
-        settings: how rays are sampled.
-        space: the space that the fields live in.
+        stage: the stage that wrote it.
+        model: the model's class (``_target_``) and its config.
+        protocol: which data trained which part; None outside a composed run.
         records: what training took, by stage.
-        training_config: the settings that decided what was learned, by config key; empty where
-            nobody told (a stage that was not trained from a config).
+        training_config: the settings that decided what was learned, by config key; empty for a
+            stage that was not trained from a config.
         complete: whether the stage's schedule has come to its end.
     """
 
     scene: str
     fingerprint: str
-    architecture: Architecture
-    settings: RenderSettings
-    space: Space = WORLD
+    stage: str
+    model: dict[str, Any]
+    protocol: str | None = None
     records: dict[str, dict[str, float | None]] = field(default_factory=dict)
     training_config: dict[str, Any] = field(default_factory=dict)
     complete: bool = True
+
+    def as_data(self) -> dict[str, Any]:
+        """Plain data, for a checkpoint."""
+        return asdict(self)
 
 
 @dataclass(frozen=True)
@@ -56,15 +66,15 @@ class LoadedCheckpoint:
 
     Attributes:
         metadata: which scene, and how it was learned.
-        model: the scene, ready to render.
+        model: the scene, ready to render: a :class:`~devrf.methods.base.DynamicModel`.
     """
 
     metadata: CheckpointMetadata
-    model: SceneModel
+    model: Any
 
 
 class ChecksummedCheckpointIO(CheckpointIO):
-    """How Lightning writes and reads checkpoints here: sealed files."""
+    """How Lightning writes and reads checkpoints here."""
 
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None
@@ -75,7 +85,7 @@ class ChecksummedCheckpointIO(CheckpointIO):
     def load_checkpoint(
         self, path: str | Path, map_location: Any = None, weights_only: bool | None = None
     ) -> dict[str, Any]:
-        """Read a sealed file onto the host; whatever the other arguments ask, no code is run."""
+        """Read a checkpoint onto the host; whatever the other arguments ask, no code is run."""
         return read_checkpoint_file(Path(path))
 
     def remove_checkpoint(self, path: str | Path) -> None:
@@ -106,7 +116,7 @@ def load_checkpoint(path: Path, scene: Scene | None = None) -> LoadedCheckpoint:
     """Read a learned scene, on the host.
 
     Args:
-        path: a checkpoint of either stage.
+        path: a checkpoint of any stage.
         scene: the scene it must belong to; None takes any.
 
     Raises:
@@ -146,41 +156,34 @@ def metadata_in(path: Path, data: dict[str, Any]) -> CheckpointMetadata:
     """
     if not isinstance(data, dict) or not isinstance(data.get("devrf"), dict):
         raise DevrfError(f"{path}: not a devrf checkpoint; set ckpt to one that devrf wrote")
-    stored = data["devrf"]
     try:
-        return CheckpointMetadata(
-            scene=stored["scene"],
-            fingerprint=stored["fingerprint"],
-            architecture=Architecture(**stored["architecture"]),
-            settings=RenderSettings(**stored["settings"]),
-            space=NormalizedDevice(**stored["space"]) if stored["space"] else WORLD,
-            records=stored["records"],
-            training_config=stored["training_config"],
-            complete=stored["complete"],
-        )
-    except (KeyError, TypeError) as error:
+        return CheckpointMetadata(**data["devrf"])
+    except TypeError as error:
         raise DevrfError(
             f"{path}: its description lacks or has an unknown entry ({error}); train again"
         ) from None
 
 
-def _model(path: Path, metadata: CheckpointMetadata, state: dict[str, Any]) -> SceneModel:
-    """Build a model of any size and let the stored state give it its shapes."""
-    box = Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
-    own = {str(k).removeprefix("scene_model."): v for k, v in state.items()}
-    build = metadata.architecture
-    # A stage that was stopped in its search has no decoder yet.
-    searched = not any(key.startswith("canonical.decoder.") for key in own)
-    model = SceneModel(
-        build.search_field(box, 8) if searched else build.radiance_field(box, 8, 8),
-        Occupancy.full((2, 2, 2), box),
-        metadata.settings,
-        space=metadata.space,
-    )
-    if any(key.startswith("deformation.") for key in own):
-        model.deformation = DeformationField(box, FrameClock((0.0, 1.0)), voxels=8)
+def _model(path: Path, metadata: CheckpointMetadata, state: dict[str, Any]) -> nn.Module:
+    """Build the model that the metadata describe, and let the stored state fill it."""
+    own = {str(k).removeprefix(MODEL): v for k, v in state.items() if str(k).startswith(MODEL)}
     try:
-        model.load_state_dict(expanded_state(own))
+        model: nn.Module = _model_class(path, metadata).from_config(metadata.model)
+        model.load_stored_state(own)  # type: ignore[operator]
     except (RuntimeError, KeyError, ValueError, TypeError, AttributeError):
         raise DevrfError(f"{path}: its fields do not fit its description; train again") from None
     return model
+
+
+def _model_class(path: Path, metadata: CheckpointMetadata) -> type[StoredModel]:
+    """The model's class; a file may not choose which other code is run."""
+    module, _, name = str(metadata.model.get("_target_")).rpartition(".")
+    if module.startswith("devrf.methods.") and not module.count(".") > 4:
+        importlib.import_module(module)
+    found = getattr(sys.modules.get(module), name, None)
+    if not (isinstance(found, type) and hasattr(found, "from_config")):
+        raise DevrfError(
+            f"{path}: was learned by {module}.{name}, which is not known here; import the "
+            "module of its method first"
+        )
+    return found

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from devrf.checkpoints.bits import pack_bits, unpack_bits
-from devrf.methods.devrf.voxel_grid import resample
+from devrf.ops.resampling import resample
 
 # Grid points of the detailed grid to one of the thinned-out grid.
 THINNING = 4

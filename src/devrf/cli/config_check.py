@@ -22,6 +22,7 @@ from devrf.errors import DevrfError
 # What the run itself reads, beside the parts.
 ROOT: dict[str, Any] = {
     "stage": str,
+    "method": str,
     "seed": int,
     "resume": bool,
     "memory_check": bool,

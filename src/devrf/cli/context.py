@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import time
-from functools import cached_property
+from collections.abc import Callable
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -19,18 +20,20 @@ from devrf.checkpoints.checkpoint import LoadedCheckpoint, load_checkpoint
 from devrf.checkpoints.checkpoint_file import digest_of
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.ddp import ManualDDP
+from devrf.engine.stage import ScheduledStage
 from devrf.errors import DevrfError
 from devrf.evaluation.suite import Evaluation
+from devrf.methods.protocol import Protocol
 from devrf.scenes.scene import Scene
 
 log = logging.getLogger(__name__)
 
-# What a deformation was learned on, among the settings it was made with: the digest of the run's
-# own canonical field, or of one that was given.
+# What a stage was learned on, among the settings it was made with: the digest of the run's own
+# checkpoint of the stage before, or of one that was given.
 OWN_REST, GIVEN_REST = "checkpoints/canonical.ckpt", "ckpt"
 
-# Stages that no checkpoint is of use to, and that begin a run of their own.
-FROM_NOTHING = ("prepare", "inspect", "canonical", "pipeline", "report")
+# What no checkpoint is of use to, beside stages that begin afresh.
+FROM_NOTHING = {"prepare", "inspect", "report"}
 
 
 class RunContext:
@@ -40,9 +43,9 @@ class RunContext:
 
     Attributes:
         config: a composed config (``conf/config.yaml``).
-        folder: where the run works: ``checkpoints/canonical.ckpt`` and ``deformation.ckpt``,
-            ``metrics.json``, ``frames.csv``, ``images/`` and ``videos/``, next to the composed
-            config and the log that Hydra writes.
+        folder: where the run works: ``checkpoints/<stage>.ckpt``, ``metrics.json``,
+            ``frames.csv``, ``images/`` and ``videos/``, next to the composed config and the log
+            that Hydra writes.
     """
 
     def __init__(self, config: DictConfig, folder: Path) -> None:
@@ -72,6 +75,40 @@ class RunContext:
     def scene(self) -> Scene:
         """The scene, read when it is first needed."""
         return self.datamodule.scene
+
+    @cached_property
+    def protocol(self) -> Protocol:
+        """Which data trains which part of the method."""
+        protocol: Protocol = instantiate(self.config.protocol, _convert_="all")
+        return protocol
+
+    @property
+    def learning_stages(self) -> tuple[str, ...]:
+        """The protocol's stages, in their order."""
+        return tuple(step.name for step in self.protocol.steps)
+
+    def stage_key(self, name: str) -> str:
+        """The key of the config that describes a stage: its own, or that of any ray stage."""
+        return name if name in self.config else "ray_stage"
+
+    def stage_builder(self, name: str) -> Callable[..., ScheduledStage]:
+        """What builds a stage, given ``rest`` if it builds on another.
+
+        Raises:
+            DevrfError: the method has no such stage.
+        """
+        key = self.stage_key(name)
+        if key not in self.config:
+            raise DevrfError(
+                f"protocol: method={self.config.method} does not learn by "
+                f"protocol={self.protocol.name}; it has no stage {name!r}"
+            )
+        build: Callable[..., ScheduledStage] = instantiate(
+            self.config[key], _partial_=True, _convert_="all"
+        )
+        if key == name:
+            return build
+        return partial(build, step=self.protocol[name], static_share=self.protocol.static_share)
 
     @cached_property
     def logger(self) -> Any:
@@ -134,8 +171,11 @@ class RunContext:
         """Where this run keeps what the stage ``name`` learned."""
         return self.folder / "checkpoints" / f"{name}.ckpt"
 
-    def checkpoint(self, *names: str) -> Path:
-        """The checkpoint that was asked for, else the first of ``names`` that the run has.
+    def checkpoint(self, name: str | None = None) -> Path:
+        """The checkpoint that was asked for, else the run's own.
+
+        Args:
+            name: of a stage; None: the last stage of the protocol that has one.
 
         Raises:
             DevrfError: there is none.
@@ -144,6 +184,7 @@ class RunContext:
             if not Path(self.config.ckpt).is_file():
                 raise DevrfError(f"{self.config.ckpt}: no such checkpoint; set ckpt to a file")
             return Path(self.config.ckpt)
+        names = self.learning_stages[::-1] if name is None else (name,)
         found = [path for path in map(self.own_checkpoint, names) if path.exists()]
         if not found:
             raise DevrfError(
@@ -152,16 +193,18 @@ class RunContext:
             )
         return found[0]
 
-    def load(self, *names: str) -> LoadedCheckpoint:
-        """What a stage learned of this run's scene; ``names`` as for :meth:`checkpoint`.
+    def load(self, name: str | None = None) -> LoadedCheckpoint:
+        """What a stage learned of this run's scene; ``name`` as for :meth:`checkpoint`.
 
-        A deformation of another canonical field than the run's is passed over.
+        What was learned on top of another checkpoint than the run's is passed over.
         """
-        path = self.checkpoint(*names)
-        stored = load_checkpoint(path, self.scene)
-        own = self.own_checkpoint("canonical")
-        rest = stored.metadata.training_config.get(OWN_REST)
-        if self.config.ckpt is None and rest and own.is_file() and digest_of(own) != rest:
-            log.info("%s: left out, it belongs to another canonical field than the run's", path)
-            return load_checkpoint(own, self.scene)
-        return stored
+        path = self.checkpoint(name)
+        loaded = load_checkpoint(path, self.scene)
+        if self.config.ckpt is None and loaded.metadata.stage in self.learning_stages:
+            below = self.protocol[loaded.metadata.stage].builds_on
+            rest = loaded.metadata.training_config.get(OWN_REST)
+            own = None if below is None else self.own_checkpoint(below)
+            if rest and own is not None and own.is_file() and digest_of(own) != rest:
+                log.info("%s: left out, it belongs to another %s than the run's", path, below)
+                return load_checkpoint(own, self.scene)
+        return loaded

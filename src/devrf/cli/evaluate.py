@@ -15,12 +15,12 @@ from devrf.artifacts.records import (
     provenance,
     write_frames,
 )
-from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.cli import job
 from devrf.cli.context import RunContext
 from devrf.evaluation.held_out import HeldOutView, score
 from devrf.evaluation.suite import MetricSuite
-from devrf.methods.devrf.renderer import Renderer
+from devrf.methods.base import DynamicModel
+from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import CaptureName
 from devrf.system.files import write_json
 
@@ -32,31 +32,40 @@ TRAINING = ("seconds", "iterations", "iterations_per_second", "peak_gpu_gb", "nu
 
 def evaluate(run: RunContext) -> None:
     """Score what was learned on held-out views; write metrics and contact sheets."""
-    stored = run.load("deformation", "canonical")
-    records = stored.metadata.records
-    judge = run.evaluation.judge(run.device)
-    rest = _score(run, stored, "static", judge)
-    frames = {"static": rest}
+    loaded = run.load()
+    model, records = loaded.model.to(run.device), loaded.metadata.records
+    suite = run.evaluation.suite(run.device)
+    frames: dict[str, list[HeldOutView]] = {"static": _score(run, model, "static", suite)}
+    by_capture = {step.capture: step.name for step in run.protocol.steps}
+    learned = by_capture.get("static", loaded.metadata.stage)
     sections: dict[str, Any] = {
-        "scene": run.scene.name,
-        "canonical": {**mean_scores(rest), **_training(records, "canonical")},
+        "static": {**mean_scores(frames["static"]), **_training(records, learned)}
     }
-    if stored.model.deformation is not None:
-        moving = frames["dynamic"] = _score(run, stored, "dynamic", judge)
-        checkpoint = run.checkpoint("deformation")
-        sections["deformation"] = {
-            **mean_scores(moving),
-            "rest_pose_psnr": round(mean(v.rest_pose_psnr for v in moving), 4),
-            **_training(records, "deformation"),
+    if model.moves:
+        frames["dynamic"] = _score(run, model, "dynamic", suite)
+        checkpoint = run.checkpoint(loaded.metadata.stage)
+        sections["dynamic"] = {
+            **mean_scores(frames["dynamic"]),
+            "rest_pose_psnr": round(mean(v.rest_pose_psnr for v in frames["dynamic"]), 4),
+            **_training(records, loaded.metadata.stage),
             "checkpoint_mb": round(checkpoint.stat().st_size / 1e6, 3),
         }
+    if learned != loaded.metadata.stage or not model.moves:
+        # By the names of the two stages, too.
+        sections[learned] = sections["static"]
+        if model.moves:
+            sections[loaded.metadata.stage] = sections["dynamic"]
     write_frames(run.folder / "frames.csv", frames)
-    ran = {**provenance(stored.model, run.device), **_origin(run, records)}
-    write_json(run.folder / "metrics.json", {**sections, "run": ran})
-    scores = {name: values for name, values in sections.items() if isinstance(values, dict)}
-    for name, values in scores.items():
-        log.info("%s: %s", name, in_words(values))
-    _track(run, scores, frames)
+    ran = {**provenance(model.size, run.device), **_origin(run, records)}
+    head = {
+        "scene": run.scene.name,
+        "method": model.name,
+        "protocol": loaded.metadata.protocol or run.protocol.name,
+    }
+    write_json(run.folder / "metrics.json", {**head, **sections, "run": ran})
+    for name in frames:
+        log.info("%s: %s", name, in_words(sections[name]))
+    _track(run, sections, frames)
 
 
 def _track(
@@ -93,7 +102,7 @@ def _origin(run: RunContext, records: Records) -> dict[str, Any]:
     """
     scene = run.scene
     frames = scene.clock.frames_of(scene.dynamic.train.times)
-    learned = {k: records.get(k, {}).get("wall_seconds") for k in ("canonical", "deformation")}
+    learned = {k: records.get(k, {}).get("wall_seconds") for k in run.learning_stages}
     return {
         "choices": job.choices(),
         "overrides": job.overrides(),
@@ -106,13 +115,13 @@ def _origin(run: RunContext, records: Records) -> dict[str, Any]:
 
 
 def _score(
-    run: RunContext, stored: LoadedCheckpoint, capture: CaptureName, judge: MetricSuite
+    run: RunContext, model: DynamicModel, capture: CaptureName, suite: MetricSuite
 ) -> list[HeldOutView]:
-    views, model = run.scene.capture(capture).test, stored.model.to(run.device)
-    if capture == "static":
-        model = model.at_rest()
-    player = Renderer(model)
-    scored = [score(player, views, k, run.scene.background, judge) for k in range(len(views))]
+    """Score a capture's held-out views; the static ones show the rest state at any time."""
+    views, background = run.scene.capture(capture).test, run.scene.background
+    time = 0.0 if capture == "static" else None
+    renderer = Renderer(model)
+    scored = [score(renderer, views, k, background, suite, time=time) for k in range(len(views))]
     sheet = write_contact_sheet(run.folder / "images" / f"{capture}.png", scored)
     for tracker in run.trackers:
         tracker.show_image(f"held_out/{capture}", sheet)

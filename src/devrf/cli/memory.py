@@ -16,8 +16,9 @@ from devrf.engine.micro_batching import MicroBatching
 from devrf.geometry.box import Box
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField
+from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.color_decoder import ColorDecoder
-from devrf.methods.devrf.schedules import CanonicalSchedule, DeformationSchedule
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.settings import MotionSettings
 from devrf.scenes.scene import Scene, Views
 
@@ -171,7 +172,7 @@ def estimate(
     grids, decoder = _grid_bytes(field), tensor_bytes(field.decoder)
     points, moving = field.density.values.numel(), _all_frames(scene)
     displacements = displacement_bytes(scene, field.box, deformation.sides[-1])
-    together = deformation.beside(len(deformation.sides) - 1, len(scene.clock))
+    together = deformation.max_parallel_frames(len(deformation.sides) - 1, len(scene.clock))
     rest = grids + decoder + points
     fields = {
         "density and features": grids,
@@ -301,7 +302,7 @@ def _level_memory(
         displacements, growth = displacements // 2, growth // 2
     rested = {} if on_host else {_all_frames(scene): displacements}
     channels, width = field.color.values.shape[-1], _width(field)
-    together = schedule.beside(level, frames)
+    together = schedule.max_parallel_frames(level, frames)
     visited = "one frame" if together == 1 else f"{together} frames side by side"
     return StageMemory(
         held={

@@ -10,22 +10,24 @@ from devrf.errors import DevrfError
 
 OF_BOTH = ("psnr", "ssim", *TRAINING)
 OF_MOTION = ("rest_pose_psnr", "checkpoint_mb")
+# Names of the two sections of metrics.json; of DeVRF also those of its stages.
+STATIC, DYNAMIC = ("static", "canonical"), ("dynamic", "deformation")
 
 
 def check_objective(key: str, metrics: Sequence[str]) -> None:
     """See that metrics.json will have ``key``.
 
     Args:
-        key: ``SECTION.NAME``, such as ``deformation.psnr``.
+        key: ``SECTION.NAME``, such as ``dynamic.psnr``.
         metrics: what is measured beside PSNR and SSIM (``evaluation.metrics``).
 
     Raises:
         DevrfError: it will not.
     """
     section, _, name = key.partition(".")
-    if section not in ("canonical", "deformation"):
-        raise DevrfError(f"objective: expected canonical.NAME or deformation.NAME, not {key!r}")
-    known = [*OF_BOTH, *metrics, *(OF_MOTION if section == "deformation" else ())]
+    if section not in (*STATIC, *DYNAMIC):
+        raise DevrfError(f"objective: expected static.NAME or dynamic.NAME, not {key!r}")
+    known = [*OF_BOTH, *metrics, *(OF_MOTION if section in DYNAMIC else ())]
     if name not in known:
         raise DevrfError(f"objective: {section} has no {name!r}; choose from {', '.join(known)}")
 
@@ -33,8 +35,9 @@ def check_objective(key: str, metrics: Sequence[str]) -> None:
 def objective(key: str, found: Mapping[str, Any]) -> float | None:
     """The number ``key`` of metrics.json; None where it could not be measured.
 
-    Of the canonical section where nothing has learned to move.
+    Of the static section where nothing has learned to move.
     """
     section, _, name = key.partition(".")
-    value: float | None = found.get(section, found["canonical"]).get(name)
+    section = "static" if section in STATIC else "dynamic"
+    value: float | None = found.get(section, found["static"]).get(name)
     return value

@@ -12,26 +12,26 @@ from devrf.artifacts.images import write_image
 from devrf.artifacts.still import StillSettings, still
 from devrf.cli.context import RunContext
 from devrf.evaluation.held_out import background_value
-from devrf.methods.devrf.renderer import Renderer
+from devrf.rendering.renderer import Renderer
 
 log = logging.getLogger(__name__)
 
 
 def render(run: RunContext) -> None:
     """Film the held-out view over time, and an orbit (or a spiral) while time runs."""
-    stored, scene = run.load("deformation", "canonical"), run.scene
+    stored, scene = run.load(), run.scene
     film: FilmSettings = instantiate(run.config.video)
-    player = Renderer(stored.model.to(run.device), half=film.half)
+    renderer = Renderer(stored.model.to(run.device), half=film.half)
     held_out = film.sized(scene.dynamic.test.cameras[[0] * film.frames])
     captured = film.sized(scene.static.train.cameras)
     paths = {"held_out": held_out}
     if scene.kind == "forward":
-        paths["spiral"] = spiral(captured, focus_distance(player, captured), film)
+        paths["spiral"] = spiral(captured, focus_distance(renderer, captured), film)
     else:
-        paths["orbit"] = orbit(captured, player.model.canonical.box, film)
+        paths["orbit"] = orbit(captured, renderer.model.box, film)
     for name, cameras in paths.items():
         path = run.folder / "videos" / f"{name}.mp4"
-        shown = pictures(player, cameras, background_value(scene.background))
+        shown = pictures(renderer, cameras, background_value(scene.background))
         write_video(path, shown, film.fps, least=WATCHABLE if film.height is None else SMALLEST)
         log.info("video written to %s", path)
         for tracker in run.trackers:
@@ -41,9 +41,9 @@ def render(run: RunContext) -> None:
 def picture(run: RunContext) -> None:
     """Picture the scene once, from one camera at one time."""
     settings: StillSettings = instantiate(run.config.still)
-    stored, camera = run.load("deformation", "canonical"), settings.camera(run.scene)
-    player = Renderer(stored.model.to(run.device), half=settings.half)
-    color, depth = still(player, camera, settings.time, background_value(run.scene.background))
+    stored, camera = run.load(), settings.camera(run.scene)
+    renderer = Renderer(stored.model.to(run.device), half=settings.half)
+    color, depth = still(renderer, camera, settings.time, background_value(run.scene.background))
     for name, image in (("still", color), ("still_depth", depth)):
         path = run.folder / "images" / f"{name}.png"
         write_image(path, image)

@@ -61,11 +61,12 @@ def deciding_settings(config: DictConfig, stage: str) -> dict[str, Any]:
 
     Args:
         config: a composed config.
-        stage: ``canonical`` or ``deformation``.
+        stage: of the protocol.
     """
-    parts = {key: OmegaConf.to_container(config[key], resolve=False) for key in ("data", stage)}
+    own = (stage,) if stage in config else ("ray_stage", "protocol")
+    parts = {key: OmegaConf.to_container(config[key], resolve=False) for key in ("data", *own)}
     found = dict(_values(config, parts, ""))
-    found["seed"] = config.seed
+    found.update(method=config.method, seed=config.seed)
     return {key: found[key] for key in sorted(found)}
 
 
@@ -99,8 +100,9 @@ def beginning(run: RunContext, stage: str) -> ResumePoint:
             checkpoint that is damaged.
     """
     training_config = deciding_settings(run.config, stage)
-    if stage == "deformation":
-        rest = run.checkpoint("canonical")
+    below = run.protocol[stage].builds_on
+    if below is not None:
+        rest = run.checkpoint(below)
         training_config[OWN_REST if run.config.ckpt is None else GIVEN_REST] = digest_of(rest)
     path = run.own_checkpoint(stage)
     if path.is_file():

@@ -6,6 +6,8 @@ import json
 import logging
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from hydra.utils import instantiate
@@ -13,7 +15,6 @@ from lightning import seed_everything
 from omegaconf import DictConfig
 
 from devrf.cli import job
-from devrf.cli.benchmark import benchmark
 from devrf.cli.context import FROM_NOTHING, RunContext
 from devrf.cli.evaluate import evaluate
 from devrf.cli.inspect_scene import inspect, prepare
@@ -22,8 +23,8 @@ from devrf.cli.preflight import preflight, shortage_in_words
 from devrf.cli.render import picture, render
 from devrf.cli.report import report
 from devrf.cli.resume import archive_previous
-from devrf.cli.train import canonical, deformation
-from devrf.cli.workers import together
+from devrf.cli.train import learn
+from devrf.cli.workers import launch_workers
 from devrf.errors import DevrfError
 from devrf.methods.devrf.motion_losses import MOTION_TERMS
 from devrf.methods.weighted_loss import WeightedLoss
@@ -31,23 +32,19 @@ from devrf.ops.choice import using
 
 log = logging.getLogger(__name__)
 
-STEPS: dict[str, tuple[Callable[[RunContext], None], ...]] = {
-    "prepare": (prepare,),
-    "inspect": (inspect,),
-    "canonical": (canonical,),
-    "deformation": (deformation,),
-    "evaluate": (evaluate,),
-    "render": (render,),
-    "still": (picture,),
-    "pipeline": (canonical, deformation, evaluate, render),
-    "benchmark": (benchmark,),
-    "report": (report,),
-}
+Step = Callable[[RunContext], None]
 
-# Steps that several processes take together; what follows them is for one.
-LEARNING = (canonical, deformation)
-# Stages that look at runs, not at a scene.
-OF_NO_SCENE = ("report",)
+# What learns nothing, by the name of its stage; the protocol's stages come beside these.
+STEPS: dict[str, Step] = {
+    "prepare": prepare,
+    "inspect": inspect,
+    "evaluate": evaluate,
+    "render": render,
+    "still": picture,
+    "report": report,
+}
+PIPELINE = ("evaluate", "render")
+MOVED = {"benchmark": "run python benchmarks/training.py instead"}
 
 # What Lightning says of every run (accelerators it looked for, tips, how many workers a loader
 # might have) is of no use to someone who watches a scene being learned.
@@ -60,6 +57,37 @@ for _words in (
     "Experiment logs directory",
 ):
     warnings.filterwarnings("ignore", message=f".*{_words}.*")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What ``stage=…`` asks for.
+
+    Attributes:
+        learning: stages of the protocol, which several processes may learn together.
+        further: steps of one process after them, by name.
+    """
+
+    learning: tuple[str, ...]
+    further: tuple[str, ...]
+
+
+def plan(stage: str, protocol: Sequence[str]) -> Plan:
+    """What a stage asks for under a protocol of some stages.
+
+    Raises:
+        DevrfError: there is no such stage.
+    """
+    if stage == "pipeline":
+        return Plan(tuple(protocol), PIPELINE)
+    if stage in protocol:
+        return Plan((stage,), ())
+    if stage in STEPS:
+        return Plan((), (stage,))
+    if stage in MOVED:
+        raise DevrfError(f"stage={stage}: moved; {MOVED[stage]}")
+    known = ", ".join(["pipeline", *protocol, *STEPS])
+    raise DevrfError(f"stage: expected one of {known}, not {stage!r}")
 
 
 def run_stage(config: DictConfig, folder: Path) -> float | None:
@@ -75,80 +103,83 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
     Raises:
         DevrfError: an unknown stage, or whatever is wrong with the input.
     """
-    stage = config.stage
-    if stage not in STEPS:
-        raise DevrfError(f"stage: expected one of {', '.join(STEPS)}, not {stage!r}")
     run = RunContext(config, folder)
-    _check(run, stage)
-    learns = [step.__name__ for step in STEPS[stage] if step in LEARNING]
+    asked = plan(config.stage, run.learning_stages)
+    _check(run, asked)
     needs = None
-    if learns and config.memory_check and run.leads:
-        further = {evaluate, render} & set(STEPS[stage])
-        needs = preflight(run, learns, scores=bool(further), films=render in further)
-    if not config.resume and not {canonical, deformation}.isdisjoint(STEPS[stage]):
-        needed = () if canonical in STEPS[stage] else (run.own_checkpoint("canonical"),)
-        archive_previous(folder, *needed)
+    if asked.learning and config.memory_check and run.leads:
+        scores = not set(PIPELINE).isdisjoint(asked.further)
+        needs = preflight(run, asked.learning, scores=scores, films="render" in asked.further)
+    if asked.learning and not config.resume:
+        below = run.protocol[asked.learning[0]].builds_on
+        archive_previous(folder, *([] if below is None else [run.own_checkpoint(below)]))
     if needs is not None:
         log.info("%s", needs)
-    learning = [step for step in STEPS[stage] if step in LEARNING]
-    others = [step for step in STEPS[stage] if step not in LEARNING]
     ended = False
     try:
-        if learning:
-            with together(run, learn):
-                _take(learning, run)
-        if not learning or run.leads:
-            _take(others, run)
+        if asked.learning:
+            with launch_workers(run, learn_all):
+                _learn(run, asked)
+        if not asked.learning or run.leads:
+            for name in asked.further:
+                _take(run, name, STEPS[name])
         ended = True
     finally:
         run.close(failed=not ended)
-    if evaluate not in others or not run.leads:
+    if "evaluate" not in asked.further or not run.leads:
         return None
     return objective(config.objective, json.loads((folder / "metrics.json").read_text()))
 
 
-def learn(config: DictConfig, folder: Path) -> None:
-    """Take the steps of ``stage=…`` that learn, as one of several processes.
+def learn_all(config: DictConfig, folder: Path) -> None:
+    """Learn what ``stage=…`` asks for, as one of several processes.
 
     Args:
         config: a composed config that has been checked.
         folder: the run's folder; rank 0 writes into it.
     """
     run = RunContext(config, folder)
-    with together(run, learn):
-        _take([step for step in STEPS[config.stage] if step in LEARNING], run)
+    with launch_workers(run, learn_all):
+        _learn(run, plan(config.stage, run.learning_stages))
 
 
-def _take(steps: Sequence[Callable[[RunContext], None]], run: RunContext) -> None:
-    for step in steps:
-        seed_everything(run.config.seed, verbose=False)
-        run.begin_step()
-        with using(run.config.kernels), shortage_in_words(step.__name__, run):
-            step(run)
+def _learn(run: RunContext, asked: Plan) -> None:
+    for name in asked.learning:
+        _take(run, name, partial(learn, name=name))
 
 
-def _check(run: RunContext, stage: str) -> None:
+def _take(run: RunContext, name: str, step: Step) -> None:
+    seed_everything(run.config.seed, verbose=False)
+    run.begin_step()
+    with using(run.config.kernels), shortage_in_words(name, run):
+        step(run)
+
+
+def _check(run: RunContext, asked: Plan) -> None:
     """Find what can be found wrong before the first step has cost any time.
 
-    A mistake in the deformation's config would else show when the canonical stage is done.
+    A mistake in the last stage's config would else show when the first is done.
     """
     config = run.config
-    if config.ckpt is not None and stage in FROM_NOTHING:
+    begins = asked.learning and run.protocol[asked.learning[0]].builds_on is None
+    if config.ckpt is not None and (begins or not FROM_NOTHING.isdisjoint(asked.further)):
         raise DevrfError(
-            f"ckpt: stage={stage} starts from nothing; with ckpt=PATH give stage=deformation, "
-            "stage=evaluate, stage=render, stage=still or stage=benchmark"
+            f"ckpt: stage={config.stage} starts from nothing; with ckpt=PATH give a stage that "
+            "builds on another, stage=evaluate, stage=render or stage=still"
         )
-    if stage in OF_NO_SCENE:
+    if "report" in asked.further:
         return
     _ = run.datamodule
-    instantiate(config.canonical, _convert_="all")
-    instantiate(config.deformation, _partial_=True, _convert_="all")
-    weights = {k: v for k, v in config.deformation.loss.items() if k != "tv"}
-    WeightedLoss(MOTION_TERMS, weights)
+    for name in run.learning_stages:
+        run.stage_builder(name)
+    if "deformation" in config:
+        weights = {k: v for k, v in config.deformation.loss.items() if k != "tv"}
+        WeightedLoss(MOTION_TERMS, weights)
     run.evaluation.check()
     check_objective(config.objective, run.evaluation.metrics)
-    if job.in_search() and evaluate not in STEPS[stage]:
-        raise DevrfError(f"stage: a search needs the objective, which stage={stage} does not score")
+    if job.in_search() and "evaluate" not in asked.further:
+        raise DevrfError(
+            f"stage: a search needs the objective, which stage={config.stage} does not score"
+        )
     instantiate(config.video)
     instantiate(config.still)
-    instantiate(config.benchmark)

@@ -1,4 +1,4 @@
-"""The steps that learn: ``stage=canonical`` and ``stage=deformation``."""
+"""The steps that learn: the stages of the run's protocol."""
 
 from __future__ import annotations
 
@@ -25,25 +25,24 @@ from devrf.system.signals import Interrupted
 log = logging.getLogger(__name__)
 
 
-def canonical(run: RunContext) -> None:
-    """Learn the scene at rest, or what is left to learn of it."""
-    begin = _begin(run, "canonical")
-    if not begin.finished:
-        _fit(run, instantiate(run.config.canonical, _convert_="all"), begin)
-
-
-def deformation(run: RunContext) -> None:
-    """Learn how the scene moves, on top of a canonical checkpoint, or what is left of that."""
-    begin = _begin(run, "deformation")
+def learn(run: RunContext, name: str) -> None:
+    """Learn a stage of the run's protocol, or what is left of it."""
+    begin = _begin(run, name)
     if begin.finished:
         return
-    rest = run.load("canonical")
-    if rest.model.deformation is not None:
-        raise DevrfError(
-            "ckpt: stage=deformation needs a canonical checkpoint, not a deformation's"
-        )
-    build = instantiate(run.config.deformation, _partial_=True, _convert_="all")
-    _fit(run, build(rest=rest), begin)
+    build, below = run.stage_builder(name), run.protocol[name].builds_on
+    if below is None:
+        stage = build()
+    else:
+        rest = run.load(below)
+        if rest.metadata.stage != below:
+            raise DevrfError(
+                f"ckpt: stage={name} needs a checkpoint of the {below} stage, not of the "
+                f"{rest.metadata.stage} stage"
+            )
+        stage = build(rest=rest)
+    stage.protocol = run.protocol.name
+    _fit(run, stage, begin)
 
 
 def _begin(run: RunContext, stage: str) -> ResumePoint:

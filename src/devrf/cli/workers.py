@@ -41,7 +41,7 @@ GRACE = 10.0
 
 
 @contextmanager
-def together(run: RunContext, work: Work) -> Iterator[None]:
+def launch_workers(run: RunContext, work: Work) -> Iterator[None]:
     """While the block lasts, all processes that ``trainer`` asks for are there.
 
     Rank 0 reads the scene first: what is wrong with it is said once, and optical flow that it

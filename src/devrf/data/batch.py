@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -55,9 +56,11 @@ class RayBatch:
         color: (R, 3) RGB in [0, 1], composited on ``background``.
         alpha: (R,) matte in [0, 1], or None for images without one.
         background: (3,) or (R, 3) RGB behind the matte.
+        time: (R,) the time of each ray in [0, 1].
+        frame: (R,) int64, the frame of the scene's clock that is nearest to that time.
         image: (R,) int64, the image of each ray among the views it was drawn from.
         pixel: (R, 2) x, y of the pixels' centres.
-        flow: (R, 2) pixels, backward optical flow, or None.
+        flow: (R, 2) pixels, backward optical flow, 0 where it is not valid; or None.
         flow_valid: (R,) bool, or None.
     """
 
@@ -65,6 +68,8 @@ class RayBatch:
     color: Tensor
     alpha: Tensor | None
     background: Tensor
+    time: Tensor
+    frame: Tensor
     image: Tensor
     pixel: Tensor
     flow: Tensor | None
@@ -95,6 +100,7 @@ def gather_batch(
     Returns:
         Rays in the fields' space with the truth at their pixels.
     """
+    assert views.frames is not None, "views of a scene know their frames"
     pixel = pixel_positions(flat, views.width)
     row = image * (views.height * views.width) + flat
     value = views.pixels.flatten(0, 2)[row].float() / 255
@@ -104,13 +110,16 @@ def gather_batch(
         color = background + alpha[:, None] * (color - background)
     flow = flow_valid = None
     if views.flow is not None:
-        flow = views.flow.vectors.flatten(0, 2)[row]
         flow_valid = views.flow.valid.flatten()[row]
+        # What was observed where it is not valid may be anything, NaN included.
+        flow = torch.where(flow_valid[:, None], views.flow.vectors.flatten(0, 2)[row], 0.0)
     return RayBatch(
         rays=space.rays(views.cameras.rays(image, pixel)),
         color=color,
         alpha=alpha,
         background=background,
+        time=views.times[image],
+        frame=views.frames[image],
         image=image,
         pixel=pixel,
         flow=flow,
@@ -130,3 +139,33 @@ def background_color(name: str, rays: int, generator: torch.Generator) -> Tensor
     if name == "random":
         return torch.rand(rays, 3, device=device, generator=generator)
     return torch.full((3,), 0.0 if name == "black" else 1.0, device=device)
+
+
+def concatenated(batches: Sequence[RayBatch]) -> RayBatch:
+    """Batches of images without optical flow as one, one after another.
+
+    Images that have no matte count as opaque beside images that have one.
+    """
+    alphas = [one.alpha for one in batches]
+    alpha = None
+    if any(a is not None for a in alphas):
+        alpha = torch.cat(
+            [torch.ones_like(b.time) if b.alpha is None else b.alpha for b in batches]
+        )
+    return RayBatch(
+        rays=Rays(
+            *(
+                torch.cat([getattr(one.rays, name) for one in batches])
+                for name in ("origins", "directions", "viewdirs")
+            )
+        ),
+        color=torch.cat([one.color for one in batches]),
+        alpha=alpha,
+        background=torch.cat([one.background.expand(len(one.rays), 3) for one in batches]),
+        time=torch.cat([one.time for one in batches]),
+        frame=torch.cat([one.frame for one in batches]),
+        image=torch.cat([one.image for one in batches]),
+        pixel=torch.cat([one.pixel for one in batches]),
+        flow=None,
+        flow_valid=None,
+    )

@@ -17,15 +17,15 @@ class SceneDataModule(LightningDataModule, ABC):
     """Serves a scene to the stages.
 
     A training batch is the whole set of training views of the capture that the stage asks for
-    (its attribute ``capture``: ``static`` or ``dynamic``), moved to the device once. The stage
-    draws its rays from it on the device, under its own schedule: no pixel crosses from the host
-    during training. A test batch is the position of one held-out image.
+    (its attribute ``capture``: ``static``, ``dynamic`` or ``both``), moved to the device once. The
+    stage draws its rays from it on the device, under its own schedule: no pixel crosses from the
+    host during training. A test batch is the position of one held-out image.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self._scene: Scene | None = None
-        self._on_device: tuple[CaptureName, torch.device, Views] | None = None
+        self._on_device: dict[tuple[CaptureName, torch.device], Views] = {}
 
     @abstractmethod
     def load(self) -> Scene:
@@ -52,25 +52,37 @@ class SceneDataModule(LightningDataModule, ABC):
 
     def test_dataloader(self) -> DataLoader[Any]:
         """A loader of the positions of the held-out images, one at a time."""
-        return DataLoader(_Positions(len(self.scene.capture(self._capture).test)), batch_size=None)
+        held_out = self.scene.capture(self._captures[-1]).test
+        return DataLoader(_Positions(len(held_out)), batch_size=None)
 
     def transfer_batch_to_device(
         self, batch: Any, device: torch.device, dataloader_idx: int
     ) -> Any:
-        """The training views on ``device``; the positions of a test batch pass through."""
-        return self.training_views(self._capture, device) if batch is None else batch
+        """The training views on ``device``; the positions of a test batch pass through.
+
+        Returns:
+            :class:`Views`, or a tuple of those of both captures, the static first.
+        """
+        if batch is not None:
+            return batch
+        views = tuple(self.training_views(capture, device) for capture in self._captures)
+        return views if len(views) > 1 else views[0]
 
     def training_views(self, capture: CaptureName, device: torch.device) -> Views:
         """The training views of ``capture`` on ``device``, moved there at the first call."""
-        if self._on_device is None or self._on_device[:2] != (capture, device):
-            self._on_device = (capture, device, self.scene.capture(capture).train.to(device))
-        return self._on_device[2]
+        key = (capture, device)
+        if key not in self._on_device:
+            kept = set(self._captures) if self.trainer is not None else {capture}
+            self._on_device = {k: v for k, v in self._on_device.items() if k[0] in kept}
+            self._on_device[key] = self.scene.capture(capture).train.to(device)
+        return self._on_device[key]
 
     @property
-    def _capture(self) -> CaptureName:
+    def _captures(self) -> tuple[CaptureName, ...]:
+        """What the trainer's stage learns from."""
         assert self.trainer is not None
-        capture: CaptureName = self.trainer.lightning_module.capture  # type: ignore[assignment]
-        return capture
+        capture = self.trainer.lightning_module.capture
+        return ("static", "dynamic") if capture == "both" else (capture,)  # type: ignore[return-value]
 
 
 class _Endless(IterableDataset[None]):

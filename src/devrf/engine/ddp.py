@@ -74,7 +74,7 @@ def _together() -> bool:
     return distributed.is_available() and distributed.is_initialized()
 
 
-def share(rays: int) -> int:
+def rays_per_rank(rays: int) -> int:
     """The rays of a batch that each process draws: rounded up, so that all draw as many."""
     return -(-rays // world_size())
 

@@ -11,36 +11,35 @@ from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
 
 from devrf.data.batch import Pixels
-from devrf.engine.ddp import average_gradients, share, world_size
+from devrf.engine.ddp import average_gradients, rays_per_rank, world_size
 from devrf.engine.graphs import Capturer, CudaGraphCapture, GraphedStep, Graphs
+from devrf.engine.metric_accumulator import MetricAccumulator
 from devrf.engine.micro_batching import MicroBatching
-from devrf.engine.parallel_batch import MetricAccumulator, ParallelBatch
+from devrf.engine.parallel_batch import ParallelBatch
 from devrf.engine.streams import StreamParallel
 from devrf.ops.adam import GridAdam
-from devrf.ops.choice import triton_runs
 from devrf.rendering.sample_capacity import SampleCapacity
-from devrf.scenes.scene import Views
 from devrf.system.out_of_memory import OutOfMemoryError
 from devrf.system.profiling import measured, span
 from devrf.system.speed import wait
 
 
 class Learner(Protocol):
-    """What is learned."""
+    """What is learned: a stage."""
 
     @property
     def optimizer(self) -> GridAdam:
-        """What steps on the parameters of all lanes."""
+        """What steps on the parameters of all batches."""
         ...
 
-    def draw(self, lane: ParallelBatch) -> Pixels:
-        """The pixels of a lane's coming iteration."""
+    def draw(self, batch: ParallelBatch) -> Pixels:
+        """The pixels of a batch's coming iteration."""
         ...
 
     def loss(
-        self, lane: ParallelBatch, views: Views, pixels: Pixels
+        self, batch: ParallelBatch, views: Any, pixels: Pixels
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """The weighted loss of a lane's pixels of ``views``, and its terms by name."""
+        """The weighted loss of a batch's pixels of ``views``, and its terms by name."""
         ...
 
     def manual_backward(self, loss: Tensor) -> Any:
@@ -51,142 +50,147 @@ class Learner(Protocol):
 class Loop:
     """Iterations, one after another: each one optimiser step on one batch, or on several.
 
-    Several batches that have nothing to do with one another (``lanes``) are learned from side by
-    side. Where memory is short a batch is taken in parts. Where Triton runs, iterations are
-    steady: lists of samples have a fixed length (``rooms``), gradients, moments and whatever else
-    goes from one iteration to the next stay in the same memory, and nothing waits for the device.
-    On one GPU each is then a CUDA graph that is replayed.
+    Several independent batches are learned from in parallel. Where memory is short a batch is
+    divided into micro-batches. Where shapes are static, the lists of samples have a fixed length
+    (their ``capacity``); gradients, moments and whatever else goes from one iteration to the next
+    stay in the same memory, and nothing waits for the device. On one GPU each iteration is then a
+    CUDA graph that is replayed.
 
     Attributes:
-        graphs: whether steady iterations are captured in a CUDA graph where that is possible.
-        lanes: the batches of an iteration; none before :meth:`renew`.
-        parts: how batches are divided when memory runs out.
-        sums: of losses and their terms, over the iterations since they were last taken.
+        graphs: whether static-shape iterations are captured in a CUDA graph where possible.
+        batches: the batches of an iteration; none before :meth:`bind`.
+        micro_batching: how batches are divided when memory runs out.
+        metrics: losses and their terms, over the iterations since they were last taken.
     """
 
     def __init__(self, graphs: Graphs = "auto") -> None:
         self.graphs = graphs
-        self.lanes: list[ParallelBatch] = []
-        self.parts = MicroBatching()
-        self.sums = MetricAccumulator()
+        self.batches: list[ParallelBatch] = []
+        self.micro_batching = MicroBatching()
+        self.metrics = MetricAccumulator()
         self._rays = 0
         self._device = torch.device("cpu")
-        self._side_by_side = StreamParallel()
-        self._repeated: GraphedStep | None = None
+        self._streams = StreamParallel()
+        self._graphed: GraphedStep | None = None
 
     @property
-    def rooms(self) -> list[SampleCapacity]:
-        """How long each lane's lists of samples are; none unless iterations are steady."""
-        return [lane.room for lane in self.lanes if lane.room is not None]
+    def capacities(self) -> list[SampleCapacity]:
+        """How long each batch's lists of samples are; none unless shapes are static."""
+        return [batch.capacity for batch in self.batches if batch.capacity is not None]
 
-    def renew(
-        self, rays: int, lanes: Sequence[Sequence[Tensor]], density: Tensor, optimizer: GridAdam
+    def bind(
+        self,
+        rays: int,
+        parameters: Sequence[Sequence[Tensor]],
+        optimizer: GridAdam,
+        *,
+        static_shape: bool,
     ) -> None:
         """Get ready for iterations on other tensors than before.
 
         Args:
             rays: of a batch, in all processes together.
-            lanes: what is learned from each of the batches of an iteration.
-            density: the grid that samples are looked up in; it tells whether Triton runs.
+            parameters: what is learned from each of the batches of an iteration.
             optimizer: what steps on them; it has them.
+            static_shape: whether no shape of an iteration may depend on data.
         """
-        self.let_go()
-        self._rays, self._device = rays, density.device
-        self.lanes = [ParallelBatch(number, learned) for number, learned in enumerate(lanes)]
-        if triton_runs(density):
-            self._make_rooms()
+        self.release()
+        self._rays, self._device = rays, parameters[0][0].device
+        self.batches = [ParallelBatch(k, learned) for k, learned in enumerate(parameters)]
+        if static_shape:
+            self._make_capacities()
             optimizer.keep_gradients()
 
-    def let_go(self) -> None:
-        """Let go of what only iterations need: a captured one holds memory of its own."""
-        self.lanes, self.sums, self._repeated = [], MetricAccumulator(), None
+    def release(self) -> None:
+        """Drop what only iterations need: a captured one holds memory of its own."""
+        self.batches, self.metrics, self._graphed = [], MetricAccumulator(), None
 
-    def once(self, learner: Learner, views: Views, optimizer: LightningOptimizer) -> None:
+    def step(self, learner: Learner, views: Any, optimizer: LightningOptimizer) -> None:
         """One iteration.
 
         Args:
             learner: what is learned.
             views: the images of all pixels.
             optimizer: the learner's, as Lightning hands it out: callbacks are asked before it
-                steps, or before the whole iteration if that is steady.
+                steps, or before the whole iteration if its shapes are static.
 
         Raises:
-            OutOfMemoryError: there is no room for the smallest part of a batch; no lane has moved.
+            OutOfMemoryError: there is no room for the smallest micro-batch; nothing was learned.
         """
-        for lane in self.lanes:
-            lane.take(learner.draw(lane))
+        for batch in self.batches:
+            batch.take(learner.draw(batch))
         try:
-            if self.rooms:
-                self._repeat(learner, views, optimizer)
+            if self.capacities:
+                self._static_step(learner, views, optimizer)
             else:
                 optimizer.zero_grad()
-                self._learn(learner, views)
+                self._accumulate(learner, views)
                 with span("optimiser"):
                     optimizer.step()
         except OutOfMemoryError:
-            optimizer.zero_grad()  # of lanes that had room
+            optimizer.zero_grad()  # of batches that had room
             raise
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Fit the lists to what iterations needed, as far as that is known by now."""
-        if any([room.look() for room in self.rooms]):  # a list: all of them look
-            self._repeated = None  # captured with lists of another length
+        if any([capacity.poll() for capacity in self.capacities]):  # a list: all of them are asked
+            self._graphed = None  # captured with lists of another length
 
-    def _make_rooms(self) -> None:
-        rays = -(-share(self._rays) // self.parts.count)
-        for lane in self.lanes:
-            lane.room = SampleCapacity(rays, self._device)
+    def _make_capacities(self) -> None:
+        rays = -(-rays_per_rank(self._rays) // self.micro_batching.count)
+        for batch in self.batches:
+            batch.capacity = SampleCapacity(rays, self._device)
 
-    def _learn(self, learner: Learner, views: Views) -> None:
-        """The gradients of each lane's batch; losses and terms are added to the sums."""
-        pieces = [partial(self._learn_from, lane, learner, views) for lane in self.lanes]
-        found = self._side_by_side(pieces, self._device)
+    def _accumulate(self, learner: Learner, views: Any) -> None:
+        """The gradients of each batch; losses and terms are added to the metrics."""
+        pieces = [partial(self._gradients, batch, learner, views) for batch in self.batches]
+        found = self._streams(pieces, self._device)
         groups = learner.optimizer.param_groups
         average_gradients(p for group in groups for p in group["params"])
-        self.sums.add(found)
+        self.metrics.add(found)
 
-    def _learn_from(self, lane: ParallelBatch, learner: Learner, views: Views) -> dict[str, Tensor]:
-        """The gradients of a lane's batch, its loss and its terms."""
-        assert lane.pixels is not None
+    def _gradients(self, batch: ParallelBatch, learner: Learner, views: Any) -> dict[str, Tensor]:
+        """The gradients of one batch, its loss and its terms."""
+        assert batch.pixels is not None
 
         def backward(total: Tensor) -> None:
             with span("backward"):
                 learner.manual_backward(total)
 
-        total, terms = self.parts.gradients(
-            lambda part: learner.loss(lane, views, part),
-            lane.pixels,
+        total, terms = self.micro_batching.gradients(
+            lambda pixels: learner.loss(batch, views, pixels),
+            batch.pixels,
             backward,
-            lambda: self._divided(lane, learner.optimizer),
+            lambda: self._divided(batch, learner.optimizer),
         )
         return {"loss": total.detach(), **terms}
 
-    def _divided(self, lane: ParallelBatch, optimizer: GridAdam) -> None:
-        """Begin a lane's iteration anew in smaller parts, which are those of all lanes."""
-        wait(self._device)  # other lanes may be at work in their rooms
-        optimizer.drop_gradients(lane.parameters)
-        if self.rooms:
-            self._make_rooms()
-            self._repeated = None
+    def _divided(self, batch: ParallelBatch, optimizer: GridAdam) -> None:
+        """Begin a batch's iteration anew in smaller parts, which are those of all batches."""
+        wait(self._device)  # other batches may be at work in their lists
+        optimizer.drop_gradients(batch.parameters)
+        if self.capacities:
+            self._make_capacities()
+            self._graphed = None
 
-    def _repeat(self, learner: Learner, views: Views, optimizer: LightningOptimizer) -> None:
-        """A steady iteration: the same work on the same tensors, with other pixels in them."""
+    def _static_step(self, learner: Learner, views: Any, optimizer: LightningOptimizer) -> None:
+        """An iteration of static shape: the same work on the same tensors, with other pixels."""
 
         def work() -> None:
-            self._learn(learner, views)
+            self._accumulate(learner, views)
             with span("optimiser"):
                 learner.optimizer.apply()
 
-        if self._repeated is None:
-            self._repeated = GraphedStep(work, self._capturer())
-        repeated = self._repeated  # which is gone if memory runs out on the way
-        # What is replayed shows none of its parts to those who measure them.
-        with learner.optimizer.stepping_by(work if measured() else repeated):
+        if self._graphed is None:
+            self._graphed = GraphedStep(work, self._capturer())
+        graphed = self._graphed  # which is gone if memory runs out on the way
+        # A replayed graph shows none of its parts to a profiler.
+        with learner.optimizer.stepping_by(work if measured() else graphed):
             optimizer.step()
-        if repeated.is_warm:
-            for room in self.rooms:
-                room.measure()
-        if repeated.failed:
+        if graphed.is_warm:
+            for capacity in self.capacities:
+                capacity.measure()
+        if graphed.failed:
             self.graphs = "off"  # one warning is enough
 
     def _capturer(self) -> Capturer | None:

@@ -8,17 +8,17 @@ import torch
 from torch import Tensor
 
 from devrf.evaluation.suite import MetricInput, MetricSuite
-from devrf.methods.devrf.model import SceneModel
-from devrf.methods.devrf.renderer import Renderer
 from devrf.metrics.image import psnr, ssim
 from devrf.metrics.masked import psnr_masked, ssim_masked, ssim_within
 from devrf.rendering.rendered_image import RenderedImage
+from devrf.rendering.renderer import Renderer
+from devrf.rendering.view import Viewable
 from devrf.scenes.scene import Background, Views
 
 
 @dataclass(frozen=True)
 class HeldOutView:
-    """A held-out image, what the model sees there, and how alike they are where pixels count.
+    """A held-out image, what the model sees there, and how alike they are at valid pixels.
 
     Attributes:
         name: the image's name.
@@ -29,7 +29,7 @@ class HeldOutView:
         ssim: in [−1, 1].
         rest_pose_psnr: dB that the canonical field alone reaches there.
         further: what else was measured, by name; None where there is nothing to compare with.
-        compared: (H, W, 3) RGB in [0, 1], the prediction where pixels count, else the truth.
+        compared: (H, W, 3) RGB in [0, 1], the prediction at valid pixels, else the truth.
     """
 
     name: str
@@ -50,53 +50,57 @@ class HeldOutView:
 
 
 def score(
-    player: Renderer,
+    renderer: Renderer,
     views: Views,
     index: int,
     background: Background,
-    judge: MetricSuite | None = None,
+    suite: MetricSuite | None = None,
+    *,
+    time: float | None = None,
 ) -> HeldOutView:
     """Render image ``index`` of held-out ``views`` and compare it with the truth.
 
-    Only pixels that count are compared: by PSNR each for itself, by SSIM in windows that lie
-    among them. Other metrics that look at neighbourhoods find the truth beyond them.
+    Only valid pixels are compared: by PSNR each for itself, by SSIM in windows that lie among
+    them. Other metrics that look at neighbourhoods find the truth beyond them.
 
     Args:
-        player: shows what was learned.
+        renderer: shows what was learned.
         views: the held-out views, on the host.
         index: which of them.
         background: what is behind the matte.
-        judge: measures more than PSNR and SSIM.
+        suite: measures more than PSNR and SSIM.
+        time: when to look, in [0, 1]; None: at the image's own time.
     """
-    time = float(views.times[index])
+    own_time = float(views.times[index])
+    time = own_time if time is None else time
     truth = truth_image(views, index, background)
     behind = background_value(background)
-    seen = player.view(views.cameras, index, time, behind)
+    seen = renderer.view(views.cameras, index, time, behind)
     prediction = _image(seen, views)
     rest = prediction
-    if player.ready(time).warp is not None:
-        rest = _image(player.view(views.cameras, index, 0.0, behind), views)
+    if not renderer.at(time).at_rest:
+        rest = _image(renderer.view(views.cameras, index, 0.0, behind), views)
     valid_mask = views.valid_mask_of(index)
     compared, rest = (compare(image, truth, valid_mask) for image in (prediction, rest))
     further: dict[str, float | None] = {}
-    if judge is not None and judge.metrics:
+    if suite is not None and suite.metrics:
         shape = (views.height, views.width)
-        distance = _world_distance(player.model, views, index, seen)
-        further = judge.scores(
+        distance = _world_distance(renderer.model, views, index, seen)
+        further = suite.scores(
             MetricInput(
-                player,
+                renderer,
                 views,
                 index,
                 compared,
                 truth,
                 distance.view(shape),
                 seen.opacity.cpu().view(shape),
-                judge.lpips,
+                suite.lpips,
             )
         )
     return HeldOutView(
         name=views.names[index],
-        time=time,
+        time=own_time,
         truth=truth,
         prediction=prediction,
         psnr=_psnr(compared, truth, valid_mask),
@@ -108,7 +112,7 @@ def score(
 
 
 def compare(prediction: Tensor, truth: Tensor, valid_mask: Tensor | None) -> Tensor:
-    """The prediction (H, W, 3) of a held-out image; the truth where its pixels do not count."""
+    """The prediction (H, W, 3) of a held-out image; the truth where pixels are not valid."""
     return (
         prediction if valid_mask is None else torch.where(valid_mask[..., None], prediction, truth)
     )
@@ -125,8 +129,8 @@ def _psnr(compared: Tensor, truth: Tensor, valid_mask: Tensor | None) -> float:
 def _ssim(compared: Tensor, truth: Tensor, valid_mask: Tensor | None) -> float:
     if valid_mask is None:
         return ssim(compared, truth)
-    # Where nothing counts that is as wide as a window, windows about what counts have to do,
-    # and where that is the image's rim, all of them.
+    # Where no valid region is as wide as a window, windows about valid pixels have to do, and
+    # where these are the image's rim, all windows.
     for measure in (ssim_within, ssim_masked):
         found = measure(compared, truth, valid_mask)
         if found is not None:
@@ -152,7 +156,7 @@ def _image(seen: RenderedImage, views: Views) -> Tensor:
     return seen.color.view(views.height, views.width, 3).clamp(0, 1).cpu()
 
 
-def _world_distance(model: SceneModel, views: Views, index: int, seen: RenderedImage) -> Tensor:
+def _world_distance(model: Viewable, views: Views, index: int, seen: RenderedImage) -> Tensor:
     """Depths (H·W,) of a picture as distances from the camera in world units."""
     rays = views.cameras.image_rays(index)
     own = model.space.rays(rays)

@@ -11,12 +11,12 @@ from torch import Tensor
 
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out_flow import flow_error
-from devrf.methods.devrf.renderer import Renderer
 from devrf.metrics.geometric import depth_error
 from devrf.metrics.image import ms_ssim
 from devrf.metrics.masked import psnr_masked, ssim_masked
 from devrf.metrics.perceptual import Lpips
 from devrf.metrics.pretrained import Network, load_lpips
+from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Views
 
 
@@ -25,17 +25,17 @@ class MetricInput:
     """What is compared with the truth: one held-out image, on the host.
 
     Attributes:
-        player: shows what was learned.
+        renderer: shows what was learned.
         views: the held-out views.
         index: which of them.
-        prediction: (H, W, 3) RGB in [0, 1]; the truth where pixels do not count.
+        prediction: (H, W, 3) RGB in [0, 1]; the truth where pixels are not valid.
         truth: (H, W, 3) RGB in [0, 1].
         depth: (H, W) rendered distance along each pixel's ray, world units.
         opacity: (H, W) in [0, 1].
         lpips: the perceptual metric, or None where it cannot be had.
     """
 
-    player: Renderer
+    renderer: Renderer
     views: Views
     index: int
     prediction: Tensor
@@ -46,7 +46,7 @@ class MetricInput:
 
     @property
     def mask(self) -> Tensor:
-        """(H, W) bool, inside the matte where pixels count; nowhere True of images without one."""
+        """(H, W) bool, inside the matte at valid pixels; nowhere True of images without one."""
         pixels = self.views.pixels[self.index]
         if not self.views.has_alpha:
             return torch.zeros(pixels.shape[:2], dtype=torch.bool)
@@ -55,45 +55,45 @@ class MetricInput:
 
     @property
     def valid_mask(self) -> Tensor | None:
-        """(H, W) bool, the pixels that count; None: all of them."""
+        """(H, W) bool, the valid pixels; None: all of them."""
         return self.views.valid_mask_of(self.index)
 
 
-def _ms_ssim(sight: MetricInput) -> float | None:
-    # Its coarse scales mix pixels that count with others.
-    return ms_ssim(sight.prediction, sight.truth) if sight.valid_mask is None else None
+def _ms_ssim(inputs: MetricInput) -> float | None:
+    # Its coarse scales mix valid pixels with others.
+    return ms_ssim(inputs.prediction, inputs.truth) if inputs.valid_mask is None else None
 
 
-def _lpips(sight: MetricInput) -> float | None:
-    if sight.lpips is None:
+def _lpips(inputs: MetricInput) -> float | None:
+    if inputs.lpips is None:
         return None
-    if sight.valid_mask is not None:
-        return sight.lpips.inside(sight.prediction, sight.truth, sight.valid_mask)
-    whole: float | None = sight.lpips(sight.prediction, sight.truth)
+    if inputs.valid_mask is not None:
+        return inputs.lpips.inside(inputs.prediction, inputs.truth, inputs.valid_mask)
+    whole: float | None = inputs.lpips(inputs.prediction, inputs.truth)
     return whole
 
 
-def _lpips_masked(sight: MetricInput) -> float | None:
-    inside = sight.lpips.inside if sight.lpips else None
-    return inside(sight.prediction, sight.truth, sight.mask) if inside else None
+def _lpips_masked(inputs: MetricInput) -> float | None:
+    inside = inputs.lpips.inside if inputs.lpips else None
+    return inside(inputs.prediction, inputs.truth, inputs.mask) if inside else None
 
 
-def _depth_error(sight: MetricInput) -> float | None:
-    truth = sight.views.depth
+def _depth_error(inputs: MetricInput) -> float | None:
+    truth = inputs.views.depth
     if truth is None:
         return None
-    return depth_error(sight.depth, sight.opacity, truth[sight.index].cpu())
+    return depth_error(inputs.depth, inputs.opacity, truth[inputs.index].cpu())
 
 
 # By name, in the order of tables; None where a view has nothing to compare with.
 MEASURES: dict[str, Callable[[MetricInput], float | None]] = {
     "ms_ssim": _ms_ssim,
     "lpips": _lpips,
-    "psnr_masked": lambda sight: psnr_masked(sight.prediction, sight.truth, sight.mask),
-    "ssim_masked": lambda sight: ssim_masked(sight.prediction, sight.truth, sight.mask),
+    "psnr_masked": lambda inputs: psnr_masked(inputs.prediction, inputs.truth, inputs.mask),
+    "ssim_masked": lambda inputs: ssim_masked(inputs.prediction, inputs.truth, inputs.mask),
     "lpips_masked": _lpips_masked,
     "depth_error": _depth_error,
-    "flow_error": lambda sight: flow_error(sight.player, sight.views, sight.index),
+    "flow_error": lambda inputs: flow_error(inputs.renderer, inputs.views, inputs.index),
 }
 
 
@@ -130,7 +130,7 @@ class Evaluation:
                 f"{self.lpips_network}, or null to look in torch's cache"
             )
 
-    def judge(self, device: torch.device) -> MetricSuite:
+    def suite(self, device: torch.device) -> MetricSuite:
         """The metrics, ready to use; networks are on ``device``."""
         self.check()
         lpips = None
@@ -151,6 +151,6 @@ class MetricSuite:
     metrics: tuple[str, ...] = ()
     lpips: Lpips | None = None
 
-    def scores(self, sight: MetricInput) -> dict[str, float | None]:
-        """Each metric of one sight; None where there is nothing to compare with."""
-        return {name: MEASURES[name](sight) for name in self.metrics}
+    def scores(self, inputs: MetricInput) -> dict[str, float | None]:
+        """Each metric of one inputs; None where there is nothing to compare with."""
+        return {name: MEASURES[name](inputs) for name in self.metrics}

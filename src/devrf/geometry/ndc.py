@@ -7,12 +7,16 @@ near plane to z' = −1, infinity to z' = 1 (NeRF, appendix C).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
+from devrf.geometry.space import WORLD, Space
 
 
 @dataclass(frozen=True)
@@ -61,3 +65,19 @@ class NormalizedDevice:
         y = -sy * (d[:, 1] / d[:, 2] - start[:, 1] / start[:, 2])
         z = -2 * self.near / start[:, 2]
         return Rays(origin, torch.stack([x, y, z], dim=-1), rays.viewdirs)
+
+    def depth_range(
+        self, box: Box, limits: tuple[float, float], position: Tensor
+    ) -> tuple[float, float]:
+        """The limits themselves: every ray goes from the near plane to infinity."""
+        return limits
+
+
+def space_config(space: Space) -> dict[str, Any]:
+    """A space as plain data; the world is empty."""
+    return asdict(space) if isinstance(space, NormalizedDevice) else {}
+
+
+def space_from(config: Mapping[str, Any]) -> Space:
+    """The space that :func:`space_config` described."""
+    return NormalizedDevice(**config) if config else WORLD

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
 from torch import Tensor
 
+from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
 
 
@@ -29,6 +31,18 @@ class Space(Protocol):
         """World rays in the fields' space; their view directions stay those of the world."""
         ...
 
+    def depth_range(
+        self, box: Box, limits: tuple[float, float], position: Tensor
+    ) -> tuple[float, float]:
+        """Depths between which a scene in ``box`` lies, about, for pictures of depth.
+
+        Args:
+            box: what holds the scene, in this space.
+            limits: distances before and behind which nothing is sampled, in this space.
+            position: (3,) the camera's, in world units.
+        """
+        ...
+
 
 @dataclass(frozen=True)
 class WorldSpace:
@@ -45,6 +59,14 @@ class WorldSpace:
     def rays(self, rays: Rays) -> Rays:
         """The rays themselves."""
         return rays
+
+    def depth_range(
+        self, box: Box, limits: tuple[float, float], position: Tensor
+    ) -> tuple[float, float]:
+        """The middle of the box, and a third of its diagonal before and behind it."""
+        distance = math.dist(position.tolist(), box.middle)
+        reach = math.dist(box.low, box.high) / 3
+        return max(distance - reach, 0.0), distance + reach
 
 
 WORLD = WorldSpace()

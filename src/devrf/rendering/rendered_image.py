@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from devrf.methods.devrf.volume_rendering import RenderOutput
+from devrf.rendering.output import RenderOutput
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class RenderedImage:
 
     @staticmethod
     def joined(parts: Sequence[RenderedImage]) -> RenderedImage:
-        """What all rays of some pictures see, one picture after another."""
+        """What all rays of some images see, one image after another."""
         return RenderedImage(
             torch.cat([part.color for part in parts]),
             torch.cat([part.depth for part in parts]),

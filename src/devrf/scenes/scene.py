@@ -48,8 +48,9 @@ class Views:
             ray hits nothing; None where it is unknown.
         ambiguous_orientation: (N,) bool, files whose EXIF orientation says that they are to be seen
             turned, which nothing confirms or refutes: they are as they are stored. None: none.
-        counted: (N, H, W) bool, the pixels that are learned from and scored; what the others
-            show is nobody's business. None: all of them.
+        valid_mask: (N, H, W) bool, the pixels that are learned from and scored. None: all of them.
+        frames: (N,) int64, the frame of the scene's clock that is nearest to each image's time;
+            None until the images are those of a :class:`Scene`.
     """
 
     pixels: Tensor
@@ -61,6 +62,7 @@ class Views:
     depth: Tensor | None = None
     ambiguous_orientation: Tensor | None = None
     valid_mask: Tensor | None = None
+    frames: Tensor | None = None
 
     def __len__(self) -> int:
         return self.pixels.shape[0]
@@ -94,6 +96,7 @@ class Views:
             None if self.depth is None else self.depth[index],
             None if self.ambiguous_orientation is None else self.ambiguous_orientation[index],
             None if self.valid_mask is None else self.valid_mask[index],
+            None if self.frames is None else self.frames[index],
         )
 
     def valid_mask_of(self, image: int) -> Tensor | None:
@@ -113,6 +116,7 @@ class Views:
             else OpticalFlow(self.flow.vectors.to(device), self.flow.valid.to(device)),
             depth=None if self.depth is None else self.depth.to(device),
             valid_mask=None if self.valid_mask is None else self.valid_mask.to(device),
+            frames=None if self.frames is None else self.frames.to(device),
         )
 
 
@@ -173,6 +177,15 @@ class Scene:
     bounds: Bounds
     background: Background
     space: Space = WORLD
+
+    def __post_init__(self) -> None:
+        for name in ("static", "dynamic"):
+            capture: Capture = getattr(self, name)
+            numbered = (self._with_frames(views) for views in (capture.train, capture.test))
+            object.__setattr__(self, name, Capture(*numbered))
+
+    def _with_frames(self, views: Views) -> Views:
+        return replace(views, frames=self.clock.frames_of(views.times))
 
     def capture(self, name: CaptureName) -> Capture:
         """The capture called ``static`` or ``dynamic``."""

@@ -11,8 +11,8 @@ from devrf.geometry.rays import Rays
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.compact_state import compact_state, expanded_state
 from devrf.methods.devrf.deformation_field import DeformationField
-from devrf.methods.devrf.model import SceneModel
-from devrf.methods.devrf.volume_rendering import RenderSettings
+from devrf.methods.devrf.model import DeVRFModel
+from devrf.methods.devrf.settings import RenderSettings
 from devrf.metrics.image import psnr
 from devrf.rendering.occupancy import Occupancy, dilate
 
@@ -21,7 +21,7 @@ TIMES = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
 @pytest.fixture
-def model(cube: Box) -> SceneModel:
+def model(cube: Box) -> DeVRFModel:
     """A speckled ball that travels along x and swells, smoothly, through empty space."""
     torch.manual_seed(0)
     canonical = Architecture(channels=4, width=8, frequencies=1).radiance_field(
@@ -40,13 +40,13 @@ def model(cube: Box) -> SceneModel:
         deformation.to_canonical[frame, ..., 0] = -way
         deformation.to_time[frame, ..., 0] = way
     settings = RenderSettings(step=0.5, alpha_threshold=1e-3, near=0.0, far=9.0)
-    return SceneModel(canonical, Occupancy(dilate(solid, 1), cube), settings, deformation)
+    return DeVRFModel(canonical, Occupancy(dilate(solid, 1), cube), settings, deformation)
 
 
-def restored(model: SceneModel, cube: Box) -> SceneModel:
+def restored(model: DeVRFModel, cube: Box) -> DeVRFModel:
     """Another model that is given what the checkpoint of ``model`` would hold."""
     build = Architecture(channels=4, width=8, frequencies=1)
-    other = SceneModel(
+    other = DeVRFModel(
         build.radiance_field(cube, 8, 8),
         Occupancy.full((2, 2, 2), cube),
         model.settings,
@@ -56,7 +56,7 @@ def restored(model: SceneModel, cube: Box) -> SceneModel:
     return other
 
 
-def picture(model: SceneModel, time: float) -> torch.Tensor:
+def picture(model: DeVRFModel, time: float) -> torch.Tensor:
     x, y = torch.meshgrid(
         torch.linspace(-0.9, 0.9, 40), torch.linspace(-0.6, 0.6, 30), indexing="ij"
     )

@@ -13,7 +13,7 @@ from devrf.geometry.rays import Rays
 from devrf.methods.devrf import image_lists as module
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.image_lists import ListRenderer
-from devrf.methods.devrf.model import SceneModel
+from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.renderer import Renderer
 from devrf.methods.devrf.volume_rendering import RenderSettings, render
 from devrf.ops.choice import using
@@ -41,7 +41,7 @@ def searches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 @pytest.mark.parametrize("time", [0.0, 0.4, 0.7])
 def test_what_the_renderer_shows(
-    moving: SceneModel, tiny_scene: Scene, time: float, same: Same
+    moving: DeVRFModel, tiny_scene: Scene, time: float, same: Same
 ) -> None:
     rays, ready = tiny_scene.dynamic.test.cameras.image_rays(0), Renderer(moving).ready(time)
     renderer = ListRenderer(moving.canonical, moving.settings, half=True)  # not on a CPU
@@ -67,7 +67,7 @@ def test_planes_of_a_forward_facing_scene(rng: torch.Generator, same: Same) -> N
 
 
 def test_lists_grow_once_and_stay(
-    moving: SceneModel, tiny_scene: Scene, searches: list[int], same: Same
+    moving: DeVRFModel, tiny_scene: Scene, searches: list[int], same: Same
 ) -> None:
     rays = tiny_scene.dynamic.test.cameras.image_rays(0)
     renderer = ListRenderer(moving.canonical, moving.settings)
@@ -77,7 +77,7 @@ def test_lists_grow_once_and_stay(
     assert searches[2:] == searches[1:2]
 
 
-def test_rays_that_meet_nothing(moving: SceneModel) -> None:
+def test_rays_that_meet_nothing(moving: DeVRFModel) -> None:
     up = torch.tensor([[0.0, 0.0, 1.0]]).expand(3, 3)
     rays = Rays(torch.tensor([[50.0, 0.0, 0.0]]).expand(3, 3), up, up)
     renderer = ListRenderer(moving.canonical, moving.settings)
@@ -90,7 +90,7 @@ def test_rays_that_meet_nothing(moving: SceneModel) -> None:
 @pytest.mark.skipif(os.environ["TRITON_INTERPRET"] != "1", reason="needs Triton's interpreter")
 @pytest.mark.parametrize("time", [0.0, 0.7])
 def test_the_player_shows_the_same_with_triton(
-    moving: SceneModel, tiny_scene: Scene, searches: list[int], time: float, same: Same
+    moving: DeVRFModel, tiny_scene: Scene, searches: list[int], time: float, same: Same
 ) -> None:
     pytest.importorskip("triton")
     player, cameras = Renderer(moving), tiny_scene.dynamic.test.cameras.resized(5, 4)

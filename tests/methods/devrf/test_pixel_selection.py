@@ -8,9 +8,9 @@ import torch
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.methods.devrf.architecture import Architecture
-from devrf.methods.devrf.model import SceneModel
+from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.pixel_selection import rays_hit_occupied
-from devrf.methods.devrf.volume_rendering import RenderSettings
+from devrf.methods.devrf.settings import RenderSettings
 from devrf.rendering.occupancy import Occupancy, dilate
 from devrf.rendering.sampling import march
 
@@ -20,7 +20,7 @@ def test_no_pixel_that_meets_matter_is_left_out(cube: Box, width: int, height: i
     mask = torch.zeros(20, 20, 20, dtype=torch.bool)
     mask[3, 14, 9] = mask[12:14, 5, 5:8] = True
     occupancy = Occupancy(dilate(mask, 1), cube)
-    model = SceneModel(
+    model = DeVRFModel(
         Architecture().search_field(cube, 20**3),
         occupancy,
         RenderSettings(step=0.5, alpha_threshold=1e-3, near=0.1, far=9.0),

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from devrf.methods.devrf import renderer as module
-from devrf.methods.devrf.model import SceneModel
+from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.renderer import Renderer
 from devrf.rendering.rendered_image import RenderedImage
 from devrf.scenes.scene import Scene
@@ -33,7 +33,7 @@ def looks(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 @pytest.mark.parametrize("time", [0.0, 0.4, 0.55, 1.0])
 def test_it_shows_what_the_model_shows(
-    moving: SceneModel, tiny_scene: Scene, time: float, same: Same
+    moving: DeVRFModel, tiny_scene: Scene, time: float, same: Same
 ) -> None:
     cameras = tiny_scene.dynamic.test.cameras
     seen = Renderer(moving).view(cameras, 1, time, 1.0)
@@ -42,7 +42,7 @@ def test_it_shows_what_the_model_shows(
     assert not seen.color.requires_grad
 
 
-def test_a_moment_is_where_the_model_says(moving: SceneModel) -> None:
+def test_a_moment_is_where_the_model_says(moving: DeVRFModel) -> None:
     ready = Renderer(moving).ready(0.4)
     assert torch.equal(ready.occupancy.mask, moving.occupancy_at(0.4).mask)
     points = torch.rand(50, 3) * 2 - 1
@@ -53,7 +53,7 @@ def test_a_moment_is_where_the_model_says(moving: SceneModel) -> None:
     assert rest.occupancy is moving.occupancy and rest.warp is rest.displacement is None
 
 
-def test_the_times_asked_for_last_are_kept(moving: SceneModel, looks: list[int]) -> None:
+def test_the_times_asked_for_last_are_kept(moving: DeVRFModel, looks: list[int]) -> None:
     player = Renderer(moving, times=2)
     for time in (0.4, 0.7, 0.4, 0.7, 0.4):
         player.ready(time)
@@ -66,7 +66,7 @@ def test_the_times_asked_for_last_are_kept(moving: SceneModel, looks: list[int])
 
 
 def test_a_stream_is_made_picture_by_picture(
-    moving: SceneModel, tiny_scene: Scene, looks: list[int], same: Same
+    moving: DeVRFModel, tiny_scene: Scene, looks: list[int], same: Same
 ) -> None:
     cameras, player = tiny_scene.dynamic.test.cameras, Renderer(moving)
     stream = player.stream(cameras, [0.4, 0.4, 1.0], 0.0)
@@ -79,7 +79,7 @@ def test_a_stream_is_made_picture_by_picture(
     assert len(looks) == 2
 
 
-def test_any_size_and_any_background(moving: SceneModel, tiny_scene: Scene) -> None:
+def test_any_size_and_any_background(moving: DeVRFModel, tiny_scene: Scene) -> None:
     cameras = tiny_scene.dynamic.test.cameras.resized(60, 45)
     seen = Renderer(moving).view(cameras, 0, 1.0, torch.tensor([0.0, 1.0, 0.0]))
     assert seen.color.shape == (60 * 45, 3) and seen.depth.shape == (60 * 45,)
@@ -88,6 +88,6 @@ def test_any_size_and_any_background(moving: SceneModel, tiny_scene: Scene) -> N
     assert torch.equal(seen.color[empty][0], torch.tensor([0.0, 1.0, 0.0]))
 
 
-def test_no_rays(moving: SceneModel, tiny_scene: Scene) -> None:
+def test_no_rays(moving: DeVRFModel, tiny_scene: Scene) -> None:
     rays = tiny_scene.dynamic.test.cameras.image_rays(0)[:0]
     assert Renderer(moving).picture(rays, 0.4, 1.0).color.shape == (0, 3)

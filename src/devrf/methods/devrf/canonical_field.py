@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from devrf.geometry.box import Box
+from devrf.methods.devrf.color_decoder import ColorDecoder
 from devrf.methods.devrf.voxel_grid import VoxelGrid
 
 
@@ -67,6 +68,11 @@ class CanonicalField(nn.Module):
         tau = -torch.log1p(-alpha.clamp(max=1 - 1e-6))
         raw = torch.log(torch.expm1(tau / self.step_in_base_voxels(1.0))) - self.shift
         self.density.values[..., 0] = raw.float()
+
+    @property
+    def has_network(self) -> bool:
+        """Whether colours come from a network: not in the coarse geometry search."""
+        return isinstance(self.decoder, ColorDecoder)
 
     def grid_shape(self, voxels: int) -> tuple[int, int, int]:
         """Grid points along (x, y, z) for about ``voxels`` voxels."""

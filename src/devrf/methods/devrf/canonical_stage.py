@@ -1,37 +1,45 @@
-"""The canonical stage: static views → the scene at rest."""
+"""The canonical stage: static views → a voxel radiance field of the rest state."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from devrf.checkpoints.bits import pack_bits, unpack_bits
-from devrf.checkpoints.checkpoint import CheckpointMetadata, LoadedCheckpoint
+from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import Pixels, background_color, gather_batch
-from devrf.data.pool import PixelPool, all_pixels, wanted_pixels
-from devrf.engine.ddp import share
+from devrf.data.pool import PixelPool
+from devrf.engine.ddp import rays_per_rank
 from devrf.engine.graphs import Graphs
 from devrf.engine.parallel_batch import ParallelBatch
-from devrf.engine.stage import Phase, ScheduledStage
+from devrf.engine.phase import Phase
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
+from devrf.methods.devrf import phase_state
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField
+from devrf.methods.devrf.canonical_schedule import CanonicalPhase, CanonicalSchedule
 from devrf.methods.devrf.free_space import possible_matter, view_count_weight
-from devrf.methods.devrf.model import SceneModel
-from devrf.methods.devrf.motion_losses import total_variation_weight
+from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.photometric_losses import PHOTOMETRIC_TERMS, Prediction, visibility
-from devrf.methods.devrf.pixel_selection import rays_hit_occupied
-from devrf.methods.devrf.schedules import CanonicalPhase, CanonicalSchedule
-from devrf.methods.devrf.settings import FINE_LOSS, SEARCH_LOSS, CanonicalRates, Precision, Sampling
-from devrf.methods.devrf.volume_rendering import RenderSettings
+from devrf.methods.devrf.pixel_selection import canonical_pool
+from devrf.methods.devrf.settings import (
+    FINE_LOSS,
+    SEARCH_LOSS,
+    CanonicalRates,
+    Precision,
+    RenderSettings,
+    Sampling,
+)
+from devrf.methods.devrf.smoothing import total_variation_weight
+from devrf.methods.devrf.voxel_stage import VoxelStage
 from devrf.methods.weighted_loss import WeightedLoss
 from devrf.ops.adam import GridAdam
+from devrf.ops.choice import triton_runs
 from devrf.rendering.occupancy import Occupancy, bounding_box, dilate
 from devrf.scenes.scene import CaptureName, Views
 from devrf.system.profiling import span
@@ -39,16 +47,18 @@ from devrf.system.profiling import span
 log = logging.getLogger(__name__)
 
 
-class CanonicalStage(ScheduledStage):
-    """Learns the canonical field of an inward-facing scene (method §2).
+class CanonicalStage(VoxelStage):
+    """Learns the canonical field from the static views (docs/method.md#canonical-stage).
 
     First the coarse geometry is searched in the box of the scene's bounds; then the box is
     tightened around it and enlarged so that motion has room, and the radiance field is learned
     inside, on rays that meet the coarse geometry.
     """
 
-    name: ClassVar[str] = "canonical"
-    capture: ClassVar[CaptureName] = "static"
+    name = "canonical"
+    capture: CaptureName = "static"
+    memory_keys = ("schedule.canonical.side", "schedule.canonical.rays")
+    rate_keys = "schedule.rates or the weights of loss.fine"
 
     def __init__(
         self,
@@ -87,25 +97,20 @@ class CanonicalStage(ScheduledStage):
             weights = dict(given)
             self.tv[kind] = weights.pop("tv", 0.0)
             self.losses[kind] = WeightedLoss(PHOTOMETRIC_TERMS, weights)
-        self._pool: PixelPool | None = None
-        self.scene_model: SceneModel | None = None
+        self.pool: PixelPool | None = None
         self._optimizer: GridAdam | None = None
 
+    # The schedule.
+
     @property
-    def resolution(self) -> tuple[int, int, int]:
+    def total_iterations(self) -> int:
+        """Iterations of search and fine stage together."""
+        return self.schedule.total
+
+    @property
+    def resolution(self) -> tuple[int, ...]:
         """Present shape of the density and feature grids."""
-        return self.model.canonical.density.shape
-
-    @property
-    def model(self) -> SceneModel:
-        """The rest state learned so far."""
-        assert self.scene_model is not None, "the stage has not been set up"
-        return self.scene_model
-
-    @property
-    def model_now(self) -> SceneModel:
-        """The same."""
-        return self.model
+        return self.scene_model.canonical.density.shape
 
     @property
     def optimizer(self) -> GridAdam:
@@ -113,17 +118,7 @@ class CanonicalStage(ScheduledStage):
         assert self._optimizer is not None, "the stage has not been set up"
         return self._optimizer
 
-    @property
-    def memory_keys(self) -> tuple[str, ...]:
-        """Grid sizes and rays."""
-        return "schedule.canonical.side", "schedule.canonical.rays"
-
-    @property
-    def total_iterations(self) -> int:
-        """Iterations of search and fine stage together."""
-        return self.schedule.total
-
-    def phase_at(self, iteration: int) -> Phase:
+    def phase_at(self, iteration: int) -> CanonicalPhase:
         """The schedule's phase."""
         return self.schedule.phase(iteration)
 
@@ -131,36 +126,41 @@ class CanonicalStage(ScheduledStage):
         """The schedule's exponential decay."""
         return self.schedule.learning_rate_factor(iteration)
 
+    # The field.
+
     def setup(self, stage: str) -> None:
         """Build the field of the first phase in the scene's box."""
         super().setup(stage)
-        if self.scene_model is not None:
+        if hasattr(self, "scene_model"):
             return
         box, first = self.scene.bounds.box, self.schedule.phase(0)
-        side = self.schedule.search_side
-        occupancy = Occupancy(
-            possible_matter(self.scene, box.grid_shape(side**3), carve=self.schedule.carve), box
-        )
+        shape = box.grid_shape(self.schedule.search_side**3)
+        occupancy = Occupancy(possible_matter(self.scene, shape, carve=self.schedule.carve), box)
         if first.kind == "search":
             canonical = self.architecture.search_field(box, first.voxels)
         else:
             canonical = self._radiance_field(occupancy, first)
-        self.scene_model = SceneModel(
-            canonical, occupancy, self._settings(first), space=self.scene.space
+        self.scene_model = DeVRFModel(
+            self.architecture,
+            canonical,
+            occupancy,
+            self.render_settings(first),
+            space=self.scene.space,
         )
-        rates = self.rates
+        groups = (
+            ("density", canonical.density, self.rates.density),
+            ("color", canonical.color, self.rates.color),
+            ("decoder", canonical.decoder, self.rates.decoder),
+        )
         self._optimizer = GridAdam(
             [
-                {"params": list(canonical.density.parameters()), "lr": rates.density},
-                {"params": list(canonical.color.parameters()), "lr": rates.color},
-                {"params": list(canonical.decoder.parameters()), "lr": rates.decoder},
+                {"params": list(module.parameters()), "lr": rate, "base_lr": rate, "name": name}
+                for name, module, rate in groups
             ]
         )
-        names = ("density", "color", "decoder")
-        for name, group in zip(names, self._optimizer.param_groups, strict=True):
-            group.update(name=name, base_lr=group["lr"])
 
-    def _settings(self, phase: CanonicalPhase) -> RenderSettings:
+    def render_settings(self, phase: CanonicalPhase) -> RenderSettings:
+        """How rays are sampled in a phase."""
         bounds, sampling = self.scene.bounds, self.sampling
         searching = phase.kind == "search"
         threshold = sampling.search_alpha_threshold if searching else sampling.alpha_threshold
@@ -170,22 +170,22 @@ class CanonicalStage(ScheduledStage):
         """Make grids, occupancy, rays and optimiser ready for ``phase``."""
         assert isinstance(phase, CanonicalPhase)
         previous, self.phase = self.phase, phase
-        views = self.scene.static.train
-        self.model.settings = self._settings(phase)
-        if isinstance(previous, CanonicalPhase) and previous.kind != phase.kind:
+        views, model = self.scene.static.train, self.scene_model
+        model.settings = self.render_settings(phase)
+        if previous is not None and previous.kind != phase.kind:
             self._begin_fine(phase)
         elif previous is not None:
-            self.model.canonical.resize(phase.voxels)
-            self._refresh_occupancy()
-        self._pool = self._useful_pixels(views, everywhere=phase.kind == "search")
-        self.setup_optimizer(views.cameras, skip_zero=phase.kind == "fine")
+            model.canonical.resize(phase.voxels)
+            self.update_occupancy()
+        self.pool = canonical_pool(views, model, everywhere=phase.kind == "search")
+        self.setup_optimizer(views.cameras)
 
     def _begin_fine(self, phase: CanonicalPhase) -> None:
         """Tighten the box around what the search found, enlarge it, start the radiance field."""
-        search, occupancy = self.model.canonical, self.model.occupancy
+        search, occupancy = self.scene_model.canonical, self.scene_model.occupancy
         found = search.voxel_alpha(self.sampling.step) > self.sampling.occupancy_threshold
         occupancy.replace(dilate(found & occupancy.mask, 1))
-        self.model.canonical = self._radiance_field(occupancy, phase).to(self.device)
+        self.scene_model.canonical = self._radiance_field(occupancy, phase).to(self.device)
 
     def _radiance_field(self, occupancy: Occupancy, phase: CanonicalPhase) -> CanonicalField:
         """A new radiance field in the box around what is occupied, with room for motion."""
@@ -209,81 +209,71 @@ class CanonicalStage(ScheduledStage):
         return box.scaled(1.05).union(bounds.motion)
 
     @torch.no_grad()
-    def _refresh_occupancy(self) -> None:
-        """Look again where something is, on the field's own grid, within what was occupied."""
-        field = self.model.canonical
-        found = dilate(field.voxel_alpha(self.sampling.step) > self.sampling.occupancy_threshold, 1)
+    def update_occupancy(self) -> None:
+        """Find anew where something is, on the field's own grid, within what was occupied."""
+        model, sampling = self.scene_model, self.sampling
+        field = model.canonical
+        found = dilate(field.voxel_alpha(sampling.step) > sampling.occupancy_threshold, 1)
         points = field.box.grid_points(field.density.shape, field.density.values)
-        before = self.model.occupancy.at(points.view(-1, 3)).view(found.shape)
-        self.model.occupancy.replace(found & before, field.box)
+        before = model.occupancy.at(points.view(-1, 3)).view(found.shape)
+        model.occupancy.replace(found & before, field.box)
 
-    def _useful_pixels(self, views: Views, *, everywhere: bool) -> PixelPool:
-        """The pixels whose rays meet something that may be occupied."""
-        images = torch.arange(len(views), device=self.device)
-        if everywhere:
-            return all_pixels(views, images)
-        cameras = views.cameras.to(self.device)
-        meeting = [
-            rays_hit_occupied(cameras, image, self.model, self.model.occupancy)
-            for image in range(len(views))
-        ]
-        pool = wanted_pixels(views, images, torch.stack(meeting))
-        if not len(pool):
-            raise DevrfError(
-                f"the field has become empty by iteration {self.iteration}: check data.background, "
-                "data.box and data.near, or lower schedule.rates.density"
-            )
-        return pool
+    def setup_optimizer(self, cameras: Cameras) -> None:
+        """Give the optimiser the present grids.
 
-    def setup_optimizer(self, cameras: Cameras, *, skip_zero: bool) -> None:
-        """Give the optimiser the present grids, each voxel paced by how many views see it.
-
-        The total variation of both is smoothed at the voxels that a batch has touched.
+        In the search each voxel learns at a rate of its own, by how many views see it; afterwards
+        a voxel without gradient keeps its moments. The total variation of both grids is smoothed
+        at the voxels that a batch has touched.
         """
-        assert isinstance(self.phase, CanonicalPhase)
-        field = self.model.canonical
+        assert self.phase is not None
+        searching, field = self.phase.kind == "search", self.scene_model.canonical
         smoothing = total_variation_weight(
             self.tv[self.phase.kind], max(field.density.shape), self.schedule.rays
         )
-        pace = None
-        if not skip_zero:
+        per_voxel_lr = None
+        if searching:
             points = field.box.grid_points(field.density.shape, field.density.values)
             points = self.scene.space.to_world(points)
-            pace = view_count_weight(cameras.to(self.device), points)[..., None]
+            per_voxel_lr = view_count_weight(cameras.to(self.device), points)[..., None]
         for group, grid in ((0, field.density), (1, field.color)):
             self.optimizer.replace(
                 group,
                 list(grid.parameters()),
-                pace=pace,
-                skip_zero=skip_zero,
+                pace=per_voxel_lr,
+                skip_zero=not searching,
                 smoothing=smoothing,
                 touched_only=True,
             )
         decoder = list(field.decoder.parameters())
         if [id(p) for p in decoder] != [id(p) for p in self.optimizer.param_groups[2]["params"]]:
             self.optimizer.replace(2, decoder)
-        groups = self.optimizer.param_groups
-        self.renew(self.schedule.rays, [[p for group in groups for p in group["params"]]])
+        learned = [p for group in self.optimizer.param_groups for p in group["params"]]
+        static_shape = triton_runs(field.density.values)
+        self.bind(self.schedule.rays, [learned], static_shape=static_shape)
 
-    def draw(self, lane: ParallelBatch) -> Pixels:
+    # An iteration.
+
+    def draw(self, batch: ParallelBatch) -> Pixels:
         """Random pixels of all images."""
-        assert self._pool is not None
+        assert self.pool is not None
         with span("batch"):
-            image, flat = self._pool.draw(share(self.schedule.rays), self.generator)
+            image, flat = self.pool.draw(rays_per_rank(self.schedule.rays), self.generator)
             background = background_color(self.scene.background, len(image), self.generator)
             return Pixels(image, flat, background)
 
     def loss(
-        self, lane: ParallelBatch, views: Views, pixels: Pixels
+        self, batch: ParallelBatch, views: Views, pixels: Pixels
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Render a batch of pixels and compare it with the images."""
-        assert isinstance(self.phase, CanonicalPhase)
+        assert self.phase is not None
         with span("batch"):
-            batch = gather_batch(
+            rays = gather_batch(
                 views, pixels.image, pixels.flat, pixels.background, self.scene.space
             )
-        output = self.see(batch.rays, self.model.occupancy, batch.background, lane.room)
-        prediction = Prediction(output, batch)
+        output = self.render_rays(
+            rays.rays, self.scene_model.occupancy, rays.background, batch.capacity
+        )
+        prediction = Prediction(output, rays)
         with span("losses"):
             total, terms = self.losses[self.phase.kind](prediction)
             return total, {**terms, **visibility(prediction)}
@@ -293,46 +283,26 @@ class CanonicalStage(ScheduledStage):
         """Empty what was never occupied, so that no deformed sample meets leftover fog."""
         if self.iteration < self.total_iterations:
             return
-        self._refresh_occupancy()
-        self.model.canonical.clear(~self.model.occupancy.mask, alpha=1e-6)
+        self.update_occupancy()
+        self.scene_model.canonical.clear(~self.scene_model.occupancy.mask, alpha=1e-6)
+
+    # What a checkpoint holds beside the tensors.
 
     def resize_to(self, state: dict[str, Tensor]) -> None:
         """Take a radiance field in place of the search's, if that is what was stored."""
         fine = any(key.startswith("scene_model.canonical.decoder.") for key in state)
         if fine and self.schedule.search_iterations:
-            box = self.model.canonical.box
-            self.model.canonical = self.architecture.radiance_field(box, 8, 8)
+            box = self.scene_model.canonical.box
+            self.scene_model.canonical = self.architecture.radiance_field(box, 8, 8)
 
     def phase_state(self) -> dict[str, Any]:
         """The pixels that batches are drawn from."""
-        assert self._pool is not None
-        views = self.scene.static.train
-        images = torch.arange(len(views), device=self.device)
-        return {"pixels": pack_bits(self._pool.mask(images, views.height * views.width))}
+        return phase_state.of_canonical(self)
 
-    def restore_phase(self, phase: Phase, kept: dict[str, Any]) -> None:
+    def restore(self, phase: Phase, kept: dict[str, Any]) -> None:
         """Go on with ``phase``, the field being loaded."""
-        assert isinstance(phase, CanonicalPhase)
-        views = self.scene.static.train
-        self.model.settings = self._settings(phase)
-        shape = (len(views), views.height * views.width)
-        images = torch.arange(len(views), device=self.device)
-        self._pool = PixelPool.of_mask(images, unpack_bits(kept["pixels"], shape, self.device))
-        self.setup_optimizer(views.cameras, skip_zero=phase.kind == "fine")
-
-    def metadata(self) -> CheckpointMetadata:
-        """What the checkpoint is, and how to build its model."""
-        return CheckpointMetadata(
-            scene=self.scene.name,
-            fingerprint=self.scene.fingerprint,
-            architecture=self.architecture,
-            settings=self.model.settings,
-            space=self.model.space,
-            records={"canonical": self.record},
-            training_config=self.training_config,
-            complete=self.iteration >= self.total_iterations,
-        )
+        phase_state.restore_canonical(self, phase, kept)
 
     def result(self) -> LoadedCheckpoint:
         """What the deformation stage builds on."""
-        return LoadedCheckpoint(self.metadata(), self.model)
+        return LoadedCheckpoint(self.metadata(), self.scene_model)

@@ -6,6 +6,7 @@ occupied. Files to go on learning from hold everything as it is.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -13,35 +14,46 @@ from torch import Tensor
 
 from devrf.checkpoints.packing import pack, unpack
 from devrf.geometry.box import Box
-from devrf.methods.devrf.model import SceneModel
+from devrf.methods.devrf.canonical_field import CanonicalField
+from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.rendering.occupancy import Occupancy, dilate
 
 Shape = tuple[int, int, int]
 
 
 @torch.no_grad()
-def compact_state(model: SceneModel) -> dict[str, Any]:
-    """The model's state with its grids packed; what no half can hold stays as it is.
+def compact_state(
+    state: Mapping[str, Any],
+    occupancy: Occupancy,
+    canonical: CanonicalField,
+    deformation: DeformationField | None,
+    occupancy_at: Callable[[float], Occupancy],
+) -> dict[str, Any]:
+    """A model's state with its grids packed; what no half can hold stays as it is.
 
     Args:
-        model: a finished scene: what was never occupied has been emptied.
+        state: of a finished scene: what was never occupied has been emptied.
+        occupancy: where something is at rest.
+        canonical: the canonical field.
+        deformation: how it moves, if it does.
+        occupancy_at: where something is at a time.
     """
-    state: dict[str, Any] = dict(model.state_dict())
-    canonical, deformation, box = model.canonical, model.deformation, model.canonical.box
-    at_rest = _near(model.occupancy, canonical.density.shape, box)[None]
+    small, box = dict(state), canonical.box
+    at_rest = _near(occupancy, canonical.density.shape, box)[None]
     for name in ("canonical.density.values", "canonical.color.values"):
-        state[name] = _packed(state[name][None], at_rest, smooth=False, many=False)
+        small[name] = _packed(small[name][None], at_rest, smooth=False, many=False)
     if deformation is not None:
         shape = deformation.shape
-        moments = [_near(model.occupancy_at(time), shape, box) for time in deformation.clock.times]
+        moments = [_near(occupancy_at(time), shape, box) for time in deformation.clock.times]
         # Between two frames what is seen is a mixture of both.
         moving = torch.stack(
             [torch.stack(moments[max(k - 1, 0) : k + 2]).any(dim=0) for k in range(len(moments))]
         )
-        state["deformation.to_canonical"] = _packed(deformation.to_canonical, moving, smooth=True)
-        at_rest = _near(model.occupancy, shape, box)[None]
-        state["deformation.to_time"] = _packed(deformation.to_time, at_rest, smooth=True)
-    return state
+        frames = "deformation.frames."
+        small[f"{frames}to_canonical"] = _packed(deformation.to_canonical, moving, smooth=True)
+        at_rest = _near(occupancy, shape, box)[None]
+        small[f"{frames}to_time"] = _packed(deformation.to_time, at_rest, smooth=True)
+    return small
 
 
 def expanded_state(state: dict[str, Any]) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from devrf.data.pool import PixelPool
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.space import WORLD, Space
 from devrf.methods.devrf.deformation_field import DeformationField
-from devrf.methods.devrf.model import SceneModel
+from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.volume_rendering import render
 from devrf.ops.trilinear import interpolate
 from devrf.scenes.scene import Views
@@ -47,7 +47,7 @@ class Tracks:
 
 @torch.no_grad()
 def follow(
-    model: SceneModel,
+    model: DeVRFModel,
     views: Views,
     pool: PixelPool,
     previous: Tensor,
@@ -118,8 +118,8 @@ def start_from_tracks(
     if len(tracks) == 0:
         return
     scale = _pixels_per_unit(tracks, cameras, space, 1e-3 * field.box.longest)
-    backward, forward = (field.here.new_empty(*field.shape, 3) for _ in range(2))
-    field.read(frame, (backward, forward))
+    backward, forward = (field.frames.here.new_empty(*field.shape, 3) for _ in range(2))
+    field.frames.read(frame, (backward, forward))
     coords = field.box.to_grid(tracks.canonical, field.shape)
 
     def misses(change: Tensor) -> Tensor:
@@ -136,7 +136,7 @@ def start_from_tracks(
         return (returned - tracks.canonical) * scale
 
     backward += _fit(errs, backward, scale, smoothness, steps)
-    field.write(frame, (backward, forward))
+    field.frames.write(frame, (backward, forward))
 
 
 def _pixels_per_unit(tracks: Tracks, cameras: Cameras, space: Space, small: float) -> float:

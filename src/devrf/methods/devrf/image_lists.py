@@ -11,7 +11,7 @@ from torch import Tensor
 from devrf.geometry.rays import Rays
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.sample_search import search
-from devrf.methods.devrf.volume_rendering import RenderSettings
+from devrf.methods.devrf.settings import RenderSettings
 from devrf.ops.compositing import composite_segments, sum_segments
 from devrf.ops.search import PackedSamples, select
 from devrf.ops.warped_depth import warped_depth

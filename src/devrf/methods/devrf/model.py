@@ -1,24 +1,39 @@
-"""A whole scene that can be rendered: canonical field, its occupancy, and how it deforms."""
+"""DeVRF's model: a canonical voxel field, its occupancy, and how it deforms."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
-from devrf.geometry.rays import Rays
+from devrf.data.batch import RayBatch
+from devrf.geometry.box import Box
+from devrf.geometry.clock import FrameClock
+from devrf.geometry.ndc import space_config, space_from
 from devrf.geometry.space import WORLD, Space
+from devrf.methods.base import DynamicModel
+from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField
+from devrf.methods.devrf.compact_state import compact_state, expanded_state
 from devrf.methods.devrf.deformation_field import DeformationField
-from devrf.methods.devrf.volume_rendering import RenderSettings, Warp, render
-from devrf.rendering.chunks import in_chunks
-from devrf.rendering.occupancy import Occupancy, dilate
-from devrf.rendering.rendered_image import RenderedImage
+from devrf.methods.devrf.deformed_occupancy import deformed_occupancy
+from devrf.methods.devrf.image_lists import ListRenderer
+from devrf.methods.devrf.photometric_losses import PHOTOMETRIC_TERMS, Prediction
+from devrf.methods.devrf.settings import RenderSettings
+from devrf.methods.devrf.view import DeVRFView
+from devrf.methods.devrf.volume_rendering import VoxelOutput, Warp, joined, render
+from devrf.rendering.occupancy import Occupancy
+from devrf.rendering.output import RenderOutput
 
 
-class SceneModel(nn.Module):
-    """What is needed to see a scene from any view at any time.
+class DeVRFModel(DynamicModel):
+    """Everything that is needed to see a scene from any view at any time.
 
     Attributes:
+        architecture: sizes of the canonical field.
         canonical: what the scene looks like at rest.
         occupancy: where something is at rest.
         deformation: how it moves; None shows the rest state at every time.
@@ -26,8 +41,11 @@ class SceneModel(nn.Module):
         space: the space that the fields live in.
     """
 
+    name: ClassVar[str] = "devrf"
+
     def __init__(
         self,
+        architecture: Architecture,
         canonical: CanonicalField,
         occupancy: Occupancy,
         settings: RenderSettings,
@@ -35,15 +53,78 @@ class SceneModel(nn.Module):
         space: Space = WORLD,
     ) -> None:
         super().__init__()
+        self.architecture = architecture
         self.canonical = canonical
         self.occupancy = occupancy
         self.settings = settings
         self.deformation = deformation
         self.space = space
+        self._lists: dict[bool, ListRenderer] = {}
 
-    def at_rest(self) -> SceneModel:
-        """The canonical field alone, sharing its memory: the rest state at every time."""
-        return SceneModel(self.canonical, self.occupancy, self.settings, space=self.space)
+    @property
+    def box(self) -> Box:  # type: ignore[override]
+        """Where the fields live."""
+        return self.canonical.box
+
+    @property
+    def depth_limits(self) -> tuple[float, float]:  # type: ignore[override]
+        """Near and far of the sampling."""
+        return self.settings.near, self.settings.far
+
+    def config(self) -> dict[str, Any]:
+        """Sizes, sampling, space, and which fields there are."""
+        return {
+            "architecture": asdict(self.architecture),
+            "settings": asdict(self.settings),
+            "space": space_config(self.space),
+            "radiance": self.canonical.has_network,
+            "deforms": self.moves,
+        }
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> DeVRFModel:
+        """Fields of a few voxels; the stored state gives them their shapes."""
+        box = Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+        build = Architecture(**config["architecture"])
+        # A stage that was stopped in its search has no colour network yet.
+        radiance = config["radiance"]
+        return cls(
+            build,
+            build.radiance_field(box, 8, 8) if radiance else build.search_field(box, 8),
+            Occupancy.full((2, 2, 2), box),
+            RenderSettings(**config["settings"]),
+            DeformationField(box, FrameClock((0.0, 1.0)), voxels=8) if config["deforms"] else None,
+            space_from(config["space"]),
+        )
+
+    def forward(self, batch: RayBatch) -> VoxelOutput:
+        """Render rays, those of each distinct time through that time's warp."""
+        outputs, places = [], []
+        for time in torch.unique(batch.time).tolist():
+            place = (batch.time == time).nonzero()[:, 0]
+            background = batch.background
+            outputs.append(
+                render(
+                    batch.rays[place],
+                    self.canonical,
+                    self.occupancy_at(time),
+                    self.settings,
+                    background if background.dim() == 1 else background[place],
+                    self.warp(time),
+                )
+            )
+            places.append(place)
+        return joined(outputs, places)
+
+    def loss_terms(self, output: RenderOutput, batch: RayBatch) -> dict[str, Tensor]:
+        """The photometric terms; those of motion need the frame before (``motion_losses``)."""
+        assert isinstance(output, VoxelOutput)
+        prediction = Prediction(output, batch)
+        return {name: term(prediction) for name, term in PHOTOMETRIC_TERMS.items()}
+
+    def parts(self) -> dict[str, Iterable[nn.Parameter]]:
+        """The canonical field; the deformation is learned frame by frame, by its own stage."""
+        return {"canonical": self.canonical.parameters()}
 
     def warp(self, time: float) -> Warp | None:
         """The map from points (M, 3) at ``time`` into canonical space; None is the identity."""
@@ -55,56 +136,44 @@ class SceneModel(nn.Module):
     def occupancy_at(self, time: float) -> Occupancy:
         """Where something is at ``time`` in [0, 1]."""
         warp = self.warp(time)
-        return self.occupancy if warp is None else deformed_occupancy(self, warp)
+        if warp is None:
+            return self.occupancy
+        return deformed_occupancy(self.occupancy, self.canonical, warp)
 
-    @torch.no_grad()
-    def picture(
-        self, rays: Rays, time: float, background: Tensor, chunk: int = 16384
-    ) -> RenderedImage:
-        """What rays see at ``time``: the plain way, which keeps nothing for another picture.
+    def at(self, time: float, *, half: bool = False) -> DeVRFView:
+        """The scene at ``time``: its occupancy and its displacements, ready."""
+        lists = self._lists.get(half)
+        if (
+            lists is None
+            or lists.field is not self.canonical
+            or lists.settings is not self.settings
+        ):
+            lists = self._lists[half] = ListRenderer(self.canonical, self.settings, half=half)
+        return DeVRFView(self.occupancy, self.deformation, lists, self.space, time)
 
-        :class:`~devrf.methods.devrf.renderer.Renderer` is the quick one.
+    @property
+    def device(self) -> torch.device:
+        """Where the canonical field is."""
+        return self.canonical.density.values.device
 
-        Args:
-            rays: R rays in world space.
-            time: in [0, 1].
-            background: (3,) RGB.
-            chunk: rays rendered at once; fewer when memory runs out.
-        """
-        rays = self.space.rays(rays)
-        warp, occupancy = self.warp(time), self.occupancy_at(time)
-        parts = in_chunks(
-            lambda some: render(some, self.canonical, occupancy, self.settings, background, warp),
-            rays,
-            chunk,
+    @property
+    def moves(self) -> bool:
+        """Whether there is a deformation field."""
+        return self.deformation is not None
+
+    @property
+    def size(self) -> int:
+        """Values of both fields."""
+        motion = self.deformation
+        frames = [] if motion is None else [motion.to_canonical, motion.to_time]
+        return super().size + sum(tensor.numel() for tensor in frames)
+
+    def stored_state(self) -> dict[str, Any]:
+        """The state with its grids in half precision, in detail only near matter."""
+        return compact_state(
+            self.state_dict(), self.occupancy, self.canonical, self.deformation, self.occupancy_at
         )
-        return RenderedImage.joined([RenderedImage.of(part) for part in parts])
 
-
-@torch.no_grad()
-def deformed_occupancy(model: SceneModel, warp: Warp) -> Occupancy:
-    """Where something is once it has moved: the grid points that the warp sends to matter.
-
-    Args:
-        model: gives the canonical occupancy and the box.
-        warp: maps points (M, 3) at the time in question into canonical space.
-    """
-    points = occupancy_points(model)
-    return occupancy_through(model, warp(points.view(-1, 3)).view(points.shape))
-
-
-def occupancy_points(model: SceneModel) -> Tensor:
-    """The grid points (X, Y, Z, 3) at which a moment's occupancy is looked at."""
-    x, y, z = model.occupancy.mask.shape
-    return model.canonical.box.grid_points((x, y, z), model.canonical.density.values)
-
-
-@torch.no_grad()
-def occupancy_through(model: SceneModel, canonical: Tensor) -> Occupancy:
-    """The occupancy of a moment whose grid points are seen at ``canonical`` (X, Y, Z, 3).
-
-    The canonical occupancy has a rim of one grid point, for what a stretching warp would step
-    over; so has the result, for what lies between its own grid points.
-    """
-    found = model.occupancy.at(canonical.view(-1, 3)).view(canonical.shape[:3])
-    return Occupancy(dilate(found, 1), model.canonical.box)
+    def load_stored_state(self, state: Mapping[str, Any]) -> None:
+        """Take a compact or a full state."""
+        self.load_state_dict(expanded_state(dict(state)))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from devrf.geometry.cameras import Cameras
@@ -35,15 +34,10 @@ class MotionPrediction(Prediction):
 
 def cycle(prediction: MotionPrediction) -> Tensor:
     """Mean over samples of ½ |x − (q + Δ_f(q, t))|²: there and back again."""
-    samples = prediction.output.samples
-    if len(samples) == 0:
-        return prediction.output.canonical.sum()
-    returned = prediction.unwarp(prediction.output.canonical)
-    missed = 0.5 * (samples.points - returned).square().sum(dim=1)
-    if samples.present is None:
-        return missed.mean()
-    total = torch.where(samples.present, missed, 0.0).sum()
-    return total / samples.present.sum().clamp(min=1)
+    output = prediction.output
+    returned = prediction.unwarp(output.canonical)
+    missed = 0.5 * (output.samples.points - returned).square().sum(dim=1)
+    return output.mean_over_samples(missed)
 
 
 def flow(prediction: MotionPrediction) -> Tensor:
@@ -56,30 +50,18 @@ def flow(prediction: MotionPrediction) -> Tensor:
     batch, output = prediction.batch, prediction.output
     if batch.flow is None or batch.flow_valid is None:
         return output.canonical.new_zeros(())
-    ray, canonical, weight = output.samples.ray, output.canonical, output.weight
-    counts = batch.flow_valid[ray]
-    if output.samples.present is None:
-        kept = counts.nonzero()[:, 0]
-        ray, canonical, weight = ray[kept], canonical[kept], weight[kept]
-        observed = batch.flow[ray]
-    else:
-        # A list of fixed length stays as long as it is: what does not count is made harmless,
-        # wherever it lies and whatever was observed there.
-        counts = (counts & output.samples.present)[:, None]
-        canonical = torch.where(counts, canonical, 0.0)
-        weight = torch.where(counts[:, 0], weight, 0.0)
-        observed = torch.where(counts, batch.flow[ray], 0.0)
-    camera = prediction.previous_image[batch.image[ray]]
+    seen = output.on_rays(batch.flow_valid)
     induced = induced_flow(
-        canonical,
+        seen.canonical,
         prediction.unwarp_previous,
         prediction.cameras,
-        camera,
-        batch.pixel[ray],
+        prediction.previous_image[batch.image[seen.ray]],
+        batch.pixel[seen.ray],
         prediction.space,
     )
+    observed = batch.flow[seen.ray]
     error = (induced - observed).abs().sum(dim=1)
-    return (weight * error).sum() / batch.flow_valid.sum().clamp(min=1)
+    return (seen.weight * error).sum() / batch.flow_valid.sum().clamp(min=1)
 
 
 def induced_flow(
@@ -109,14 +91,3 @@ MOTION_TERMS = {
     "cycle": cycle,
     "flow": flow,
 }
-
-
-def total_variation_weight(weight: float, side: int, rays: int) -> float:
-    """Factor of the Huber total variation's gradient: ω·(side/128)/R/6 (method §3, TV).
-
-    Args:
-        weight: ω, the term's weight.
-        side: the longest side of the motion grid.
-        rays: R, the rays of a batch.
-    """
-    return weight * (side / 128) / rays / 6

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from devrf.data.batch import RayBatch
-from devrf.methods.devrf.volume_rendering import RenderOutput
+from devrf.methods.devrf.volume_rendering import VoxelOutput
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Prediction:
         batch: the rays and the truth at their pixels.
     """
 
-    output: RenderOutput
+    output: VoxelOutput
     batch: RayBatch
 
 

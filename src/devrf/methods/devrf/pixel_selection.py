@@ -1,14 +1,17 @@
-"""Which pixels are worth learning from: those whose rays meet matter."""
+"""Which pixels batches are drawn from: all, or those whose rays meet matter."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
+from devrf.data.pool import PixelPool, all_pixels, wanted_pixels
+from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
-from devrf.methods.devrf.model import SceneModel
+from devrf.methods.devrf.model import DeVRFModel
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.sampling import hits
+from devrf.scenes.scene import Views
 
 # Rays are followed through blocks of so many pixels a side.
 BLOCK = 2
@@ -16,7 +19,7 @@ BLOCK = 2
 
 @torch.no_grad()
 def rays_hit_occupied(
-    cameras: Cameras, image: int, model: SceneModel, occupancy: Occupancy
+    cameras: Cameras, image: int, model: DeVRFModel, occupancy: Occupancy
 ) -> Tensor:
     """Mask (H·W,): the pixels of an image whose rays pass near anything occupied.
 
@@ -40,3 +43,82 @@ def rays_hit_occupied(
     )
     rows = hit.view(height, width).repeat_interleave(BLOCK, dim=0)[: cameras.height]
     return rows.repeat_interleave(BLOCK, dim=1)[:, : cameras.width].reshape(-1)
+
+
+def canonical_pool(views: Views, model: DeVRFModel, *, everywhere: bool) -> PixelPool:
+    """The pixels of the static images to draw from.
+
+    Args:
+        views: the static training views, on the model's device.
+        model: the canonical field and its occupancy.
+        everywhere: all pixels; else those whose rays meet something that may be occupied.
+
+    Raises:
+        DevrfError: nothing is occupied.
+    """
+    device = model.device
+    images = torch.arange(len(views), device=device)
+    if everywhere:
+        return all_pixels(views, images)
+    cameras = views.cameras.to(device)
+    hit = [rays_hit_occupied(cameras, k, model, model.occupancy) for k in range(len(views))]
+    pool = wanted_pixels(views, images, torch.stack(hit))
+    if not len(pool):
+        raise DevrfError(
+            "the canonical field has become empty: check data.background, data.box and "
+            "data.near, or lower schedule.rates.density"
+        )
+    return pool
+
+
+@torch.no_grad()
+def frame_pools(
+    views: Views,
+    frame: int,
+    model: DeVRFModel,
+    occupancy: Occupancy,
+    *,
+    occupied_only: bool,
+    join_views: bool,
+) -> list[PixelPool]:
+    """The pixels to learn a frame from: pools that batches are drawn from in turn.
+
+    Args:
+        views: the dynamic training views, on the model's device.
+        frame: the frame.
+        model: gives box, space, near and far.
+        occupancy: where the frame's matter is.
+        occupied_only: only pixels on the matte, or whose rays meet the frame's matter.
+        join_views: one pool of all views; else one pool a view.
+
+    Raises:
+        DevrfError: no image shows the frame.
+    """
+    images = images_of(views, frame)
+    if len(images) == 0:
+        raise DevrfError(f"dynamic training set: no image at frame {frame}")
+    pools = [
+        _occupied(views, image, model, occupancy)
+        if occupied_only
+        else all_pixels(views, image[None])
+        for image in images
+    ]
+    if not join_views:
+        return pools
+    parts = [torch.cat([getattr(pool, name) for pool in pools]) for name in ("image", "flat")]
+    return [PixelPool(*parts)]
+
+
+def images_of(views: Views, frame: int) -> Tensor:
+    """The images (K,) int64 that show a frame, ascending."""
+    assert views.frames is not None
+    return (views.frames == frame).nonzero()[:, 0]
+
+
+def _occupied(views: Views, image: Tensor, model: DeVRFModel, occupancy: Occupancy) -> PixelPool:
+    """Pixels on the matte, or whose rays meet matter; all if there are none."""
+    wanted = rays_hit_occupied(views.cameras, int(image), model, occupancy)
+    if views.has_alpha:
+        wanted |= views.pixels[image, :, :, 3].flatten() > 0
+    pool = wanted_pixels(views, image[None], wanted[None])
+    return pool if len(pool) else all_pixels(views, image[None])

@@ -8,7 +8,8 @@ from torch import Tensor
 
 from devrf.geometry.rays import Rays
 from devrf.methods.devrf.canonical_field import CanonicalField
-from devrf.methods.devrf.volume_rendering import STOP, RenderSettings
+from devrf.methods.devrf.settings import RenderSettings
+from devrf.methods.devrf.volume_rendering import STOP
 from devrf.ops.search import PackedSamples, Thresholds, find_samples
 from devrf.rendering.occupancy import Occupancy
 

@@ -95,3 +95,21 @@ class MotionSettings:
                 "schedule.motion.min_rel_improvement: expected above 0, at most 1, or null, not "
                 f"{self.min_rel_improvement}"
             )
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """How finely rays are sampled and what is too faint to matter.
+
+    Attributes:
+        step: distance between samples in voxels of the present resolution.
+        alpha_threshold: samples with a lower opacity are dropped, then samples with a lower
+            weight, before their colour is computed.
+        near: distance before which nothing is sampled, in world units (or NDC).
+        far: distance behind which nothing is sampled, likewise.
+    """
+
+    step: float
+    alpha_threshold: float
+    near: float
+    far: float

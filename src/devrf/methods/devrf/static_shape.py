@@ -13,7 +13,8 @@ from devrf.geometry.rays import Rays
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.grid_warp import GridWarp
 from devrf.methods.devrf.sample_search import search
-from devrf.methods.devrf.volume_rendering import RenderOutput, RenderSettings
+from devrf.methods.devrf.settings import RenderSettings
+from devrf.methods.devrf.volume_rendering import VoxelOutput
 from devrf.ops.compositing import composite_segments, sum_segments
 from devrf.ops.search import PackedSamples, SampleSubset, select
 from devrf.ops.trilinear import kept_gradient
@@ -24,17 +25,17 @@ from devrf.rendering.sampling import Samples, march, most_steps, steps_through
 from devrf.system.profiling import measured, span, tally
 
 
-def render_in_lists(
+def render_static(
     rays: Rays,
     field: CanonicalField,
     occupancy: Occupancy,
     settings: RenderSettings,
     background: Tensor,
     warp: GridWarp | None,
-    room: SampleCapacity,
+    capacity: SampleCapacity,
     precision: torch.dtype = torch.float32,
-) -> RenderOutput:
-    """What ``render`` gives, in lists of ``room.heavy`` places (method §2).
+) -> VoxelOutput:
+    """What ``render`` gives, in lists of ``capacity.significant`` places (method §2).
 
     Gradients of grids that have one already (``grad``) are added to it in place.
 
@@ -46,7 +47,7 @@ def render_in_lists(
         background: (3,) or (R, 3) RGB behind everything.
         warp: maps the rays' points into canonical space, over the field's own box; None leaves
             them.
-        room: how long the lists are; it is told how long they would have to be.
+        capacity: how long the lists are; it is told how long they would have to be.
         precision: what the colour network works in.
 
     Returns:
@@ -55,7 +56,7 @@ def render_in_lists(
     warp = warp or GridWarp((), field.box)
     delta, density = field.step_in_base_voxels(settings.step), field.density.values
     with span("sampling"):
-        found = _search(rays, field, occupancy, settings, warp, room.visible)
+        found = _search(rays, field, occupancy, settings, warp, capacity.visible)
     with span("density"):
         canonical, tau = warped_depth(
             found.points,
@@ -71,8 +72,8 @@ def render_in_lists(
     with span("compositing"):
         weight, transmittance = composite_segments(tau, found.first)
     with span("sampling"):
-        chosen = select(found.heavy, found.first, room.heavy)
-        room.note(found.total, chosen.total)
+        chosen = select(found.heavy, found.first, capacity.significant)
+        capacity.note(found.total, chosen.total)
         tally("reached", found.total)
         tally("heavy", chosen.total)
         samples, present = _listed(found, chosen, len(rays))
@@ -85,7 +86,7 @@ def render_in_lists(
         reached, mass = sum_segments(weight, distance, chosen.first).unbind(1)
     with span("compositing"):
         seen = sum_segments(weight, color, chosen.first)
-    return RenderOutput(
+    return VoxelOutput(
         color=seen + transmittance[:, None] * background,
         depth=reached / mass.clamp(min=1e-6),
         transmittance=transmittance,

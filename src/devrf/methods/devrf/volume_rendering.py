@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -10,8 +10,10 @@ from torch import Tensor
 
 from devrf.geometry.rays import Rays
 from devrf.methods.devrf.canonical_field import CanonicalField
+from devrf.methods.devrf.settings import RenderSettings
 from devrf.ops.compositing import composite, sum_by_ray, transmittances
 from devrf.rendering.occupancy import Occupancy
+from devrf.rendering.output import RenderOutput
 from devrf.rendering.sampling import Samples, march
 from devrf.system.profiling import span, tally
 
@@ -22,44 +24,92 @@ STOP = 1e-4
 
 
 @dataclass(frozen=True)
-class RenderSettings:
-    """How finely rays are sampled and what is too faint to matter.
+class Segments:
+    """S samples of a render, those of some rays alone; what lies elsewhere has no weight.
 
     Attributes:
-        step: distance between samples in voxels of the present resolution.
-        alpha_threshold: samples with a lower opacity are dropped, then samples with a lower
-            weight, before their colour is computed.
-        near: distance before which nothing is sampled, in world units (or NDC).
-        far: distance behind which nothing is sampled, likewise.
+        ray: (S,) int64, the ray of each sample.
+        canonical: (S, 3) positions in canonical space.
+        weight: (S,) rendering weights.
     """
 
-    step: float
-    alpha_threshold: float
-    near: float
-    far: float
+    ray: Tensor
+    canonical: Tensor
+    weight: Tensor
 
 
-@dataclass(frozen=True)
-class RenderOutput:
-    """What R rays see.
+@dataclass(frozen=True, kw_only=True)
+class VoxelOutput(RenderOutput):
+    """What R rays see, and the samples that they see it by.
 
     Attributes:
-        color: (R, 3) RGB, composited on the background.
-        depth: (R,) mean distance of what is seen along the ray; 0 where nothing is.
-        transmittance: (R,) what is left of the ray behind the last sample, T_end.
         samples: the K samples whose colour was computed, at their own positions.
         canonical: (K, 3) positions of the samples in canonical space.
         weight: (K,) their weights.
         sample_color: (K, 3) their colours.
     """
 
-    color: Tensor
-    depth: Tensor
-    transmittance: Tensor
     samples: Samples
     canonical: Tensor
     weight: Tensor
     sample_color: Tensor
+
+    def mean_over_samples(self, values: Tensor) -> Tensor:
+        """The mean () of values (K,) of samples; 0 without samples, differentiable all the same."""
+        present = self.samples.present
+        if present is not None:
+            # A list of fixed length: padding counts for nothing.
+            return torch.where(present, values, 0.0).sum() / present.sum().clamp(min=1)
+        return values.mean() if len(values) else values.sum()
+
+    def on_rays(self, chosen: Tensor) -> Segments:
+        """The samples of the ``chosen`` rays, (R,) bool."""
+        ray, counts = self.samples.ray, chosen[self.samples.ray]
+        if self.samples.present is None:
+            kept = counts.nonzero()[:, 0]
+            return Segments(ray[kept], self.canonical[kept], self.weight[kept])
+        # A list of fixed length stays as long as it is: what does not count is made harmless,
+        # wherever it lies.
+        counts = counts & self.samples.present
+        canonical = torch.where(counts[:, None], self.canonical, 0.0)
+        return Segments(ray, canonical, torch.where(counts, self.weight, 0.0))
+
+
+def joined(outputs: Sequence[VoxelOutput], places: Sequence[Tensor]) -> VoxelOutput:
+    """What some renders see as that of one batch.
+
+    Args:
+        outputs: of the rays at ``places[k]``, in lists as long as need be.
+        places: (R_k,) int64, where in the batch the rays of each output stand; together all.
+    """
+    if len(outputs) == 1:
+        return outputs[0]
+    back = torch.cat(list(places)).argsort()
+    rays = len(back)
+    ray = torch.cat([place[one.samples.ray] for one, place in zip(outputs, places, strict=True)])
+    order = ray.argsort(stable=True)
+
+    def per_ray(name: str) -> Tensor:
+        return torch.cat([getattr(one, name) for one in outputs])[back]
+
+    def per_sample(values: Sequence[Tensor]) -> Tensor:
+        return torch.cat(list(values))[order]
+
+    samples = Samples(
+        ray[order],
+        per_sample([one.samples.distance for one in outputs]),
+        per_sample([one.samples.points for one in outputs]),
+        rays,
+    )
+    return VoxelOutput(
+        color=per_ray("color"),
+        depth=per_ray("depth"),
+        transmittance=per_ray("transmittance"),
+        samples=samples,
+        canonical=per_sample([one.canonical for one in outputs]),
+        weight=per_sample([one.weight for one in outputs]),
+        sample_color=per_sample([one.sample_color for one in outputs]),
+    )
 
 
 def render(
@@ -70,7 +120,7 @@ def render(
     background: Tensor,
     warp: Warp | None = None,
     precision: torch.dtype = torch.float32,
-) -> RenderOutput:
+) -> VoxelOutput:
     """Colours and depths of rays: C = Σ w_i c_i + T_end · background (method §2).
 
     Args:
@@ -106,9 +156,9 @@ def render(
     with span("compositing"):
         weight, transmittance = composite(tau, samples.ray, len(rays))
     with span("sampling"):
-        heavy = _at_least(weight.detach(), settings.alpha_threshold)
-        samples, canonical = samples[heavy], canonical.index_select(0, heavy)
-        weight = weight.index_select(0, heavy)
+        significant = _at_least(weight.detach(), settings.alpha_threshold)
+        samples, canonical = samples[significant], canonical.index_select(0, significant)
+        weight = weight.index_select(0, significant)
         tally("heavy", len(samples))
     with span("decoder"):
         color = field.rgb(canonical, rays.viewdirs, samples.ray, precision)
@@ -117,7 +167,7 @@ def render(
         with torch.no_grad():
             mass = sum_by_ray(weight, samples.ray, len(rays))
             depth = sum_by_ray(weight * samples.distance, samples.ray, len(rays))
-    return RenderOutput(
+    return VoxelOutput(
         color=seen + transmittance[:, None] * background,
         depth=depth / mass.clamp(min=1e-6),
         transmittance=transmittance,

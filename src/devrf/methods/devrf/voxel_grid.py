@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from devrf.geometry.box import Box
 from devrf.ops.corners import to_grid
+from devrf.ops.resampling import resample
 from devrf.ops.trilinear import interpolate, kept_gradient
 
 
@@ -49,15 +50,3 @@ class VoxelGrid(nn.Module):
         if stored is not None and stored.shape != self.values.shape:
             self.values = nn.Parameter(self.values.new_empty(stored.shape))
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
-
-
-def resample(values: Tensor, shape: tuple[int, int, int]) -> Tensor:
-    """A grid (X, Y, Z, C) at another resolution ``shape``, corners kept in place."""
-    if tuple(values.shape[:3]) == tuple(shape):
-        return values.detach().clone()
-    channels_first = values.permute(3, 0, 1, 2)[None]
-    resized = torch.nn.functional.interpolate(
-        channels_first, size=shape, mode="trilinear", align_corners=True
-    )
-    # Not contiguous(): of a single channel it keeps a stray stride, and look-ups become slow.
-    return resized[0].permute(1, 2, 3, 0).clone(memory_format=torch.contiguous_format)

@@ -1,0 +1,172 @@
+"""Where the displacements of all frames rest while a few of them are learned.
+
+All frames together are large (50 × 160³ × 3 single-precision values are 2.5 GB per direction), and
+few are needed at a time: they may rest on the host, or in half precision. Whatever is read is in
+single precision and on the device that the module is on.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from devrf.ops.resampling import resample
+
+log = logging.getLogger(__name__)
+
+Directions = tuple[Tensor, Tensor]
+NAMES = ("to_canonical", "to_time")
+
+
+class FrameStore(nn.Module):
+    """Displacements of T frames in two directions.
+
+    Attributes:
+        to_canonical: (T, X, Y, Z, 3) backward: points of the frame → canonical space.
+        to_time: (T, X, Y, Z, 3) forward: canonical points → the frame.
+        on_host: whether they stay on the host wherever the module goes.
+    """
+
+    to_canonical: Tensor
+    to_time: Tensor
+    here: Tensor
+
+    def __init__(self, frames: int, shape: tuple[int, int, int]) -> None:
+        """Zero displacements of ``frames`` frames on grids of ``shape`` (X, Y, Z)."""
+        super().__init__()
+        self.on_host = False
+        for name in NAMES:
+            self.register_buffer(name, torch.zeros(frames, *shape, 3))
+        # It goes where the module goes, and so tells where that is.
+        self.register_buffer("here", torch.zeros(0), persistent=False)
+        self._fetched: dict[int, tuple[Directions, torch.cuda.Stream]] = {}
+
+    @torch.no_grad()
+    def read(self, frame: int, into: Directions) -> None:
+        """Copy a frame out, without waiting for the device.
+
+        Args:
+            frame: which.
+            into: backward and forward displacements (X, Y, Z, 3), overwritten.
+        """
+        source = (self.to_canonical[frame], self.to_time[frame])
+        if frame in self._fetched:
+            source, side = self._fetched.pop(frame)
+            present = torch.cuda.current_stream(self.here.device)
+            present.wait_stream(side)
+            for tensor in source:
+                tensor.record_stream(present)
+        for tensor, value in zip(into, source, strict=True):
+            tensor.copy_(value, non_blocking=True)
+
+    @torch.no_grad()
+    def read_forward(self, frame: int, into: Tensor) -> None:
+        """As :meth:`read`, of the forward displacements alone."""
+        into.copy_(self.to_time[frame], non_blocking=True)
+
+    @torch.no_grad()
+    def write(self, frame: int, displacements: Directions) -> None:
+        """Copy backward and forward ``displacements`` (X, Y, Z, 3) back into a frame.
+
+        Does not wait for the device: :meth:`synchronize` before the host looks at them.
+
+        Raises:
+            IndexError: frame 0, which is the rest state, or one that is not there.
+        """
+        if not 1 <= frame < len(self.to_time):
+            last = len(self.to_time) - 1
+            raise IndexError(f"frame {frame} cannot be trained: only 1 to {last}")
+        for name, value in zip(NAMES, displacements, strict=True):
+            getattr(self, name)[frame].copy_(value, non_blocking=True)
+        self._fetched.pop(frame, None)  # what is on its way is of before
+
+    def synchronize(self) -> None:
+        """Wait until the host sees everything that was written."""
+        if self.on_host and self.here.is_cuda:
+            torch.cuda.current_stream(self.here.device).synchronize()
+
+    @torch.no_grad()
+    def prefetch(self, frames: Sequence[int]) -> None:
+        """Begin to fetch frames from the host, beside other work: they are read next."""
+        if not (self.on_host and self.here.is_cuda):
+            return
+        device, self._fetched = self.here.device, {}
+        side = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+        # What was written to the frames has to be there first.
+        side.wait_stream(torch.cuda.current_stream(device))
+        with torch.cuda.stream(side):
+            for frame in frames:
+                backward = self.to_canonical[frame].to(device, non_blocking=True)
+                forward = self.to_time[frame].to(device, non_blocking=True)
+                self._fetched[frame] = ((backward, forward), side)
+
+    @torch.no_grad()
+    def copy_previous(self, frame: int) -> None:
+        """Start ``frame`` from the frame before it, in both directions."""
+        self.synchronize()
+        for name in NAMES:
+            getattr(self, name)[frame] = getattr(self, name)[frame - 1]
+
+    @torch.no_grad()
+    def resize(self, shape: tuple[int, int, int]) -> None:
+        """Resample every frame to grids of ``shape``, trilinearly."""
+        self._fetched = {}
+        for name in NAMES:
+            frames = getattr(self, name)
+            resized = self._empty((len(frames), *shape, 3), frames.dtype)
+            # Each written to its place: no copy of all.
+            for into, frame in zip(resized, frames, strict=True):
+                into.copy_(resample(frame.to(self.here), shape), non_blocking=True)
+            self.synchronize()
+            setattr(self, name, resized)
+
+    @torch.no_grad()
+    def offload(self, *, on_host: bool, half: bool) -> None:
+        """Say where the displacements rest, and how.
+
+        Args:
+            on_host: keep them on the host, in memory that a CUDA device reaches beside its work.
+            half: keep them in half precision: to 1/2048 of each value.
+        """
+        self.on_host = on_host
+        for name in NAMES:
+            frames = getattr(self, name)
+            moved = self._empty(frames.shape, torch.float16 if half else torch.float32)
+            setattr(self, name, moved.copy_(frames))
+
+    def _empty(self, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+        """An uninitialised tensor where displacements rest."""
+        if not self.on_host:
+            return torch.empty(shape, dtype=dtype, device=self.here.device)
+        if torch.cuda.is_available():
+            try:
+                return torch.empty(shape, dtype=dtype, pin_memory=True)
+            except RuntimeError as error:
+                reason = str(error).splitlines()[0]
+                log.warning("displacements are fetched slowly: no page-locked memory (%s)", reason)
+        return torch.empty(shape, dtype=dtype)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> FrameStore:
+        kept = NAMES if self.on_host else ()
+        frames = {name: self._buffers.pop(name) for name in kept}
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
+        self._buffers.update(frames)
+        return self
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy takes over: not what is on its way."""
+        return {**self.__dict__, "_fetched": {}}
+
+    def _load_from_state_dict(
+        self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
+    ) -> None:
+        self._fetched = {}
+        for name in NAMES:
+            stored, frames = state_dict.get(prefix + name), getattr(self, name)
+            if stored is not None and stored.shape != frames.shape:
+                setattr(self, name, self._empty(stored.shape, frames.dtype))
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)

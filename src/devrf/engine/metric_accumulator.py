@@ -1,0 +1,43 @@
+"""Losses and their terms, added up over the iterations of a Lightning step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from devrf.engine.ddp import average
+
+
+class MetricAccumulator:
+    """Sums by name, for each of the parallel batches.
+
+    From the first addition on they stay in the same memory.
+    """
+
+    def __init__(self) -> None:
+        self._names: tuple[str, ...] = ()
+        self._values: Tensor | None = None  # (batches, names)
+
+    def add(self, found: Sequence[Mapping[str, Tensor]]) -> None:
+        """Add what an iteration has come to: scalars by name for each batch, all the same names."""
+        self._names = tuple(found[0])
+        values = torch.stack([terms[name] for terms in found for name in self._names])
+        values = values.view(len(found), len(self._names))
+        if self._values is None:
+            self._values = values
+        else:
+            self._values += values
+
+    def take(self, iterations: int) -> tuple[dict[str, Tensor], Tensor]:
+        """The means over some iterations and all processes; the sums begin anew.
+
+        Returns:
+            Of each name the mean over the batches, (); of each batch its ``loss``, (batches,).
+        """
+        assert self._values is not None
+        means = average(self._values) / iterations
+        self._values.zero_()
+        together = means.mean(dim=0).unbind()
+        return dict(zip(self._names, together, strict=True)), means[:, self._names.index("loss")]

@@ -1,0 +1,42 @@
+"""A stretch of a stage's schedule."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+
+class Phase(Protocol):
+    """A stretch of a schedule in which the same tensors are learned.
+
+    Attributes:
+        start: first iteration.
+        stop: one past the last iteration.
+        kind: what is learned, in a word or two: ``search``, ``fine``, ``level 2``.
+        frames: the frames that are learned, ascending; none where all times are learned at once.
+    """
+
+    @property
+    def start(self) -> int:
+        """First iteration."""
+        ...
+
+    @property
+    def stop(self) -> int:
+        """One past the last iteration."""
+        ...
+
+    @property
+    def kind(self) -> str:
+        """What is learned."""
+        ...
+
+    @property
+    def frames(self) -> tuple[int, ...]:
+        """The frames that are learned."""
+        ...
+
+
+def in_words(frames: tuple[int, ...]) -> str:
+    """Frames in words: ``frame 3``, or ``frames 3, 10``."""
+    noun = "frame" if len(frames) == 1 else "frames"
+    return f"{noun} {', '.join(str(frame) for frame in frames)}"

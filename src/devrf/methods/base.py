@@ -1,0 +1,144 @@
+"""What every method is: a module that renders a batch of rays and says its losses.
+
+A method's module is configured by ``conf/method/<name>.yaml``; which data trains which of its
+parts is said by ``conf/protocol/*.yaml``, and carried out by a stage (``methods.ray_stage`` for any
+method, ``methods.devrf`` has two of its own). Everything that shows a learned scene (films,
+stills, evaluation) asks for :meth:`DynamicModel.at` alone.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from devrf.data.batch import RayBatch
+from devrf.errors import DevrfError
+from devrf.geometry.box import Box
+from devrf.geometry.space import Space
+from devrf.rendering.output import RenderOutput
+from devrf.rendering.view import View
+from devrf.scenes.scene import Scene
+
+
+class DynamicModel(nn.Module, ABC):
+    """A scene that moves, learned by some method.
+
+    Attributes:
+        name: the method's name: what ``method=`` chooses, and tables say.
+        box: what holds the scene, in the space of the fields.
+        space: the space that the fields live in: world units, or NDC.
+        depth_limits: distances along a ray before and behind which nothing is sampled, in the
+            space of the fields.
+    """
+
+    name: ClassVar[str]
+    box: Box
+    space: Space
+    depth_limits: tuple[float, float]
+
+    @abstractmethod
+    def config(self) -> dict[str, Any]:
+        """Plain data from which :meth:`from_config` builds a module that takes this one's state.
+
+        A checkpoint holds it, beside the class.
+        """
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> DynamicModel:
+        """The module that :meth:`config` described, with other values in it."""
+        return cls(**config)
+
+    def setup(self, scene: Scene) -> None:
+        """Take from a scene what the method needs: bounds, the frames' times, priors.
+
+        Called once, before anything is learned; not for a model that was loaded.
+
+        Raises:
+            DevrfError: the scene lacks what the method needs.
+        """
+
+    @abstractmethod
+    def forward(self, batch: RayBatch) -> RenderOutput:
+        """Render a batch of R rays, each at its own time; differentiable in the parameters."""
+
+    def loss_terms(self, output: RenderOutput, batch: RayBatch) -> dict[str, Tensor]:
+        """The unweighted loss terms () by name; may render again.
+
+        ``color`` is the mean squared colour error over rays and channels.
+        """
+        return {"color": nn.functional.mse_loss(output.color, batch.color)}
+
+    @abstractmethod
+    def parts(self) -> dict[str, Iterable[nn.Parameter]]:
+        """The parameters by the name of the part they belong to, as protocols call it."""
+
+    def param_groups(self) -> list[dict[str, Any]]:
+        """Groups for an optimiser: ``name`` and ``params`` of each part that is not frozen.
+
+        A method that wants its parts learned at different rates adds ``rate``: a factor of the
+        configured learning rate.
+        """
+        groups = []
+        for name, parameters in self.parts().items():
+            free = [one for one in parameters if one.requires_grad]
+            if free:
+                groups.append({"name": name, "params": free})
+        return groups
+
+    def freeze(self, parts: Sequence[str]) -> None:
+        """Keep some parts as they are, and let the others learn.
+
+        Raises:
+            DevrfError: the method has no such part.
+        """
+        own = self.parts()
+        for name in parts:
+            if name not in own:
+                known = ", ".join(own)
+                raise DevrfError(f"protocol: {self.name} has no part {name!r}; it has {known}")
+        for name, parameters in own.items():
+            for parameter in parameters:
+                parameter.requires_grad_(name not in parts)
+
+    def on_iteration(self, step: int, total: int) -> None:
+        """Called before iteration ``step`` of ``total``: for encoding windows and curricula."""
+
+    @abstractmethod
+    def at(self, time: float, *, half: bool = False) -> View:
+        """The scene at ``time`` in [0, 1], ready to be looked at from anywhere.
+
+        Args:
+            time: in [0, 1].
+            half: let networks work in half precision where device and method can.
+        """
+
+    @property
+    def device(self) -> torch.device:
+        """Where the parameters are."""
+        return next(self.parameters()).device
+
+    @property
+    def moves(self) -> bool:
+        """Whether it has learned to move: False for a rest state alone."""
+        return True
+
+    @property
+    def size(self) -> int:
+        """How many numbers are learned."""
+        return sum(parameter.numel() for parameter in self.parameters())
+
+    def stored_state(self) -> dict[str, Any]:
+        """The state for a finished checkpoint: tensors and plain data, as small as can be."""
+        return self.state_dict()
+
+    def load_stored_state(self, state: Mapping[str, Any]) -> None:
+        """Take what :meth:`stored_state` gave, or a full state.
+
+        Raises:
+            RuntimeError | KeyError | ValueError | TypeError: it does not fit.
+        """
+        self.load_state_dict(dict(state))

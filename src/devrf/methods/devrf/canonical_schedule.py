@@ -1,0 +1,108 @@
+"""The canonical stage's schedule: a pure map from an iteration to what is learned then."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+from devrf.errors import DevrfError
+
+
+@dataclass(frozen=True)
+class CanonicalPhase:
+    """A stretch of the canonical stage with one grid.
+
+    Attributes:
+        kind: ``search`` for the coarse geometry, ``fine`` for the radiance field.
+        start: first iteration.
+        stop: one past the last iteration.
+        voxels: about how many voxels the grids have.
+    """
+
+    kind: Literal["search", "fine"]
+    start: int
+    stop: int
+    voxels: int
+
+    @property
+    def frames(self) -> tuple[int, ...]:
+        """None: the scene is at rest."""
+        return ()
+
+
+@dataclass(frozen=True)
+class CanonicalSchedule:
+    """The canonical stage's course (method §2); the defaults are the paper's, inward-facing.
+
+    Attributes:
+        search_iterations: length of the coarse geometry search; 0 leaves it out.
+        search_side: side of the search grid: it has about side³ voxels.
+        carve: start from the visual hull of the static views where the images have mattes;
+            then the search sees little empty space and may be short, or left out.
+        iterations: length of the fine stage.
+        side: side of the final grid of about side³ voxels.
+        doublings: iterations of the fine stage at which the number of voxels doubles; it starts
+            at side³ / 2^len(doublings).
+        decay_iterations: every so many iterations the learning rates fall to a tenth.
+        rays: rays a batch.
+    """
+
+    search_iterations: int = 5000
+    search_side: int = 100
+    carve: bool = False
+    iterations: int = 20000
+    side: float = 160
+    doublings: Sequence[int] = (1000, 2000, 3000, 4000)
+    decay_iterations: int = 20000
+    rays: int = 8192
+    phases: tuple[CanonicalPhase, ...] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        least = {
+            "search_iterations": 0,
+            "search_side": 2,
+            "iterations": 1,
+            "side": 2,
+            "decay_iterations": 1,
+            "rays": 1,
+        }
+        for name, bound in least.items():
+            if getattr(self, name) < bound:
+                raise DevrfError(
+                    f"schedule.canonical.{name}: expected at least {bound}, "
+                    f"not {getattr(self, name)}"
+                )
+        if self.side**3 < 8 * 2 ** len(self.doublings):
+            raise DevrfError(
+                f"schedule.canonical.doublings: {len(self.doublings)} of them are too many for "
+                f"side {self.side}; start from 8 voxels or more"
+            )
+        edges = [0, *self.doublings, self.iterations]
+        if any(a >= b for a, b in zip(edges, edges[1:], strict=False)):
+            raise DevrfError(
+                "schedule.canonical.doublings must ascend between 0 and iterations "
+                f"({self.iterations}), not {list(self.doublings)}"
+            )
+        offset, phases = self.search_iterations, []
+        if offset:
+            phases.append(CanonicalPhase("search", 0, offset, self.search_side**3))
+        for k, (start, stop) in enumerate(zip(edges, edges[1:], strict=False)):
+            voxels = round(self.side**3) // 2 ** (len(self.doublings) - k)
+            phases.append(CanonicalPhase("fine", offset + start, offset + stop, voxels))
+        object.__setattr__(self, "phases", tuple(phases))
+
+    @property
+    def total(self) -> int:
+        """Iterations of the whole stage."""
+        return self.search_iterations + self.iterations
+
+    def phase(self, iteration: int) -> CanonicalPhase:
+        """The phase that ``iteration`` belongs to; the last one from the end on."""
+        return next((p for p in self.phases if iteration < p.stop), self.phases[-1])
+
+    def learning_rate_factor(self, iteration: int) -> float:
+        """0.1^(n / decay_iterations), n counted from the start of the search or fine part."""
+        searching = iteration < self.search_iterations
+        since = iteration if searching else iteration - self.search_iterations
+        return float(0.1 ** (since / self.decay_iterations))

@@ -1,0 +1,110 @@
+"""A DeVRF scene at one time, ready to be looked at."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from devrf.geometry.cameras import Cameras
+from devrf.geometry.rays import Rays
+from devrf.geometry.space import Space
+from devrf.methods.devrf.deformation_field import DeformationField
+from devrf.methods.devrf.deformed_occupancy import occupancy_points, occupancy_through
+from devrf.methods.devrf.grid_warp import GridWarp
+from devrf.methods.devrf.image_lists import ListRenderer
+from devrf.methods.devrf.motion_losses import induced_flow
+from devrf.methods.devrf.volume_rendering import render
+from devrf.ops.choice import triton_runs
+from devrf.ops.compositing import sum_by_ray
+from devrf.ops.corners import shape_of
+from devrf.ops.resampling import resample
+from devrf.rendering.occupancy import Occupancy
+from devrf.rendering.rendered_image import RenderedImage
+
+# Rays at once: on a CPU what its caches hold, on a GPU what keeps it busy and fits.
+ON_CPU, ON_GPU, IN_LISTS = 8192, 2**15, 2**18
+
+
+class DeVRFView:
+    """The occupancy and the displacements of one time; it shares the fields' memory.
+
+    Attributes:
+        at_rest: whether nothing has moved at this time.
+        occupancy: where something is.
+        displacement: (X, Y, Z, 3) from here to canonical space, over the fields' box; None at
+            rest.
+    """
+
+    @torch.no_grad()
+    def __init__(
+        self,
+        occupancy: Occupancy,
+        deformation: DeformationField | None,
+        lists: ListRenderer,
+        space: Space,
+        time: float,
+    ) -> None:
+        """Find out what there is to know about a time.
+
+        Args:
+            occupancy: where something is at rest.
+            deformation: how the scene moves; None: it rests at every time.
+            lists: renders the canonical field where Triton runs; has the field and its settings.
+            space: the space that the fields live in.
+            time: in [0, 1].
+        """
+        canonical = self._canonical = lists.field
+        self._lists, self._settings, self._space = lists, lists.settings, space
+        self._motion = deformation
+        self.occupancy, self.displacement = occupancy, None
+        self.at_rest = deformation is None or deformation.clock.at(time).after == 0
+        self._warp: GridWarp | None = None
+        if deformation is not None and not self.at_rest:
+            self.displacement = deformation.blended(time)
+            # At the points of a grid over the same box, looking up is resampling: several times
+            # faster.
+            points = occupancy_points(occupancy, canonical)
+            moved = points + resample(self.displacement, shape_of(points))
+            self.occupancy = occupancy_through(occupancy, canonical, moved)
+            self._warp = GridWarp((self.displacement,), deformation.box)
+
+    @property
+    def chunk(self) -> int:
+        """Rays that are best rendered at once."""
+        density = self._canonical.density.values
+        if triton_runs(density):
+            return IN_LISTS
+        return ON_GPU if density.is_cuda else ON_CPU
+
+    @torch.no_grad()
+    def render(self, rays: Rays, background: Tensor) -> RenderedImage:
+        """What R rays in the fields' space see."""
+        if triton_runs(self._canonical.density.values):
+            return self._lists.picture(rays, self.occupancy, self.displacement, background)
+        return RenderedImage.of(
+            render(rays, self._canonical, self.occupancy, self._settings, background, self._warp)
+        )
+
+    @torch.no_grad()
+    def induced_flow(
+        self, rays: Rays, pixels: Tensor, cameras: Cameras, time: float
+    ) -> tuple[Tensor, Tensor]:
+        """The mean induced flow (R, 2) of R rays, and the mass (R,) that it is a mean over.
+
+        Each sample of a ray goes to canonical space, from there to where it was at ``time``, and
+        onto the image of that time.
+        """
+        black = torch.zeros(3, device=rays.origins.device)
+        seen = render(rays, self._canonical, self.occupancy, self._settings, black, self._warp)
+        motion = self._motion
+
+        def unwarp(points: Tensor) -> Tensor:
+            return points if motion is None else motion.unwarp(points, time)
+
+        ray, weight = seen.samples.ray, seen.weight
+        moved = induced_flow(
+            seen.canonical, unwarp, cameras, torch.zeros_like(ray), pixels[ray], self._space
+        )
+        mass = sum_by_ray(weight, ray, len(rays))
+        total = sum_by_ray(weight[:, None] * moved, ray, len(rays))
+        return total / mass.clamp(min=1e-6)[:, None], mass

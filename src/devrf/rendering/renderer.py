@@ -1,0 +1,78 @@
+"""Renders a learned scene: images of any size, from anywhere, at any time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import lru_cache, partial
+
+import torch
+from torch import Tensor
+
+from devrf.geometry.cameras import Cameras
+from devrf.geometry.rays import Rays
+from devrf.rendering.chunks import in_chunks
+from devrf.rendering.rendered_image import RenderedImage
+from devrf.rendering.view import Viewable
+
+
+class Renderer:
+    """Shows a learned scene of any method, without gradients.
+
+    The views of the times that it was asked for last are kept: what is learned afterwards is not
+    seen at these times.
+
+    Attributes:
+        model: the scene.
+        device: where it is, and where images are rendered.
+        at: time in [0, 1] → the :class:`~devrf.rendering.view.View` of that time, cached.
+    """
+
+    def __init__(self, model: Viewable, *, times: int = 4, half: bool = False) -> None:
+        """Prepare to render.
+
+        Args:
+            model: a learned scene; it should not be moved to another device afterwards.
+            times: how many times are kept.
+            half: let networks work in half precision, on a CUDA device only.
+        """
+        self.model = model
+        self.device = model.device
+        self.at = lru_cache(maxsize=times)(partial(model.at, half=half))
+
+    @torch.no_grad()
+    def picture(self, rays: Rays, time: float, background: float | Tensor) -> RenderedImage:
+        """What R rays see at ``time``.
+
+        Args:
+            rays: R rays in world space, on any device.
+            time: in [0, 1].
+            background: grey level, or RGB (3,).
+        """
+        view = self.at(time)
+        if not isinstance(background, Tensor):
+            background = torch.full((3,), background, device=self.device)
+        own = self.model.space.rays(rays.to(self.device))
+        return RenderedImage.joined(
+            in_chunks(lambda part: view.render(part, background), own, view.chunk)
+        )
+
+    def view(
+        self, cameras: Cameras, index: int, time: float, background: float | Tensor
+    ) -> RenderedImage:
+        """All H·W pixels of camera ``index`` at ``time``, in row-major order."""
+        rays = cameras[[index]].to(self.device).image_rays(0)
+        return self.picture(rays, time, background)
+
+    def stream(
+        self, cameras: Cameras, times: Sequence[float], background: float | Tensor
+    ) -> Iterator[RenderedImage]:
+        """One image after another, each rendered when it is asked for.
+
+        Args:
+            cameras: N cameras.
+            times: N times in [0, 1].
+            background: as for :meth:`picture`.
+        """
+        cameras = cameras.to(self.device)
+        for index, time in enumerate(times):
+            yield self.view(cameras, index, time, background)
