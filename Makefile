@@ -1,5 +1,9 @@
 # make quickstart   install into .venv and learn the embedded scene: nothing else to set up
 # make test         install with the development tools, then lint, types, architecture, tests
+# make docs         build the documentation into site/; needs no network once installed
+# make fuzz         the readers' fuzz tests with 100 000 inputs (make test has 1000)
+# make format       format the code and mend what the linter can
+# make shell        a shell in which .venv is active
 # make clean        remove .venv and everything that tools leave behind
 
 PYTHON ?= python3
@@ -10,20 +14,41 @@ CONSTRAINTS ?= constraints.txt
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --disable-pip-version-check \
 	$(if $(CONSTRAINTS),--constraint $(CONSTRAINTS)) --editable
+PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --durations 15
 
-.PHONY: quickstart test clean
+.PHONY: quickstart test docs fuzz format shell clean
 
 quickstart: $(VENV)/.installed
 	$(BIN)/python -m devrf experiment=quickstart
+	@echo
+	@echo "Results: outputs/robot/quickstart (videos/orbit.mp4, images/, metrics.json)."
+	@echo "Next: source $(BIN)/activate, then"
+	@echo "  python -m devrf experiment=quickstart data.shape=flower"
+	@echo "  python -m devrf stage=inspect data=inward data.root=PATH   # a scene of your own"
 
 test: $(VENV)/.installed-dev
-	$(BIN)/ruff check src tests benchmarks notebooks
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4
+	$(PYTEST)
+
+docs: $(VENV)/.installed-dev
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+	@echo "The documentation: site/index.html"
+
+fuzz: $(VENV)/.installed-dev
+	DEVRF_FUZZ_INPUTS=100000 $(PYTEST) tests/scenes/fuzz
+
+format: $(VENV)/.installed-dev
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+shell: $(VENV)/.installed
+	@. $(BIN)/activate && exec $${SHELL:-/bin/sh}
 
 clean:
-	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis build dist
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis build dist site
 
 # The stamps say what is installed; a change of the requirements installs anew.
 $(VENV)/.created:

@@ -112,6 +112,7 @@ def test_the_source_distribution_has_what_a_build_needs(built):
     with tarfile.open(path) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
     assert {"pyproject.toml", "conf/config.yaml", "src/devrf/cli/app.py", "LICENSE"} <= names
+    assert {"mkdocs.yml", "docs/method.md", "CHANGELOG.md", "CITATION.cff"} <= names
 
 
 def test_an_installed_devrf_learns_a_scene_from_any_folder(environment, tmp_path):

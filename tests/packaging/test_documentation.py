@@ -1,0 +1,97 @@
+"""What the documentation names exists: tests, files, links, anchors, commands, keys."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from devrf.cli.config_check import check_config
+
+REPOSITORY = Path(__file__).parents[2]
+PAGES = [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md"]
+PAGES += sorted((REPOSITORY / "docs").glob("*.md"))
+
+SPAN = re.compile(r"`([^`\n]+)`")
+TEST = re.compile(r"(tests/[\w/]+\.py)(?:::(\w+))?")
+LINK = re.compile(r"\]\((?!https?:)([^)#\s]+)")
+COMMAND = re.compile(r"python -m devrf ((?:-m )?[\w./]+=[^\s`]+(?: [\w./]+=[^\s`]+)*)")
+GROUPS = "callbacks|data|evaluation|field|sampling|schedule|still|video"
+KEY = re.compile(rf"([a-z_]+(?:\.[a-z_]+)+)=|^((?:{GROUPS})(?:\.[a-z_]+)+)$")
+ROOTS = ("src/", "conf/", "tests/", "docs/", "notebooks/", "benchmarks/")
+PACKAGE = REPOSITORY / "src" / "devrf"
+CHOICES = [f"data={name}" for name in ("procedural", "procedural_forward", "inward", "forward")]
+CHOICES += ["data=nerfstudio", "data=nerfies", "logger=wandb"]
+
+
+# Of the commands without a placeholder that a reader has to fill in.
+COMMANDS = sorted(
+    {
+        command
+        for page in PAGES
+        for command in COMMAND.findall(page.read_text())
+        if not re.search("NAME|CHOICE|hparams_search", command)
+    }
+)
+
+
+@pytest.fixture(params=PAGES, ids=lambda path: path.stem)
+def page(request) -> Path:
+    return request.param
+
+
+def spans(page: Path) -> list[str]:
+    return SPAN.findall(re.sub(r"```.*?```", "", page.read_text(), flags=re.S))
+
+
+def test_tests_exist(page):
+    for file, name in TEST.findall(page.read_text()):
+        source = (REPOSITORY / file).read_text()
+        assert not name or f"def {name}(" in source, f"{file} has no {name}"
+
+
+def test_files_exist(page):
+    paths = [s for s in spans(page) if re.fullmatch(r"[\w./]+(\.\w+|/)", s) and "/" in s]
+    named = [s for s in paths if s.startswith(ROOTS) or (PACKAGE / s.split("/")[0]).is_dir()]
+    missing = [s for s in named if "NAME" not in s and not (REPOSITORY / s).exists()]
+    assert not [s for s in missing if not (PACKAGE / s).exists()]
+
+
+def test_links_lead_somewhere(page):
+    links = LINK.findall(page.read_text())
+    assert not [link for link in links if not (page.parent / link).exists()]
+
+
+def test_docstrings_cite_anchors_of_the_method():
+    anchors = re.findall(r"\{ #([\w-]+) \}", (REPOSITORY / "docs" / "method.md").read_text())
+    assert len(anchors) == len(set(anchors))
+    for source in PACKAGE.rglob("*.py"):
+        cited = re.findall(r"docs/method\.md#([\w-]+)", source.read_text())
+        assert set(cited) <= set(anchors), source
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_commands_compose(command, composed):
+    # Of the values of a sweep, the first.
+    words = [word if "[" in word else word.split(",")[0] for word in command.split()]
+    words = [re.sub(r"=(PATH|FOLDER|…)$", "=scene", word) for word in words if word != "-m"]
+    check_config(composed(*words))
+
+
+def test_keys_exist(composed):
+    configs = [OmegaConf.to_container(composed(choice), resolve=False) for choice in CHOICES]
+    known = {key for config in configs for key in dotted(config)}
+    for page in PAGES:
+        keys = {a or b for span in spans(page) for a, b in KEY.findall(span)}
+        assert {key for key in keys if not key.startswith("hydra.")} <= known, page.name
+
+
+def dotted(value: object, prefix: str = "") -> Iterator[str]:
+    """The keys of nested mappings, from the root."""
+    yield prefix.removesuffix(".")
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            yield from dotted(inner, f"{prefix}{key}.")
