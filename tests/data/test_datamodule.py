@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import inspect
 import itertools
+from collections.abc import Callable
+from typing import get_type_hints
 
 import pytest
 import torch
 
 from devrf.data.datamodule import SceneDataModule
+from devrf.data.forward import ForwardFacingDataModule
 from devrf.data.inward import InwardFacingDataModule
+from devrf.data.nerfies import NerfiesDataModule
+from devrf.data.nerfstudio import NerfstudioDataModule
 from devrf.data.procedural import ProceduralDataModule
+from devrf.data.recorded import RecordedDataModule
 from devrf.errors import DevrfError
 from devrf.scenes.scene import Scene
 
@@ -67,6 +74,31 @@ def test_the_procedural_module_renders_what_it_was_told() -> None:
     assert scene.clock.times == (0.0, 1.0)
 
 
-def test_an_unknown_source_of_flow_is_an_error_that_names_the_choices() -> None:
-    with pytest.raises(DevrfError, match="data.flow.*raft"):
-        InwardFacingDataModule("nowhere", flow="farneback")  # type: ignore[arg-type]
+@pytest.mark.parametrize(
+    ("module", "sources"),
+    [
+        (InwardFacingDataModule, "'auto', 'files', 'dis', 'raft' or 'none'"),
+        (ForwardFacingDataModule, "'auto', 'files', 'dis', 'raft' or 'none'"),
+        (NerfiesDataModule, "'auto', 'dis', 'raft' or 'none'"),
+        (NerfstudioDataModule, "'auto', 'dis', 'raft' or 'none'"),
+    ],
+)
+def test_options_are_checked_before_anything_is_read(
+    module: Callable[..., RecordedDataModule], sources: str
+) -> None:
+    with pytest.raises(DevrfError, match=f"data.flow: should be {sources}, not 'farneback'"):
+        module("nowhere", flow="farneback")
+    with pytest.raises(DevrfError, match="data.rot: no such option"):
+        module("nowhere", rot=3)
+    with pytest.raises(DevrfError, match="data.root: is missing"):
+        module()
+
+
+def test_a_datamodule_has_the_options_of_its_reader_with_their_types() -> None:
+    parameters = inspect.signature(NerfiesDataModule).parameters
+    assert parameters["root"].default is inspect.Parameter.empty
+    assert (parameters["downscale"].default, parameters["holdout"].default) == (4, 8)
+    assert "train_views" not in parameters and "export" not in parameters
+    hints = get_type_hints(NerfiesDataModule.__init__)
+    assert hints["downscale"] is int and hints["frames"] == int | None
+    assert inspect.signature(ProceduralDataModule).parameters["export"].default is None

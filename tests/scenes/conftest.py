@@ -14,11 +14,28 @@ import numpy as np
 import pytest
 import torch
 
+from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.lens import Lens
+from devrf.scenes.reader import SceneReader
 from devrf.scenes.resampling import shrink_pixels
 from devrf.scenes.scene import Views
+
+
+@pytest.fixture
+def refusal() -> Callable[..., str]:
+    """A function that returns the one line with which a reader refuses a scene or an option."""
+
+    def message_of(reader: type[SceneReader], root: Path | str, **options: Any) -> str:
+        with pytest.raises(DevrfError) as caught:
+            reader(root, **options).read()
+        message = str(caught.value)
+        assert len(message) < 500 and len(message.splitlines()) == 1 and message.isprintable()
+        return message
+
+    return message_of
+
 
 # Not square, so that a swap of the axes cannot hide: 32 columns, 24 rows.
 WIDTH, HEIGHT, ANGLE = 32, 24, 0.8

@@ -15,7 +15,6 @@ from devrf.geometry.cameras import Cameras
 from devrf.scenes.bounds import (
     FALLBACK_BOUND_SCALE,
     axes_meet,
-    bound_scale_number,
     box_from_cameras,
     depth_range,
     inward_bounds,
@@ -83,14 +82,6 @@ def test_cameras_that_look_outward_ask_for_a_box(ring_cameras: RingCameras) -> N
     )
     with pytest.raises(DevrfError, match="look away from one another"):
         axes_meet(outward)
-
-
-def test_bound_scale_is_auto_or_at_least_one() -> None:
-    assert bound_scale_number("auto") == FALLBACK_BOUND_SCALE
-    assert bound_scale_number(1.05) == 1.05
-    for wrong in (0.9, "large", float("nan"), True):
-        with pytest.raises(DevrfError, match="data.bound_scale"):
-            bound_scale_number(wrong)
 
 
 def bounds_of(views: Views, **options: Any) -> Bounds:

@@ -12,7 +12,7 @@ import torch
 
 from devrf.errors import DevrfError
 from devrf.scenes.export import export, export_llff
-from devrf.scenes.llff import read_llff
+from devrf.scenes.llff import LlffReader
 from devrf.scenes.procedural import ProceduralForwardScene
 from devrf.scenes.scene import Capture, Scene, Views
 
@@ -31,7 +31,7 @@ def views_of(scene: Scene) -> list[Views]:
 
 def test_what_is_exported_reads_back_the_same(scene: Scene, tmp_path: Path) -> None:
     export(scene, tmp_path / "scene")
-    again = read_llff(tmp_path / "scene")
+    again = LlffReader(tmp_path / "scene").read()
     for ours, read in zip(views_of(scene), views_of(again), strict=True):
         assert torch.equal(ours.pixels, read.pixels)
         assert torch.equal(ours.times, read.times) and torch.equal(ours.view, read.view)
@@ -54,7 +54,7 @@ def test_points_of_the_exact_scene_fall_on_the_pixels_that_show_them(
     scene: Scene, tmp_path: Path
 ) -> None:
     export(scene, tmp_path / "scene")
-    again = read_llff(tmp_path / "scene")
+    again = LlffReader(tmp_path / "scene").read()
     for ours, read in zip(views_of(scene), views_of(again), strict=True):
         assert ours.depth is not None
         camera = torch.arange(len(ours)).repeat_interleave(40 * 28)

@@ -16,7 +16,7 @@ from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.image_files import decode, image_size, read_header
 from devrf.scenes.images import load_images
-from devrf.scenes.nerfstudio import read_nerfstudio
+from devrf.scenes.nerfstudio import NerfstudioReader
 
 WIDE, HIGH = (24, 16), (16, 24)
 
@@ -113,7 +113,7 @@ def capture(folder: Path, orientation: int, **shared: float) -> None:
 
 def test_a_capture_follows_its_cameras(tmp_path):
     capture(tmp_path, 6, w=24, h=16)
-    train = read_nerfstudio(tmp_path).dynamic.train
+    train = NerfstudioReader(tmp_path).read().dynamic.train
     assert (train.width, train.height) == WIDE
     with Image.open(tmp_path / train.names[0]) as image:
         seen = np.asarray(ImageOps.exif_transpose(image))
@@ -123,10 +123,10 @@ def test_a_capture_follows_its_cameras(tmp_path):
 
 def test_inspecting_names_the_files_of_which_nobody_can_tell(tmp_path):
     capture(tmp_path, 6)
-    scene = read_nerfstudio(tmp_path)
+    scene = NerfstudioReader(tmp_path).read()
     assert (scene.dynamic.train.width, scene.dynamic.train.height) == HIGH
     said = [str(advice) for advice in image_advice(scene) if "EXIF" in advice.what]
     assert len(said) == 1
     assert said[0].startswith("0.jpg, 1.jpg, 2.jpg and 6 more: its EXIF orientation says")
     capture(tmp_path, 1)
-    assert not [a for a in image_advice(read_nerfstudio(tmp_path)) if "EXIF" in a.what]
+    assert not [a for a in image_advice(NerfstudioReader(tmp_path).read()) if "EXIF" in a.what]

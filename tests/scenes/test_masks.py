@@ -24,7 +24,7 @@ from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.distortion import Distortion
 from devrf.scenes.lens import Lens
-from devrf.scenes.nerfstudio import read_nerfstudio
+from devrf.scenes.nerfstudio import NerfstudioReader
 from devrf.scenes.visual_hull import visual_hull
 
 WIDTH, HEIGHT = 80, 60
@@ -96,9 +96,9 @@ def plain(root: Path, masks: list[np.ndarray] | None = None) -> None:
 
 @pytest.mark.parametrize("downscale", [1, 2, 3])
 def test_mattes_are_those_of_images_that_were_cut_out(root: Path, downscale: int) -> None:
-    ours = read_nerfstudio(root, downscale=downscale, masks="matte").dynamic.train
+    ours = NerfstudioReader(root, downscale=downscale, masks="matte").read().dynamic.train
     edit(root, lambda c: [f.update(file_path=f"cut_{f['file_path']}") for f in c["frames"]])
-    theirs = read_nerfstudio(root, downscale=downscale, masks="none").dynamic.train
+    theirs = NerfstudioReader(root, downscale=downscale, masks="none").read().dynamic.train
     assert ours.valid_mask is None and torch.equal(ours.pixels, theirs.pixels)
 
 
@@ -108,30 +108,30 @@ def test_a_pixel_counts_if_all_that_it_is_made_of_does(root: Path, downscale: in
         with Image.open(root / f"masks/{k}.png") as mask:
             sharp = np.where(np.asarray(mask) > 127, 255, 0).astype(np.uint8)
         paint(root, k, sharp)
-    valid_mask = read_nerfstudio(root, downscale=downscale).dynamic.train.valid_mask
+    valid_mask = NerfstudioReader(root, downscale=downscale).read().dynamic.train.valid_mask
     # Downscaling and undistortion blur the matte as they blur the picture.
-    mattes = read_nerfstudio(root, downscale=downscale, masks="matte").dynamic.train
+    mattes = NerfstudioReader(root, downscale=downscale, masks="matte").read().dynamic.train
     assert valid_mask is not None and torch.equal(valid_mask, mattes.pixels[..., 3] == 255)
     assert 0 < int(valid_mask.sum()) < valid_mask.numel()
 
 
 def test_they_can_be_left_alone(root: Path) -> None:
     edit(root, lambda c: c["frames"][0].update(mask_path="nowhere.png"))
-    train = read_nerfstudio(root, masks="none").dynamic.train
+    train = NerfstudioReader(root, masks="none").read().dynamic.train
     assert train.valid_mask is None and not train.has_alpha
 
 
 def test_only_some_images_have_one(root: Path) -> None:
     plain(root)
     edit(root, lambda c: [f.pop("mask_path") for f in c["frames"][2:]])
-    train = read_nerfstudio(root).dynamic.train
+    train = NerfstudioReader(root).read().dynamic.train
     valid_mask = train.valid_mask
     assert valid_mask is not None and torch.equal(
         valid_mask[0, 0], torch.arange(WIDTH) < WIDTH // 2
     )
     assert bool(valid_mask[2:].all())
     with pytest.raises(DevrfError, match="2.png: has no mask_path although others have"):
-        read_nerfstudio(root, masks="matte")
+        NerfstudioReader(root, masks="matte").read()
 
 
 @pytest.mark.parametrize("kind", ["L", "labels", "1", "P", "RGB", "RGBA", "LA", "dull"])
@@ -141,7 +141,7 @@ def test_whatever_is_grey_will_do(root: Path, kind: str) -> None:
         image = Image.fromarray(half({"labels": 1, "dull": 200}.get(kind, 255)))
         image = image if kind in ("labels", "dull") else image.convert(kind)
         image.save(root / f"masks/{k}.png")
-    valid_mask = read_nerfstudio(root).dynamic.train.valid_mask
+    valid_mask = NerfstudioReader(root).read().dynamic.train.valid_mask
     assert valid_mask is not None
     assert bool(valid_mask[:, :, : WIDTH // 2].all()) and not bool(
         valid_mask[:, :, WIDTH // 2 :].any()
@@ -154,7 +154,7 @@ def test_a_mask_may_be_of_the_size_of_the_camera(root: Path) -> None:
         with Image.open(root / f"{k}.png") as image:
             image.resize((WIDTH // 2, HEIGHT // 2)).save(root / f"{k}.png")
     for masks in ("ignore", "matte"):
-        train = read_nerfstudio(root, masks=masks).dynamic.train  # type: ignore[arg-type]
+        train = NerfstudioReader(root, masks=masks).read().dynamic.train  # type: ignore[arg-type]
         kept = train.pixels[..., 3] == 255 if train.valid_mask is None else train.valid_mask
         assert torch.equal(kept[0, 0], torch.arange(WIDTH // 2) < WIDTH // 4)
 
@@ -173,7 +173,7 @@ def write_deep(root: Path) -> None:
         ),
         (
             lambda r: edit(r, lambda c: c["frames"][1].update(mask_path=3)),
-            "frames[1]: mask_path is 3, expected a file's path",
+            "frames[1].mask_path: should be a valid string, not 3",
         ),
         (lambda r: edit(r, lambda c: c["frames"][1].update(mask_path="../../m.png")), "m.png"),
         (lambda r: edit(r, lambda c: c["frames"][1].update(mask_path="masks")), "no such mask"),
@@ -190,21 +190,23 @@ def write_deep(root: Path) -> None:
 def test_wrong_masks(root: Path, masks: str, spoil: Callable[[Path], object], said: str) -> None:
     spoil(root)
     with pytest.raises(DevrfError) as caught:
-        read_nerfstudio(root, masks=masks)  # type: ignore[arg-type]
+        NerfstudioReader(root, masks=masks).read()  # type: ignore[arg-type]
     assert said in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_a_mask_that_leaves_nothing(root: Path) -> None:
     paint(root, 4, 0 * half())
     with pytest.raises(DevrfError, match=r"masks/4.png: leaves nothing of .*4.png to learn from"):
-        read_nerfstudio(root)
+        NerfstudioReader(root).read()
     # Nothing may be there to be cut out.
-    assert not bool(read_nerfstudio(root, masks="matte").dynamic.train.pixels[4, ..., 3].any())
+    assert not bool(
+        NerfstudioReader(root, masks="matte").read().dynamic.train.pixels[4, ..., 3].any()
+    )
 
 
 def test_an_option_that_is_none(root: Path) -> None:
-    with pytest.raises(DevrfError, match="data.masks: expected one of ignore, matte, none"):
-        read_nerfstudio(root, masks="yes")  # type: ignore[arg-type]
+    with pytest.raises(DevrfError, match="data.masks: should be 'ignore', 'matte' or 'none'"):
+        NerfstudioReader(root, masks="yes").read()  # type: ignore[arg-type]
 
 
 def test_only_pixels_that_count_are_drawn(root: Path) -> None:
@@ -221,7 +223,7 @@ def test_only_pixels_that_count_are_drawn(root: Path) -> None:
 def test_masks_go_with_their_images(root: Path) -> None:
     masks = [half() if k % 2 else 255 - half() for k in range(9)]
     plain(root, masks)
-    train = read_nerfstudio(root).dynamic.train
+    train = NerfstudioReader(root).read().dynamic.train
     assert train.valid_mask is not None
     one = train[torch.tensor([3])].to("cpu").valid_mask
     assert one is not None and torch.equal(one[0], train.valid_mask[3])
@@ -229,7 +231,7 @@ def test_masks_go_with_their_images(root: Path) -> None:
 
 def test_flow_is_valid_at_pixels_that_count(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plain(root)
-    scene = read_nerfstudio(root)
+    scene = NerfstudioReader(root).read()
     everywhere = lambda now, before: torch.zeros(HEIGHT, WIDTH, 2)  # noqa: E731
     monkeypatch.setattr("devrf.scenes.optical_flow.estimator", lambda method: everywhere)
     flow = with_flow(scene, "dis", None).dynamic.train.flow
@@ -241,25 +243,25 @@ def test_flow_is_valid_at_pixels_that_count(root: Path, monkeypatch: pytest.Monk
 def test_inspecting_says_how_much_they_cover(root: Path, caplog: pytest.LogCaptureFixture) -> None:
     plain(root, [255 - half() if k == 3 else half() for k in range(9)])
     with caplog.at_level(logging.INFO):
-        scene = read_nerfstudio(root)
+        scene = NerfstudioReader(root).read()
     assert "masks of 8 images leave out 50.0 % of the pixels of all" in caplog.text
     facts = inspect_scene(scene).sets[0]
     assert facts.mattes is None and facts.left_out == pytest.approx(0.5)
     assert not [advice for advice in image_advice(scene) if "masks" in advice.what]
     abbreviated = counted_pixels(scene.dynamic.train, 0)
     assert abbreviated.shape[2] == 4 and abbreviated[0, :, 3].tolist() == [255] * 40 + [0] * 40
-    matte = inspect_scene(read_nerfstudio(root, masks="matte")).sets[0]
+    matte = inspect_scene(NerfstudioReader(root, masks="matte").read()).sets[0]
     assert matte.mattes == pytest.approx(0.5) and matte.left_out is None
 
 
 def test_masks_that_cut_out_the_subject_are_told_from_others(root: Path) -> None:
-    found = [a for a in image_advice(read_nerfstudio(root)) if "masks" in a.what]
+    found = [a for a in image_advice(NerfstudioReader(root).read()) if "masks" in a.what]
     assert len(found) == 1 and "set data.masks=matte" in found[0].remedy
     assert found[0].where.startswith("static training set, ")
 
 
 def test_where_pixels_do_not_count_nothing_is_carved_away(root: Path) -> None:
-    views = read_nerfstudio(root, masks="matte").static.train
+    views = NerfstudioReader(root, masks="matte").read().static.train
     box = Box.of((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
     whole = visual_hull(views, box, (12, 12, 12))
     nothing = replace(views, valid_mask=torch.zeros(views.pixels.shape[:3], dtype=torch.bool))
