@@ -9,6 +9,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import cv2
 import imageio.v3 as iio
 import numpy as np
 import pytest
@@ -202,11 +203,25 @@ def _balls(numbers: tuple[float, ...], lens: Lens, width: int, height: int) -> n
 
 @cache
 def _directions(lens: Lens, width: int, height: int) -> torch.Tensor:
-    """(H, W, 2) where the lens looks in each pixel: x/z and y/z, y down."""
-    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    py = (y.double() + 0.5 - lens.center[1]) / lens.focal[1]
-    px = (x.double() + 0.5 - lens.center[0] - lens.skew * py) / lens.focal[0]
-    return lens.distortion.undistort(torch.stack([px, py], dim=-1))
+    """(H, W, 2) where the lens looks in each pixel: x/z and y/z, y down; by OpenCV."""
+    (fx, fy), (cx, cy) = lens.focal, lens.center
+    (k1, k2, k3, _), tangential = lens.distortion.radial, lens.distortion.tangential
+    y, x = np.mgrid[:height, :width] + 0.5
+    py = (y - cy) / fy
+    px = (x - cx - lens.skew * py) / fx
+    straight = cv2.undistortPoints(
+        np.stack([px, py], axis=-1).reshape(-1, 1, 2),
+        np.eye(3),
+        np.array([k1, k2, *tangential, k3]),
+        criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12),
+    )
+    return torch.from_numpy(straight.reshape(height, width, 2))
+
+
+@pytest.fixture
+def lens_directions() -> Callable[[Lens, int, int], torch.Tensor]:
+    """The function :func:`_directions`."""
+    return _directions
 
 
 def ball_centers(pixels: torch.Tensor) -> torch.Tensor:

@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
 from devrf.errors import DevrfError
 from devrf.geometry.distortion import Distortion
 from devrf.scenes.lens import Lens
-from devrf.scenes.undistortion import as_pinhole, resample
+from devrf.scenes.resampling import look_up_pixels
+from devrf.scenes.undistortion import as_pinhole
 
 BARREL = Distortion((-0.2, 0.05, 0.0, 0.0), (0.004, -0.006))
 PINCUSHION = Distortion((0.15, 0.02, 0.01, 0.0), (-0.004, 0.003))
@@ -20,13 +22,13 @@ WIDTH, HEIGHT = 96, 64
 
 @pytest.mark.parametrize("distortion", [BARREL, PINCUSHION, Distortion()])
 @pytest.mark.parametrize("skew", [0.0, 4.0])
-def test_straight_lines_come_out_straight(distortion: Distortion, skew: float) -> None:
+def test_straight_lines_come_out_straight(
+    distortion: Distortion, skew: float, lens_directions: Callable[..., torch.Tensor]
+) -> None:
     """Each pixel shows its own direction: an image of x/z and y/z becomes one linear in them."""
     lens = Lens((70.0, 60.0), (50.0, 30.0), distortion, skew)
     y, x = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
-    py = (y.double() + 0.5 - 30) / 60
-    px = (x.double() + 0.5 - 50 - skew * py) / 70
-    direction = distortion.undistort(torch.stack([px, py], dim=-1))
+    direction = lens_directions(lens, WIDTH, HEIGHT)
     coded = ((direction + 1.5) * 80).round().clamp(0, 255).to(torch.uint8)
     image = torch.cat([coded, coded[..., :1]], dim=-1)
     pixels, (plain,) = as_pinhole(image[None], [lens], ["image"])
@@ -60,11 +62,16 @@ def test_a_plain_lens_leaves_every_pixel() -> None:
 
 
 def test_colours_behind_the_matte_do_not_bleed_in() -> None:
-    image = torch.zeros(1, 2, 4, dtype=torch.uint8)
-    image[0, 0] = torch.tensor([200, 100, 50, 255])
-    image[0, 1] = torch.tensor([0, 255, 0, 0])
-    between = resample(image, torch.tensor([[[1.0, 0.5], [1.5, 0.5], [0.5, 0.5]]]))
+    image = np.array([[[200, 100, 50, 255], [0, 255, 0, 0]]], dtype=np.uint8)
+    places = np.array([[[1.0, 0.5], [1.5, 0.5], [0.5, 0.5]]], dtype=np.float32)
+    between = look_up_pixels(image, places)
     assert between[0].tolist() == [[200, 100, 50, 128], [0, 0, 0, 0], [200, 100, 50, 255]]
+
+
+def test_an_image_that_is_too_wide_is_an_error_that_names_it() -> None:
+    image = torch.zeros(1, 8, 40_000, 3, dtype=torch.uint8)
+    with pytest.raises(DevrfError, match=r"a.png: 40000x8 px, .* use a larger data.downscale"):
+        as_pinhole(image, [Lens((4e4, 4e4), (2e4, 4.0), BARREL)], ["a.png"])
 
 
 @pytest.mark.parametrize("k1", [-3.0, 60.0])

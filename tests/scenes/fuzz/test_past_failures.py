@@ -9,6 +9,7 @@ import time
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -250,6 +251,6 @@ def test_a_folder_that_may_not_be_listed(llff_folder: Any, monkeypatch: pytest.M
 
 def test_more_than_fits_into_memory(scene_folder: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.rmtree(scene_folder.static)
-    monkeypatch.setattr("devrf.scenes.memory._machine_memory", lambda: 2**10)
+    monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(total=2**10))
     images = sorted((scene_folder.dynamic / "train").iterdir())
     assert "6 images of 32x24 px take 0.0 GiB" in refused(lambda: load_images(images, 1))
