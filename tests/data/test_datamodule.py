@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import itertools
-from collections.abc import Callable
 from typing import get_type_hints
 
 import pytest
@@ -16,7 +15,6 @@ from devrf.data.inward import InwardFacingDataModule
 from devrf.data.nerfies import NerfiesDataModule
 from devrf.data.nerfstudio import NerfstudioDataModule
 from devrf.data.procedural import ProceduralDataModule
-from devrf.data.recorded import RecordedDataModule
 from devrf.errors import DevrfError
 from devrf.scenes.scene import Scene
 
@@ -33,7 +31,7 @@ class Given(SceneDataModule):
         return self.given
 
 
-def test_the_scene_is_loaded_once_and_only_when_needed(tiny_scene: Scene) -> None:
+def test_the_scene_is_loaded_once_and_only_when_needed(tiny_scene):
     module = Given(tiny_scene)
     assert module.loads == 0
     module.setup("fit")
@@ -41,7 +39,7 @@ def test_the_scene_is_loaded_once_and_only_when_needed(tiny_scene: Scene) -> Non
     assert module.scene is tiny_scene and module.loads == 1
 
 
-def test_training_views_move_to_the_device_once_for_each_capture(tiny_scene: Scene) -> None:
+def test_training_views_move_to_the_device_once_for_each_capture(tiny_scene):
     module, cpu = Given(tiny_scene), torch.device("cpu")
     static = module.training_views("static", cpu)
     assert module.training_views("static", cpu) is static
@@ -51,12 +49,12 @@ def test_training_views_move_to_the_device_once_for_each_capture(tiny_scene: Sce
     assert dynamic.flow is not None and len(dynamic) == 6
 
 
-def test_the_training_loader_never_ends(tiny_scene: Scene) -> None:
+def test_the_training_loader_never_ends(tiny_scene):
     loader = Given(tiny_scene).train_dataloader()
     assert list(itertools.islice(loader, 50)) == [None] * 50
 
 
-def test_the_procedural_module_renders_what_it_was_told() -> None:
+def test_the_procedural_module_renders_what_it_was_told():
     module = ProceduralDataModule(
         "flower",
         width=12,
@@ -83,9 +81,7 @@ def test_the_procedural_module_renders_what_it_was_told() -> None:
         (NerfstudioDataModule, "'auto', 'dis', 'raft' or 'none'"),
     ],
 )
-def test_options_are_checked_before_anything_is_read(
-    module: Callable[..., RecordedDataModule], sources: str
-) -> None:
+def test_options_are_checked_before_anything_is_read(module, sources):
     with pytest.raises(DevrfError, match=f"data.flow: should be {sources}, not 'farneback'"):
         module("nowhere", flow="farneback")
     with pytest.raises(DevrfError, match="data.rot: no such option"):
@@ -94,7 +90,7 @@ def test_options_are_checked_before_anything_is_read(
         module()
 
 
-def test_a_datamodule_has_the_options_of_its_reader_with_their_types() -> None:
+def test_a_datamodule_has_the_options_of_its_reader_with_their_types():
     parameters = inspect.signature(NerfiesDataModule).parameters
     assert parameters["root"].default is inspect.Parameter.empty
     assert (parameters["downscale"].default, parameters["holdout"].default) == (4, 8)

@@ -18,6 +18,7 @@ import torch
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
+from devrf.geometry.distortion import Distortion
 from devrf.scenes.lens import Lens
 from devrf.scenes.reader import SceneReader
 from devrf.scenes.resampling import shrink_pixels
@@ -118,13 +119,13 @@ class SceneFolder:
 
 
 @pytest.fixture
-def scene_folder(tmp_path: Path) -> SceneFolder:
+def scene_folder(tmp_path) -> SceneFolder:
     """A valid scene on disk."""
     return SceneFolder(tmp_path / "scene")
 
 
 @pytest.fixture
-def single_folder(tmp_path: Path) -> Path:
+def single_folder(tmp_path) -> Path:
     """A scene in D-NeRF's layout: 8 training images and 3 test images of a moving camera."""
     root = tmp_path / "monocular"
     size: dict[str, Any] = {"width": WIDTH, "height": HEIGHT, "angle": ANGLE}
@@ -317,6 +318,59 @@ class LlffFolder:
 
 
 @pytest.fixture
-def llff_folder(tmp_path: Path) -> LlffFolder:
+def llff_folder(tmp_path) -> LlffFolder:
     """A valid forward-facing scene on disk."""
     return LlffFolder(tmp_path / "toy")
+
+
+BALLS_LENS = Lens((88.0, 84.0), (42.0, 28.0), Distortion((-0.3, 0.1, 0.01, 0.0), (0.006, -0.008)))
+
+
+class BallsFolder:
+    """Writes ``transforms.json`` and pictures of the balls, 80×60 px, in nerfstudio's layout."""
+
+    WIDTH, HEIGHT = 80, 60
+    # BALLS_LENS in the words of the file, and keys that say nothing of the cameras.
+    SHARED = {
+        **{"camera_model": "OPENCV", "fl_x": 88.0, "fl_y": 84.0, "cx": 42.0, "cy": 28.0},
+        **{"w": 80, "h": 60, "k1": -0.3, "k2": 0.1, "k3": 0.01, "p1": 0.006, "p2": -0.008},
+        **{"applied_transform": [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]], "applied_scale": 0.5},
+    }
+
+    @classmethod
+    def write(
+        cls,
+        folder: Path,
+        times: list[float] | None,
+        *,
+        turn: float = 0.0,
+        lens: Callable[[int], Lens] = lambda index: BALLS_LENS,
+        shared: dict[str, Any] = SHARED,
+        views: int | None = None,
+    ) -> dict[str, Any]:
+        """One image for each time (None: nine images without), by ``views`` cameras in turn."""
+        count = 9 if times is None else len(times)
+        cameras = ring(views or count, turn=turn, width=cls.WIDTH, height=cls.HEIGHT, angle=0.9)
+        frames = frames_json(cameras[torch.arange(count) % len(cameras)], times, "images")
+        (folder / "images").mkdir(parents=True)
+        for i, frame in enumerate(frames):
+            frame["file_path"] += ".png"
+            pose = torch.tensor(frame["transform_matrix"][:3])
+            picture = balls_picture(pose, lens(i), cls.WIDTH, cls.HEIGHT)
+            iio.imwrite(folder / frame["file_path"], picture)
+        content = {**shared, "frames": frames}
+        (folder / "transforms.json").write_text(json.dumps(content))
+        return content
+
+    @staticmethod
+    def edit(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
+        """Change the content of ``transforms.json``."""
+        content = json.loads((folder / "transforms.json").read_text())
+        change(content)
+        (folder / "transforms.json").write_text(json.dumps(content))
+
+
+@pytest.fixture
+def balls() -> type[BallsFolder]:
+    """The writer of pictures of the balls."""
+    return BallsFolder

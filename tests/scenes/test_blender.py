@@ -24,7 +24,7 @@ def drop_times(content: dict[str, Any]) -> None:
         del frame["time"]
 
 
-def test_published_layout(scene_folder: Any) -> None:
+def test_published_layout(scene_folder):
     scene = BlenderReader(scene_folder.root).read()
     assert (scene.name, scene.kind, scene.background) == ("scene", "inward", "white")
     assert scene.static.train.pixels.shape == (6, 24, 32, 4)
@@ -41,7 +41,7 @@ def test_published_layout(scene_folder: Any) -> None:
     assert scene.static.train.view.tolist() == list(range(6))
 
 
-def test_camera_angle_becomes_a_focal_length_and_a_known_pixel(scene_folder: Any) -> None:
+def test_camera_angle_becomes_a_focal_length_and_a_known_pixel(scene_folder):
     cameras = BlenderReader(scene_folder.root).read().static.train.cameras
     focal = 16 / math.tan(0.4)
     assert cameras.focal[0].tolist() == pytest.approx([focal, focal])
@@ -52,7 +52,7 @@ def test_camera_angle_becomes_a_focal_length_and_a_known_pixel(scene_folder: Any
     assert float(depth) == pytest.approx(4, abs=1e-5)
 
 
-def test_downscale_scales_each_axis_by_what_is_left_of_it(scene_folder: Any) -> None:
+def test_downscale_scales_each_axis_by_what_is_left_of_it(scene_folder):
     # 32×24 by 3: 10×8, so the focal lengths scale by 10/32 and 8/24.
     train = BlenderReader(scene_folder.root, downscale=3).read().dynamic.train
     assert train.pixels.shape == (6, 8, 10, 4)
@@ -63,7 +63,7 @@ def test_downscale_scales_each_axis_by_what_is_left_of_it(scene_folder: Any) -> 
     assert half.pixels[1, 4, 6].tolist() == [1, 100, 200, 255]
 
 
-def test_intrinsics_in_pixels_are_honoured(scene_folder: Any) -> None:
+def test_intrinsics_in_pixels_are_honoured(scene_folder):
     def give_pixels(content: dict[str, Any]) -> None:
         del content["camera_angle_x"]
         content.update(fl_x=40.0, fl_y=44.0, cx=15.0, cy=13.0)
@@ -73,9 +73,7 @@ def test_intrinsics_in_pixels_are_honoured(scene_folder: Any) -> None:
     assert cameras.focal[0].tolist() == [20, 22] and cameras.center[0].tolist() == [7.5, 6.5]
 
 
-def test_a_lens_is_undistorted_and_its_flow_files_are_left_out(
-    scene_folder: Any, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_lens_is_undistorted_and_its_flow_files_are_left_out(scene_folder, caplog):
     flow = scene_folder.dynamic / "train_flow"
     flow.mkdir()
     for index in range(2, 6):
@@ -89,7 +87,7 @@ def test_a_lens_is_undistorted_and_its_flow_files_are_left_out(
     assert float(train.cameras.focal[0, 0]) > 16 / math.tan(0.4) + 0.5
 
 
-def test_times_come_from_the_order_where_the_file_gives_none(scene_folder: Any) -> None:
+def test_times_come_from_the_order_where_the_file_gives_none(scene_folder):
     scene_folder.edit(scene_folder.dynamic / "transforms_train.json", drop_times)
     scene_folder.edit(scene_folder.dynamic / "transforms_test.json", drop_times)
     scene = BlenderReader(scene_folder.root).read()
@@ -97,20 +95,18 @@ def test_times_come_from_the_order_where_the_file_gives_none(scene_folder: Any) 
     assert scene.dynamic.test.times.tolist() == [0, 0.5, 1]
 
 
-def test_views_are_counted_from_the_poses_not_from_the_folder(scene_folder: Any) -> None:
+def test_views_are_counted_from_the_poses_not_from_the_folder(scene_folder):
     scene_folder.dynamic.rename(scene_folder.root / "dynamic_16views")
     train = BlenderReader(scene_folder.root).read().dynamic.train
     assert train.view.tolist() == [0, 1, 0, 1, 0, 1]
 
 
-def test_train_views_keeps_the_first_views(scene_folder: Any) -> None:
+def test_train_views_keeps_the_first_views(scene_folder):
     train = BlenderReader(scene_folder.root, train_views=1).read().dynamic.train
     assert train.view.tolist() == [0, 0, 0] and train.times.tolist() == [0, 0.5, 1]
 
 
-def test_frames_keeps_the_first_and_the_last_time(
-    scene_folder: Any, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_frames_keeps_the_first_and_the_last_time(scene_folder, caplog):
     caplog.set_level(logging.INFO)
     scene = BlenderReader(scene_folder.root, frames=2).read()
     assert scene.dynamic.train.times.tolist() == [0, 0, 1, 1]
@@ -119,7 +115,7 @@ def test_frames_keeps_the_first_and_the_last_time(
     assert len(BlenderReader(scene_folder.root, frames=3).read().dynamic.train) == 6
 
 
-def test_flow_belongs_to_the_place_in_the_file(scene_folder: Any) -> None:
+def test_flow_belongs_to_the_place_in_the_file(scene_folder):
     folder = scene_folder.dynamic / "train_flow"
     folder.mkdir()
     for index in range(2, 6):
@@ -134,13 +130,13 @@ def test_flow_belongs_to_the_place_in_the_file(scene_folder: Any) -> None:
     assert BlenderReader(scene_folder.root, flow="none").read().dynamic.train.flow is None
 
 
-def test_one_of_several_captures_is_chosen(scene_folder: Any) -> None:
+def test_one_of_several_captures_is_chosen(scene_folder):
     shutil.copytree(scene_folder.dynamic, scene_folder.root / "dynamic_3views")
     train = BlenderReader(scene_folder.root, dynamic="dynamic_3views").read().dynamic.train
     assert train.names[0].startswith("dynamic_3views/")
 
 
-def test_images_are_found_with_or_without_suffix_and_may_lack_a_matte(scene_folder: Any) -> None:
+def test_images_are_found_with_or_without_suffix_and_may_lack_a_matte(scene_folder):
     folder = scene_folder.static / "test"
     rgb = np.full((24, 32, 3), 77, dtype=np.uint8)
     for i, name in enumerate(("a.jpg", "b.webp")):
@@ -157,13 +153,13 @@ def test_images_are_found_with_or_without_suffix_and_may_lack_a_matte(scene_fold
     assert bool(((test.pixels.int() - 77).abs() <= 1).all())
 
 
-def test_an_opaque_image_among_mattes_becomes_rgba(scene_folder: Any) -> None:
+def test_an_opaque_image_among_mattes_becomes_rgba(scene_folder):
     iio.imwrite(scene_folder.static / "test/r_001.png", np.full((24, 32, 3), 9, dtype=np.uint8))
     pixels = BlenderReader(scene_folder.root).read().static.test.pixels
     assert pixels.shape[3] == 4 and bool((pixels[1, ..., 3] == 255).all())
 
 
-def test_given_box_and_bound_scale(scene_folder: Any) -> None:
+def test_given_box_and_bound_scale(scene_folder):
     scene = BlenderReader(
         scene_folder.root, box=[[-1, -1, 0], [1, 1, 2]], bound_scale=1.2, near=1, far=9
     ).read()
@@ -172,9 +168,7 @@ def test_given_box_and_bound_scale(scene_folder: Any) -> None:
     assert scene.bounds.source == "canonical box x bound scale 1.2"
 
 
-def test_single_folder_learns_the_static_scene_from_early_images(
-    single_folder: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_single_folder_learns_the_static_scene_from_early_images(single_folder, caplog):
     scene = BlenderReader(single_folder, static_until=0.5).read()
     assert len(scene.static.train) == 4 and len(scene.dynamic.train) == 8
     assert scene.static.test.times.tolist() == pytest.approx([0.1, 0.4])
@@ -186,12 +180,12 @@ def test_single_folder_learns_the_static_scene_from_early_images(
     assert len(whole.static.train) == 8 and len(whole.static.test) == 3
 
 
-def test_single_folder_without_an_early_test_image_keeps_all_of_them(single_folder: Path) -> None:
+def test_single_folder_without_an_early_test_image_keeps_all_of_them(single_folder):
     scene = BlenderReader(single_folder, static_until=0.05, box=[[-1, -1, -1], [1, 1, 1]]).read()
     assert len(scene.static.train) == 1 and len(scene.static.test) == 3
 
 
-def test_a_moving_camera_with_three_by_four_poses(single_folder: Path) -> None:
+def test_a_moving_camera_with_three_by_four_poses(single_folder):
     file = single_folder / "transforms_train.json"
     content = json.loads(file.read_text())
     for frame in content["frames"]:
@@ -202,7 +196,7 @@ def test_a_moving_camera_with_three_by_four_poses(single_folder: Path) -> None:
 
 
 @pytest.mark.skipif(not SUZANNE.is_dir(), reason="the suzanne scene is not next to the repository")
-def test_a_published_scene() -> None:
+def test_a_published_scene():
     scene = BlenderReader(SUZANNE, downscale=4).read()
     train, clock = scene.dynamic.train, scene.clock
     assert (len(scene.static.train), len(scene.static.test)) == (100, 20)

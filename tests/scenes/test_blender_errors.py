@@ -22,7 +22,7 @@ MOVING = "dynamic_2views/transforms_train.json"
 
 
 @pytest.fixture
-def message_of(refusal: Callable[..., str]) -> Callable[..., str]:
+def message_of(refusal) -> Callable[..., str]:
     return partial(refusal, BlenderReader)
 
 
@@ -82,13 +82,7 @@ def pose(first: object) -> list[list[object]]:
         (MOVING, lambda c: [f.update(time=0.3) for f in c["frames"]], "distinct times"),
     ],
 )
-def test_wrong_json_values(
-    scene_folder: Any,
-    file: str,
-    change: Callable[[dict[str, Any]], object],
-    said: str,
-    message_of: Callable[..., str],
-) -> None:
+def test_wrong_json_values(scene_folder, file, change, said, message_of):
     path = scene_folder.root / file
     scene_folder.edit(path, change)
     message = message_of(scene_folder.root)
@@ -96,13 +90,13 @@ def test_wrong_json_values(
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1]", "\xff", "[" * 100_000])
-def test_json_that_is_none(scene_folder: Any, text: str, message_of: Callable[..., str]) -> None:
+def test_json_that_is_none(scene_folder, text, message_of):
     path = scene_folder.root / TRAIN
     path.write_bytes(text.encode("latin-1"))
     assert str(path) in message_of(scene_folder.root)
 
 
-def test_missing_folders(scene_folder: Any, tmp_path: Path, message_of: Callable[..., str]) -> None:
+def test_missing_folders(scene_folder, tmp_path, message_of):
     assert "nowhere: no such folder" in message_of(tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
     assert "expected static/ and dynamic_<V>views/" in message_of(tmp_path / "empty")
@@ -110,14 +104,12 @@ def test_missing_folders(scene_folder: Any, tmp_path: Path, message_of: Callable
     assert "no folder dynamic_<V>views" in message_of(scene_folder.root)
 
 
-def test_a_dynamic_capture_without_a_static_one(
-    scene_folder: Any, message_of: Callable[..., str]
-) -> None:
+def test_a_dynamic_capture_without_a_static_one(scene_folder, message_of):
     shutil.rmtree(scene_folder.static)
     assert f"{scene_folder.static}: no such folder" in message_of(scene_folder.root)
 
 
-def test_several_captures_are_listed(scene_folder: Any, message_of: Callable[..., str]) -> None:
+def test_several_captures_are_listed(scene_folder, message_of):
     shutil.copytree(scene_folder.dynamic, scene_folder.root / "dynamic_3views")
     message = message_of(scene_folder.root)
     assert "dynamic_2views, dynamic_3views" in message and "data.dynamic=" in message
@@ -126,25 +118,21 @@ def test_several_captures_are_listed(scene_folder: Any, message_of: Callable[...
 
 
 @pytest.mark.parametrize("capture", ["static", "dynamic_2views"])
-def test_a_missing_test_split(
-    scene_folder: Any, capture: str, message_of: Callable[..., str]
-) -> None:
+def test_a_missing_test_split(scene_folder, capture, message_of):
     path = scene_folder.root / capture / "transforms_test.json"
     path.unlink()
     assert f"{path}: no such file" in message_of(scene_folder.root)
 
 
 @pytest.mark.parametrize("escape", ["../../secret", "/etc/passwd", "train/../../../x"])
-def test_image_paths_stay_inside_the_scene(
-    scene_folder: Any, escape: str, message_of: Callable[..., str]
-) -> None:
+def test_image_paths_stay_inside_the_scene(scene_folder, escape, message_of):
     path = scene_folder.root / TRAIN
     scene_folder.edit(path, in_first_frame("file_path", escape))
     message = message_of(scene_folder.root)
     assert str(path) in message and "outside the scene's folder" in message
 
 
-def test_links_that_lie_in_the_scene_are_followed(scene_folder: Any, tmp_path: Path) -> None:
+def test_links_that_lie_in_the_scene_are_followed(scene_folder, tmp_path):
     (scene_folder.static / "train").rename(tmp_path / "elsewhere")
     (scene_folder.static / "train").symlink_to(tmp_path / "elsewhere")
     (tmp_path / "scene").rename(tmp_path / "moved")
@@ -152,9 +140,7 @@ def test_links_that_lie_in_the_scene_are_followed(scene_folder: Any, tmp_path: P
     assert BlenderReader(tmp_path / "link").read().static.train.names[0] == "static/train/r_000.png"
 
 
-def test_text_does_not_leave_through_a_link(
-    scene_folder: Any, tmp_path: Path, message_of: Callable[..., str]
-) -> None:
+def test_text_does_not_leave_through_a_link(scene_folder, tmp_path, message_of):
     """For the system ``link/..`` is where the link leads; here it is the scene's folder."""
     (tmp_path / "elsewhere" / "images").mkdir(parents=True)
     (scene_folder.static / "train/r_000.png").rename(tmp_path / "elsewhere/secret.png")
@@ -165,9 +151,7 @@ def test_text_does_not_leave_through_a_link(
     assert f"{scene_folder.static}/secret.png: no such image" in message
 
 
-def test_a_scene_beside_the_current_folder(
-    scene_folder: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_scene_beside_the_current_folder(scene_folder, monkeypatch):
     monkeypatch.chdir(scene_folder.static)
     assert BlenderReader("..").read().static.train.names[0] == "static/train/r_000.png"
     inner = str(scene_folder.static / "train/r_001.png")
@@ -175,27 +159,27 @@ def test_a_scene_beside_the_current_folder(
     assert BlenderReader(Path("..")).read().static.train.names[0] == "static/train/r_001.png"
 
 
-def test_a_missing_image(scene_folder: Any, message_of: Callable[..., str]) -> None:
+def test_a_missing_image(scene_folder, message_of):
     (scene_folder.static / "train/r_002.png").unlink()
     message = message_of(scene_folder.root)
     assert str(scene_folder.static / "train/r_002") in message and "no such image" in message
 
 
 @pytest.mark.parametrize("keep", [0, 20, 60])
-def test_a_damaged_image(scene_folder: Any, keep: int, message_of: Callable[..., str]) -> None:
+def test_a_damaged_image(scene_folder, keep, message_of):
     path = scene_folder.static / "train/r_001.png"
     path.write_bytes(path.read_bytes()[:keep])
     assert f"{path}: not a readable image" in message_of(scene_folder.root)
 
 
-def test_images_of_two_sizes(scene_folder: Any, message_of: Callable[..., str]) -> None:
+def test_images_of_two_sizes(scene_folder, message_of):
     path = scene_folder.dynamic / "train/r_004.png"
     iio.imwrite(path, np.zeros((32, 24, 4), dtype=np.uint8))
     message = message_of(scene_folder.root)
     assert str(path) in message and "24x32" in message and "32x24" in message
 
 
-def test_sixteen_bit_images(scene_folder: Any, message_of: Callable[..., str]) -> None:
+def test_sixteen_bit_images(scene_folder, message_of):
     path = scene_folder.static / "test/r_000.png"
     iio.imwrite(path, np.zeros((24, 32), dtype=np.uint16))
     assert f"{path}: expected 8 bits a channel" in message_of(scene_folder.root)
@@ -203,9 +187,7 @@ def test_sixteen_bit_images(scene_folder: Any, message_of: Callable[..., str]) -
 
 @pytest.mark.parametrize("side", [10_500, 2**31 - 1])
 @pytest.mark.filterwarnings("ignore::PIL.Image.DecompressionBombWarning")
-def test_a_header_that_claims_too_much_is_refused_before_decoding(
-    scene_folder: Any, side: int, message_of: Callable[..., str]
-) -> None:
+def test_a_header_that_claims_too_much_is_refused_before_decoding(scene_folder, side, message_of):
     path = scene_folder.static / "train/r_003.png"
     header = b"IHDR" + struct.pack(">IIBBBBB", side, side, 8, 6, 0, 0, 0)
     content = path.read_bytes()
@@ -214,7 +196,7 @@ def test_a_header_that_claims_too_much_is_refused_before_decoding(
     assert f"{path}: the image claims more than 100 megapixels" in message_of(scene_folder.root)
 
 
-def test_flow_of_another_size(scene_folder: Any, message_of: Callable[..., str]) -> None:
+def test_flow_of_another_size(scene_folder, message_of):
     folder = scene_folder.dynamic / "train_flow"
     folder.mkdir()
     np.savez(folder / "002_bwd.npz", flow=np.zeros((12, 16, 2)), mask=np.ones((12, 16), bool))
@@ -223,9 +205,7 @@ def test_flow_of_another_size(scene_folder: Any, message_of: Callable[..., str])
     assert BlenderReader(scene_folder.root, flow="none").read().dynamic.train.flow is None
 
 
-def test_fixed_views_without_times_have_to_take_turns(
-    scene_folder: Any, message_of: Callable[..., str]
-) -> None:
+def test_fixed_views_without_times_have_to_take_turns(scene_folder, message_of):
     def shuffle(content: dict[str, Any]) -> None:
         for frame in content["frames"]:
             del frame["time"]
@@ -237,16 +217,12 @@ def test_fixed_views_without_times_have_to_take_turns(
     assert str(path) in message and "2 fixed views do not take turns" in message
 
 
-def test_views_that_are_not_there(
-    scene_folder: Any, single_folder: Path, message_of: Callable[..., str]
-) -> None:
+def test_views_that_are_not_there(scene_folder, single_folder, message_of):
     assert "the set has 2 views" in message_of(scene_folder.root, train_views=3)
     assert "needs fixed cameras" in message_of(single_folder, train_views=1)
 
 
-def test_no_image_early_enough_for_the_static_scene(
-    scene_folder: Any, single_folder: Path, message_of: Callable[..., str]
-) -> None:
+def test_no_image_early_enough_for_the_static_scene(scene_folder, single_folder, message_of):
     def later(content: dict[str, Any]) -> None:
         for frame in content["frames"]:
             frame["time"] = 0.5 + frame["time"] / 2
@@ -275,7 +251,5 @@ def test_no_image_early_enough_for_the_static_scene(
         ({"static_until": 2}, "data.static_until"),
     ],
 )
-def test_wrong_options(
-    scene_folder: Any, options: dict[str, Any], said: str, message_of: Callable[..., str]
-) -> None:
+def test_wrong_options(scene_folder, options, said, message_of):
     assert said in message_of(scene_folder.root, **options)

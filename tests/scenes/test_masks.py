@@ -1,4 +1,4 @@
-"""Masks of nerfstudio's frames: pixels that do not count, or mattes."""
+"""Masks of nerfstudio's frames: pixels that are ignored, or mattes."""
 
 from __future__ import annotations
 
@@ -22,50 +22,25 @@ from devrf.data.nerfstudio import NerfstudioDataModule
 from devrf.data.pool import all_pixels
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
-from devrf.geometry.distortion import Distortion
-from devrf.scenes.lens import Lens
 from devrf.scenes.nerfstudio import NerfstudioReader
 from devrf.scenes.visual_hull import visual_hull
 
 WIDTH, HEIGHT = 80, 60
-LENS = Lens((88.0, 84.0), (42.0, 28.0), Distortion((-0.3, 0.1, 0.01, 0.0), (0.006, -0.008)))
-SHARED = {
-    "fl_x": 88.0,
-    "fl_y": 84.0,
-    "cx": 42.0,
-    "cy": 28.0,
-    "w": WIDTH,
-    "h": HEIGHT,
-    "k1": -0.3,
-    "k2": 0.1,
-    "k3": 0.01,
-    "p1": 0.006,
-    "p2": -0.008,
-}
 
 
 @pytest.fixture
-def root(tmp_path: Path, ring_cameras: Callable[..., Any], picture: Callable[..., Any]) -> Path:
+def root(tmp_path, balls) -> Path:
     """Nine RGB images of balls by a moving camera, and masks that are white on the balls."""
     folder = tmp_path / "scene"
-    (folder / "masks").mkdir(parents=True)
-    frames = []
-    ring = ring_cameras(9, width=WIDTH, height=HEIGHT, angle=0.9)
-    for k, pose in enumerate(ring.camera_to_world):
-        pixels = picture(pose, LENS, WIDTH, HEIGHT)
-        Image.fromarray(pixels[..., :3]).save(folder / f"{k}.png")
-        Image.fromarray(pixels).save(folder / f"cut_{k}.png")
-        Image.fromarray(pixels[..., 3]).save(folder / f"masks/{k}.png")
-        matrix = torch.cat([pose, torch.tensor([[0.0, 0.0, 0.0, 1.0]])]).tolist()
-        frames.append(
-            {
-                "file_path": f"{k}.png",
-                "mask_path": f"masks/{k}.png",
-                "transform_matrix": matrix,
-                "time": k / 8,
-            }
-        )
-    (folder / "transforms.json").write_text(json.dumps({**SHARED, "frames": frames}))
+    content = balls.write(folder, [k / 8 for k in range(9)])
+    (folder / "masks").mkdir()
+    for k, frame in enumerate(content["frames"]):
+        with Image.open(folder / frame["file_path"]) as image:
+            image.save(folder / f"cut_{k}.png")
+            image.getchannel("A").save(folder / f"masks/{k}.png")
+            image.convert("RGB").save(folder / f"{k}.png")
+        frame |= {"file_path": f"{k}.png", "mask_path": f"masks/{k}.png"}
+    edit(folder, lambda listed: listed.update(content))
     return folder
 
 
@@ -95,7 +70,7 @@ def plain(root: Path, masks: list[np.ndarray] | None = None) -> None:
 
 
 @pytest.mark.parametrize("downscale", [1, 2, 3])
-def test_mattes_are_those_of_images_that_were_cut_out(root: Path, downscale: int) -> None:
+def test_mattes_are_those_of_images_that_were_cut_out(root, downscale):
     ours = NerfstudioReader(root, downscale=downscale, masks="matte").read().dynamic.train
     edit(root, lambda c: [f.update(file_path=f"cut_{f['file_path']}") for f in c["frames"]])
     theirs = NerfstudioReader(root, downscale=downscale, masks="none").read().dynamic.train
@@ -103,7 +78,7 @@ def test_mattes_are_those_of_images_that_were_cut_out(root: Path, downscale: int
 
 
 @pytest.mark.parametrize("downscale", [1, 2])
-def test_a_pixel_counts_if_all_that_it_is_made_of_does(root: Path, downscale: int) -> None:
+def test_a_pixel_is_valid_if_all_that_it_is_made_of_is(root, downscale):
     for k in range(9):
         with Image.open(root / f"masks/{k}.png") as mask:
             sharp = np.where(np.asarray(mask) > 127, 255, 0).astype(np.uint8)
@@ -115,13 +90,13 @@ def test_a_pixel_counts_if_all_that_it_is_made_of_does(root: Path, downscale: in
     assert 0 < int(valid_mask.sum()) < valid_mask.numel()
 
 
-def test_they_can_be_left_alone(root: Path) -> None:
+def test_they_can_be_left_alone(root):
     edit(root, lambda c: c["frames"][0].update(mask_path="nowhere.png"))
     train = NerfstudioReader(root, masks="none").read().dynamic.train
     assert train.valid_mask is None and not train.has_alpha
 
 
-def test_only_some_images_have_one(root: Path) -> None:
+def test_only_some_images_have_one(root):
     plain(root)
     edit(root, lambda c: [f.pop("mask_path") for f in c["frames"][2:]])
     train = NerfstudioReader(root).read().dynamic.train
@@ -135,7 +110,7 @@ def test_only_some_images_have_one(root: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["L", "labels", "1", "P", "RGB", "RGBA", "LA", "dull"])
-def test_whatever_is_grey_will_do(root: Path, kind: str) -> None:
+def test_any_grey_file_is_a_mask(root, kind):
     plain(root)
     for k in range(9):
         image = Image.fromarray(half({"labels": 1, "dull": 200}.get(kind, 255)))
@@ -148,7 +123,7 @@ def test_whatever_is_grey_will_do(root: Path, kind: str) -> None:
     )
 
 
-def test_a_mask_may_be_of_the_size_of_the_camera(root: Path) -> None:
+def test_a_mask_may_be_of_the_size_of_the_camera(root):
     plain(root)
     for k in range(9):
         with Image.open(root / f"{k}.png") as image:
@@ -187,14 +162,14 @@ def write_deep(root: Path) -> None:
         (lambda r: (r / "masks/1.png").write_text("nothing"), "masks/1.png: not a readable image"),
     ],
 )
-def test_wrong_masks(root: Path, masks: str, spoil: Callable[[Path], object], said: str) -> None:
+def test_wrong_masks(root, masks, spoil, said):
     spoil(root)
     with pytest.raises(DevrfError) as caught:
         NerfstudioReader(root, masks=masks).read()  # type: ignore[arg-type]
     assert said in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_a_mask_that_leaves_nothing(root: Path) -> None:
+def test_a_mask_that_leaves_nothing(root):
     paint(root, 4, 0 * half())
     with pytest.raises(DevrfError, match=r"masks/4.png: leaves nothing of .*4.png to learn from"):
         NerfstudioReader(root).read()
@@ -204,12 +179,7 @@ def test_a_mask_that_leaves_nothing(root: Path) -> None:
     )
 
 
-def test_an_option_that_is_none(root: Path) -> None:
-    with pytest.raises(DevrfError, match="data.masks: should be 'ignore', 'matte' or 'none'"):
-        NerfstudioReader(root, masks="yes").read()  # type: ignore[arg-type]
-
-
-def test_only_pixels_that_count_are_drawn(root: Path) -> None:
+def test_only_valid_pixels_are_drawn(root):
     plain(root)
     train = NerfstudioDataModule(root, flow="none").scene.dynamic.train
     assert train.valid_mask is not None
@@ -220,7 +190,7 @@ def test_only_pixels_that_count_are_drawn(root: Path) -> None:
     assert pool.image.dtype == pool.flat.dtype == torch.int32
 
 
-def test_masks_go_with_their_images(root: Path) -> None:
+def test_masks_go_with_their_images(root):
     masks = [half() if k % 2 else 255 - half() for k in range(9)]
     plain(root, masks)
     train = NerfstudioReader(root).read().dynamic.train
@@ -229,7 +199,7 @@ def test_masks_go_with_their_images(root: Path) -> None:
     assert one is not None and torch.equal(one[0], train.valid_mask[3])
 
 
-def test_flow_is_valid_at_pixels_that_count(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_flow_is_valid_at_valid_pixels(root, monkeypatch):
     plain(root)
     scene = NerfstudioReader(root).read()
     everywhere = lambda now, before: torch.zeros(HEIGHT, WIDTH, 2)  # noqa: E731
@@ -240,7 +210,7 @@ def test_flow_is_valid_at_pixels_that_count(root: Path, monkeypatch: pytest.Monk
     assert bool(flow.valid[1].any()) and not bool((flow.valid & ~valid_mask).any())
 
 
-def test_inspecting_says_how_much_they_cover(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_inspecting_says_how_much_they_cover(root, caplog):
     plain(root, [255 - half() if k == 3 else half() for k in range(9)])
     with caplog.at_level(logging.INFO):
         scene = NerfstudioReader(root).read()
@@ -248,19 +218,19 @@ def test_inspecting_says_how_much_they_cover(root: Path, caplog: pytest.LogCaptu
     facts = inspect_scene(scene).sets[0]
     assert facts.mattes is None and facts.left_out == pytest.approx(0.5)
     assert not [advice for advice in image_advice(scene) if "masks" in advice.what]
-    abbreviated = counted_pixels(scene.dynamic.train, 0)
-    assert abbreviated.shape[2] == 4 and abbreviated[0, :, 3].tolist() == [255] * 40 + [0] * 40
+    picture = counted_pixels(scene.dynamic.train, 0)
+    assert picture.shape[2] == 4 and picture[0, :, 3].tolist() == [255] * 40 + [0] * 40
     matte = inspect_scene(NerfstudioReader(root, masks="matte").read()).sets[0]
     assert matte.mattes == pytest.approx(0.5) and matte.left_out is None
 
 
-def test_masks_that_cut_out_the_subject_are_told_from_others(root: Path) -> None:
+def test_masks_that_cut_out_the_subject_are_told_from_others(root):
     found = [a for a in image_advice(NerfstudioReader(root).read()) if "masks" in a.what]
     assert len(found) == 1 and "set data.masks=matte" in found[0].remedy
     assert found[0].where.startswith("static training set, ")
 
 
-def test_where_pixels_do_not_count_nothing_is_carved_away(root: Path) -> None:
+def test_where_pixels_are_not_valid_nothing_is_carved_away(root):
     views = NerfstudioReader(root, masks="matte").read().static.train
     box = Box.of((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
     whole = visual_hull(views, box, (12, 12, 12))

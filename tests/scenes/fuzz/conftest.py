@@ -309,7 +309,7 @@ class Verdicts:
 
 
 @pytest.fixture
-def verdicts(tmp_path: Path) -> Verdicts:
+def verdicts(tmp_path) -> Verdicts:
     """The verdicts on files below ``tmp_path``."""
     return Verdicts(tmp_path)
 

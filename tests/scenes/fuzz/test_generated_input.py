@@ -475,9 +475,7 @@ def most_memory() -> int:
 
 @pytest.mark.parametrize("parser", PARSERS)
 @pytest.mark.filterwarnings("ignore")
-def test_damaged_input_is_read_or_refused(
-    parser: str, request: pytest.FixtureRequest, verdicts: Any
-) -> None:
+def test_damaged_input_is_read_or_refused(parser, request, verdicts):
     share, prepare = PARSERS[parser]
     inputs, read = prepare(request.getfixturevalue)
 

@@ -185,7 +185,7 @@ CASES: dict[str, tuple[str, str | None, Callable[[Path], Path]]] = {
 
 
 @pytest.fixture(scope="module")
-def verdicts(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
+def verdicts(tmp_path_factory) -> Iterator[dict[str, Any]]:
     """What became of each case: message, seconds, bytes; the process is killed when it hangs."""
     folder = tmp_path_factory.mktemp("hostile")
     listed = [
@@ -207,14 +207,14 @@ def verdicts(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_it_costs_little(name: str, verdicts: dict[str, Any]) -> None:
+def test_it_costs_little(name, verdicts):
     message, took, grown = verdicts[name]
     said = CASES[name][1]
     assert message is None if said is None else said in message
     assert grown < GIB and took < 20
 
 
-def test_the_cases_are_what_they_are_called(tmp_path: Path) -> None:
+def test_the_cases_are_what_they_are_called(tmp_path):
     """The archives made by hand are whole ones, and unpack to what was put in."""
     path = npz(tmp_path / "f.npz", {"flow": VECTORS, "mask": MASK}, zeros=1)
     import zipfile

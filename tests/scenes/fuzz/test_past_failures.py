@@ -89,14 +89,12 @@ for _ in range(100):
         ),
     ],
 )
-def test_values_of_a_transforms_file(
-    scene_folder: Any, change: Callable[[dict[str, Any]], None], said: str
-) -> None:
+def test_values_of_a_transforms_file(scene_folder, change, said):
     scene_folder.edit(scene_folder.root / TRAIN, change)
     assert said in refused(lambda: BlenderReader(scene_folder.root).read())
 
 
-def test_a_byte_order_mark_is_no_mistake(tmp_path: Path) -> None:
+def test_a_byte_order_mark_is_no_mistake(tmp_path):
     file = tmp_path / "a.json"
     file.write_bytes(b'\xef\xbb\xbf{"a": 1, "a": 2}')
     assert read_json(file, TypeAdapter(dict[str, int]), "it is tested") == {"a": 2}
@@ -116,7 +114,7 @@ ROWS = "static/poses_bounds.npy"
         ((2, 3), 1e8, "too far from the others"),
     ],
 )
-def test_values_of_llff_poses(llff_folder: Any, place: Any, value: float, said: str) -> None:
+def test_values_of_llff_poses(llff_folder, place, value, said):
     rows = np.load(llff_folder.root / ROWS)
     rows[place] = value
     llff_folder.save(ROWS, rows)
@@ -142,7 +140,7 @@ HEADERS = {
 
 
 @pytest.mark.parametrize("text", HEADERS.values(), ids=HEADERS)
-def test_headers_of_arrays(tmp_path: Path, text: str) -> None:
+def test_headers_of_arrays(tmp_path, text):
     npy, npz, cache = tmp_path / "a.npy", tmp_path / "a.npz", tmp_path / "cache.npz"
     npy.write_bytes(header(text))
     for path, names in ((npz, ("flow", "mask")), (cache, ("key", "vectors", "valid"))):
@@ -159,9 +157,7 @@ def arrays() -> dict[str, np.ndarray]:
     return {"flow": np.ones((4, 6, 2), np.float32), "mask": np.ones((4, 6), bool)}
 
 
-def test_a_member_that_goes_by_the_name_of_an_array(
-    tmp_path: Path, arrays: dict[str, np.ndarray]
-) -> None:
+def test_a_member_that_goes_by_the_name_of_an_array(tmp_path, arrays):
     """numpy prefers ``flow`` to ``flow.npy``, whose header alone had been looked at."""
     path = tmp_path / "f.npz"
     np.savez(path, **arrays)
@@ -170,7 +166,7 @@ def test_a_member_that_goes_by_the_name_of_an_array(
     assert read_flow_file(path, width=6, height=4)[1].all()
 
 
-def test_two_members_of_one_name(tmp_path: Path, arrays: dict[str, np.ndarray]) -> None:
+def test_two_members_of_one_name(tmp_path, arrays):
     path = tmp_path / "f.npz"
     np.savez(path, **arrays)
     with zipfile.ZipFile(path, "a") as archive, pytest.warns(UserWarning, match="Duplicate"):
@@ -178,7 +174,7 @@ def test_two_members_of_one_name(tmp_path: Path, arrays: dict[str, np.ndarray]) 
     assert 'more than one array "mask"' in refused(lambda: read_flow_file(path, 6, 4))
 
 
-def test_a_compression_that_numpy_does_not_write(tmp_path: Path) -> None:
+def test_a_compression_that_numpy_does_not_write(tmp_path):
     """LZMA takes as much memory as its own header asks for."""
     path = tmp_path / "f.npz"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_LZMA) as archive:
@@ -187,9 +183,7 @@ def test_a_compression_that_numpy_does_not_write(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("value", [1e30, 1e300, 11.0])
-def test_vectors_longer_than_the_image_are_not_trusted(
-    tmp_path: Path, arrays: dict[str, np.ndarray], value: float
-) -> None:
+def test_vectors_longer_than_the_image_are_not_trusted(tmp_path, arrays, value):
     vectors = arrays["flow"].astype(np.float64)
     vectors[1, 2, 0] = -value
     np.savez(tmp_path / "f.npz", flow=vectors, mask=arrays["mask"])
@@ -198,7 +192,7 @@ def test_vectors_longer_than_the_image_are_not_trusted(
 
 
 @pytest.mark.parametrize("frame", ["001", "002"])
-def test_a_pipe_in_the_place_of_a_flow_file(llff_folder: Any, frame: str) -> None:
+def test_a_pipe_in_the_place_of_a_flow_file(llff_folder, frame):
     """Opening it waits for ever for somebody who writes."""
     for other in ("001", "002"):
         llff_folder.flow(1, other, 0.5)
@@ -210,14 +204,14 @@ def test_a_pipe_in_the_place_of_a_flow_file(llff_folder: Any, frame: str) -> Non
 
 
 @pytest.mark.parametrize("kind", ["BMP", "GIF", "TIFF", "EPS", "PDF"])
-def test_other_formats_under_the_name_of_a_png(tmp_path: Path, kind: str) -> None:
+def test_other_formats_under_the_name_of_a_png(tmp_path, kind):
     """Pillow would start Ghostscript for some of them."""
     path = tmp_path / "a.png"
     Image.new("RGB", (16, 16)).save(path, kind)
     assert f"{path}: not a readable image" in refused(lambda: load_images([path], 1))
 
 
-def test_many_ids_are_looked_up_at_once(tmp_path: Path) -> None:
+def test_many_ids_are_looked_up_at_once(tmp_path):
     """Once the square of their number: minutes."""
     (tmp_path / "rgb/1x").mkdir(parents=True)
     ids = [f"{i:06d}" for i in range(40_000)]
@@ -231,11 +225,11 @@ def test_many_ids_are_looked_up_at_once(tmp_path: Path) -> None:
     assert time.perf_counter() - start < 10
 
 
-def test_a_home_that_is_not_there() -> None:
+def test_a_home_that_is_not_there():
     assert refused(lambda: BlenderReader("~nobody-of-that-name/x").read()).startswith("data.root: ")
 
 
-def test_a_folder_that_may_not_be_listed(llff_folder: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_that_may_not_be_listed(llff_folder, monkeypatch):
     closed, listed = llff_folder.static / "images_4", Path.iterdir
 
     def iterdir(path: Path) -> Any:
@@ -249,7 +243,7 @@ def test_a_folder_that_may_not_be_listed(llff_folder: Any, monkeypatch: pytest.M
     )
 
 
-def test_more_than_fits_into_memory(scene_folder: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_than_fits_into_memory(scene_folder, monkeypatch):
     shutil.rmtree(scene_folder.static)
     monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(total=2**10))
     images = sorted((scene_folder.dynamic / "train").iterdir())
