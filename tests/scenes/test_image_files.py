@@ -47,25 +47,25 @@ def test_an_image_is_turned_where_only_so_it_fits_its_camera(tmp_path, orientati
     assert np.array_equal(pixels(path, fits), seen if quarter else stored)
     assert image_size(path, fits) == (HIGH if quarter else WIDE)
     # Half turns and mirrors leave the shape: nobody can tell.
-    assert read_header(path, fits).doubtful == (orientation in (2, 3, 4))
+    assert read_header(path, fits).ambiguous_orientation == (orientation in (2, 3, 4))
     # The camera is one of the image as it is stored.
     assert np.array_equal(pixels(path, WIDE), stored)
-    assert read_header(path, WIDE).doubtful == (orientation in (2, 3, 4))
+    assert read_header(path, WIDE).ambiguous_orientation == (orientation in (2, 3, 4))
     # No camera says anything, or all that it says fits neither.
     for unknown in (None, (300, 100)):
         assert np.array_equal(pixels(path, unknown), stored)
-        assert read_header(path, unknown).doubtful == (orientation != 1)
+        assert read_header(path, unknown).ambiguous_orientation == (orientation != 1)
 
 
 def test_of_a_square_nobody_can_tell(tmp_path):
     header = read_header(photo(tmp_path / "a.jpg", 6, (16, 16)), (16, 16))
-    assert (header.turn, header.doubtful) == (1, True)
+    assert (header.turn, header.ambiguous_orientation) == (1, True)
 
 
 @pytest.mark.parametrize("orientation", [0, 9, 77])
 def test_an_orientation_that_is_none_is_as_it_is(tmp_path, orientation):
     header = read_header(photo(tmp_path / "a.jpg", orientation), HIGH)
-    assert (header.turn, header.doubtful) == (1, False)
+    assert (header.turn, header.ambiguous_orientation) == (1, False)
 
 
 def test_damaged_notes_do_not_spoil_a_picture(tmp_path):
@@ -82,7 +82,7 @@ def test_a_set_is_of_one_size_once_it_is_turned(tmp_path, caplog):
     with caplog.at_level(logging.INFO):
         loaded = load_images(paths, 2, [WIDE, WIDE])
     assert loaded.pixels.shape == (2, 8, 12, 3) and (loaded.width, loaded.height) == WIDE
-    assert not bool(loaded.doubtful.any())
+    assert not bool(loaded.ambiguous_orientation.any())
     assert "1 of them turned as their EXIF orientation says" in caplog.text
     with pytest.raises(DevrfError, match="1.jpg: 16x24 px, but .*0.jpg of the same set has 24x16"):
         load_images(paths, 1)

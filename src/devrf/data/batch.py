@@ -19,7 +19,7 @@ class Pixels:
     Attributes:
         image: (R,) int64, the image of each among the views.
         flat: (R,) int64, its row-major number in the image.
-        background: (3,) or (R, 3) RGB in [0, 1] that mattes are composited on.
+        background: (3,) or (R, 3) RGB in [0, 1] that colours are composited on.
     """
 
     image: Tensor
@@ -53,8 +53,8 @@ class RayBatch:
     Attributes:
         rays: R rays in the fields' space.
         color: (R, 3) RGB in [0, 1], composited on ``background``.
-        alpha: (R,) matte in [0, 1], or None for images without one.
-        background: (3,) or (R, 3) RGB behind the matte.
+        alpha: (R,) alpha in [0, 1], or None for images without one.
+        background: (3,) or (R, 3) RGB behind the alpha mask.
         image: (R,) int64, the image of each ray among the views it was drawn from.
         pixel: (R, 2) x, y of the pixels' centres.
         flow: (R, 2) pixels, backward optical flow, or None.
@@ -89,7 +89,7 @@ def gather_batch(
         views: images and cameras, on the device of the indices.
         image: (R,) int64, which image.
         flat: (R,) int64, row-major pixel number within it.
-        background: (3,) or (R, 3) RGB in [0, 1] that mattes are composited on.
+        background: (3,) or (R, 3) RGB in [0, 1] that colours are composited on.
         space: the space that the fields live in.
 
     Returns:

@@ -131,9 +131,9 @@ def inward_bounds(
 
     Args:
         static: training views at rest, whose cameras give the box.
-        dynamic: training views in motion, whose mattes give the motion box.
+        dynamic: training views in motion, whose alpha masks give the motion box.
         everyone: all views, test included; near and far hold for all their cameras.
-        bound_scale: "auto" (silhouettes where there are mattes) or a number ≥ 1.
+        bound_scale: "auto" (silhouettes where there are alpha masks) or a number ≥ 1.
         near: distance in world units, or None for the cameras to say.
         far: distance in world units, or None.
         box: the scene's box, or None.
@@ -147,7 +147,7 @@ def inward_bounds(
     if bound_scale == "auto":
         motion = motion_box(dynamic, box)
         if motion is None:
-            source += " (no mattes from two cameras at every time)"
+            source += " (no alpha masks from two cameras at every time)"
         else:
             views, frames = len(set(dynamic.view.tolist())), len(set(dynamic.times.tolist()))
             source = f"silhouettes of {views} views x {frames} frames"

@@ -79,7 +79,7 @@ def _write_split(views: Views, split: str, folder: Path) -> None:
 
 
 def _rgba(pixels: Tensor) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    """(H, W, 4) uint8; an image without a matte is opaque."""
+    """(H, W, 4) uint8; an image without an alpha mask is opaque."""
     if pixels.shape[-1] == 3:
         pixels = torch.cat([pixels, torch.full_like(pixels[..., :1], 255)], dim=-1)
     array: np.ndarray[Any, np.dtype[np.uint8]] = pixels.cpu().numpy()

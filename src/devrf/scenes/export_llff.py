@@ -19,7 +19,7 @@ from devrf.scenes.validation import scene_error
 # The published scenes are read at this factor, from folders images_4; larger images need not
 # be there, and are not.
 FACTOR = 4
-# Readers hold out every so manieth static image, the first one included.
+# Readers hold out every eighth static image, the first one included.
 HOLDOUT = 8
 # Times are not written, but counted: k / (T − 1).
 _TIME_TOLERANCE = 1e-5

@@ -89,7 +89,7 @@ def _static(folder: Path, root: Path, downscale: int, holdout: int) -> Capture:
         torch.zeros(count),
         torch.arange(count),
         _names(images, root),
-        ambiguous_orientation=loaded.doubtful,
+        ambiguous_orientation=loaded.ambiguous_orientation,
     )
     order = torch.arange(count)
     train, test = views[order[order % holdout != 0]], views[order[order % holdout == 0]]
@@ -166,7 +166,7 @@ def _moving(
         times.float().repeat_interleave(len(folders)),
         view,
         _names(images, root),
-        ambiguous_orientation=loaded.doubtful,
+        ambiguous_orientation=loaded.ambiguous_orientation,
     )
 
 

@@ -88,7 +88,8 @@ class NerfiesReader(InwardReader):
     World units are those of ``scene.json``: (position − center) · scale; it gives near and far,
     too. The time of an image is its ``time_id`` (HyperNeRF), else its ``warp_id``, brought to
     [0, 1]. Images come from ``rgb/<downscale>x``, or from a larger folder and are made smaller;
-    they are undistorted. Without mattes the box is all that the cameras see between near and far.
+    they are undistorted. Without alpha masks the box is all that the cameras see
+    between near and far.
 
     Attributes:
         holdout: without ``val_ids``, one of so many images is held out.
@@ -119,7 +120,7 @@ class NerfiesReader(InwardReader):
         far = world.far if self.far is None else self.far
         box = self.box
         if box is None and not static.train.has_alpha and 0 <= near < far:
-            # Without mattes the backdrop is to be learned too.
+            # Without alpha masks the backdrop is to be learned too.
             seen = box_of_frusta(static.train.cameras, near, far)
             box = [seen.low, seen.high]
         return replace(self, near=near, far=far, box=box).scene(folder, static, dynamic)

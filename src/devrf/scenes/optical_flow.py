@@ -26,7 +26,7 @@ FlowMethod = Literal["dis", "raft"]
 # A vector is trusted when going there and back ends this near: 1 px, and 5 % of its length.
 CLOSED_PIXELS = 1.0
 CLOSED_SHARE = 0.05
-MATTE_THRESHOLD = 127
+ALPHA_THRESHOLD = 127
 
 
 def estimate_flow(views: Views, method: FlowMethod, cache: Path | None = None) -> OpticalFlow:
@@ -35,7 +35,7 @@ def estimate_flow(views: Views, method: FlowMethod, cache: Path | None = None) -
     A fixed camera's images follow one another by time; a moving camera's images (each its own
     view) are taken as one sequence. Images are compared on white. A vector is valid where the
     forward flow leads back, |b(x) + f(x + b(x))| < 1 px + 5 % · |b(x)|, where it stays in the
-    image, and on the matte where there is one.
+    image, and on the alpha mask where there is one.
 
     Args:
         views: N images of the scene in motion.
@@ -74,7 +74,7 @@ def estimate_flow(views: Views, method: FlowMethod, cache: Path | None = None) -
         backward, forward = between(now, before), between(before, now)
         valid = consistent(backward, forward)
         if views.has_alpha:
-            valid &= views.pixels[image, ..., 3].cpu() > MATTE_THRESHOLD
+            valid &= views.pixels[image, ..., 3].cpu() > ALPHA_THRESHOLD
         flow.valid[image] = valid
         flow.vectors[image] = backward * valid[..., None]
         if (done + 1) % 100 == 0:

@@ -54,7 +54,7 @@ class SceneReader(ABC):
         root: the scene's folder.
         name: short name; None takes the folder's.
         downscale: integer factor ≥ 1 by which images and flow are made smaller.
-        background: what is behind the mattes of RGBA images; RGB images are used as they are.
+        background: what is behind the alpha masks of RGBA images; RGB images are used as they are.
         flow: ``files`` reads the scene's backward flow where there is any, ``dis`` and ``raft``
             estimate it, ``none`` does without; ``auto`` reads the files, else estimates with
             DIS unless the cameras jump from frame to frame.

@@ -14,7 +14,7 @@ from torch import Tensor
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
 from devrf.scenes.images import load_images
-from devrf.scenes.masks import Masks, counted_pixels, cutting_out
+from devrf.scenes.masks import Masks, cutting_out, valid_pixels
 from devrf.scenes.scene import Views
 from devrf.scenes.transforms import Transforms, read_transforms
 from devrf.scenes.undistortion import as_pinhole
@@ -191,8 +191,8 @@ def load_views(split: Split, root: Path, downscale: int, masks: Masks = "none") 
     known = [split.transforms.intrinsics[i] for i in used.tolist()]
     sizes = [inner.size for inner in known]
     listed = [split.transforms.masks[i] for i in used.tolist()] if split.transforms.masks else []
-    mattes = cutting_out(listed, sizes, files) if masks == "matte" else None
-    loaded = load_images(files, downscale, sizes, mattes)
+    finish = cutting_out(listed, sizes, files) if masks == "matte" else None
+    loaded = load_images(files, downscale, sizes, finish)
     height, width = loaded.pixels.shape[1:3]
     distorted = [
         inner.lens(loaded.width, loaded.height, file).scaled(
@@ -202,7 +202,7 @@ def load_views(split: Split, root: Path, downscale: int, masks: Masks = "none") 
     ]
     valid_mask = None
     if masks == "ignore":
-        valid_mask = counted_pixels(
+        valid_mask = valid_pixels(
             listed, (loaded.width, loaded.height), (width, height), sizes, distorted, files
         )
     # Undistorted after the images are made smaller: a tenth of the work for the same picture.
@@ -221,6 +221,6 @@ def load_views(split: Split, root: Path, downscale: int, masks: Masks = "none") 
         split.times[used],
         split.view[used],
         names,
-        ambiguous_orientation=loaded.doubtful,
+        ambiguous_orientation=loaded.ambiguous_orientation,
         valid_mask=valid_mask,
     )
