@@ -16,7 +16,8 @@ from devrf.scenes.layout import Layout, fewer, load_layout, without_static_set
 from devrf.scenes.paths import existing_folder, scene_folder
 from devrf.scenes.reader import Count, InwardReader, Time
 from devrf.scenes.scene import Scene, Views
-from devrf.scenes.splits import Split, dynamic_split, static_split
+from devrf.scenes.splits import Split, at_rest, in_motion
+from devrf.scenes.transforms import read_transforms
 from devrf.scenes.validation import scene_error
 
 log = logging.getLogger(__name__)
@@ -64,16 +65,21 @@ def _layout(root: Path, dynamic: str | None, static_until: float) -> tuple[Layou
                 "expected static/ and dynamic_<V>views/, or transforms_train.json; "
                 "set data.root to the scene's folder",
             )
-        train = dynamic_split(root / "transforms_train.json", root)
-        test = dynamic_split(root / "transforms_test.json", root)
+        train = in_motion(read_transforms(root / "transforms_train.json", root))
+        test = in_motion(read_transforms(root / "transforms_test.json", root))
         return without_static_set(train, test, static_until), root / "train_flow"
     existing_folder(static)
     moving = chosen_dynamic(root, dynamic)
+    at_rest_train, at_rest_test, moving_train, moving_test = (
+        read_transforms(capture / f"transforms_{split}.json", root)
+        for capture in (static, moving)
+        for split in ("train", "test")
+    )
     layout = Layout(
-        static_split(static / "transforms_train.json", root),
-        static_split(static / "transforms_test.json", root),
-        dynamic_split(moving / "transforms_train.json", root),
-        dynamic_split(moving / "transforms_test.json", root),
+        at_rest(at_rest_train),
+        at_rest(at_rest_test),
+        in_motion(moving_train),
+        in_motion(moving_test),
     )
     return layout, moving / "train_flow"
 

@@ -16,7 +16,7 @@ from devrf.geometry.clock import FrameClock
 from devrf.scenes.images import load_images
 from devrf.scenes.masks import Masks, cutting_out, valid_pixels
 from devrf.scenes.scene import Views
-from devrf.scenes.transforms import Transforms, read_transforms
+from devrf.scenes.transforms import Transforms
 from devrf.scenes.undistortion import as_pinhole
 from devrf.scenes.validation import scene_error
 
@@ -81,21 +81,11 @@ def distinct_poses(poses: Tensor) -> Tensor:
     return torch.tensor(numbers, dtype=torch.int64)
 
 
-def static_split(file: Path, root: Path) -> Split:
-    """The split of a scene at rest that ``file`` lists; see :func:`at_rest`."""
-    return at_rest(read_transforms(file, root))
-
-
 def at_rest(transforms: Transforms) -> Split:
     """A split of a scene at rest: every image its own view, time 0 unless the file says more."""
     count = len(transforms.images)
     times = torch.zeros(count) if transforms.times is None else torch.tensor(transforms.times)
     return Split(transforms, times, torch.arange(count), False, torch.arange(count))
-
-
-def dynamic_split(file: Path, root: Path) -> Split:
-    """The split of a scene in motion that ``file`` lists; see :func:`in_motion`."""
-    return in_motion(read_transforms(file, root))
 
 
 def in_motion(transforms: Transforms) -> Split:
