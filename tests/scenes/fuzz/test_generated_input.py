@@ -329,18 +329,7 @@ def read_nerfstudio(root: Path) -> Any:
     return NerfstudioDataModule(root, flow="none", bound_scale=1.5).load()
 
 
-CHANGES = [
-    "gone",
-    "empty",
-    "folder",
-    "loop",
-    "dangling",
-    "pipe",
-    "half",
-    "rubbish",
-    "damaged",
-    "swapped",
-]
+CHANGES = "gone empty folder loop dangling pipe half rubbish damaged swapped".split()
 
 
 def scene_files(
