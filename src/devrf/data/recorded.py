@@ -1,4 +1,4 @@
-"""Scenes that a reader brings from disk, with their optical flow from wherever it comes."""
+"""Scenes read from disk, with optical flow from their files or estimated."""
 
 from __future__ import annotations
 

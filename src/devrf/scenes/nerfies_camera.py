@@ -63,7 +63,7 @@ def read_camera(
         intrinsics in pixels of the full image.
 
     Raises:
-        DevrfError: the file is missing or a value in it is none.
+        DevrfError: the file is missing, or a value in it is wrong.
     """
     file = inside(folder, folder / "camera", f"{item}.json", folder / "dataset.json")
     camera = read_json(file, _CAMERA, "every image needs its camera; add it")

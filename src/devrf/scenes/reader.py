@@ -14,7 +14,7 @@ from pydantic.dataclasses import dataclass
 from devrf.scenes.bounds import inward_bounds
 from devrf.scenes.json_files import Number
 from devrf.scenes.scene import Background, Capture, Scene
-from devrf.scenes.validation import checked_box, first_error
+from devrf.scenes.validation import LARGEST, checked_box, first_error
 
 FlowSource = Literal["auto", "files", "dis", "raft", "none"]
 # Of layouts that have no place for flow files.
@@ -30,7 +30,7 @@ Time = Annotated[Number, Field(ge=0, le=1)]
 def _bound_scale(value: object) -> object:
     number = isinstance(value, int | float) and not isinstance(value, bool)
     # NaN compares false.
-    if value != "auto" and not (number and 1 <= value < float("inf")):  # type: ignore[operator]
+    if value != "auto" and not (number and 1 <= value < LARGEST):  # type: ignore[operator]
         raise ValueError(f'expected "auto" or a number of at least 1, not {value!r}')
     return value
 

@@ -108,7 +108,7 @@ def read_listing(file: Path) -> TransformsFile:
 
     Raises:
         DevrfError: the file is missing, is no JSON, lacks a key, holds no frames, or holds a
-            value that is none (NaN poses, times outside [0, 1], negative focal lengths …).
+            wrong value (NaN poses, times outside [0, 1], negative focal lengths …).
     """
     return read_json(file, _FILE, "every capture needs its posed images")
 
@@ -130,7 +130,8 @@ def posed_images(
         masked: whether ``mask_path`` is followed, too.
 
     Raises:
-        DevrfError: an image is missing, a pose is none, or some frames only have a time.
+        DevrfError: an image is missing, a pose is no rigid transform, or only some frames have
+            a time.
     """
     frames = listing.frames
     where = [f"{file}: frames[{index}]" for index in range(len(frames))]

@@ -12,7 +12,7 @@ from devrf.scenes.lens import Lens
 from devrf.scenes.resampling import LONGEST_SIDE, look_up_pixels
 from devrf.scenes.validation import scene_error
 
-# A lens that needs a longer focal length than this to fill its image is no such lens.
+# A lens that has to be zoomed by more than this to fill its image is given up as folded.
 _LONGEST = 2.0
 _HALVINGS = 24
 
