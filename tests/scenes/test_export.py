@@ -20,13 +20,9 @@ from devrf.scenes.scene import Capture, Scene
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    built = ProceduralScene(
+    return ProceduralScene(
         width=24, height=16, static_views=3, static_test_views=2, train_views=2, frames=3
     )()
-    torch.set_num_threads(threads)
-    return built
 
 
 def test_what_is_exported_reads_back_exactly(scene, tmp_path):
