@@ -24,11 +24,13 @@ from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
+from devrf.geometry.rays import Rays
 from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.schedules import CanonicalSchedule
+from devrf.methods.devrf.volume_rendering import render
 from devrf.rendering.rendered_image import RenderedImage
 from devrf.scenes.procedural import ProceduralScene
 from devrf.scenes.scene import Scene
@@ -170,13 +172,28 @@ def rest(learned: tuple[CanonicalStage, Trainer]) -> LoadedCheckpoint:
 @pytest.fixture
 def moving(learned: tuple[CanonicalStage, Trainer], rng: torch.Generator) -> DeVRFModel:
     """The tiny scene; at the times 0.4 and 1 every point has moved by up to 5 % of its box."""
-    model = copy.deepcopy(learned[0].model)
+    model = copy.deepcopy(learned[0].scene_model)
     box = model.canonical.box
     motion = DeformationField(box, FrameClock((0.0, 0.4, 1.0)), voxels=5**3)
     shape = motion.to_canonical[1:].shape
     motion.to_canonical[1:] = 0.1 * box.longest * (torch.rand(shape, generator=rng) - 0.5)
     model.deformation = motion
     return model
+
+
+def plain_picture(
+    model: DeVRFModel, rays: Rays, time: float, background: torch.Tensor
+) -> RenderedImage:
+    """What rays in the fields' space see of a model at ``time``, by the plain renderer."""
+    scene = model.canonical, model.occupancy_at(time), model.settings
+    with torch.no_grad():
+        return RenderedImage.of(render(rays, *scene, background, model.warp(time)))
+
+
+@pytest.fixture
+def reference() -> Callable[[DeVRFModel, Rays, float, torch.Tensor], RenderedImage]:
+    """The function :func:`plain_picture`."""
+    return plain_picture
 
 
 @pytest.fixture

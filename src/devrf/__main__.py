@@ -28,7 +28,7 @@ def entry() -> None:
     except Interrupted as stop:
         print(f"devrf: {stop.said}", file=sys.stderr)
         raise
-    except KeyboardInterrupt:  # raised by somebody else's answer to Ctrl-C
+    except KeyboardInterrupt:  # raised by another library's handler of Ctrl-C
         print("devrf: interrupted", file=sys.stderr)
         sys.exit(130)
 

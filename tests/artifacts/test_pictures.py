@@ -12,17 +12,25 @@ import torch
 from torch import Tensor
 
 from devrf.artifacts.camera_paths import orbit
-from devrf.artifacts.colors import depth_colors, error_colors, to_bytes
-from devrf.artifacts.contact_sheet import GAP, side_by_side, write_contact_sheet
+from devrf.artifacts.colors import (
+    UNKNOWN,
+    depth_colors,
+    error_colors,
+    flow_colors,
+    flow_wheel,
+    to_bytes,
+)
+from devrf.artifacts.contact_sheet import GAP, write_contact_sheet
 from devrf.artifacts.film import WATCHABLE, FilmSettings, film_bytes, pictures, write_video
+from devrf.artifacts.images import short_name
 from devrf.evaluation.held_out import HeldOutView
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.renderer import Renderer
 from devrf.methods.devrf.settings import RenderSettings
 from devrf.rendering.occupancy import Occupancy
+from devrf.rendering.renderer import Renderer
 
 
 def flat(height: int, width: int, color: tuple[float, float, float]) -> Tensor:
@@ -30,14 +38,8 @@ def flat(height: int, width: int, color: tuple[float, float, float]) -> Tensor:
 
 
 def test_bytes_are_rounded_and_clamped() -> None:
-    assert to_bytes(torch.tensor([-1.0, 0.0, 0.5, 1.0, 7.0, 0.9985])).tolist() == [
-        0,
-        0,
-        128,
-        255,
-        255,
-        255,
-    ]
+    values = torch.tensor([-1.0, 0.0, 0.5, 1.0, 7.0, 0.9985])
+    assert to_bytes(values).tolist() == [0, 0, 128, 255, 255, 255]
 
 
 def test_depth_is_bright_near_dark_far_and_white_where_nothing_is() -> None:
@@ -59,33 +61,59 @@ def test_no_error_is_black_and_more_is_brighter_up_to_the_full_one() -> None:
     assert light[0] < light[1] < light[2] and light[2] == light[3]
 
 
-def view(number: int, height: int = 6, width: int = 9) -> HeldOutView:
+def test_flow_as_colours() -> None:
+    vectors = torch.tensor([[[2.0, 0.0], [0.0, -2.0], [-9.0, 0.0], [0.0, 0.0], [7.0, 7.0]]])
+    valid = torch.tensor([[True, True, True, True, False]])
+    expected = torch.tensor(
+        [
+            [0.9, 0.0, 0.0],  # to the right: red
+            [0.45, 0.9, 0.0],  # up: a quarter turn further
+            [0.0, 0.9, 0.9],  # to the left, as saturated as it gets
+            [1.0, 1.0, 1.0],  # nowhere
+            [UNKNOWN] * 3,
+        ]
+    )
+    colors = flow_colors(vectors, valid, full=2.0)
+    torch.testing.assert_close(colors[0], expected, atol=1e-5, rtol=0)
+
+
+def test_the_wheel_shows_the_directions_that_it_explains() -> None:
+    wheel = flow_wheel(101)
+    assert torch.equal(wheel[0, 0], torch.ones(3))
+    red, cyan = wheel[50, 99], wheel[50, 1]
+    assert red[0] > 0.85 > 0.1 > red[1] and cyan[0] < 0.1 < 0.85 < cyan[1]
+    torch.testing.assert_close(wheel[50, 50], torch.ones(3), atol=0.02, rtol=0)
+
+
+def view(number: int, height: int = 90, width: int = 120) -> HeldOutView:
     truth = flat(height, width, (0.0, 0.0, 1.0))
     prediction = flat(height, width, (number / 255, 0.0, 0.0))
     return HeldOutView(f"{number}", 0.0, truth, prediction, 10.0, 0.5, 9.0, compared=prediction)
 
 
-def test_a_contact_sheet_shows_prediction_truth_and_error_of_spread_views(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("count", "shades"), [(11, [0, 50, 100]), (2, [0, 10]), (1, [0])])
+def test_a_contact_sheet_shows_prediction_truth_and_error_of_spread_views(
+    tmp_path: Path, count: int, shades: list[int]
+) -> None:
     path = tmp_path / "images" / "static.png"
-    write_contact_sheet(path, [view(10 * k) for k in range(11)], rows=3)
+    shown = write_contact_sheet(path, [view(10 * k) for k in range(count)], rows=3)
     sheet = iio.imread(path)
-    assert sheet.shape == (3 * 6 + 2 * GAP, 3 * 9 + 2 * GAP, 3)
-    # The first, the middle and the last view.
-    assert [int(sheet[row * (6 + GAP), 0, 0]) for row in range(3)] == [0, 50, 100]
-    assert (sheet[:6, 9 : 9 + GAP] == 255).all()
-    assert (sheet[:6, 9 + GAP : 18 + GAP] == [0, 0, 255]).all()
+    assert torch.equal(torch.from_numpy(sheet), to_bytes(shown))
+    # Images are enlarged twice, to 240 pixels; labels 30 pixels high stand above and below.
+    assert sheet.shape == (30 + len(shades) * (180 + 30), 3 * 240 + 2 * GAP, 3)
+    for row, shade in enumerate(shades):
+        top = 30 + row * 210
+        assert (sheet[top : top + 180, :240] == [shade, 0, 0]).all()
+        assert (sheet[top : top + 180, 240 : 240 + GAP] == 255).all()
+        assert (sheet[top : top + 180, 240 + GAP : 480 + GAP] == [0, 0, 255]).all()
+        for column in range(3):
+            label = sheet[top + 180 : top + 210, column * 242 : (column + 1) * 242]
+            assert label.min() < 50 and label.max() == 255
 
 
-@pytest.mark.parametrize("count", [1, 2])
-def test_a_contact_sheet_of_few_views_has_a_row_each(tmp_path: Path, count: int) -> None:
-    write_contact_sheet(tmp_path / "sheet.png", [view(k) for k in range(count)])
-    assert iio.imread(tmp_path / "sheet.png").shape[0] == count * 6 + (count - 1) * GAP
-
-
-def test_images_stand_side_by_side_with_white_between() -> None:
-    row = side_by_side([flat(2, 3, (0, 0, 0)), flat(2, 1, (0, 0, 0))], gap=2)
-    assert row.shape == (2, 6, 3)
-    assert row[0, :, 0].tolist() == [0, 0, 0, 1, 1, 0]
+def test_of_a_long_name_the_end_is_shown() -> None:
+    assert short_name("folder/r_000.png") == "r_000.png"
+    assert short_name(30 * "a" + "_000.png") == "…" + 21 * "a" + "_000.png"
 
 
 @pytest.mark.parametrize(("height", "width"), [(48, 96), (241, 33), (15, 7), (301, 300)])
@@ -135,12 +163,13 @@ def test_an_orbit_circles_the_box_at_the_cameras_distance(cube: Box) -> None:
 
 
 def test_pictures_show_colour_beside_depth_while_time_runs(cube: Box) -> None:
-    canonical = Architecture().search_field(cube, 5**3)
+    build = Architecture()
+    canonical = build.search_field(cube, 5**3)
     with torch.no_grad():
         canonical.density.values[2, 2, 2] = 60.0
         canonical.color.values.copy_(torch.tensor([9.0, -9.0, -9.0]).expand(5, 5, 5, 3))
     settings = RenderSettings(0.5, 1e-4, 0.0, 9.0)
-    model = DeVRFModel(canonical, Occupancy.full((5, 5, 5), cube), settings)
+    model = DeVRFModel(build, canonical, Occupancy.full((5, 5, 5), cube), settings)
     shown = list(pictures(Renderer(model), ring(3), 1.0))
     assert len(shown) == 3
     for image in shown:

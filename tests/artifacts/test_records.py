@@ -1,4 +1,4 @@
-"""Means, rows and provenance: read back as a user would."""
+"""Mean scores, rows and provenance, read back."""
 
 from __future__ import annotations
 
@@ -54,35 +54,17 @@ def test_frames_read_back(tmp_path: Path) -> None:
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["capture"] for row in rows] == ["static"] + ["dynamic"] * 3
-    assert rows[0] == {
-        "capture": "static",
-        "name": "r, 0",
-        "time": "0",
-        "psnr": "20",
-        "ssim": "0.5",
-        "rest_pose_psnr": "9",
-        "depth_error": "0.5",
-        "flow_error": "",
-    }
+    at_rest = {"capture": "static", "name": "r, 0", "time": "0", "psnr": "20", "ssim": "0.5"}
+    assert rows[0] == {**at_rest, "rest_pose_psnr": "9", "depth_error": "0.5", "flow_error": ""}
     assert [float(row["time"]) for row in rows[1:]] == [0.0, 0.5, 1.0]
     assert [float(row["psnr"]) for row in rows[1:]] == [20.0, 21.0, 22.0]
     assert {(row["depth_error"], row["flow_error"]) for row in rows[1:]} == {("", "1.5")}
 
 
-def test_provenance_is_plain_and_whole(rest: LoadedCheckpoint) -> None:
+def test_provenance_is_plain_data(rest: LoadedCheckpoint) -> None:
     found = provenance(rest.model, HOST)
     assert json.loads(json.dumps(found)) == found
-    assert set(found) == {
-        "devrf",
-        "python",
-        "torch",
-        "lightning",
-        "device",
-        "git",
-        "parameters",
-        "peak_host_gb",
-        "date",
-    }
+    assert {"lightning", "python", "git", "parameters", "peak_host_gb"} < set(found)
     assert found["devrf"] == devrf.__version__ and found["torch"] == torch.__version__
     assert found["device"]
     assert found["date"].endswith("+00:00")
@@ -111,13 +93,8 @@ def test_the_revision_is_that_of_a_checkout(tmp_path: Path) -> None:
 
     def git(*arguments: str) -> str:
         identity = ["-c", "user.name=a", "-c", "user.email=a@b.c", "-c", "commit.gpgsign=false"]
-        done = subprocess.run(
-            ["git", *identity, *arguments],
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
+        command = ["git", *identity, *arguments]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
         return done.stdout.strip()
 
     try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -12,7 +13,7 @@ from devrf.artifacts.film import FilmSettings
 from devrf.artifacts.still import StillSettings, still
 from devrf.errors import DevrfError
 from devrf.methods.devrf.canonical_stage import CanonicalStage
-from devrf.methods.devrf.renderer import Renderer
+from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene
 
 
@@ -46,12 +47,12 @@ def test_a_film_too_small_for_its_format() -> None:
 
 
 def test_colour_and_depth_of_any_size(
-    learned: tuple[CanonicalStage, Trainer], tiny_scene: Scene
+    learned: tuple[CanonicalStage, Trainer], tiny_scene: Scene, reference: Callable[..., Any]
 ) -> None:
-    model, camera = learned[0].model, StillSettings(view=2, height=31).camera(tiny_scene)
+    model, camera = learned[0].scene_model, StillSettings(view=2, height=31).camera(tiny_scene)
     color, depth = still(Renderer(model), camera, 0.0, 0.0)
     assert color.shape == depth.shape == (31, 41, 3)
-    seen = model.picture(camera.image_rays(0), 0.0, torch.zeros(3))
+    seen = reference(model, camera.image_rays(0), 0.0, torch.zeros(3))
     torch.testing.assert_close(color.view(-1, 3), seen.color.clamp(0, 1))
     # Where nothing is, the colour is that of the background, and the depth is white.
     nothing = seen.opacity.view(31, 41) == 0

@@ -1,4 +1,4 @@
-"""ResumableCSVLogger as CSV: continued, cut back, whole after a kill, patient on a full disk."""
+"""Training curves as CSV: continued, cut back, whole after a kill, patient on a full disk."""
 
 from __future__ import annotations
 
@@ -14,65 +14,71 @@ from devrf.callbacks import csv_logger as module
 from devrf.callbacks.csv_logger import ResumableCSVLogger
 
 
-def table(curves: ResumableCSVLogger) -> list[dict[str, str]]:
-    with curves.path.open(newline="") as file:
+def table(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
         return list(csv.DictReader(file))
 
 
 @pytest.fixture
-def curves(tmp_path: Path) -> ResumableCSVLogger:
-    """Three rows of the static part and two of the dynamic one, written and closed."""
+def path(tmp_path: Path) -> Path:
+    """A table of three rows of the static capture and two of the dynamic one."""
     written = ResumableCSVLogger(tmp_path, "logs", "pipeline")
     for step in (10, 20, 30):
         written.log_metrics({"static/loss": 1 / step}, step)
     for step in (10, 20):
         written.log_metrics({"dynamic/loss": 2.0, "dynamic/flow": 0.5}, step)
-    return ResumableCSVLogger(tmp_path, "logs", "pipeline")
+    return tmp_path / "logs" / "pipeline" / "metrics.csv"
 
 
-def test_a_row_is_on_the_disk_at_once(curves: ResumableCSVLogger) -> None:
-    rows = table(curves)
-    assert curves.path.parts[-3:] == ("logs", "pipeline", "metrics.csv")
+def again(path: Path) -> ResumableCSVLogger:
+    """The logger of a run that is started again."""
+    return ResumableCSVLogger(path.parents[2], "logs", "pipeline")
+
+
+def test_a_row_is_on_the_disk_at_once(path: Path) -> None:
+    rows = table(path)
     assert list(rows[0]) == ["dynamic/flow", "dynamic/loss", "static/loss", "step"]
     assert [row["step"] for row in rows] == ["10", "20", "30", "10", "20"]
     assert rows[1]["static/loss"] == "0.05" and rows[1]["dynamic/loss"] == ""
     assert rows[4]["dynamic/flow"] == "0.5"
 
 
-def test_a_table_is_continued(curves: ResumableCSVLogger) -> None:
-    before = curves.path.read_text()
-    curves.log_metrics({"dynamic/loss": 3.0}, 30)
-    assert curves.path.read_text().startswith(before)
-    assert [row["step"] for row in table(curves)] == ["10", "20", "30", "10", "20", "30"]
+def test_a_table_is_continued(path: Path) -> None:
+    before = path.read_text()
+    again(path).log_metrics({"dynamic/loss": 3.0}, 30)
+    assert path.read_text().startswith(before)
+    assert [row["step"] for row in table(path)] == ["10", "20", "30", "10", "20", "30"]
 
 
-def test_what_lies_beyond_the_point_to_go_on_from_goes(curves: ResumableCSVLogger) -> None:
+def test_rows_beyond_the_resume_point_are_dropped(path: Path) -> None:
+    curves = again(path)
     curves.go_on("dynamic", 10)
-    assert [row["step"] for row in table(curves)] == ["10", "20", "30", "10"]
+    assert [row["step"] for row in table(path)] == ["10", "20", "30", "10"]
     curves.go_on("static", 0)
-    assert [row["dynamic/loss"] for row in table(curves)] == ["2.0"]
+    assert [row["dynamic/loss"] for row in table(path)] == ["2.0"]
+    curves.go_on("dynamic", 0)
+    assert table(path) == []
 
 
-def test_a_line_that_was_cut_off_is_no_row(curves: ResumableCSVLogger) -> None:
-    whole = curves.path.read_text()
-    curves.path.write_text(whole[:-3])  # the last row's step, 20, has become 2
-    curves.log_metrics({"dynamic/loss": 2.0, "dynamic/flow": 0.5}, 20)
-    assert curves.path.read_text().split() == whole.split()
+def test_a_line_that_was_cut_off_is_no_row(path: Path) -> None:
+    whole = path.read_text()
+    path.write_text(whole[:-3])  # the last row's step, 20, has become 2
+    again(path).log_metrics({"dynamic/loss": 2.0, "dynamic/flow": 0.5}, 20)
+    assert path.read_text().split() == whole.split()
 
 
 def test_on_a_full_disk_rows_wait(
-    curves: ResumableCSVLogger, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def full(*_: Any) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    before = curves.path.read_text()
+    before, curves = path.read_text(), again(path)
     with monkeypatch.context() as patch, caplog.at_level(logging.WARNING, logger="devrf"):
         patch.setattr(module, "atomic_write", full)
         for step in (30, 40):
             curves.log_metrics({"dynamic/loss": 1.0}, step)
-        assert curves.path.read_text() == before
-    (said,) = caplog.messages
-    assert said == f"{curves.path}: No space left on device; its rows wait in memory"
+        assert path.read_text() == before
+    assert caplog.messages == [f"{path}: No space left on device; its rows wait in memory"]
     curves.log_metrics({"dynamic/loss": 1.0}, 50)
-    assert [row["step"] for row in table(curves)][-4:] == ["20", "30", "40", "50"]
+    assert [row["step"] for row in table(path)][-4:] == ["20", "30", "40", "50"]

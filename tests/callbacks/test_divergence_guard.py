@@ -23,9 +23,10 @@ from devrf.data.datamodule import SceneDataModule
 from devrf.engine.stage import ScheduledStage
 from devrf.errors import DevrfError
 from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
-from devrf.methods.devrf.schedules import CanonicalSchedule, DeformationSchedule
 from devrf.methods.devrf.settings import CanonicalRates
 from devrf.scenes.scene import Scene
 
@@ -287,7 +288,8 @@ def test_a_frame_whose_loss_stands_out_is_told(
     health = DivergenceGuard()
     schedule = DeformationSchedule(sides=(4,), iterations_per_frame=(20,), rays=64)
     stage = DeformationStage(copy.deepcopy(rest), schedule, iterations_per_step=1)
-    health.load_state_dict({**health.state_dict(), "visited": [0.01, 0.011, 0.012, 0.01]})
+    seen = {"kind": "level 0", "visited": [0.01, 0.011, 0.012, 0.01]}
+    health.load_state_dict({**health.state_dict(), **seen})
     monkeypatch.setattr(health, "_forget", lambda: None)
     with caplog.at_level(logging.WARNING, logger="devrf"):
         fit(stage, health)

@@ -21,8 +21,8 @@ from devrf.checkpoints.progress import progress_files
 from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
 from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
-from devrf.methods.devrf.schedules import CanonicalSchedule
 
 SMALL = Architecture(channels=4, width=8, frequencies=1)
 SCHEDULE = CanonicalSchedule(
@@ -69,17 +69,15 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_the_last_two_are_kept(fit, tmp_path: Path) -> None:
-    saving = PeriodicCheckpoint(tmp_path, every_seconds=0, share=1.0)
+@pytest.mark.parametrize(("seconds", "left"), [(0, [10, 11]), (1000, [])])
+def test_the_last_two_are_kept_and_none_is_written_before_its_time(
+    fit, tmp_path: Path, seconds: float, left: list[int]
+) -> None:
+    saving = PeriodicCheckpoint(tmp_path, seconds, share=1.0)
     fit(saving)
     # The stage's last iteration is its checkpoint's.
-    assert names(tmp_path) == ["canonical-progress-10.ckpt", "canonical-progress-11.ckpt"]
-    assert saving.saved == 11
-
-
-def test_none_is_written_before_its_time(fit, tmp_path: Path) -> None:
-    fit(PeriodicCheckpoint(tmp_path, every_seconds=1000))
-    assert names(tmp_path) == []
+    assert names(tmp_path) == [f"canonical-progress-{n}.ckpt" for n in left]
+    assert saving.saved == (left[-1] if left else None)
 
 
 def test_writing_takes_its_share_of_the_time(
@@ -91,6 +89,7 @@ def test_writing_takes_its_share_of_the_time(
 
     def write(trainer: Trainer, path: Path, **_: Any) -> None:
         written.append(trainer.lightning_module.iteration)
+        path.touch()
         clock[0] += 2.0  # a file takes two seconds, an iteration one
 
     monkeypatch.setattr(module, "save_checkpoint", write)
@@ -104,7 +103,7 @@ def test_writing_takes_its_share_of_the_time(
     assert written == [1, 4, 7, 10]
 
 
-def test_a_line_of_the_curves_that_is_due_is_waited_for(
+def test_a_row_of_the_curves_that_is_due_is_waited_for(
     datamodule: SceneDataModule, trainer: Callable[..., Trainer], tmp_path: Path
 ) -> None:
     seen: list[list[str]] = []
@@ -112,7 +111,7 @@ def test_a_line_of_the_curves_that_is_due_is_waited_for(
     stage = CanonicalStage(SCHEDULE, SMALL, iterations_per_step=1)
     watch = At(6, lambda: seen.append(names(tmp_path)))
     trainer(saving, watch, max_epochs=1, log_every_n_steps=3).fit(stage, datamodule=datamodule)
-    # Lines are written after iterations 3, 6, 9, once the callbacks are done.
+    # Rows are written after iterations 3, 6, 9, once the callbacks are done.
     assert seen == [["canonical-progress-4.ckpt", "canonical-progress-5.ckpt"]]
 
 
@@ -152,20 +151,18 @@ def test_senseless_times_are_refused(tmp_path: Path, seconds: float, share: floa
         PeriodicCheckpoint(tmp_path, seconds, share)
 
 
-def test_a_signal_stops_the_stage_saved(fit, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("iteration", "left"),
+    [(5, ["canonical-progress-5.ckpt"]), (12, [])],
+    ids=["on the way", "after the last iteration"],
+)
+def test_a_signal_stops_the_stage_saved(
+    fit, tmp_path: Path, iteration: int, left: list[str]
+) -> None:
     saving = PeriodicCheckpoint(tmp_path, every_seconds=1000)
     with StopOnSignal(saving) as stop:
-        stage = fit(At(5, lambda: os.kill(os.getpid(), signal.SIGTERM)), saving, stop)
-    assert stop.number == signal.SIGTERM
-    assert stage.iteration == 5
-    assert names(tmp_path) == ["canonical-progress-5.ckpt"]
-
-
-def test_a_signal_after_the_last_iteration_lets_the_stage_end(fit, tmp_path: Path) -> None:
-    saving = PeriodicCheckpoint(tmp_path, every_seconds=1000)
-    with StopOnSignal(saving) as stop:
-        stage = fit(At(12, lambda: os.kill(os.getpid(), signal.SIGTERM)), saving, stop)
-    assert (stop.number, stage.iteration, names(tmp_path)) == (signal.SIGTERM, 12, [])
+        stage = fit(At(iteration, lambda: os.kill(os.getpid(), signal.SIGTERM)), saving, stop)
+    assert (stop.number, stage.iteration, names(tmp_path)) == (signal.SIGTERM, iteration, left)
 
 
 def test_seconds_add_up_over_interruptions(fit, tmp_path: Path) -> None:

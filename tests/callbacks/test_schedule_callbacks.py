@@ -16,9 +16,10 @@ from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
 from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
-from devrf.methods.devrf.schedules import CanonicalSchedule, DeformationSchedule
 from devrf.methods.devrf.settings import MotionSettings
 
 SMALL = Architecture(channels=4, width=8, frequencies=1)
@@ -35,7 +36,7 @@ CANONICAL = CanonicalSchedule(
 DEFORMATION = DeformationSchedule(sides=(4, 6), iterations_per_frame=(3, 2), rays=64)
 
 
-class SweepMonitor(Callback):
+class Watch(Callback):
     """Notes iteration, phase and rates at each optimiser step, after the other callbacks."""
 
     def __init__(self) -> None:
@@ -51,7 +52,7 @@ class SweepMonitor(Callback):
 def test_canonical_rates_and_phases_are_the_schedules_at_every_step(
     datamodule: SceneDataModule, trainer: Callable[..., Trainer]
 ) -> None:
-    watch = SweepMonitor()
+    watch = Watch()
     trainer(watch, max_epochs=1).fit(CanonicalStage(CANONICAL, SMALL), datamodule=datamodule)
     assert [step for step, _, _ in watch.steps] == list(range(12))
     for step, phase, rates in watch.steps:
@@ -64,7 +65,7 @@ def test_canonical_rates_and_phases_are_the_schedules_at_every_step(
 def test_deformation_rates_and_phases_are_the_schedules_at_every_step(
     rest: LoadedCheckpoint, datamodule: SceneDataModule, trainer: Callable[..., Trainer], unit: Any
 ) -> None:
-    watch, motion = SweepMonitor(), MotionSettings(learning_rate=2e-3, unit=unit)
+    watch, motion = Watch(), MotionSettings(learning_rate=2e-3, unit=unit)
     stage = DeformationStage(rest, DEFORMATION, motion)
     trainer(watch, max_epochs=1).fit(stage, datamodule=datamodule)
     assert [step for step, _, _ in watch.steps] == list(range(15))

@@ -16,8 +16,8 @@ from devrf.artifacts.tracking import Row, Tracker, trackers
 from devrf.callbacks import GridUpscaling, LearningRateDecay, Meter, Previews, TrainingRecord
 from devrf.data.datamodule import SceneDataModule
 from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
-from devrf.methods.devrf.schedules import CanonicalSchedule
 
 SCHEDULE = CanonicalSchedule(
     search_iterations=0,
@@ -101,8 +101,8 @@ def test_previews_come_as_often_as_asked_for_and_look_right(datamodule: SceneDat
 
 
 def test_watching_changes_nothing_of_what_is_learned(datamodule: SceneDataModule) -> None:
-    watched = learn(datamodule, Album(), Meter(), Previews(times=4)).model
-    alone = learn(datamodule, Album()).model
+    watched = learn(datamodule, Album(), Meter(), Previews(times=4)).scene_model
+    alone = learn(datamodule, Album()).scene_model
     assert torch.equal(watched.canonical.density.values, alone.canonical.density.values)
     assert torch.equal(watched.canonical.color.values, alone.canonical.color.values)
 

@@ -11,7 +11,7 @@ from devrf.checkpoints.bits import pack_bits, unpack_bits
 def test_masks_are_packed_to_bits() -> None:
     mask = torch.rand(3, 5, 7) > 0.5
     assert pack_bits(mask).numel() == 14  # 105 bits
-    assert torch.equal(unpack_bits(pack_bits(mask), mask.shape, torch.device("cpu")), mask)
+    assert torch.equal(unpack_bits(pack_bits(mask), mask.shape), mask)
 
 
 def test_too_few_bits_are_refused() -> None:

@@ -15,11 +15,13 @@ from devrf.checkpoints.checkpoint import LoadedCheckpoint, load_checkpoint, save
 from devrf.checkpoints.checkpoint_file import read_checkpoint_file, write_checkpoint_file
 from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
+from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.schedules import CanonicalSchedule, DeformationSchedule
 from devrf.metrics.image import psnr
+from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene
 
 
@@ -36,7 +38,7 @@ def assert_alike(one: DeVRFModel, other: DeVRFModel, scene: Scene) -> None:
     cameras = scene.dynamic.test.cameras
     shape = (cameras.height, cameras.width, 3)
     for time in (0.0, 0.3, 0.5, 1.0):
-        a, b = (model.picture(cameras.image_rays(0), time, torch.ones(3)) for model in (one, other))
+        a, b = (Renderer(model).view(cameras, 0, time, 1.0) for model in (one, other))
         assert psnr(a.color.view(shape), b.color.view(shape)) > 60, f"at {time}"
         torch.testing.assert_close(a.opacity, b.opacity, atol=0.01, rtol=0)
 
@@ -62,7 +64,7 @@ def test_the_canonical_stage_comes_back(
     canonical: Path, learned: tuple[CanonicalStage, Trainer], tiny_scene: Scene
 ) -> None:
     stored = load_checkpoint(canonical, tiny_scene)
-    assert_alike(stored.model, learned[0].model, tiny_scene)
+    assert_alike(stored.model, learned[0].scene_model, tiny_scene)
     assert stored.metadata == learned[0].metadata()
     assert stored.model.deformation is None
     assert [p.name for p in canonical.parent.iterdir()] == ["canonical.ckpt"]
@@ -80,15 +82,14 @@ def test_the_deformation_stage_comes_back_and_alone_suffices(
     fit.fit(stage, datamodule=datamodule)
     save_checkpoint(fit, tmp_path / "deformation.ckpt")
     stored = load_checkpoint(tmp_path / "deformation.ckpt", tiny_scene)
-    assert_alike(stored.model, stage.model, tiny_scene)
+    assert_alike(stored.model, stage.scene_model, tiny_scene)
     assert stored.model.deformation is not None
     assert stored.model.deformation.clock == tiny_scene.clock
     assert set(stored.metadata.records) == {"canonical", "deformation"}
     # It moves: otherwise equal pictures would say nothing of the deformation.
-    rays = tiny_scene.dynamic.test.cameras.image_rays(0)
-    black = torch.zeros(3)
-    still = stored.model.picture(rays, 0.0, black).color
-    assert not torch.equal(stored.model.picture(rays, 1.0, black).color, still)
+    renderer, cameras = Renderer(stored.model), tiny_scene.dynamic.test.cameras
+    still, moved = (renderer.view(cameras, 0, time, 0.0).color for time in (0.0, 1.0))
+    assert not torch.equal(moved, still)
 
 
 def test_a_deformation_can_be_learned_on_a_loaded_checkpoint(
@@ -129,8 +130,8 @@ def test_checkpoints_of_others_are_refused(tmp_path: Path, foreign: dict[str, An
     "change",
     [
         lambda data: data["devrf"].pop("scene"),
-        lambda data: data["devrf"]["architecture"].update(depth=3),
-        lambda data: data["devrf"]["architecture"].update(channels=5),
+        lambda data: data["devrf"]["model"]["architecture"].update(depth=3),
+        lambda data: data["devrf"]["model"]["architecture"].update(channels=5),
         lambda data: data.pop("state_dict"),
         lambda data: data.update(state_dict=[1]),
         lambda data: data["state_dict"].update({"scene_model.occupancy.mask": "all"}),
@@ -156,6 +157,20 @@ def test_a_checkpoint_that_contradicts_itself_is_refused(
     refusal(edit(canonical, change))
 
 
+@pytest.mark.parametrize(
+    "target",
+    [
+        "os.system",
+        "devrf.methods.devrf.model.Architecture",
+        "devrf.methods.unheard_of.Model",
+        None,
+    ],
+)
+def test_a_file_may_not_choose_which_code_is_run(canonical: Path, target: str | None) -> None:
+    path = edit(canonical, lambda data: data["devrf"]["model"].update(_target_=target))
+    assert "which is not known here" in refusal(path)
+
+
 def test_a_stage_stopped_in_its_search_comes_back(
     datamodule: SceneDataModule,
     tiny_scene: Scene,
@@ -167,4 +182,4 @@ def test_a_stage_stopped_in_its_search_comes_back(
     fit.fit(stage, datamodule=datamodule)
     save_checkpoint(fit, tmp_path / "search.ckpt")
     stored = load_checkpoint(tmp_path / "search.ckpt", tiny_scene)
-    assert_alike(stored.model, stage.model, tiny_scene)
+    assert_alike(stored.model, stage.scene_model, tiny_scene)

@@ -26,9 +26,10 @@ from devrf.data.datamodule import SceneDataModule
 from devrf.engine.stage import ScheduledStage
 from devrf.errors import DevrfError
 from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
-from devrf.methods.devrf.schedules import CanonicalSchedule, DeformationSchedule
 from devrf.methods.devrf.settings import MotionSettings
 from devrf.scenes.scene import Scene
 
@@ -48,7 +49,7 @@ SEARCHING = CanonicalSchedule(
 MOVING = DeformationSchedule(sides=(4, 6), iterations_per_frame=(6, 4), rays=64)
 # The occupancy is looked up anew in iterations 3, 6, 9 of a visit; frames start along the flow.
 ALONG_FLOW = MotionSettings(
-    learning_rate=2e-3, unit="box", views="all", pixels="useful", occupancy_every=3, start="flow"
+    learning_rate=2e-3, unit="box", views="all", pixels="occupied", occupancy_every=3, start="flow"
 )
 # Four frames. Level 0 in 0–15; level 1: frame 2 in 16–21, frames 1 and 3 in 22–27.
 TOGETHER = DeformationSchedule(

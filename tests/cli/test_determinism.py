@@ -12,7 +12,7 @@ def scores(folder: Path) -> dict[str, float]:
     sections = json.loads((folder / "metrics.json").read_text())
     return {
         f"{section}.{name}": value
-        for section in ("canonical", "deformation")
+        for section in ("static", "dynamic")
         for name, value in sections[section].items()
         if value is not None and "second" not in name and name != "checkpoint_mb"
     }

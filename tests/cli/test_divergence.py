@@ -109,4 +109,4 @@ def test_no_alarm_in_other_scenes(devrf, tiny, arguments) -> None:
     assert (outcome.status, outcome.err) == (0, "")
     assert not [line for line in outcome.out.splitlines() if any(a in line for a in ALARMS)]
     # What was watched did learn something.
-    assert "deformation: psnr" in outcome.out
+    assert "dynamic: psnr" in outcome.out

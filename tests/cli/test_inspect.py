@@ -1,4 +1,4 @@
-"""``stage=inspect``: what a scene holds, said and drawn before anything is learned."""
+"""``stage=inspect``: what a scene holds, written and drawn before anything is learned."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 def test_a_scene_is_described_and_drawn(devrf, tmp_path, tiny):
     outcome = devrf(*tiny, "stage=inspect", "data.static_views=16", "hydra.run.dir=run")
     assert (outcome.status, outcome.err) == (0, "")
-    for words in (
+    for part in (
         "robot, inward-facing",
         "static train",
         "24 x 20",
@@ -20,9 +20,9 @@ def test_a_scene_is_described_and_drawn(devrf, tmp_path, tiny):
         "no problems found",
         "inspect.png",
     ):
-        assert words in outcome.out
+        assert part in outcome.out
     page = iio.imread(tmp_path / "run" / "images" / "inspect.png")
-    assert page.shape[1:] == (1600, 3)
+    assert page.shape[1] == 1600
     assert "inward-facing" in (tmp_path / "run" / "run.log").read_text()
     assert not (tmp_path / "run" / "checkpoints").exists()
 
@@ -35,7 +35,7 @@ def test_problems_are_advice(devrf, tiny):
     assert "static training set: no view from a sector of" in outcome.out
 
 
-def test_more_of_the_schedule_needs_more_memory(devrf, tiny):
+def test_a_finer_schedule_needs_more_memory(devrf, tiny):
     def checkpoint(*more: str) -> str:
         lines = devrf(*tiny, "stage=inspect", *more).out.splitlines()
         return next(line for line in lines if line.strip().startswith("checkpoint"))
@@ -51,7 +51,7 @@ def test_more_of_the_schedule_needs_more_memory(devrf, tiny):
         ("data.frames=1", "data.frames"),
     ],
 )
-def test_a_scene_that_cannot_be_read_is_a_mistake(devrf, tmp_path, tiny, argument, expected):
+def test_a_scene_that_cannot_be_read_is_an_error(devrf, tmp_path, tiny, argument, expected):
     outcome = devrf(*tiny, "stage=inspect", argument)
     assert outcome.status == 2
     assert outcome.err.startswith("devrf: ") and expected in outcome.err

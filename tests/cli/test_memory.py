@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import pytest
 import torch
+from torch import nn
 
 from devrf.cli.memory import (
-    BATCH,
+    FRAMES,
+    GRIDS,
+    IMAGES,
+    PARALLEL,
     PROGRAM,
-    StageFiles,
-    StageMemory,
-    batch_bytes,
+    Budget,
+    StageNeeds,
+    budget_rows,
     estimate,
+    module_needs,
     samples_per_ray,
-    view_bytes,
+    tensor_bytes,
 )
 from devrf.geometry.box import Box
 from devrf.methods.devrf.architecture import Architecture
-from devrf.methods.devrf.schedules import CanonicalSchedule, DeformationSchedule
+from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule
+from devrf.methods.devrf.settings import MotionSettings
 from devrf.scenes.scene import Scene
 
 SMALL = Architecture(channels=4, width=16, frequencies=2)
@@ -28,173 +34,158 @@ CANONICAL = CanonicalSchedule(
     search_iterations=0, search_side=8, iterations=10, side=10, doublings=(5,), rays=64
 )
 DEFORMATION = DeformationSchedule(sides=(4, 8), iterations_per_frame=(2, 2), rays=64)
+POINTS, GRID_BYTES = 10**3, 10**3 * (1 + 4) * 4
+# 4→16 with bias, direction (3 + 6·2)→16, 16→16 and 16→3 with bias.
+DECODER = 4 * (4 * 16 + 16 + 15 * 16 + 16 * 16 + 16 + 3 * 16 + 3)
+# Both directions of one frame on 8³ points.
+SLICES = 2 * 8**3 * 12
 
 
 @pytest.fixture
-def cubic(tiny_scene: Scene, cube: Box) -> Scene:
-    """The tiny scene (24×18 px; 8 static views, 2 views × 3 frames) in a cube."""
-    return replace(tiny_scene, bounds=replace(tiny_scene.bounds, box=cube, motion=None))
+def cubic(four_frame_scene: Scene, cube: Box) -> Scene:
+    """24×18 px; 8 static views, 2 moving views × 4 frames; in a cube."""
+    return replace(four_frame_scene, bounds=replace(four_frame_scene.bounds, box=cube, motion=None))
 
 
-def test_fields_gradients_and_moments_by_hand(cubic: Scene) -> None:
-    budget = estimate(cubic, CANONICAL, DEFORMATION, SMALL)
-    grids = 10**3 * (1 + 4) * 4
-    # 4→16 with bias, direction (3 + 6·2)→16, 16→16 and 16→3 with bias.
-    decoder = 4 * (4 * 16 + 16 + 15 * 16 + 16 * 16 + 16 + 3 * 16 + 3)
-    canonical = budget.canonical.held
-    assert canonical["density and features"] == grids == canonical["their gradients"]
-    assert canonical["their Adam moments"] == 2 * grids
-    assert canonical["decoder, with gradients and moments"] == 4 * decoder
-    assert canonical["occupancy"] == 2 * 10**3
-    assert canonical["pixels to draw from"] == 8 * 24 * 18 * 8
-    moving = budget.deformation.held
-    displacements = 2 * 3 * 8**3 * 3 * 4  # both ways, 3 frames
-    assert moving["displacements of 3 frames, both ways"] == displacements
-    assert moving["gradients of one frame"] == displacements // 3
-    assert moving["Adam moments of one frame"] == 2 * displacements // 3
-    assert moving["pixels to draw from"] == 2 * 24 * 18 * 8
-    # The old grids of one direction.
-    grown = 3 * 4**3 * 12
-    assert budget.deformation.passing["growing the grids"] == grown
-    assert sum(budget.fields.values()) == grids + decoder + 10**3 + displacements
-    # Grids in half precision.
-    small = grids // 2 + decoder + 10**3
-    assert sum(budget.checkpoint.values()) == small + displacements // 2
-    assert budget.files["canonical"].finished == small
-    assert budget.files["deformation"].progress == (
-        grids + decoder + 10**3 + displacements + 2 * displacements // 3
+def stage(**changes: object) -> StageNeeds:
+    """A stage of round numbers."""
+    return replace(StageNeeds(50, {GRIDS: 100}, 800, "rays", 200, 40, 30, 70), **changes)  # type: ignore[arg-type]
+
+
+def test_the_canonical_stage_by_hand(cubic: Scene) -> None:
+    needs = estimate(cubic, CANONICAL, DEFORMATION, SMALL).stages["canonical"]
+    field = GRID_BYTES + DECODER
+    # Values, gradients, two moments, a copy; occupancy.
+    assert needs.held == {GRIDS: 5 * field + 2 * POINTS, IMAGES: 8 * 24 * 18 * 8}
+    assert needs.views == tensor_bytes(cubic.static.train)
+    assert needs.learned == field + POINTS
+    assert needs.checkpoint == GRID_BYTES // 2 + DECODER + POINTS
+    assert needs.progress == 3 * field + 5 * POINTS
+
+
+def test_the_deformation_stage_by_hand(cubic: Scene) -> None:
+    needs = estimate(cubic, CANONICAL, DEFORMATION, SMALL).stages["deformation"]
+    field = GRID_BYTES + DECODER + POINTS
+    assert needs.held[FRAMES] == 4 * SLICES + 11 * SLICES // 2
+    assert needs.held[GRIDS] == field + 3 * POINTS
+    assert needs.held[IMAGES] == 2 * 24 * 18 * 8
+    assert needs.learned == field + 4 * SLICES
+    assert needs.checkpoint == GRID_BYTES // 2 + DECODER + POINTS + 2 * SLICES
+    assert needs.progress == field + 4 * SLICES + 2 * SLICES
+
+
+def test_where_displacements_rest_counts(cubic: Scene) -> None:
+    def frames(**motion: object) -> int:
+        settings = MotionSettings(**motion)  # type: ignore[arg-type]
+        budget = estimate(cubic, CANONICAL, DEFORMATION, SMALL, motion=settings)
+        return budget.stages["deformation"].held[FRAMES]
+
+    active = 11 * SLICES // 2
+    assert frames(store_half=True) == 2 * SLICES + active
+    assert frames(store="host") == active + SLICES  # the next frame on its way
+
+
+def test_frames_that_are_learned_together_count_each(cubic: Scene) -> None:
+    together = replace(DEFORMATION, parallel_frames=(1, 2))
+    one, two = (
+        estimate(cubic, CANONICAL, schedule, SMALL).stages["deformation"]
+        for schedule in (DEFORMATION, together)
     )
+    assert two.held[FRAMES] == 4 * SLICES and two.held[PARALLEL] == 11 * SLICES
+    assert two.held[IMAGES] == 2 * one.held[IMAGES]
+    assert (two.batch, two.batches) == (2 * one.batch, 2)
+    assert two.progress - one.progress == 2 * SLICES
 
 
-def test_images_flow_and_depth_by_hand(tiny_scene: Scene) -> None:
-    moving = tiny_scene.dynamic.train
-    assert len(moving) == 6 and moving.flow is not None
-    parts = view_bytes(replace(moving, depth=torch.zeros(6, 18, 24)))
-    pixels = 6 * 24 * 18
-    channels = moving.pixels.shape[3]
-    assert parts == {
-        "images": channels * pixels,
-        "optical flow": (2 * 4 + 1) * pixels,
-        "depth": 4 * pixels,
-    }
-    assert set(view_bytes(replace(moving, flow=None, depth=None))) == {"images"}
-    masked = replace(moving, valid_mask=torch.ones(6, 18, 24, dtype=torch.bool))
-    assert view_bytes(masked)["masks"] == pixels
-
-
-def test_the_host_holds_all_views_the_fields_and_their_checkpoint(cubic: Scene) -> None:
-    budget = estimate(cubic, CANONICAL, DEFORMATION, SMALL)
-    everything = [v for c in (cubic.static, cubic.dynamic) for v in (c.train, c.test)]
-    assert budget.scene["images"] == sum(v.pixels.numel() for v in everything)
-    scene = sum(budget.scene.values())
-    learned = sum(budget.fields.values()) + sum(budget.checkpoint.values())
-    assert budget.host == PROGRAM + scene + learned
-    assert budget.host_alone >= budget.host
-
-
-def test_a_copy_to_go_back_to_counts(cubic: Scene) -> None:
-    budget = estimate(cubic, CANONICAL, DEFORMATION, SMALL)
-    fields = budget.canonical.held["density and features"] + budget.deformation.held["decoder"]
-    assert budget.canonical.held["a copy to go back to"] == fields
-    slices = budget.deformation.held["gradients of one frame"]
-    assert budget.deformation.held["a copy of one frame to go back to"] == slices
-
-
-@pytest.fixture
-def four_cubic(four_frame_scene: Scene, cube: Box) -> Scene:
-    """The same in four frames."""
-    bounds = replace(four_frame_scene.bounds, box=cube, motion=None)
-    return replace(four_frame_scene, bounds=bounds)
-
-
-def test_frames_that_are_learned_together_count_each(four_cubic: Scene) -> None:
-    alone = estimate(four_cubic, CANONICAL, DEFORMATION, SMALL)
-    both = estimate(four_cubic, CANONICAL, replace(DEFORMATION, parallel_frames=(1, 2)), SMALL)
-    one, two = alone.deformation, both.deformation
-    for part in ("{}", "gradients of {}", "Adam moments of {}", "a copy of {} to go back to"):
-        name = part.format("2 frames side by side")
-        assert two.held[name] == 2 * one.held[part.format("one frame")]
-    assert two.held["pixels to draw from"] == 2 * one.held["pixels to draw from"]
-    assert two.held["occupancy"] - one.held["occupancy"] == 10**3
-    assert two.passing[BATCH] == 2 * one.passing[BATCH]
-    # The place beside each of both, and what each needs in its turn.
-    slices = one.held["gradients of one frame"]
-    assert two.passing["an optimiser step"] == 3 * slices
-    moments = both.files["deformation"].progress - alone.files["deformation"].progress
-    assert moments == 2 * slices
-
-
-def test_the_level_that_needs_most_counts(four_cubic: Scene) -> None:
-    # Both frames on nearly as many voxels, or one on all.
+def test_the_level_that_needs_most_counts(cubic: Scene) -> None:
+    # Two frames on nearly as many voxels, or one on all; files are of the last level.
     schedule = DeformationSchedule(
         sides=(4, 22, 24), iterations_per_frame=(1, 1, 1), rays=64, parallel_frames=(1, 2, 1)
     )
-    held = estimate(four_cubic, CANONICAL, schedule, SMALL).deformation.held
-    assert held["gradients of 2 frames side by side"] == 2 * 2 * 22**3 * 12
-    assert held["displacements of 4 frames, both ways"] == 2 * 4 * 22**3 * 12
+    budget = estimate(cubic, CANONICAL, schedule, SMALL)
+    needs = budget.stages["deformation"]
+    assert needs.held[PARALLEL] == 2 * 11 * 22**3 * 12
+    frames = 4 * 2 * 24**3 * 12
+    assert needs.learned == budget.stages["canonical"].learned + frames
 
 
-def test_a_cpu_has_one_batch_at_a_time() -> None:
-    together = StageMemory({"a": 100}, {BATCH: 800, "b": 200}, batches=4)
-    assert (together.peak, together.least, together.on_host) == (900, 300, 390)
-
-
-def test_in_hard_times_a_batch_is_taken_in_eight_parts() -> None:
-    assert StageMemory({"a": 3}, {BATCH: 80, "b": 4}).least == 13
-    assert StageMemory({"a": 3}, {BATCH: 80, "b": 40}).least == 43
-
-
-def test_on_the_host_the_images_are_there_anyway() -> None:
-    assert StageMemory({"a": 100, "images": 50, "depth": 7}, {"c": 100}).on_host == 260
-
-
-def test_the_files_of_a_stage() -> None:
-    # Two that are kept, and the next beside them; or the finished one.
-    assert StageFiles(finished=5, progress=8).peak(kept=2) == 24
-    assert StageFiles(finished=9, progress=8).peak(kept=2) == 25
+def test_any_module_that_adam_trains(cubic: Scene) -> None:
+    with torch.device("meta"):
+        network = nn.Sequential(nn.Linear(10, 5), nn.BatchNorm1d(5))
+    views = cubic.static.train
+    needs = module_needs(network, views, keys=("method.width",), batch=1000, rays="method.rays")
+    parameters, buffers = 4 * (10 * 5 + 5 + 5 + 5), 4 * (5 + 5) + 8
+    assert needs.held == {("method.width",): 5 * parameters + buffers, IMAGES: 8 * 24 * 18 * 8}
+    assert (needs.learned, needs.progress) == (parameters + buffers, 3 * parameters + buffers)
+    assert needs.batch == 1000
 
 
 def test_a_peak_is_what_is_held_and_the_largest_of_what_passes() -> None:
-    assert StageMemory({"a": 3, "b": 4}, {"c": 10, "d": 2}).peak == 17
-    assert StageMemory({"a": 3}, {}).peak == 3
+    assert stage().peak() == 50 + 100 + 800
+    assert stage().peak(8) == 50 + 100 + 200  # 800 / 8 is less than what else passes
+    # A CPU takes one of four batches at a time, and has the views anyway.
+    assert stage(batches=4, temporary=0).on_host == round(1.3 * (100 + 200))
+
+
+def test_a_host_needs_program_scene_and_stage() -> None:
+    budget = Budget(1000, {"one": stage(), "other": stage(learned=90, checkpoint=60)})
+    beside_a_gpu = PROGRAM + 1000 + 150
+    assert budget.host(alone=False) == beside_a_gpu
+    assert budget.host(alone=False, processes=2) == 2 * beside_a_gpu
+    assert budget.host(alone=True) == PROGRAM + 1000 + round(1.3 * 900)
+    assert budget_rows(budget) == [
+        ("GPU, one stage", 950),
+        ("GPU, other stage", 950),
+        ("host, beside a GPU", beside_a_gpu),
+        ("host, without a GPU", PROGRAM + 2170),
+        ("checkpoint", 60),
+    ]
+
+
+def test_a_disk_needs_what_is_there_at_once() -> None:
+    first, second = stage(checkpoint=400, progress=1200), stage(checkpoint=1400, progress=1500)
+    both = Budget(0, {"one": first, "other": second})
+    # Three progress files of the second stage beside the first one's checkpoint.
+    assert both.disk(kept=2) == 400 + 3 * 1500
+    assert Budget(0, {"one": first}).disk(kept=2) == 3 * 1200
+    assert both.disk(kept=2, films=9000) == 400 + 1400 + 9000
+    assert Budget(0, {"one": stage(checkpoint=9, progress=8)}).disk(kept=2) == 2 * 8 + 9
+
+
+def test_tensors_of_views_by_hand(tiny_scene: Scene) -> None:
+    moving = tiny_scene.dynamic.train
+    pixels = len(moving) * 24 * 18
+    assert moving.flow is not None
+    assert tensor_bytes(moving.flow) == (2 * 4 + 1) * pixels
+    deep = replace(moving, depth=torch.zeros(len(moving), 18, 24))
+    assert tensor_bytes(deep) - tensor_bytes(replace(moving, depth=None)) == 4 * pixels
 
 
 def test_the_fields_of_a_learned_scene(tiny_scene: Scene, rest) -> None:
     # As the fixture was learned: side 20; the box that it found is another than the bounds'.
     schedule = CanonicalSchedule(search_iterations=0, iterations=120, side=20, doublings=(40,))
-    parts = estimate(tiny_scene, schedule, DEFORMATION, SMALL).fields
-    said = sum(size for name, size in parts.items() if "frames" not in name)
-    kept = [v for v in rest.model.state_dict().values() if isinstance(v, torch.Tensor)]
-    assert said == pytest.approx(sum(v.numel() * v.element_size() for v in kept), rel=0.1)
+    needs = estimate(tiny_scene, schedule, DEFORMATION, SMALL).stages["canonical"]
+    assert needs.learned == pytest.approx(tensor_bytes(rest.model), rel=0.1)
 
 
 def test_samples_of_a_ray(cube: Box) -> None:
     # The mean chord of a cube is 2/3 of its edge: of 30 voxels 20, sampled twice each.
-    assert samples_per_ray(cube, 30**3, None, 0.5) == pytest.approx(40)
-    assert samples_per_ray(cube, 30**3, 128, 0.5) == 255
-
-
-def test_fog_costs_most(cube: Box) -> None:
-    schedule = CanonicalSchedule()
-    sizes = [batch_bytes(schedule, k, Architecture(), cube, 0.5) for k in range(6)]
-    # The first fine phase decodes every sample of its fog; later ones a tenth of them.
-    assert sizes[1] > 4 * sizes[2] > 0
-    assert sizes[2] < sizes[3] < sizes[4] < sizes[5]
-    assert sizes[0] > 0
+    with torch.device("meta"):
+        field = Architecture().radiance_field(cube, 30**3, 30**3)
+        planes = Architecture(planes=128).radiance_field(cube, 30**3, 30**3)
+    assert samples_per_ray(field, 30**3, 0.5) == pytest.approx(40)
+    assert samples_per_ray(planes, 30**3, 0.5) == 255
 
 
 def test_the_papers_sizes(cubic: Scene) -> None:
-    """50 × 160³ displacements of 12 bytes each way: 2.46 GB per direction (method §3)."""
-    times = torch.linspace(0, 1, 50)
     moving = cubic.dynamic.train[torch.zeros(50, dtype=torch.long)]
-    dynamic = replace(cubic.dynamic, train=replace(moving, times=times))
+    dynamic = replace(cubic.dynamic, train=replace(moving, times=torch.linspace(0, 1, 50)))
     budget = estimate(
         replace(cubic, dynamic=dynamic), CanonicalSchedule(), DeformationSchedule(), Architecture()
     )
-    both = budget.fields["displacements of 50 frames, both ways"]
-    assert both == pytest.approx(2 * 2.46e9, rel=0.01)
-    assert 5e9 < budget.gpu < 12e9
-    assert math.isfinite(budget.host)
+    for needs in budget.stages.values():
+        assert 1e9 < needs.peak() < 12e9
+    assert budget.stages["deformation"].learned > 2 * 2.4576e9
 
 
 def test_nothing_is_drawn_at_random(cubic: Scene) -> None:

@@ -19,12 +19,28 @@ MISTAKES = {
     "appended unknown key": (["+data.widht=3"], "did you mean data.width?"),
     "appended unknown section": (["+loss.deform.flow=1"], "loss.deform.flow: no such key"),
     "appended unknown root key": (["+sede=3"], "sede: no such key; did you mean seed?"),
+    "renamed key": (
+        ["schedule.motion.least_gain=0.1"],
+        "schedule.motion.least_gain: renamed; write schedule.motion.min_rel_improvement=VALUE",
+    ),
+    "renamed key, appended": (
+        ["+schedule.deformation.frames_at_once=[1,2]"],
+        "schedule.deformation.frames_at_once: renamed; write schedule.deformation.parallel_frames=",
+    ),
+    "renamed value": (
+        ["schedule.motion.pixels=useful"],
+        "schedule.motion.pixels: useful was renamed; write schedule.motion.pixels=occupied",
+    ),
     "unknown option": (["data=legoo"], "data=legoo: no such option; choose one of"),
     "unknown experiment": (["experiment=paper"], "experiment=paper: no such option"),
     "unreadable override": (["data.box=[[1"], "data.box=[[1: not understood"),
     "missing root": (["data=inward"], "data.root: required; give data.root=PATH"),
     "missing folder": (["data=inward", "data.root=nowhere"], "nowhere: no such folder"),
     "unknown stage": (["stage=train"], "stage: expected one of prepare, inspect"),
+    "moved stage": (
+        ["stage=benchmark"],
+        "stage=benchmark: moved; run python benchmarks/training.py",
+    ),
     "too few frames": (["data.frames=1"], "data.frames"),
     "word for a number": (["data.width=abc"], "data.width: expected a whole number, not 'abc'"),
     "fraction for a count": (["seed=1.5"], "seed: expected a whole number, not 1.5"),

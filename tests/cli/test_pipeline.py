@@ -44,8 +44,11 @@ def test_the_whole_run_succeeds_and_says_nothing_on_stderr(trained):
 def test_metrics_have_the_documented_keys(trained):
     folder, _ = trained
     found = metrics(folder)
-    assert list(found) == ["scene", "canonical", "deformation", "run"]
-    assert found["scene"] == "robot"
+    names = ["scene", "method", "protocol", "static", "dynamic", "canonical", "deformation", "run"]
+    assert list(found) == names
+    assert [found[name] for name in names[:3]] == ["robot", "devrf", "two_stage"]
+    # DeVRF's sections have the names of its stages, too.
+    assert found["static"] == found["canonical"] and found["dynamic"] == found["deformation"]
     assert set(found["canonical"]) == CANONICAL_KEYS
     assert set(found["deformation"]) == DEFORMATION_KEYS
     assert found["canonical"]["iterations"] == 6
@@ -113,9 +116,12 @@ def test_fewer_metrics_may_be_asked_for(devrf, tmp_path, tiny, trained):
     [
         ("evaluation.metrics=[lpisp]", "evaluation.metrics: no metric 'lpisp'"),
         ("evaluation.lpips_weights=no.pth", "evaluation.lpips_weights: no file no.pth"),
+        ("protocol=joint", "protocol: method=devrf does not learn by protocol=joint"),
+        ("stage=canonicl", "stage: expected one of pipeline, canonical, deformation, prepare"),
+        ("stage=benchmark", "stage=benchmark: moved; run python benchmarks/training.py instead"),
     ],
 )
-def test_a_metric_that_cannot_be_is_a_mistake(devrf, tmp_path, tiny, argument, expected):
+def test_what_cannot_be_is_told_before_anything_is_made(devrf, tmp_path, tiny, argument, expected):
     outcome = devrf(*tiny, argument)
     assert outcome.status == 2
     assert expected in outcome.err
@@ -170,7 +176,7 @@ def test_the_canonical_stage_alone_can_be_scored(devrf, tmp_path, tiny):
         outcome = devrf(*tiny, f"stage={stage}", "hydra.run.dir=run")
         assert (outcome.status, outcome.err) == (0, "")
     found = metrics(tmp_path / "run")
-    assert list(found) == ["scene", "canonical", "run"]
+    assert list(found) == ["scene", "method", "protocol", "static", "canonical", "run"]
     assert found["run"]["wall_seconds"]["deformation"] is None
 
 
@@ -215,5 +221,5 @@ def test_a_deformation_of_another_canonical_field_is_not_passed_off_as_its_own(
     other.replace(folder / "checkpoints" / "canonical.ckpt")
     outcome = devrf(*tiny, "stage=evaluate", f"hydra.run.dir={folder}")
     assert outcome.status == 0
-    assert "deformation.ckpt: left out, it belongs to another canonical field" in outcome.out
-    assert "deformation" not in metrics(folder)
+    assert "deformation.ckpt: left out, it belongs to another canonical.ckpt" in outcome.out
+    assert not {"dynamic", "deformation"} & set(metrics(folder))

@@ -10,11 +10,45 @@ import pytest
 import torch
 
 from devrf.checkpoints.checkpoint_file import read_checkpoint_file
-from devrf.cli import preflight as room
+from devrf.cli import preflight
+from devrf.cli.preflight import Requirement, check
+from devrf.errors import DevrfError
 
+GIB = 2**30
 NEEDS = re.compile(
     r"needs about ([\d.]+) of [\d.]+ GiB of host memory, ([\d.]+) of [\d.]+ GiB of disk"
 )
+
+
+def need(what: str, needed: float, there: float, least: float | None = None) -> Requirement:
+    """A requirement in GiB."""
+    parts = {("data.frames", "data.width"): 3, ("data.rays",): 5, ("data.unused",): 0}
+    own = None if least is None else round(least * GIB)
+    return Requirement(what, round(needed * GIB), round(there * GIB), parts, own)
+
+
+def test_needs_in_one_line() -> None:
+    needs = [need("host memory", 1.2, 21.3), need("disk", 0.25, 8)]
+    assert (
+        check(needs, bool) == "needs about 1.2 of 21.3 GiB of host memory, 0.25 of 8.0 GiB of disk"
+    )
+
+
+def test_where_only_whole_batches_are_too_large_the_run_may_begin() -> None:
+    said = check([need("GPU memory", 9.0, 8.0, least=3.0)], bool)
+    assert said.endswith("9.0 of 8.0 GiB of GPU memory; batches will be taken in parts, slower")
+
+
+def test_what_cannot_suffice_is_refused_with_numbers_and_keys() -> None:
+    needs = [need("GPU memory", 2.0, 8.0), need("host memory", 30.1, 21.3)]
+    assert needs[0].keys == ["data.rays", "data.frames", "data.width"]
+    with pytest.raises(DevrfError) as caught:
+        check(needs, {"data.width", "data.rays"}.__contains__)
+    assert str(caught.value) == (
+        "data.rays: the run needs about 2.0 of 8.0 GiB of GPU memory, 30.1 of 21.3 GiB of host "
+        "memory; it would end for lack of host memory: change data.rays, data.width, or try all "
+        "the same with memory_check=false"
+    )
 
 
 def test_the_budget_is_told_first(trained) -> None:
@@ -42,30 +76,23 @@ def test_what_cannot_be_is_refused_before_it_begins(devrf, tiny, tmp_path, argum
 
 
 def test_a_full_disk_is_noticed_before_it_begins(devrf, tiny, monkeypatch) -> None:
-    monkeypatch.setattr(room, "free_disk", lambda folder: 1000)
+    monkeypatch.setattr(preflight, "free_disk", lambda folder: 1000)
     outcome = devrf(*tiny)
     assert outcome.status == 2
     assert re.search(r" of 9.3e-07 GiB of disk; it would end for lack of disk", outcome.err)
 
 
-def test_the_estimate_may_be_overruled(devrf, tiny, monkeypatch) -> None:
-    monkeypatch.setattr(room, "free_host_memory", lambda: -(10**12))
-    outcome = devrf(*tiny, "stage=canonical", "hydra.run.dir=run")
+def test_little_memory_refuses_what_is_to_be_learned_and_touches_nothing(
+    devrf, tiny, monkeypatch, tmp_path
+) -> None:
+    command = (*tiny, "stage=canonical", "hydra.run.dir=run")
+    monkeypatch.setattr(preflight, "free_host_memory", lambda: -(10**12))
+    outcome = devrf(*command)
     assert outcome.status == 2 and "lack of host memory" in outcome.err
-    assert devrf(*tiny, "stage=canonical", "hydra.run.dir=run", "memory_check=false").status == 0
-
-
-def test_what_is_learned_needs_nothing(devrf, tiny, monkeypatch) -> None:
-    command = (*tiny, "stage=canonical", "hydra.run.dir=run")
+    assert not (tmp_path / "run").exists()
+    assert devrf(*command, "memory_check=false").status == 0
+    # What is learned already needs nothing.
     assert devrf(*command).status == 0
-    monkeypatch.setattr(room, "free_host_memory", lambda: -(10**12))
-    assert devrf(*command).status == 0
-
-
-def test_nothing_is_set_aside_for_a_run_that_cannot_be(devrf, tiny, monkeypatch, tmp_path) -> None:
-    command = (*tiny, "stage=canonical", "hydra.run.dir=run")
-    assert devrf(*command).status == 0
-    monkeypatch.setattr(room, "free_host_memory", lambda: -(10**12))
     assert devrf(*command, "resume=false").status == 2
     assert (tmp_path / "run" / "checkpoints" / "canonical.ckpt").is_file()
     assert not (tmp_path / "run" / "previous-1").exists()

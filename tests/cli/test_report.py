@@ -29,7 +29,7 @@ def test_finished_runs_become_a_report_and_nothing_else_is_left(devrf, tmp_path,
     assert (outcome.status, outcome.err) == (0, "")
     assert outcome.out.splitlines()[-1] == "report written to mine/report/report.md"
     psnr = json.loads((finished / "one" / "metrics.json").read_text())["deformation"]["psnr"]
-    assert outcome.out.count(f"{psnr:.2f}") == 2
+    assert f"{psnr:.2f} ± 0.00" in outcome.out and "(n = 2)" in outcome.out
     made = everything_in(tmp_path) - before
     assert {"mine/report", *(f"mine/report/report.{s}" for s in ("md", "csv", "tex"))} <= made
     assert all(name.startswith("mine/report") for name in made)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import struct
 from pathlib import Path
 
 import pytest
@@ -94,10 +95,9 @@ def test_beginning_afresh_keeps_the_old_run_whole(again, run):
     assert f"what was in {run} is kept in {run}/previous-1" in outcome.out
     kept = contents(run / "previous-1")
     assert kept == {k: v for k, v in before.items() if not k.startswith((".hydra", ".devrf"))}
-    # What it was learned with lies beside what was learned.
+    # The config stands beside what was learned with it.
     assert OmegaConf.load(run / "previous-1" / "checkpoints" / "config.yaml").seed == 0
     assert OmegaConf.load(run / "checkpoints" / "config.yaml").seed == 1
-    assert (run / "metrics.json").is_file()
     assert "previous" not in (run / "run.log").read_text().replace(str(run / "previous-1"), "")
     assert again("resume=false", "seed=2", "stage=canonical").status == 0
     assert contents(run / "previous-1") == kept
@@ -105,29 +105,30 @@ def test_beginning_afresh_keeps_the_old_run_whole(again, run):
 
 
 def test_a_deformation_learned_afresh_keeps_its_canonical_field(again, run):
-    before = contents(run)
+    before = contents(run / "checkpoints")
     outcome = again("resume=false", "stage=deformation", "schedule.motion.start=previous")
     assert (outcome.status, outcome.err) == (0, "")
-    now, kept = contents(run), contents(run / "previous-1")
-    for name in ("canonical", "deformation"):
-        assert kept[f"checkpoints/{name}.ckpt"] == before[f"checkpoints/{name}.ckpt"]
-    assert now["checkpoints/canonical.ckpt"] == before["checkpoints/canonical.ckpt"]
-    assert now["checkpoints/deformation.ckpt"] != before["checkpoints/deformation.ckpt"]
+    assert contents(run / "previous-1" / "checkpoints") == before
+    now = contents(run / "checkpoints")
+    assert now["canonical.ckpt"] == before["canonical.ckpt"]
+    assert now["deformation.ckpt"] != before["deformation.ckpt"]
 
 
-@pytest.mark.parametrize("stage", ["evaluate", "render"])
-def test_where_nothing_is_learned_nothing_is_set_aside(again, run, stage):
-    assert again("resume=false", f"stage={stage}").status == 0
+@pytest.mark.parametrize(
+    ("argument", "status"),
+    [
+        ("stage=evaluate", 0),
+        ("stage=render", 0),
+        ("loss.deformation.cycle=high", 2),
+        ("schedule.canonical.doublings=[9]", 2),
+    ],
+)
+def test_where_nothing_is_learned_nothing_is_archived(again, run, argument, status):
+    assert again("resume=false", argument).status == status
     assert not (run / "previous-1").exists()
 
 
-def test_a_mistake_sets_nothing_aside(again, run):
-    assert again("resume=false", "loss.deformation.cycle=high").status == 2
-    assert again("resume=false", "schedule.canonical.doublings=[9]").status == 2
-    assert not (run / "previous-1").exists()
-
-
-def test_setting_aside_finds_a_free_name(tmp_path):
+def test_an_archive_gets_a_free_name(tmp_path):
     for name in ("previous-1", "previous-12", "previous-x", ".hydra", ".devrf"):
         (tmp_path / name).mkdir()
     archive_previous(tmp_path)
@@ -137,11 +138,16 @@ def test_setting_aside_finds_a_free_name(tmp_path):
     assert [path.name for path in (tmp_path / "previous-13").iterdir()] == ["metrics.json"]
 
 
-def test_a_deformation_is_learned_anew_on_another_canonical_field(again, run, devrf, tiny):
-    path = run / "checkpoints" / "canonical.ckpt"
+def learned_another_day(path: Path, to: Path) -> None:
+    """Write the same fields with another digest."""
     content = read_checkpoint_file(path)
-    content["devrf"]["records"] = {}  # as if learned on another day
-    write_checkpoint_file(path, content)
+    content["devrf"]["records"] = {}
+    write_checkpoint_file(to, content)
+
+
+def test_a_deformation_is_learned_anew_on_another_canonical_field(again, run):
+    path = run / "checkpoints" / "canonical.ckpt"
+    learned_another_day(path, path)
     outcome = again("stage=deformation")
     assert outcome.status == 0
     assert "deformation.ckpt: belongs to another canonical field; learned anew" in outcome.out
@@ -154,10 +160,7 @@ def test_a_canonical_field_that_is_given_belongs_to_the_deformation(devrf, tiny,
     assert devrf(*command, f"ckpt={given}").status == 0
     copied = shutil.copy(given, tmp_path / "same.ckpt")
     assert "learned already" in devrf(*command, f"ckpt={copied}").out
-    content = read_checkpoint_file(given)
-    write_checkpoint_file(
-        tmp_path / "other.ckpt", {**content, "devrf": {**content["devrf"], "records": {}}}
-    )
+    learned_another_day(given, tmp_path / "other.ckpt")
     outcome = devrf(*command, "ckpt=other.ckpt")
     assert outcome.status == 2
     assert outcome.err.startswith("devrf: ckpt: ")
@@ -184,15 +187,22 @@ OFTEN = (
 )
 
 
-def test_a_run_that_was_cut_short_goes_on(devrf, tiny, tmp_path):
+@pytest.fixture
+def cut_short(devrf, tiny, tmp_path):
+    """A command, and the checkpoints of it, left after iteration 4 of the canonical stage."""
     command = (*tiny, *OFTEN, "hydra.run.dir=run", "stage=canonical")
     checkpoints = tmp_path / "run" / "checkpoints"
-    assert devrf(*command, "trainer.max_steps=3").status == 0
+    assert devrf(*command, "trainer.max_steps=4").status == 0
     left = {path.name for path in checkpoints.glob("*.ckpt")}
-    assert left == {"canonical-progress-2.ckpt", "canonical-progress-3.ckpt", "canonical.ckpt"}
+    assert left == {"canonical-progress-3.ckpt", "canonical-progress-4.ckpt", "canonical.ckpt"}
+    return command, checkpoints
+
+
+def test_a_run_that_was_cut_short_goes_on(devrf, cut_short, tmp_path):
+    command, checkpoints = cut_short
     outcome = devrf(*command)
     assert outcome.status == 0
-    assert "canonical: goes on at iteration 3" in outcome.out
+    assert "canonical: goes on at iteration 4" in outcome.out
     assert {path.name for path in checkpoints.glob("*.ckpt")} == {"canonical.ckpt"}
     assert devrf(*command, "hydra.run.dir=whole").status == 0
     ours, whole = (
@@ -202,10 +212,9 @@ def test_a_run_that_was_cut_short_goes_on(devrf, tiny, tmp_path):
     assert (ours.density.values == whole.density.values).all()
 
 
-def test_a_damaged_progress_file_gives_way_to_the_one_before(devrf, tiny, tmp_path):
-    command = (*tiny, *OFTEN, "hydra.run.dir=run", "stage=canonical")
-    assert devrf(*command, "trainer.max_steps=4").status == 0
-    newest = tmp_path / "run" / "checkpoints" / "canonical-progress-4.ckpt"
+def test_a_damaged_progress_file_gives_way_to_the_one_before(devrf, cut_short):
+    command, checkpoints = cut_short
+    newest = checkpoints / "canonical-progress-4.ckpt"
     newest.write_bytes(newest.read_bytes()[:-100])
     outcome = devrf(*command)
     assert (outcome.status, outcome.err) == (0, "")
@@ -214,10 +223,19 @@ def test_a_damaged_progress_file_gives_way_to_the_one_before(devrf, tiny, tmp_pa
     assert "canonical: goes on at iteration 3" in outcome.out
 
 
-def test_a_run_left_with_another_config_is_refused(devrf, tiny, tmp_path):
-    command = (*tiny, *OFTEN, "hydra.run.dir=run", "stage=canonical")
-    assert devrf(*command, "trainer.max_steps=4").status == 0
-    (tmp_path / "run" / "checkpoints" / "canonical.ckpt").unlink()
+def test_progress_of_another_format_is_refused_and_stays(devrf, cut_short):
+    command, checkpoints = cut_short
+    newest = checkpoints / "canonical-progress-4.ckpt"
+    newest.write_bytes(b"PK" + bytes(100) + struct.pack("<8sIQ32s", b"\x89devrf\r\n", 2, 102, b""))
+    outcome = devrf(*command)
+    assert outcome.status == 2
+    assert f"{newest}: has format 2, older than" in outcome.err
+    assert newest.is_file()
+
+
+def test_a_run_left_with_another_config_is_refused(devrf, cut_short):
+    command, checkpoints = cut_short
+    (checkpoints / "canonical.ckpt").unlink()
     outcome = devrf(*command, "sampling.step=0.4")
     assert outcome.status == 2
     assert outcome.err.startswith("devrf: sampling.step: ")

@@ -1,4 +1,4 @@
-"""Who answers signals: a block of ours, unless somebody else already does."""
+"""Signals are answered by a block of ours, unless another program's handler does."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
-from devrf.system.signals import ASKING, Interrupted, answered_by, end_at_once
+from devrf.system.signals import STOP_SIGNALS, Interrupted, answered_by, end_at_once
 
 
 @pytest.fixture(autouse=True)
 def as_before() -> Iterator[None]:
-    before = {number: signal.getsignal(number) for number in ASKING}
+    before = {number: signal.getsignal(number) for number in STOP_SIGNALS}
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
@@ -25,7 +25,7 @@ def send(number: int) -> None:
     os.kill(os.getpid(), number)
 
 
-@pytest.mark.parametrize("number", ASKING)
+@pytest.mark.parametrize("number", STOP_SIGNALS)
 def test_the_block_answers_and_gives_back(number: int) -> None:
     before, heard = signal.getsignal(number), []
     with answered_by(heard.append):
@@ -82,4 +82,4 @@ def test_ending_at_once_has_the_status_of_a_shell() -> None:
     with pytest.raises(Interrupted) as caught, answered_by(end_at_once):
         send(signal.SIGTERM)
     assert caught.value.code == 143
-    assert not isinstance(caught.value, Exception)  # nobody takes it for a fault or a mistake
+    assert not isinstance(caught.value, Exception)  # so no handler of faults or mistakes catches it

@@ -1,4 +1,4 @@
-"""Sweeps: what fails is recorded, the rest goes on, and the end says so."""
+"""Sweeps: a failed job is recorded, the others go on, and the end says which failed."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from devrf.cli.context import RunContext
 from devrf.cli.steps import STEPS
 
 LEARN = ("stage=canonical", "hydra.sweep.dir=sweep")
+SEARCH = ("hparams_search=loss_weights", "hydra.sweeper.n_trials=2")
 
 
 def installed(plugin: str) -> pytest.MarkDecorator:
@@ -56,7 +57,9 @@ def test_a_mistake_in_one_job_is_recorded_and_the_others_go_on(devrf, tmp_path, 
         assert not (tmp_path / "sweep" / job / "failure.json").exists()
 
 
-def test_so_is_a_fault_of_the_program_with_its_traceback_in_the_log(devrf, tmp_path, tiny, steps):
+def test_a_fault_of_the_program_is_recorded_with_its_traceback_in_the_log(
+    devrf, tmp_path, tiny, steps
+):
     def boom(run: RunContext) -> None:
         (run.folder / "done").write_text(str(1 / (run.config.seed - 1)))
 
@@ -97,7 +100,7 @@ def test_an_interruption_ends_the_sweep(devrf, tmp_path, tiny, steps):
 
 
 @pytest.mark.parametrize("wrong", ["data.widht=3,4", "ablation=base,nonsense"])
-def test_what_is_wrong_before_the_first_job_ends_it_at_once(devrf, tmp_path, tiny, wrong):
+def test_an_error_before_the_first_job_ends_the_sweep_at_once(devrf, tmp_path, tiny, wrong):
     outcome = devrf("-m", *tiny, wrong)
     assert outcome.status == 2
     assert outcome.err.count("\n") == 1
@@ -134,18 +137,9 @@ def test_a_slurm_job_has_a_gpu(devrf, tiny):
 def test_jobs_in_processes_of_their_own(tmp_path, tiny):
     source = str(Path(package.__file__).parents[1])
     path = os.pathsep.join(filter(None, [source, os.environ.get("PYTHONPATH")]))
+    joblib = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "data.frames=3,1")
     done = subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "devrf",
-            "-m",
-            *tiny,
-            *LEARN,
-            "hydra/launcher=joblib",
-            "hydra.launcher.n_jobs=2",
-            "data.frames=3,1",
-        ],
+        [sys.executable, "-m", "devrf", "-m", *tiny, *LEARN, *joblib],
         cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"},
         capture_output=True,
@@ -162,15 +156,8 @@ def test_jobs_in_processes_of_their_own(tmp_path, tiny):
 
 @installed("hydra_optuna_sweeper")
 def test_a_search_maximises_the_objective(devrf, tmp_path, tiny):
-    outcome = devrf(
-        "-m",
-        *tiny,
-        "hparams_search=loss_weights",
-        "hydra.sweeper.n_trials=2",
-        "hydra.sweep.dir=sweep",
-        "video.frames=1",
-    )
-    assert outcome.status == 0
+    folder = ("hydra.sweep.dir=sweep", "video.frames=1")
+    assert devrf("-m", *tiny, *SEARCH, *folder).status == 0
     found = {
         job: json.loads((tmp_path / "sweep" / job / "metrics.json").read_text())
         for job in ("0_robot", "1_robot")
@@ -191,9 +178,7 @@ def test_a_search_maximises_the_objective(devrf, tmp_path, tiny):
     ],
 )
 def test_a_search_of_which_every_job_fails_says_so(devrf, tiny, argument, why):
-    outcome = devrf(
-        "-m", *tiny, "hparams_search=loss_weights", "hydra.sweeper.n_trials=2", argument
-    )
+    outcome = devrf("-m", *tiny, *SEARCH, argument)
     assert outcome.status == 3
     lines = [line for line in outcome.err.splitlines() if line.startswith("devrf: ")]
     assert [f"job {k}_robot: {why}" in lines[k] for k in (0, 1)] == [True, True]

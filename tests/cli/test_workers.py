@@ -39,7 +39,7 @@ MEANINGFUL = (
 )
 # Callbacks for both processes, in a module that both can import.
 MODULE = '''
-import hashlib, json
+import hashlib, json, os, signal
 from pathlib import Path
 import torch
 from lightning import Callback
@@ -62,14 +62,18 @@ class Witness(Callback):
 
 
 class Trip(Callback):
-    """Raises in one process, while the other goes on."""
+    """Fails in one process, while the other goes on."""
 
-    def __init__(self, rank: int, mistake: bool) -> None:
-        self.rank, self.mistake = rank, mistake
+    def __init__(self, rank: int, how: str) -> None:
+        self.rank, self.how = rank, how
 
     def on_train_start(self, trainer, stage):
         if trainer.global_rank == self.rank:
-            raise DevrfError("data.root: gone") if self.mistake else ZeroDivisionError("ours")
+            if self.how == "killed":
+                os.kill(os.getpid(), signal.SIGKILL)
+            if self.how == "mistake":
+                raise DevrfError("data.root: gone")
+            raise ZeroDivisionError("ours")
 
 
 class Stray(Callback):
@@ -166,18 +170,34 @@ def test_one_process_records(pair):
     assert not [path for path in folder.rglob("*") if "partial" in path.name]
 
 
-def test_a_mistake_of_this_process_ends_both_with_its_line(devrf, arguments):
-    trip = ("_target_=witnesses.Trip", "rank=0", "mistake=true")
-    outcome = devrf(*arguments, *(f"+callbacks.trip.{word}" for word in trip))
-    assert (outcome.status, outcome.err) == (2, "devrf: data.root: gone\n")
+def trip(rank: int, how: str) -> list[str]:
+    """Arguments that make one process fail."""
+    words = ("_target_=witnesses.Trip", f"rank={rank}", f"how={how}")
+    return [f"+callbacks.trip.{word}" for word in words]
+
+
+@pytest.mark.parametrize(
+    ("rank", "how", "line"),
+    [
+        (0, "mistake", "data.root: gone"),
+        (1, "mistake", "data.root: gone"),
+        (
+            1,
+            "killed",
+            "trainer.devices: the process of rank 1 was ended by signal 9; was memory short?",
+        ),
+    ],
+)
+def test_a_failure_of_one_process_ends_both_with_its_line(devrf, arguments, rank, how, line):
+    outcome = devrf(*arguments, *trip(rank, how))
+    assert (outcome.status, outcome.err) == (2, f"devrf: {line}\n")
     assert not multiprocessing.active_children()
     assert not {"LOCAL_RANK", "MASTER_PORT"} & set(os.environ)
 
 
 def test_a_fault_of_another_process_keeps_its_traceback(devrf, arguments):
-    trip = ("_target_=witnesses.Trip", "rank=1", "mistake=false")
     with pytest.raises(RuntimeError, match="(?s)witnesses.py.*ZeroDivisionError: ours"):
-        devrf(*arguments, *(f"+callbacks.trip.{word}" for word in trip))
+        devrf(*arguments, *trip(1, "fault"))
     assert not multiprocessing.active_children()
 
 

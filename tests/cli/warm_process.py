@@ -7,7 +7,7 @@ the signal that ended it:
 * ``folder``, ``arguments``: where to run what. What the command says is added to ``said.txt``,
   and how many steps and file operations it took is in ``counts.json`` if it got to its end.
 * ``after``: ``[kind, count]``, the moment of the signal. The kind is ``step`` (an optimiser step
-  begins) or ``file`` (a write, fsync or rename; of a write, half is still done).
+  begins) or ``file`` (the write of a tensor, an fsync or a rename begins).
 * ``delay``: seconds from that moment to the signal.
 * ``signals``: the numbers of the signals to send.
 * ``most_bytes``: how large a file may become, as on a disk that is full.
@@ -34,7 +34,7 @@ import devrf.artifacts.film
 import devrf.callbacks
 import devrf.cli.steps  # noqa: F401
 from devrf.__main__ import entry
-from devrf.checkpoints import checkpoint_file as sealed_file
+from devrf.checkpoints import checkpoint_file
 from devrf.ops.adam import GridAdam
 
 
@@ -64,26 +64,19 @@ class Fuse:
 
     def install(self) -> None:
         """Count from now on."""
-        step, write = GridAdam.step, sealed_file._Sealing.write
+        step = GridAdam.step
 
         def counted_step(optimizer: Any, closure: Any = None) -> Any:
             if self.tick("step"):
                 self.burn()
             return step(optimizer, closure)
 
-        def counted_write(sealing: Any, data: Any) -> int:
-            if self.tick("file"):
-                view = memoryview(data).cast("B")
-                sealing._file.write(view[: len(view) // 2])
-                sealing._file.flush()
-                self.burn()
-            return write(sealing, data)
-
         GridAdam.step = counted_step  # type: ignore[method-assign]
-        sealed_file._Sealing.write = counted_write  # type: ignore[method-assign]
-        os.fsync, os.replace = self._valid_mask(os.fsync), self._valid_mask(os.replace)
+        # Before a tensor is written, the file holds those before it.
+        checkpoint_file._data = self._counted(checkpoint_file._data)
+        os.fsync, os.replace = self._counted(os.fsync), self._counted(os.replace)
 
-    def _valid_mask(self, function: Callable[..., Any]) -> Callable[..., Any]:
+    def _counted(self, function: Callable[..., Any]) -> Callable[..., Any]:
         def call(*arguments: Any) -> Any:
             if self.tick("file"):
                 self.burn()

@@ -6,9 +6,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch import Tensor
 
-from devrf.data.batch import background_color, gather_batch, pixel_positions
+from devrf.data.batch import background_color, concatenated, gather_batch, pixel_positions
 from devrf.data.pool import PixelPool, all_pixels, wanted_pixels
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.scene import OpticalFlow, Views
@@ -34,10 +33,11 @@ def views(channels: int = 4, flow: bool = True) -> Views:
     return Views(
         pixels.to(torch.uint8),
         cameras,
-        torch.tensor([0.0, 1.0]),
+        torch.tensor([0.25, 1.0]),
         torch.tensor([0, 0]),
         ("a", "b"),
         OpticalFlow(vectors, column > row) if flow else None,
+        frames=torch.tensor([1, 4]),
     )
 
 
@@ -45,22 +45,23 @@ def views(channels: int = 4, flow: bool = True) -> Views:
 IMAGE, FLAT = torch.tensor([1, 0]), torch.tensor([9, 3])
 
 
-def test_pixel_positions_are_x_then_y() -> None:
+def test_pixel_positions_are_x_then_y():
     assert pixel_positions(FLAT, WIDTH).tolist() == [[1.5, 2.5], [3.5, 0.5]]
 
 
-def test_a_batch_holds_the_right_pixels_with_their_flow() -> None:
+def test_a_batch_holds_the_right_pixels_with_their_flow():
     batch = gather_batch(views(), IMAGE, FLAT, torch.zeros(3))
     assert batch.pixel.tolist() == [[1.5, 2.5], [3.5, 0.5]]
     assert batch.flow is not None and batch.flow_valid is not None
-    assert batch.flow.tolist() == [[1.5, -2.5], [3.5, -0.5]]
     assert batch.flow_valid.tolist() == [False, True]
+    assert batch.flow.tolist() == [[0, 0], [3.5, -0.5]]  # nothing where it is not valid
     assert batch.image.tolist() == [1, 0]
+    assert batch.time.tolist() == [1.0, 0.25] and batch.frame.tolist() == [4, 1]
     # On black, colour times alpha 51/255.
     torch.testing.assert_close(batch.color[:, 0], torch.tensor([121, 3]) / 255 * 0.2)
 
 
-def test_rays_belong_to_the_cameras_of_their_images() -> None:
+def test_rays_belong_to_the_cameras_of_their_images():
     data = views()
     batch = gather_batch(data, IMAGE, FLAT, torch.zeros(3))
     expected = data.cameras.rays(IMAGE, batch.pixel)
@@ -73,7 +74,7 @@ def test_rays_belong_to_the_cameras_of_their_images() -> None:
 @pytest.mark.parametrize(
     "background", [torch.tensor([1.0, 1.0, 1.0]), torch.tensor([[1.0, 0.0, 0.5], [0.2, 0.4, 0.6]])]
 )
-def test_mattes_are_composited_on_one_background_or_one_a_ray(background: Tensor) -> None:
+def test_mattes_are_composited_on_one_background_or_one_a_ray(background):
     batch = gather_batch(views(), IMAGE, FLAT, background)
     rgb = torch.tensor([[121 / 255, 0.0, 1.0], [3 / 255, 0.0, 1.0]])
     torch.testing.assert_close(batch.color, 0.2 * rgb + 0.8 * background)
@@ -81,10 +82,30 @@ def test_mattes_are_composited_on_one_background_or_one_a_ray(background: Tensor
     torch.testing.assert_close(batch.alpha, torch.tensor([0.2, 0.2]))
 
 
-def test_images_without_matte_or_flow() -> None:
+def test_images_without_matte_or_flow():
     batch = gather_batch(views(channels=3, flow=False), IMAGE, FLAT, torch.zeros(3))
     assert batch.alpha is None and batch.flow is None and batch.flow_valid is None
     torch.testing.assert_close(batch.color[0], torch.tensor([121 / 255, 0.0, 1.0]))
+
+
+def test_flow_that_is_not_valid_may_be_anything() -> None:
+    data = views()
+    assert data.flow is not None
+    data.flow.vectors[~data.flow.valid] = torch.nan
+    flow = gather_batch(data, IMAGE, FLAT, torch.zeros(3)).flow
+    assert flow is not None and flow.tolist() == [[0, 0], [3.5, -0.5]]
+
+
+def test_batches_become_one(rng: torch.Generator) -> None:
+    opaque = gather_batch(views(channels=3), IMAGE, FLAT, torch.zeros(3))
+    behind = torch.rand(2, 3, generator=rng)
+    both = concatenated([opaque, gather_batch(views(), IMAGE, FLAT, behind)])
+    assert both.alpha is not None
+    torch.testing.assert_close(both.alpha, torch.tensor([1.0, 1.0, 0.2, 0.2]))
+    assert torch.equal(both.background, torch.cat([torch.zeros(2, 3), behind]))
+    assert both.frame.tolist() == [4, 1] * 2 and both.time.tolist() == [1.0, 0.25] * 2
+    assert torch.equal(both.rays.origins[2:], opaque.rays.origins) and len(both.rays) == 4
+    assert both.flow is None and both.flow_valid is None
 
 
 def test_backgrounds(rng: torch.Generator) -> None:
@@ -94,7 +115,7 @@ def test_backgrounds(rng: torch.Generator) -> None:
     assert drawn.shape == (5, 3) and len(drawn.unique(dim=0)) == 5
 
 
-def test_all_pixels_of_some_images() -> None:
+def test_all_pixels_of_some_images():
     pool = all_pixels(views(), torch.tensor([1, 0]))
     assert len(pool) == 2 * WIDTH * HEIGHT
     assert pool.image.tolist() == [1] * 12 + [0] * 12
@@ -103,7 +124,7 @@ def test_all_pixels_of_some_images() -> None:
     assert kept.image.unique().tolist() == [0] and kept.flat.tolist() == list(range(12))
 
 
-def test_draws_come_from_the_pool_and_reach_all_of_it(rng: torch.Generator) -> None:
+def test_draws_come_from_the_pool_and_reach_all_of_it(rng):
     pool = PixelPool(
         torch.tensor([0, 1, 1], dtype=torch.int32), torch.tensor([7, 2, 5], dtype=torch.int32)
     )
@@ -113,7 +134,7 @@ def test_draws_come_from_the_pool_and_reach_all_of_it(rng: torch.Generator) -> N
     assert drawn == {(0, 7), (1, 2), (1, 5)}
 
 
-def test_a_pool_is_told_by_its_mask() -> None:
+def test_a_pool_is_told_by_its_mask():
     whole = all_pixels(views(), torch.arange(2))
     some = PixelPool(whole.image[1::3], whole.flat[1::3])
     of_second = some.of_images(torch.tensor([1]))
@@ -125,7 +146,7 @@ def test_a_pool_is_told_by_its_mask() -> None:
         assert torch.equal(again.flat, pool.flat) and again.flat.dtype == torch.int32
 
 
-def test_what_is_wanted_but_does_not_count_is_left_out() -> None:
+def test_what_is_wanted_but_does_not_count_is_left_out():
     shown = views()
     area = shown.height * shown.width
     wanted = torch.zeros(2, area, dtype=torch.bool)

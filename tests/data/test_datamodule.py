@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import inspect
 import itertools
+from types import SimpleNamespace
+from typing import Any, get_type_hints
 
 import pytest
 import torch
 
 from devrf.data.datamodule import SceneDataModule
+from devrf.data.forward import ForwardFacingDataModule
 from devrf.data.inward import InwardFacingDataModule
+from devrf.data.nerfies import NerfiesDataModule
+from devrf.data.nerfstudio import NerfstudioDataModule
 from devrf.data.procedural import ProceduralDataModule
 from devrf.errors import DevrfError
 from devrf.scenes.scene import Scene
@@ -26,7 +32,7 @@ class Given(SceneDataModule):
         return self.given
 
 
-def test_the_scene_is_loaded_once_and_only_when_needed(tiny_scene: Scene) -> None:
+def test_the_scene_is_loaded_once_and_only_when_needed(tiny_scene):
     module = Given(tiny_scene)
     assert module.loads == 0
     module.setup("fit")
@@ -34,7 +40,7 @@ def test_the_scene_is_loaded_once_and_only_when_needed(tiny_scene: Scene) -> Non
     assert module.scene is tiny_scene and module.loads == 1
 
 
-def test_training_views_move_to_the_device_once_for_each_capture(tiny_scene: Scene) -> None:
+def test_training_views_move_to_the_device_once_for_each_capture(tiny_scene):
     module, cpu = Given(tiny_scene), torch.device("cpu")
     static = module.training_views("static", cpu)
     assert module.training_views("static", cpu) is static
@@ -44,12 +50,29 @@ def test_training_views_move_to_the_device_once_for_each_capture(tiny_scene: Sce
     assert dynamic.flow is not None and len(dynamic) == 6
 
 
+@pytest.mark.parametrize(
+    ("capture", "images", "held_out"), [("static", (8,), 2), ("both", (8, 6), 3)]
+)
+def test_a_stage_is_served_what_it_learns_from(
+    tiny_scene: Scene, capture: str, images: tuple[int, ...], held_out: int
+) -> None:
+    module, cpu = Given(tiny_scene), torch.device("cpu")
+    learner: Any = SimpleNamespace(lightning_module=SimpleNamespace(capture=capture))
+    module.trainer = learner
+    served = module.transfer_batch_to_device(None, cpu, 0)
+    views = served if isinstance(served, tuple) else (served,)
+    assert tuple(len(one) for one in views) == images
+    assert all(one.frames is not None for one in views)
+    assert len(module.test_dataloader()) == held_out
+    assert module.transfer_batch_to_device(1, cpu, 0) == 1
+
+
 def test_the_training_loader_never_ends(tiny_scene: Scene) -> None:
     loader = Given(tiny_scene).train_dataloader()
     assert list(itertools.islice(loader, 50)) == [None] * 50
 
 
-def test_the_procedural_module_renders_what_it_was_told() -> None:
+def test_the_procedural_module_renders_what_it_was_told():
     module = ProceduralDataModule(
         "flower",
         width=12,
@@ -67,6 +90,29 @@ def test_the_procedural_module_renders_what_it_was_told() -> None:
     assert scene.clock.times == (0.0, 1.0)
 
 
-def test_an_unknown_source_of_flow_is_an_error_that_names_the_choices() -> None:
-    with pytest.raises(DevrfError, match="data.flow.*raft"):
-        InwardFacingDataModule("nowhere", flow="farneback")  # type: ignore[arg-type]
+@pytest.mark.parametrize(
+    ("module", "sources"),
+    [
+        (InwardFacingDataModule, "'auto', 'files', 'dis', 'raft' or 'none'"),
+        (ForwardFacingDataModule, "'auto', 'files', 'dis', 'raft' or 'none'"),
+        (NerfiesDataModule, "'auto', 'dis', 'raft' or 'none'"),
+        (NerfstudioDataModule, "'auto', 'dis', 'raft' or 'none'"),
+    ],
+)
+def test_options_are_checked_before_anything_is_read(module, sources):
+    with pytest.raises(DevrfError, match=f"data.flow: should be {sources}, not 'farneback'"):
+        module("nowhere", flow="farneback")
+    with pytest.raises(DevrfError, match="data.rot: no such option"):
+        module("nowhere", rot=3)
+    with pytest.raises(DevrfError, match="data.root: is missing"):
+        module()
+
+
+def test_a_datamodule_has_the_options_of_its_reader_with_their_types():
+    parameters = inspect.signature(NerfiesDataModule).parameters
+    assert parameters["root"].default is inspect.Parameter.empty
+    assert (parameters["downscale"].default, parameters["holdout"].default) == (4, 8)
+    assert "train_views" not in parameters and "export" not in parameters
+    hints = get_type_hints(NerfiesDataModule.__init__)
+    assert hints["downscale"] is int and hints["frames"] == int | None
+    assert inspect.signature(ProceduralDataModule).parameters["export"].default is None

@@ -20,7 +20,7 @@ from devrf.engine.ddp import (
     average_gradients,
     broadcast,
     rank,
-    share,
+    rays_per_rank,
     world_size,
 )
 from devrf.errors import DevrfError
@@ -32,7 +32,7 @@ def conversation(number: int, port: int, answer: Connection) -> None:
     torch.set_num_threads(1)
     address = f"tcp://127.0.0.1:{port}"
     distributed.init_process_group("gloo", init_method=address, rank=number, world_size=2)
-    found: dict[str, Any] = {"rank": rank(), "size": world_size(), "share": share(7)}
+    found: dict[str, Any] = {"rank": rank(), "size": world_size(), "rays": rays_per_rank(7)}
 
     # The first has met nothing with its second parameter, neither with the third.
     parameters = [torch.zeros(2), torch.zeros(3, 1), torch.zeros(1)]
@@ -91,8 +91,8 @@ def found() -> list[dict[str, Any]]:
             process.kill()
 
 
-def test_each_has_its_number_and_its_share_rounded_up(found: list[dict[str, Any]]) -> None:
-    assert [(one["rank"], one["size"], one["share"]) for one in found] == [(0, 2, 4), (1, 2, 4)]
+def test_each_has_its_number_and_its_rays_rounded_up(found: list[dict[str, Any]]) -> None:
+    assert [(one["rank"], one["size"], one["rays"]) for one in found] == [(0, 2, 4), (1, 2, 4)]
 
 
 def test_a_missing_gradient_counts_as_zero(found: list[dict[str, Any]]) -> None:
@@ -121,7 +121,7 @@ def test_one_process_gives_back_what_it_is_given() -> None:
     parameter = torch.zeros(2, requires_grad=True)
     average_gradients([parameter])
     assert parameter.grad is None
-    assert (rank(), world_size(), share(7)) == (0, 1, 7)
+    assert (rank(), world_size(), rays_per_rank(7)) == (0, 1, 7)
     value = torch.tensor(2.0)
     assert average(value) is value
     broadcast([parameter])

@@ -1,4 +1,4 @@
-"""Steady iterations: nothing waits, nothing is replaced, and a replay learns what Python learns.
+"""Static-shape iterations: nothing waits or is replaced; a replay learns what Python learns.
 
 The kernels run in Triton's interpreter. In place of CUDA a stand-in captures: it does the work
 again at each replay, and compares everything that a graph would have written down for good.
@@ -24,11 +24,12 @@ from devrf.data.datamodule import SceneDataModule
 from devrf.engine.graphs import Graph, GraphedStep, Work
 from devrf.engine.stage import ScheduledStage
 from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
-from devrf.methods.devrf.schedules import CanonicalSchedule, DeformationSchedule
 from devrf.methods.devrf.settings import MotionSettings
-from devrf.ops.choice import Kind, using
+from devrf.ops.dispatch import Kind, using
 from devrf.ops.kernels import adam, compositing, search, trilinear, warped_depth
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.sample_capacity import SampleCapacity
@@ -98,7 +99,7 @@ WAITING = {
 }
 
 
-class SweepMonitor(TorchDispatchMode):
+class Watch(TorchDispatchMode):
     """Writes down what is done, and on which memory that was there before."""
 
     def __init__(self) -> None:
@@ -139,9 +140,9 @@ class SweepMonitor(TorchDispatchMode):
 
 
 @contextmanager
-def watching() -> Iterator[SweepMonitor]:
+def watching() -> Iterator[Watch]:
     """Watch what torch does and which kernels are launched; not what a kernel does itself."""
-    usual, watch = adam.launch, SweepMonitor()
+    usual, watch = adam.launch, Watch()
 
     def launch(kernel: Any, programs: int, on: Tensor, *args: Any, **constants: Any) -> None:
         watch.note(str(kernel), [programs, *args, *constants.values()], constants)
@@ -203,7 +204,7 @@ def learn(
     stage.loop._capturer = lambda: capturer  # type: ignore[method-assign]
     if capturer is not None:
         draw, prepare = stage.draw, stage.prepare
-        stage.draw = lambda lane: watched(lambda: draw(lane))  # type: ignore[method-assign]
+        stage.draw = lambda batch: watched(lambda: draw(batch))  # type: ignore[method-assign]
         stage.prepare = lambda: watched(prepare)  # type: ignore[method-assign]
     with using(kernels):
         trainer(max_epochs=1).fit(stage, datamodule=datamodule)
@@ -220,17 +221,17 @@ def test_a_replay_is_the_same_work_on_the_same_memory_and_learns_the_same(
     # Once a phase, or once a level: the frames of a level are the same work.
     assert len(capturer.graphs) == (3 if isinstance(replayed, CanonicalStage) else 2)
     assert all(graph.first for graph in capturer.graphs)
-    steady = learn(build, trainer, datamodule, "triton")
+    static = learn(build, trainer, datamodule, "triton")
     exact = learn(build, trainer, datamodule, "torch")
-    assert steady.optimizer.keeps_gradients and not exact.optimizer.keeps_gradients
-    for name, value in steady.state_dict().items():
+    assert static.optimizer.keeps_gradients and not exact.optimizer.keeps_gradients
+    for name, value in static.state_dict().items():
         if isinstance(value, Tensor):
             assert torch.equal(replayed.state_dict()[name], value), name
     # Lists of another length, sums in another order. Where a gradient is rounding alone Adam's
     # first steps still have the rate's length.
     for name, value in exact.state_dict().items():
         if isinstance(value, Tensor) and value.is_floating_point():
-            off = (steady.state_dict()[name] - value).abs()
+            off = (static.state_dict()[name] - value).abs()
             assert off.mean() <= 0.02 * value.abs().mean() + 1e-6, name
 
 
@@ -255,8 +256,8 @@ def test_one_graph_is_of_all_frames_that_are_visited_together(
     # Captured in the second iteration, and the same in the third.
     (graph,) = capturer.graphs
     assert graph.first is not None and stage.iteration == 6
-    assert stage.model.deformation is not None
-    assert [bool(frame.any()) for frame in stage.model.deformation.to_canonical] == [
+    assert stage.scene_model.deformation is not None
+    assert [bool(frame.any()) for frame in stage.scene_model.deformation.to_canonical] == [
         False,
         True,
         False,

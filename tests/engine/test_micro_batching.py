@@ -18,15 +18,16 @@ from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, LoadedCheckpoi
 from devrf.data.batch import Pixels
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine import micro_batching as parts_module
-from devrf.engine import stage as stage_module
 from devrf.engine.micro_batching import MicroBatching
 from devrf.engine.stage import ScheduledStage
 from devrf.errors import DevrfError
 from devrf.methods.devrf import volume_rendering as rendering
+from devrf.methods.devrf import voxel_stage
 from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
-from devrf.methods.devrf.schedules import CanonicalSchedule, DeformationSchedule
 
 SMALL = Architecture(channels=4, width=8, frequencies=1)
 SCHEDULE = CanonicalSchedule(
@@ -59,7 +60,7 @@ def room(monkeypatch: pytest.MonkeyPatch) -> Callable[[int, int], list[int]]:
                 raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.50 GiB.")
             return rendering.render(some, *others)
 
-        monkeypatch.setattr(stage_module, "render", render)
+        monkeypatch.setattr(voxel_stage, "render", render)
         return calls
 
     return limit
@@ -102,7 +103,7 @@ def test_the_canonical_stage_learns_the_same_in_parts(
     calls = room(rays)
     with caplog.at_level(logging.WARNING, logger="devrf"):
         divided = fit(canonical())
-    assert divided.loop.parts.count == parts
+    assert divided.loop.micro_batching.count == parts
     assert calls[-parts:] == [rays] * parts
     assert_alike(divided, whole)
     said = [line for line in caplog.messages if "out of memory" in line]
@@ -115,7 +116,7 @@ def test_the_deformation_stage_learns_the_same_in_parts(fit, room, rest: LoadedC
     whole = fit(moving(rest))
     room(16, from_call=5)
     divided = fit(moving(rest))
-    assert divided.loop.parts.count == 4
+    assert divided.loop.micro_batching.count == 4
     assert_alike(divided, whole)
 
 
@@ -126,7 +127,9 @@ def test_a_frame_that_runs_short_takes_nothing_from_the_one_beside_it(
     # Four iterations of one frame, one of two; then the second of them runs short.
     calls = room(32, from_call=4 + 2 + 1)
     divided = fit(moving(rest, TOGETHER), data=four_frames)
-    assert divided.loop.parts.count == 2 and calls == [64] * 8 + [32] * 2 + [32] * 2 * 2 * 2
+    assert (
+        divided.loop.micro_batching.count == 2 and calls == [64] * 8 + [32] * 2 + [32] * 2 * 2 * 2
+    )
     assert_alike(divided, whole)
 
 
@@ -159,7 +162,7 @@ def test_memory_that_runs_out_at_the_backward_pass_does_no_harm(
 
     monkeypatch.setattr(failing, "manual_backward", backward)
     fit(failing)
-    assert failing.loop.parts.count == 2
+    assert failing.loop.micro_batching.count == 2
     assert_alike(failing, whole)
 
 
@@ -170,7 +173,7 @@ def test_the_parts_are_remembered(fit, room, tmp_path: Path) -> None:
     calls = room(64)
     again = canonical()
     fit(again, ckpt_path=str(tmp_path / "canonical-progress-4.ckpt"))
-    assert again.loop.parts.count == 2 and set(calls) == {32}
+    assert again.loop.micro_batching.count == 2 and set(calls) == {32}
 
 
 def test_memory_that_never_suffices_ends_the_stage_saved(fit, room, tmp_path: Path) -> None:
@@ -200,7 +203,7 @@ def test_before_the_first_iteration_nothing_is_logged(fit, room, tmp_path: Path)
 def test_other_errors_pass_through(fit, monkeypatch: pytest.MonkeyPatch) -> None:
     stage = canonical()
 
-    def broken(lane: Any, views: Any, pixels: Any) -> Any:
+    def broken(batch: Any, views: Any, pixels: Any) -> Any:
         raise RuntimeError("shapes cannot be multiplied")
 
     monkeypatch.setattr(stage, "loss", broken)

@@ -11,16 +11,16 @@ from typing import Any
 import pytest
 import torch
 from lightning import Callback, Trainer
+from torch.profiler import ProfilerActivity, profile
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import Pixels
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.parallel_batch import ParallelBatch
 from devrf.engine.streams import StreamParallel
+from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
-from devrf.methods.devrf.schedules import DeformationPhase, DeformationSchedule
 from devrf.methods.devrf.settings import MotionSettings
-from devrf.system.profiling import measuring
 
 GPU, CPU = torch.device("cuda"), torch.device("cpu")
 
@@ -114,7 +114,7 @@ def test_one_alone_and_those_on_a_cpu_need_no_streams(
 
 
 def test_what_is_measured_is_done_one_by_one(streams: Streams) -> None:
-    with measuring(CPU):
+    with profile(activities=[ProfilerActivity.CPU]):
         StreamParallel()([streams.piece(name) for name in "ab"], GPU)
     assert streams.noted == ["a on present", "b on present"]
 
@@ -140,7 +140,7 @@ TOGETHER = Alone(
     "motion",
     [
         MotionSettings(occupancy_every=3),
-        MotionSettings(learning_rate=3e-3, unit="box", views="all", pixels="useful"),
+        MotionSettings(learning_rate=3e-3, unit="box", views="all", pixels="occupied"),
     ],
     ids=["views by turns", "useful pixels"],
 )
@@ -156,10 +156,10 @@ def test_a_frame_learns_beside_another_what_it_learns_alone(
         stage = DeformationStage(copy.deepcopy(rest), schedule, motion, iterations_per_step=3)
         usual = stage.draw
 
-        def draw(lane: ParallelBatch) -> Pixels:
-            place = (stage.visits[lane.number].frame, stage.iteration)
+        def draw(batch: ParallelBatch) -> Pixels:
+            place = (stage.active[batch.number].number, stage.iteration)
             if not schedule.frame:
-                drawn[place] = usual(lane)
+                drawn[place] = usual(batch)
             return drawn[place]
 
         stage.draw = draw  # type: ignore[method-assign]
@@ -183,13 +183,13 @@ class Before(Callback):
         self.visited: list[tuple[int, ...]] = []
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: Any, *_: Any) -> None:
-        visit = (pl_module.phase.level, *(visit.frame for visit in pl_module.visits))
+        visit = (pl_module.phase.level, *(frame.number for frame in pl_module.active))
         if self.visited[-1:] != [visit]:
             self.visited.append(visit)
-        for visit in pl_module.visits:
-            neighbour = pl_module.field.to_time[visit.frame - 1]
-            assert torch.equal(visit.before, neighbour)
-            assert bool(neighbour.any()) == (visit.frame > 1)
+        for frame in pl_module.active:
+            neighbour = pl_module.field.to_time[frame.number - 1]
+            assert torch.equal(frame.before, neighbour)
+            assert bool(neighbour.any()) == (frame.number > 1)
 
 
 def test_what_a_frame_knows_of_the_one_before_it(
@@ -213,11 +213,11 @@ def test_from_rest_the_first_of_a_stretch_follows_no_flow(
 ) -> None:
     followed: list[int] = []
     monkeypatch.setattr(
-        DeformationStage, "_follow_flow", lambda stage, views, frame: followed.append(frame)
+        DeformationStage, "_follow_flow", lambda stage, number: followed.append(number)
     )
     stage = DeformationStage(rest, TOGETHER, MotionSettings(start="flow"))
     trainer(max_epochs=1).fit(stage, datamodule=four_frames)
-    # Frame 1, which nobody had learned yet, could not tell where its parts have gone in frame 2.
+    # Frame 1 was not learned yet: it could not tell where its parts have gone in frame 2.
     assert followed == [1, 3]
 
 
@@ -228,14 +228,14 @@ def test_a_visit_goes_on_while_one_of_its_frames_has_something_to_gain(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     asked: list[list[float]] = []
-    # Frame 2 at once. Of the others nobody; the first, but not the second; both.
+    # Frame 2 at once. Of the others neither; the first, but not the second; both.
     answers = iter([True, False, True, False, True, True])
 
-    def settled(losses: list[float], gain: float) -> bool:
+    def converged(losses: list[float], gain: float) -> bool:
         asked.append(list(losses))
         return next(answers)
 
-    monkeypatch.setattr("devrf.methods.devrf.deformation_stage.settled", settled)
+    monkeypatch.setattr("devrf.methods.devrf.convergence.converged", converged)
     stage = DeformationStage(
         rest, TOGETHER, MotionSettings(min_rel_improvement=0.01), iterations_per_step=2
     )

@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import pytest
 import torch
 from lightning import Trainer
-from torch import Tensor
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.evaluation.held_out import background_value, score, truth_image
 from devrf.evaluation.suite import MetricSuite
 from devrf.geometry.clock import FrameClock
-from devrf.methods.devrf import renderer as player_module
+from devrf.methods.devrf import view as view_module
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_field import DeformationField
-from devrf.methods.devrf.model import DeVRFModel, occupancy_through
-from devrf.methods.devrf.renderer import Renderer
+from devrf.methods.devrf.model import DeVRFModel
 from devrf.metrics.image import psnr, ssim
-from devrf.rendering.occupancy import Occupancy
+from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene
 
 
@@ -46,13 +45,13 @@ def test_truth_by_hand(tiny_scene: Scene) -> None:
 def test_only_pixels_that_count_are_scored(
     learned: tuple[CanonicalStage, Trainer], tiny_scene: Scene
 ) -> None:
-    views, player = tiny_scene.dynamic.test, Renderer(learned[0].model)
+    views, renderer = tiny_scene.dynamic.test, Renderer(learned[0].scene_model)
     valid_mask = torch.ones(len(views), 18, 24, dtype=torch.bool)
-    whole = score(player, views, 1, "white")
-    same = score(player, replace(views, valid_mask=valid_mask), 1, "white")
+    whole = score(renderer, views, 1, "white")
+    same = score(renderer, replace(views, valid_mask=valid_mask), 1, "white")
     assert same.scores == pytest.approx(whole.scores)
     valid_mask[:, :, 16:] = False
-    some = score(player, replace(views, valid_mask=valid_mask), 1, "white")
+    some = score(renderer, replace(views, valid_mask=valid_mask), 1, "white")
     seen, truth = whole.prediction[:, :16], whole.truth[:, :16]
     assert some.psnr == some.rest_pose_psnr == pytest.approx(psnr(seen, truth))
     assert some.ssim == pytest.approx(ssim(seen, truth), abs=1e-6)
@@ -61,20 +60,20 @@ def test_only_pixels_that_count_are_scored(
     assert torch.equal(some.compared[:, 16:], whole.truth[:, 16:])
     # Too narrow for a window, or only the image's rim.
     valid_mask[:, :, 8:] = False
-    assert -1 <= score(player, replace(views, valid_mask=valid_mask), 1, "white").ssim <= 1
+    assert -1 <= score(renderer, replace(views, valid_mask=valid_mask), 1, "white").ssim <= 1
     valid_mask[:, 1:] = False
-    rim = score(player, replace(views, valid_mask=valid_mask), 1, "white")
+    rim = score(renderer, replace(views, valid_mask=valid_mask), 1, "white")
     assert rim.psnr == pytest.approx(psnr(whole.prediction[:1, :8], whole.truth[:1, :8]))
 
 
 def test_a_score_is_that_of_the_picture_at_the_views_time(
-    learned: tuple[CanonicalStage, Trainer], tiny_scene: Scene
+    learned: tuple[CanonicalStage, Trainer], tiny_scene: Scene, reference: Callable[..., Any]
 ) -> None:
-    views, model = tiny_scene.dynamic.test, learned[0].model
+    views, model = tiny_scene.dynamic.test, learned[0].scene_model
     scored = score(Renderer(model), views, 2, "white")
     assert scored.name == views.names[2] and scored.time == 1.0
     assert scored.prediction.shape == scored.truth.shape == (18, 24, 3)
-    seen = model.picture(views.cameras.image_rays(2), 1.0, torch.ones(3)).color.clamp(0, 1)
+    seen = reference(model, views.cameras.image_rays(2), 1.0, torch.ones(3)).color.clamp(0, 1)
     torch.testing.assert_close(scored.prediction, seen.view(18, 24, 3))
     assert scored.psnr == pytest.approx(psnr(scored.prediction, scored.truth))
     assert scored.ssim == pytest.approx(ssim(scored.prediction, scored.truth))
@@ -82,19 +81,30 @@ def test_a_score_is_that_of_the_picture_at_the_views_time(
     assert scored.rest_pose_psnr == scored.psnr
 
 
-def test_where_a_frame_s_matter_is_is_looked_for_once(
+def test_static_views_are_scored_at_rest_whatever_their_time(
+    moving: DeVRFModel, tiny_scene: Scene
+) -> None:
+    views, renderer = tiny_scene.dynamic.test, Renderer(moving)
+    moved, rest = (score(renderer, views, 2, "white", time=time) for time in (None, 0.0))
+    assert (moved.time, rest.time) == (1.0, 1.0)
+    assert rest.psnr == rest.rest_pose_psnr == moved.rest_pose_psnr != moved.psnr
+
+
+def test_the_occupancy_of_a_frame_is_found_once(
     rest: LoadedCheckpoint, tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model, looked = rest.model, []
     model.deformation = DeformationField(model.canonical.box, FrameClock((0.0, 0.5, 1.0)), voxels=8)
 
-    def valid_mask(model: DeVRFModel, canonical: Tensor) -> Occupancy:
-        looked.append(1)
-        return occupancy_through(model, canonical)
+    usual: Callable[..., Any] = view_module.occupancy_through
 
-    monkeypatch.setattr(player_module, "occupancy_through", valid_mask)
-    player, judge = Renderer(model), MetricSuite(("psnr_masked", "flow_error"))
-    view = score(player, tiny_scene.dynamic.test, 1, "white", judge)
+    def counted(*arguments: Any) -> Any:
+        looked.append(1)
+        return usual(*arguments)
+
+    monkeypatch.setattr(view_module, "occupancy_through", counted)
+    suite = MetricSuite(("psnr_masked", "flow_error"))
+    view = score(Renderer(model), tiny_scene.dynamic.test, 1, "white", suite)
     # The picture, the rest pose and the flow: the field is at rest, so all flow is missed.
     assert view.further["flow_error"] is not None
     assert view.psnr == pytest.approx(view.rest_pose_psnr, abs=1e-3)

@@ -18,9 +18,10 @@ from devrf.geometry.space import WORLD
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.renderer import Ready, Renderer
 from devrf.methods.devrf.settings import RenderSettings
+from devrf.methods.devrf.view import DeVRFView
 from devrf.rendering.occupancy import Occupancy
+from devrf.rendering.renderer import Renderer
 from devrf.scenes.procedural import Material, ProceduralScene
 from devrf.scenes.scene import OpticalFlow, Scene, Views
 
@@ -50,8 +51,8 @@ class ExactField:
         return torch.zeros_like(points)
 
 
-def exact_player(scene: Scene, recipe: ProceduralScene) -> Any:
-    """What would show a scene model that knows the shape and its motion."""
+def exact_renderer(scene: Scene, recipe: ProceduralScene, *, moves: bool = True) -> Any:
+    """What would show a model that knows the shape, and its motion if it ``moves``."""
     field, shape = ExactField(scene, recipe), recipe.model()
 
     def unwarp(points: Tensor, time: float) -> Tensor:
@@ -59,20 +60,17 @@ def exact_player(scene: Scene, recipe: ProceduralScene) -> Any:
         return shape.forward(Material(points, part), time)
 
     occupancy = Occupancy.full((12, 12, 12), field.box)
-    model = SimpleNamespace(
-        canonical=field,
-        deformation=SimpleNamespace(unwarp=unwarp),
-        settings=SETTINGS,
-        space=WORLD,
-    )
+    lists: Any = SimpleNamespace(field=field, settings=SETTINGS)
 
-    def ready(time: float) -> Ready:
-        moves = model.deformation is not None
-        return Ready(
-            occupancy, warp=(lambda points: shape.material(points, time).rest) if moves else None
-        )
+    def at(time: float) -> DeVRFView:
+        view: Any = DeVRFView(occupancy, None, lists, WORLD, time)
+        if moves:
+            view._motion = SimpleNamespace(unwarp=unwarp)
+            view._warp = lambda points: shape.material(points, time).rest
+        return view
 
-    return SimpleNamespace(model=model, device=torch.device("cpu"), ready=ready)
+    device = torch.device("cpu")
+    return SimpleNamespace(model=SimpleNamespace(space=WORLD), device=device, at=at)
 
 
 @pytest.mark.parametrize("index", [1, 2])
@@ -84,26 +82,28 @@ def test_the_exact_motion_of_a_procedural_scene_gives_its_exact_flow(
     truth = views.flow.vectors[index][views.flow.valid[index]]
     assert len(truth) > 40 and truth.norm(dim=1).mean() > 0.5
     flat = views.flow.valid[index].flatten().nonzero()[:, 0]
-    player = exact_player(tiny_scene, tiny_recipe)
-    errors = (seen_flow(player, views, index, index - 1, flat) - truth).norm(dim=1)
+    renderer = exact_renderer(tiny_scene, tiny_recipe)
+    errors = (seen_flow(renderer, views, index, index - 1, flat) - truth).norm(dim=1)
     # Where parts touch, a canonical point may belong to either: a few pixels go astray.
     assert errors.quantile(0.85) < 0.03 and errors.median() < 0.01
-    assert flow_error(player, views, index) == pytest.approx(float(errors.mean()))
+    assert flow_error(renderer, views, index) == pytest.approx(float(errors.mean()))
     # A scene that stays at rest is off by about the flow itself.
-    player.model.deformation = None
-    at_rest = flow_error(player, views, index)
+    at_rest = flow_error(exact_renderer(tiny_scene, tiny_recipe, moves=False), views, index)
     assert at_rest is not None and at_rest > 3 * float(errors.mean())
 
 
 def test_without_flow_or_an_earlier_frame_it_is_unknown(
     tiny_scene: Scene, tiny_recipe: ProceduralScene
 ) -> None:
-    views, player = tiny_scene.dynamic.test, exact_player(tiny_scene, tiny_recipe)
-    assert flow_error(player, views, 0) is None
-    assert flow_error(player, replace(views, flow=None), 1) is None
+    views, renderer = tiny_scene.dynamic.test, exact_renderer(tiny_scene, tiny_recipe)
+    assert flow_error(renderer, views, 0) is None
+    assert flow_error(renderer, replace(views, flow=None), 1) is None
     assert views.flow is not None
     nowhere = OpticalFlow(views.flow.vectors, torch.zeros_like(views.flow.valid))
-    assert flow_error(player, replace(views, flow=nowhere), 1) is None
+    assert flow_error(renderer, replace(views, flow=nowhere), 1) is None
+    # A method whose views do not know where points go.
+    renderer.at = lambda time: SimpleNamespace(chunk=1, at_rest=False, render=None)
+    assert flow_error(renderer, views, 1) is None
 
 
 SIDE = 21
@@ -115,7 +115,8 @@ def block(cube: Box) -> DeVRFModel:
 
     It moves by +0.2 along x until t = 0.5 and by +0.5 until t = 1.
     """
-    canonical = Architecture().search_field(cube, SIDE**3)
+    build = Architecture()
+    canonical = build.search_field(cube, SIDE**3)
     mask = torch.zeros(SIDE, SIDE, SIDE, dtype=torch.bool)
     mask[:, :, :10] = True
     with torch.no_grad():
@@ -125,7 +126,7 @@ def block(cube: Box) -> DeVRFModel:
     for frame, way in ((1, 0.2), (2, 0.5)):
         deformation.to_canonical[frame, ..., 0] = -way
         deformation.to_time[frame, ..., 0] = way
-    return DeVRFModel(canonical, Occupancy.full((SIDE,) * 3, cube), SETTINGS, deformation)
+    return DeVRFModel(build, canonical, Occupancy.full((SIDE,) * 3, cube), SETTINGS, deformation)
 
 
 def filmed_from_above(flow: tuple[float, float]) -> Views:

@@ -16,14 +16,15 @@ from devrf.evaluation.suite import MEASURES, Evaluation
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.ndc import NormalizedDevice
+from devrf.geometry.space import WORLD, Space
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.renderer import Renderer
 from devrf.methods.devrf.settings import RenderSettings
 from devrf.metrics.masked import psnr_masked, ssim_masked
 from devrf.metrics.perceptual import TRUNKS
 from devrf.rendering.occupancy import Occupancy
+from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene, Views
 
 HOST = torch.device("cpu")
@@ -39,16 +40,14 @@ def alex(tmp_path: Path) -> Path:
     return path
 
 
-def slab(box: Box, settings: RenderSettings, space=None) -> DeVRFModel:
+def slab(box: Box, settings: RenderSettings, space: Space = WORLD) -> DeVRFModel:
     """All of the box below z = −0.025, halfway between two grid points, is solid."""
-    field = Architecture().search_field(box, SIDE**3)
+    build = Architecture()
+    field = build.search_field(box, SIDE**3)
     with torch.no_grad():
         field.density.values.fill_(-400.0)
         field.density.values[:, :, : SIDE // 2] = 400.0
-    model = DeVRFModel(field, Occupancy.full((SIDE,) * 3, box), settings)
-    if space is not None:
-        model.space = space
-    return model
+    return DeVRFModel(build, field, Occupancy.full((SIDE,) * 3, box), settings, space=space)
 
 
 def views(depth: torch.Tensor, z: float) -> Views:
@@ -68,10 +67,10 @@ def test_depth_of_a_slab_by_hand(cube: Box) -> None:
     # A ray meets the face after 4 / cos of its angle.
     truth = 4 / -images.cameras.image_rays(0).directions[:, 2].view(8, 8)
     assert float(truth.max() - truth.min()) > 0.01
-    judge = Evaluation(metrics=["depth_error"]).judge(HOST)
+    suite = Evaluation(metrics=["depth_error"]).suite(HOST)
     for off in (0.0, 0.25, -0.5):
         known = replace(images, depth=truth[None] + off)
-        found = score(Renderer(model), known, 0, "black", judge).further["depth_error"]
+        found = score(Renderer(model), known, 0, "black", suite).further["depth_error"]
         # A step is 0.005 long.
         assert found == pytest.approx(abs(off), abs=0.01)
 
@@ -87,17 +86,17 @@ def test_depth_of_a_scene_in_ndc_is_in_world_units() -> None:
     images = views(torch.zeros(1, 8, 8), z=0.0)
     truth = 4 / 0.975 / -images.cameras.image_rays(0).directions[:, 2].view(8, 8)
     images = replace(images, depth=truth[None] + 0.5)
-    judge = Evaluation(metrics=["depth_error"]).judge(HOST)
-    found = score(Renderer(model), images, 0, "black", judge).further["depth_error"]
+    suite = Evaluation(metrics=["depth_error"]).suite(HOST)
+    found = score(Renderer(model), images, 0, "black", suite).further["depth_error"]
     assert found == pytest.approx(0.5, abs=0.03)
 
 
 def test_every_metric_of_a_learned_scene(
     learned: tuple[CanonicalStage, Trainer], tiny_scene: Scene, alex: Path
 ) -> None:
-    judge = Evaluation(lpips_network="alex", lpips_weights=alex).judge(HOST)
-    held_out, model = tiny_scene.dynamic.test, learned[0].model
-    view = score(Renderer(model), held_out, 2, "white", judge)
+    suite = Evaluation(lpips_network="alex", lpips_weights=alex).suite(HOST)
+    held_out, model = tiny_scene.dynamic.test, learned[0].scene_model
+    view = score(Renderer(model), held_out, 2, "white", suite)
     assert list(view.further) == list(MEASURES)
     assert list(view.scores)[:3] == ["psnr", "ssim", "rest_pose_psnr"]
     mask = held_out.pixels[2, ..., 3] > 127
@@ -117,8 +116,8 @@ def test_what_a_scene_does_not_know_is_none(
     held_out = tiny_scene.dynamic.test
     bare = replace(held_out, pixels=held_out.pixels[..., :3], flow=None, depth=None)
     names = [name for name in MEASURES if not name.startswith("lpips")]
-    judge = Evaluation(metrics=names).judge(HOST)
-    found = score(Renderer(learned[0].model), bare, 1, "white", judge).further
+    suite = Evaluation(metrics=names).suite(HOST)
+    found = score(Renderer(learned[0].scene_model), bare, 1, "white", suite).further
     assert found == dict.fromkeys(names)
 
 
@@ -131,11 +130,12 @@ def test_without_weights_lpips_is_none_and_a_line_says_why(
 ) -> None:
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     with caplog.at_level(logging.INFO):
-        judge = Evaluation(metrics=["lpips", "lpips_masked"]).judge(HOST)
+        suite = Evaluation(metrics=["lpips", "lpips_masked"]).suite(HOST)
+        renderer, views = Renderer(learned[0].scene_model), tiny_scene.static.test
         for index in range(2):
-            view = score(Renderer(learned[0].model), tiny_scene.static.test, index, "white", judge)
+            view = score(renderer, views, index, "white", suite)
             assert view.further == {"lpips": None, "lpips_masked": None}
-        Evaluation(metrics=["ms_ssim"]).judge(HOST)
+        Evaluation(metrics=["ms_ssim"]).suite(HOST)
     assert len(caplog.messages) == 1 and "LPIPS is null" in caplog.text
 
 

@@ -73,13 +73,15 @@ def test_without_skip_zero_momentum_moves_an_untouched_entry() -> None:
 
 @pytest.mark.parametrize("skip_zero", [False, True])
 def test_pace_scales_each_voxel(rng: torch.Generator, skip_zero: bool) -> None:
-    pace = torch.rand(*SHAPE[:3], 1, generator=rng, dtype=torch.float64)
+    per_voxel_lr = torch.rand(*SHAPE[:3], 1, generator=rng, dtype=torch.float64)
     grads = gradients(rng, 5)
-    paced, plain = (torch.zeros(SHAPE, dtype=torch.float64, requires_grad=True) for _ in range(2))
-    slow = GridAdam([{"params": [paced], "pace": pace, "skip_zero": skip_zero}], lr=0.1)
-    # The moments do not depend on the values, so each move is the plain one times the pace.
-    moved = run(slow, paced, grads)
-    torch.testing.assert_close(moved, pace * run(GridAdam([plain], lr=0.1), plain, grads))
+    scaled, plain = (torch.zeros(SHAPE, dtype=torch.float64, requires_grad=True) for _ in range(2))
+    slow = GridAdam(
+        [{"params": [scaled], "per_voxel_lr": per_voxel_lr, "skip_zero": skip_zero}], lr=0.1
+    )
+    # The moments do not depend on the values, so each move is the plain one times the per_voxel_lr.
+    moved = run(slow, scaled, grads)
+    torch.testing.assert_close(moved, per_voxel_lr * run(GridAdam([plain], lr=0.1), plain, grads))
 
 
 def test_replaced_parameters_start_afresh() -> None:

@@ -31,15 +31,6 @@ def test_a_step_clears_the_gradient_unless_told_otherwise() -> None:
         assert gradient.any() != clear
 
 
-def test_second_step_by_hand() -> None:
-    values, mean, square = torch.zeros(1), torch.tensor([0.2]), torch.tensor([0.04])
-    adam_step(values, torch.tensor([3.0]), mean, square, rule(2))
-    # m = 0.9·0.2 + 0.1·3, s = 0.99·0.04 + 0.01·9.
-    assert mean.item() == pytest.approx(0.48) and square.item() == pytest.approx(0.1296)
-    move = 0.1 * (0.48 / (1 - 0.81)) / (0.1296 / (1 - 0.9801)) ** 0.5
-    assert values.item() == pytest.approx(-move, rel=1e-5)
-
-
 def test_smoothing_pulls_at_a_peak_and_its_neighbours_by_their_old_values() -> None:
     values, into, gradient = peak(), torch.empty(2, 2, 2, 1), torch.zeros(2, 2, 2, 1)
     mean, square = torch.zeros_like(values), torch.zeros_like(values)
@@ -77,8 +68,8 @@ def test_smoothing_of_what_is_touched_leaves_the_rest(skip_zero: bool) -> None:
 
 def test_is_the_two_steps_it_stands_for(rng: torch.Generator) -> None:
     values, gradient, mean = (torch.randn(3, 4, 2, 3, generator=rng) for _ in range(3))
-    square, pace = torch.rand(3, 4, 2, 3, generator=rng), torch.rand(3, 4, 2, 1, generator=rng)
-    into, how = torch.empty_like(values), rule(4, pace=pace)
+    square, factors = (torch.rand(3, 4, 2, c, generator=rng) for c in (3, 1))
+    into, how = torch.empty_like(values), rule(4, per_voxel_lr=factors)
     expected = [t.clone() for t in (values, gradient, mean, square)]
     add_total_variation_gradient(expected[0].clone(), expected[1], 0.3)
     adam_step(expected[0], expected[1], expected[2], expected[3], how)

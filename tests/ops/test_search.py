@@ -51,14 +51,14 @@ def test_by_hand() -> None:
     assert found.distance.tolist() == [1, 2, 3, 0, 0, 0]
     assert found.points[:3].tolist() == [[1, 0, 0], [2, 0, 0], [3, 0, 0]]
     # Weights 0.5, 0.25, 0.25.
-    assert found.heavy.tolist() == [True, True, True, False, False, False]
+    assert found.significant.tolist() == [True, True, True, False, False, False]
     assert found.first.tolist() == [0, 3, 3]
     assert found.total == 3 and not found.overflow
 
 
 def test_weight_decides_what_is_heavy() -> None:
     found = along_x(thresholds=Thresholds(alpha=0.01, stop=1e-4, weight=0.3))
-    assert found.heavy.tolist() == [True, False, False, False, False, False]
+    assert found.significant.tolist() == [True, False, False, False, False, False]
 
 
 def test_what_was_dropped_hides_nothing() -> None:
@@ -67,7 +67,7 @@ def test_what_was_dropped_hides_nothing() -> None:
     mask[3] = False
     found = along_x(mask=mask, thresholds=Thresholds(alpha=0.01, stop=0.25, weight=0.125))
     assert found.distance[:3].tolist() == [1, 2, 4]
-    assert found.heavy[:3].all()
+    assert found.significant[:3].all()
 
 
 def test_a_displacement_leads_elsewhere() -> None:
@@ -120,10 +120,10 @@ def test_finds_what_the_renderer_finds(rng: torch.Generator, cube: Box) -> None:
         delta=field.step_in_base_voxels(settings.step),
         thresholds=Thresholds(0.02, STOP, 0.02),
     )
-    heavy = select(found.heavy, found.first, 1000)
-    used = int(heavy.total)
+    significant = select(found.significant, found.first, 1000)
+    used = int(significant.total)
     assert len(truth) == used > 100 and not found.overflow
-    index = heavy.index[:used]
+    index = significant.index[:used]
     assert torch.equal(found.ray[index], truth.ray)
     torch.testing.assert_close(found.distance[index], truth.distance)
     torch.testing.assert_close(found.points[index], truth.points)

@@ -13,17 +13,17 @@ from omegaconf import OmegaConf
 
 from devrf.cli.config import config_folder
 from devrf.cli.config_check import check_config
+from devrf.cli.context import RunContext
 from devrf.data.datamodule import SceneDataModule
+from devrf.engine.stage import ScheduledStage
+from devrf.errors import DevrfError
 from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
-from devrf.methods.devrf.schedules import DeformationSchedule
 
 GROUPS = sorted({path.name for path in config_folder().iterdir() if path.is_dir()} - {"hydra"})
-FILES = [
-    f"{group}={file.stem}"
-    for group in GROUPS
-    for file in sorted((config_folder() / group).glob("*.yaml"))
-]
+NAMES = {g: sorted(p.stem for p in (config_folder() / g).glob("*.yaml")) for g in GROUPS}
+FILES = [f"{group}={name}" for group in GROUPS for name in NAMES[group]]
 NEEDS = {
     "logger=tensorboard": "tensorboard",
     "hparams_search=loss_weights": "hydra_plugins.hydra_optuna_sweeper",
@@ -44,20 +44,21 @@ def test_the_groups_are_the_documented_ones():
         "data",
         "experiment",
         "field",
+        "evaluation",
         "logger",
         "loss",
+        "method",
+        "protocol",
         "report",
-        "benchmark",
         "sampling",
         "schedule",
-        "stages",
         "still",
         "trainer",
         "video",
     } <= set(GROUPS)
 
 
-@pytest.mark.parametrize("choice", FILES)
+@pytest.mark.parametrize("choice", [name for name in FILES if not name.startswith("method=")])
 def test_it_composes_and_builds(composed, choice):
     needed = NEEDS.get(choice)
     if needed and importlib.util.find_spec(needed) is None:
@@ -72,6 +73,28 @@ def test_it_composes_and_builds(composed, choice):
     callbacks = list(instantiate(config.callbacks).values())
     instantiate(config.trainer, logger=instantiate(config.logger), callbacks=callbacks)
     assert instantiate(config.video).frames > 0
+
+
+@pytest.mark.parametrize("protocol", NAMES["protocol"])
+@pytest.mark.parametrize("method", NAMES["method"])
+def test_a_method_learns_by_the_protocols_that_it_has_stages_for(
+    composed, tmp_path, method, protocol
+):
+    config = composed(f"method={method}", f"protocol={protocol}")
+    check_config(config)
+    run = RunContext(config, tmp_path)
+    assert (config.method, run.protocol.name) == (method, protocol)
+    assert run.learning_stages
+    for step in run.protocol.steps:
+        if run.stage_key(step.name) not in config:
+            refused = f"protocol: method={method} does not learn by protocol={protocol}"
+            with pytest.raises(DevrfError, match=refused):
+                run.stage_builder(step.name)
+            continue
+        build = run.stage_builder(step.name)
+        assert issubclass(build.func, ScheduledStage)
+        if step.builds_on is None:
+            assert isinstance(build(), ScheduledStage)
 
 
 @pytest.mark.parametrize("choice", FILES)

@@ -199,7 +199,7 @@ def test_two_steps_of_both_stages(
     canonical = instantiate(config.canonical, _convert_="all")
     trainer(max_steps=2).fit(canonical, datamodule=module)
     assert canonical.iteration == 2
-    assert canonical.model.canonical.color.values.abs().max() > 0
+    assert canonical.scene_model.canonical.color.values.abs().max() > 0
     build = instantiate(config.deformation, _partial_=True, _convert_="all")
     deformation: DeformationStage = build(canonical.result())
     trainer(max_steps=2).fit(deformation, datamodule=module)

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
-from typing import Any
 
 import pytest
 
-Ran = Callable[..., Path]
+from devrf.reporting.runs import collect
+from devrf.reporting.table import tabulate
 
 
 @pytest.fixture
-def runs(tmp_path: Path) -> Path:
+def runs(tmp_path):
     """The folder that the runs of a test lie in."""
     folder = tmp_path / "runs"
     folder.mkdir()
@@ -22,39 +20,38 @@ def runs(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def ran(runs: Path) -> Ran:
+def ran(runs):
     """``ran(name, …)``: leaves a finished run in ``runs/name`` and returns its folder."""
 
     def write(
-        name: str,
-        scene: str = "robot",
+        name,
+        scene="robot",
         *,
-        scores: Mapping[str, float | None] | None = None,
-        seconds: tuple[float | None, float | None] = (10.0, 20.0),
-        gpu: tuple[float | None, float | None] = (None, None),
-        ablation: str | None = "full",
-        choices: Mapping[str, str | None] | None = None,
-        overrides: Sequence[str] = (),
-        seed: int | None = 0,
-        frames: Sequence[tuple[float, float]] = (),
-        **of_run: Any,
-    ) -> Path:
-        sections: dict[str, Any] = {
+        method=None,
+        protocol=None,
+        scores=None,
+        seconds=(10.0, 20.0),
+        gpu=(None, None),
+        ablation="full",
+        choices=None,
+        overrides=(),
+        seed=0,
+        frames=(),
+        **of_run,
+    ):
+        # Without a method: as earlier versions wrote it.
+        new = {"method": method, "protocol": protocol} if method else {}
+        static, dynamic = ("static", "dynamic") if method else ("canonical", "deformation")
+        scored = {"psnr": 29.0, "ssim": 0.95, "lpips": None, **(scores or {})}
+        record = {
             "scene": scene,
-            "canonical": {"psnr": 33.0, "seconds": seconds[0], "peak_gpu_gb": gpu[0]},
-            "deformation": {
-                "psnr": 29.0,
-                "ssim": 0.95,
-                "lpips": None,
-                **(scores or {}),
-                "seconds": seconds[1],
-                "peak_gpu_gb": gpu[1],
-            },
+            **new,
+            static: {"psnr": 33.0, "seconds": seconds[0], "peak_gpu_gb": gpu[0]},
+            dynamic: {**scored, "seconds": seconds[1], "peak_gpu_gb": gpu[1]},
             "run": {
                 "device": "a processor",
                 "git": "0123456789abcdef",
-                "parameters": 1000,
-                "choices": {"ablation": ablation, "logger": "csv", **(choices or {})},
+                "choices": {"ablation": ablation, "logger": "csv", **new, **(choices or {})},
                 "overrides": list(overrides),
                 "seed": seed,
                 **of_run,
@@ -62,7 +59,7 @@ def ran(runs: Path) -> Ran:
         }
         folder = runs / name
         folder.mkdir(parents=True)
-        (folder / "metrics.json").write_text(json.dumps(sections))
+        (folder / "metrics.json").write_text(json.dumps(record))
         if frames:
             with (folder / "frames.csv").open("w", newline="") as file:
                 table = csv.writer(file)
@@ -75,10 +72,10 @@ def ran(runs: Path) -> Ran:
 
 
 @pytest.fixture
-def failed(runs: Path) -> Ran:
+def failed(runs):
     """``failed(name, error, …)``: leaves the record of a failed job in ``runs/name``."""
 
-    def write(name: str, error: str, **further: Any) -> Path:
+    def write(name, error, **further):
         record = {
             "scene": "robot",
             "choices": {"ablation": "base"},
@@ -91,6 +88,11 @@ def failed(runs: Path) -> Ran:
         folder = runs / name
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "failure.json").write_text(json.dumps({**record, **further}))
-        return folder
 
     return write
+
+
+@pytest.fixture
+def table(runs):
+    """``table(…)``: the table of what lies in the folder."""
+    return lambda *published: tabulate(collect(runs), *published)

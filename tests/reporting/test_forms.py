@@ -1,68 +1,49 @@
-"""The same table as Markdown, plain text, LaTeX and CSV, read back."""
+"""The same table as Markdown, plain text and LaTeX, read back."""
 
 from __future__ import annotations
 
-import csv
 import re
 
 import pytest
 
 from devrf.reporting import latex as latex_form
 from devrf.reporting import markdown as markdown_form
-from devrf.reporting.csv_table import write_csv
 from devrf.reporting.latex import latex
 from devrf.reporting.markdown import markdown, plain
-from devrf.reporting.runs import collect
-from devrf.reporting.table import tabulate
+
+FULL = "Ours w/ c2f, tv, cycle, flow"
+METRICS = ["PSNR ↑", "SSIM ↑", "LPIPS ↓", "GPU (GB) ↓", "Time ↓"]
 
 
 @pytest.fixture
-def table(runs, ran):
+def pig_and_robot(table, ran):
     """Pig toy by three ablations, one of them with two seeds; and a run of the robot."""
     for k, (ablation, psnr, seed) in enumerate(
         [("base", 20.0, 0), ("c2f", 24.0, 0), ("full", 29.0, 0), ("full", 31.0, 1)]
     ):
-        ran(
-            f"{k}_pig_toy",
-            "pig_toy",
-            ablation=ablation,
-            seed=seed,
-            seconds=(k, 20),
-            scores={"psnr": psnr, "ssim": psnr / 40},
-            overrides=[f"seed={seed}"],
-        )
+        scores = {"psnr": psnr, "ssim": psnr / 40}
+        ran(f"{k}_pig", "pig_toy", ablation=ablation, seed=seed, seconds=(k, 20), scores=scores)
     ran("robot", ablation="c2f", scores={"psnr": 25.0, "ssim": 0.9})
-    return lambda: tabulate(collect(runs))
+    return table
 
 
 def rows_below(text, heading):
     """Cells of the Markdown table below a heading, without its rule."""
     section = text.split(f"## {heading}\n")[1].split("\n## ")[0]
     lines = [line for line in section.splitlines() if line.startswith("|")]
-    return [
-        [cell.strip() for cell in line.strip("|").split(" | ")]
-        for k, line in enumerate(lines)
-        if k != 1
-    ]
+    return [[cell.strip() for cell in line[1:-1].split(" | ")] for line in lines[:1] + lines[2:]]
 
 
-def test_markdown_tables_read_back(table):
-    text = markdown(table(), {})
+def test_markdown_tables_read_back(pig_and_robot):
+    text = markdown(pig_and_robot(), {})
     head, *rows = rows_below(text, "pig_toy")
-    assert head == ["", "PSNR ↑", "SSIM ↑", "LPIPS ↓", "GPU (GB) ↓", "Time ↓"]
+    assert head == ["", *METRICS]
     assert rows[:3] == [
         ["Ours (base)", "*20.00*", "*0.500*", "–", "–", "**20 s**"],
         ["Ours w/ c2f", "<ins>24.00</ins>", "<ins>0.600</ins>", "–", "–", "<ins>21 s</ins>"],
-        [
-            "Ours w/ c2f, tv, cycle, flow (n = 2)",
-            "**30.00 ± 1.41**",
-            "**0.750 ± 0.035**",
-            "–",
-            "–",
-            "*22 ± 1 s*",
-        ],
+        [f"{FULL} (n = 2)", "**30.00 ± 1.41**", "**0.750 ± 0.035**", "–", "–", "*22 ± 1 s*"],
     ]
-    assert rows[3][0] == "*† published, on an NVIDIA GeForce RTX 3090*"
+    assert rows[3] == ["*† published, on an NVIDIA GeForce RTX 3090*", *[""] * 5]
     assert rows[4] == ["† D-NeRF", "31.23", "0.974", "0.0381", "12.4", "22.1hrs"]
     assert len(rows) == 3 + 1 + 9 and all(len(row) == 6 for row in rows)
     assert "# Runs compared\n\n5 finished runs below `" in text
@@ -70,18 +51,33 @@ def test_markdown_tables_read_back(table):
     assert "- No run has LPIPS: " in text
 
 
-def test_nothing_is_credited_that_is_not_shown(runs, ran):
+def test_methods_and_protocols_have_columns_where_they_differ(table, ran):
+    ran("a", "lego", method="dnerf", protocol="joint")
+    ran("b", "lego", method="dnerf", protocol="dynamic")
+    head, *rows = rows_below(markdown(table(), {}), "lego")
+    assert head == ["", "Protocol", *METRICS]
+    assert [row[:3] for row in rows[:2]] == [["D-NeRF", p, "29.00"] for p in ("dynamic", "joint")]
+    assert rows[3][:2] == ["† Neural Volumes", ""]
+    assert re.search("^D-NeRF +dynamic +29.00", plain(table()), flags=re.MULTILINE)
+    assert "D-NeRF & dynamic & 29.00" in latex(table())
+    ran("c", "lego", method="devrf", protocol="joint", scores={"psnr": 31.0})
+    head, *rows = rows_below(markdown(table(), {}), "lego")
+    assert head == ["Method", "Protocol", *METRICS]
+    assert rows[0][:3] == [FULL, "joint", "**31.00**"]
+
+
+def test_nothing_is_credited_that_is_not_shown(table, ran):
     ran("a")
-    text = markdown(tabulate(collect(runs)), {})
+    text = markdown(table(), {})
     assert "NeurIPS" not in text and "†" not in text and "± " not in text
 
 
-def test_failures_are_listed_with_their_reason(table, failed, runs):
+def test_failures_are_listed_with_their_reason(pig_and_robot, failed, runs):
     failed("7_robot", "data.frames: expected 2 or more", overrides=["data.frames=1"])
     failed("8_robot", "ZeroDivisionError: division by zero", mistake=False, overrides=[])
     (runs / "9_robot").mkdir()
     (runs / "9_robot" / "metrics.json").write_text("{")
-    found = table()
+    found = pig_and_robot()
     first = "7_robot (robot data.frames=1): data.frames: expected 2 or more"
     second = (
         "8_robot (robot): ZeroDivisionError: division by zero "
@@ -97,62 +93,43 @@ def test_failures_are_listed_with_their_reason(table, failed, runs):
     assert f"% failed: {first}\n% failed: {second}\n" in latex(found)
 
 
-def test_a_failure_is_told_by_what_it_does_not_share_with_the_others(runs, ran, failed):
+def test_a_failure_is_told_by_what_it_does_not_share_with_the_others(table, ran, failed):
     failed("1", "lost", overrides=["data.width=24", "seed=1"])
-    alone = markdown(tabulate(collect(runs)), {})
-    assert "- 1 (robot data.width=24 seed=1): lost\n" in alone
+    assert "- 1 (robot data.width=24 seed=1): lost\n" in markdown(table(), {})
     ran("0", overrides=["data.width=24", "seed=0"])
-    assert "- 1 (robot seed=1): lost\n" in markdown(tabulate(collect(runs)), {})
+    assert "- 1 (robot seed=1): lost\n" in markdown(table(), {})
 
 
-def test_plain_text_is_aligned_and_marked(table):
-    lines = plain(table()).splitlines()
-    assert lines[0].split() == "pig_toy PSNR ↑ SSIM ↑ LPIPS ↓ GPU (GB) ↓ Time ↓".split()
+def test_plain_text_is_aligned_and_marked(pig_and_robot):
+    lines = plain(pig_and_robot()).splitlines()
+    assert lines[0].split() == ["pig_toy", *" ".join(METRICS).split()]
     assert lines[1].startswith("Ours (base) ") and "20.00³" in lines[1] and "20 s¹" in lines[1]
     assert len({line.index("–") for line in lines[1:4]}) == 1
 
 
-def test_remarks_and_plots_are_linked(table):
-    text = markdown(table(), {"PSNR over time": "figures/a b.png"}, ["No plots: none."])
-    assert "\n- No plots: none.\n" in text
+def test_plots_are_linked(pig_and_robot):
+    text = markdown(pig_and_robot(), {"PSNR over time": "figures/a b.png"})
     assert "![PSNR over time](<figures/a b.png>)" in text
-    assert "No plots: none." in plain(table(), ["No plots: none."])
 
 
 @pytest.mark.parametrize(
-    ("text", "expected"),
+    ("escaped", "text", "expected"),
     [
-        ("pig_toy", "pig_toy"),
-        ("_a_ b", r"\_a\_ b"),
-        ("a|b", r"a\|b"),
-        ("2*3*4", r"2\*3\*4"),
-        ("<b> `x` [y]", r"\<b\> \`x\` \[y\]"),
-        ("a\\b", r"a\\b"),
+        (markdown_form.escaped, "pig_toy _a_ a|b 2*3*4", r"pig_toy \_a\_ a\|b 2\*3\*4"),
+        (markdown_form.escaped, "<b> `x` [y] a\\b", r"\<b\> \`x\` \[y\] a\\b"),
+        (latex_form.escaped, "pig_toy 100 % & more", r"pig\_toy 100 \% \& more"),
+        (latex_form.escaped, "$x^2$ #{1}", r"\$x\textasciicircum{}2\$ \#\{1\}"),
+        (latex_form.escaped, "C:\\x~", r"C:\textbackslash{}x\textasciitilde{}"),
+        (latex_form.escaped, "29 ± 1 ↑ ↓", r"29 $\pm$ 1 $\uparrow$ $\downarrow$"),
+        (latex_form.escaped, "– † <|>", r"-- $\dagger$ \textless{}\textbar{}\textgreater{}"),
     ],
 )
-def test_markdown_escapes(text, expected):
-    assert markdown_form.escaped(text) == expected
+def test_nothing_in_a_text_is_taken_for_markup(escaped, text, expected):
+    assert escaped(text) == expected
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("pig_toy", r"pig\_toy"),
-        ("100 % & more", r"100 \% \& more"),
-        ("a{b}", r"a\{b\}"),
-        ("$x^2$", r"\$x\textasciicircum{}2\$"),
-        ("C:\\x~#1", r"C:\textbackslash{}x\textasciitilde{}\#1"),
-        ("29.00 ± 0.11", r"29.00 $\pm$ 0.11"),
-        ("PSNR ↑ LPIPS ↓", r"PSNR $\uparrow$ LPIPS $\downarrow$"),
-        ("– † <a|b>", r"-- $\dagger$ \textless{}a\textbar{}b\textgreater{}"),
-    ],
-)
-def test_latex_escapes(text, expected):
-    assert latex_form.escaped(text) == expected
-
-
-def test_latex_has_the_scenes_side_by_side(table):
-    text = latex(table())
+def test_latex_has_the_scenes_side_by_side(pig_and_robot):
+    text = latex(pig_and_robot())
     assert text.isascii()
     assert r"\begin{tabular}{l|ccccc|ccccc|ccccc}" in text
     body = text.split(r"\begin{tabular}")[1].split(r"\end{tabular}")[0]
@@ -168,39 +145,20 @@ def test_latex_has_the_scenes_side_by_side(table):
         r"Ours w/ c2f & \devrfsecond{24.00} & \devrfsecond{0.600} & -- & -- & \devrfsecond{21 s} & "
         r"25.00 & 0.900 & -- & -- & 30 s & 24.50 & 0.750 & -- & -- & 26 s \\"
     )
-    full = next(line for line in lines if line.startswith("Ours w/ c2f, tv, cycle, flow (n = 2)"))
+    full = next(line for line in lines if line.startswith(f"{FULL} (n = 2)"))
     assert r"\devrfbest{30.00 $\pm$ 1.41}" in full
     # What a scene does not have stays empty.
     assert re.search(r"(&  ){9}&  \\\\$", full)
-    assert r"\textit{$\dagger$ published, on an NVIDIA GeForce RTX 3090}" in body
+    heading = r"\textit{$\dagger$ published, on an NVIDIA GeForce RTX 3090}"
+    assert f"\\hline\n\\multicolumn{{16}}{{l}}{{{heading}}} \\\\\n" in body
     assert r"\providecommand{\devrfbest}[1]{\textbf{#1}}" in text
 
 
-def test_latex_begins_a_new_table_after_three_scenes(runs, ran):
+def test_latex_begins_a_new_table_after_three_scenes(table, ran):
     for k in range(4):
         ran(str(k), f"scene_{k}")
-    text = latex(tabulate(collect(runs)))
+    text = latex(table())
     assert text.count(r"\begin{table*}") == text.count(r"\end{table*}") == 2
     assert text.count("{") == text.count("}")
     assert r"\begin{tabular}{l|ccccc|ccccc|ccccc}" in text
     assert r"\begin{tabular}{l|ccccc|ccccc}" in text  # the fourth, and the average
-
-
-def test_csv_has_a_row_for_each_run_and_failure_and_every_number(table, failed, tmp_path):
-    failed("7_robot", "data.frames: expected 2, or more", overrides=["data.frames=1"])
-    write_csv(tmp_path / "report.csv", table())
-    with (tmp_path / "report.csv").open(newline="", encoding="utf-8") as file:
-        rows = {row["folder"]: row for row in csv.DictReader(file)}
-    assert len(rows) == 6
-    one = rows["3_pig_toy"]
-    assert (one["status"], one["scene"]) == ("finished", "pig_toy")
-    assert one["row"] == "Ours w/ c2f, tv, cycle, flow"
-    assert (one["deformation.psnr"], one["deformation.lpips"]) == ("31.0", "")
-    assert (one["canonical.seconds"], one["deformation.seconds"]) == ("3", "20")
-    assert (one["train_seconds"], one["peak_gpu_gb"]) == ("23.0", "")
-    assert (one["run.seed"], one["run.choices.ablation"]) == ("1", "full")
-    assert one["run.git"] == "0123456789abcdef" and one["run.overrides"] == "seed=1"
-    lost = rows["7_robot"]
-    assert (lost["status"], lost["error"]) == ("failed", "data.frames: expected 2, or more")
-    assert (lost["mistake"], lost["run.overrides"]) == ("true", "data.frames=1")
-    assert lost["deformation.psnr"] == ""

@@ -2,19 +2,7 @@
 
 from __future__ import annotations
 
-import pytest
-
-pytest.importorskip("matplotlib", reason="needs devrf[plots]")
-
 from devrf.reporting.plots import against_views, plots, psnr_against_seconds, psnr_over_time
-from devrf.reporting.runs import collect
-from devrf.reporting.table import tabulate
-
-
-@pytest.fixture
-def table(runs):
-    """``table()``: the table of what lies in the folder."""
-    return lambda: tabulate(collect(runs))
 
 
 def curves(axes):

@@ -3,134 +3,146 @@
 from __future__ import annotations
 
 import json
+import math
 
 import pytest
 
 from devrf.errors import DevrfError
-from devrf.reporting.runs import collect
+from devrf.reporting.runs import collect, metric_over_time, number
 
 
-def names(found):
-    return [run.name for run in found.runs]
+def one(folder):
+    (run,) = collect(folder).runs.to_dict("records")
+    return run
+
+
+def written(folder, record):
+    folder.mkdir()
+    (folder / "metrics.json").write_text(json.dumps(record))
+    return one(folder)
 
 
 def test_runs_are_found_at_any_depth_in_the_order_of_their_jobs(runs, ran):
     for name in ("10_robot", "2_robot", "lego/paper/x", "sweeps/monday/0_robot"):
         ran(name)
-    found = names(collect(runs))
+    found = list(collect(runs).runs["folder"])
     assert found == ["2_robot", "10_robot", "lego/paper/x", "sweeps/monday/0_robot"]
 
 
-def test_the_folder_may_be_a_run_itself(ran):
-    folder = ran("one")
-    (run,) = collect(folder).runs
-    assert (run.name, run.folder, run.scene) == ("one", folder, "robot")
-
-
-def test_a_run_without_metrics_is_none(runs, ran):
+def test_only_finished_runs_are_found_and_hidden_folders_passed_over(runs, ran):
     ran("finished")
     (runs / "under_way" / "checkpoints").mkdir(parents=True)
     (runs / "under_way" / ".partial-metrics.json").write_text("{")
     (runs / "finished" / ".cache").mkdir()
     (runs / "finished" / ".cache" / "metrics.json").write_text("{")
     found = collect(runs)
-    assert names(found) == ["finished"] and not found.skipped
+    assert list(found.runs["folder"]) == ["finished"] and not found.skipped
 
 
-def test_a_record_is_read_back(runs, ran):
-    ran(
-        "a",
-        scores={"psnr": 30.5, "lpips": None},
-        seconds=(17.5, 38.0),
-        gpu=(2.0, 3.25),
-        overrides=["ablation=full", "seed=3"],
-        seed=3,
-        train_views=4,
-        wall_seconds={"evaluate": 7},
+def test_a_record_is_read_back(ran):
+    typed = {"overrides": ["ablation=full", "seed=3"], "seed": 3, "wall_seconds": {"evaluate": 7}}
+    folder = ran("a", scores={"psnr": 30.5}, seconds=(17.5, 38.0), gpu=(2.0, 3.25), **typed)
+    run = one(folder)
+    assert (run["folder"], run["path"], run["scene"]) == ("a", folder, "robot")
+    assert run["dynamic.psnr"] == run["deformation.psnr"] == 30.5 and run["dynamic.lpips"] is None
+    assert (run["train_seconds"], run["peak_gpu_gb"]) == (55.5, 3.25)
+    assert run["run.wall_seconds.evaluate"] == 7 and run["run.device"] == "a processor"
+    assert run["run.overrides"] == ["ablation=full", "seed=3"] and run["run.seed"] == 3
+    assert run["run.choices.ablation"] == "full"
+
+
+def test_records_of_earlier_versions_are_devrf_in_two_stages(runs):
+    deformation = {"psnr": 29.0, "seconds": 38.0, "back_offs": 1}
+    run = written(
+        runs / "old", {"scene": "x", "canonical": {"psnr": 31}, "deformation": deformation}
     )
-    (run,) = collect(runs).runs
-    assert run.number("deformation.psnr") == 30.5 and run.number("deformation.lpips") is None
-    assert (run.seconds, run.gpu_gb) == (55.5, 3.25)
-    assert run.number("run.wall_seconds.evaluate") == 7 and run.number("run.train_views") == 4
-    assert run.text("run.device") == "a processor" and run.text("run.seed") is None
-    assert run.record["run.overrides"] == "ablation=full seed=3"
-    assert run.setup.seed == 3 and run.setup.choices == {"ablation": "full", "logger": "csv"}
-
-
-def test_what_was_not_recorded_is_unknown(runs):
-    # As versions before the records of choices, seed and views wrote it.
-    old = {"scene": "robot", "deformation": {"psnr": 29.0, "seconds": 38.0}, "run": {"git": None}}
-    (runs / "old").mkdir()
-    (runs / "old" / "metrics.json").write_text(json.dumps(old))
-    (run,) = collect(runs).runs
-    assert (run.setup.choices, run.setup.overrides, run.setup.seed) == (None, (), None)
+    assert (run["method"], run["protocol"]) == ("devrf", "two_stage")
+    assert (run["static.psnr"], run["dynamic.psnr"]) == (31, 29.0)
+    assert run["dynamic.num_rollbacks"] == run["deformation.num_rollbacks"] == 1
     # Both stages make the time: that of one alone is not the run's.
-    assert run.seconds is None and run.gpu_gb is None and run.moving
+    assert math.isnan(run["train_seconds"]) and math.isnan(run["peak_gpu_gb"])
 
 
-def test_what_is_not_finite_is_unknown(runs, ran):
-    ran("a", scores={"psnr": float("nan"), "ssim": float("inf")})
-    (run,) = collect(runs).runs
-    assert run.number("deformation.psnr") is None and run.number("deformation.ssim") is None
-    assert not run.moving
+@pytest.mark.parametrize(
+    ("protocol", "static", "seconds"),
+    [("two_stage", 10, 48), ("two_stage", None, math.nan), ("joint", None, 38), ("dynamic", 1, 39)],
+)
+def test_the_time_is_that_of_the_stages_of_the_protocol(runs, protocol, static, seconds):
+    sections = {"static": {"seconds": static}, "dynamic": {"psnr": 29.0, "seconds": 38.0}}
+    record = {"scene": "x", "method": "dnerf", "protocol": protocol, **sections, "run": {}}
+    run = written(runs / "new", record)
+    assert (run["method"], run["protocol"]) == ("dnerf", protocol)
+    assert run["train_seconds"] == pytest.approx(seconds, nan_ok=True)
+
+
+def test_only_finite_numbers_are_values():
+    assert number(3) == 3.0
+    assert all(math.isnan(number(value)) for value in (None, True, "3", math.inf, math.nan))
 
 
 def test_a_failure_is_told_in_one_line(runs, failed):
     failed("0_robot", "data.frames: expected\n2 or more")
-    (failure,) = collect(runs).failures
-    assert (failure.name, failure.error) == ("0_robot", "data.frames: expected 2 or more")
-    assert (failure.scene, failure.mistake) == ("robot", True)
-    assert failure.setup.overrides == ("ablation=base",)
+    (failure,) = collect(runs).failures.to_dict("records")
+    assert (failure["folder"], failure["scene"]) == ("0_robot", "robot")
+    assert failure["error"] == "data.frames: expected 2 or more" and failure["mistake"] is True
+    assert failure["run.overrides"] == ["ablation=base"]
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (b"", "damaged"),
+        (b"{", "damaged"),
+        (b"\xff\xfe", "damaged"),
+        (b"[" * 100_000, "damaged"),
+        (b"[1, 2]", "the file"),
+        (b"{}", "scene|error"),
+        (b'{"scene": 3}', "scene|error"),
+        (b'{"scene": "robot", "error": 3, "run": []}', "run|error"),
+        (b'{"scene": "robot", "deformation": 30}', "deformation|error"),
+        (b'{"scene": "robot", "run": {"choices": ["full"]}}', "run.choices|error"),
+        (b'{"scene": "robot", "run": {"overrides": [1]}}', "run.overrides.0|error"),
+        (b'{"scene": "robot", "run": {"seed": "one"}}', "run.seed|error"),
+        (b'{"scene": "robot", "run": {"device": 3}}', "run.device|error"),
+    ],
+)
+def test_damaged_records_are_skipped_with_a_line_that_says_where(runs, ran, content, reason):
+    ran("good")
+    for name in ("failure", "metrics"):
+        (runs / name).mkdir()
+        (runs / name / f"{name}.json").write_bytes(content)
+    found = collect(runs)
+    assert list(found.runs["folder"]) == ["good"] and found.failures.empty
+    assert len(found.skipped) == 2
+    for line, name in zip(found.skipped, ("failure", "metrics"), strict=True):
+        assert line.startswith(f"{runs / name / name}.json: skipped; ") and "\n" not in line
+        assert any(part in line for part in reason.split("|"))
+
+
+def test_no_folder_is_an_error(tmp_path):
+    with pytest.raises(DevrfError, match="report.runs: no folder .*nowhere"):
+        collect(tmp_path / "nowhere")
+
+
+def test_curves_are_over_the_dynamic_images_views_of_a_time_averaged(ran):
+    folder = ran("a", frames=[(1.0, 20.0), (0.0, 30.0), (0.0, 32.0)])
+    assert metric_over_time(folder, "psnr").to_dict() == {0.0: 31.0, 1.0: 20.0}
+    assert metric_over_time(folder, "ssim").empty and metric_over_time(folder, "nothing").empty
 
 
 @pytest.mark.parametrize(
     "content",
     [
         b"",
-        b"{",
-        b"\xff\xfe",
-        b"[1, 2]",
-        b"{}",
-        b'{"scene": 3}',
-        b"[" * 100_000,
-        b'{"scene": "robot", "run": []}',
-        b'{"scene": "robot", "deformation": 30}',
-        b'{"scene": "robot", "run": {"choices": ["full"]}}',
-        b'{"scene": "robot", "run": {"overrides": "seed=1"}}',
-        b'{"scene": "robot", "run": {"overrides": [1]}}',
-        b'{"scene": "robot", "run": {"seed": "one"}}',
+        b"\xff",
+        b"capture,psnr\ndynamic,3\n",
+        b"a\0b",
+        b"capture,time,psnr\ndynamic,x,3\n",
+        None,
     ],
 )
-def test_damaged_records_are_skipped_with_a_line_that_names_them(runs, ran, content):
-    ran("good")
-    for name in ("metrics.json", "failure.json"):
-        folder = runs / name.partition(".")[0]
-        folder.mkdir()
-        (folder / name).write_bytes(content)
-    found = collect(runs)
-    assert names(found) == ["good"] and not found.failures
-    assert len(found.skipped) == 2
-    for line, path in zip(
-        found.skipped, ("failure/failure.json", "metrics/metrics.json"), strict=True
-    ):
-        assert line.startswith(f"{runs / path}: skipped; ") and "\n" not in line
-
-
-def test_no_folder_is_a_mistake(tmp_path):
-    with pytest.raises(DevrfError, match="report.runs: no folder .*nowhere"):
-        collect(tmp_path / "nowhere")
-
-
-def test_curves_are_over_the_moving_images_views_of_a_time_averaged(runs, ran):
-    ran("a", frames=[(1.0, 20.0), (0.0, 30.0), (0.0, 32.0)])
-    (run,) = collect(runs).runs
-    assert run.over_time("psnr") == ((0.0, 31.0), (1.0, 20.0))
-    assert run.over_time("ssim") == () and run.over_time("nothing") == ()
-
-
-@pytest.mark.parametrize("content", [b"", b"\xff", b"capture,psnr\ndynamic,3\n", b"a\0b", None])
-def test_a_run_without_readable_frames_has_no_curve(runs, ran, content):
+def test_a_run_without_readable_frames_has_no_curve(ran, content):
     folder = ran("a")
     if content is not None:
         (folder / "frames.csv").write_bytes(content)
-    assert collect(runs).runs[0].over_time("psnr") == ()
+    assert metric_over_time(folder, "psnr").empty

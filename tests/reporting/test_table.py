@@ -2,36 +2,21 @@
 
 from __future__ import annotations
 
+import pandas as pd
 import pytest
 
-from devrf.reporting.columns import (
-    COLUMNS,
-    GPU,
-    LPIPS,
-    PSNR,
-    SSIM,
-    TIME,
-    Cell,
-    cell,
-    ranked,
-    shown,
-)
-from devrf.reporting.runs import collect
-from devrf.reporting.table import tabulate
+from devrf.reporting.table import GPU, LPIPS, PSNR, SSIM, TIME, ranked, shown
+
+FULL = "Ours w/ c2f, tv, cycle, flow"
 
 
-@pytest.fixture
-def table(runs):
-    """``table(…)``: the table of what lies in the folder."""
-    return lambda *published: tabulate(collect(runs), *published)
-
-
-def texts(row):
-    return [cell.text for cell in row.cells]
+def texts(rows):
+    """The cells of each row, by label."""
+    return {label: list(cells) for label, cells in rows["text"].T.items()}
 
 
 def ranks(rows, column):
-    return [row.cells[COLUMNS.index(column)].rank for row in rows]
+    return list(rows["rank", column.title])
 
 
 @pytest.mark.parametrize(
@@ -54,37 +39,39 @@ def test_digits_are_the_papers_and_times_are_in_the_unit_that_reads_best(value, 
     assert shown(value, column) == text
 
 
-def test_seeds_are_averaged_with_their_spread():
-    # 29, 30, 31: mean 30, sample standard deviation 1.
-    assert cell([29.0, 30.0, 31.0], PSNR) == Cell(30.0, "30.00 ± 1.00")
-    assert cell([240.0, 360.0], TIME) == Cell(300.0, "5.0 ± 1.4 min")  # 60·√2 s
-    assert cell([29.0], PSNR) == Cell(29.0, "29.00")
+def test_seeds_are_averaged_with_their_spread(table, ran):
+    # 29, 30, 31: mean 30, sample standard deviation 1. 240, 360 and 300 s: 5 ± 1 min.
+    for seed, (psnr, seconds) in enumerate([(29, 100), (30, 220), (31, 160)]):
+        ran(str(seed), scores={"psnr": psnr}, seconds=(140, seconds), seed=seed)
+    ((cells),) = texts(table().blocks[0].measured).values()
+    assert (cells[0], cells[-1]) == ("30.00 ± 1.00", "5.0 ± 1.0 min")
 
 
-def test_a_mean_of_fewer_seeds_than_the_row_has_is_not_shown():
-    assert cell([29.0, None], PSNR) == Cell(None, "–")
-    assert cell([None], LPIPS) == Cell(None, "–")
+def test_a_mean_of_fewer_runs_than_the_row_has_is_not_shown(table, ran):
+    for seed, lpips in enumerate([0.1, None]):
+        ran(str(seed), scores={"lpips": lpips}, seed=seed)
+    ((cells),) = texts(table().blocks[0].measured).values()
+    assert cells == ["29.00 ± 0.00", "0.950 ± 0.000", "–", "–", "30 ± 0 s"]
 
 
 @pytest.mark.parametrize(
     ("values", "column", "expected"),
     [
-        ([20, 24, 22, 21], PSNR, [None, 1, 2, 3]),
-        ([0.3, 0.1, 0.2, 0.4], LPIPS, [3, 1, 2, None]),
+        ([20, 24, 22, 21], PSNR, [0, 1, 2, 3]),
+        ([0.3, 0.1, 0.2, 0.4], LPIPS, [3, 1, 2, 0]),
         # Kuka's LPIPS in the paper: three methods share the best value.
         ([0.105, 0.0147, 0.0176, 0.0147, 0.0147], LPIPS, [3, 1, 2, 1, 1]),
         # What looks the same is the same.
         ([29.421, 29.419, 28], PSNR, [1, 1, 2]),
-        ([None, 22, 21], PSNR, [None, 1, 2]),
-        ([22], PSNR, [None]),
-        ([22, 22], PSNR, [None, None]),
-        ([None, None], PSNR, [None, None]),
-        ([None, 22], PSNR, [None, None]),
+        ([None, 22, 21], PSNR, [0, 1, 2]),
+        ([22], PSNR, [0]),
+        ([22, 22], PSNR, [0, 0]),
+        ([None, None], PSNR, [0, 0]),
+        ([None, 22], PSNR, [0, 0]),
     ],
 )
 def test_the_best_three_values_are_marked(values, column, expected):
-    cells = [cell([value], column) for value in values]
-    assert [c.rank for c in ranked(cells, column)] == expected
+    assert list(ranked(pd.Series(values, dtype=float), column)) == expected
 
 
 def test_a_block_by_hand(table, ran):
@@ -92,14 +79,14 @@ def test_a_block_by_hand(table, ran):
     ran("1", ablation="c2f", scores={"psnr": 23.98, "ssim": 0.932}, seconds=(17, 60), gpu=(2.5, 2))
     ran("2", ablation="full", scores={"psnr": 29.42, "ssim": 0.977, "lpips": 0.1}, gpu=(1.0, 2.0))
     (block,) = table().blocks
-    assert block.title == "robot" and block.published == ()
-    assert [(row.label, *texts(row)) for row in block.measured] == [
-        ("Ours (base)", "20.07", "0.834", "0.2000", "2.0", "30 s"),
-        ("Ours w/ c2f", "23.98", "0.932", "–", "2.5", "77 s"),
-        ("Ours w/ c2f, tv, cycle, flow", "29.42", "0.977", "0.1000", "2.0", "30 s"),
-    ]
+    assert block.title == "robot" and block.published.empty
+    assert texts(block.measured) == {
+        "Ours (base)": ["20.07", "0.834", "0.2000", "2.0", "30 s"],
+        "Ours w/ c2f": ["23.98", "0.932", "–", "2.5", "77 s"],
+        FULL: ["29.42", "0.977", "0.1000", "2.0", "30 s"],
+    }
     assert ranks(block.measured, PSNR) == [3, 2, 1]
-    assert ranks(block.measured, LPIPS) == [2, None, 1]
+    assert ranks(block.measured, LPIPS) == [2, 0, 1]
     assert ranks(block.measured, GPU) == [1, 2, 1]
     assert ranks(block.measured, TIME) == [1, 2, 1]
 
@@ -109,7 +96,7 @@ def test_times_of_different_devices_are_not_ranked(table, ran):
     ran("1", seconds=(9, 9), device="another processor", scores={"psnr": 31})
     found = table()
     (block,) = found.blocks
-    assert ranks(block.measured, TIME) == [None, None]
+    assert ranks(block.measured, TIME) == [0, 0]
     assert ranks(block.measured, PSNR) == [2, 1]
     assert "Memory and time are marked only among rows of one device." in found.notes
 
@@ -122,13 +109,14 @@ def test_the_average_is_over_scenes_that_a_configuration_was_run_on(table, ran):
     ran("robot_c2f", ablation="c2f")
     *scenes, average = table().blocks
     assert [block.title for block in scenes] == ["flower", "robot"]
-    assert average.title == "average over 2 scenes"
+    assert average.title == "average over 2 scenes" and average.published.empty
     # Base: (23 + (20 + 22) / 2) / 2 = 22. c2f was run on the robot alone.
-    assert [(row.label, row.cells[0].text, row.seeds) for row in average.measured] == [
-        ("Ours (base)", "22.00", {1, 2}),
-        ("Ours w/ c2f, tv, cycle, flow", "31.50", {1}),
-    ]
-    assert average.published == ()
+    assert {label: cells[0] for label, cells in texts(average.measured).items()} == {
+        "Ours (base)": "22.00",
+        FULL: "31.50",
+    }
+    assert list(average.measured["head", "counts"]) == [{1, 2}, {1}]
+    assert ranks(average.measured, PSNR) == [2, 1]
 
 
 def test_no_average_of_what_was_not_run_everywhere(table, ran):
@@ -140,54 +128,47 @@ def test_no_average_of_what_was_not_run_everywhere(table, ran):
 def test_a_value_that_one_scene_lacks_has_no_average(table, ran):
     ran("a", "robot", scores={"lpips": 0.1})
     ran("b", "flower", scores={"lpips": None})
-    assert table().blocks[-1].measured[0].cells[COLUMNS.index(LPIPS)].text == "–"
+    assert table().blocks[-1].measured.loc[FULL, ("text", "LPIPS")] == "–"
 
 
 def test_published_rows_are_those_of_the_scenes_that_were_run(table, ran):
     ran("a", "lego")
     ran("b", "robot")
     lego, robot = table().blocks[:2]
-    assert len(lego.published) == 17 and robot.published == ()
-    assert texts(lego.published[0]) == ["5.958", "0.369", "0.8314", "19.4", "22.4hrs"]
-    assert all(cell.rank is None for row in lego.published for cell in row.cells)
-    assert not [block for block in table("none").blocks if block.published]
+    assert len(lego.published) == 17 and robot.published.empty
+    first = ["5.958", "0.369", "0.8314", "19.4", "22.4hrs"]
+    assert texts(lego.published)["Neural Volumes"] == first
+    assert not lego.published["rank"].any(axis=None)
+    assert all(block.published.empty for block in table("none").blocks)
     everything = table("all").blocks
-    assert [block.title for block in everything] == [
-        "lego",
-        "robot",
-        "floating_robot",
-        "daisy",
-        "glove",
-        "kuka",
-        "pig_toy",
-        "average over 2 scenes",
-    ]
-    assert everything[2].measured == () and len(everything[6].published) == 9
+    others = ["floating_robot", "daisy", "glove", "kuka", "pig_toy"]
+    assert [b.title for b in everything] == ["lego", "robot", *others, "average over 2 scenes"]
+    assert everything[2].measured.empty and len(everything[6].published) == 9
 
 
 def test_published_rows_are_averaged_over_the_same_scenes(table, ran):
     for scene in ("lego", "pig_toy"):
         ran(scene, scene)
-    average = table().blocks[-1].published
-    rows = {row.label: texts(row) for row in average}
+    rows = texts(table().blocks[-1].published)
     # (29.25 + 30.85) / 2; (9 + 10) / 2 minutes.
     full = rows["DeVRF w/ c2f, tv, cycle, flow"]
     assert (full[0], full[-1]) == ("30.05", "9.5 min")
     assert "Neural Volumes" not in rows  # not in the table of pig toy
 
 
-def test_a_column_that_nobody_has_is_explained(table, ran):
+def test_a_column_without_values_is_explained(table, ran):
     ran("a")
     found = table()
-    assert texts(found.blocks[0].measured[0])[2:4] == ["–", "–"]
+    assert texts(found.blocks[0].measured)[FULL][2:4] == ["–", "–"]
     (lpips, gpu) = found.notes
     assert lpips.startswith("No run has LPIPS: ") and "evaluation.lpips_weights" in lpips
     assert gpu.startswith("No run has GPU (GB): ")
 
 
-def test_what_was_scored_at_rest_only_is_named_and_not_tabulated(table, ran):
+@pytest.mark.parametrize("psnr", [None, float("nan")])
+def test_what_was_scored_at_rest_only_is_named_and_not_tabulated(table, ran, psnr):
     ran("a")
-    ran("still", scores={"psnr": None})
+    ran("still", scores={"psnr": psnr})
     found = table()
     assert len(found.rows) == 1
     assert "Scored at rest only, and therefore not in the tables: still." in found.notes

@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
+import csv
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
-import devrf
 from devrf.errors import DevrfError
 from devrf.reporting.runs import collect
-from devrf.reporting.write import NO_PLOTS, ReportSettings, write_report
+from devrf.reporting.settings import ReportSettings
+from devrf.reporting.write import write_report
 
 
 def files(folder):
     return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
 
 
-def test_it_lies_beside_the_runs_and_is_none(runs, ran):
-    pytest.importorskip("matplotlib", reason="needs devrf[plots]")
+def test_a_report_is_written_beside_the_runs_and_not_taken_for_one(runs, ran):
     ran("a", frames=[(0.0, 20.0), (1.0, 21.0)])
     written = write_report(ReportSettings(runs))
     assert written.path == runs / "report" / "report.md"
@@ -33,26 +32,45 @@ def test_it_lies_beside_the_runs_and_is_none(runs, ran):
     }
     for plot in plots:
         assert f"(<{plot}.png>)" in written.path.read_text(encoding="utf-8")
-    again = write_report(ReportSettings(runs))
-    assert len(again.table.found.runs) == 1 and not again.table.found.skipped
-    assert len(collect(runs).runs) == 1
+    again = write_report(ReportSettings(runs)).table.found
+    assert len(again.runs) == len(collect(runs).runs) == 1 and not again.skipped
 
 
-def test_it_can_be_written_elsewhere(runs, ran, tmp_path):
-    ran("a")
-    written = write_report(ReportSettings(runs, into=tmp_path / "some" / "where"))
-    assert written.path == tmp_path / "some" / "where" / "report.md"
-    assert not (runs / "report").exists()
+def test_csv_has_a_row_for_each_run_and_failure_and_every_number(runs, ran, failed):
+    ran("a", scores={"psnr": 31.0}, seconds=(3, 20), seed=1, overrides=["seed=1"])
+    ran("at_rest", scores={"psnr": None})
+    failed("7_robot", "data.frames: expected 2, or more", overrides=["data.frames=1", "seed=0"])
+    write_report(ReportSettings(runs))
+    with (runs / "report" / "report.csv").open(newline="", encoding="utf-8") as file:
+        rows = {row["folder"]: row for row in csv.DictReader(file)}
+    assert set(rows) == {"a", "at_rest", "7_robot"}
+    one = rows["a"]
+    assert (one["status"], one["scene"]) == ("finished", "robot")
+    assert (one["method"], one["protocol"]) == ("devrf", "two_stage")
+    assert one["row"] == "Ours w/ c2f, tv, cycle, flow" and rows["at_rest"]["row"] == ""
+    assert (one["deformation.psnr"], one["deformation.lpips"]) == ("31.0", "")
+    assert (one["canonical.seconds"], one["deformation.seconds"]) == ("3", "20")
+    assert (one["train_seconds"], one["peak_gpu_gb"]) == ("23.0", "")
+    assert (one["run.seed"], one["run.choices.ablation"]) == ("1", "full")
+    assert one["run.git"] == "0123456789abcdef" and one["run.overrides"] == "seed=1"
+    lost = rows["7_robot"]
+    assert (lost["status"], lost["error"]) == ("failed", "data.frames: expected 2, or more")
+    assert (lost["mistake"], lost["run.overrides"]) == ("true", "data.frames=1 seed=0")
+    assert lost["deformation.psnr"] == "" and lost["run.choices.ablation"] == "base"
 
 
 def test_failures_alone_are_a_report(runs, failed):
     failed("a", "out of luck")
     text = write_report(ReportSettings(runs)).path.read_text(encoding="utf-8")
     assert "0 finished runs" in text and "out of luck" in text
+    failed("b", "too early to know", scene=None, overrides=None, mistake=None)
+    assert "- b (unknown scene): too early to know" in write_report(
+        ReportSettings(runs, published="all")
+    ).path.read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("damaged", [False, True])
-def test_no_runs_are_a_mistake_and_nothing_is_written(runs, damaged):
+def test_no_runs_are_an_error_and_nothing_is_written(runs, damaged):
     if damaged:
         (runs / "metrics.json").write_text("{")
     with pytest.raises(DevrfError, match="report.runs: no finished run below") as error:
@@ -61,30 +79,14 @@ def test_no_runs_are_a_mistake_and_nothing_is_written(runs, damaged):
     assert not (runs / "report").exists()
 
 
-def test_without_matplotlib_there_are_tables_and_a_line(runs, ran, monkeypatch):
-    monkeypatch.delitem(sys.modules, "devrf.reporting.plots", raising=False)
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    ran("a", frames=[(0.0, 20.0)])
-    written = write_report(ReportSettings(runs))
-    assert written.remarks == (NO_PLOTS,) and 'pip install "devrf[plots]"' in NO_PLOTS
-    assert files(runs / "report") == {"report.md", "report.csv", "report.tex"}
-    assert NO_PLOTS.split("(")[0] in written.path.read_text(encoding="utf-8")
-
-
-def test_it_needs_no_torch(runs, ran):
-    ran("a")
-    script = (
-        "import sys; from devrf.reporting.write import ReportSettings, write_report\n"
-        f"write_report(ReportSettings({str(runs)!r}))\n"
-        "assert not {'torch', 'lightning', 'hydra'} & set(sys.modules)\n"
-    )
-    source = str(Path(devrf.__file__).parents[1])
-    done = subprocess.run(
-        [sys.executable, "-c", script],
-        env={"PYTHONPATH": source, "HOME": str(runs)},
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+@pytest.mark.parametrize(
+    ("module", "absent"),
+    [
+        ("devrf.reporting.write", {"torch", "lightning", "hydra"}),
+        ("devrf.cli.config, devrf.cli.sweep_report", {"torch", "pandas", "matplotlib"}),
+    ],
+)
+def test_imports_are_no_heavier_than_needed(module, absent):
+    script = f"import sys, {module}; assert not {absent} & set(sys.modules)"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

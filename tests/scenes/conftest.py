@@ -9,16 +9,35 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import cv2
 import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
 
+from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
+from devrf.geometry.distortion import Distortion
 from devrf.scenes.lens import Lens
+from devrf.scenes.reader import SceneReader
 from devrf.scenes.resampling import shrink_pixels
 from devrf.scenes.scene import Views
+
+
+@pytest.fixture
+def refusal() -> Callable[..., str]:
+    """A function that returns the one line with which a reader refuses a scene or an option."""
+
+    def message_of(reader: type[SceneReader], root: Path | str, **options: Any) -> str:
+        with pytest.raises(DevrfError) as caught:
+            reader(root, **options).read()
+        message = str(caught.value)
+        assert len(message) < 500 and len(message.splitlines()) == 1 and message.isprintable()
+        return message
+
+    return message_of
+
 
 # Not square, so that a swap of the axes cannot hide: 32 columns, 24 rows.
 WIDTH, HEIGHT, ANGLE = 32, 24, 0.8
@@ -100,13 +119,13 @@ class SceneFolder:
 
 
 @pytest.fixture
-def scene_folder(tmp_path: Path) -> SceneFolder:
+def scene_folder(tmp_path) -> SceneFolder:
     """A valid scene on disk."""
     return SceneFolder(tmp_path / "scene")
 
 
 @pytest.fixture
-def single_folder(tmp_path: Path) -> Path:
+def single_folder(tmp_path) -> Path:
     """A scene in D-NeRF's layout: 8 training images and 3 test images of a moving camera."""
     root = tmp_path / "monocular"
     size: dict[str, Any] = {"width": WIDTH, "height": HEIGHT, "angle": ANGLE}
@@ -185,11 +204,25 @@ def _balls(numbers: tuple[float, ...], lens: Lens, width: int, height: int) -> n
 
 @cache
 def _directions(lens: Lens, width: int, height: int) -> torch.Tensor:
-    """(H, W, 2) where the lens looks in each pixel: x/z and y/z, y down."""
-    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    py = (y.double() + 0.5 - lens.center[1]) / lens.focal[1]
-    px = (x.double() + 0.5 - lens.center[0] - lens.skew * py) / lens.focal[0]
-    return lens.distortion.undistort(torch.stack([px, py], dim=-1))
+    """(H, W, 2) where the lens looks in each pixel: x/z and y/z, y down; by OpenCV."""
+    (fx, fy), (cx, cy) = lens.focal, lens.center
+    (k1, k2, k3, _), tangential = lens.distortion.radial, lens.distortion.tangential
+    y, x = np.mgrid[:height, :width] + 0.5
+    py = (y - cy) / fy
+    px = (x - cx - lens.skew * py) / fx
+    straight = cv2.undistortPoints(
+        np.stack([px, py], axis=-1).reshape(-1, 1, 2),
+        np.eye(3),
+        np.array([k1, k2, *tangential, k3]),
+        criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12),
+    )
+    return torch.from_numpy(straight.reshape(height, width, 2))
+
+
+@pytest.fixture
+def lens_directions() -> Callable[[Lens, int, int], torch.Tensor]:
+    """The function :func:`_directions`."""
+    return _directions
 
 
 def ball_centers(pixels: torch.Tensor) -> torch.Tensor:
@@ -285,6 +318,59 @@ class LlffFolder:
 
 
 @pytest.fixture
-def llff_folder(tmp_path: Path) -> LlffFolder:
+def llff_folder(tmp_path) -> LlffFolder:
     """A valid forward-facing scene on disk."""
     return LlffFolder(tmp_path / "toy")
+
+
+BALLS_LENS = Lens((88.0, 84.0), (42.0, 28.0), Distortion((-0.3, 0.1, 0.01, 0.0), (0.006, -0.008)))
+
+
+class BallsFolder:
+    """Writes ``transforms.json`` and pictures of the balls, 80×60 px, in nerfstudio's layout."""
+
+    WIDTH, HEIGHT = 80, 60
+    # BALLS_LENS in the words of the file, and keys that say nothing of the cameras.
+    SHARED = {
+        **{"camera_model": "OPENCV", "fl_x": 88.0, "fl_y": 84.0, "cx": 42.0, "cy": 28.0},
+        **{"w": 80, "h": 60, "k1": -0.3, "k2": 0.1, "k3": 0.01, "p1": 0.006, "p2": -0.008},
+        **{"applied_transform": [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]], "applied_scale": 0.5},
+    }
+
+    @classmethod
+    def write(
+        cls,
+        folder: Path,
+        times: list[float] | None,
+        *,
+        turn: float = 0.0,
+        lens: Callable[[int], Lens] = lambda index: BALLS_LENS,
+        shared: dict[str, Any] = SHARED,
+        views: int | None = None,
+    ) -> dict[str, Any]:
+        """One image for each time (None: nine images without), by ``views`` cameras in turn."""
+        count = 9 if times is None else len(times)
+        cameras = ring(views or count, turn=turn, width=cls.WIDTH, height=cls.HEIGHT, angle=0.9)
+        frames = frames_json(cameras[torch.arange(count) % len(cameras)], times, "images")
+        (folder / "images").mkdir(parents=True)
+        for i, frame in enumerate(frames):
+            frame["file_path"] += ".png"
+            pose = torch.tensor(frame["transform_matrix"][:3])
+            picture = balls_picture(pose, lens(i), cls.WIDTH, cls.HEIGHT)
+            iio.imwrite(folder / frame["file_path"], picture)
+        content = {**shared, "frames": frames}
+        (folder / "transforms.json").write_text(json.dumps(content))
+        return content
+
+    @staticmethod
+    def edit(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
+        """Change the content of ``transforms.json``."""
+        content = json.loads((folder / "transforms.json").read_text())
+        change(content)
+        (folder / "transforms.json").write_text(json.dumps(content))
+
+
+@pytest.fixture
+def balls() -> type[BallsFolder]:
+    """The writer of pictures of the balls."""
+    return BallsFolder

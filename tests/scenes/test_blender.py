@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from devrf.scenes.blender import read_blender
+from devrf.scenes.blender import BlenderReader
 
 SUZANNE = Path(__file__).resolve().parents[2] / ".." / "shared" / "scenes" / "suzanne"
 
@@ -24,8 +24,8 @@ def drop_times(content: dict[str, Any]) -> None:
         del frame["time"]
 
 
-def test_published_layout(scene_folder: Any) -> None:
-    scene = read_blender(scene_folder.root)
+def test_published_layout(scene_folder):
+    scene = BlenderReader(scene_folder.root).read()
     assert (scene.name, scene.kind, scene.background) == ("scene", "inward", "white")
     assert scene.static.train.pixels.shape == (6, 24, 32, 4)
     assert scene.static.train.pixels.dtype == torch.uint8
@@ -41,8 +41,8 @@ def test_published_layout(scene_folder: Any) -> None:
     assert scene.static.train.view.tolist() == list(range(6))
 
 
-def test_camera_angle_becomes_a_focal_length_and_a_known_pixel(scene_folder: Any) -> None:
-    cameras = read_blender(scene_folder.root).static.train.cameras
+def test_camera_angle_becomes_a_focal_length_and_a_known_pixel(scene_folder):
+    cameras = BlenderReader(scene_folder.root).read().static.train.cameras
     focal = 16 / math.tan(0.4)
     assert cameras.focal[0].tolist() == pytest.approx([focal, focal])
     assert cameras.center[0].tolist() == [16, 12]
@@ -52,95 +52,91 @@ def test_camera_angle_becomes_a_focal_length_and_a_known_pixel(scene_folder: Any
     assert float(depth) == pytest.approx(4, abs=1e-5)
 
 
-def test_downscale_scales_each_axis_by_what_is_left_of_it(scene_folder: Any) -> None:
+def test_downscale_scales_each_axis_by_what_is_left_of_it(scene_folder):
     # 32×24 by 3: 10×8, so the focal lengths scale by 10/32 and 8/24.
-    train = read_blender(scene_folder.root, downscale=3).dynamic.train
+    train = BlenderReader(scene_folder.root, downscale=3).read().dynamic.train
     assert train.pixels.shape == (6, 8, 10, 4)
     focal = 16 / math.tan(0.4)
     assert train.cameras.focal[0].tolist() == pytest.approx([focal * 10 / 32, focal / 3])
     assert train.cameras.center[0].tolist() == pytest.approx([5, 4])
-    half = read_blender(scene_folder.root, downscale=2).dynamic.train
+    half = BlenderReader(scene_folder.root, downscale=2).read().dynamic.train
     assert half.pixels[1, 4, 6].tolist() == [1, 100, 200, 255]
 
 
-def test_intrinsics_in_pixels_are_honoured(scene_folder: Any) -> None:
+def test_intrinsics_in_pixels_are_honoured(scene_folder):
     def give_pixels(content: dict[str, Any]) -> None:
         del content["camera_angle_x"]
         content.update(fl_x=40.0, fl_y=44.0, cx=15.0, cy=13.0)
 
     scene_folder.edit(scene_folder.static / "transforms_train.json", give_pixels)
-    cameras = read_blender(scene_folder.root, downscale=2).static.train.cameras
+    cameras = BlenderReader(scene_folder.root, downscale=2).read().static.train.cameras
     assert cameras.focal[0].tolist() == [20, 22] and cameras.center[0].tolist() == [7.5, 6.5]
 
 
-def test_a_lens_is_undistorted_and_its_flow_files_are_left_out(
-    scene_folder: Any, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_lens_is_undistorted_and_its_flow_files_are_left_out(scene_folder, caplog):
     flow = scene_folder.dynamic / "train_flow"
     flow.mkdir()
     for index in range(2, 6):
         np.savez(flow / f"{index:03d}_bwd.npz", flow=np.zeros((24, 32, 2)), mask=np.ones((24, 32)))
-    assert read_blender(scene_folder.root).dynamic.train.flow is not None
+    assert BlenderReader(scene_folder.root).read().dynamic.train.flow is not None
     file = scene_folder.dynamic / "transforms_train.json"
     # Pincushion: the pinhole needs a longer focal length to see no empty border.
     scene_folder.edit(file, lambda content: content.update(k1=0.3))
-    train = read_blender(scene_folder.root).dynamic.train
+    train = BlenderReader(scene_folder.root).read().dynamic.train
     assert train.flow is None and "left out: they are of images before undistortion" in caplog.text
     assert float(train.cameras.focal[0, 0]) > 16 / math.tan(0.4) + 0.5
 
 
-def test_times_come_from_the_order_where_the_file_gives_none(scene_folder: Any) -> None:
+def test_times_come_from_the_order_where_the_file_gives_none(scene_folder):
     scene_folder.edit(scene_folder.dynamic / "transforms_train.json", drop_times)
     scene_folder.edit(scene_folder.dynamic / "transforms_test.json", drop_times)
-    scene = read_blender(scene_folder.root)
+    scene = BlenderReader(scene_folder.root).read()
     assert scene.dynamic.train.times.tolist() == [0, 0, 0.5, 0.5, 1, 1]
     assert scene.dynamic.test.times.tolist() == [0, 0.5, 1]
 
 
-def test_views_are_counted_from_the_poses_not_from_the_folder(scene_folder: Any) -> None:
+def test_views_are_counted_from_the_poses_not_from_the_folder(scene_folder):
     scene_folder.dynamic.rename(scene_folder.root / "dynamic_16views")
-    train = read_blender(scene_folder.root).dynamic.train
+    train = BlenderReader(scene_folder.root).read().dynamic.train
     assert train.view.tolist() == [0, 1, 0, 1, 0, 1]
 
 
-def test_train_views_keeps_the_first_views(scene_folder: Any) -> None:
-    train = read_blender(scene_folder.root, train_views=1).dynamic.train
+def test_train_views_keeps_the_first_views(scene_folder):
+    train = BlenderReader(scene_folder.root, train_views=1).read().dynamic.train
     assert train.view.tolist() == [0, 0, 0] and train.times.tolist() == [0, 0.5, 1]
 
 
-def test_frames_keeps_the_first_and_the_last_time(
-    scene_folder: Any, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_frames_keeps_the_first_and_the_last_time(scene_folder, caplog):
     caplog.set_level(logging.INFO)
-    scene = read_blender(scene_folder.root, frames=2)
+    scene = BlenderReader(scene_folder.root, frames=2).read()
     assert scene.dynamic.train.times.tolist() == [0, 0, 1, 1]
     assert scene.dynamic.test.times.tolist() == [0, 1]
     assert scene.dynamic.train.flow is None and "flow files dropped" in caplog.text
-    assert len(read_blender(scene_folder.root, frames=3).dynamic.train) == 6
+    assert len(BlenderReader(scene_folder.root, frames=3).read().dynamic.train) == 6
 
 
-def test_flow_belongs_to_the_place_in_the_file(scene_folder: Any) -> None:
+def test_flow_belongs_to_the_place_in_the_file(scene_folder):
     folder = scene_folder.dynamic / "train_flow"
     folder.mkdir()
     for index in range(2, 6):
         vectors = np.full((24, 32, 2), float(index), dtype=np.float32)
         np.savez(folder / f"{index:03d}_bwd.npz", flow=vectors, mask=np.ones((24, 32), bool))
-    flow = read_blender(scene_folder.root, downscale=3).dynamic.train.flow
+    flow = BlenderReader(scene_folder.root, downscale=3).read().dynamic.train.flow
     assert flow is not None and flow.vectors.shape == (6, 8, 10, 2)
     assert not flow.valid[:2].any() and flow.valid[2:].all()
     assert flow.vectors[5, 3, 4].tolist() == pytest.approx([5 * 10 / 32, 5 / 3])
-    second = read_blender(scene_folder.root, train_views=1).dynamic.train.flow
+    second = BlenderReader(scene_folder.root, train_views=1).read().dynamic.train.flow
     assert second is not None and second.vectors[:, 0, 0, 0].tolist() == [0, 2, 4]
-    assert read_blender(scene_folder.root, flow="none").dynamic.train.flow is None
+    assert BlenderReader(scene_folder.root, flow="none").read().dynamic.train.flow is None
 
 
-def test_one_of_several_captures_is_chosen(scene_folder: Any) -> None:
+def test_one_of_several_captures_is_chosen(scene_folder):
     shutil.copytree(scene_folder.dynamic, scene_folder.root / "dynamic_3views")
-    train = read_blender(scene_folder.root, dynamic="dynamic_3views").dynamic.train
+    train = BlenderReader(scene_folder.root, dynamic="dynamic_3views").read().dynamic.train
     assert train.names[0].startswith("dynamic_3views/")
 
 
-def test_images_are_found_with_or_without_suffix_and_may_lack_a_matte(scene_folder: Any) -> None:
+def test_images_are_found_with_or_without_suffix_and_may_lack_a_matte(scene_folder):
     folder = scene_folder.static / "test"
     rgb = np.full((24, 32, 3), 77, dtype=np.uint8)
     for i, name in enumerate(("a.jpg", "b.webp")):
@@ -152,58 +148,56 @@ def test_images_are_found_with_or_without_suffix_and_may_lack_a_matte(scene_fold
         content["frames"][1]["file_path"] = "test/b"
 
     scene_folder.edit(scene_folder.static / "transforms_test.json", rename)
-    test = read_blender(scene_folder.root).static.test
+    test = BlenderReader(scene_folder.root).read().static.test
     assert not test.has_alpha and test.names == ("static/test/a.jpg", "static/test/b.webp")
     assert bool(((test.pixels.int() - 77).abs() <= 1).all())
 
 
-def test_an_opaque_image_among_mattes_becomes_rgba(scene_folder: Any) -> None:
+def test_an_opaque_image_among_mattes_becomes_rgba(scene_folder):
     iio.imwrite(scene_folder.static / "test/r_001.png", np.full((24, 32, 3), 9, dtype=np.uint8))
-    pixels = read_blender(scene_folder.root).static.test.pixels
+    pixels = BlenderReader(scene_folder.root).read().static.test.pixels
     assert pixels.shape[3] == 4 and bool((pixels[1, ..., 3] == 255).all())
 
 
-def test_given_box_and_bound_scale(scene_folder: Any) -> None:
-    scene = read_blender(
+def test_given_box_and_bound_scale(scene_folder):
+    scene = BlenderReader(
         scene_folder.root, box=[[-1, -1, 0], [1, 1, 2]], bound_scale=1.2, near=1, far=9
-    )
+    ).read()
     assert scene.bounds.box.low == (-1, -1, 0) and scene.bounds.motion is None
     assert (scene.bounds.near, scene.bounds.far) == (1, 9)
     assert scene.bounds.source == "canonical box x bound scale 1.2"
 
 
-def test_single_folder_learns_the_static_scene_from_early_images(
-    single_folder: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    scene = read_blender(single_folder, static_until=0.5)
+def test_single_folder_learns_the_static_scene_from_early_images(single_folder, caplog):
+    scene = BlenderReader(single_folder, static_until=0.5).read()
     assert len(scene.static.train) == 4 and len(scene.dynamic.train) == 8
     assert scene.static.test.times.tolist() == pytest.approx([0.1, 0.4])
     assert scene.dynamic.train.view.tolist() == list(range(8))
     assert torch.equal(scene.static.train.pixels, scene.dynamic.train.pixels[:4])
     assert "no static set" in caplog.text
     assert scene.bounds.motion is None  # never two cameras at one time
-    whole = read_blender(single_folder)
+    whole = BlenderReader(single_folder).read()
     assert len(whole.static.train) == 8 and len(whole.static.test) == 3
 
 
-def test_single_folder_without_an_early_test_image_keeps_all_of_them(single_folder: Path) -> None:
-    scene = read_blender(single_folder, static_until=0.05, box=[[-1, -1, -1], [1, 1, 1]])
+def test_single_folder_without_an_early_test_image_keeps_all_of_them(single_folder):
+    scene = BlenderReader(single_folder, static_until=0.05, box=[[-1, -1, -1], [1, 1, 1]]).read()
     assert len(scene.static.train) == 1 and len(scene.static.test) == 3
 
 
-def test_a_moving_camera_with_three_by_four_poses(single_folder: Path) -> None:
+def test_a_moving_camera_with_three_by_four_poses(single_folder):
     file = single_folder / "transforms_train.json"
     content = json.loads(file.read_text())
     for frame in content["frames"]:
         frame["transform_matrix"] = frame["transform_matrix"][:3]
     file.write_text(json.dumps(content))
-    scene = read_blender(single_folder)
+    scene = BlenderReader(single_folder).read()
     assert scene.dynamic.train.cameras.positions.norm(dim=1).tolist() == pytest.approx([4] * 8)
 
 
 @pytest.mark.skipif(not SUZANNE.is_dir(), reason="the suzanne scene is not next to the repository")
-def test_a_published_scene() -> None:
-    scene = read_blender(SUZANNE, downscale=4)
+def test_a_published_scene():
+    scene = BlenderReader(SUZANNE, downscale=4).read()
     train, clock = scene.dynamic.train, scene.clock
     assert (len(scene.static.train), len(scene.static.test)) == (100, 20)
     assert (len(train), len(clock), int(train.view.max()) + 1) == (200, 50, 4)

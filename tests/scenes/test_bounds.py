@@ -15,7 +15,6 @@ from devrf.geometry.cameras import Cameras
 from devrf.scenes.bounds import (
     FALLBACK_BOUND_SCALE,
     axes_meet,
-    bound_scale_number,
     box_from_cameras,
     depth_range,
     inward_bounds,
@@ -32,19 +31,19 @@ def moved(cameras: Cameras, offset: list[float]) -> Cameras:
     return Cameras(pose, cameras.focal, cameras.center, cameras.width, cameras.height)
 
 
-def test_axes_meet_where_the_cameras_look(ring_cameras: RingCameras) -> None:
+def test_axes_meet_where_the_cameras_look(ring_cameras):
     cameras = moved(ring_cameras(5, width=40, height=30, angle=0.7), [1.0, -2.0, 0.5])
     torch.testing.assert_close(axes_meet(cameras), torch.tensor([1.0, -2.0, 0.5]))
 
 
-def test_radius_is_what_the_smaller_field_of_view_holds(ring_cameras: RingCameras) -> None:
+def test_radius_is_what_the_smaller_field_of_view_holds(ring_cameras):
     # Rows are fewer than columns: the vertical half angle is atan(15 / 20 · tan(0.35)).
     cameras = ring_cameras(5, width=40, height=30, angle=0.7)
     half = math.atan(0.75 * math.tan(0.35))
     assert seen_radius(cameras, torch.zeros(3)) == pytest.approx(4 * math.sin(half), rel=1e-5)
 
 
-def test_box_of_the_usual_synthetic_cameras(ring_cameras: RingCameras) -> None:
+def test_box_of_the_usual_synthetic_cameras(ring_cameras):
     box = box_from_cameras(ring_cameras(9, width=80, height=80, angle=0.6911112))
     half = 4 * math.sin(0.6911112 / 2)
     assert half == pytest.approx(1.355, abs=1e-3)
@@ -52,21 +51,19 @@ def test_box_of_the_usual_synthetic_cameras(ring_cameras: RingCameras) -> None:
     assert box.high == pytest.approx((half,) * 3, abs=1e-5)
 
 
-def test_depth_range_holds_the_sphere_around_the_box(
-    ring_cameras: RingCameras, unit_box: Box
-) -> None:
+def test_depth_range_holds_the_sphere_around_the_box(ring_cameras, unit_box):
     near, far = depth_range(ring_cameras(4, width=8, height=8, angle=0.7), unit_box)
     assert near == pytest.approx(4 - math.sqrt(3), abs=1e-5)
     assert far == pytest.approx(4 + math.sqrt(3), abs=1e-5)
 
 
-def test_near_stays_positive_for_a_camera_inside_the_box(ring_cameras: RingCameras) -> None:
+def test_near_stays_positive_for_a_camera_inside_the_box(ring_cameras):
     large = Box((-5.0, -5.0, -5.0), (5.0, 5.0, 5.0))
     near, far = depth_range(ring_cameras(4, width=8, height=8, angle=0.7), large)
     assert 0 < near < far
 
 
-def test_parallel_axes_ask_for_a_box() -> None:
+def test_parallel_axes_ask_for_a_box():
     where = torch.tensor([[0.0, 4, 0], [0.5, 4, 0], [1, 4, 0.3]])
     cameras = Cameras.looking_at(
         where, where - torch.tensor([0.0, 1, 0]), focal=20, width=16, height=16
@@ -76,7 +73,7 @@ def test_parallel_axes_ask_for_a_box() -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_cameras_that_look_outward_ask_for_a_box(ring_cameras: RingCameras) -> None:
+def test_cameras_that_look_outward_ask_for_a_box(ring_cameras):
     inward = ring_cameras(6, width=16, height=16, angle=0.7)
     outward = Cameras.looking_at(
         inward.positions, inward.positions * 2, focal=20, width=16, height=16
@@ -85,19 +82,11 @@ def test_cameras_that_look_outward_ask_for_a_box(ring_cameras: RingCameras) -> N
         axes_meet(outward)
 
 
-def test_bound_scale_is_auto_or_at_least_one() -> None:
-    assert bound_scale_number("auto") == FALLBACK_BOUND_SCALE
-    assert bound_scale_number(1.05) == 1.05
-    for wrong in (0.9, "large", float("nan"), True):
-        with pytest.raises(DevrfError, match="data.bound_scale"):
-            bound_scale_number(wrong)
-
-
 def bounds_of(views: Views, **options: Any) -> Bounds:
     return inward_bounds(views, views, [views], **options)
 
 
-def test_source_says_where_the_motion_box_came_from(ball_views: Callable[..., Views]) -> None:
+def test_source_says_where_the_motion_box_came_from(ball_views):
     places = torch.tensor([[0.0, 0, 0], [0.3, 0, 0], [0.6, 0, 0]])
     views = ball_views(places, 0.4)
     carved = bounds_of(views)
@@ -108,9 +97,7 @@ def test_source_says_where_the_motion_box_came_from(ball_views: Callable[..., Vi
     assert plain.motion is None and f"bound scale {FALLBACK_BOUND_SCALE}" in plain.source
 
 
-def test_near_and_far_hold_for_what_moves_beyond_the_box(
-    ball_views: Callable[..., Views],
-) -> None:
+def test_near_and_far_hold_for_what_moves_beyond_the_box(ball_views):
     views = ball_views(torch.tensor([[0.0, 0, 0], [0.9, 0, 0]]), 0.3)
     small = Box((-0.4, -0.4, -0.4), (0.4, 0.4, 0.4)).scaled(2.0)
     carved, plain = bounds_of(views, box=small), bounds_of(views, box=small, bound_scale=1.0)
@@ -118,7 +105,7 @@ def test_near_and_far_hold_for_what_moves_beyond_the_box(
     assert carved.near < plain.near and carved.far > plain.far
 
 
-def test_given_near_and_far_are_kept_and_checked(ball_views: Callable[..., Views]) -> None:
+def test_given_near_and_far_are_kept_and_checked(ball_views):
     views = ball_views(torch.tensor([[0.0, 0, 0], [0.3, 0, 0]]), 0.4)
     bounds = bounds_of(views, near=2.0, far=6.0)
     assert (bounds.near, bounds.far) == (2.0, 6.0)

@@ -19,7 +19,7 @@ def write_flow(path: Path, vectors: np.ndarray, mask: np.ndarray) -> None:
     np.savez_compressed(path, flow=vectors, mask=mask)
 
 
-def test_shrinking_scales_each_axis_by_its_own_factor() -> None:
+def test_shrinking_scales_each_axis_by_its_own_factor():
     vectors = np.empty((6, 12, 2), dtype=np.float32)
     vectors[...] = (6.0, 9.0)
     shrunk, valid = shrink_flow(vectors, np.ones((6, 12), bool), width=4, height=3)
@@ -29,7 +29,7 @@ def test_shrinking_scales_each_axis_by_its_own_factor() -> None:
     np.testing.assert_allclose(shrunk[..., 1], 9.0 * 3 / 6, rtol=1e-6)
 
 
-def test_shrinking_averages_trusted_vectors_only_and_needs_half_of_them() -> None:
+def test_shrinking_averages_trusted_vectors_only_and_needs_half_of_them():
     vectors = np.zeros((2, 4, 2), dtype=np.float32)
     vectors[:, :, 0] = [[2, 4, 8, 8], [900, 900, 900, 900]]
     valid = np.array([[True, True, True, False], [False] * 4])
@@ -38,18 +38,18 @@ def test_shrinking_averages_trusted_vectors_only_and_needs_half_of_them() -> Non
     np.testing.assert_allclose(shrunk[0, :, 0], [(2 + 4) / 2 / 2, 0])
 
 
-def test_area_averages_count_fractions_of_cells() -> None:
+def test_area_averages_count_fractions_of_cells():
     row = np.array([[[0], [3], [6]]], dtype=np.float32)
     # Two cells of 1.5 pixels each: (1·0 + 0.5·3) / 1.5 and (0.5·3 + 1·6) / 1.5.
     np.testing.assert_allclose(area_average(row, width=2, height=1)[0, :, 0], [1, 5], rtol=1e-6)
 
 
-def test_colours_behind_a_clear_matte_do_not_bleed_in() -> None:
+def test_colours_behind_a_clear_matte_do_not_bleed_in():
     image = np.array([[[200, 0, 0, 255], [0, 255, 0, 0]]], dtype=np.uint8)
     np.testing.assert_array_equal(shrink_pixels(image, 1, 1)[0, 0], [200, 0, 0, 128])
 
 
-def test_masked_nan_and_infinite_vectors_are_invalid_and_zero(tmp_path: Path) -> None:
+def test_masked_nan_and_infinite_vectors_are_invalid_and_zero(tmp_path):
     vectors = np.ones((3, 5, 2), dtype=np.float32)
     vectors[0, 0, 1], vectors[1, 2, 0] = np.nan, np.inf
     mask = np.ones((3, 5), dtype=np.uint8)
@@ -60,7 +60,7 @@ def test_masked_nan_and_infinite_vectors_are_invalid_and_zero(tmp_path: Path) ->
     assert (read[~valid] == 0).all() and (read[valid] == 1).all()
 
 
-def test_files_are_found_by_their_place_in_the_list(tmp_path: Path) -> None:
+def test_files_are_found_by_their_place_in_the_list(tmp_path):
     for index in (4, 5):
         vectors = np.full((8, 12, 2), float(index), dtype=np.float32)
         write_flow(tmp_path / f"{index:03d}_bwd.npz", vectors, np.ones((8, 12), bool))
@@ -70,15 +70,13 @@ def test_files_are_found_by_their_place_in_the_list(tmp_path: Path) -> None:
     assert torch.equal(flow.vectors[:, 0, 0], torch.tensor([[0.0, 0], [2, 1], [2.5, 1.25]]))
 
 
-def test_no_file_at_all_means_no_flow(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_no_file_at_all_means_no_flow(tmp_path, caplog):
     with caplog.at_level(logging.INFO):
         assert read_flow(tmp_path, [0, 1], [False, True], (9, 9), (9, 9)) is None
     assert len(caplog.records) == 1 and str(tmp_path) in caplog.text
 
 
-def test_some_missing_files_leave_their_images_without_flow(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_some_missing_files_leave_their_images_without_flow(tmp_path, caplog):
     write_flow(tmp_path / "002_bwd.npz", np.ones((9, 9, 2)), np.ones((9, 9), bool))
     flow = read_flow(tmp_path, [1, 2], [True, True], (9, 9), (9, 9))
     assert flow is not None and not flow.valid[0].any() and flow.valid[1].all()
@@ -95,7 +93,7 @@ def test_some_missing_files_leave_their_images_without_flow(
         ({"flow": np.full((4, 6, 2), None), "mask": np.ones((4, 6))}, "not a readable npz"),
     ],
 )
-def test_wrong_arrays_are_named(tmp_path: Path, arrays: dict[str, np.ndarray], said: str) -> None:
+def test_wrong_arrays_are_named(tmp_path, arrays, said):
     path = tmp_path / "001_bwd.npz"
     np.savez(path, allow_pickle=True, **arrays)
     with pytest.raises(DevrfError) as caught:
@@ -104,7 +102,7 @@ def test_wrong_arrays_are_named(tmp_path: Path, arrays: dict[str, np.ndarray], s
     assert str(path) in message and said in message and "\n" not in message
 
 
-def test_a_file_that_is_no_npz_is_named(tmp_path: Path) -> None:
+def test_a_file_that_is_no_npz_is_named(tmp_path):
     path = tmp_path / "001_bwd.npz"
     path.write_bytes(b"not a zip file")
     with pytest.raises(DevrfError, match="001_bwd.npz: not a readable npz"):

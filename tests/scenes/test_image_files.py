@@ -11,12 +11,12 @@ import pytest
 import torch
 from PIL import ExifTags, Image, ImageOps
 
-from devrf.artifacts.image_advice import image_advice
+from devrf.artifacts.inspection.image_advice import image_advice
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.image_files import decode, image_size, read_header
 from devrf.scenes.images import load_images
-from devrf.scenes.nerfstudio import read_nerfstudio
+from devrf.scenes.nerfstudio import NerfstudioReader
 
 WIDE, HIGH = (24, 16), (16, 24)
 
@@ -47,25 +47,25 @@ def test_an_image_is_turned_where_only_so_it_fits_its_camera(tmp_path, orientati
     assert np.array_equal(pixels(path, fits), seen if quarter else stored)
     assert image_size(path, fits) == (HIGH if quarter else WIDE)
     # Half turns and mirrors leave the shape: nobody can tell.
-    assert read_header(path, fits).doubtful == (orientation in (2, 3, 4))
+    assert read_header(path, fits).ambiguous_orientation == (orientation in (2, 3, 4))
     # The camera is one of the image as it is stored.
     assert np.array_equal(pixels(path, WIDE), stored)
-    assert read_header(path, WIDE).doubtful == (orientation in (2, 3, 4))
+    assert read_header(path, WIDE).ambiguous_orientation == (orientation in (2, 3, 4))
     # No camera says anything, or all that it says fits neither.
     for unknown in (None, (300, 100)):
         assert np.array_equal(pixels(path, unknown), stored)
-        assert read_header(path, unknown).doubtful == (orientation != 1)
+        assert read_header(path, unknown).ambiguous_orientation == (orientation != 1)
 
 
 def test_of_a_square_nobody_can_tell(tmp_path):
     header = read_header(photo(tmp_path / "a.jpg", 6, (16, 16)), (16, 16))
-    assert (header.turn, header.doubtful) == (1, True)
+    assert (header.turn, header.ambiguous_orientation) == (1, True)
 
 
 @pytest.mark.parametrize("orientation", [0, 9, 77])
 def test_an_orientation_that_is_none_is_as_it_is(tmp_path, orientation):
     header = read_header(photo(tmp_path / "a.jpg", orientation), HIGH)
-    assert (header.turn, header.doubtful) == (1, False)
+    assert (header.turn, header.ambiguous_orientation) == (1, False)
 
 
 def test_damaged_notes_do_not_spoil_a_picture(tmp_path):
@@ -82,7 +82,7 @@ def test_a_set_is_of_one_size_once_it_is_turned(tmp_path, caplog):
     with caplog.at_level(logging.INFO):
         loaded = load_images(paths, 2, [WIDE, WIDE])
     assert loaded.pixels.shape == (2, 8, 12, 3) and (loaded.width, loaded.height) == WIDE
-    assert not bool(loaded.doubtful.any())
+    assert not bool(loaded.ambiguous_orientation.any())
     assert "1 of them turned as their EXIF orientation says" in caplog.text
     with pytest.raises(DevrfError, match="1.jpg: 16x24 px, but .*0.jpg of the same set has 24x16"):
         load_images(paths, 1)
@@ -113,7 +113,7 @@ def capture(folder: Path, orientation: int, **shared: float) -> None:
 
 def test_a_capture_follows_its_cameras(tmp_path):
     capture(tmp_path, 6, w=24, h=16)
-    train = read_nerfstudio(tmp_path).dynamic.train
+    train = NerfstudioReader(tmp_path).read().dynamic.train
     assert (train.width, train.height) == WIDE
     with Image.open(tmp_path / train.names[0]) as image:
         seen = np.asarray(ImageOps.exif_transpose(image))
@@ -123,10 +123,10 @@ def test_a_capture_follows_its_cameras(tmp_path):
 
 def test_inspecting_names_the_files_of_which_nobody_can_tell(tmp_path):
     capture(tmp_path, 6)
-    scene = read_nerfstudio(tmp_path)
+    scene = NerfstudioReader(tmp_path).read()
     assert (scene.dynamic.train.width, scene.dynamic.train.height) == HIGH
     said = [str(advice) for advice in image_advice(scene) if "EXIF" in advice.what]
     assert len(said) == 1
     assert said[0].startswith("0.jpg, 1.jpg, 2.jpg and 6 more: its EXIF orientation says")
     capture(tmp_path, 1)
-    assert not [a for a in image_advice(read_nerfstudio(tmp_path)) if "EXIF" in a.what]
+    assert not [a for a in image_advice(NerfstudioReader(tmp_path).read()) if "EXIF" in a.what]

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import logging
 import shutil
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 from devrf.geometry.ndc import NormalizedDevice
-from devrf.scenes.llff import read_llff
+from devrf.scenes.llff import LlffReader
 from devrf.scenes.scene import Views
 
 
@@ -20,8 +19,8 @@ def reds(views: Views) -> list[int]:
     return views.pixels[:, 0, 0, 0].tolist()
 
 
-def test_the_published_layout(llff_folder: Any) -> None:
-    scene = read_llff(llff_folder.root)
+def test_the_published_layout(llff_folder):
+    scene = LlffReader(llff_folder.root).read()
     assert (scene.name, scene.kind, scene.background) == ("toy", "forward", "white")
     assert scene.static.train.pixels.shape == (7, 16, 24, 3)
     # Every eighth image is held out: 0 and 8.
@@ -39,8 +38,8 @@ def test_the_published_layout(llff_folder: Any) -> None:
     assert train.flow is None and scene.clock.times == (0.0, 0.5, 1.0)
 
 
-def test_static_poses_by_hand(llff_folder: Any) -> None:
-    cameras = read_llff(llff_folder.root).static.train.cameras
+def test_static_poses_by_hand(llff_folder):
+    cameras = LlffReader(llff_folder.root).read().static.train.cameras
     # 4.5 world units apart are one unit of 0.75 · 6; the middle one of nine is the origin. What
     # was [down, right, back] along (−z, y, x) is right, up, back along (x, y, z) when centred.
     expected = torch.eye(3, 4).repeat(7, 1, 1)
@@ -52,8 +51,8 @@ def test_static_poses_by_hand(llff_folder: Any) -> None:
     assert (cameras.width, cameras.height) == (24, 16)
 
 
-def test_a_world_point_falls_on_the_pixel_computed_by_hand(llff_folder: Any) -> None:
-    scene = read_llff(llff_folder.root)
+def test_a_world_point_falls_on_the_pixel_computed_by_hand(llff_folder):
+    scene = LlffReader(llff_folder.root).read()
     # The world point 9 before the middle camera (at y = 20 + 4 · 4.5), 1.8 right, 0.9 up of it:
     # (0.4, 0.2, −2) in the reader's frame.
     point = torch.tensor([[0.4, 0.2, -2.0]])
@@ -66,8 +65,8 @@ def test_a_world_point_falls_on_the_pixel_computed_by_hand(llff_folder: Any) -> 
     assert pixel[1].tolist() == pytest.approx([16, 6])
 
 
-def test_dynamic_poses_are_taken_as_they_are(llff_folder: Any) -> None:
-    scene = read_llff(llff_folder.root)
+def test_dynamic_poses_are_taken_as_they_are(llff_folder):
+    scene = LlffReader(llff_folder.root).read()
     # The last three of five; 40 px in images of 48×32 are 20 px here.
     assert scene.dynamic.train.cameras.positions[:2, 0].tolist() == [-0.5, 0]
     assert scene.dynamic.test.cameras.positions[0].tolist() == [0.5, 0, 0]
@@ -75,7 +74,7 @@ def test_dynamic_poses_are_taken_as_they_are(llff_folder: Any) -> None:
     assert torch.equal(scene.dynamic.train.cameras.camera_to_world[0, :, :3], torch.eye(3))
 
 
-def test_a_tilted_world_is_turned_back(llff_folder: Any) -> None:
+def test_a_tilted_world_is_turned_back(llff_folder):
     angle = 0.7
     turn = np.array(
         [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
@@ -84,9 +83,9 @@ def test_a_tilted_world_is_turned_back(llff_folder: Any) -> None:
     matrix = rows[:, :15].reshape(9, 3, 5)
     matrix[:, :, :4] = turn @ matrix[:, :, :4]
     rows[:, :15] = matrix.reshape(9, 15)
-    straight = read_llff(llff_folder.root).static.train.cameras
+    straight = LlffReader(llff_folder.root).read().static.train.cameras
     llff_folder.save("static/poses_bounds.npy", rows)
-    tilted = read_llff(llff_folder.root).static.train.cameras
+    tilted = LlffReader(llff_folder.root).read().static.train.cameras
     torch.testing.assert_close(tilted.camera_to_world, straight.camera_to_world)
 
 
@@ -98,34 +97,32 @@ def test_a_tilted_world_is_turned_back(llff_folder: Any) -> None:
         ([[64], [96], [80], [72], [44], [36]], (20, 18), (11, 9)),
     ],
 )
-def test_poses_without_intrinsics_take_them_from_their_own_file(
-    llff_folder: Any, inner: Any, focal: tuple[float, ...], center: tuple[float, ...]
-) -> None:
+def test_poses_without_intrinsics_take_them_from_their_own_file(llff_folder, inner, focal, center):
     rows = llff_folder.static_rows()
     matrix = rows[:, :15].reshape(9, 3, 5)[:, :, :4].reshape(9, 12)
     llff_folder.save("static/poses_bounds.npy", np.concatenate([matrix, rows[:, 15:]], axis=1))
     llff_folder.save("static/hwf_cxcy.npy", np.array(inner, dtype=float))
-    cameras = read_llff(llff_folder.root).static.train.cameras
+    cameras = LlffReader(llff_folder.root).read().static.train.cameras
     assert tuple(cameras.focal[0].tolist()) == focal
     assert tuple(cameras.center[0].tolist()) == center
     assert cameras.positions[:, 0].tolist() == pytest.approx([k - 4 for k in range(1, 8)])
 
 
-def test_full_size_images_are_made_smaller_where_the_factor_is_missing(llff_folder: Any) -> None:
+def test_full_size_images_are_made_smaller_where_the_factor_is_missing(llff_folder):
     for folder in (llff_folder.static, *llff_folder.dynamic.glob("view*")):
         count = len(list((folder / "images_4").iterdir()))
         shutil.rmtree(folder / "images_4")
         llff_folder.images(folder / "images", count, times=4)
-    scene = read_llff(llff_folder.root)
+    scene = LlffReader(llff_folder.root).read()
     assert scene.static.train.pixels.shape == (7, 16, 24, 3)
     assert scene.static.train.cameras.focal[0].tolist() == [20, 20]
     assert scene.dynamic.train.cameras.focal[0].tolist() == [20, 20]
-    assert read_llff(llff_folder.root, downscale=2).static.train.width == 48
+    assert LlffReader(llff_folder.root, downscale=2).read().static.train.width == 48
 
 
-def test_images_of_a_lesser_factor_go_the_rest_of_the_way(llff_folder: Any) -> None:
+def test_images_of_a_lesser_factor_go_the_rest_of_the_way(llff_folder):
     llff_folder.flow(1, "001", 3.0)
-    scene = read_llff(llff_folder.root, downscale=8)
+    scene = LlffReader(llff_folder.root, downscale=8).read()
     assert scene.static.train.width == 12
     assert scene.static.train.cameras.focal[0].tolist() == [10, 10]
     flow = scene.dynamic.train.flow
@@ -146,9 +143,7 @@ def test_images_of_a_lesser_factor_go_the_rest_of_the_way(llff_folder: Any) -> N
         (("8.png", "9.png", "10.png"), {"9": 1, "10": 2}),
     ],
 )
-def test_flow_finds_its_frame(
-    llff_folder: Any, names: tuple[str, ...], found: dict[str, int]
-) -> None:
+def test_flow_finds_its_frame(llff_folder, names, found):
     for view in (1, 2, 3):
         folder = llff_folder.dynamic / f"view{view}" / "images_4"
         for k, name in enumerate(names):
@@ -157,7 +152,7 @@ def test_flow_finds_its_frame(
             (folder / f"moving_{name}").rename(folder / name)
         for name, frame in found.items():
             llff_folder.flow(view, name, 10 * view + frame)
-    train = read_llff(llff_folder.root).dynamic.train
+    train = LlffReader(llff_folder.root).read().dynamic.train
     assert reds(train) == [0, 10, 1, 11, 2, 12]
     assert train.flow is not None
     assert train.flow.vectors[:, 3, 5, 0].tolist() == [0, 0, 11, 21, 12, 22]
@@ -165,20 +160,20 @@ def test_flow_finds_its_frame(
     assert train.flow.valid.flatten(1).any(dim=1).tolist() == [False] * 2 + [True] * 4
 
 
-def test_missing_flow_files_leave_images_without_flow(llff_folder: Any, caplog: Any) -> None:
+def test_missing_flow_files_leave_images_without_flow(llff_folder, caplog):
     llff_folder.flow(2, "002", 5.0)
     with caplog.at_level(logging.WARNING):
-        train = read_llff(llff_folder.root).dynamic.train
+        train = LlffReader(llff_folder.root).read().dynamic.train
     assert "3 of 4 flow files are missing" in caplog.text
     assert train.flow is not None
     assert train.flow.valid.flatten(1).any(dim=1).tolist() == [False] * 5 + [True]
-    assert read_llff(llff_folder.root, flow="none").dynamic.train.flow is None
+    assert LlffReader(llff_folder.root, flow="none").read().dynamic.train.flow is None
 
 
 @pytest.mark.parametrize(("test_view", "held_out"), [(1, 0), (2, 10), (-3, 0), (3, 20)])
-def test_another_view_is_held_out(llff_folder: Any, test_view: int, held_out: int) -> None:
+def test_another_view_is_held_out(llff_folder, test_view, held_out):
     llff_folder.flow(3, "001", 3.0)
-    dynamic = read_llff(llff_folder.root, test_view=test_view).dynamic
+    dynamic = LlffReader(llff_folder.root, test_view=test_view).read().dynamic
     assert reds(dynamic.test) == [held_out, held_out + 1, held_out + 2]
     assert set(reds(dynamic.train)) == {0, 1, 2, 10, 11, 12, 20, 21, 22} - set(reds(dynamic.test))
     assert dynamic.train.view.tolist() == [0, 1] * 3
@@ -193,23 +188,23 @@ def test_another_view_is_held_out(llff_folder: Any, test_view: int, held_out: in
         assert held_out == 20
 
 
-def test_fewer_views_and_frames(llff_folder: Any) -> None:
+def test_fewer_views_and_frames(llff_folder):
     llff_folder.flow(1, "001", 3.0)
-    scene = read_llff(llff_folder.root, train_views=1, frames=2, holdout=3)
+    scene = LlffReader(llff_folder.root, train_views=1, frames=2, holdout=3).read()
     assert reds(scene.dynamic.train) == [0, 2] and reds(scene.dynamic.test) == [20, 22]
     assert scene.dynamic.train.times.tolist() == [0, 1]
     assert scene.dynamic.train.flow is None
     assert reds(scene.static.test) == [0, 3, 6]
 
 
-def test_the_number_of_views_is_that_of_the_folders(llff_folder: Any) -> None:
+def test_the_number_of_views_is_that_of_the_folders(llff_folder):
     llff_folder.dynamic.rename(llff_folder.root / "dynamic_12views")
-    scene = read_llff(llff_folder.root)
+    scene = LlffReader(llff_folder.root).read()
     assert len(scene.dynamic.train) == 6
 
 
-def test_space_and_box_by_hand(llff_folder: Any) -> None:
-    scene = read_llff(llff_folder.root)
+def test_space_and_box_by_hand(llff_folder):
+    scene = LlffReader(llff_folder.root).read()
     assert scene.space == NormalizedDevice(24, 16, (20.0, 20.0), 1.0)
     bounds = scene.bounds
     # All cameras look straight ahead: at infinity they see [−1, 1]; on the near plane a camera
@@ -217,4 +212,4 @@ def test_space_and_box_by_hand(llff_folder: Any) -> None:
     assert bounds.box.low == pytest.approx((-6.0, -1.0, -1.0))
     assert bounds.box.high == pytest.approx((6.0, 1.0, 1.0))
     assert (bounds.near, bounds.far, bounds.motion, bounds.scale) == (0.0, 1.0, None, 1.0)
-    assert read_llff(llff_folder.root, near=0.5).bounds.box.high[0] == pytest.approx(11.0)
+    assert LlffReader(llff_folder.root, near=0.5).read().bounds.box.high[0] == pytest.approx(11.0)

@@ -3,28 +3,23 @@
 from __future__ import annotations
 
 import shutil
-from pathlib import Path
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
-import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from devrf.errors import DevrfError
-from devrf.scenes.llff import read_llff
+from devrf.scenes.llff import LlffReader
 
 STATIC = "static/poses_bounds.npy"
 POSES = "dynamic_3views/poses.npy"
 BOUNDS = "dynamic_3views/bds.npy"
 
 
-def message_of(root: Path, **options: Any) -> str:
-    """The one-line message with which the scene is refused."""
-    with pytest.raises(DevrfError) as caught:
-        read_llff(root, **options)
-    message = str(caught.value)
-    assert "\n" not in message and len(message) < 600
-    return message
+@pytest.fixture
+def message_of(refusal) -> Callable[..., str]:
+    return partial(refusal, LlffReader)
 
 
 def stored(folder: Any, file: str) -> np.ndarray:
@@ -50,9 +45,7 @@ def stored(folder: Any, file: str) -> np.ndarray:
         (BOUNDS, (1, 0), -1, "camera 1: expected 0 < least depth"),
     ],
 )
-def test_wrong_numbers(
-    llff_folder: Any, file: str, where: tuple[int, ...], value: float, said: str
-) -> None:
+def test_wrong_numbers(llff_folder, file, where, value, said, message_of):
     values = stored(llff_folder, file)
     values[where] = value
     path = llff_folder.save(file, values)
@@ -62,14 +55,14 @@ def test_wrong_numbers(
 
 @pytest.mark.parametrize("file", [STATIC, POSES, BOUNDS])
 @pytest.mark.parametrize("keep", [0, 5, 100, 200])
-def test_truncated_arrays(llff_folder: Any, file: str, keep: int) -> None:
+def test_truncated_arrays(llff_folder, file, keep, message_of):
     path = llff_folder.root / file
     path.write_bytes(path.read_bytes()[:keep])
     assert f"{path}: not a readable npy file" in message_of(llff_folder.root)
 
 
 @pytest.mark.parametrize("file", [STATIC, POSES, BOUNDS])
-def test_arrays_of_something_else(llff_folder: Any, file: str) -> None:
+def test_arrays_of_something_else(llff_folder, file, message_of):
     path = llff_folder.save(file, np.array(["a", "b"]))
     assert f"{path}: holds values of type" in message_of(llff_folder.root)
     llff_folder.save(file, np.array([{"a": 1}], dtype=object))
@@ -83,21 +76,13 @@ def test_arrays_of_something_else(llff_folder: Any, file: str) -> None:
     assert f"{path}: not a readable npy file" in message_of(llff_folder.root)
 
 
-def test_a_header_that_promises_more_than_memory_holds(llff_folder: Any) -> None:
-    path = llff_folder.root / STATIC
-    header = {"descr": "<f8", "fortran_order": False, "shape": (10**15, 17)}
-    with path.open("wb") as file:
-        np.lib.format.write_array_header_1_0(file, header)
-    assert f"{path}: not a readable npy file" in message_of(llff_folder.root)
-
-
 @pytest.mark.parametrize("file", [STATIC, POSES, BOUNDS])
-def test_missing_files(llff_folder: Any, file: str) -> None:
+def test_missing_files(llff_folder, file, message_of):
     (llff_folder.root / file).unlink()
     assert f"{llff_folder.root / file}: no such file" in message_of(llff_folder.root)
 
 
-def test_poses_without_intrinsics(llff_folder: Any) -> None:
+def test_poses_without_intrinsics(llff_folder, message_of):
     rows = stored(llff_folder, STATIC)
     llff_folder.save(STATIC, np.delete(rows, [4, 9, 14], axis=1))
     path = llff_folder.static / "hwf_cxcy.npy"
@@ -113,7 +98,7 @@ def test_poses_without_intrinsics(llff_folder: Any) -> None:
         assert said in message and "static" in message
 
 
-def test_counts_that_do_not_match(llff_folder: Any) -> None:
+def test_counts_that_do_not_match(llff_folder, message_of):
     rows, poses = stored(llff_folder, STATIC), stored(llff_folder, POSES)
     path = llff_folder.save(STATIC, rows[:8])
     assert f"{path}: has 8 cameras, but" in message_of(llff_folder.root)
@@ -125,7 +110,7 @@ def test_counts_that_do_not_match(llff_folder: Any) -> None:
     assert f"{path}: has 2 cameras, but there are 3 folders" in message_of(llff_folder.root)
 
 
-def test_missing_folders(llff_folder: Any, tmp_path: Path) -> None:
+def test_missing_folders(llff_folder, tmp_path, message_of):
     root = llff_folder.root
     assert "nowhere: no such folder" in message_of(tmp_path / "nowhere")
     (llff_folder.dynamic / "view2").rename(llff_folder.dynamic / "other")
@@ -139,13 +124,7 @@ def test_missing_folders(llff_folder: Any, tmp_path: Path) -> None:
     assert f"{llff_folder.static}: no such folder" in message_of(root)
 
 
-def test_several_captures_are_listed(llff_folder: Any) -> None:
-    shutil.copytree(llff_folder.dynamic, llff_folder.root / "dynamic_4views")
-    assert "dynamic_3views, dynamic_4views" in message_of(llff_folder.root)
-    assert read_llff(llff_folder.root, dynamic="dynamic_4views").name == "toy"
-
-
-def test_missing_images(llff_folder: Any) -> None:
+def test_missing_images(llff_folder, message_of):
     message = message_of(llff_folder.root, downscale=2)
     assert "no folder images_2 or images (found: images_4)" in message
     assert "no folder images (found: images_4)" in message_of(llff_folder.root, downscale=1)
@@ -159,14 +138,14 @@ def test_missing_images(llff_folder: Any) -> None:
     assert f"{images.parent}: no folder images_4 or images" in message_of(llff_folder.root)
 
 
-def test_views_at_different_sizes(llff_folder: Any) -> None:
+def test_views_at_different_sizes(llff_folder, message_of):
     view = llff_folder.dynamic / "view2"
     shutil.rmtree(view / "images_4")
     llff_folder.images(view / "images", 3, times=4)
     assert f"{view}: no folder images_4" in message_of(llff_folder.root)
 
 
-def test_one_image_is_no_capture(llff_folder: Any) -> None:
+def test_one_image_is_no_capture(llff_folder, message_of):
     for view in (1, 2, 3):
         for frame in ("001", "002"):
             (llff_folder.dynamic / f"view{view}" / "images_4" / f"{frame}.png").unlink()
@@ -180,26 +159,20 @@ def test_one_image_is_no_capture(llff_folder: Any) -> None:
 @pytest.mark.parametrize(
     "file", ["static/images_4/004.png", "dynamic_3views/view2/images_4/001.png"]
 )
-def test_a_damaged_image(llff_folder: Any, file: str) -> None:
+def test_a_damaged_image(llff_folder, file, message_of):
     path = llff_folder.root / file
     path.write_bytes(path.read_bytes()[:30])
     assert f"{path}: not a readable image" in message_of(llff_folder.root)
 
 
-def test_images_of_two_sizes(llff_folder: Any) -> None:
-    path = llff_folder.static / "images_4" / "004.png"
-    iio.imwrite(path, np.zeros((24, 16, 3), dtype=np.uint8))
-    assert str(path) in message_of(llff_folder.root)
-
-
-def test_flow_of_another_size(llff_folder: Any) -> None:
+def test_flow_of_another_size(llff_folder, message_of):
     llff_folder.HEIGHT, llff_folder.WIDTH = 24, 16
     llff_folder.flow(1, "001", 1.0)
     message = message_of(llff_folder.root)
     assert "001_bwd.npz" in message and "(16, 24, 2)" in message
 
 
-def test_cameras_around_a_scene_are_not_forward_facing(llff_folder: Any) -> None:
+def test_cameras_around_a_scene_are_not_forward_facing(llff_folder, message_of):
     rows = stored(llff_folder, STATIC)
     matrix = rows[:, :15].reshape(9, 3, 5)
     for k in range(9):
@@ -212,7 +185,7 @@ def test_cameras_around_a_scene_are_not_forward_facing(llff_folder: Any) -> None
 
 
 @pytest.mark.parametrize("camera", [2, 4])
-def test_a_fixed_camera_that_looks_elsewhere(llff_folder: Any, camera: int) -> None:
+def test_a_fixed_camera_that_looks_elsewhere(llff_folder, camera, message_of):
     poses = stored(llff_folder, POSES)
     # A quarter turn about the vertical axis: right is back, back is left.
     poses[camera, :, :3] = [[0, 0, -1], [0, 1, 0], [1, 0, 0]]
@@ -224,13 +197,8 @@ def test_a_fixed_camera_that_looks_elsewhere(llff_folder: Any, camera: int) -> N
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"downscale": 0}, "data.downscale"),
-        ({"downscale": 2.5}, "data.downscale"),
         ({"downscale": 12}, "8x5 px"),
-        ({"background": "grey"}, "white, black, random"),
-        ({"flow": "raft"}, "files, none"),
         ({"holdout": 1}, "data.holdout"),
-        ({"frames": 1}, "data.frames"),
         ({"train_views": 0}, "data.train_views"),
         ({"train_views": 3}, "there are 2 views to learn from"),
         ({"test_view": 0}, "data.test_view"),
@@ -242,5 +210,5 @@ def test_a_fixed_camera_that_looks_elsewhere(llff_folder: Any, camera: int) -> N
         ({"dynamic": "other"}, "'other'"),
     ],
 )
-def test_wrong_options(llff_folder: Any, options: dict[str, Any], said: str) -> None:
+def test_wrong_options(llff_folder, options, said, message_of):
     assert said in message_of(llff_folder.root, **options)

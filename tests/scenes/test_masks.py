@@ -1,4 +1,4 @@
-"""Masks of nerfstudio's frames: pixels that do not count, or mattes."""
+"""Masks of nerfstudio's frames: pixels that are ignored, or mattes."""
 
 from __future__ import annotations
 
@@ -14,58 +14,33 @@ import pytest
 import torch
 from PIL import Image
 
-from devrf.artifacts.image_advice import image_advice
-from devrf.artifacts.inspection import inspect_scene
-from devrf.artifacts.inspection_picture import counted_pixels
+from devrf.artifacts.inspection.image_advice import image_advice
+from devrf.artifacts.inspection.picture import shown
+from devrf.artifacts.inspection.report import inspect_scene
 from devrf.data.flow_source import with_flow
 from devrf.data.nerfstudio import NerfstudioDataModule
 from devrf.data.pool import all_pixels
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
-from devrf.geometry.distortion import Distortion
-from devrf.scenes.lens import Lens
-from devrf.scenes.nerfstudio import read_nerfstudio
+from devrf.scenes.nerfstudio import NerfstudioReader
 from devrf.scenes.visual_hull import visual_hull
 
 WIDTH, HEIGHT = 80, 60
-LENS = Lens((88.0, 84.0), (42.0, 28.0), Distortion((-0.3, 0.1, 0.01, 0.0), (0.006, -0.008)))
-SHARED = {
-    "fl_x": 88.0,
-    "fl_y": 84.0,
-    "cx": 42.0,
-    "cy": 28.0,
-    "w": WIDTH,
-    "h": HEIGHT,
-    "k1": -0.3,
-    "k2": 0.1,
-    "k3": 0.01,
-    "p1": 0.006,
-    "p2": -0.008,
-}
 
 
 @pytest.fixture
-def root(tmp_path: Path, ring_cameras: Callable[..., Any], picture: Callable[..., Any]) -> Path:
+def root(tmp_path, balls) -> Path:
     """Nine RGB images of balls by a moving camera, and masks that are white on the balls."""
     folder = tmp_path / "scene"
-    (folder / "masks").mkdir(parents=True)
-    frames = []
-    ring = ring_cameras(9, width=WIDTH, height=HEIGHT, angle=0.9)
-    for k, pose in enumerate(ring.camera_to_world):
-        pixels = picture(pose, LENS, WIDTH, HEIGHT)
-        Image.fromarray(pixels[..., :3]).save(folder / f"{k}.png")
-        Image.fromarray(pixels).save(folder / f"cut_{k}.png")
-        Image.fromarray(pixels[..., 3]).save(folder / f"masks/{k}.png")
-        matrix = torch.cat([pose, torch.tensor([[0.0, 0.0, 0.0, 1.0]])]).tolist()
-        frames.append(
-            {
-                "file_path": f"{k}.png",
-                "mask_path": f"masks/{k}.png",
-                "transform_matrix": matrix,
-                "time": k / 8,
-            }
-        )
-    (folder / "transforms.json").write_text(json.dumps({**SHARED, "frames": frames}))
+    content = balls.write(folder, [k / 8 for k in range(9)])
+    (folder / "masks").mkdir()
+    for k, frame in enumerate(content["frames"]):
+        with Image.open(folder / frame["file_path"]) as image:
+            image.save(folder / f"cut_{k}.png")
+            image.getchannel("A").save(folder / f"masks/{k}.png")
+            image.convert("RGB").save(folder / f"{k}.png")
+        frame |= {"file_path": f"{k}.png", "mask_path": f"masks/{k}.png"}
+    edit(folder, lambda listed: listed.update(content))
     return folder
 
 
@@ -95,66 +70,66 @@ def plain(root: Path, masks: list[np.ndarray] | None = None) -> None:
 
 
 @pytest.mark.parametrize("downscale", [1, 2, 3])
-def test_mattes_are_those_of_images_that_were_cut_out(root: Path, downscale: int) -> None:
-    ours = read_nerfstudio(root, downscale=downscale, masks="matte").dynamic.train
+def test_mattes_are_those_of_images_that_were_cut_out(root, downscale):
+    ours = NerfstudioReader(root, downscale=downscale, masks="matte").read().dynamic.train
     edit(root, lambda c: [f.update(file_path=f"cut_{f['file_path']}") for f in c["frames"]])
-    theirs = read_nerfstudio(root, downscale=downscale, masks="none").dynamic.train
+    theirs = NerfstudioReader(root, downscale=downscale, masks="none").read().dynamic.train
     assert ours.valid_mask is None and torch.equal(ours.pixels, theirs.pixels)
 
 
 @pytest.mark.parametrize("downscale", [1, 2])
-def test_a_pixel_counts_if_all_that_it_is_made_of_does(root: Path, downscale: int) -> None:
+def test_a_pixel_is_valid_if_all_that_it_is_made_of_is(root, downscale):
     for k in range(9):
         with Image.open(root / f"masks/{k}.png") as mask:
             sharp = np.where(np.asarray(mask) > 127, 255, 0).astype(np.uint8)
         paint(root, k, sharp)
-    valid_mask = read_nerfstudio(root, downscale=downscale).dynamic.train.valid_mask
+    valid_mask = NerfstudioReader(root, downscale=downscale).read().dynamic.train.valid_mask
     # Downscaling and undistortion blur the matte as they blur the picture.
-    mattes = read_nerfstudio(root, downscale=downscale, masks="matte").dynamic.train
+    mattes = NerfstudioReader(root, downscale=downscale, masks="matte").read().dynamic.train
     assert valid_mask is not None and torch.equal(valid_mask, mattes.pixels[..., 3] == 255)
     assert 0 < int(valid_mask.sum()) < valid_mask.numel()
 
 
-def test_they_can_be_left_alone(root: Path) -> None:
+def test_they_can_be_left_alone(root):
     edit(root, lambda c: c["frames"][0].update(mask_path="nowhere.png"))
-    train = read_nerfstudio(root, masks="none").dynamic.train
+    train = NerfstudioReader(root, masks="none").read().dynamic.train
     assert train.valid_mask is None and not train.has_alpha
 
 
-def test_only_some_images_have_one(root: Path) -> None:
+def test_only_some_images_have_one(root):
     plain(root)
     edit(root, lambda c: [f.pop("mask_path") for f in c["frames"][2:]])
-    train = read_nerfstudio(root).dynamic.train
+    train = NerfstudioReader(root).read().dynamic.train
     valid_mask = train.valid_mask
     assert valid_mask is not None and torch.equal(
         valid_mask[0, 0], torch.arange(WIDTH) < WIDTH // 2
     )
     assert bool(valid_mask[2:].all())
     with pytest.raises(DevrfError, match="2.png: has no mask_path although others have"):
-        read_nerfstudio(root, masks="matte")
+        NerfstudioReader(root, masks="matte").read()
 
 
 @pytest.mark.parametrize("kind", ["L", "labels", "1", "P", "RGB", "RGBA", "LA", "dull"])
-def test_whatever_is_grey_will_do(root: Path, kind: str) -> None:
+def test_any_grey_file_is_a_mask(root, kind):
     plain(root)
     for k in range(9):
         image = Image.fromarray(half({"labels": 1, "dull": 200}.get(kind, 255)))
         image = image if kind in ("labels", "dull") else image.convert(kind)
         image.save(root / f"masks/{k}.png")
-    valid_mask = read_nerfstudio(root).dynamic.train.valid_mask
+    valid_mask = NerfstudioReader(root).read().dynamic.train.valid_mask
     assert valid_mask is not None
     assert bool(valid_mask[:, :, : WIDTH // 2].all()) and not bool(
         valid_mask[:, :, WIDTH // 2 :].any()
     )
 
 
-def test_a_mask_may_be_of_the_size_of_the_camera(root: Path) -> None:
+def test_a_mask_may_be_of_the_size_of_the_camera(root):
     plain(root)
     for k in range(9):
         with Image.open(root / f"{k}.png") as image:
             image.resize((WIDTH // 2, HEIGHT // 2)).save(root / f"{k}.png")
     for masks in ("ignore", "matte"):
-        train = read_nerfstudio(root, masks=masks).dynamic.train  # type: ignore[arg-type]
+        train = NerfstudioReader(root, masks=masks).read().dynamic.train  # type: ignore[arg-type]
         kept = train.pixels[..., 3] == 255 if train.valid_mask is None else train.valid_mask
         assert torch.equal(kept[0, 0], torch.arange(WIDTH // 2) < WIDTH // 4)
 
@@ -173,7 +148,7 @@ def write_deep(root: Path) -> None:
         ),
         (
             lambda r: edit(r, lambda c: c["frames"][1].update(mask_path=3)),
-            "frames[1]: mask_path is 3, expected a file's path",
+            "frames[1].mask_path: should be a valid string, not 3",
         ),
         (lambda r: edit(r, lambda c: c["frames"][1].update(mask_path="../../m.png")), "m.png"),
         (lambda r: edit(r, lambda c: c["frames"][1].update(mask_path="masks")), "no such mask"),
@@ -187,27 +162,24 @@ def write_deep(root: Path) -> None:
         (lambda r: (r / "masks/1.png").write_text("nothing"), "masks/1.png: not a readable image"),
     ],
 )
-def test_wrong_masks(root: Path, masks: str, spoil: Callable[[Path], object], said: str) -> None:
+def test_wrong_masks(root, masks, spoil, said):
     spoil(root)
     with pytest.raises(DevrfError) as caught:
-        read_nerfstudio(root, masks=masks)  # type: ignore[arg-type]
+        NerfstudioReader(root, masks=masks).read()  # type: ignore[arg-type]
     assert said in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_a_mask_that_leaves_nothing(root: Path) -> None:
+def test_a_mask_that_leaves_nothing(root):
     paint(root, 4, 0 * half())
     with pytest.raises(DevrfError, match=r"masks/4.png: leaves nothing of .*4.png to learn from"):
-        read_nerfstudio(root)
+        NerfstudioReader(root).read()
     # Nothing may be there to be cut out.
-    assert not bool(read_nerfstudio(root, masks="matte").dynamic.train.pixels[4, ..., 3].any())
+    assert not bool(
+        NerfstudioReader(root, masks="matte").read().dynamic.train.pixels[4, ..., 3].any()
+    )
 
 
-def test_an_option_that_is_none(root: Path) -> None:
-    with pytest.raises(DevrfError, match="data.masks: expected one of ignore, matte, none"):
-        read_nerfstudio(root, masks="yes")  # type: ignore[arg-type]
-
-
-def test_only_pixels_that_count_are_drawn(root: Path) -> None:
+def test_only_valid_pixels_are_drawn(root):
     plain(root)
     train = NerfstudioDataModule(root, flow="none").scene.dynamic.train
     assert train.valid_mask is not None
@@ -218,18 +190,18 @@ def test_only_pixels_that_count_are_drawn(root: Path) -> None:
     assert pool.image.dtype == pool.flat.dtype == torch.int32
 
 
-def test_masks_go_with_their_images(root: Path) -> None:
+def test_masks_go_with_their_images(root):
     masks = [half() if k % 2 else 255 - half() for k in range(9)]
     plain(root, masks)
-    train = read_nerfstudio(root).dynamic.train
+    train = NerfstudioReader(root).read().dynamic.train
     assert train.valid_mask is not None
     one = train[torch.tensor([3])].to("cpu").valid_mask
     assert one is not None and torch.equal(one[0], train.valid_mask[3])
 
 
-def test_flow_is_valid_at_pixels_that_count(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_flow_is_valid_at_valid_pixels(root, monkeypatch):
     plain(root)
-    scene = read_nerfstudio(root)
+    scene = NerfstudioReader(root).read()
     everywhere = lambda now, before: torch.zeros(HEIGHT, WIDTH, 2)  # noqa: E731
     monkeypatch.setattr("devrf.scenes.optical_flow.estimator", lambda method: everywhere)
     flow = with_flow(scene, "dis", None).dynamic.train.flow
@@ -238,28 +210,28 @@ def test_flow_is_valid_at_pixels_that_count(root: Path, monkeypatch: pytest.Monk
     assert bool(flow.valid[1].any()) and not bool((flow.valid & ~valid_mask).any())
 
 
-def test_inspecting_says_how_much_they_cover(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_inspecting_says_how_much_they_cover(root, caplog):
     plain(root, [255 - half() if k == 3 else half() for k in range(9)])
     with caplog.at_level(logging.INFO):
-        scene = read_nerfstudio(root)
+        scene = NerfstudioReader(root).read()
     assert "masks of 8 images leave out 50.0 % of the pixels of all" in caplog.text
     facts = inspect_scene(scene).sets[0]
-    assert facts.mattes is None and facts.left_out == pytest.approx(0.5)
+    assert facts.alpha_share is None and facts.masked_share == pytest.approx(0.5)
     assert not [advice for advice in image_advice(scene) if "masks" in advice.what]
-    abbreviated = counted_pixels(scene.dynamic.train, 0)
-    assert abbreviated.shape[2] == 4 and abbreviated[0, :, 3].tolist() == [255] * 40 + [0] * 40
-    matte = inspect_scene(read_nerfstudio(root, masks="matte")).sets[0]
-    assert matte.mattes == pytest.approx(0.5) and matte.left_out is None
+    image, pixels = shown(scene.dynamic.train, 0), scene.dynamic.train.pixels[0].numpy()
+    assert (image[:, :40] == pixels[:, :40]).all() and (image[:, 40:] >= 232).all()
+    matte = inspect_scene(NerfstudioReader(root, masks="matte").read()).sets[0]
+    assert matte.alpha_share == pytest.approx(0.5) and matte.masked_share is None
 
 
-def test_masks_that_cut_out_the_subject_are_told_from_others(root: Path) -> None:
-    found = [a for a in image_advice(read_nerfstudio(root)) if "masks" in a.what]
+def test_masks_that_cut_out_the_subject_are_told_from_others(root):
+    found = [a for a in image_advice(NerfstudioReader(root).read()) if "masks" in a.what]
     assert len(found) == 1 and "set data.masks=matte" in found[0].remedy
     assert found[0].where.startswith("static training set, ")
 
 
-def test_where_pixels_do_not_count_nothing_is_carved_away(root: Path) -> None:
-    views = read_nerfstudio(root, masks="matte").static.train
+def test_where_pixels_are_not_valid_nothing_is_carved_away(root):
+    views = NerfstudioReader(root, masks="matte").read().static.train
     box = Box.of((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
     whole = visual_hull(views, box, (12, 12, 12))
     nothing = replace(views, valid_mask=torch.zeros(views.pixels.shape[:3], dtype=torch.bool))

@@ -5,97 +5,39 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import imageio.v3 as iio
 import pytest
 import torch
 
-from devrf.errors import DevrfError
 from devrf.geometry.distortion import Distortion
 from devrf.scenes.lens import Lens
-from devrf.scenes.nerfstudio import read_nerfstudio
+from devrf.scenes.nerfstudio import NerfstudioReader
 
-# Not square, and the principal point off the middle.
 WIDTH, HEIGHT = 80, 60
-BARREL = Distortion((-0.3, 0.1, 0.01, 0.0), (0.006, -0.008))
-LENS = Lens((88.0, 84.0), (42.0, 28.0), BARREL)
-SHARED = {
-    "camera_model": "OPENCV",
-    "fl_x": 88.0,
-    "fl_y": 84.0,
-    "cx": 42.0,
-    "cy": 28.0,
-    "w": WIDTH,
-    "h": HEIGHT,
-    "k1": -0.3,
-    "k2": 0.1,
-    "k3": 0.01,
-    "p1": 0.006,
-    "p2": -0.008,
-    "applied_transform": [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]],
-    "applied_scale": 0.5,
-}
-Frames = list[dict[str, Any]]
 
 
 @pytest.fixture
-def write(
-    ring_cameras: Callable[..., Any], picture: Callable[..., Any]
-) -> Callable[..., dict[str, Any]]:
-    """A function that writes ``transforms.json`` and pictures of the balls into a folder."""
-
-    def written(
-        folder: Path,
-        times: list[float] | None,
-        *,
-        turn: float = 0.0,
-        lens: Callable[[int], Lens] = lambda index: LENS,
-        shared: dict[str, Any] = SHARED,
-        views: int | None = None,
-        count: int = 9,
-    ) -> dict[str, Any]:
-        count = count if times is None else len(times)
-        ring = ring_cameras(views or count, turn=turn, width=WIDTH, height=HEIGHT, angle=0.9)
-        poses = ring.camera_to_world[torch.arange(count) % (views or count)]
-        (folder / "images").mkdir(parents=True)
-        frames: Frames = []
-        for i, pose in enumerate(poses):
-            iio.imwrite(folder / f"images/frame_{i:05d}.png", picture(pose, lens(i), WIDTH, HEIGHT))
-            matrix = torch.cat([pose, torch.tensor([[0.0, 0.0, 0.0, 1.0]])]).tolist()
-            frame = {"file_path": f"images/frame_{i:05d}.png", "transform_matrix": matrix}
-            frames.append(frame if times is None else frame | {"time": times[i]})
-        content = {**shared, "frames": frames}
-        (folder / "transforms.json").write_text(json.dumps(content))
-        return content
-
-    return written
+def message_of(refusal) -> Callable[..., str]:
+    return partial(refusal, NerfstudioReader)
 
 
 @pytest.fixture
-def moving(tmp_path: Path, write: Callable[..., Any]) -> Path:
+def moving(tmp_path, balls) -> Path:
     """Nine images of a moving camera."""
-    write(tmp_path / "scene", [i / 8 for i in range(9)])
+    balls.write(tmp_path / "scene", [i / 8 for i in range(9)])
     return tmp_path / "scene"
 
 
-def edit(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
-    file = root / "transforms.json"
-    content = json.loads(file.read_text())
-    change(content)
-    file.write_text(json.dumps(content))
-
-
 def listed(*numbers: int) -> list[str]:
-    return [f"./images/frame_{i:05d}.png" for i in numbers]
+    return [f"./images/r_{i:03d}.png" for i in numbers]
 
 
 @pytest.mark.parametrize("downscale", [1, 2])
-def test_points_fall_on_the_pixels_that_show_them(
-    moving: Path, balls_are_where_they_project: Callable[..., None], downscale: int
-) -> None:
-    scene = read_nerfstudio(moving, downscale=downscale)
+def test_points_fall_on_the_pixels_that_show_them(moving, balls_are_where_they_project, downscale):
+    scene = NerfstudioReader(moving, downscale=downscale).read()
     assert scene.kind == "inward" and scene.name == "scene"
     train = scene.dynamic.train
     assert (train.width, train.height) == (WIDTH // downscale, HEIGHT // downscale)
@@ -104,67 +46,59 @@ def test_points_fall_on_the_pixels_that_show_them(
     assert train.has_alpha and scene.bounds.box.contains(torch.zeros(3))
 
 
-def test_without_the_coefficients_they_do_not(
-    moving: Path, balls_are_where_they_project: Callable[..., None]
-) -> None:
-    edit(moving, lambda c: c.update(k1=0, k2=0, k3=0, p1=0, p2=0, camera_model="PINHOLE"))
+def test_without_the_coefficients_they_do_not(moving, balls_are_where_they_project, balls):
+    balls.edit(moving, lambda c: c.update(k1=0, k2=0, k3=0, p1=0, p2=0, camera_model="PINHOLE"))
     with pytest.raises(AssertionError, match="not close"):
-        balls_are_where_they_project(read_nerfstudio(moving).dynamic.train)
+        balls_are_where_they_project(NerfstudioReader(moving).read().dynamic.train)
 
 
-def test_each_frame_may_bring_its_own_lens(
-    tmp_path: Path, write: Callable[..., Any], balls_are_where_they_project: Callable[..., None]
-) -> None:
+def test_each_frame_may_bring_its_own_lens(tmp_path, balls_are_where_they_project, balls):
     def lens(index: int) -> Lens:
         strength = Distortion((-0.04 * index, 0.0, 0.0, 0.0)) if index % 2 else Distortion()
         return Lens((80.0 + 2 * index, 80.0), (40.0 + index / 2, 30.0), strength)
 
-    content = write(tmp_path / "scene", [i / 8 for i in range(9)], lens=lens, shared={})
+    content = balls.write(tmp_path / "scene", [i / 8 for i in range(9)], lens=lens, shared={})
     for i, frame in enumerate(content["frames"]):
         frame |= {"fl_x": 80.0 + 2 * i, "fl_y": 80.0, "cx": 40 + i / 2, "cy": 30, "w": 80, "h": 60}
         frame |= {"k1": -0.04 * i} if i % 2 else {}
     (tmp_path / "scene/transforms.json").write_text(json.dumps(content))
-    train = read_nerfstudio(tmp_path / "scene").dynamic.train
+    train = NerfstudioReader(tmp_path / "scene").read().dynamic.train
     balls_are_where_they_project(train)
     assert len(set(train.cameras.focal[:, 0].tolist())) == len(train)
     # What is not distorted is not zoomed either.
     assert train.cameras.focal[2].tolist() == [84.0, 80.0]
 
 
-def test_an_angle_stands_in_for_a_focal_length(
-    tmp_path: Path, write: Callable[..., Any], balls_are_where_they_project: Callable[..., None]
-) -> None:
+def test_an_angle_stands_in_for_a_focal_length(tmp_path, balls, balls_are_where_they_project):
     # 2 atan(80 / 2 / 90): 90 pixels.
-    write(
+    balls.write(
         tmp_path / "scene",
         [i / 8 for i in range(9)],
         shared={"camera_angle_x": 0.8364488},
         lens=lambda index: Lens((90.0, 90.0), (40.0, 30.0)),
     )
-    train = read_nerfstudio(tmp_path / "scene").dynamic.train
+    train = NerfstudioReader(tmp_path / "scene").read().dynamic.train
     balls_are_where_they_project(train)
     torch.testing.assert_close(train.cameras.focal[0], torch.tensor([90.0, 90.0]))
 
 
-def test_pixels_are_counted_in_the_size_that_the_file_gives(
-    moving: Path, balls_are_where_they_project: Callable[..., None]
-) -> None:
+def test_pixels_are_those_of_the_size_that_the_file_gives(
+    moving, balls_are_where_they_project, balls
+):
     def twice(content: dict[str, Any]) -> None:
         for key in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
             content[key] *= 2
 
-    edit(moving, twice)
-    balls_are_where_they_project(read_nerfstudio(moving).dynamic.train)
+    balls.edit(moving, twice)
+    balls_are_where_they_project(NerfstudioReader(moving).read().dynamic.train)
 
 
-def test_a_moving_camera_without_a_static_set(
-    moving: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_moving_camera_without_a_static_set(moving, caplog):
     with caplog.at_level(logging.WARNING):
-        scene = read_nerfstudio(moving)
+        scene = NerfstudioReader(moving).read()
     assert "no static set: the canonical field is learned from 8 of the 8" in caplog.text
     # The eighth of nine images is held out.
-    assert scene.dynamic.test.names == ("images/frame_00007.png",)
+    assert scene.dynamic.test.names == ("images/r_007.png",)
     assert scene.static.train is scene.dynamic.train
     assert scene.dynamic.train.view.tolist() == list(range(8))
     torch.testing.assert_close(
@@ -189,33 +123,29 @@ def test_a_moving_camera_without_a_static_set(
         ({"test_filenames": listed(4), "val_filenames": listed(4)}, [0, 1, 2, 3, 5, 6, 7, 8], [4]),
     ],
 )
-def test_listed_splits(
-    moving: Path, lists: dict[str, list[str]], train: list[int], test: list[int]
-) -> None:
-    edit(moving, lambda c: c.update(lists))
-    scene = read_nerfstudio(moving)
+def test_listed_splits(moving, lists, train, test, balls):
+    balls.edit(moving, lambda c: c.update(lists))
+    scene = NerfstudioReader(moving).read()
     assert scene.dynamic.train.names == tuple(n[2:] for n in listed(*train))
     assert scene.dynamic.test.names == tuple(n[2:] for n in listed(*test))
 
 
-def test_every_nth_is_held_out(moving: Path) -> None:
-    scene = read_nerfstudio(moving, holdout=3)
+def test_every_nth_is_held_out(moving):
+    scene = NerfstudioReader(moving, holdout=3).read()
     assert scene.dynamic.test.names == tuple(n[2:] for n in listed(2, 5, 8))
     assert len(scene.dynamic.train) == 6
 
 
-def test_images_at_time_zero_are_the_static_set(
-    tmp_path: Path, write: Callable[..., Any], balls_are_where_they_project: Callable[..., None]
-) -> None:
+def test_images_at_time_zero_are_the_static_set(tmp_path, balls_are_where_they_project, balls):
     # Ten images around the scene at rest; then two fixed cameras (of ten poses) at later times.
     later = [0.5] * 2 + [1.0] * 2
-    content = write(tmp_path / "scene", [0.0] * 10 + later, views=10)
+    content = balls.write(tmp_path / "scene", [0.0] * 10 + later, views=10)
     for i in range(10, 14):
         matrix = content["frames"][i % 2]["transform_matrix"]
         content["frames"][i]["transform_matrix"] = matrix
     content["test_filenames"] = listed(5, 6, 11)
     (tmp_path / "scene/transforms.json").write_text(json.dumps(content))
-    scene = read_nerfstudio(tmp_path / "scene")
+    scene = NerfstudioReader(tmp_path / "scene").read()
     assert len(scene.static.train) == 8 and not scene.static.train.times.any()
     assert scene.static.test.names == tuple(n[2:] for n in listed(5, 6))
     balls_are_where_they_project(scene.static.train)
@@ -227,23 +157,21 @@ def test_images_at_time_zero_are_the_static_set(
     assert scene.clock.times == (0.0, 0.5, 1.0)
 
 
-def test_static_until_is_honoured(moving: Path) -> None:
-    scene = read_nerfstudio(moving, static_until=0.25)
+def test_static_until_is_honoured(moving):
+    scene = NerfstudioReader(moving, static_until=0.25).read()
     assert len(scene.static.train) == 3 and len(scene.dynamic.train) == 8
 
 
-def test_two_folders(
-    tmp_path: Path, write: Callable[..., Any], balls_are_where_they_project: Callable[..., None]
-) -> None:
+def test_two_folders(tmp_path, balls_are_where_they_project, balls):
     root = tmp_path / "scene"
-    write(root / "static", None)
-    write(root / "dynamic", [0.0, 0.0, 0.5, 0.5, 1.0, 1.0], views=2, turn=0.4)
-    scene = read_nerfstudio(root, holdout=6)
+    balls.write(root / "static", None)
+    balls.write(root / "dynamic", [0.0, 0.0, 0.5, 0.5, 1.0, 1.0], views=2, turn=0.4)
+    scene = NerfstudioReader(root, holdout=6).read()
     assert len(scene.static.train) == 8 and len(scene.static.test) == 1
     assert scene.dynamic.train.view.tolist() == [0, 1, 0, 1, 0]
     balls_are_where_they_project(scene.static.train)
     balls_are_where_they_project(scene.dynamic.train)
-    thinned = read_nerfstudio(root, holdout=6, frames=2, train_views=1)
+    thinned = NerfstudioReader(root, holdout=6, frames=2, train_views=1).read()
     assert thinned.dynamic.train.times.tolist() == [0.0, 1.0]
 
 
@@ -251,37 +179,33 @@ def test_two_folders(
     ("change", "said"),
     [
         (lambda c: [f.pop("time") for f in c["frames"]], 'no "time", which a capture of a moving'),
-        (lambda c: c["frames"][2].pop("time"), 'frames[2]: has no "time" although'),
-        (lambda c: c["frames"][2].update(time=2), "frames[2]: time is 2, outside [0, 1]"),
         (lambda c: c.update(camera_model="OPENCV_FISHEYE"), "'OPENCV_FISHEYE' is not supported"),
-        (lambda c: c.update(camera_model=[1]), "camera model [1] is not supported"),
-        (lambda c: c.update(is_fisheye=True), "camera model a fisheye is not supported"),
-        (lambda c: c.update(fl_x=0), "fl_x is 0, expected pixels > 0"),
+        (lambda c: c.update(camera_model=[1]), "camera_model: [1] is not supported"),
+        (lambda c: c.update(is_fisheye=True), "is_fisheye: a fisheye is not supported"),
         (lambda c: c.pop("fl_x"), 'has no "camera_angle_x" (radians) and no "fl_x"'),
-        (lambda c: c["frames"][1].update(fl_x="wide"), "frames[1]: fl_x is 'wide'"),
-        (lambda c: c.update(k1=float("nan")), "k1 is nan"),
+        (
+            lambda c: c["frames"][1].update(fl_x="wide"),
+            "frames[1].fl_x: should be a valid number, not 'wide'",
+        ),
+        (lambda c: c.update(k1=float("nan")), "k1: should be a finite number"),
         (lambda c: c.update(k1=-9.0), "folds over"),
         (lambda c: c.update(w=60, h=80), "80x60 px, but its camera is one for 60x80 px"),
-        (lambda c: c["frames"][0].pop("transform_matrix"), 'no "transform_matrix"'),
-        (lambda c: c["frames"][0]["transform_matrix"][0].__setitem__(3, float("nan")), "NaN"),
-        (lambda c: c.update(frames=[]), '"frames"'),
-        (lambda c: c.update(test_filenames=["images/frame_9.png"]), "no such image"),
-        (lambda c: c.update(test_filenames=7), "list of file paths as test_filenames"),
+        (lambda c: c.update(test_filenames=["images/r_9.png"]), "no such image"),
+        (lambda c: c.update(test_filenames=7), "test_filenames: should be a valid array"),
         (
             lambda c: c.update(train_filenames=listed(0, 1), test_filenames=listed(1)),
             "2 images to learn from, 1 held out, 1 of them both",
         ),
         (lambda c: c.update(frames=c["frames"][:1]), "1 images to learn from, 0 held out"),
-        (lambda c: [f.update(time=0.5) for f in c["frames"]], "have one time"),
         (lambda c: [f.update(time=0.0) for f in c["frames"]], "at a time above 0"),
     ],
 )
-def test_wrong_values(moving: Path, change: Callable[[dict[str, Any]], object], said: str) -> None:
-    edit(moving, change)
+def test_wrong_values(moving, change, said, message_of, balls):
+    balls.edit(moving, change)
     assert said in message_of(moving)
 
 
-def test_wrong_files(moving: Path, tmp_path: Path) -> None:
+def test_wrong_files(moving, tmp_path, message_of):
     (tmp_path / "empty").mkdir()
     assert "expected transforms.json, or static/transforms.json" in message_of(tmp_path / "empty")
     text = (moving / "transforms.json").read_text()
@@ -296,22 +220,11 @@ def test_wrong_files(moving: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("option", "said"),
     [
-        ({"holdout": 1}, "data.holdout: expected a whole number of at least 2"),
-        ({"downscale": 0}, "data.downscale"),
+        ({"holdout": 1}, "data.holdout: should be greater than or equal to 2, not 1"),
         ({"static_until": 2.0}, "data.static_until"),
-        ({"near": "x"}, "data.near"),
-        ({"frames": 1}, "data.frames"),
-        ({"background": "red"}, "data.background"),
+        ({"masks": "yes"}, "data.masks: should be 'ignore', 'matte' or 'none'"),
         ({"train_views": 2}, "these move"),
     ],
 )
-def test_wrong_options(moving: Path, option: dict[str, Any], said: str) -> None:
+def test_wrong_options(moving, option, said, message_of):
     assert said in message_of(moving, **option)
-
-
-def message_of(root: Path, **options: Any) -> str:
-    with pytest.raises(DevrfError) as caught:
-        read_nerfstudio(root, **options)
-    message = str(caught.value)
-    assert "\n" not in message and len(message) < 600
-    return message

@@ -36,7 +36,7 @@ def one_thread() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module", params=["robot", "flower"])
-def built(request: pytest.FixtureRequest) -> tuple[ProceduralScene, Scene]:
+def built(request) -> tuple[ProceduralScene, Scene]:
     recipe = replace(RECIPE, shape=request.param)
     return recipe, recipe()
 
@@ -55,20 +55,20 @@ def seen_points(cameras: Cameras, depth: torch.Tensor) -> torch.Tensor:
     return rays.at(torch.arange(len(rays)), depth[depth.isfinite()])
 
 
-def test_every_robot_part_rests_at_time_zero() -> None:
+def test_every_robot_part_rests_at_time_zero():
     rest = solid_motions(1.3, 0.0)
     assert torch.equal(rest, torch.eye(3, 4, dtype=rest.dtype).expand_as(rest))
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=repr)
-def test_nothing_has_moved_at_time_zero(shape: Shape) -> None:
+def test_nothing_has_moved_at_time_zero(shape):
     outline = shape.outline()
     torch.testing.assert_close(shape.forward(outline, 0.0), outline.rest, atol=2e-6, rtol=0)
 
 
 @pytest.mark.parametrize("time", TIMES)
 @pytest.mark.parametrize("shape", SHAPES, ids=repr)
-def test_forward_undoes_the_backward_warp(shape: Shape, time: float) -> None:
+def test_forward_undoes_the_backward_warp(shape, time):
     points = surface_points(shape, time)
     assert len(points) > 300
     again = shape.forward(shape.material(points, time), time)
@@ -76,7 +76,7 @@ def test_forward_undoes_the_backward_warp(shape: Shape, time: float) -> None:
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=repr)
-def test_distance_never_exceeds_that_to_a_seen_surface_point(shape: Shape) -> None:
+def test_distance_never_exceeds_that_to_a_seen_surface_point(shape):
     # Sphere tracing is safe exactly when no step is longer than the way to any surface.
     generator = torch.Generator().manual_seed(0)
     points = 3 * torch.rand(2000, 3, generator=generator) - 1.5
@@ -86,14 +86,14 @@ def test_distance_never_exceeds_that_to_a_seen_surface_point(shape: Shape) -> No
 
 
 @pytest.mark.parametrize("shape", SHAPES[:2], ids=repr)
-def test_material_stays_on_the_surface_or_inside(shape: Shape) -> None:
+def test_material_stays_on_the_surface_or_inside(shape):
     # A moved surface point may be swallowed by another part, but never leaves the object.
     points = surface_points(shape, 0.4)
     assert (shape.distance(moved(shape, points, 0.4, 0.9), 0.9) < 3 * HIT).all()
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=repr)
-def test_motion_stays_within_the_extent(shape: Shape) -> None:
+def test_motion_stays_within_the_extent(shape):
     where = extent(shape)
     assert where.rest.contains(surface_points(shape, 0.0)).all()
     for time in TIMES:
@@ -102,7 +102,7 @@ def test_motion_stays_within_the_extent(shape: Shape) -> None:
         assert float(points.norm(dim=-1).max()) < where.reach
 
 
-def test_color_belongs_to_the_material() -> None:
+def test_color_belongs_to_the_material():
     for shape in (Robot(), Flower()):
         points = surface_points(shape, 0.5)
         then = shape.material(points, 0.5)
@@ -116,7 +116,7 @@ def test_color_belongs_to_the_material() -> None:
         )
 
 
-def test_views_are_ordered_time_major(built: tuple[ProceduralScene, Scene]) -> None:
+def test_views_are_ordered_time_major(built):
     recipe, scene = built
     train = scene.dynamic.train
     assert train.view.tolist() == [0, 1, 2] * 4
@@ -132,7 +132,7 @@ def all_views(scene: Scene) -> list[Views]:
     return [c.__dict__[split] for c in (scene.static, scene.dynamic) for split in ("train", "test")]
 
 
-def test_depth_ends_on_the_surface(built: tuple[ProceduralScene, Scene]) -> None:
+def test_depth_ends_on_the_surface(built):
     recipe, scene = built
     shape = recipe.model()
     for views in all_views(scene):
@@ -146,7 +146,7 @@ def test_depth_ends_on_the_surface(built: tuple[ProceduralScene, Scene]) -> None
             assert scene.bounds.near < float(seen.min()) <= float(seen.max()) < scene.bounds.far
 
 
-def test_flow_is_the_projected_scene_flow(built: tuple[ProceduralScene, Scene]) -> None:
+def test_flow_is_the_projected_scene_flow(built):
     recipe, scene = built
     shape = recipe.model()
     for views in (scene.dynamic.train, scene.dynamic.test):
@@ -174,7 +174,7 @@ def test_flow_is_the_projected_scene_flow(built: tuple[ProceduralScene, Scene]) 
         assert largest > 1.0
 
 
-def test_flow_leads_to_the_same_color(built: tuple[ProceduralScene, Scene]) -> None:
+def test_flow_leads_to_the_same_color(built):
     # The images themselves agree: away from silhouettes, a pixel looks as it did where its
     # flow points to. The albedo alone is compared, so the lamp is off.
     recipe = replace(built[0], light=0.0, width=96, height=80, frames=12, static_views=1)
@@ -198,7 +198,7 @@ def test_flow_leads_to_the_same_color(built: tuple[ProceduralScene, Scene]) -> N
     assert torch.cat(errors).mean() < 0.5 * torch.cat(still).mean()
 
 
-def test_edges_are_antialiased(built: tuple[ProceduralScene, Scene]) -> None:
+def test_edges_are_antialiased(built):
     alpha = built[1].static.train.pixels[..., 3]
     assert set(alpha.unique().tolist()) == {0, 64, 128, 191, 255}
     # Straight alpha: a half-covered pixel is as bright as its neighbours, not half as bright.
@@ -208,7 +208,7 @@ def test_edges_are_antialiased(built: tuple[ProceduralScene, Scene]) -> None:
     assert edge[:, :3].mean() > 0.75 * inner[:, :3].mean()
 
 
-def test_static_views_show_the_first_frame() -> None:
+def test_static_views_show_the_first_frame():
     shape = Flower()
     cameras, _ = dynamic_rig(2, width=24, height=32, reach=1.3)
     still = render(Flower(0.0), cameras, 0.7, reach=1.3)
@@ -218,7 +218,7 @@ def test_static_views_show_the_first_frame() -> None:
     assert not torch.equal(later.pixels, first.pixels)
 
 
-def test_rest_pose_alone_explains_later_frames_badly(built: tuple[ProceduralScene, Scene]) -> None:
+def test_rest_pose_alone_explains_later_frames_badly(built):
     pixels = built[1].dynamic.train.pixels.float() / 255
     white = pixels[..., :3] * pixels[..., 3:] + 1 - pixels[..., 3:]
     frames = white.view(4, 3, 28, 40, 3)
@@ -226,7 +226,7 @@ def test_rest_pose_alone_explains_later_frames_badly(built: tuple[ProceduralScen
     assert (psnr < 21).all() and psnr[-1] < 18
 
 
-def test_the_same_recipe_gives_the_same_scene(built: tuple[ProceduralScene, Scene]) -> None:
+def test_the_same_recipe_gives_the_same_scene(built):
     recipe, scene = built
     again = recipe()
     assert scene.fingerprint == again.fingerprint
@@ -237,7 +237,7 @@ def test_the_same_recipe_gives_the_same_scene(built: tuple[ProceduralScene, Scen
 
 
 @pytest.mark.parametrize(("width", "height"), [(48, 16), (16, 48)])
-def test_the_whole_object_fits_into_any_format(width: int, height: int) -> None:
+def test_the_whole_object_fits_into_any_format(width, height):
     scene = ProceduralScene(
         width=width, height=height, frames=3, static_views=6, static_test_views=1, supersample=1
     )()
@@ -249,7 +249,7 @@ def test_the_whole_object_fits_into_any_format(width: int, height: int) -> None:
         assert alpha.any(dim=-1).any(dim=-1).all()
 
 
-def test_held_out_cameras_are_not_training_cameras(built: tuple[ProceduralScene, Scene]) -> None:
+def test_held_out_cameras_are_not_training_cameras(built):
     for capture in (built[1].static, built[1].dynamic):
         apart = torch.cdist(capture.train.cameras.positions, capture.test.cameras.positions)
         assert float(apart.min()) > 0.5
@@ -273,13 +273,13 @@ def test_held_out_cameras_are_not_training_cameras(built: tuple[ProceduralScene,
         ("light", "bright"),
     ],
 )
-def test_wrong_arguments_are_named(key: str, value: object) -> None:
+def test_wrong_arguments_are_named(key, value):
     with pytest.raises(DevrfError, match=f"data.{key}") as caught:
         replace(RECIPE, **{key: value})()  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)
 
 
-def test_material_is_named_by_part() -> None:
+def test_material_is_named_by_part():
     # Two robot parts can share a point at rest and part ways: the part decides.
     shape = Robot()
     where = torch.zeros(2, 3)

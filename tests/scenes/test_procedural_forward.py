@@ -52,7 +52,7 @@ def all_views(scene: Scene) -> list[Views]:
     return [v for c in (scene.static, scene.dynamic) for v in (c.train, c.test)]
 
 
-def test_what_is_promised(scene: Scene) -> None:
+def test_what_is_promised(scene):
     assert (scene.name, scene.kind) == ("plush", "forward")
     # Seven of eight are learned from: 10 = 8 + 2.
     assert len(scene.static.train) == 8 and len(scene.static.test) == 2
@@ -63,27 +63,27 @@ def test_what_is_promised(scene: Scene) -> None:
         assert views.pixels.shape[1:] == (28, 40, 3)
 
 
-def test_every_ray_meets_something(scene: Scene) -> None:
+def test_every_ray_meets_something(scene):
     for views in all_views(scene):
         assert views.depth is not None and bool(views.depth.isfinite().all())
         assert int(views.pixels.amax(dim=-1).min()) > 0
 
 
-def test_every_ray_of_the_default_cameras_meets_something() -> None:
+def test_every_ray_of_the_default_cameras_meets_something():
     cameras, _ = dynamic_rig(4, width=96, height=72)
     filming = Filming(ProceduralForwardScene().model(), 9.0, 1, 0.0, steps=400)
     assert bool(filming.pictures(cameras, 0.5).depth.isfinite().all())
 
 
 @pytest.mark.parametrize("count", [2, 7, 23])
-def test_the_static_cameras_are_centred_and_face_the_scene(count: int) -> None:
+def test_the_static_cameras_are_centred_and_face_the_scene(count):
     cameras = static_rig(count, width=40, height=28)
     average = average_pose(cameras.camera_to_world.double())
     torch.testing.assert_close(average, torch.eye(3, 4).double(), atol=1e-6, rtol=0)
     assert bool((cameras.forwards[:, 2] < -0.98).all())
 
 
-def test_nothing_is_nearer_than_the_bound_of_the_published_layout(scene: Scene) -> None:
+def test_nothing_is_nearer_than_the_bound_of_the_published_layout(scene):
     for views in all_views(scene):
         camera = torch.arange(len(views)).repeat_interleave(views.height * views.width)
         _, depth = views.cameras.project(camera, seen(views))
@@ -91,7 +91,7 @@ def test_nothing_is_nearer_than_the_bound_of_the_published_layout(scene: Scene) 
 
 
 @pytest.mark.parametrize("shape", [(40, 28), (28, 40), (32, 32)])
-def test_the_floor_stays_far_enough_in_images_of_any_shape(shape: tuple[int, int]) -> None:
+def test_the_floor_stays_far_enough_in_images_of_any_shape(shape):
     cameras = static_rig(23, width=shape[0], height=shape[1])
     down = torch.tensor([[shape[0] / 2, shape[1]]], dtype=torch.float32).repeat(23, 1)
     rays = cameras.rays(torch.arange(23), down)
@@ -99,14 +99,14 @@ def test_the_floor_stays_far_enough_in_images_of_any_shape(shape: tuple[int, int
     assert float((reach * -rays.directions[:, 2]).min()) > 1 / 0.75
 
 
-def test_the_box_holds_every_visible_surface(scene: Scene) -> None:
+def test_the_box_holds_every_visible_surface(scene):
     for views in (scene.static.train, scene.dynamic.train):
         device = scene.space.from_world(seen(views))
         assert bool(scene.bounds.box.contains(device).all())
     assert (scene.bounds.near, scene.bounds.far) == (0.0, 1.0)
 
 
-def test_points_lie_on_the_ndc_rays_of_their_pixels(scene: Scene) -> None:
+def test_points_lie_on_the_ndc_rays_of_their_pixels(scene):
     views = scene.dynamic.train
     camera = torch.arange(len(views)).repeat_interleave(28 * 40)
     world = views.cameras.rays(camera, views.cameras.pixel_grid().repeat(len(views), 1))
@@ -118,14 +118,14 @@ def test_points_lie_on_the_ndc_rays_of_their_pixels(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=repr)
-def test_nothing_has_moved_at_time_zero(shape: OnStage) -> None:
+def test_nothing_has_moved_at_time_zero(shape):
     outline = shape.outline()
     torch.testing.assert_close(shape.forward(outline, 0.0), outline.rest, atol=2e-6, rtol=0)
 
 
 @pytest.mark.parametrize("time", TIMES)
 @pytest.mark.parametrize("shape", SHAPES, ids=repr)
-def test_forward_undoes_the_backward_warp(shape: OnStage, time: float) -> None:
+def test_forward_undoes_the_backward_warp(shape, time):
     points = surface(shape, time)
     material = shape.material(points, time)
     assert set(material.part.tolist()) >= {0, 1, 2, 3, 4}
@@ -136,7 +136,7 @@ def test_forward_undoes_the_backward_warp(shape: OnStage, time: float) -> None:
 
 @pytest.mark.parametrize("time", TIMES)
 @pytest.mark.parametrize("shape", SHAPES, ids=repr)
-def test_distance_never_exceeds_that_to_a_seen_surface_point(shape: OnStage, time: float) -> None:
+def test_distance_never_exceeds_that_to_a_seen_surface_point(shape, time):
     # Sphere tracing is safe exactly when no step is longer than the way to any surface.
     points = surface(shape, time)
     generator = torch.Generator().manual_seed(3)
@@ -151,7 +151,7 @@ def test_distance_never_exceeds_that_to_a_seen_surface_point(shape: OnStage, tim
 
 
 @pytest.mark.parametrize("speed", [0.0, 1.0, 2.0])
-def test_the_toy_stays_in_the_ball_around_its_base(speed: float) -> None:
+def test_the_toy_stays_in_the_ball_around_its_base(speed):
     toy = Plush(speed)
     outline = toy.outline()
     base = torch.tensor(BASE)
@@ -161,7 +161,7 @@ def test_the_toy_stays_in_the_ball_around_its_base(speed: float) -> None:
         assert float((toy.forward(outline, time) - base).norm(dim=1).max()) < reach
 
 
-def test_flow_leads_to_the_same_material_in_the_frame_before(scene: Scene) -> None:
+def test_flow_leads_to_the_same_material_in_the_frame_before(scene):
     views, shape = scene.dynamic.train, RECIPE.model()
     flow = views.flow
     assert flow is not None
@@ -179,7 +179,7 @@ def test_flow_leads_to_the_same_material_in_the_frame_before(scene: Scene) -> No
     assert float((length < 1e-3).float().mean()) > 0.6
 
 
-def test_the_same_recipe_gives_the_same_scene(scene: Scene) -> None:
+def test_the_same_recipe_gives_the_same_scene(scene):
     again = replace(RECIPE, frames=2)()
     assert torch.equal(again.static.train.pixels, scene.static.train.pixels)
     assert torch.equal(again.dynamic.train.pixels[:3], scene.dynamic.train.pixels[:3])
@@ -199,7 +199,7 @@ def test_the_same_recipe_gives_the_same_scene(scene: Scene) -> None:
         ("supersample", 17, "at most 16"),
     ],
 )
-def test_wrong_numbers_are_named(key: str, value: object, said: str) -> None:
+def test_wrong_numbers_are_named(key, value, said):
     recipe = replace(RECIPE, **{key: value})  # type: ignore[arg-type]
     with pytest.raises(DevrfError, match=f"data.{key}.*{said}"):
         recipe()

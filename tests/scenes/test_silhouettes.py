@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from devrf.geometry.box import Box
 from devrf.scenes.scene import Views
 from devrf.scenes.silhouettes import _dilated, motion_box
 
@@ -21,7 +20,7 @@ PLACES = torch.stack(
 )
 
 
-def test_box_holds_the_moving_ball_and_little_more(ball_views: BallViews, unit_box: Box) -> None:
+def test_box_holds_the_moving_ball_and_little_more(ball_views, unit_box):
     box = motion_box(ball_views(PLACES, RADIUS), unit_box)
     assert box is not None
     low, high = PLACES.amin(dim=0) - RADIUS, PLACES.amax(dim=0) + RADIUS
@@ -32,15 +31,13 @@ def test_box_holds_the_moving_ball_and_little_more(ball_views: BallViews, unit_b
     assert float(slack_low.max()) < 0.3 and float(slack_high.max()) < 0.25
 
 
-def test_a_ball_far_smaller_than_a_grid_cell_is_not_lost(
-    ball_views: BallViews, unit_box: Box
-) -> None:
+def test_a_ball_far_smaller_than_a_grid_cell_is_not_lost(ball_views, unit_box):
     place = torch.tensor([[0.31, 0.17, 0.23], [0.52, 0.17, 0.23]])
     box = motion_box(ball_views(place, 0.05), unit_box, resolution=12)
     assert box is not None and bool(box.contains(place).all())
 
 
-def test_a_ball_cut_off_by_one_image_is_kept_whole(ball_views: BallViews, unit_box: Box) -> None:
+def test_a_ball_cut_off_by_one_image_is_kept_whole(ball_views, unit_box):
     # Two of the cameras see as far as y = 1.93 only, the two others look along y.
     places = torch.tensor([[0.0, 0.0, 0.0], [0.0, 1.9, 0.0]])
     views = ball_views(places, RADIUS)
@@ -51,7 +48,7 @@ def test_a_ball_cut_off_by_one_image_is_kept_whole(ball_views: BallViews, unit_b
     assert box is not None and box.high[1] >= 1.9 + RADIUS
 
 
-def test_what_does_not_count_rules_nothing_out(ball_views: BallViews, unit_box: Box) -> None:
+def test_what_does_not_count_rules_nothing_out(ball_views, unit_box):
     views = ball_views(PLACES, RADIUS)
     box = motion_box(views, unit_box)
     valid_mask = torch.ones(views.pixels.shape[:3], dtype=torch.bool)
@@ -67,18 +64,14 @@ def test_what_does_not_count_rules_nothing_out(ball_views: BallViews, unit_box: 
     assert motion_box(replace(views, valid_mask=valid_mask), unit_box) is None
 
 
-def test_nothing_is_imagined_beyond_images_that_hold_the_ball_whole(
-    ball_views: BallViews, unit_box: Box
-) -> None:
+def test_nothing_is_imagined_beyond_images_that_hold_the_ball_whole(ball_views, unit_box):
     # Opposite cameras both see the ball along x; the two others see no farther than 1.93.
     views = ball_views(torch.tensor([[0.0, 0, 0], [0.05, 0, 0]]), 0.8)
     box = motion_box(views, unit_box.scaled(2.0))
     assert box is not None and max(box.high[:2]) < 1.3 and min(box.low[:2]) > -1.3
 
 
-def test_no_box_without_mattes_or_without_two_cameras_at_every_time(
-    ball_views: BallViews, unit_box: Box
-) -> None:
+def test_no_box_without_mattes_or_without_two_cameras_at_every_time(ball_views, unit_box):
     assert motion_box(ball_views(PLACES, RADIUS, channels=3), unit_box) is None
     assert motion_box(ball_views(PLACES, RADIUS, count=1), unit_box) is None
     whole = ball_views(PLACES, RADIUS)
@@ -86,14 +79,14 @@ def test_no_box_without_mattes_or_without_two_cameras_at_every_time(
     assert motion_box(missing, unit_box) is None
 
 
-def test_no_box_when_every_matte_is_empty(ball_views: BallViews, unit_box: Box) -> None:
+def test_no_box_when_every_matte_is_empty(ball_views, unit_box):
     views = ball_views(PLACES, RADIUS)
     empty = replace(views, pixels=torch.zeros_like(views.pixels))
     assert motion_box(empty, unit_box) is None
 
 
 @pytest.mark.parametrize("reach", [1, 2, 5, 6])
-def test_dilation_reaches_exactly_so_far(reach: int) -> None:
+def test_dilation_reaches_exactly_so_far(reach):
     masks = torch.zeros((1, 15, 17), dtype=torch.bool)
     masks[0, 7, 8] = True
     expected = torch.zeros_like(masks)

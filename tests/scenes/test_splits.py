@@ -23,13 +23,13 @@ def one_by_one(poses: torch.Tensor) -> list[int]:
 
 
 @given(st.lists(st.tuples(st.integers(0, 5), st.integers(-3, 3)), min_size=1, max_size=30))
-def test_poses_are_told_apart_as_defined(drawn: list[tuple[int, int]]) -> None:
+def test_poses_are_told_apart_as_defined(drawn):
     cameras = torch.randn((6, 3, 4), generator=torch.Generator().manual_seed(0))
     # Steps of 0.6 of the limit: neighbours are the same camera, others are not.
     poses = torch.stack([cameras[k] + 0.6 * SAME_POSE * step for k, step in drawn])
     assert distinct_poses(poses).tolist() == one_by_one(poses)
 
 
-def test_a_moving_camera_with_many_images_takes_a_moment() -> None:
+def test_a_moving_camera_with_many_images_takes_a_moment():
     poses = torch.randn((20_000, 3, 4), generator=torch.Generator().manual_seed(0))
     assert distinct_poses(poses).tolist() == list(range(20_000))

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
+import numpy as np
 import pytest
 import torch
 
 from devrf.errors import DevrfError
 from devrf.geometry.distortion import Distortion
 from devrf.scenes.lens import Lens
-from devrf.scenes.undistortion import as_pinhole, resample
+from devrf.scenes.resampling import look_up_pixels
+from devrf.scenes.undistortion import as_pinhole
 
 BARREL = Distortion((-0.2, 0.05, 0.0, 0.0), (0.004, -0.006))
 PINCUSHION = Distortion((0.15, 0.02, 0.01, 0.0), (-0.004, 0.003))
@@ -20,13 +19,11 @@ WIDTH, HEIGHT = 96, 64
 
 @pytest.mark.parametrize("distortion", [BARREL, PINCUSHION, Distortion()])
 @pytest.mark.parametrize("skew", [0.0, 4.0])
-def test_straight_lines_come_out_straight(distortion: Distortion, skew: float) -> None:
+def test_straight_lines_come_out_straight(distortion, skew, lens_directions):
     """Each pixel shows its own direction: an image of x/z and y/z becomes one linear in them."""
     lens = Lens((70.0, 60.0), (50.0, 30.0), distortion, skew)
     y, x = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
-    py = (y.double() + 0.5 - 30) / 60
-    px = (x.double() + 0.5 - 50 - skew * py) / 70
-    direction = distortion.undistort(torch.stack([px, py], dim=-1))
+    direction = lens_directions(lens, WIDTH, HEIGHT)
     coded = ((direction + 1.5) * 80).round().clamp(0, 255).to(torch.uint8)
     image = torch.cat([coded, coded[..., :1]], dim=-1)
     pixels, (plain,) = as_pinhole(image[None], [lens], ["image"])
@@ -41,7 +38,7 @@ def test_straight_lines_come_out_straight(distortion: Distortion, skew: float) -
     assert (found - expected).abs()[2:-2, 2:-2].max() < 1.1 / 80
 
 
-def test_a_pincushion_is_zoomed_until_nothing_is_missing() -> None:
+def test_a_pincushion_is_zoomed_until_nothing_is_missing():
     _, (plain,) = as_pinhole(
         torch.zeros(1, HEIGHT, WIDTH, 3, dtype=torch.uint8),
         [Lens((70.0, 70.0), (48.0, 32.0), PINCUSHION)],
@@ -52,23 +49,28 @@ def test_a_pincushion_is_zoomed_until_nothing_is_missing() -> None:
     assert plain.focal[0] > 70 and (reached <= torch.tensor([48.0, 32.0])).all()
 
 
-def test_a_plain_lens_leaves_every_pixel() -> None:
+def test_a_plain_lens_leaves_every_pixel():
     image = torch.randint(256, (2, HEIGHT, WIDTH, 4), dtype=torch.uint8)
     lens = Lens((70.0, 60.0), (50.0, 30.0))
     pixels, lenses = as_pinhole(image.clone(), [lens, lens], ["a", "b"])
     assert torch.equal(pixels, image) and lenses == (lens, lens)
 
 
-def test_colours_behind_the_matte_do_not_bleed_in() -> None:
-    image = torch.zeros(1, 2, 4, dtype=torch.uint8)
-    image[0, 0] = torch.tensor([200, 100, 50, 255])
-    image[0, 1] = torch.tensor([0, 255, 0, 0])
-    between = resample(image, torch.tensor([[[1.0, 0.5], [1.5, 0.5], [0.5, 0.5]]]))
+def test_colours_behind_the_matte_do_not_bleed_in():
+    image = np.array([[[200, 100, 50, 255], [0, 255, 0, 0]]], dtype=np.uint8)
+    places = np.array([[[1.0, 0.5], [1.5, 0.5], [0.5, 0.5]]], dtype=np.float32)
+    between = look_up_pixels(image, places)
     assert between[0].tolist() == [[200, 100, 50, 128], [0, 0, 0, 0], [200, 100, 50, 255]]
 
 
+def test_an_image_that_is_too_wide_is_an_error_that_names_it():
+    image = torch.zeros(1, 8, 40_000, 3, dtype=torch.uint8)
+    with pytest.raises(DevrfError, match=r"a.png: 40000x8 px, .* use a larger data.downscale"):
+        as_pinhole(image, [Lens((4e4, 4e4), (2e4, 4.0), BARREL)], ["a.png"])
+
+
 @pytest.mark.parametrize("k1", [-3.0, 60.0])
-def test_a_lens_that_folds_is_an_error_that_names_the_image(k1: float) -> None:
+def test_a_lens_that_folds_is_an_error_that_names_the_image(k1):
     lens = Lens((50.0, 50.0), (48.0, 32.0), Distortion((k1, 0.0, 0.0, 0.0)))
     folded = Lens((12.0, 12.0), (48.0, 32.0), Distortion((-3.0, 0.0, 0.0, 0.0)))
     chosen = lens if k1 > 0 else folded
@@ -77,9 +79,7 @@ def test_a_lens_that_folds_is_an_error_that_names_the_image(k1: float) -> None:
         as_pinhole(image, [chosen], ["view_7.png"])
 
 
-def test_the_balls_are_where_the_pinhole_projects_them(
-    ring_cameras: Callable[..., Any], picture: Callable[..., Any]
-) -> None:
+def test_the_balls_are_where_the_pinhole_projects_them(ring_cameras, picture):
     cameras = ring_cameras(1, width=WIDTH, height=HEIGHT, angle=0.7)
     lens = Lens((110.0, 105.0), (50.0, 30.0), BARREL)
     pose = cameras.camera_to_world[0]

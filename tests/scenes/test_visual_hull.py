@@ -32,7 +32,7 @@ def ball_views(width: int = 72, height: int = 56) -> Views:
     return Views(pixels, cameras, torch.zeros(12), count, tuple("abcdefghijkl"))
 
 
-def test_hull_holds_the_ball_and_little_more() -> None:
+def test_hull_holds_the_ball_and_little_more():
     shape = (33, 33, 33)
     hull = visual_hull(ball_views(), BOX, shape)
     distance = (BOX.grid_points(shape, torch.zeros(1)) - CENTER).norm(dim=-1)
@@ -41,7 +41,7 @@ def test_hull_holds_the_ball_and_little_more() -> None:
     assert not hull[distance > RADIUS + 0.3].any()
 
 
-def test_points_that_no_view_has_in_the_picture_stay() -> None:
+def test_points_that_no_view_has_in_the_picture_stay():
     views = ball_views()
     away = Cameras.looking_at(
         views.cameras.positions,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -29,6 +30,34 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
         raise RuntimeError("disk full")
     assert path.read_text() == "old"
     assert [p.name for p in tmp_path.iterdir()] == ["metrics.json"]
+
+
+def test_the_content_is_on_the_disk_before_it_has_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps: list[str] = []
+    sync, replace = os.fsync, os.replace
+    monkeypatch.setattr(os, "fsync", lambda handle: (steps.append("sync"), sync(handle)))
+    monkeypatch.setattr(os, "replace", lambda *names: (steps.append("name"), replace(*names)))
+    with atomic_write(tmp_path / "a") as partial:
+        partial.write_text("whole")
+    assert steps == ["sync", "name", "sync"]  # the file, its name, the folder that has the name
+
+
+def test_what_the_system_refuses_is_named_by_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "folder"
+    path.mkdir()
+    (path / "a").write_text("")
+    with pytest.raises(OSError) as caught, atomic_write(path) as partial:
+        partial.write_text("no file takes the place of a folder")
+    assert caught.value.filename == str(path)
+    with pytest.raises(OSError) as caught, atomic_write(path / "a" / "b"):
+        pass
+    assert caught.value.filename == str(path / "a")
+    # An error of another file is that file's.
+    with pytest.raises(FileNotFoundError) as caught, atomic_write(path / "c"):
+        (tmp_path / "missing").read_text()
+    assert caught.value.filename == str(tmp_path / "missing")
 
 
 def test_json_takes_the_place_of_what_was_there(tmp_path: Path) -> None:

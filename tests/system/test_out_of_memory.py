@@ -27,7 +27,7 @@ HOST = "DefaultCPUAllocator: can't allocate memory: you tried to allocate 107374
         (ValueError("out of memory"), False),
     ],
 )
-def test_what_is_a_shortage(error: BaseException, short: bool) -> None:
+def test_what_is_out_of_memory(error: BaseException, short: bool) -> None:
     assert is_oom(error) is short
 
 
@@ -44,7 +44,7 @@ def test_the_numbers(said: str, asked: str) -> None:
     assert re.fullmatch(rf"{asked} GiB more asked, [\d.]+ GiB free on cpu", words)
 
 
-def test_what_nobody_said_is_left_out() -> None:
+def test_an_unknown_amount_is_left_out() -> None:
     assert re.fullmatch(r"[\d.]+ GiB free on cpu", numbers("std::bad_alloc", torch.device("cpu")))
 
 

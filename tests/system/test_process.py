@@ -1,4 +1,4 @@
-"""What a process that trains asks of the system."""
+"""Settings of the C library and the system for a process that trains."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
-"""What a run leaves in numbers: means, a row per held-out image, and what it takes to repeat it."""
+"""A run's numbers: mean scores, a row for each held-out image, and the run's provenance."""
 
 from __future__ import annotations
 
-import csv
 import platform
 import subprocess
 import sys
@@ -13,6 +12,7 @@ from statistics import mean
 from typing import Any
 
 import lightning
+import pandas as pd
 import torch
 
 import devrf
@@ -21,10 +21,11 @@ from devrf.system.files import atomic_write
 
 
 def mean_scores(views: Sequence[HeldOutView]) -> dict[str, float | None]:
-    """Means of each metric over held-out images, as the paper's tables have them.
+    """Means of each metric over held-out images, as in the paper's tables.
 
-    Over the images that have a value, of which there may be none (None); rounded to five
-    digits after the point. ``rest_pose_psnr`` is not among them: at rest it says nothing.
+    Returns:
+        Means over the images that have a value, None where no image has; rounded to five digits
+        after the point. Without ``rest_pose_psnr``, which is of the dynamic capture only.
     """
     names = [name for name in views[0].scores if name != "rest_pose_psnr"]
     means: dict[str, float | None] = {}
@@ -39,14 +40,10 @@ def write_frames(path: Path, captures: Mapping[str, Sequence[HeldOutView]]) -> N
 
     Args:
         path: the file.
-        captures: images that were scored alike, by the capture they belong to.
+        captures: scored images, by the name of their capture.
     """
-    rows = frame_rows(captures)
-    with atomic_write(path) as partial, partial.open("w", newline="") as file:
-        table = csv.DictWriter(file, list(dict.fromkeys(name for row in rows for name in row)))
-        table.writeheader()
-        for row in rows:
-            table.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
+    with atomic_write(path) as partial:
+        pd.DataFrame(frame_rows(captures)).to_csv(partial, index=False, float_format="%.6g")
 
 
 def frame_rows(
@@ -61,11 +58,15 @@ def frame_rows(
 
 
 def provenance(size: int, device: torch.device) -> dict[str, Any]:
-    """What it takes, beside the composed config, to tell how numbers came about.
+    """What identifies how numbers were produced, beside the composed config.
+
+    Args:
+        size: how many values were learned.
+        device: where.
 
     Returns:
         Plain data: versions, device, git revision (None outside a checkout; ``-dirty`` where
-        files were changed), learned values, peak memory of this process in GiB, UTC date.
+        files were changed), number of parameters, peak memory of this process in GiB, UTC date.
     """
     return {
         "devrf": devrf.__version__,
@@ -111,7 +112,7 @@ def git_revision(root: Path | None = None) -> str | None:
 
 
 def peak_host_memory() -> float | None:
-    """The most memory this process has held so far, GiB; None where the system does not say."""
+    """The peak memory of this process so far, GiB; None where the system does not tell."""
     if sys.platform == "win32":
         return None
     import resource
@@ -122,5 +123,5 @@ def peak_host_memory() -> float | None:
 
 
 def in_words(values: Mapping[str, Any]) -> str:
-    """``name value, name value, …`` on one line, without what is not known."""
+    """``name value, name value, …`` on one line, without unknown values."""
     return ", ".join(f"{key} {value}" for key, value in values.items() if value is not None)

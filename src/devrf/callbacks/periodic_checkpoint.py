@@ -1,10 +1,13 @@
-"""Writes down, now and then, all that it takes to go on exactly."""
+"""Writes progress files while a stage learns: every so often, and when it is asked to stop.
+
+Lightning's ModelCheckpoint with a time interval does less: it bounds no share of the time, ends the
+training where the disk is full, and may write what has diverged.
+"""
 
 from __future__ import annotations
 
 import logging
 import time
-from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +29,7 @@ class PeriodicCheckpoint(Callback):
     stay, a line says so, and the next one is tried when it is due.
 
     Attributes:
-        saved: the iteration of the last file written or gone on from; None before the first.
+        saved: the iteration of the last file written or resumed from; None before the first.
     """
 
     KEPT = 2
@@ -60,7 +63,7 @@ class PeriodicCheckpoint(Callback):
         self._asked = True
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Start the clock, and forget half-written files of a process that was killed."""
+        """Start the clock, and remove half-written files of a process that was killed."""
         assert isinstance(pl_module, ScheduledStage)
         self._failing = False
         self.saved = pl_module.iteration or None
@@ -72,7 +75,7 @@ class PeriodicCheckpoint(Callback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Write a file when it is time, or the last chance; stop if somebody asked."""
+        """Write a file if one is due, if this step is the last, or if the stage is to stop."""
         assert isinstance(pl_module, ScheduledStage)
         asked, due = self._asked, time.monotonic() >= self._due
         if trainer.world_size > 1:  # what one process is asked, all must do
@@ -80,16 +83,16 @@ class PeriodicCheckpoint(Callback):
             asked, due = agreed(asked, all=False), agreed(due and trainer.is_global_zero, all=False)
         if pl_module.iteration >= pl_module.total_iterations:
             return  # the stage is done: its checkpoint is next
-        # This step's line of the curves, if it has one, is only written after this: a file
-        # written now would make a run that is killed in between go on without it.
+        # This step's row of the curves, if it has one, is only written after this: a run that
+        # went on from a file written now would lack the row if it was killed in between.
         every: int = trainer.log_every_n_steps  # type: ignore[attr-defined]
-        logged_next = every > 1 and (batch_idx + 1) % every == 0
+        row_follows = every > 1 and (batch_idx + 1) % every == 0
         last = trainer.should_stop or 0 < trainer.max_steps <= trainer.global_step
-        if asked or last or due and not logged_next:
+        if asked or last or due and not row_follows:
             callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
             for one in callbacks:
                 if isinstance(one, DivergenceGuard):
-                    one.check(pl_module)  # what has gone wrong is not worth going on from
+                    one.check(pl_module)  # rolls back first: a diverged state is never written
             if trainer.is_global_zero:
                 self._write(trainer, pl_module)
         if asked:
@@ -112,9 +115,9 @@ class PeriodicCheckpoint(Callback):
         else:
             self.saved, self._failing = stage.iteration, False
             files = progress_files(self.folder, stage.name)
-            # Those further on are of a course that was taken back.
-            ahead = list(takewhile(lambda file: file != path, files))
-            for old in [*ahead, *files[len(ahead) + self.KEPT :]]:
+            # Files further on are of a course that was rolled back.
+            newest = files.index(path)
+            for old in files[:newest] + files[newest + self.KEPT :]:
                 old.unlink(missing_ok=True)
         now = time.monotonic()
         rest = (now - began) * (1 / self.share - 1)

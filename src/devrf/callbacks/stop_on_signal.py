@@ -15,13 +15,13 @@ from devrf.system.signals import Interrupted, answered_by
 class StopOnSignal(Callback):
     """Lets the first signal stop the stage, saved; after it Ctrl-C ends the run at once.
 
-    Launchers may send theirs more than once: those change nothing any more.
+    Other signals after the first change nothing: launchers may send theirs more than once.
 
     As a context it answers signals within its block; as a callback it takes them back from
     Lightning, whose own handler would end the run between two steps with nothing written.
 
     Attributes:
-        number: the signal that asked; None if none did.
+        number: the first signal; None before it.
     """
 
     def __init__(self, saving: PeriodicCheckpoint) -> None:

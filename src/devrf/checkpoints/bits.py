@@ -1,4 +1,4 @@
-"""Masks as bits, to be written to files."""
+"""Masks as bits, for files."""
 
 from __future__ import annotations
 

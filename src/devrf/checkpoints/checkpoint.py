@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -179,7 +180,8 @@ def _model_class(path: Path, metadata: CheckpointMetadata) -> type[StoredModel]:
     """The model's class; a file may not choose which other code is run."""
     module, _, name = str(metadata.model.get("_target_")).rpartition(".")
     if module.startswith("devrf.methods.") and not module.count(".") > 4:
-        importlib.import_module(module)
+        with suppress(ModuleNotFoundError):
+            importlib.import_module(module)
     found = getattr(sys.modules.get(module), name, None)
     if not (isinstance(found, type) and hasattr(found, "from_config")):
         raise DevrfError(

@@ -1,8 +1,8 @@
-"""Grids at rest: in half precision, and in full detail only where something ever is.
+"""Grids as a finished checkpoint holds them: in half precision, in detail only near matter.
 
-Most of a field's voxels lie in empty space. What a grid says there is not seen, but it is not
-without meaning: a deformation field has to lead points of empty space to empty space, also
-between frames. So a smooth grid is kept twice: thinned out everywhere, in detail near matter.
+Most of a field's voxels lie in empty space. Their values are not seen, but still matter: a
+deformation field has to map points of empty space to empty space, also between frames. So a smooth
+grid is kept twice: thinned out everywhere, in detail near matter.
 """
 
 from __future__ import annotations
@@ -20,9 +20,8 @@ from devrf.ops.resampling import resample
 # Grid points of the detailed grid to one of the thinned-out grid.
 THINNING = 4
 
-# Packing makes grids smaller by this factor at most, whatever is in them: whoever claims more
-# wants memory.
-MOST = 1000
+# Packing makes grids smaller by this factor at most: a file that claims more is hostile.
+MAX_RATIO = 1000
 
 Packed = dict[str, Any]
 
@@ -33,8 +32,8 @@ def pack(grids: Tensor, keep: Tensor, *, smooth: bool) -> Packed:
     Args:
         grids: (N, X, Y, Z, C) of finite values.
         keep: (N, X, Y, Z) bool, where detail is kept; (1, X, Y, Z) serves all N.
-        smooth: what stands elsewhere: True, a trilinear interpolation of every fourth grid
-            point; False, each channel's mean over the voxels that are left out.
+        smooth: which values elsewhere get: True, the trilinear interpolation of every fourth
+            grid point; False, each channel's mean over the voxels that are left out.
 
     Returns:
         Tensors and numbers by name, for :func:`unpack`.
@@ -73,7 +72,7 @@ def unpack(packed: Packed) -> Tensor:
     shape = (x, y, z)
     elsewhere, kept = packed["elsewhere"].float(), packed["kept"]
     stored = sum(packed[name].nbytes for name in ("keep", "kept", "elsewhere"))
-    if 4 * len(elsewhere) * elsewhere.shape[-1] * x * y * z > MOST * stored:
+    if 4 * len(elsewhere) * elsewhere.shape[-1] * x * y * z > MAX_RATIO * stored:
         raise ValueError("the stored grids claim to be larger than they can be")
     keep = [unpack_bits(bits, shape) for bits in packed["keep"]]
     counts = [int(one.sum()) for one in keep]

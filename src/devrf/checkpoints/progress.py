@@ -1,23 +1,22 @@
-"""What it takes to go on exactly where a stage was left, and where that is kept.
+"""Progress files: all that a stage needs to go on exactly where it was left.
 
 How a run survives being killed, from end to end:
 
-* ``callbacks.PeriodicCheckpoint`` writes a progress file every so often, between two
-  Lightning steps, and when it is asked to stop. It is a Lightning checkpoint: the fields at
-  their present resolution (state_dict), the optimiser (moments, step counts, rates, which
-  entries it skips), Lightning's loop (so that curves go on in step), and what the callbacks
-  remember (seconds, memory).
-* ``ScheduledStage.on_save_checkpoint`` adds the rest: the iteration, the phase that the grids
-  are ready for, every random state, and what the phase has at hand that the
-  schedule alone does not tell (:meth:`ScheduledStage.phase_state`): the pixels to draw from, and
-  the visited frames' occupancy as it is now, as bits.
+* ``callbacks.PeriodicCheckpoint`` writes a progress file every so often, between two Lightning
+  steps, and when it is asked to stop. It is a Lightning checkpoint: the fields at their present
+  resolution (state_dict), the optimiser (moments, step counts, rates), Lightning's loop (so that
+  curves go on in step), and the state of the callbacks (seconds, memory).
+* ``ScheduledStage.on_save_checkpoint`` adds the iteration, the phase that the grids are ready for,
+  every random state, and the state of the phase that does not follow from the schedule
+  (:meth:`ScheduledStage.phase_state`): the pixels to draw from, and the occupancy of the active
+  frames, as bits.
 * ``checkpoints.checkpoint_file`` writes it whole or not at all, with a checksum.
+* ``cli.resume`` finds the file, and checks that it was made with the present settings.
 * ``Trainer.fit(ckpt_path=…)`` reads it. The stage is set up as at its beginning and takes its
   fields' shapes from the file; the optimiser is given the grids, then its state; the random
   states are set last, when nothing but the next iteration can draw from them.
-* ``cli.resume`` finds the file, and checks that it was made with the settings of today.
 
-A finished stage leaves one checkpoint without any of this, and its progress files go.
+A finished stage leaves one checkpoint without any of this, and its progress files are removed.
 """
 
 from __future__ import annotations
@@ -48,12 +47,11 @@ def progress_files(folder: Path, stage: str) -> list[Path]:
 
 def rng_state(device: torch.device) -> dict[str, Any]:
     """The state of everything that a run on ``device`` draws random numbers from, as plain data."""
-    version, words, gauss = random.getstate()
     numpy = np.random.get_state(legacy=False)
     assert isinstance(numpy, dict)
     key = torch.from_numpy(numpy["state"]["key"].astype(np.int64))
     states: dict[str, Any] = {
-        "python": [version, list(words), gauss],
+        "python": random.getstate(),
         "numpy": {**numpy, "state": {"key": key, "pos": int(numpy["state"]["pos"])}},
         "torch": torch.get_rng_state(),
     }
@@ -63,9 +61,8 @@ def rng_state(device: torch.device) -> dict[str, Any]:
 
 
 def set_rng_state(states: dict[str, Any], device: torch.device) -> None:
-    """Draw on from where :func:`rng_state` was asked."""
-    version, words, gauss = states["python"]
-    random.setstate((version, tuple(words), gauss))
+    """Restore the state that :func:`rng_state` gave."""
+    random.setstate(states["python"])
     numpy = states["numpy"]
     key = numpy["state"]["key"].numpy().astype(np.uint32)
     np.random.set_state({**numpy, "state": {**numpy["state"], "key": key}})

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from devrf.reporting.write import ReportSettings
+from devrf.reporting.settings import ReportSettings
 
 
 def config_folder() -> Path:

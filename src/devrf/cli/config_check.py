@@ -11,18 +11,19 @@ import inspect
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 
-from devrf.cli.value_types import described, fits, held
+from devrf.cli.value_types import described, fits
 from devrf.errors import DevrfError
 
 # What the run itself reads, beside the parts.
 ROOT: dict[str, Any] = {
     "stage": str,
     "method": str,
+    "profile": str | None,
     "seed": int,
     "resume": bool,
     "memory_check": bool,
@@ -33,13 +34,21 @@ ROOT: dict[str, Any] = {
     "graphs": Literal["auto", "off"],
     "decoder_precision": Literal["auto", "float32", "bfloat16"],
 }
+# Keys of earlier versions, and what they are called now; then values, by key.
+RENAMED = {
+    "schedule.deformation.frames_at_once": "schedule.deformation.parallel_frames",
+    "schedule.motion.least_gain": "schedule.motion.min_rel_improvement",
+}
+RENAMED_VALUES = {"schedule.motion.pixels": {"useful": "occupied"}}
 # Hydra's own keys in a part's config.
 RESERVED = {"_target_", "_partial_", "_convert_", "_recursive_", "_args_"}
 REFERENCE = re.compile(r"\$\{([\w.]+)\}")
 
+Node = Mapping[Any, Any]
+
 
 def check_config(config: DictConfig) -> None:
-    """Check that every value is set, is read by someone, and is of the type its part expects.
+    """Check that every value is set, belongs to a part, and is of the type its part expects.
 
     Args:
         config: a composed config, as ``conf/config.yaml`` describes it.
@@ -47,7 +56,7 @@ def check_config(config: DictConfig) -> None:
     Raises:
         DevrfError: naming the key at fault and what was expected.
     """
-    raw = OmegaConf.to_container(config, resolve=False)
+    raw = OmegaConf.to_container(config)
     assert isinstance(raw, dict)
     for key, value in _leaves(raw):
         if value == "???":
@@ -64,18 +73,15 @@ def check_config(config: DictConfig) -> None:
     _check_group(raw, resolved, "", {*ROOT, *read})
 
 
-def _leaves(raw: Mapping[Any, Any], path: str = "") -> Iterator[tuple[str, Any]]:
+def _leaves(raw: Node, path: str = "") -> Iterator[tuple[str, Any]]:
     for key, value in raw.items():
-        where = f"{path}{key}"
         if isinstance(value, Mapping):
-            yield from _leaves(value, f"{where}.")
+            yield from _leaves(value, f"{path}{key}.")
         else:
-            yield where, value
+            yield f"{path}{key}", value
 
 
-def _check_group(
-    raw: Mapping[Any, Any], resolved: Mapping[Any, Any], path: str, read: set[str]
-) -> None:
+def _check_group(raw: Node, resolved: Node, path: str, read: set[str]) -> None:
     """Check what is no part itself: parts below it, and values that parts refer to."""
     for key, value in raw.items():
         where = f"{path}{key}"
@@ -87,25 +93,20 @@ def _check_group(
             raise unknown_key(where, {*map(str, raw), *known} - {str(key)})
 
 
-def _check_part(
-    raw: Mapping[Any, Any], resolved: Mapping[Any, Any], path: str, read: set[str]
-) -> None:
+def _check_part(raw: Node, resolved: Node, path: str, read: set[str]) -> None:
     settings = _settings(str(resolved["_target_"]), path)
-    for key, value in raw.items():
-        if key in RESERVED:
-            continue
-        where = f"{path}{key}"
+    for key in (key for key in raw if key not in RESERVED):
+        where, given, value = f"{path}{key}", raw[key], resolved[key]
         if key not in settings and "**" not in settings:
             raise unknown_key(where, settings)
-        reference = REFERENCE.fullmatch(value) if isinstance(value, str) else None
-        if isinstance(value, Mapping) and "_target_" in value:
-            _check_part(value, resolved[key], f"{where}.", read)
-        elif not (isinstance(resolved[key], Mapping) and "_target_" in resolved[key]):
-            # The key to blame is the one where the value stands.
-            blamed = reference.group(1) if reference else where
+        if isinstance(given, Mapping) and "_target_" in given:
+            _check_part(given, value, f"{where}.", read)
+        elif not (isinstance(value, Mapping) and "_target_" in value):
             hint, default = settings.get(key, (Any, None))
-            if resolved[key] != default:
-                _check_value(blamed, resolved[key], hint)
+            # The key to blame is the one where the value stands.
+            reference = REFERENCE.fullmatch(given) if isinstance(given, str) else None
+            if value != default:
+                _check_value(reference.group(1) if reference else where, value, hint)
 
 
 def _settings(target: str, path: str) -> dict[str, tuple[Any, Any]]:
@@ -127,16 +128,20 @@ def _settings(target: str, path: str) -> dict[str, tuple[Any, Any]]:
 
 
 def _check_value(where: str, value: object, hint: Any) -> None:
-    inner = held(hint)
-    if isinstance(value, Mapping) and inner is not None:
+    if isinstance(value, Mapping) and get_origin(hint) in (dict, Mapping):
         for key, one in value.items():
-            _check_value(f"{where}.{key}", one, inner)
+            _check_value(f"{where}.{key}", one, get_args(hint)[1])
     elif not fits(value, hint):
+        now = RENAMED_VALUES.get(where, {}).get(str(value))
+        if now:
+            raise DevrfError(f"{where}: {value} was renamed; write {where}={now}")
         raise DevrfError(f"{where}: expected {described(hint)}, not {value!r}")
 
 
 def unknown_key(where: str, known: Iterable[object]) -> DevrfError:
-    """The error for a key that nobody knows, with the known one it may have been meant for."""
+    """The error for a key that does not exist, with the one that may have been meant."""
+    if where in RENAMED:
+        return DevrfError(f"{where}: renamed; write {RENAMED[where]}=VALUE")
     name = where.rpartition(".")[2]
     close = difflib.get_close_matches(name, [str(k) for k in known if k != "**"], n=1)
     meant = where[: -len(name)] + close[0] if close else ""

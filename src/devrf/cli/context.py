@@ -205,6 +205,6 @@ class RunContext:
             rest = loaded.metadata.training_config.get(OWN_REST)
             own = None if below is None else self.own_checkpoint(below)
             if rest and own is not None and own.is_file() and digest_of(own) != rest:
-                log.info("%s: left out, it belongs to another %s than the run's", path, below)
+                log.info("%s: left out, it belongs to another %s.ckpt than the run's", path, below)
                 return load_checkpoint(own, self.scene)
         return loaded

@@ -36,25 +36,24 @@ def evaluate(run: RunContext) -> None:
     model, records = loaded.model.to(run.device), loaded.metadata.records
     suite = run.evaluation.suite(run.device)
     frames: dict[str, list[HeldOutView]] = {"static": _score(run, model, "static", suite)}
-    by_capture = {step.capture: step.name for step in run.protocol.steps}
-    learned = by_capture.get("static", loaded.metadata.stage)
-    sections: dict[str, Any] = {
-        "static": {**mean_scores(frames["static"]), **_training(records, learned)}
-    }
-    if model.moves:
+    last = loaded.metadata.stage
+    # What one stage learned at once is told of the dynamic section, where there is one.
+    rest = next((step.name for step in run.protocol.steps if step.capture == "static"), None)
+    moved = model.moves and last != rest
+    static = mean_scores(frames["static"])
+    sections: dict[str, Any] = {"static": static}
+    if rest is not None or not moved:
+        sections["static"] = sections[rest or last] = {**static, **_training(records, rest or last)}
+    if moved:
         frames["dynamic"] = _score(run, model, "dynamic", suite)
-        checkpoint = run.checkpoint(loaded.metadata.stage)
-        sections["dynamic"] = {
+        dynamic = sections["dynamic"] = {
             **mean_scores(frames["dynamic"]),
             "rest_pose_psnr": round(mean(v.rest_pose_psnr for v in frames["dynamic"]), 4),
-            **_training(records, loaded.metadata.stage),
-            "checkpoint_mb": round(checkpoint.stat().st_size / 1e6, 3),
+            **_training(records, last),
+            "checkpoint_mb": round(run.checkpoint(last).stat().st_size / 1e6, 3),
         }
-    if learned != loaded.metadata.stage or not model.moves:
-        # By the names of the two stages, too.
-        sections[learned] = sections["static"]
-        if model.moves:
-            sections[loaded.metadata.stage] = sections["dynamic"]
+        if rest is not None:
+            sections[last] = dynamic
     write_frames(run.folder / "frames.csv", frames)
     ran = {**provenance(model.size, run.device), **_origin(run, records)}
     head = {

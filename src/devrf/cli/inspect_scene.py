@@ -5,12 +5,14 @@ from __future__ import annotations
 import logging
 
 from rich.console import Console
+from rich.filesize import decimal
 
-from devrf.artifacts.inspection import inspect_scene
-from devrf.artifacts.inspection_picture import write_inspection_picture
-from devrf.artifacts.inspection_text import plain, tables
+from devrf.artifacts.inspection.report import inspect_scene
+from devrf.artifacts.inspection.text import inspection_text
+from devrf.artifacts.tables import as_text
 from devrf.cli.context import RunContext
-from devrf.cli.preflight import estimated
+from devrf.cli.memory import budget_rows
+from devrf.cli.preflight import requirements
 from devrf.errors import DevrfError
 from devrf.scenes.export import export
 
@@ -27,14 +29,17 @@ def prepare(run: RunContext) -> None:
 
 
 def inspect(run: RunContext) -> None:
-    """Say and draw what the scene holds and what may be wrong with it; learn nothing."""
-    budget = estimated(run)
-    found = inspect_scene(run.scene)
+    """Report and draw what the scene holds and what may be wrong with it; learn nothing."""
+    # Only this step draws with matplotlib.
+    from devrf.artifacts.inspection.picture import write_inspection_picture
+
+    needs = [(name, decimal(size)) for name, size in budget_rows(requirements(run))]
+    report = inspection_text(inspect_scene(run.scene), needs)
     console = Console()
     if console.is_terminal:
-        console.print(tables(found, budget))
+        console.print(report)
     else:
-        log.info("%s", plain(found, budget))
+        log.info("%s", as_text(report))
     path = run.folder / "images" / "inspect.png"
     write_inspection_picture(path, run.scene)
     log.info("picture written to %s", path)

@@ -1,4 +1,4 @@
-"""The user's mistakes, said in one line."""
+"""Errors that the user can correct, each on one line."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from omegaconf.errors import OmegaConfBaseException
 from devrf.cli.config_check import unknown_key
 from devrf.errors import DevrfError
 
-# Read once: the entry point sets the variable for Hydra's sake.
+# Read at import: the entry point sets the variable, so that Hydra raises its errors.
 FULL_ERRORS = os.environ.get("HYDRA_FULL_ERROR", "0") != "0"
 
-# What a disk refuses, whatever the program does. A file that is not there may be our own fault.
+# Errors of a disk or its permissions. A missing file may be a fault of the program instead.
 REFUSED = {
     errno.EACCES,
     errno.EPERM,
@@ -29,7 +29,7 @@ REFUSED = {
     errno.EEXIST,
 }
 
-# What Hydra's plugins for sweeps add to its groups.
+# Options that Hydra's plugins for sweeps add to its groups.
 PLUGINS = {
     "hydra/launcher": ("joblib", "submitit_local", "submitit_slurm"),
     "hydra/sweeper": ("optuna",),
@@ -39,7 +39,7 @@ PLUGINS = {
 
 @contextmanager
 def report_user_errors() -> Iterator[None]:
-    """Turn a mistake in config or input into one line on stderr and exit status 2.
+    """Turn an error in config or input into one line on stderr and exit status 2.
 
     With HYDRA_FULL_ERROR=1 in the environment it is raised with its traceback instead. Other
     errors are faults of the program and pass through.
@@ -54,12 +54,12 @@ def report_user_errors() -> Iterator[None]:
 
 
 def is_user_error(error: Exception) -> bool:
-    """Whether the user can put it right: input, config, or a disk that refuses."""
+    """Whether the user can correct it: input, config, or a disk that refuses."""
     if own_error(error) is not None:
         return True
     if isinstance(error, OSError) and not isinstance(error, HydraException):
         return error.errno in REFUSED
-    # What one of our parts did not foresee when it was built is a fault of ours.
+    # An error of another kind from one of our own constructors is a fault of the program.
     ours = "Error in call to target 'devrf." in str(error)
     return isinstance(error, HydraException | OmegaConfBaseException) and not ours
 
@@ -77,11 +77,8 @@ def one_line(error: BaseException) -> str:
     own = own_error(error)
     if own is not None:
         text = str(own)
-    elif isinstance(error, MissingConfigException) and _plugin(error):
-        text = f'{_plugin(error)}: not installed; pip install "devrf[sweeps]"'
-    elif isinstance(error, MissingConfigException) and error.options:
-        group, _, option = str(error.missing_cfg_file).rpartition("/")
-        text = f"{group}={option}: no such option; choose one of {', '.join(error.options)}"
+    elif isinstance(error, MissingConfigException):
+        text = _missing_option(error)
     elif isinstance(error, OverrideParseException):
         text = f"{error.override}: not understood; write KEY=VALUE, in quotes where needed"
     elif isinstance(error, OSError) and not isinstance(error, HydraException):
@@ -91,10 +88,13 @@ def one_line(error: BaseException) -> str:
     return " ".join(text.split())
 
 
-def _plugin(error: MissingConfigException) -> str | None:
-    """``group=option`` where what is missing would come with a plugin."""
+def _missing_option(error: MissingConfigException) -> str:
     group, _, option = str(error.missing_cfg_file).rpartition("/")
-    return f"{group}={option}" if option in PLUGINS.get(group, ()) else None
+    if option in PLUGINS.get(group, ()):
+        return f'{group}={option}: not installed; pip install "devrf[sweeps]"'
+    if error.options:
+        return f"{group}={option}: no such option; choose one of {', '.join(error.options)}"
+    return _of_hydra(error)
 
 
 def _of_hydra(error: BaseException) -> str:
@@ -104,7 +104,7 @@ def _of_hydra(error: BaseException) -> str:
         # OmegaConf keeps the mapping that does not have the key.
         near = getattr(error.__cause__, "parent_node", None)
         return str(unknown_key(unknown.group(1), near or ()))
-    # `full_key` names the key at fault; the rest of OmegaConf's bookkeeping helps nobody.
+    # OmegaConf adds lines on its types; of these only `full_key`, the key at fault, is shown.
     key = re.search(r"^\s*full_key: (\S+)$", text, re.MULTILINE)
     kept = [
         line

@@ -1,11 +1,11 @@
-"""Whether the machine has room for a run, before it has cost any time."""
+"""Whether memory and disk suffice for a run, before it has cost any time."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
@@ -13,29 +13,97 @@ from omegaconf import OmegaConf
 from devrf.artifacts.film import film_bytes
 from devrf.callbacks import PeriodicCheckpoint
 from devrf.cli.context import RunContext
-from devrf.cli.memory import Budget, estimate
-from devrf.cli.requirements import Requirement, check, disk_need, gpu_need, host_need
+from devrf.cli.memory import IMAGES, Budget, Parts, estimate, module_needs, tensor_bytes
+from devrf.engine.micro_batching import MicroBatching
 from devrf.errors import DevrfError
 from devrf.system.machine import free_disk, free_host_memory, free_memory, own_memory
-from devrf.system.out_of_memory import is_oom, numbers
+from devrf.system.out_of_memory import gib, is_oom, numbers
 
-# What lowers the need, by the step that has too little.
+# What lowers the need, by the step that ran out of memory.
 LOWER = {
     "canonical": "schedule.canonical.side or schedule.canonical.rays",
     "deformation": "schedule.deformation.sides, schedule.deformation.rays or data.frames",
 }
 
 
-def preflight(run: RunContext, learns: Sequence[str], *, scores: bool, films: bool) -> str | None:
-    """Compare what a run needs with what there is; all figures are estimates.
+@dataclass(frozen=True)
+class Requirement:
+    """How much a run needs of ``what``, in bytes.
 
-    Stages whose checkpoint is there already need nothing.
+    Attributes:
+        what: in words: ``host memory``.
+        needed: how much.
+        there: how much can be had.
+        parts: what it is made of.
+        least: the least that the run can do with; None: all that is needed.
+    """
+
+    what: str
+    needed: int
+    there: int
+    parts: Parts
+    least: int | None = None
+
+    def __str__(self) -> str:
+        return f"{gib(self.needed)} of {gib(self.there)} GiB of {self.what}"
+
+    @property
+    def possible(self) -> bool:
+        """Whether the run can do with what is there."""
+        return (self.needed if self.least is None else self.least) <= self.there
+
+    @property
+    def keys(self) -> list[str]:
+        """The config keys that change it, those of the largest part first."""
+        largest = sorted(self.parts, key=lambda keys: -self.parts[keys])
+        return list(dict.fromkeys(key for keys in largest if self.parts[keys] for key in keys))
+
+
+def requirements(run: RunContext) -> Budget:
+    """What the configured run needs; each of several processes takes its share of a batch."""
+    budget = _of_devrf(run) if "canonical" in run.config else _of_rays(run)
+    processes = getattr(run.strategy, "world_size", 1)
+    stages = {k: replace(v, batch=v.batch // processes) for k, v in budget.stages.items()}
+    return replace(budget, stages=stages)
+
+
+def _of_rays(run: RunContext) -> Budget:
+    """Of a method that is learned by ray stages: each trains the whole model."""
+    model = instantiate(run.config.ray_stage.model, _convert_="all")
+    rays, scene = run.config.ray_stage.schedule.rays, run.scene
+    stages = {
+        step.name: module_needs(
+            model,
+            (scene.static if step.capture == "static" else scene.dynamic).train,
+            keys=("ray_stage.schedule.rays",),
+            batch=model.batch_bytes(rays),
+            rays="ray_stage.schedule.rays",
+        )
+        for step in run.protocol.steps
+    }
+    return Budget(tensor_bytes((scene.static, scene.dynamic)), stages)
+
+
+def _of_devrf(run: RunContext) -> Budget:
+    canonical = instantiate(run.config.canonical, _convert_="all")
+    return estimate(
+        run.scene,
+        canonical.schedule,
+        instantiate(run.config.deformation.schedule, _convert_="all"),
+        canonical.architecture,
+        canonical.sampling.step,
+        instantiate(run.config.deformation.motion, _convert_="all"),
+    )
+
+
+def preflight(run: RunContext, learns: Sequence[str], *, films: bool) -> str | None:
+    """Compare what a run needs with what there is.
 
     Args:
         run: the run; its scene is read.
-        learns: the stages that it will learn, by name.
-        scores: whether it also scores or films.
-        films: whether it makes videos.
+        learns: the stages that it will learn, by name. One whose checkpoint is there needs
+            nothing.
+        films: whether the run makes videos.
 
     Returns:
         Both, in one line; None where nothing is needed.
@@ -43,81 +111,65 @@ def preflight(run: RunContext, learns: Sequence[str], *, scores: bool, films: bo
     Raises:
         DevrfError: memory or disk cannot suffice.
     """
-    resumed = run.config.resume
-    stages = [name for name in learns if not (resumed and run.own_checkpoint(name).is_file())]
-    if not stages:
+    config = run.config
+    names = [name for name in learns if not (config.resume and run.own_checkpoint(name).is_file())]
+    if not names:
         return None
-    processes = getattr(run.strategy, "num_processes", 1)
-    world = getattr(run.strategy, "world_size", 1)
-    budget = estimated(run, world)
-    on_gpu = run.device.type == "cuda"
-    host = free_host_memory()
-    needs: list[Requirement] = [gpu_need(budget, stages, free_memory(run.device))] if on_gpu else []
-    needs.append(
-        host_need(
-            budget,
-            stages,
-            None if host is None else host + own_memory(),
-            alone=not on_gpu,
-            scores=scores,
-            processes=processes,
-        )
-    )
-    disk, videos = free_disk(run.folder), 0
+    budget = requirements(run)
+    budget = replace(budget, stages={name: budget.stages[name] for name in names})
+    stage = max(budget.stages.values(), key=lambda one: one.peak())
+    parts = {**stage.held, (stage.rays,): stage.batch}
+    needs, on_gpu = [], run.device.type == "cuda"
+    if on_gpu:
+        there, least = free_memory(run.device), stage.peak(MicroBatching.MOST)
+        needs.append(Requirement("GPU memory", stage.peak(), there, parts, least))
+    host = budget.host(alone=not on_gpu, processes=getattr(run.strategy, "num_processes", 1))
+    on_host = Counter(stage.held if on_gpu else parts) + Counter({IMAGES: budget.scene})
+    needs.append(Requirement("host memory", host, free_host_memory() + own_memory(), on_host))
+    free, videos = free_disk(run.folder), 0
+    if config.resume:  # these files will be replaced
+        free += sum(file.stat().st_size for file in run.folder.glob("checkpoints/*.ckpt"))
     if films:
-        videos = 2 * film_bytes(instantiate(run.config.video), run.scene.static.train.cameras)
-    if disk is not None and resumed:
-        disk += sum(file.stat().st_size for file in run.folder.glob("checkpoints/*.ckpt"))
-    needs.append(disk_need(budget, stages, disk, kept=PeriodicCheckpoint.KEPT, films=videos))
-    settings = OmegaConf.to_container(run.config)
-    assert isinstance(settings, dict)
-    return check(needs, set(_keys(settings)))
+        videos = 2 * film_bytes(instantiate(config.video), run.scene.static.train.cameras)
+    disk = budget.disk(kept=PeriodicCheckpoint.KEPT, films=videos)
+    needs.append(Requirement("disk", disk, free, stage.held))
+    return check(needs, lambda key: OmegaConf.select(config, key, default="") != "")
 
 
-def estimated(run: RunContext, processes: int = 1) -> Budget:
-    """What the configured run will need, in each of some processes that share the rays."""
-    canonical = instantiate(run.config.canonical, _convert_="all")
-    moving = instantiate(run.config.deformation.schedule, _convert_="all")
-    motion = instantiate(run.config.deformation.motion, _convert_="all")
-    resting = canonical.schedule
-    return estimate(
-        run.scene,
-        replace(resting, rays=-(-resting.rays // processes)),
-        replace(moving, rays=-(-moving.rays // processes)),
-        canonical.architecture,
-        canonical.sampling.step,
-        motion,
-    )
+def check(needs: Sequence[Requirement], known: Callable[[str], bool]) -> str:
+    """What is needed, in one line; ``known`` says whether the config has a key.
+
+    Raises:
+        DevrfError: something cannot suffice.
+    """
+    said = f"needs about {', '.join(map(str, needs))}"
+    for need in needs:
+        if not need.possible:
+            keys = list(filter(known, need.keys))[:4]
+            raise DevrfError(
+                f"{keys[0] if keys else 'data'}: the run {said}; it would end for lack of "
+                f"{need.what}: change {', '.join(keys)}, or try all the same with "
+                "memory_check=false"
+            )
+    short = any(need.needed > need.there for need in needs)
+    return f"{said}; batches will be taken in parts, slower" if short else said
 
 
 @contextmanager
 def shortage_in_words(name: str, run: RunContext) -> Iterator[None]:
-    """Say in one line that memory has run out where nothing could be done about it.
-
-    Args:
-        name: the step.
-        run: says where it works.
+    """Turn an error that says that memory ran out, in the step ``name``, into one line.
 
     Raises:
-        DevrfError: it has.
+        DevrfError: memory has run out.
     """
     try:
         yield
     except (RuntimeError, MemoryError) as error:
         if not is_oom(error):
             raise
-        said = str(error)
         keys = LOWER.get(name)
-        remedy = f"lower {keys}" if keys else "free some of it, or use a larger machine"
+        hint = f"lower {keys}" if keys else "free some of it, or use a larger machine"
         raise DevrfError(
-            f"stage={name}: out of memory ({numbers(said, run.device)}); {remedy}; what was "
+            f"stage={name}: out of memory ({numbers(str(error), run.device)}); {hint}; what was "
             "written before stays"
         ) from error
-
-
-def _keys(values: Mapping[Any, Any], path: str = "") -> Iterator[str]:
-    """Every key of nested settings, with dots."""
-    for key, value in values.items():
-        yield f"{path}{key}"
-        if isinstance(value, Mapping):
-            yield from _keys(value, f"{path}{key}.")

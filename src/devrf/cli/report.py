@@ -7,14 +7,15 @@ import logging
 from hydra.utils import instantiate
 
 from devrf.cli.context import RunContext
-from devrf.reporting.markdown import plain
-from devrf.reporting.write import write_report
 
 log = logging.getLogger(__name__)
 
 
 def report(run: RunContext) -> None:
     """Write tables and plots of the runs below ``report.runs``; needs no scene."""
+    # pandas and matplotlib are needed only here.
+    from devrf.reporting.write import write_report
+
     written = write_report(instantiate(run.config.report))
-    log.info("%s", plain(written.table, written.remarks))
+    log.info("%s", written.text)
     log.info("report written to %s", written.path)

@@ -1,10 +1,9 @@
-"""Whether a stage is finished, goes on where it was left, or begins; and what belongs together.
+"""Where a stage begins when a command is repeated in the same folder.
 
-A run is repeated by the same command in the same folder. Each stage's checkpoints say which
-settings decided what was learned, so that nothing is taken for what it is not:
+Each checkpoint holds the settings that decided what was learned:
 
-* a finished checkpoint with the settings of today: the stage is skipped;
-* a progress file with the settings of today: the stage goes on from there;
+* a finished checkpoint with the present settings: the stage is skipped;
+* a progress file with the present settings: the stage goes on from there;
 * either with other settings: the run is refused, naming the first that differs;
 * a deformation on top of another canonical field than the run's: it is learned anew.
 
@@ -16,7 +15,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -26,7 +24,11 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from devrf.checkpoints.checkpoint import CheckpointMetadata, metadata_in
-from devrf.checkpoints.checkpoint_file import digest_of, read_checkpoint_file
+from devrf.checkpoints.checkpoint_file import (
+    OtherFormatError,
+    digest_of,
+    read_checkpoint_file,
+)
 from devrf.checkpoints.progress import progress_files
 from devrf.cli.config_check import REFERENCE
 from devrf.cli.context import GIVEN_REST, OWN_REST, RunContext
@@ -36,7 +38,7 @@ from devrf.errors import DevrfError
 log = logging.getLogger(__name__)
 
 # Settings of a datamodule or a stage that change nothing that is learned.
-ELSEWHERE = {"root", "name", "flow_cache", "export", "graphs", "store"}
+UNDECISIVE = {"root", "name", "flow_cache", "export", "graphs", "store"}
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,7 @@ class ResumePoint:
     """Where a stage begins.
 
     Attributes:
-        training_config: the settings of today that decide what is learned.
+        training_config: the present settings that decide what is learned.
         finished: there is nothing left to learn.
         progress: the file to go on from; None begins at the beginning.
         iteration: how far that file is.
@@ -81,7 +83,7 @@ def _values(config: DictConfig, raw: Mapping[Any, Any], path: str) -> Iterator[t
                 value = OmegaConf.to_container(value, resolve=False)
         if isinstance(value, Mapping):
             yield from _values(config, value, f"{where}.")
-        elif key not in ELSEWHERE:
+        elif key not in UNDECISIVE:
             plain = OmegaConf.select(config, where)
             yield where, plain if isinstance(plain, str) else json.loads(_as_json(plain))
 
@@ -96,8 +98,8 @@ def beginning(run: RunContext, stage: str) -> ResumePoint:
     """Find where ``stage`` begins in the run's folder.
 
     Raises:
-        DevrfError: the folder holds what was learned with other settings, or a finished
-            checkpoint that is damaged.
+        DevrfError: the folder holds what was learned with other settings or has another format,
+            or a finished checkpoint that is damaged.
     """
     training_config = deciding_settings(run.config, stage)
     below = run.protocol[stage].builds_on
@@ -115,6 +117,8 @@ def beginning(run: RunContext, stage: str) -> ResumePoint:
         try:
             content = read_checkpoint_file(progress)
             metadata, iteration = metadata_in(progress, content), content["progress"]["iteration"]
+        except OtherFormatError:
+            raise
         except DevrfError as error:
             log.warning("%s; the file before it is taken", error)
             progress.unlink()
@@ -128,10 +132,10 @@ def beginning(run: RunContext, stage: str) -> ResumePoint:
 
 
 def _agrees(path: Path, metadata: CheckpointMetadata, training_config: Mapping[str, Any]) -> bool:
-    """Whether a checkpoint was made with the settings of today; False if on another rest state.
+    """Whether a checkpoint has the present settings; False if it is of another canonical field.
 
     Raises:
-        DevrfError: with other settings.
+        DevrfError: it has other settings.
     """
     old = metadata.training_config
     if old == training_config:
@@ -170,11 +174,8 @@ def archive_previous(folder: Path, *kept: Path) -> None:
         folder: the run's folder.
         kept: files that the present command needs: they are found in both places.
     """
-    old = [
-        path
-        for path in folder.iterdir()
-        if path.name not in AT_FIRST and not path.name.startswith("previous-")
-    ]
+    names = {path.name for path in folder.iterdir()} - AT_FIRST
+    old = [folder / name for name in names if not name.startswith("previous-")]
     if not old:
         return
     for handler in logging.getLogger().handlers:
@@ -189,8 +190,5 @@ def archive_previous(folder: Path, *kept: Path) -> None:
         moved = previous / path.relative_to(folder)
         if moved.is_file():
             path.parent.mkdir(parents=True, exist_ok=True)
-            try:
-                os.link(moved, path)
-            except OSError:
-                shutil.copy2(moved, path)
+            shutil.copy2(moved, path)
     log.info("what was in %s is kept in %s", folder, previous)

@@ -1,4 +1,4 @@
-"""The folder of a run that came to nothing."""
+"""Removes the folder of a run that ends in a mistake before it has made anything."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 from devrf.cli.messages import is_user_error
 from devrf.cli.run_lock import PLACE
 
-# What is made in the folder before the program has had a look at its input.
+# What is made in the folder before the program looks at its input.
 AT_FIRST = {".hydra", PLACE}
 
 
@@ -20,28 +20,23 @@ def nothing_left_of_mistakes(folder: Path) -> Iterator[None]:
     """Remove ``folder`` when the run ends in the user's mistake before it has made anything.
 
     A folder that holds the results of an earlier run, or a first result of this one, stays.
-    Parents that are empty then go too, up to the working folder.
     """
-    held_nothing = _holds_at_most(folder, AT_FIRST)
+    was_new = _holds_at_most(folder, AT_FIRST)
     try:
         yield
     except Exception as error:
-        if is_user_error(error) and held_nothing:
+        if was_new and is_user_error(error):
             remove_if_only(folder, {*AT_FIRST, "run.log"})
         raise
 
 
 def remove_if_only(folder: Path, names: set[str]) -> None:
-    """Remove ``folder`` if it holds nothing but ``names``, and parents that are empty then."""
-    if _holds_at_most(folder, names):
-        _remove(folder, names)
+    """Remove ``folder`` if it holds nothing but ``names``, and parents that are empty then.
 
-
-def _holds_at_most(folder: Path, names: set[str]) -> bool:
-    return folder.is_dir() and {path.name for path in folder.iterdir()} <= names
-
-
-def _remove(folder: Path, names: set[str]) -> None:
+    The working folder and all above it stay; of a folder elsewhere, its parents.
+    """
+    if not _holds_at_most(folder, names):
+        return
     for handler in list(logging.getLogger().handlers):
         if isinstance(handler, logging.FileHandler):
             logging.getLogger().removeHandler(handler)
@@ -51,10 +46,13 @@ def _remove(folder: Path, names: set[str]) -> None:
             shutil.rmtree(path, ignore_errors=True)
         else:
             path.unlink(missing_ok=True)
-    here = Path.cwd()
-    for path in (folder.resolve(), *folder.resolve().parents):
-        # Nothing above a folder that lies elsewhere is ours, nor is the working folder.
-        elsewhere = path != folder.resolve() and here not in path.parents
-        if elsewhere or path == here or path in here.parents or any(path.iterdir()):
+    here, folder = Path.cwd(), folder.resolve()
+    below_here = [path for path in folder.parents if here in path.parents]
+    for path in [] if here.is_relative_to(folder) else [folder, *below_here]:
+        if any(path.iterdir()):
             break
         path.rmdir()
+
+
+def _holds_at_most(folder: Path, names: set[str]) -> bool:
+    return folder.is_dir() and {path.name for path in folder.iterdir()} <= names

@@ -1,13 +1,11 @@
 """One process at a time works in a run's folder.
 
-The lock is the system's on an open file: it vanishes with the process, however that ends. Which
-process has it stands beside it, for those who have to wait. Of several processes that learn one
-scene together, the first has the lock for all.
+The lock is the system's on an open file, so it goes with its process, however that ends. A record
+beside it tells the others which process that is.
 """
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import socket
@@ -26,34 +24,37 @@ from omegaconf.errors import OmegaConfBaseException
 
 from devrf.cli.messages import REFUSED, report_user_errors
 from devrf.errors import DevrfError
-from devrf.system.files import write_json
+from devrf.system.files import atomic_write
 
 log = logging.getLogger(__name__)
 
-# Within the run's folder; it stays there, with an empty file to lock.
+# Within the run's folder; the lock file stays there, empty.
 PLACE = ".devrf"
-LOCK, OWNER = "lock", "process.json"
-# Stages that write nothing into the folder of a run.
-OF_OTHERS = ("report",)
-# What torchrun and SLURM call the number of a process among those that they have started.
-NUMBERS = ("RANK", "SLURM_PROCID")
+LOCK, OWNER = "lock", "process.txt"
+# Environment variables in which torchrun and SLURM number the processes that they start.
+RANKS = ("RANK", "SLURM_PROCID")
 
-# Hydra begins to write before it calls the program: a lock has to be handed over.
+# Hydra writes before it calls the program, so its callback locks and the program finds it locked.
 _held: dict[Path, FileLock] = {}
 
 
 class RunDirLock(Callback):
     """Hydra's callback that locks a run's or a sweep's folder before anything is written there.
 
-    Hydra passes over what a callback raises, but for an exit: the mistake is said here.
+    Hydra ignores what a callback raises, except an exit: so errors are reported here.
     """
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Lock the folder of a run; :func:`alone_in` finds it locked."""
+        """Lock the folder of a run; :func:`alone_in` releases it."""
+        hydra = HydraConfig.instance()
+        before = hydra.cfg
         try:
-            folder = _run_folder(config)
+            hydra.set_config(config)  # Hydra does so later, and the folder may refer to it
+            folder = Path(config.hydra.run.dir)
         except OmegaConfBaseException:
-            return  # Hydra comes to say what is wrong with the config
+            return  # Hydra will say what is wrong with the config
+        finally:
+            hydra.cfg = before
         if _locks(config):
             with report_user_errors():
                 _lock(folder, "hydra.run.dir")
@@ -64,26 +65,8 @@ class RunDirLock(Callback):
             _lock(Path(config.hydra.sweep.dir), "hydra.sweep.dir")
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
-        """Let others work in the sweep's folder."""
-        _unlock(Path(config.hydra.sweep.dir))
-
-
-def _run_folder(config: DictConfig) -> Path:
-    """Where Hydra will make the run's folder; it has not set itself up yet."""
-    hydra = HydraConfig.instance()
-    before = hydra.cfg
-    try:
-        hydra.set_config(config)
-        return Path(config.hydra.run.dir)
-    finally:
-        hydra.cfg = before
-
-
-def _locks(config: DictConfig) -> bool:
-    """Whether the process works in a run's folder, and is the first of those that do together."""
-    together = config.trainer.get("strategy") is not None
-    follows = any(os.environ.get(name, "0") != "0" for name in NUMBERS)
-    return config.stage not in OF_OTHERS and not (together and follows)
+        """Release the sweep's folder."""
+        _release(Path(config.hydra.sweep.dir))
 
 
 @contextmanager
@@ -98,63 +81,58 @@ def alone_in(folder: Path, config: DictConfig, key: str) -> Iterator[None]:
     Raises:
         DevrfError: another process works there.
     """
-    if not _locks(config):
-        yield
-        return
-    if not _lock(folder, key):
+    if _locks(config) and not _lock(folder, key):
         log.warning(
             "%s: its file system has no locks; see that no other process works there", folder
         )
     try:
         yield
     finally:
-        _unlock(folder)
+        _release(folder)
+
+
+def _locks(config: DictConfig) -> bool:
+    """Whether a process needs the lock: a report only reads, and rank 0 locks for its workers."""
+    worker = any(os.environ.get(name, "0") != "0" for name in RANKS)
+    return config.stage != "report" and not (worker and config.trainer.get("strategy") is not None)
 
 
 def _lock(folder: Path, key: str) -> bool:
     """Lock a folder unless this process has done so; False where its file system cannot."""
     if folder.resolve() in _held:
         return True
-    folder.mkdir(parents=True, exist_ok=True)
     place = folder / PLACE
+    folder.mkdir(parents=True, exist_ok=True)
     place.mkdir(exist_ok=True)
-    lock = FileLock(place / LOCK)
+    lock, owner = FileLock(place / LOCK), place / OWNER
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             lock.acquire(timeout=0)
     except Timeout:
+        try:
+            which = f" ({owner.read_text()})"
+        except OSError:  # it has the lock, but has not written its record yet
+            which = ""
         raise DevrfError(
-            f"{folder}: another devrf process{_owner(place / OWNER)} works in this folder; wait "
-            f"for it, or use {key}=FOLDER"
+            f"{folder}: another devrf process{which} works in this folder; wait for it, or use "
+            f"{key}=FOLDER"
         ) from None
-    except NotImplementedError:
-        return False
-    except OSError as error:
-        if error.errno in REFUSED:
+    except (NotImplementedError, OSError) as error:
+        if isinstance(error, OSError) and error.errno in REFUSED:
             raise
         return False
-    if isinstance(lock, SoftFileLock):
-        # What filelock takes to without the system's locks: it would outlive a killed process.
+    if isinstance(lock, SoftFileLock):  # filelock's substitute would outlive a killed process
         lock.release()
         return False
     _held[folder.resolve()] = lock
     since = datetime.now().astimezone().isoformat(" ", "seconds")
-    write_json(place / OWNER, {"pid": os.getpid(), "host": socket.gethostname(), "since": since})
+    with atomic_write(owner) as partial:
+        partial.write_text(f"pid {os.getpid()} on {socket.gethostname()}, since {since}")
     return True
 
 
-def _unlock(folder: Path) -> None:
+def _release(folder: Path) -> None:
     lock = _held.pop(folder.resolve(), None)
     if lock is not None:
         (folder / PLACE / OWNER).unlink(missing_ok=True)
         lock.release()
-
-
-def _owner(file: Path) -> str:
-    """Which process it is, in brackets; nothing in the moment before it has said so."""
-    try:
-        owner = json.loads(file.read_text())
-        return f" (pid {owner['pid']} on {owner['host']}, since {owner['since']})"
-    except (OSError, ValueError, LookupError, TypeError):
-        return ""

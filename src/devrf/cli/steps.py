@@ -28,7 +28,7 @@ from devrf.cli.workers import launch_workers
 from devrf.errors import DevrfError
 from devrf.methods.devrf.motion_losses import MOTION_TERMS
 from devrf.methods.weighted_loss import WeightedLoss
-from devrf.ops.choice import using
+from devrf.ops.dispatch import using
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +44,7 @@ STEPS: dict[str, Step] = {
     "report": report,
 }
 PIPELINE = ("evaluate", "render")
-MOVED = {"benchmark": "run python benchmarks/training.py instead"}
+MOVED = {"benchmark": "run python benchmarks/training.py with the other overrides"}
 
 # What Lightning says of every run (accelerators it looked for, tips, how many workers a loader
 # might have) is of no use to someone who watches a scene being learned.
@@ -108,8 +108,7 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
     _check(run, asked)
     needs = None
     if asked.learning and config.memory_check and run.leads:
-        scores = not set(PIPELINE).isdisjoint(asked.further)
-        needs = preflight(run, asked.learning, scores=scores, films="render" in asked.further)
+        needs = preflight(run, asked.learning, films="render" in asked.further)
     if asked.learning and not config.resume:
         below = run.protocol[asked.learning[0]].builds_on
         archive_previous(folder, *([] if below is None else [run.own_checkpoint(below)]))

@@ -1,4 +1,4 @@
-"""Sweeps: a job that fails is recorded, the others go on, and the end says which failed."""
+"""Sweeps: a failed job is recorded, the others go on, and the end names the failed ones."""
 
 from __future__ import annotations
 
@@ -24,26 +24,26 @@ from devrf.system.process import forget_peak_memory
 
 log = logging.getLogger(__name__)
 
-# The exit status of a sweep of which jobs failed.
+# The exit status of a sweep with failed jobs.
 JOBS_FAILED = 3
 FAILURE = "failure.json"
-# What is in the sweep's folder before Hydra looks at the jobs.
+# What the sweep's folder holds before Hydra starts the first job.
 OF_SWEEP = {"multirun.yaml", PLACE}
-# How Optuna ends when it asks for the best of no finished trial.
+# How Optuna's error begins when no trial finished.
 NOTHING_FINISHED = "No trials are completed"
 
 
 def run_job(run: Callable[[], float | None], config: DictConfig, folder: Path) -> float | None:
-    """Run a job of a sweep so that the others go on whatever becomes of it.
+    """Run one job of a sweep; if it fails, record why, so that the next jobs still run.
 
     Args:
         run: does the job and returns its objective.
         config: the job's config.
-        folder: the job's folder; ``failure.json`` in it says why the job failed, if it did.
+        folder: the job's folder; a failure is recorded in its ``failure.json``.
 
     Returns:
-        The objective; None for a job that failed, which a search counts as just that. (It would
-        stop at a nan, and the basic sweeper at an exception.)
+        The objective; None for a job that failed, which a search counts as failed. (A NaN would
+        end the search, an exception the basic sweeper.)
     """
     forget_peak_memory()
     try:
@@ -54,18 +54,18 @@ def run_job(run: Callable[[], float | None], config: DictConfig, folder: Path) -
         _record(error, config, folder)
         return None
     finally:
-        gc.collect()  # a job shall not be charged with the memory of the one before it
+        gc.collect()  # so that the next job does not start with the memory of this one
 
 
 def forget_failure(folder: Path) -> None:
-    """Remove the record of an earlier failure in the folder of a run that succeeded."""
+    """Remove the record of an earlier failure from the folder of a run that succeeded."""
     (folder / FAILURE).unlink(missing_ok=True)
 
 
 def _record(error: Exception, config: DictConfig, folder: Path) -> None:
-    """Write down that and why a job failed, in its folder and in a line on stderr."""
-    mistake = is_user_error(error)
-    said = one_line(error) if mistake else f"{type(error).__name__}: {one_line(error)}"
+    """Say why a job failed: in its folder, and in one line on stderr."""
+    user_error = is_user_error(error)
+    said = one_line(error) if user_error else f"{type(error).__name__}: {one_line(error)}"
     write_json(
         folder / FAILURE,
         {
@@ -74,13 +74,14 @@ def _record(error: Exception, config: DictConfig, folder: Path) -> None:
             "overrides": job.overrides(),
             "seed": config.get("seed"),
             "error": said,
-            "mistake": mistake,
+            "mistake": user_error,
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
         },
     )
-    where = "" if mistake else f"; the traceback is in {folder / 'run.log'}"
-    if not mistake:
+    where = ""
+    if not user_error:
         _into_run_log(error)
+        where = f"; the traceback is in {folder / 'run.log'}"
     print(f"devrf: job {folder.name}: {said}{where}", file=sys.stderr)
 
 
@@ -92,7 +93,7 @@ def _scene(config: DictConfig) -> str | None:
 
 
 def _into_run_log(error: Exception) -> None:
-    """Write the traceback to the job's log, not to the terminal between the other jobs' lines."""
+    """Write the traceback to the job's log only: the terminal has one line a job."""
     trace = (type(error), error, error.__traceback__)
     record = log.makeRecord(log.name, logging.ERROR, __file__, 0, "the job failed", (), trace)
     for handler in logging.getLogger().handlers:
@@ -101,12 +102,12 @@ def _into_run_log(error: Exception) -> None:
 
 
 class SweepMonitor(Callback):
-    """Hydra's callback that tells :func:`failures_at_the_end` of a sweep and its folder."""
+    """Hydra callback that tells :func:`failures_at_the_end` which jobs of a sweep failed."""
 
     started: SweepMonitor | None = None
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Note what the sweep's folder holds before the first job."""
+        """Record what the sweep's folder holds before the first job."""
         self.folder = Path(config.hydra.sweep.dir)
         self.was_there = self.folder.exists()
         self.failures, self.jobs = self._stamps(FAILURE), self._stamps(".hydra/config.yaml")
@@ -118,21 +119,21 @@ class SweepMonitor(Callback):
         return [str(path.parent) for path in sorted(now) if now[path] != self.failures.get(path)]
 
     def count(self) -> int:
-        """How many jobs this sweep has begun."""
+        """The number of jobs that this sweep has started."""
         now = self._stamps(".hydra/config.yaml")
         return sum(stamp != self.jobs.get(path) for path, stamp in now.items())
 
     def _stamps(self, name: str) -> dict[Path, int]:
-        """When each file of that name below the sweep's folder was written."""
+        """The time each file of that name below the sweep's folder was written, in nanoseconds."""
         found = self.folder.rglob(name)
         return {path.relative_to(self.folder): path.stat().st_mtime_ns for path in found}
 
 
 @contextmanager
 def failures_at_the_end() -> Iterator[None]:
-    """When a sweep has ended, say which of its jobs failed and exit with status 3.
+    """When a sweep has ended, name the jobs that failed and exit with status 3.
 
-    A sweep that ends in a mistake before its first job leaves no folder behind.
+    A sweep that a user error ends before its first job leaves no folder behind.
     """
     SweepMonitor.started = None
     try:
@@ -144,14 +145,14 @@ def failures_at_the_end() -> Iterator[None]:
         if not (sweep and sweep.failed()):
             raise
         if NOTHING_FINISHED not in str(error):
-            _say(sweep)
+            _print_failed(sweep)
             raise
     if SweepMonitor.started is not None and SweepMonitor.started.failed():
-        _say(SweepMonitor.started)
+        _print_failed(SweepMonitor.started)
         raise SystemExit(JOBS_FAILED)
 
 
-def _say(sweep: SweepMonitor) -> None:
+def _print_failed(sweep: SweepMonitor) -> None:
     failed = sweep.failed()
     print(
         f"devrf: {len(failed)} of {sweep.count()} jobs failed: {', '.join(failed)}; "

@@ -1,4 +1,4 @@
-"""A report where a sweep ends: of the sweep's own runs."""
+"""The report of a sweep's runs, written at the sweep's end."""
 
 from __future__ import annotations
 
@@ -9,19 +9,20 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 
 from devrf.errors import DevrfError
-from devrf.reporting.markdown import plain
-from devrf.reporting.write import write_report
 
 
 class SweepReport(Callback):
-    """Compares the runs of a sweep once all its jobs are done, here and not where jobs ran."""
+    """Compares a sweep's runs once all jobs are done, in the process that started them."""
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Write the report into the sweep's folder and print it; nothing if no job was scored."""
+        # Hydra loads this module with every command; pandas and matplotlib are needed only here.
+        from devrf.reporting.write import write_report
+
         try:
             written = write_report(instantiate(config.report, runs=config.hydra.sweep.dir))
         except DevrfError:
             return
-        # Printed: Hydra's last job took the log with it.
-        print(plain(written.table, written.remarks))
+        # Printed, because Hydra's last job has closed the log.
+        print(written.text)
         print(f"report written to {written.path}")

@@ -85,7 +85,7 @@ def _fit(run: RunContext, stage: ScheduledStage, begin: ResumePoint) -> None:
 def _keep(run: RunContext, trainer: Trainer, stage: ScheduledStage) -> None:
     """Write what the stage has learned, and the config that it was learned with."""
     path = run.own_checkpoint(stage.name)
-    # The checkpoint carries it to whoever scores the run, hence without its own writing.
+    # Scoring reads it from the checkpoint; hence without the time of writing that.
     stage.record["wall_seconds"] = run.step_seconds
     try:
         save_checkpoint(trainer, path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import types
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -18,24 +19,22 @@ WORDS = {
 
 
 def fits(value: object, hint: Any) -> bool:
-    """Whether ``value`` can be given where ``hint`` is stated; True for types not known here."""
-    origin, inner = get_origin(hint), get_args(hint)
-    if origin in (Union, types.UnionType):
-        return any(fits(value, one) for one in inner)
-    if origin is Literal:
-        return value in inner
-    if origin in (list, Sequence):
-        return isinstance(value, list) and all(fits(v, inner[0]) for v in value)
-    if origin in (dict, Mapping):
-        return isinstance(value, Mapping) and all(fits(v, inner[1]) for v in value.values())
-    if hint is float:
-        return isinstance(value, int | float) and not isinstance(value, bool)
-    if hint is int:
-        return isinstance(value, int) and not isinstance(value, bool)
-    if hint in (str, Path):
-        return isinstance(value, str)
-    if hint in (bool, type(None)):
-        return isinstance(value, hint)
+    """Whether ``value`` can be given where ``hint`` is stated; True where no config value can be.
+
+    Text counts as a path, a list as any sequence, a whole number as a number; nothing else is
+    converted.
+    """
+    # Imported here: --help is answered before it has loaded.
+    from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
+
+    try:
+        adapter = TypeAdapter(hint, config=ConfigDict(arbitrary_types_allowed=True))
+        # As JSON: given as Python's objects, strictly, text would be no path and a list no tuple.
+        adapter.validate_json(json.dumps(value, default=str), strict=True)
+    except PydanticUserError:  # a hint that pydantic does not know
+        return True
+    except ValidationError as error:
+        return any(one["type"] == "needs_python_object" for one in error.errors())
     return True
 
 
@@ -51,8 +50,3 @@ def described(hint: Any) -> str:
     if origin in (dict, Mapping):
         return "a mapping"
     return WORDS.get(hint, getattr(hint, "__name__", str(hint)))
-
-
-def held(hint: Any) -> Any:
-    """The type of a mapping's values; None where ``hint`` is no mapping."""
-    return get_args(hint)[1] if get_origin(hint) in (dict, Mapping) else None

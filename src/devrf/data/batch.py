@@ -20,7 +20,7 @@ class Pixels:
     Attributes:
         image: (R,) int64, the image of each among the views.
         flat: (R,) int64, its row-major number in the image.
-        background: (3,) or (R, 3) RGB in [0, 1] that mattes are composited on.
+        background: (3,) or (R, 3) RGB in [0, 1] that colours are composited on.
     """
 
     image: Tensor
@@ -94,7 +94,7 @@ def gather_batch(
         views: images and cameras, on the device of the indices.
         image: (R,) int64, which image.
         flat: (R,) int64, row-major pixel number within it.
-        background: (3,) or (R, 3) RGB in [0, 1] that mattes are composited on.
+        background: (3,) or (R, 3) RGB in [0, 1] that colours are composited on.
         space: the space that the fields live in.
 
     Returns:

@@ -43,7 +43,7 @@ class SceneDataModule(LightningDataModule, ABC):
         _ = self.scene
 
     def setup(self, stage: str) -> None:
-        """Read the scene, in case nobody asked for it yet."""
+        """Read the scene, if that was not done yet."""
         _ = self.scene
 
     def train_dataloader(self) -> DataLoader[Any]:

@@ -55,7 +55,7 @@ class PixelPool:
 
 
 def all_pixels(views: Views, images: Tensor) -> PixelPool:
-    """Every pixel of ``images`` (K,) int64 that counts."""
+    """Every valid pixel of ``images`` (K,) int64."""
     area = views.height * views.width
     if views.valid_mask is not None:
         everything = torch.ones(len(images), area, dtype=torch.bool, device=images.device)
@@ -65,7 +65,7 @@ def all_pixels(views: Views, images: Tensor) -> PixelPool:
 
 
 def wanted_pixels(views: Views, images: Tensor, wanted: Tensor) -> PixelPool:
-    """The pixels of ``images`` (K,) int64 that are ``wanted``, (K, H·W) bool, and count."""
+    """The valid pixels of ``images`` (K,) int64 that are ``wanted``, (K, H·W) bool."""
     if views.valid_mask is not None:
         valid_mask = views.valid_mask[images.to(views.valid_mask.device)]
         wanted = wanted & valid_mask.flatten(1).to(wanted.device)

@@ -20,9 +20,9 @@ class StreamParallel:
     What was made before the fork is there for all, what they give may be used after the join,
     and in a captured CUDA graph they are branches.
 
-    What a piece allocates for itself is of its own stream's memory: nobody else is given it
-    before the next fork, which waits for whoever read it after the join. Autograd goes back on the
-    stream that it came on. Gradients that pieces leave behind must be of different tensors.
+    A piece allocates from its own stream's memory, which is not reused before the next fork; that
+    fork waits for what read it after the join. Autograd runs backward on the stream of the forward
+    pass. Gradients that pieces leave behind must be of different tensors.
 
     On a CPU, whose cores each operation uses already, and where parts are measured, which must
     not overlap, one piece follows the other.

@@ -51,7 +51,10 @@ class Box:
         return x * y * z
 
     def voxel_size(self, voxels: int) -> float:
-        """s = (volume / N)^(1/3): the edge of each of ``voxels`` equal cubes (method §2)."""
+        """s = (volume / N)^(1/3): the edge of each of ``voxels`` equal cubes.
+
+        See docs/method.md#notation.
+        """
         return float((self.volume / voxels) ** (1 / 3))
 
     def grid_shape(self, voxels: int) -> tuple[int, int, int]:

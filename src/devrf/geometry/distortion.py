@@ -14,10 +14,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-# Newton's method doubles the digits at every step; real lenses are done after five.
-_STEPS = 30
-_SOLVED = 1e-9
-
 
 @dataclass(frozen=True)
 class Distortion:
@@ -49,26 +45,6 @@ class Distortion:
             ],
             dim=-1,
         )
-
-    def undistort(self, points: Tensor) -> Tensor:
-        """The pinhole's points (..., 2) that the lens puts at ``points``, by Newton's method.
-
-        Returns:
-            In the dtype of ``points``; computed in float64. NaN where there is no such point:
-            a strong distortion folds the plane, and nothing is seen beyond the fold.
-        """
-        goal = points.double()
-        found = goal.clone()
-        for _ in range(_STEPS):
-            rx, ry = (self.distort(found) - goal).unbind(-1)
-            xx, xy, yy = self._jacobian(found)
-            determinant = xx * yy - xy * xy
-            step = torch.stack([yy * rx - xy * ry, xx * ry - xy * rx], dim=-1)
-            found = found - step / determinant[..., None]
-        miss = (self.distort(found) - goal).abs().amax(dim=-1)
-        solved = (miss < _SOLVED * (1 + goal.abs().amax(dim=-1))) & self.upright(found)
-        nothing = torch.full_like(found, torch.nan)
-        return torch.where(solved[..., None], found, nothing).to(points.dtype)
 
     def upright(self, points: Tensor) -> Tensor:
         """Mask (...,) of the pinhole's ``points`` (..., 2) that lie before the fold."""

@@ -9,7 +9,7 @@ stills, evaluation) asks for :meth:`DynamicModel.at` alone.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -29,6 +29,7 @@ class DynamicModel(nn.Module, ABC):
 
     Attributes:
         name: the method's name: what ``method=`` chooses, and tables say.
+        losses: the names of its loss terms.
         box: what holds the scene, in the space of the fields.
         space: the space that the fields live in: world units, or NDC.
         depth_limits: distances along a ray before and behind which nothing is sampled, in the
@@ -36,6 +37,7 @@ class DynamicModel(nn.Module, ABC):
     """
 
     name: ClassVar[str]
+    losses: ClassVar[tuple[str, ...]] = ("color",)
     box: Box
     space: Space
     depth_limits: tuple[float, float]
@@ -65,10 +67,17 @@ class DynamicModel(nn.Module, ABC):
     def forward(self, batch: RayBatch) -> RenderOutput:
         """Render a batch of R rays, each at its own time; differentiable in the parameters."""
 
-    def loss_terms(self, output: RenderOutput, batch: RayBatch) -> dict[str, Tensor]:
-        """The unweighted loss terms () by name; may render again.
+    def loss_terms(
+        self, output: RenderOutput, batch: RayBatch, names: Collection[str]
+    ) -> dict[str, Tensor]:
+        """Unweighted loss terms () by name; may render again.
 
         ``color`` is the mean squared colour error over rays and channels.
+
+        Args:
+            output: what :meth:`forward` gave.
+            batch: the rays and the truth at their pixels.
+            names: of the terms that count: the others need not be computed.
         """
         return {"color": nn.functional.mse_loss(output.color, batch.color)}
 
@@ -130,6 +139,14 @@ class DynamicModel(nn.Module, ABC):
     def size(self) -> int:
         """How many numbers are learned."""
         return sum(parameter.numel() for parameter in self.parameters())
+
+    def batch_bytes(self, rays: int) -> int:
+        """About what learning from a batch of rays takes, the graph of its gradients included.
+
+        Three single-precision values are kept for each output of each layer, for 128 samples a ray.
+        """
+        layers = [module for module in self.modules() if isinstance(module, nn.Linear)]
+        return 128 * rays * 12 * sum(layer.out_features for layer in layers)
 
     def stored_state(self) -> dict[str, Any]:
         """The state for a finished checkpoint: tensors and plain data, as small as can be."""

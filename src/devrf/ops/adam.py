@@ -1,4 +1,4 @@
-"""Adam for grids: entries without gradient stand still, each voxel may have its own pace."""
+"""Adam for grids: entries without gradient stand still, each voxel may have its own rate."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ import torch
 from torch import Tensor
 
 from devrf.ops.adam_step import AdamRule, adam_step, smooth_adam_step
-from devrf.ops.choice import triton_runs
+from devrf.ops.dispatch import triton_runs
 from devrf.ops.total_variation import add_total_variation_gradient
 
 
 class GridAdam(torch.optim.Optimizer):
-    """Adam (Kingma & Ba 2015) with additions for voxel grids (method §2, Optimiser; §3, TV).
+    """Adam (Kingma & Ba 2015) with additions for voxel grids.
 
     Each parameter group takes, beside ``lr``, ``betas`` and ``eps``:
 
     * ``skip_zero``: an entry whose gradient is exactly zero keeps its value *and its moments*:
       a voxel that no sample of this batch touched is not moved by what was seen before.
-    * ``pace``: None, or a tensor (X, Y, Z, 1) that multiplies the learning rate voxel by voxel.
+    * ``per_voxel_lr``: None, or a tensor (X, Y, Z, 1) of factors of the learning rate.
     * ``smoothing``: weight of the total variation of each grid, whose gradient is added to what
       the backward pass gave.
     * ``touched_only``: add it to entries alone that have a gradient.
@@ -47,7 +47,7 @@ class GridAdam(torch.optim.Optimizer):
             "betas": betas,
             "eps": eps,
             "skip_zero": False,
-            "pace": None,
+            "per_voxel_lr": None,
             "smoothing": 0.0,
             "touched_only": False,
         }
@@ -79,8 +79,8 @@ class GridAdam(torch.optim.Optimizer):
     def stepping_by(self, work: Callable[[], None]) -> Iterator[None]:
         """Within, :meth:`step` does ``work`` in place of :meth:`apply`, which is part of it.
 
-        For work that is done as a whole, like a captured iteration: whoever must be asked before
-        a step, and sets learning rates, is asked before it.
+        For work that is done as a whole, like a captured iteration: callbacks that run before
+        a step, and set learning rates, run before all of it.
         """
         usual, self._work = self._work, work
         try:
@@ -106,7 +106,12 @@ class GridAdam(torch.optim.Optimizer):
         gradient, state = parameter.grad, self._state_of(parameter)
         state["steps"] += 1
         rule = AdamRule(
-            rate, state["steps"], group["betas"], group["eps"], group["skip_zero"], group["pace"]
+            rate,
+            state["steps"],
+            group["betas"],
+            group["eps"],
+            group["skip_zero"],
+            group["per_voxel_lr"],
         )
         moments = state["mean"], state["square"]
         tensors = (parameter, gradient, *moments)
@@ -162,8 +167,8 @@ class GridAdam(torch.optim.Optimizer):
             # torch makes every number of a state one of its parameter's type.
             state["steps"] = state["steps"].double()
         for group in self.param_groups:
-            if group["pace"] is not None:
-                group["pace"] = group["pace"].to(group["params"][0].device)
+            if group["per_voxel_lr"] is not None:
+                group["per_voxel_lr"] = group["per_voxel_lr"].to(group["params"][0].device)
 
     def replace(self, group: int, parameters: Sequence[Tensor], **settings: Any) -> None:
         """Give a group other parameters (a resized grid) with fresh moments.
@@ -171,14 +176,14 @@ class GridAdam(torch.optim.Optimizer):
         Args:
             group: its number.
             parameters: what it is to step on.
-            settings: settings of the group that change with them; a pace that is not given is
-                None.
+            settings: settings of the group that change with them; ``per_voxel_lr`` is None
+                unless it is given.
         """
         for old in self.param_groups[group]["params"]:
             self.state.pop(old, None)
             self._spare.pop(old, None)
         self.param_groups[group]["params"] = list(parameters)
-        self.param_groups[group].update({"pace": None, **settings})
+        self.param_groups[group].update({"per_voxel_lr": None, **settings})
         if self.keeps_gradients:
             self.keep_gradients()
 

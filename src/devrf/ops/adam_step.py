@@ -12,13 +12,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from devrf.ops.choice import triton_runs
+from devrf.ops.dispatch import triton_runs
 from devrf.ops.total_variation import add_total_variation_gradient
 
 
 @dataclass(frozen=True)
 class AdamRule:
-    """How Adam steps (Kingma & Ba 2015), with what voxel grids need (method §2, Optimiser).
+    """How Adam steps (Kingma & Ba 2015), with what voxel grids need.
 
     Attributes:
         rate: () learning rate, on the device.
@@ -26,7 +26,7 @@ class AdamRule:
         betas: decay of the mean and of the square.
         eps: what is added to the square's root.
         skip_zero: an entry whose gradient is exactly zero keeps its value *and its moments*.
-        pace: None, or (X, Y, Z, 1) that multiplies the learning rate voxel by voxel.
+        per_voxel_lr: None, or factors (X, Y, Z, 1) of the learning rate, voxel by voxel.
     """
 
     rate: Tensor
@@ -34,7 +34,7 @@ class AdamRule:
     betas: tuple[float, float] = (0.9, 0.99)
     eps: float = 1e-8
     skip_zero: bool = False
-    pace: Tensor | None = None
+    per_voxel_lr: Tensor | None = None
 
 
 def adam_step(
@@ -49,10 +49,10 @@ def adam_step(
     """Step in place; with ``clear`` the gradient is zero afterwards, ready to be added to.
 
     ``m ← β₁m + (1 − β₁)g``, ``s ← β₂s + (1 − β₂)g²``,
-    ``v ← v − rate·pace · (m / (1 − β₁ᵗ)) / (√(s / (1 − β₂ᵗ)) + ε)``.
+    ``v ← v − rate·per_voxel_lr · (m / (1 − β₁ᵗ)) / (√(s / (1 − β₂ᵗ)) + ε)``.
 
     Args:
-        values: of any shape, contiguous; (X, Y, Z, C) if there is a pace.
+        values: of any shape, contiguous; (X, Y, Z, C) with ``per_voxel_lr``.
         gradient: the same shape.
         mean: first moments, the same shape, changed in place.
         square: second moments, likewise.
@@ -63,7 +63,7 @@ def adam_step(
     if all(tensor.is_contiguous() for tensor in tensors) and triton_runs(*tensors):
         from devrf.ops.kernels.adam import step_in_one_pass
 
-        step_in_one_pass(values, values, gradient, mean, square, rule, clear=clear)
+        step_in_one_pass(values, values, gradient, mean, square, **vars(rule), clear=clear)
         return
     _step(values, gradient, mean, square, rule)
     if clear:
@@ -108,7 +108,7 @@ def smooth_adam_step(
             gradient,
             mean,
             square,
-            rule,
+            **vars(rule),
             smoothing=smoothing,
             touched_only=touched_only,
         )
@@ -133,8 +133,8 @@ def _step_all(values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, rule: 
     square.mul_(beta2).addcmul_(grad, grad, value=1 - beta2)
     size, correction = _step_size(rule)
     move = mean / (square / correction).sqrt_().add_(rule.eps)
-    if rule.pace is not None:
-        move *= rule.pace
+    if rule.per_voxel_lr is not None:
+        move *= rule.per_voxel_lr
     values.addcmul_(move, size.to(values.dtype), value=-1)
 
 
@@ -156,8 +156,8 @@ def _step_touched(
     squares.index_copy_(0, rows, s)
     size, correction = _step_size(rule)
     move = m / (s / correction).sqrt_().add_(rule.eps)
-    if rule.pace is not None:
-        move *= rule.pace.view(-1, 1)[rows]
+    if rule.per_voxel_lr is not None:
+        move *= rule.per_voxel_lr.view(-1, 1)[rows]
     table = values.view(-1, channels)
     before = table.index_select(0, rows)
     after = before - size * torch.where(touched, move, torch.zeros_like(move))

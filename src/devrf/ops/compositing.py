@@ -15,11 +15,11 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from devrf.ops.choice import triton_runs
+from devrf.ops.dispatch import triton_runs
 
 
 def composite(depth: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
-    """Weights of samples and what is left of each ray behind them (method §2, Compositing).
+    """Weights of samples and what is left of each ray behind them (Max 1995).
 
     ``w_i = T_i α_i`` and ``T_end = exp(−Σ_i τ_i)``; for example τ = (ln 2, ln 2) on one ray
     gives w = (1/2, 1/4) and T_end = 1/4.

@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from devrf.ops.choice import triton_runs
 from devrf.ops.compositing import transmittances
 from devrf.ops.corners import Corners, shape_of, to_grid
+from devrf.ops.dispatch import triton_runs
 from devrf.ops.warped_depth import warped_depth
 
 
@@ -26,7 +26,7 @@ class Thresholds:
     Attributes:
         alpha: a sample of lower opacity is dropped.
         stop: a sample is dropped if less than this of its ray is left before it.
-        weight: a sample of lower weight T·α is not heavy.
+        weight: a sample of lower weight T·α is not significant.
     """
 
     alpha: float
@@ -42,7 +42,7 @@ class PackedSamples:
         ray: (C,) int64, the ray of each sample; R in the padding.
         distance: (C,) along the ray, in units of its direction; 0 in the padding.
         points: (C, 3) positions; 0 in the padding.
-        heavy: (C,) bool, whether the sample weighs enough for its colour to matter.
+        significant: (C,) bool, whether the sample weighs enough for its colour to matter.
         first: (R + 1,) int64, where each ray's samples begin; the last entry is how many of the
             C places are used.
         total: () int64, how many samples there were to find; more than C if some were dropped.
@@ -52,7 +52,7 @@ class PackedSamples:
     ray: Tensor
     distance: Tensor
     points: Tensor
-    heavy: Tensor
+    significant: Tensor
     first: Tensor
     total: Tensor
     overflow: Tensor
@@ -96,12 +96,12 @@ def find_samples(
     delta: float,
     thresholds: Thresholds,
 ) -> PackedSamples:
-    """Samples that can be seen (method §2, Rays), at ``entry + k·step``, k = 0 … count − 1.
+    """Samples that can be seen, at ``entry + k·step``, k = 0 … count − 1.
 
     A sample is kept if the grid point nearest to it is occupied, its opacity is no less than
     ``thresholds.alpha``, and the transmittance before it, over the samples in front of it that
-    pass both tests, is no less than ``thresholds.stop``. It is heavy if its weight is no less than
-    ``thresholds.weight`` too. No gradient, and with Triton no waiting for the device.
+    pass both tests, is no less than ``thresholds.stop``. It is significant if its weight is no
+    less than ``thresholds.weight`` too. No gradient, and with Triton no waiting for the device.
 
     Args:
         origins: (R, 3) of rays in the box's units.
@@ -128,7 +128,7 @@ def find_samples(
     if triton_runs(origins, directions, entry, density, *slices):
         from devrf.ops.kernels.search import find_samples_on_device
 
-        return find_samples_on_device(
+        found = find_samples_on_device(
             origins,
             directions,
             entry,
@@ -144,8 +144,9 @@ def find_samples(
             box,
             shift,
             delta,
-            thresholds,
+            (thresholds.alpha, thresholds.stop, thresholds.weight),
         )
+        return PackedSamples(*found)
     rays = len(origins)
     samples = count.clamp(max=longest)
     ray = torch.repeat_interleave(samples)
@@ -159,7 +160,7 @@ def find_samples(
     kept = (alpha >= thresholds.alpha).nonzero()[:, 0]
     ray, distance, points = ray[kept], distance[kept], points[kept]
     before = transmittances(tau[kept], ray, rays)
-    heavy = before * alpha[kept] >= thresholds.weight
+    significant = before * alpha[kept] >= thresholds.weight
     kept = (before >= thresholds.stop).nonzero()[:, 0]
     first = torch.searchsorted(ray[kept], torch.arange(rays + 1, device=ray.device))
     total = first[-1]
@@ -169,7 +170,7 @@ def find_samples(
         pad(ray[kept], (0, room), value=rays),
         pad(distance[kept], (0, room)),
         pad(points[kept], (0, 0, 0, room)),
-        pad(heavy[kept], (0, room)),
+        pad(significant[kept], (0, room)),
         first.clamp(max=capacity),
         total,
         (total > capacity) | (count > longest).any(),

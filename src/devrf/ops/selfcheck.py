@@ -14,9 +14,9 @@ from torch import Tensor
 
 from devrf.errors import DevrfError
 from devrf.ops.adam_step import AdamRule, adam_step, smooth_adam_step
-from devrf.ops.choice import Kind, using
 from devrf.ops.compositing import composite_segments, sum_segments
 from devrf.ops.corners import Triple
+from devrf.ops.dispatch import Kind, using
 from devrf.ops.search import Thresholds, find_samples
 from devrf.ops.total_variation import add_total_variation_gradient
 from devrf.ops.trilinear import interpolate
@@ -124,7 +124,7 @@ def sample_search(draw: Draw, frames: Sequence[int] = (1, 2)) -> Results:
             found.ray,
             found.distance,
             found.points,
-            found.heavy,
+            found.significant,
             found.first,
             found.total,
             found.overflow,
@@ -156,12 +156,12 @@ def adam(draw: Draw) -> Results:
     """Steps with and without what is optional."""
     results: list[Tensor] = []
     for skip_zero in (False, True):
-        pace = draw(4, 3, 5, 1).abs()
+        factors = draw(4, 3, 5, 1).abs()
         rule = AdamRule(
             draw(1)[0].abs(),
-            torch.full_like(pace[0, 0, 0, 0], 3.0),
+            torch.full_like(factors[0, 0, 0, 0], 3.0),
             skip_zero=skip_zero,
-            pace=pace if skip_zero else None,
+            per_voxel_lr=factors if skip_zero else None,
         )
         values, gradient, mean = draw(4, 3, 5, 3), draw(4, 3, 5, 3).clamp(min=0), draw(4, 3, 5, 3)
         square, smooth = draw(4, 3, 5, 3).square() + 0.1, torch.zeros_like(values)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from devrf.ops.choice import triton_runs
+from devrf.ops.dispatch import triton_runs
 
 
 def total_variation(grid: Tensor) -> Tensor:
@@ -28,7 +28,7 @@ def total_variation(grid: Tensor) -> Tensor:
 def add_total_variation_gradient(
     grid: Tensor, gradient: Tensor, weight: float, *, touched_only: bool = False
 ) -> None:
-    """Add ``weight`` · ∂ total_variation(grid) / ∂ grid to ``gradient`` in place (method §3, TV).
+    """Add ``weight`` · ∂ total_variation(grid) / ∂ grid to ``gradient`` in place.
 
     The derivative at a voxel is Σ_neighbours clamp(v − v', −1, 1); it is added without building
     a graph, since the penalty touches every voxel at every step.

@@ -14,8 +14,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import embedding_bag
 
-from devrf.ops.choice import triton_runs
 from devrf.ops.corners import Shape, shape_of
+from devrf.ops.dispatch import triton_runs
 
 Pair = tuple[Tensor, Tensor]
 

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from devrf.errors import DevrfError
-from devrf.ops.choice import triton_runs
 from devrf.ops.corners import Corners, shape_of, to_grid
+from devrf.ops.dispatch import triton_runs
 from devrf.ops.trilinear import interpolate
 
 
@@ -25,7 +25,7 @@ def warped_depth(
     density_gradient: Tensor | None = None,
     slice_gradients: Sequence[Tensor | None] = (),
 ) -> tuple[Tensor, Tensor]:
-    """Where points lie in canonical space, and how opaque it is there (method §2 and §3).
+    """Where points lie in canonical space, and how opaque it is there.
 
     ``q = x + Δ(x)`` and ``τ = softplus(v(q) + b)·δ``, where Δ and v are trilinear, and
     ``Δ = (1 − w)·Δ_0 + w·Δ_1`` between two frames. All grids have their corners on one box;

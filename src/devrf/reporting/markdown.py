@@ -3,73 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 
-from devrf.reporting.columns import Cell
-from devrf.reporting.table import Block, Row, Table
-from devrf.reporting.text import (
-    aligned,
-    caption,
-    credit,
-    headings,
-    published_heading,
-    reasons,
-    valid_mask,
-)
-
-MARKS = {1: "**{}**", 2: "<ins>{}</ins>", 3: "*{}*", None: "{}"}
-PLAIN_MARKS = {1: "{}¹", 2: "{}²", 3: "{}³", None: "{} "}
-
-
-def markdown(table: Table, figures: Mapping[str, str], remarks: Sequence[str] = ()) -> str:
-    """The whole report.
-
-    Args:
-        table: what it says.
-        figures: links to plots, by what they show.
-        remarks: further sentences for the reader.
-    """
-    found = table.found
-    failed = f", {len(found.failures)} failed" if found.failures else ""
-    parts = [
-        "# Runs compared",
-        f"{_runs(len(found.runs))} below `{found.folder}`{failed}.",
-        f"{escaped(caption(table))} **Best**, <ins>second</ins>, *third*.",
-    ]
-    if table.shows_published:
-        parts.append(f"† {escaped(credit())}")
-    for block in table.blocks:
-        parts += [f"## {escaped(block.title)}", _table(block)]
-    notes = [*table.notes, *remarks]
-    if notes:
-        parts.append("\n".join(f"- {escaped(note)}" for note in notes))
-    if found.failures:
-        parts += ["## Failed", "\n".join(f"- {escaped(line)}" for line in reasons(found))]
-    if found.skipped:
-        parts += ["## Skipped", "\n".join(f"- {escaped(line)}" for line in found.skipped)]
-    if figures:
-        parts.append("## Plots")
-        parts += [f"![{escaped(shows)}](<{link}>)" for shows, link in figures.items()]
-    return "\n\n".join(parts) + "\n"
-
-
-def plain(table: Table, remarks: Sequence[str] = ()) -> str:
-    """The tables, notes and failures, for a terminal; ¹ ² ³ mark the best.
-
-    Args:
-        table: what it says.
-        remarks: further sentences for the reader.
-    """
-    lines: list[str] = []
-    for block in table.blocks:
-        rows = [[block.title, *(f"{text} " for text in headings())]]
-        rows += [_cells(row, PLAIN_MARKS, str) for row in block.measured]
-        if block.published:
-            rows += [[published_heading(), *[""] * len(headings())]]
-            rows += [_cells(row, PLAIN_MARKS, "† {}".format) for row in block.published]
-        lines += ["  ".join(row).rstrip() for row in aligned(rows)] + [""]
-    lines += [*table.notes, *remarks, *(f"failed: {why}" for why in reasons(table.found))]
-    return "\n".join([*lines, *table.found.skipped]).rstrip()
+from devrf.reporting.table import COLUMNS, Block, Table
+from devrf.reporting.text import Style, caption, credit, printed, reasons
 
 
 def escaped(text: str) -> str:
@@ -77,23 +14,61 @@ def escaped(text: str) -> str:
     return re.sub(r"([\\`*<>|\[\]])|((?<!\w)_|_(?!\w))", r"\\\1\2", text)
 
 
-def _runs(count: int) -> str:
-    return "1 finished run" if count == 1 else f"{count} finished runs"
+MARKDOWN = Style(escaped, ("{}", "**{}**", "<ins>{}</ins>", "*{}*"), "*{}*")
+PLAIN = Style(str, ("{} ", "{}¹", "{}²", "{}³"))
 
 
-def _table(block: Block) -> str:
-    head = ["", *headings()]
-    rows = [head, *(_cells(row, MARKS, escaped) for row in block.measured)]
-    if block.published:
-        rows.append([f"*{published_heading()}*", *[""] * len(headings())])
-        rows += [_cells(row, MARKS, lambda text: f"† {escaped(text)}") for row in block.published]
-    first, *others = aligned(rows)
-    rule = [":" + "-" * (len(first[0]) - 1), *("-" * (len(cell) - 1) + ":" for cell in first[1:])]
-    return "\n".join(f"| {' | '.join(row)} |" for row in (first, rule, *others))
+def markdown(table: Table, figures: Mapping[str, str]) -> str:
+    """The whole report.
+
+    Args:
+        table: its contents.
+        figures: links to plots, by what they show.
+    """
+    found = table.found
+    failed = f", {len(found.failures)} failed" if len(found.failures) else ""
+    count = len(found.runs)
+    parts = [
+        "# Runs compared",
+        f"{count} finished run{'s' * (count != 1)} below `{found.folder}`{failed}.",
+        f"{escaped(caption(table))} **Best**, <ins>second</ins>, *third*.",
+    ]
+    if table.shows_published:
+        parts.append(f"† {escaped(credit())}")
+    for block in table.blocks:
+        parts += [f"## {escaped(block.title)}", _block(table, block)]
+    for heading, lines in (
+        ("", table.notes),
+        ("## Failed", reasons(found)),
+        ("## Skipped", found.skipped),
+    ):
+        if lines:
+            parts += [heading, "\n".join(f"- {escaped(line)}" for line in lines)]
+    if figures:
+        parts.append("## Plots")
+        parts += [f"![{escaped(shows)}](<{link}>)" for shows, link in figures.items()]
+    return "\n\n".join(filter(None, parts)) + "\n"
 
 
-def _cells(row: Row, marks: Mapping[int | None, str], label: Callable[[str], str]) -> list[str]:
-    def marked(cell: Cell) -> str:
-        return marks[cell.rank].format(cell.text)
+def plain(table: Table) -> str:
+    """The tables, notes and failures, for a terminal; ¹ ² ³ mark the best."""
+    parts = [_plain_block(table, block) + "\n" for block in table.blocks]
+    failed = [f"failed: {why}" for why in reasons(table.found)]
+    return "\n".join([*parts, *table.notes, *failed, *table.found.skipped]).rstrip()
 
-    return [label(row.label + valid_mask(row.seeds)), *map(marked, row.cells)]
+
+def _block(table: Table, block: Block) -> str:
+    frame = printed(table, [block], MARKDOWN).droplevel(0, axis=1)
+    left = len(frame.columns) - len(COLUMNS)
+    align = ["left"] * left + ["right"] * len(COLUMNS)
+    return str(frame.to_markdown(index=False, disable_numparse=True, colalign=align))
+
+
+def _plain_block(table: Table, block: Block) -> str:
+    frame = printed(table, [block], PLAIN).droplevel(0, axis=1)
+    heads, cells = frame.iloc[:, : -len(COLUMNS)], frame.iloc[:, -len(COLUMNS) :]
+    heads = heads.apply(lambda column: column.str.ljust(column.str.len().max()))
+    cells.index = heads.agg("  ".join, axis=1)
+    cells.columns = [f"{heading} " for heading in cells.columns]
+    cells.columns.name = block.title
+    return "\n".join(line.rstrip() for line in cells.to_string().splitlines())

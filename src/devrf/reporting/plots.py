@@ -1,50 +1,33 @@
-"""Plots of finished runs (matplotlib: ``pip install "devrf[plots]"``)."""
+"""Plots of finished runs."""
 
 from __future__ import annotations
 
 import re
-from collections import defaultdict
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
-from statistics import mean
 from typing import Any
 
 import matplotlib as mpl
+import pandas as pd
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
 
-from devrf.reporting.columns import COLUMNS, LPIPS, PSNR, SSIM, TIME, Column, cell
-from devrf.reporting.rows import RowOfRuns
-from devrf.reporting.table import Block, Table
-from devrf.reporting.text import heading
+from devrf.reporting.runs import metric_over_time
+from devrf.reporting.table import LPIPS, PSNR, SSIM, TIME, Block, Table
 
-# Okabe and Ito's, to be told apart by everyone.
-COLORS = (
-    "#0072B2",
-    "#D55E00",
-    "#009E73",
-    "#CC79A7",
-    "#E69F00",
-    "#56B4E9",
-    "#000000",
-    "#8C6D31",
-)
+# The palette of Okabe and Ito, distinguishable with colour-blindness; then dashes.
+COLORS = "#0072B2 #D55E00 #009E73 #CC79A7 #E69F00 #56B4E9 #000000 #8C6D31".split()
 DASHES = ("-", "--", ":", "-.")
-PUBLISHED = ", published"
-INK, PALE = "#222222", "#9a9a9a"
+PUBLISHED, GREY = ", published", "#9a9a9a"
 STYLE: dict[Any, Any] = {
-    "figure.dpi": 110,
-    "savefig.dpi": 160,
-    "figure.facecolor": "white",
+    "figure.dpi": 160,
     "font.size": 9,
     "axes.titlesize": 10,
     "axes.spines.top": False,
     "axes.spines.right": False,
-    "axes.edgecolor": INK,
     "axes.grid": True,
+    "axes.formatter.useoffset": False,
     "grid.color": "#e6e6e6",
     "axes.axisbelow": True,
     "legend.frameon": False,
@@ -52,37 +35,16 @@ STYLE: dict[Any, Any] = {
     "lines.linewidth": 1.6,
     "lines.markersize": 4,
 }
-# Marks of the paper's methods; what follows a name is a variant.
-FAMILIES = {
-    "DeVRF": "s",
-    "D-NeRF": "^",
-    "Nerfies": "v",
-    "HyperNeRF": "D",
-    "NSFF": "P",
-    "Neural Volumes": "X",
-}
+# Markers of the paper's methods; what follows a name is a variant.
+METHODS = ("DeVRF", "D-NeRF", "Nerfies", "HyperNeRF", "NSFF", "Neural Volumes")
+MARKERS = dict(zip(METHODS, "s^vDPX", strict=True))
 VARIANT = r"-2 ?stage$|-dynamic$| \(base\)$| w/ .*$"
-# Seconds to write on an axis, where it spans more than a factor of a hundred and where less.
-FEW_TICKS = (1, 10, 60, 600, 3600, 36000, 360000)
+# Seconds to label on an axis, where it spans more than a factor of a hundred and where less.
+FEW_TICKS = (0.1, 1, 10, 60, 600, 3600, 36000, 360000)
 TICKS = (
-    1,
-    2,
-    5,
-    10,
-    20,
-    30,
-    60,
-    120,
-    300,
-    600,
-    1200,
-    1800,
-    3600,
-    7200,
-    18000,
-    36000,
-    86400,
-    172800,
+    *(0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 30),
+    *(60 * minutes for minutes in (1, 2, 5, 10, 20, 30)),
+    *(3600 * hours for hours in (1, 2, 5, 10, 24)),
 )
 
 
@@ -102,125 +64,103 @@ class Plot:
 
 
 def plots(table: Table) -> list[Plot]:
-    """Every plot that there is something to show in."""
-    scenes = dict.fromkeys(row.scene for row in table.rows)
+    """Every plot that has data."""
     found = [
         ("psnr_against_seconds", "PSNR against training time", psnr_against_seconds(table)),
         ("metrics_against_views", "Metrics against dynamic training views", against_views(table)),
-        *(
-            (
-                f"psnr_over_time_{_file(scene)}",
-                f"{scene}: PSNR over time",
-                psnr_over_time(table, scene),
-            )
-            for scene in scenes
-        ),
     ]
+    for scene in table.runs["scene"].unique():
+        file = re.sub(r"[^\w.-]+", "_", scene)
+        shows = f"{scene}: PSNR over time"
+        found.append((f"psnr_over_time_{file}", shows, psnr_over_time(table, scene)))
     return [Plot(name, shows, figure) for name, shows, figure in found if figure is not None]
 
 
+@mpl.rc_context(STYLE)
 def psnr_over_time(table: Table, scene: str) -> Figure | None:
-    """PSNR of the held-out images of one scene over time, a curve a row; the mean over seeds.
+    """PSNR of the held-out images of one scene over time, a curve a row; the mean over runs.
 
     None where no run has frames.
     """
-    rows = [row for row in table.rows if row.scene == scene]
-    curves = {row.label: curve for row in rows if (curve := _mean_curve(row))}
+    curves: dict[str, pd.Series] = {}
+    for label, runs in table.runs[table.runs["scene"] == scene].groupby("label", sort=False):
+        of_runs = [metric_over_time(path, "psnr") for path in runs["path"]]
+        curves[label] = pd.concat(of_runs, axis=1, join="inner").mean(axis=1)
+    curves = {label: curve for label, curve in curves.items() if len(curve)}
     if not curves:
         return None
-    with _styled():
-        figure = Figure(figsize=(6.4, 3.6), layout="constrained")
-        axes = figure.subplots()
-        for label, curve in curves.items():
-            color, dashes = _look(table, label)
-            marker = "o" if len(curve) < 30 else ""
-            times, values = zip(*curve, strict=True)
-            axes.plot(times, values, dashes, color=color, marker=marker, label=label)
-        axes.set(title=scene, xlabel="time", ylabel=f"{PSNR.title} (dB)")
-        _legend(figure, axes)
+    figure = Figure(figsize=(6.4, 3.6), layout="constrained")
+    axes = figure.subplots()
+    for label, curve in curves.items():
+        color, dashes = _look(table, label)
+        marker = "o" if len(curve) < 30 else ""
+        axes.plot(curve.index, curve, dashes, color=color, marker=marker, label=label)
+    axes.set(title=scene, xlabel="time", ylabel=f"{PSNR.title} (dB)")
+    _legend(figure)
     return figure
 
 
+@mpl.rc_context(STYLE)
 def psnr_against_seconds(table: Table) -> Figure | None:
     """PSNR against training time, a panel a scene, the paper's rows as hollow marks.
 
     None where no run has both.
     """
-    scenes = {row.scene for row in table.rows if _value(row, TIME) and _value(row, PSNR)}
+    both = table.rows[(table.rows[TIME.title] > 0) & table.rows[PSNR.title].notna()]
+    scenes = both.index.get_level_values("scene")
     blocks = [block for block in table.blocks if block.title in scenes]
     if not blocks:
         return None
     across = min(3, len(blocks))
     down = -(-len(blocks) // across)
-    with _styled():
-        figure = Figure(figsize=(1.2 + 3.2 * across, 0.9 + 2.9 * down), layout="constrained")
-        panels = figure.subplots(down, across, squeeze=False).flat
-        for axes, block in zip(panels, blocks, strict=False):
-            _points(axes, table, block)
-        for axes in list(panels)[len(blocks) :]:
-            axes.set_visible(False)
-        _legend(figure, *figure.axes)
+    figure = Figure(figsize=(1.2 + 3.2 * across, 0.9 + 2.9 * down), layout="constrained")
+    panels = list(figure.subplots(down, across, squeeze=False).flat)
+    for axes, block in zip(panels, blocks, strict=False):
+        _points(axes, table, block)
+    for axes in panels[len(blocks) :]:
+        axes.remove()
+    _legend(figure)
     return figure
 
 
+@mpl.rc_context(STYLE)
 def against_views(table: Table) -> Figure | None:
     """PSNR, and LPIPS or else SSIM, against the number of dynamic training views.
 
-    A line for each scene and method. None unless some method was run with several numbers.
+    A line for each scene and configuration. None unless one was run with several numbers.
     """
-    lines: dict[tuple[str, str], list[RowOfRuns]] = defaultdict(list)
-    for row in table.rows:
-        if row.views is not None:
-            lines[row.scene, row.method].append(row)
-    lines = {key: rows for key, rows in lines.items() if len({row.views for row in rows}) > 1}
-    if not lines:
+    rows = table.rows.dropna(subset="views").sort_values("views")
+    lines = rows.groupby(["scene", "line"], sort=False).filter(lambda g: g["views"].nunique() > 1)
+    if lines.empty:
         return None
-    methods = {method for _, method in lines}
-    second = LPIPS if any(_value(r, LPIPS) for rows in lines.values() for r in rows) else SSIM
-    with _styled():
-        figure = Figure(figsize=(7.4, 3.4), layout="constrained")
-        for axes, column in zip(figure.subplots(1, 2), (PSNR, second), strict=True):
-            for k, ((scene, method), rows) in enumerate(lines.items()):
-                known = sorted(
-                    (row.views, value)
-                    for row in rows
-                    if row.views is not None and (value := _value(row, column)) is not None
-                )
-                label = scene if len(methods) == 1 else f"{scene}: {method}"
-                color, dashes = _style(k)
-                axes.plot(
-                    [views for views, _ in known],
-                    [value for _, value in known],
-                    dashes,
-                    color=color,
-                    marker="o",
-                    label=label,
-                )
-            axes.set(xlabel="dynamic training views", ylabel=heading(column))
-            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-        _legend(figure, *figure.axes)
+    one_line = lines["line"].nunique() == 1
+    second = LPIPS if lines[LPIPS.title].notna().any() else SSIM
+    figure = Figure(figsize=(7.4, 3.4), layout="constrained")
+    for axes, column in zip(figure.subplots(1, 2), (PSNR, second), strict=True):
+        for k, ((scene, line), group) in enumerate(lines.groupby(["scene", "line"], sort=False)):
+            color, dashes = _style(k)
+            known = group.dropna(subset=column.title)
+            label = scene if one_line else f"{scene}: {line}"
+            points = known["views"], known[column.title]
+            axes.plot(*points, dashes, color=color, marker="o", label=label)
+        axes.set(xlabel="dynamic training views", ylabel=column.heading)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    _legend(figure)
     return figure
 
 
 def _points(axes: Axes, table: Table, block: Block) -> None:
     """One scene's panel."""
-    for row in table.rows:
-        seconds, psnr = _value(row, TIME), _value(row, PSNR)
-        if row.scene == block.title and seconds and psnr is not None:
-            color, _ = _look(table, row.label)
-            axes.plot(seconds, psnr, "o", color=color, markersize=6, label=row.label)
-    for published in block.published:
-        method = re.sub(VARIANT, "", published.label)
-        seconds, psnr = (published.cells[COLUMNS.index(column)].value for column in (TIME, PSNR))
-        if seconds and psnr is not None:
-            axes.plot(
-                seconds,
-                psnr,
-                FAMILIES.get(method, "o"),
-                color=PALE,
-                markerfacecolor="none",
-                label=f"{method}{PUBLISHED}",
-            )
+    for label, seconds, psnr in _seconds_and_psnr(block.measured):
+        axes.plot(seconds, psnr, "o", color=_look(table, label)[0], markersize=6, label=label)
+    for label, seconds, psnr in _seconds_and_psnr(block.published):
+        method = re.sub(VARIANT, "", label)
+        look: dict[str, Any] = {
+            "marker": MARKERS.get(method, "o"),
+            "color": GREY,
+            "markerfacecolor": "none",
+        }
+        axes.plot(seconds, psnr, linestyle="", label=f"{method}{PUBLISHED}", **look)
     axes.set(title=block.title, xscale="log", xlabel="training time", ylabel=f"{PSNR.title} (dB)")
     low, high = axes.get_xlim()
     low, high = low / 1.5, high * 1.5
@@ -230,6 +170,12 @@ def _points(axes: Axes, table: Table, block: Block) -> None:
     axes.xaxis.set_major_formatter(FuncFormatter(_time))
 
 
+def _seconds_and_psnr(rows: pd.DataFrame) -> list[tuple[str, float, float]]:
+    """(label, seconds, PSNR) where both are known and a logarithm can show the time."""
+    known = rows["value"][[TIME.title, PSNR.title]].dropna()
+    return list(known[known[TIME.title] > 0].itertuples(name=None))
+
+
 def _time(seconds: float, position: int | None = None) -> str:
     for unit, size in (("h", 3600), ("min", 60)):
         if seconds >= size:
@@ -237,43 +183,22 @@ def _time(seconds: float, position: int | None = None) -> str:
     return f"{seconds:g} s"
 
 
-def _value(row: RowOfRuns, column: Column) -> float | None:
-    return cell([column.of(run) for run in row.runs], column).value
-
-
-def _mean_curve(row: RowOfRuns) -> list[tuple[float, float]]:
-    """(time, PSNR), where all seeds of a row have the time."""
-    curves = [dict(run.over_time("psnr")) for run in row.runs]
-    shared = sorted(set.intersection(*(set(curve) for curve in curves)))
-    return [(time, mean(curve[time] for curve in curves)) for time in shared]
-
-
 def _look(table: Table, label: str) -> tuple[str, str]:
     """Colour and dashes of a row, the same in all plots of a report."""
-    return _style(list(dict.fromkeys(row.label for row in table.rows)).index(label))
+    return _style(list(table.runs["label"].unique()).index(label))
 
 
 def _style(k: int) -> tuple[str, str]:
     return COLORS[k % len(COLORS)], DASHES[k // len(COLORS) % len(DASHES)]
 
 
-def _legend(figure: Figure, *panels: Axes) -> None:
+def _legend(figure: Figure) -> None:
     """One legend below the figure for all its panels: each label once, ours first."""
     handles: dict[str, Artist] = {}
-    for axes in panels:
+    for axes in figure.axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
     handles = dict(sorted(handles.items(), key=lambda entry: entry[0].endswith(PUBLISHED)))
     longest = max(map(len, handles))
     columns = max(1, min(len(handles), int(figure.get_figwidth() * 16 / (longest + 6))))
     figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=columns)
-
-
-def _file(scene: str) -> str:
-    return re.sub(r"[^\w.-]+", "_", scene)
-
-
-@contextmanager
-def _styled() -> Iterator[None]:
-    with mpl.rc_context(STYLE):
-        yield

@@ -2,50 +2,14 @@
 
 from __future__ import annotations
 
-import re
 import tomllib
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 
-UNITS = {"mins": 60.0, "hrs": 3600.0}
+import pandas as pd
 
-
-@dataclass(frozen=True)
-class PublishedRow:
-    """A method on a scene, as the paper prints it.
-
-    Attributes:
-        method: its name there; ``[7]`` is one of the paper's references, "Ours" its authors'.
-        psnr: dB.
-        ssim: structural similarity.
-        lpips: with VGG.
-        gpu: memory in GB.
-        time: of optimisation, in minutes or hours: ``8mins``, ``22.4hrs``.
-    """
-
-    method: str
-    psnr: str
-    ssim: str
-    lpips: str
-    gpu: str
-    time: str
-
-    @property
-    def label(self) -> str:
-        """The name for a table in which "Ours" is somebody else."""
-        return re.sub(r" \[\d+\]", "", self.method).replace("Ours", "DeVRF")
-
-    @property
-    def texts(self) -> tuple[str, ...]:
-        """The five cells, in the order of the table's columns."""
-        return (self.psnr, self.ssim, self.lpips, self.gpu, self.time)
-
-    @property
-    def values(self) -> tuple[float, ...]:
-        """The five cells as numbers, the time in seconds."""
-        amount, unit = re.fullmatch(r"([\d.]+)(mins|hrs)", self.time).groups()  # type: ignore[union-attr]
-        return (*map(float, self.texts[:-1]), float(amount) * UNITS[unit])
+METRICS = ["PSNR", "SSIM", "LPIPS", "GPU (GB)", "Time"]
 
 
 @dataclass(frozen=True)
@@ -57,25 +21,31 @@ class Published:
         authors: of the paper.
         venue: where it appeared, and in which tables.
         hardware: what it was measured on.
-        scenes: the rows of each scene, by the name that devrf gives the scene.
-        tables: the number of the table that holds each scene.
+        tables: the number of the table that holds each scene, by devrf's name of the scene.
+        texts: the cells as printed, indexed by scene and label; PSNR in dB, LPIPS with VGG, time
+            in minutes or hours (``8mins``, ``22.4hrs``). The column ``method`` is the paper's own
+            name: ``[7]`` is one of its references, and its "Ours" is DeVRF in the label.
+        values: the same cells as numbers, the time in seconds.
     """
 
     title: str
     authors: str
     venue: str
     hardware: str
-    scenes: dict[str, tuple[PublishedRow, ...]]
     tables: dict[str, int]
+    texts: pd.DataFrame
+    values: pd.DataFrame
 
 
 @cache
 def published() -> Published:
     """The paper's rows, from ``published.toml``."""
     data = tomllib.loads(files(__package__).joinpath("published.toml").read_text("utf-8"))
-    scenes = data["scenes"]
-    return Published(
-        **data["source"],
-        scenes={s["name"]: tuple(PublishedRow(*row) for row in s["rows"]) for s in scenes},
-        tables={s["name"]: s["table"] for s in scenes},
-    )
+    rows = [(scene["name"], *row) for scene in data["scenes"] for row in scene["rows"]]
+    texts = pd.DataFrame(rows, columns=["scene", "method", *METRICS], dtype=object)
+    label = texts["method"].str.replace(r" \[\d+\]", "", regex=True).str.replace("Ours", "DeVRF")
+    texts = texts.assign(label=label).set_index(["scene", "label"])
+    values = texts[METRICS].assign(Time=texts["Time"].str.extract(r"([\d.]+)")[0]).astype(float)
+    values["Time"] *= texts["Time"].str.endswith("hrs").map({True: 3600.0, False: 60.0})
+    tables = {scene["name"]: scene["table"] for scene in data["scenes"]}
+    return Published(**data["source"], tables=tables, texts=texts, values=values)

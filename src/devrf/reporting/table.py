@@ -1,38 +1,66 @@
-"""The table itself: scene blocks of rows and cells, whatever it is written as."""
+"""The tables' contents: rows of runs averaged, ranked and put beside the paper's, by scene."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
 from dataclasses import dataclass
-from statistics import mean
-from typing import Literal
 
-from devrf.reporting.columns import COLUMNS, UNKNOWN, Cell, Column, cell, ranked, shown
+import pandas as pd
+
+from devrf.reporting.labels import labelled
 from devrf.reporting.published import published
-from devrf.reporting.rows import RowOfRuns, rows_of
-from devrf.reporting.runs import Collection
+from devrf.reporting.runs import Collection, number
+from devrf.reporting.settings import PublishedScenes
 
-PublishedScenes = Literal["matching", "all", "none"]
+UNKNOWN = "–"
 
 
 @dataclass(frozen=True)
-class Row:
-    """A row.
+class Column:
+    """A column of the paper's tables.
 
     Attributes:
-        label: the method.
-        cells: one for each of the columns.
-        seeds: how many runs its values are means of; more than one number where scenes differ.
+        title: its heading.
+        key: the column of a collection that holds its value; times are in seconds.
+        higher_is_better: else lower is.
+        digits: after the point; None: a time in the unit that reads best.
+        of_hardware: whether values of different devices cannot be compared.
+        why_missing: why no run may have it.
     """
 
-    label: str
-    cells: tuple[Cell, ...]
-    seeds: frozenset[int] = frozenset({1})
+    title: str
+    key: str
+    higher_is_better: bool
+    digits: int | None
+    of_hardware: bool = False
+    why_missing: str = "it was not recorded"
+
+    @property
+    def heading(self) -> str:
+        """The title with the direction in which it is better."""
+        return f"{self.title} {'↑' if self.higher_is_better else '↓'}"
+
+
+NO_WEIGHTS = (
+    "it was not asked for, or the weights that it needs were not available "
+    "(evaluation.lpips_weights, evaluation.download)"
+)
+PSNR = Column("PSNR", "dynamic.psnr", True, 2)
+SSIM = Column("SSIM", "dynamic.ssim", True, 3)
+LPIPS = Column("LPIPS", "dynamic.lpips", False, 4, False, NO_WEIGHTS)
+GPU = Column("GPU (GB)", "peak_gpu_gb", False, 1, True, "no run is known to have used a GPU")
+TIME = Column("Time", "train_seconds", False, None, True)
+COLUMNS = (PSNR, SSIM, LPIPS, GPU, TIME)
+TITLES = [column.title for column in COLUMNS]
 
 
 @dataclass(frozen=True)
 class Block:
     """The rows of one scene, or of an average over scenes.
+
+    Both frames are indexed by label. Their columns have two levels: ``head`` has ``name``,
+    ``protocol`` and ``counts`` (a set of numbers of runs averaged); ``value`` (NaN where unknown),
+    ``text`` and ``rank`` (1, 2, 3 for the best, else 0) have every title.
 
     Attributes:
         title: the scene's name, or what was averaged.
@@ -41,138 +69,165 @@ class Block:
     """
 
     title: str
-    measured: tuple[Row, ...]
-    published: tuple[Row, ...]
+    measured: pd.DataFrame
+    published: pd.DataFrame
 
 
 @dataclass(frozen=True)
 class Table:
-    """What a report says.
+    """The contents of a report.
 
     Attributes:
         found: the runs and failures that it is about.
-        rows: the runs whose motion was scored, as they are put into rows.
+        runs: the runs whose dynamic capture was scored, labelled.
+        rows: means over runs, indexed by scene and label: ``name``, ``protocol``, ``line``,
+            ``views``, ``count`` and every title; NaN unless all runs of the row have the value.
         blocks: one for each scene, then the average if there is more than one.
-        notes: what a reader must know of columns and rows, a sentence each.
+        notes: remarks on columns and rows, a sentence each.
     """
 
     found: Collection
-    rows: tuple[RowOfRuns, ...]
+    runs: pd.DataFrame
+    rows: pd.DataFrame
     blocks: tuple[Block, ...]
     notes: tuple[str, ...]
 
     @property
     def shows_published(self) -> bool:
         """Whether any row is the paper's."""
-        return any(block.published for block in self.blocks)
+        return any(len(block.published) for block in self.blocks)
 
 
 def tabulate(found: Collection, published_scenes: PublishedScenes = "matching") -> Table:
-    """Make the table of what was found.
+    """Make the tables of a collection.
 
     Args:
         found: finished runs and failures.
         published_scenes: which of the paper's rows stand beside them: those of the scenes that
             were run, all, or none.
     """
-    rows = rows_of([run for run in found.runs if run.moving])
-    ours = list(dict.fromkeys(row.scene for row in rows))
-    theirs = [] if published_scenes == "none" else list(published().scenes)
-    if published_scenes == "matching":
-        theirs = [scene for scene in ours if scene in theirs]
-    blocks = [
-        Block(scene, _scene([row for row in rows if row.scene == scene]), _paper(scene, theirs))
-        for scene in dict.fromkeys([*ours, *theirs])
-    ]
+    scored = found.runs[PSNR.key].map(number).notna()
+    runs = labelled(found.runs[scored])
+    for column in COLUMNS:
+        runs[column.title] = runs[column.key].map(number).astype(float)
+    groups = runs.groupby(["scene", "label"], sort=False)
+    heads = groups[["name", "protocol", "line", "views"]].first().assign(count=groups.size())
+    complete = groups[TITLES].count().eq(heads["count"], axis=0)
+    rows = heads.join(groups[TITLES].mean().where(complete))
+    spread = groups[TITLES].std().where(complete)
+
+    ours, known = list(runs["scene"].unique()), list(published().tables)
+    beside = {"none": [], "all": known, "matching": [scene for scene in ours if scene in known]}
+    theirs = beside[published_scenes]
+    blocks: list[Block] = []
+    for scene in dict.fromkeys([*ours, *theirs]):
+        measured = _cells(
+            _of(rows, [scene]).assign(counts=lambda found: found["count"].map(lambda n: {n})),
+            _of(spread, [scene]),
+            runs.loc[runs["scene"] == scene, "run.device"],
+        )
+        blocks.append(Block(scene, measured, _published([scene], theirs)))
     if len(ours) > 1:
         title = f"average over {len(ours)} scenes"
-        block = Block(title, _average(rows, len(ours)), _paper_average(ours, theirs))
-        blocks += [block] if block.measured else []
-    return Table(found, tuple(rows), tuple(blocks), tuple(_notes(found, rows)))
+        average = Block(title, _average(runs, rows, ours), _published(ours, theirs))
+        blocks += [average] if len(average.measured) else []
+    notes = _notes(runs, found.runs.loc[~scored, "folder"])
+    return Table(found, runs, rows, tuple(blocks), tuple(notes))
 
 
-def _scene(rows: Sequence[RowOfRuns]) -> tuple[Row, ...]:
-    """The measured rows of one scene."""
-    return _marked([[row] for row in rows], [[_cell_of(row, c) for row in rows] for c in COLUMNS])
+def shown(value: float, column: Column, spread: float = math.nan) -> str:
+    """A value with the digits of its column: ``29.42``, ``29.42 ± 0.11``, ``9.2 min``, ``–``."""
+    if math.isnan(value):
+        return UNKNOWN
+    size, digits, unit = 1.0, column.digits, ""
+    if digits is None:
+        if value < 99.5:
+            unit, digits = " s", 0 if value >= 9.95 else 1
+        elif value < 99.5 * 60:
+            size, unit, digits = 60.0, " min", 1
+        else:
+            size, unit, digits = 3600.0, " h", 1
+    text = f"{value / size:.{digits}f}"
+    if not math.isnan(spread):
+        text += f" ± {spread / size:.{digits}f}"
+    return text + unit
 
 
-def _average(rows: Sequence[RowOfRuns], scenes: int) -> tuple[Row, ...]:
-    """Means over all scenes of the configurations that were run on all of them."""
-    groups = [
-        [same for same in rows if same.identity == identity]
-        for identity in dict.fromkeys(row.identity for row in rows)
-    ]
-    groups = [group for group in groups if len(group) == scenes]
-    columns = [
-        [_mean([_cell_of(row, column).value for row in group], column) for group in groups]
-        for column in COLUMNS
-    ]
-    return _marked(groups, columns)
+def ranked(values: pd.Series, column: Column) -> pd.Series:
+    """1, 2, 3 for the best values, else 0; values that look the same share a rank.
+
+    No value is ranked where all look the same, for none is better than another.
+    """
+    looks = values.map(lambda value: shown(value, column)).where(values.notna())
+    if looks.nunique() < 2:
+        return values.mul(0).fillna(0).astype(int)
+    alike = values.groupby(looks).transform("min")
+    ranks = alike.rank(method="dense", ascending=not column.higher_is_better)
+    return ranks.where(ranks <= 3, 0).astype(int)
 
 
-def _cell_of(row: RowOfRuns, column: Column) -> Cell:
-    return cell([column.of(run) for run in row.runs], column)
+def _of(frame: pd.DataFrame, scenes: list[str]) -> pd.DataFrame:
+    """The rows of some scenes, by label."""
+    return frame[frame.index.get_level_values("scene").isin(scenes)].droplevel("scene")
 
 
-def _mean(values: Sequence[float | None], column: Column) -> Cell:
-    """The mean over scenes; what scenes differ in is no spread of a measurement."""
-    known = [value for value in values if value is not None]
-    if len(known) < len(values):
-        return Cell(None, UNKNOWN)
-    return Cell(mean(known), shown(mean(known), column))
+def _cells(rows: pd.DataFrame, spread: pd.DataFrame, devices: pd.Series | None) -> pd.DataFrame:
+    """Cells as a block holds them.
 
-
-def _marked(
-    groups: Sequence[Sequence[RowOfRuns]], columns: Sequence[Sequence[Cell]]
-) -> tuple[Row, ...]:
-    """A row for each group of rows, from columns of cells, marked where they can be compared."""
-    one_device = len(_devices([row for group in groups for row in group])) == 1
-    marked = [
-        ranked(cells, column) if one_device or not column.of_hardware else cells
-        for cells, column in zip(columns, COLUMNS, strict=True)
-    ]
-    return tuple(
-        Row(group[0].label, cells, frozenset(len(row.runs) for row in group))
-        for group, cells in zip(groups, zip(*marked, strict=True), strict=True)
-    )
-
-
-def _devices(rows: Sequence[RowOfRuns]) -> set[str | None]:
-    return {run.text("run.device") for row in rows for run in row.runs}
-
-
-def _paper(scene: str, theirs: Sequence[str]) -> tuple[Row, ...]:
-    rows = published().scenes[scene] if scene in theirs else ()
-    return tuple(Row(row.label, tuple(map(Cell, row.values, row.texts))) for row in rows)
-
-
-def _paper_average(scenes: Sequence[str], theirs: Sequence[str]) -> tuple[Row, ...]:
-    """Means of the paper's numbers over the same scenes, if it has all of them."""
-    if not set(scenes) <= set(theirs):
-        return ()
-    tables = [{row.label: row.values for row in published().scenes[scene]} for scene in scenes]
-    return tuple(
-        Row(
-            label,
-            tuple(
-                _mean([table[label][k] for table in tables], column)
-                for k, column in enumerate(COLUMNS)
-            ),
-        )
-        for label in tables[0]
-        if all(label in table for table in tables)
-    )
-
-
-def _notes(found: Collection, rows: Sequence[RowOfRuns]) -> list[str]:
-    notes: list[str] = []
+    Args:
+        rows: ``name``, ``protocol``, ``counts`` and every title, by label.
+        spread: standard deviations, NaN where there is none to show.
+        devices: of the runs; memory and time are ranked if they agree. None: nothing is.
+    """
+    texts, ranks = rows[TITLES].astype(object), rows[TITLES].mul(0).fillna(0).astype(int)
     for column in COLUMNS:
-        if rows and not any(column.of(run) is not None for row in rows for run in row.runs):
-            notes.append(f"No run has {column.title}: {column.why_missing}.")
-    if len(_devices(rows)) > 1:
+        both = zip(rows[column.title], spread[column.title], strict=True)
+        texts[column.title] = [shown(value, column, deviation) for value, deviation in both]
+        if devices is not None and (devices.nunique(dropna=False) == 1 or not column.of_hardware):
+            ranks[column.title] = ranked(rows[column.title], column)
+    heads = rows[["name", "protocol", "counts"]]
+    parts = {"head": heads, "value": rows[TITLES], "text": texts, "rank": ranks}
+    return pd.concat(parts, axis=1)
+
+
+def _average(runs: pd.DataFrame, rows: pd.DataFrame, scenes: list[str]) -> pd.DataFrame:
+    """Means over all scenes of the configurations that were run on all of them.
+
+    Without a spread: what scenes differ in is no uncertainty of a measurement.
+    """
+    groups = rows.groupby("label", sort=False)
+    means = _over_scenes(rows[TITLES], scenes).join(groups[["name", "protocol"]].first())
+    means = means.assign(counts=groups["count"].agg(set))[groups.size() == len(scenes)]
+    devices = runs.loc[runs["label"].isin(means.index), "run.device"]
+    return _cells(means, means[TITLES] * math.nan, devices)
+
+
+def _published(scenes: list[str], theirs: list[str]) -> pd.DataFrame:
+    """The paper's rows of a scene, or their means over several; none unless it has them all."""
+    asked = scenes if set(scenes) <= set(theirs) else []
+    values = _over_scenes(_of(published().values, asked), scenes).dropna()
+    rows = values.assign(name=values.index, protocol="", counts=[{1} for _ in values.index])
+    cells = _cells(rows, values * math.nan, devices=None)
+    if len(scenes) == 1:
+        cells["text"] = _of(published().texts[TITLES], asked)
+    return cells
+
+
+def _over_scenes(values: pd.DataFrame, scenes: list[str]) -> pd.DataFrame:
+    """Means by label; NaN unless every scene has the value."""
+    groups = values.groupby("label", sort=False)
+    return groups.mean().where(groups.count() == len(scenes))
+
+
+def _notes(runs: pd.DataFrame, at_rest: pd.Series) -> list[str]:
+    notes = [
+        f"No run has {column.title}: {column.why_missing}."
+        for column in COLUMNS
+        if len(runs) and runs[column.title].isna().all()
+    ]
+    if runs["run.device"].nunique(dropna=False) > 1:
         notes.append("Memory and time are marked only among rows of one device.")
-    still = [run for run in found.runs if not run.moving]
-    if still:
-        names = ", ".join(run.name for run in still)
+    if len(at_rest):
+        names = ", ".join(at_rest)
         notes.append(f"Scored at rest only, and therefore not in the tables: {names}.")
     return notes

@@ -1,43 +1,104 @@
-"""What every form of the report says in words."""
+"""What every form of the report shares: its sentences, and its cells as text."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
-from devrf.reporting.columns import COLUMNS, Column
+import pandas as pd
+
 from devrf.reporting.published import published
 from devrf.reporting.runs import Collection
-from devrf.reporting.table import Table
+from devrf.reporting.table import COLUMNS, Block, Table
 
 
-def heading(column: Column) -> str:
-    """A column's title with the direction in which it is better."""
-    return f"{column.title} {'↑' if column.higher_is_better else '↓'}"
+@dataclass(frozen=True)
+class Style:
+    """How a form writes text.
+
+    Attributes:
+        escape: makes plain text safe in it.
+        marks: formats of a cell: unmarked, best, second, third.
+        heading: format of the line above the published rows.
+    """
+
+    escape: Callable[[str], str]
+    marks: tuple[str, str, str, str]
+    heading: str = "{}"
 
 
-def headings() -> list[str]:
-    """The columns' headings."""
-    return [heading(column) for column in COLUMNS]
+def printed(table: Table, blocks: Sequence[Block], style: Style) -> pd.DataFrame:
+    """Blocks side by side as text: measured rows, then published ones below a line of their own.
+
+    Returns:
+        Columns of two levels: the label, and the protocol where it differs, below an empty title;
+        then each block's title with every metric's heading below it. What a block does not have is
+        empty.
+    """
+    parts = [_rows(table, blocks, [block.measured for block in blocks], style, "{}")]
+    if any(len(block.published) for block in blocks):
+        line = style.heading.format(style.escape(f"† published, on an {published().hardware}"))
+        parts.append(pd.DataFrame([[line]], columns=parts[0].columns[:1]))
+        parts.append(_rows(table, blocks, [block.published for block in blocks], style, "† {}"))
+    return pd.concat(parts, ignore_index=True).fillna("")
 
 
-def valid_mask(seeds: Iterable[int]) -> str:
-    """How many seeds a row's values are means of, in parentheses; nothing where it is one."""
-    counts = sorted(set(seeds))
-    return "" if counts == [1] else f" (n = {', '.join(map(str, counts))})"
+def _rows(
+    table: Table,
+    blocks: Sequence[Block],
+    frames: Sequence[pd.DataFrame],
+    style: Style,
+    label: str,
+) -> pd.DataFrame:
+    """A row for each label of any frame."""
+    cells = [_marked(frame, style) for frame in frames]
+    titles = [style.escape(block.title) for block in blocks]
+    found = pd.concat(cells, axis=1, keys=titles, sort=False)
+    heads = pd.concat([frame["head"] for frame in frames]).groupby(level=0)
+    counts = heads["counts"].agg(lambda sets: set().union(*sets))
+    names = heads["name"].first() + counts.map(_repeats)
+    lead = {("", _methods(table)): names.map(lambda name: style.escape(label.format(name)))}
+    if table.rows["protocol"].nunique() > 1:
+        lead["", "Protocol"] = heads["protocol"].first().map(style.escape)
+    return pd.concat([pd.DataFrame(lead).reindex(found.index), found], axis=1)
+
+
+def _marked(frame: pd.DataFrame, style: Style) -> pd.DataFrame:
+    return pd.DataFrame(
+        {
+            style.escape(column.heading): [
+                style.marks[rank].format(style.escape(text))
+                for text, rank in zip(
+                    frame["text", column.title], frame["rank", column.title], strict=True
+                )
+            ]
+            for column in COLUMNS
+        },
+        index=frame.index,
+        dtype=object,
+    )
+
+
+def _methods(table: Table) -> str:
+    """The heading of the labels: none where all rows are of one method."""
+    return "Method" if table.runs["method"].nunique() > 1 else ""
+
+
+def _repeats(counts: set[int]) -> str:
+    """How many runs a row's values are means of, in parentheses; nothing where it is one."""
+    return "" if counts == {1} else f" (n = {', '.join(map(str, sorted(counts)))})"
 
 
 def caption(table: Table) -> str:
     """What the measured numbers are, and which are marked; without the marks' own names."""
-    devices = [run.text("run.device") for row in table.rows for run in row.runs]
-    known = list(dict.fromkeys(device for device in devices if device))
-    where = f" on {', '.join(known)}" if known else ""
-    seeds = any(len(row.runs) > 1 for row in table.rows)
-    spread = " ± is the standard deviation over n seeds." if seeds else ""
+    devices = table.runs["run.device"].dropna().unique()
+    where = f" on {', '.join(devices)}" if len(devices) else ""
+    repeated = bool((table.rows["count"] > 1).any())
+    spread = " ± is the standard deviation over n runs." * repeated
     return (
-        f"Measured{where}: means over the held-out images of the moving scene; peak GPU memory "
-        "and wall-clock time of optimisation, both stages together."
-        f"{spread} Marks are within a scene, among measured rows; values that look the same share "
-        "a mark."
+        f"Measured{where}: means over the held-out images of the dynamic scene; peak GPU memory "
+        f"and wall-clock time of optimisation, all stages together.{spread} Marks are within a "
+        "scene, among measured rows; values that look the same share a mark."
     )
 
 
@@ -51,32 +112,16 @@ def credit() -> str:
     )
 
 
-def published_heading() -> str:
-    """What stands above published rows."""
-    return f"† published, on an {published().hardware}"
-
-
 def reasons(found: Collection) -> list[str]:
     """Which runs failed, and why, a line each; overrides that all runs share are left out."""
-    setups = [run.setup for run in found.runs] + [lost.setup for lost in found.failures]
-    told = [set(setup.overrides) for setup in setups]
+    told = [
+        set(typed) for frame in (found.runs, found.failures) for typed in frame["run.overrides"]
+    ]
     shared = set.intersection(*told) if len(told) > 1 else set()
     lines: list[str] = []
-    for failure in found.failures:
-        own = [text for text in failure.setup.overrides if text not in shared]
-        what = " ".join([failure.scene or "unknown scene", *own])
-        fault = " (a fault of the program: see its run.log)" if failure.mistake is False else ""
-        lines.append(f"{failure.name} ({what}): {failure.error}{fault}")
+    for failure in found.failures.to_dict("records"):
+        own = [text for text in failure["run.overrides"] if text not in shared]
+        what = " ".join([failure["scene"] or "unknown scene", *own])
+        bug = " (a fault of the program: see its run.log)" * (failure["mistake"] is False)
+        lines.append(f"{failure['folder']} ({what}): {failure['error']}{bug}")
     return lines
-
-
-def aligned(rows: Sequence[Sequence[str]]) -> list[list[str]]:
-    """Cells of text, the columns filled up to one width: the first to the left, others right."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return [
-        [
-            text.rjust(width) if k else text.ljust(width)
-            for k, (text, width) in enumerate(zip(row, widths, strict=True))
-        ]
-        for row in rows
-    ]

@@ -5,36 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import pandas as pd
+
 from devrf.errors import DevrfError
-from devrf.reporting.csv_table import write_csv
 from devrf.reporting.latex import latex
-from devrf.reporting.markdown import markdown
+from devrf.reporting.markdown import markdown, plain
+from devrf.reporting.plots import plots
 from devrf.reporting.runs import collect
-from devrf.reporting.table import PublishedScenes, Table, tabulate
+from devrf.reporting.settings import ReportSettings
+from devrf.reporting.table import Table, tabulate
 from devrf.system.files import atomic_write
-
-NO_PLOTS = 'No plots: matplotlib is not installed (pip install "devrf[plots]").'
-
-
-@dataclass(frozen=True)
-class ReportSettings:
-    """What is reported.
-
-    Attributes:
-        runs: the folder below which finished runs are collected.
-        into: the folder that the report is written to; None: ``report`` in ``runs``.
-        published: which of the paper's own rows stand beside them: those of the scenes that
-            were run, all, or none.
-    """
-
-    runs: str | Path = "outputs"
-    into: str | Path | None = None
-    published: PublishedScenes = "matching"
-
-    @property
-    def folder(self) -> Path:
-        """Where the report is written."""
-        return Path(self.runs) / "report" if self.into is None else Path(self.into)
 
 
 @dataclass(frozen=True)
@@ -42,14 +22,14 @@ class Report:
     """A report that was written.
 
     Attributes:
-        table: what it says.
+        table: its contents.
+        text: the tables, notes and failures for a terminal.
         path: its ``report.md``; ``report.csv``, ``report.tex`` and ``figures/`` are beside it.
-        remarks: what could not be done.
     """
 
     table: Table
+    text: str
     path: Path
-    remarks: tuple[str, ...]
 
 
 def write_report(settings: ReportSettings) -> Report:
@@ -58,36 +38,52 @@ def write_report(settings: ReportSettings) -> Report:
     Raises:
         DevrfError: no such folder, or nothing below it that a run left; nothing is written.
     """
-    table = tabulate(collect(Path(settings.runs)), settings.published)
-    found, folder = table.found, settings.folder
-    if not found.runs and not found.failures:
+    found, folder = collect(Path(settings.runs)), settings.folder
+    if found.runs.empty and found.failures.empty:
         why = f" ({found.skipped[0]})" if found.skipped else ""
         raise DevrfError(
             f"report.runs: no finished run below {settings.runs}{why}; give the folder of runs "
             "that were scored (stage=pipeline or stage=evaluate)"
         )
-    figures, remarks = _draw(table, folder)
-    _write(folder / "report.md", markdown(table, figures, remarks))
-    _write(folder / "report.tex", latex(table, remarks))
-    write_csv(folder / "report.csv", table)
-    return Report(table, folder / "report.md", remarks)
+    table = tabulate(found, settings.published)
+    figures = _write_plots(table, folder)
+    _write(folder / "report.md", markdown(table, figures))
+    _write(folder / "report.tex", latex(table))
+    _write(folder / "report.csv", csv(table))
+    return Report(table, plain(table), folder / "report.md")
 
 
-def _draw(table: Table, folder: Path) -> tuple[dict[str, str], tuple[str, ...]]:
-    """Plot what there is to plot: links by what they show, and what to say if nothing can be."""
-    try:
-        from devrf.reporting.plots import plots
-    except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] != "matplotlib":
-            raise
-        return {}, (NO_PLOTS,)
+def csv(table: Table) -> str:
+    """A row for each run and failure, with everything that is known of it.
+
+    ``train_seconds`` and ``peak_gpu_gb`` are the tables' Time and GPU; further columns are what
+    ``metrics.json`` holds, by dotted name. What is not known is empty.
+    """
+    runs = table.found.runs.drop(columns="path")
+    runs.insert(3, "row", table.runs["label"])
+    failures = table.found.failures.drop(columns="path")
+    rows = pd.concat([runs, failures], ignore_index=True)
+    return str(rows.map(_csv_cell).to_csv(index=False, lineterminator="\n"))
+
+
+def _csv_cell(value: object) -> str:
+    """Text as it was recorded: a column of integers stays one where some are unknown."""
+    if isinstance(value, list):
+        return " ".join(map(str, value))
+    if isinstance(value, bool):
+        return str(value).lower()
+    return "" if pd.isna(value) else str(value)
+
+
+def _write_plots(table: Table, folder: Path) -> dict[str, str]:
+    """Write the plots as PNG and PDF; returns links to the former, by what they show."""
     links: dict[str, str] = {}
     for plot in plots(table):
         for suffix in (".png", ".pdf"):
             with atomic_write(folder / "figures" / f"{plot.name}{suffix}") as partial:
                 plot.figure.savefig(partial)
         links[plot.shows] = f"figures/{plot.name}.png"
-    return links, ()
+    return links
 
 
 def _write(path: Path, text: str) -> None:

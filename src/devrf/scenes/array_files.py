@@ -1,7 +1,8 @@
 """Arrays in ``.npy`` and ``.npz`` files: nothing is executed, and nothing unpacked unexpected.
 
-A header is compared with the file, or with what the images explain, before its array is read: no
-header can take memory by what it claims. Pickled objects are never loaded.
+``np.load`` makes room for all that a header claims and unpacks all that an archive holds. So a
+header is compared with the file, or with what the images explain, before its array is read.
+Pickled objects are never loaded.
 """
 
 from __future__ import annotations

@@ -4,98 +4,55 @@ from __future__ import annotations
 
 import logging
 import os
-from dataclasses import replace
+from dataclasses import KW_ONLY, replace
 from pathlib import Path
-from typing import Literal, get_args
 
-from devrf.scenes.bounds import inward_bounds
+from pydantic.dataclasses import dataclass
+
 from devrf.scenes.capture_folders import chosen_dynamic, dynamic_folders
 from devrf.scenes.flow_files import read_flow
 from devrf.scenes.image_files import image_size
 from devrf.scenes.layout import Layout, fewer, load_layout, without_static_set
-from devrf.scenes.options import check_options
 from devrf.scenes.paths import existing_folder, scene_folder
-from devrf.scenes.scene import Background, Scene, Views
-from devrf.scenes.splits import Split, dynamic_split, static_split
-from devrf.scenes.validation import check_choice, scene_error
+from devrf.scenes.reader import Count, InwardReader, Time
+from devrf.scenes.scene import Scene, Views
+from devrf.scenes.splits import Split, at_rest, in_motion
+from devrf.scenes.transforms import read_transforms
+from devrf.scenes.validation import scene_error
 
 log = logging.getLogger(__name__)
 
-FlowSource = Literal["files", "none"]
 
-
-def read_blender(
-    root: str | Path,
-    *,
-    name: str | None = None,
-    dynamic: str | None = None,
-    downscale: int = 1,
-    background: Background = "white",
-    bound_scale: float | str = "auto",
-    near: float | None = None,
-    far: float | None = None,
-    box: list[list[float]] | None = None,
-    flow: FlowSource = "files",
-    train_views: int | None = None,
-    frames: int | None = None,
-    static_until: float = 1.0,
-) -> Scene:
-    """Read a scene that cameras look in at, from ``transforms_{train,test}.json`` and images.
+@dataclass(frozen=True)
+class BlenderReader(InwardReader):
+    """Reads ``transforms_{train,test}.json`` and images.
 
     Two layouts: ``static/`` next to ``dynamic_<V>views/``, or (D-NeRF) the JSON files in
     ``root`` itself, where the static capture is taken from the training images.
 
-    Args:
-        root: the scene's folder.
-        name: short name; None takes the folder's.
+    Attributes:
         dynamic: which ``dynamic_*views`` folder, where there are several.
-        downscale: integer factor ≥ 1 by which images and flow are made smaller.
-        background: what is behind the mattes of RGBA images; RGB images are used as they are.
-        bound_scale: "auto" (room for motion from silhouettes) or a number ≥ 1 by which the
-            tightened canonical box is enlarged.
-        near: distance in world units before which nothing is; None: from the cameras.
-        far: distance in world units behind which nothing is; None: from the cameras.
-        box: [[x, y, z], [x, y, z]] in world units; None: from the cameras.
-        flow: "files" reads backward flow where there is any; "none" does not.
         train_views: train on the first so many dynamic views; None: all.
-        frames: keep so many times, evenly spread, first and last included; None: all.
         static_until: without a static set, the latest time of an image that counts as static.
-
-    Raises:
-        DevrfError: a file or an option is wrong; the message names it.
     """
-    check_choice("data.flow", flow, get_args(FlowSource))
-    given_box = check_options(
-        downscale=downscale,
-        background=background,
-        bound_scale=bound_scale,
-        near=near,
-        far=far,
-        box=box,
-        frames=frames,
-        static_until=static_until,
-        train_views=train_views,
-    )
-    folder = scene_folder(root)
 
-    layout, flow_folder = _layout(folder, dynamic, static_until)
-    layout, thinned = fewer(layout, train_views, frames)
-    static, dynamic_ = load_layout(layout, folder, downscale)
-    if flow == "files" and thinned:
-        log.info("flow files dropped: with data.frames=%s neighbouring frames are left out", frames)
-    elif flow == "files":
-        train = _with_flow(dynamic_.train, layout.dynamic_train, flow_folder)
-        dynamic_ = replace(dynamic_, train=train)
-    bounds = inward_bounds(
-        static.train,
-        dynamic_.train,
-        [static.train, static.test, dynamic_.train, dynamic_.test],
-        bound_scale=bound_scale,
-        near=near,
-        far=far,
-        box=given_box,
-    )
-    return Scene(name or folder.resolve().name, "inward", static, dynamic_, bounds, background)
+    _: KW_ONLY
+    dynamic: str | None = None
+    train_views: Count | None = None
+    static_until: Time = 1.0
+
+    def read(self) -> Scene:
+        """See :meth:`devrf.scenes.reader.SceneReader.read`."""
+        folder = scene_folder(self.root)
+        layout, flow_folder = _layout(folder, self.dynamic, self.static_until)
+        layout, thinned = fewer(layout, self.train_views, self.frames)
+        static, dynamic = load_layout(layout, folder, self.downscale)
+        if self.wants_flow_files and thinned:
+            log.info("flow files dropped: data.frames=%s leaves out neighbours", self.frames)
+        elif self.wants_flow_files:
+            train = _with_flow(dynamic.train, layout.dynamic_train, flow_folder)
+            dynamic = replace(dynamic, train=train)
+        return self.scene(folder, static, dynamic)
 
 
 def _layout(root: Path, dynamic: str | None, static_until: float) -> tuple[Layout, Path]:
@@ -108,16 +65,21 @@ def _layout(root: Path, dynamic: str | None, static_until: float) -> tuple[Layou
                 "expected static/ and dynamic_<V>views/, or transforms_train.json; "
                 "set data.root to the scene's folder",
             )
-        train = dynamic_split(root / "transforms_train.json", root)
-        test = dynamic_split(root / "transforms_test.json", root)
+        train = in_motion(read_transforms(root / "transforms_train.json", root))
+        test = in_motion(read_transforms(root / "transforms_test.json", root))
         return without_static_set(train, test, static_until), root / "train_flow"
     existing_folder(static)
     moving = chosen_dynamic(root, dynamic)
+    at_rest_train, at_rest_test, moving_train, moving_test = (
+        read_transforms(capture / f"transforms_{split}.json", root)
+        for capture in (static, moving)
+        for split in ("train", "test")
+    )
     layout = Layout(
-        static_split(static / "transforms_train.json", root),
-        static_split(static / "transforms_test.json", root),
-        dynamic_split(moving / "transforms_train.json", root),
-        dynamic_split(moving / "transforms_test.json", root),
+        at_rest(at_rest_train),
+        at_rest(at_rest_test),
+        in_motion(moving_train),
+        in_motion(moving_test),
     )
     return layout, moving / "train_flow"
 

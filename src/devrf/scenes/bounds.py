@@ -10,7 +10,7 @@ from devrf.geometry.cameras import Cameras
 from devrf.scenes.poses import FARTHEST
 from devrf.scenes.scene import Bounds, Views
 from devrf.scenes.silhouettes import motion_box
-from devrf.scenes.validation import check_bound_scale, scene_error
+from devrf.scenes.validation import scene_error
 
 # Room for motion where nothing else is known: the published scenes use 1.05 to 2.
 FALLBACK_BOUND_SCALE = 1.5
@@ -21,16 +21,6 @@ NEAR_SHARE = 0.02
 # Shortest edge of a box, as a share of its distance from the origin: in a float32 a thousand
 # steps along it are still a thousand places.
 LEAST_EDGE = 1e-4
-
-
-def bound_scale_number(bound_scale: float | str) -> float:
-    """The factor that enlarges the tightened canonical box when there is no motion box.
-
-    Args:
-        bound_scale: "auto" or a number of at least 1; anything else is a DevrfError.
-    """
-    check_bound_scale(bound_scale)
-    return FALLBACK_BOUND_SCALE if bound_scale == "auto" else float(bound_scale)
 
 
 def axes_meet(cameras: Cameras) -> Tensor:
@@ -141,9 +131,9 @@ def inward_bounds(
 
     Args:
         static: training views at rest, whose cameras give the box.
-        dynamic: training views in motion, whose mattes give the motion box.
+        dynamic: training views in motion, whose alpha masks give the motion box.
         everyone: all views, test included; near and far hold for all their cameras.
-        bound_scale: "auto" (silhouettes where there are mattes) or a number ≥ 1.
+        bound_scale: "auto" (silhouettes where there are alpha masks) or a number ≥ 1.
         near: distance in world units, or None for the cameras to say.
         far: distance in world units, or None.
         box: the scene's box, or None.
@@ -151,13 +141,13 @@ def inward_bounds(
     Raises:
         DevrfError: the cameras do not say where the scene is, or near ≥ far.
     """
-    scale = bound_scale_number(bound_scale)
+    scale = FALLBACK_BOUND_SCALE if bound_scale == "auto" else float(bound_scale)
     box = box or box_from_cameras(static.cameras)
     motion, source = None, f"canonical box x bound scale {scale:g}"
     if bound_scale == "auto":
         motion = motion_box(dynamic, box)
         if motion is None:
-            source += " (no mattes from two cameras at every time)"
+            source += " (no alpha masks from two cameras at every time)"
         else:
             views, frames = len(set(dynamic.view.tolist())), len(set(dynamic.times.tolist()))
             source = f"silhouettes of {views} views x {frames} frames"

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from devrf.geometry.cameras import Cameras
+from devrf.scenes.flow_files import write_flow
 from devrf.scenes.new_folder import time_major, whole_folder
 from devrf.scenes.scene import Capture, Scene, Views
 from devrf.scenes.validation import scene_error
@@ -54,7 +55,9 @@ def _write_capture(capture: Capture, folder: Path) -> None:
     ):
         _write_split(views, split, folder)
     if capture.train.flow is not None:
-        _write_flow(capture.train, folder / "train_flow")
+        # The first images of the views have no earlier one.
+        later = (capture.train.times > 0).nonzero().flatten().tolist()
+        write_flow(folder / "train_flow", capture.train.flow, later)
 
 
 def _write_split(views: Views, split: str, folder: Path) -> None:
@@ -79,7 +82,7 @@ def _write_split(views: Views, split: str, folder: Path) -> None:
 
 
 def _rgba(pixels: Tensor) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    """(H, W, 4) uint8; an image without a matte is opaque."""
+    """(H, W, 4) uint8; an image without an alpha mask is opaque."""
     if pixels.shape[-1] == 3:
         pixels = torch.cat([pixels, torch.full_like(pixels[..., :1], 255)], dim=-1)
     array: np.ndarray[Any, np.dtype[np.uint8]] = pixels.cpu().numpy()
@@ -96,15 +99,3 @@ def _field_of_view(cameras: Cameras) -> float:
     if not torch.allclose(center, middle.expand_as(center), rtol=0.0, atol=1e-4):
         raise scene_error("cameras", "camera_angle_x needs principal points in the images' middle")
     return 2 * math.atan(cameras.width / 2 / shared)
-
-
-def _write_flow(views: Views, folder: Path) -> None:
-    """``<index>_bwd.npz`` for each image that has an earlier one."""
-    assert views.flow is not None  # its caller looked
-    folder.mkdir()
-    for k in (views.times > 0).nonzero().flatten().tolist():
-        np.savez_compressed(
-            folder / f"{k:03d}_bwd.npz",
-            flow=views.flow.vectors[k].float().cpu().numpy(),
-            mask=views.flow.valid[k].cpu().numpy(),
-        )

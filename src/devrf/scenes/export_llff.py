@@ -11,6 +11,7 @@ from torch import Tensor
 
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.array_files import Numbers
+from devrf.scenes.flow_files import write_flow
 from devrf.scenes.llff_poses import BOUND_FACTOR
 from devrf.scenes.new_folder import time_major, whole_folder
 from devrf.scenes.scene import Capture, Scene, Views
@@ -19,7 +20,7 @@ from devrf.scenes.validation import scene_error
 # The published scenes are read at this factor, from folders images_4; larger images need not
 # be there, and are not.
 FACTOR = 4
-# Readers hold out every so manieth static image, the first one included.
+# Readers hold out every eighth static image, the first one included.
 HOLDOUT = 8
 # Times are not written, but counted: k / (T − 1).
 _TIME_TOLERANCE = 1e-5
@@ -157,7 +158,8 @@ def _write_moving(views: list[Views], bounds: Numbers, folder: Path) -> None:
         images = folder / f"view{number}" / f"images_{FACTOR}"
         _write_images(view, images)
         if view.flow is not None and number < len(views):
-            _write_flow(view, images.with_name(f"{images.name}_flow"))
+            flow_folder = images.with_name(f"{images.name}_flow")
+            write_flow(flow_folder, view.flow, range(1, len(view)))
         pose = _double(view.cameras.camera_to_world[0])
         matrices.append(np.concatenate([pose, _intrinsics(view, 1)[:1].T], axis=1))
     np.save(folder / "poses.npy", np.stack(matrices))
@@ -174,15 +176,3 @@ def _write_images(views: Views, folder: Path) -> None:
     folder.mkdir(parents=True)
     for k, pixels in enumerate(views.pixels):
         iio.imwrite(folder / f"{k:03d}.png", pixels.cpu().numpy())
-
-
-def _write_flow(views: Views, folder: Path) -> None:
-    """``<frame>_bwd.npz`` for each image but the first; the frame is the image's name."""
-    assert views.flow is not None  # its caller looked
-    folder.mkdir()
-    for k in range(1, len(views)):
-        np.savez_compressed(
-            folder / f"{k:03d}_bwd.npz",
-            flow=views.flow.vectors[k].float().cpu().numpy(),
-            mask=views.flow.valid[k].cpu().numpy(),
-        )

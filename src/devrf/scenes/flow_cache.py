@@ -19,7 +19,7 @@ from devrf.scenes.validation import scene_error
 log = logging.getLogger(__name__)
 
 # Part of the key: a change of the estimate makes earlier files foreign.
-VERSION = "1"
+VERSION = "2"
 
 
 def content_key(views: Views, method: str) -> str:

@@ -5,13 +5,15 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Callable
-from types import ModuleType
 from typing import Any
 
+import cv2
+import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate, pad
+from torch.nn.functional import pad
 
+from devrf.scenes.resampling import area_average
 from devrf.scenes.validation import scene_error
 
 # Both methods work on coarse levels of an image pyramid and see nothing in smaller images.
@@ -31,24 +33,13 @@ def estimator(method: str) -> Estimator:
         method: "dis" or "raft".
 
     Raises:
-        DevrfError: the method's library is not installed, or its weights cannot be had.
+        DevrfError: RAFT's library is not installed, or its weights cannot be downloaded.
     """
     return _dis() if method == "dis" else _raft()
 
 
-def _library(name: str, method: str, package: str) -> ModuleType:
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        raise scene_error(
-            f"data.flow={method}",
-            f'{package} is not installed; run pip install "devrf[flow]", or set data.flow=none',
-        ) from None
-
-
 def _dis() -> Estimator:
-    cv2: Any = _library("cv2", "dis", "opencv-python-headless")
-    dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    dis: Any = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
 
     def flow(image: Tensor, other: Tensor) -> Tensor:
         height, width = image.shape[:2]
@@ -57,29 +48,20 @@ def _dis() -> Estimator:
         grey = [cv2.cvtColor(i.numpy(), cv2.COLOR_RGB2GRAY) for i in (image, other)]
         if size != (width, height):
             grey = [cv2.resize(g, size, interpolation=cv2.INTER_CUBIC) for g in grey]
-        vectors = torch.from_numpy(dis.calc(grey[0], grey[1], None))
-        return _resized(vectors, width, height)
+        vectors = area_average(dis.calc(grey[0], grey[1], None), width, height)
+        return torch.from_numpy(vectors * np.array([width / size[0], height / size[1]], np.float32))
 
     return flow
 
 
-def _resized(vectors: Tensor, width: int, height: int) -> Tensor:
-    """Flow (H, W, 2) of a larger image as that of a ``width`` × ``height`` one, in its pixels."""
-    rows, columns = vectors.shape[:2]
-    if (rows, columns) == (height, width):
-        return vectors
-    small = interpolate(
-        vectors.permute(2, 0, 1)[None],
-        size=(height, width),
-        mode="bilinear",
-        align_corners=False,
-        antialias=True,
-    )[0].permute(1, 2, 0)
-    return small * torch.tensor([width / columns, height / rows])
-
-
 def _raft() -> Estimator:
-    models: Any = _library("torchvision.models.optical_flow", "raft", "torchvision")
+    try:
+        models: Any = importlib.import_module("torchvision.models.optical_flow")
+    except ImportError:
+        raise scene_error(
+            "data.flow=raft",
+            'torchvision is not installed; run pip install "devrf[raft]", or set data.flow=dis',
+        ) from None
     device = "cuda" if torch.cuda.is_available() else "cpu"
     try:
         model = models.raft_large(weights=models.Raft_Large_Weights.DEFAULT, progress=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -134,3 +134,14 @@ def stacked_flow(
         "read %d flow files from %s in %.1f s", len(files), folder, time.perf_counter() - start
     )
     return OpticalFlow(torch.from_numpy(vectors), torch.from_numpy(valid))
+
+
+def write_flow(folder: Path, flow: OpticalFlow, images: Iterable[int]) -> None:
+    """Write ``<index>_bwd.npz`` of ``images`` into ``folder``, which is made."""
+    folder.mkdir()
+    for k in images:
+        np.savez_compressed(
+            folder / f"{k:03d}_bwd.npz",
+            flow=flow.vectors[k].float().cpu().numpy(),
+            mask=flow.valid[k].cpu().numpy(),
+        )

@@ -11,7 +11,7 @@ from devrf.geometry.ndc import NormalizedDevice
 from devrf.scenes.scene import Bounds, Views
 from devrf.scenes.validation import scene_error
 
-# Cosine of the steepest angle, about 84 degrees, to −z: beyond it the box gets out of hand.
+# Cosine of the steepest angle, about 84 degrees, to −z: beyond it the box grows without bound.
 LEAST_COSINE = 0.1
 # How many times as wide as the reference camera's view the box may be: beyond it the other
 # cameras are not before the same scene, and a float32 cannot tell its points apart.

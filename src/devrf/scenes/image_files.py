@@ -50,7 +50,8 @@ class Header:
         has_alpha: whether it has an alpha channel.
         file_size: bytes of the file.
         turn: the EXIF orientation by which it has to be turned; 1 is as it is stored.
-        doubtful: it says that it is to be seen turned, and its camera does not tell whether so.
+        ambiguous_orientation: its EXIF orientation asks for a turn, and its camera neither
+            confirms nor refutes it.
     """
 
     width: int
@@ -58,7 +59,7 @@ class Header:
     has_alpha: bool
     file_size: int
     turn: int = 1
-    doubtful: bool = False
+    ambiguous_orientation: bool = False
 
 
 def find_image(path: Path) -> Path:
@@ -93,7 +94,7 @@ def read_header(path: Path, camera: Size | None = None) -> Header:
 
     Args:
         path: the file.
-        camera: (width, height) of the images that its camera is for; None: nobody knows.
+        camera: (width, height) of the images that its camera is for; None: unknown.
 
     Raises:
         DevrfError: it is no image of at most 100 megapixels with 8 bits a channel.
@@ -102,10 +103,12 @@ def read_header(path: Path, camera: Size | None = None) -> Header:
         if image.mode in DEEP_MODES:
             raise scene_error(path, f"expected 8 bits a channel, not mode {image.mode}; convert it")
         alpha = "A" in image.mode or "a" in image.mode or "transparency" in image.info
-        turn, doubtful = _turn(_orientation(image), (image.width, image.height), camera)
+        turn, ambiguous_orientation = _turn(
+            _orientation(image), (image.width, image.height), camera
+        )
         size = (image.width, image.height)
         width, height = size[::-1] if turn in QUARTER_TURNS else size
-        return Header(width, height, alpha, os.path.getsize(path), turn, doubtful)
+        return Header(width, height, alpha, os.path.getsize(path), turn, ambiguous_orientation)
 
 
 def _orientation(image: Image.Image) -> int:
@@ -119,7 +122,7 @@ def _orientation(image: Image.Image) -> int:
         try:
             exif.load(stored)
             value = exif.get(ExifTags.Base.Orientation)
-        # Any exception, as in decoding(); but a picture is none the worse for damaged notes.
+        # Any exception, as in decoding(); but damaged EXIF data do not spoil the picture.
         except Exception:
             return 1
     return value if isinstance(value, int) and value in TURNS else 1

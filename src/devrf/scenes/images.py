@@ -42,14 +42,14 @@ class Loaded:
         pixels: (N, H, W, 3 or 4) uint8 after downscaling, alpha not premultiplied.
         width: columns of the files, before downscaling.
         height: rows of the files, before downscaling.
-        doubtful: (N,) bool, images that are read as they are stored although they say that they
-            are to be seen turned, and nothing tells which of the two their cameras are for.
+        ambiguous_orientation: (N,) bool, images that are read as they are stored although their
+            EXIF orientation asks for a turn, which nothing confirms or refutes.
     """
 
     pixels: Tensor
     width: int
     height: int
-    doubtful: Tensor
+    ambiguous_orientation: Tensor
 
 
 def workers(width: int, height: int) -> int:
@@ -93,7 +93,7 @@ def load_images(
     pixels = np.empty(shape, dtype=np.uint8)
 
     def fill(index: int) -> None:
-        # An image without a matte in a set with mattes is opaque: WebP drops a full alpha.
+        # An image without alpha in a set with alpha is opaque: WebP drops a full alpha channel.
         image = decode(paths[index], headers[index], "RGBA" if alpha else "RGB")
         image = image if finish is None else finish(index, image)
         whole = size == (first.width, first.height)
@@ -115,8 +115,8 @@ def load_images(
             "%d of them turned as their EXIF orientation says: only so they fit their cameras",
             turned,
         )
-    doubtful = torch.tensor([header.doubtful for header in headers])
-    return Loaded(torch.from_numpy(pixels), first.width, first.height, doubtful)
+    ambiguous_orientation = torch.tensor([header.ambiguous_orientation for header in headers])
+    return Loaded(torch.from_numpy(pixels), first.width, first.height, ambiguous_orientation)
 
 
 def _check_size(needed: int, headers: Sequence[Header], what: str, paths: Sequence[Path]) -> None:

@@ -4,32 +4,70 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BaseModel
 
 from devrf.geometry.distortion import Distortion
+from devrf.scenes.json_files import Number, Positive
 from devrf.scenes.lens import MOST_FOCAL, Lens
-from devrf.scenes.validation import abbreviated, number, same_shape, scene_error
+from devrf.scenes.validation import abbreviated, same_shape, scene_error
 
 # Models of the one equation that Distortion states; the simpler ones leave coefficients out.
 CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
-KEYS = (
-    "fl_x",
-    "fl_y",
-    "cx",
-    "cy",
-    "w",
-    "h",
-    "camera_angle_x",
-    "camera_model",
-    "is_fisheye",
-    "k1",
-    "k2",
-    "k3",
-    "k4",
-    "p1",
-    "p2",
-)
 _LEAST_ANGLE = 1 / MOST_FOCAL
+_UNDISTORT = "undistort the images and list them as PINHOLE"
+
+
+def _supported(model: object) -> object:
+    if model not in CAMERA_MODELS:
+        raise ValueError(
+            f"{abbreviated(model)} is not supported, only {', '.join(CAMERA_MODELS)}; {_UNDISTORT}"
+        )
+    return model
+
+
+def _no_fisheye(value: object) -> object:
+    if value:
+        raise ValueError(f"a fisheye is not supported; {_UNDISTORT}")
+    return value
+
+
+class CameraKeys(BaseModel):
+    """The keys of a camera, in a transforms file or in one of its frames.
+
+    Attributes:
+        fl_x: focal length in pixels of an image of ``w`` × ``h``; or there is an angle.
+        fl_y: None: as ``fl_x``.
+        cx: principal point in pixels; None: the image's middle.
+        cy: as ``cx``.
+        w: width of the image that pixels are measured in; None: the file's.
+        h: as ``w``.
+        camera_angle_x: horizontal field of view in radians.
+        camera_model: one of :data:`CAMERA_MODELS`.
+        is_fisheye: must be false.
+        k1: with ``k2`` to ``k4``, radial distortion.
+        p1: with ``p2``, tangential distortion.
+    """
+
+    fl_x: Positive | None = None
+    fl_y: Positive | None = None
+    cx: Positive | None = None
+    cy: Positive | None = None
+    w: Positive | None = None
+    h: Positive | None = None
+    camera_angle_x: Number | None = None
+    camera_model: Annotated[Any, AfterValidator(_supported)] = "OPENCV"
+    is_fisheye: Annotated[Any, AfterValidator(_no_fisheye)] = False
+    k1: Number = 0.0
+    k2: Number = 0.0
+    k3: Number = 0.0
+    k4: Number = 0.0
+    p1: Number = 0.0
+    p2: Number = 0.0
+
+
+KEYS = set(CameraKeys.model_fields)
 
 
 @dataclass(frozen=True)
@@ -40,7 +78,7 @@ class Intrinsics:
         angle_x: horizontal field of view in radians, or None when ``focal`` is given.
         focal: (fx, fy) in pixels, or None.
         center: (cx, cy) in pixels; None means the image's middle.
-        size: (width, height) of the image that pixels are counted in; None: the file's.
+        size: (width, height) of the image that pixels are measured in; None: the file's.
         distortion: of the lens.
         skew: pixels; 0 where the sensor's axes are square to one another.
     """
@@ -69,7 +107,7 @@ class Intrinsics:
         if self.focal is not None:
             focal = self.focal
         else:
-            assert self.angle_x is not None  # read_intrinsics asks for one of the two
+            assert self.angle_x is not None  # intrinsics_of asks for one of the two
             square = w / 2 / math.tan(self.angle_x / 2)
             focal = (square, square)
         cx, cy = self.center
@@ -85,82 +123,41 @@ class Intrinsics:
         return lens
 
 
-def read_intrinsics(content: dict[str, Any], where: object) -> Intrinsics:
-    """The intrinsics among the keys of a transforms file, or of one of its frames.
-
-    ``fl_x``, ``fl_y``, ``cx``, ``cy`` in pixels of an image of ``w`` × ``h``, or
-    ``camera_angle_x`` in radians; ``k1`` to ``k4``, ``p1``, ``p2``; ``camera_model``.
+def intrinsics_of(camera: CameraKeys, where: object) -> Intrinsics:
+    """The intrinsics that the keys of a file, or of one of its frames, state.
 
     Raises:
-        DevrfError: no focal length, a value that is none, or a model that is not supported.
+        DevrfError: ``where`` has no focal length, or an angle out of range.
     """
-
-    def pixels(key: str) -> float | None:
-        if key not in content:
-            return None
-        value = number(content[key])
-        if value is None or value <= 0:
-            raise scene_error(
-                where, f"{key} is {abbreviated(content[key])}, expected pixels > 0; correct it"
-            )
-        return value
-
-    def coefficient(key: Literal["k1", "k2", "k3", "k4", "p1", "p2"]) -> float:
-        value = number(content.get(key, 0.0))
-        if value is None:
-            raise scene_error(
-                where, f"{key} is {abbreviated(content[key])}, expected a number; correct it"
-            )
-        return value
-
-    _check_model(content, where)
-    distortion = Distortion(
-        (coefficient("k1"), coefficient("k2"), coefficient("k3"), coefficient("k4")),
-        (coefficient("p1"), coefficient("p2")),
-    )
-    center = pixels("cx"), pixels("cy")
-    fx, fy, w, h = pixels("fl_x"), pixels("fl_y"), pixels("w"), pixels("h")
-    size = None if w is None or h is None else (w, h)
-    if fx is not None:
-        return Intrinsics(None, (fx, fx if fy is None else fy), center, size, distortion)
-    if "camera_angle_x" not in content:
+    c = camera
+    distortion = Distortion((c.k1, c.k2, c.k3, c.k4), (c.p1, c.p2))
+    size = None if c.w is None or c.h is None else (c.w, c.h)
+    if c.fl_x is not None:
+        focal = (c.fl_x, c.fl_x if c.fl_y is None else c.fl_y)
+        return Intrinsics(None, focal, (c.cx, c.cy), size, distortion)
+    angle = c.camera_angle_x
+    if angle is None:
         raise scene_error(
             where, 'has no "camera_angle_x" (radians) and no "fl_x" (pixels); add one'
         )
-    angle = number(content["camera_angle_x"])
-    if angle is None or not _LEAST_ANGLE <= angle < math.pi:
+    if not _LEAST_ANGLE <= angle < math.pi:
         raise scene_error(
-            where,
-            f"camera_angle_x is {abbreviated(content['camera_angle_x'])}, expected radians "
-            "between 0 and pi; correct it",
+            where, f"camera_angle_x is {angle}, expected radians between 0 and pi; correct it"
         )
-    return Intrinsics(angle, None, center, size, distortion)
+    return Intrinsics(angle, None, (c.cx, c.cy), size, distortion)
 
 
-def frame_intrinsics(
-    shared: dict[str, Any], frame: dict[str, Any], where: object
-) -> Intrinsics | None:
+def frame_intrinsics(shared: CameraKeys, frame: CameraKeys, where: object) -> Intrinsics | None:
     """The intrinsics of a frame that brings its own, over the shared ones; None: it brings none.
 
     Raises:
-        DevrfError: what :func:`read_intrinsics` raises.
+        DevrfError: what :func:`intrinsics_of` raises.
     """
-    own = {key: frame[key] for key in KEYS if key in frame}
+    own = frame.model_dump(include=KEYS, exclude_unset=True)
     if not own:
         return None
-    merged = {key: shared[key] for key in KEYS if key in shared} | own
+    merged = shared.model_dump(include=KEYS, exclude_unset=True) | own
     if "camera_angle_x" in own and "fl_x" not in own:
         # Its angle stands against focal lengths of other images.
         merged = {key: value for key, value in merged.items() if key not in ("fl_x", "fl_y")}
-    return read_intrinsics(merged, where)
-
-
-def _check_model(content: dict[str, Any], where: object) -> None:
-    model = content.get("camera_model", "OPENCV")
-    if model not in CAMERA_MODELS or content.get("is_fisheye"):
-        kind = "a fisheye" if content.get("is_fisheye") else abbreviated(model)
-        raise scene_error(
-            where,
-            f"camera model {kind} is not supported, only {', '.join(CAMERA_MODELS)}; "
-            "undistort the images and list them as PINHOLE",
-        )
+    return intrinsics_of(CameraKeys.model_construct(**merged), where)

@@ -1,31 +1,44 @@
-"""JSON files that hold an object, and the numbers in them: read with one clear line on failure."""
+"""JSON files read by pydantic, with one clear line on failure."""
 
 from __future__ import annotations
 
-import json
+import codecs
 from pathlib import Path
-from typing import Any
+from typing import Annotated, TypeVar
+
+from pydantic import Field, TypeAdapter, ValidationError
 
 from devrf.scenes.paths import existing_file
-from devrf.scenes.validation import abbreviated, number, scene_error
+from devrf.scenes.validation import LARGEST, first_error, scene_error
 
 # Some 60,000 posed images with every number on a line of its own.
 MAX_BYTES = 64 * 2**20
-# As many images without white space. Python takes up to 100 bytes for each value and key.
+# As many images without white space. A parser takes up to 300 bytes for each value and key.
 MAX_VALUES = 4_000_000
 _BEFORE_VALUES = b"[{,:"
 
+# A number that float32 holds: no text, no truth value, neither NaN nor infinity.
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=-LARGEST, lt=LARGEST)]
+Positive = Annotated[Number, Field(gt=0)]
+Vector2 = tuple[Number, Number]
+Vector3 = tuple[Number, Number, Number]
+Vector4 = tuple[Number, Number, Number, Number]
+Name = Annotated[str, Field(min_length=1)]
 
-def json_object(file: Path, purpose: str) -> dict[str, Any]:
-    """The content of a JSON file; of a key that is there twice, the last one.
+Content = TypeVar("Content")
+
+
+def read_json(file: Path, kind: TypeAdapter[Content], purpose: str) -> Content:
+    """The content of a JSON file; of a key that is there twice, the last one counts.
 
     Args:
         file: a file that holds one object.
-        purpose: what it is needed for, for the message when it is missing.
+        kind: what the object must be.
+        purpose: what the file is needed for, for the message when it is missing.
 
     Raises:
-        DevrfError: there is no such file, it is no JSON, it holds something else, or it is so
-            large that it cannot be a list of images.
+        DevrfError: there is no such file, it is no JSON, a key is missing or its value wrong, or
+            the file is so large that it cannot be a list of images.
     """
     if existing_file(file, purpose) > MAX_BYTES:
         raise scene_error(
@@ -36,7 +49,7 @@ def json_object(file: Path, purpose: str) -> dict[str, Any]:
         data = file.read_bytes()
     except OSError as error:
         raise scene_error(file, f"cannot be read ({error.strerror}); {purpose}") from None
-    # Counted before they are made: two bytes of text can become a hundred of memory.
+    # Counted before they are made: two bytes of text can become hundreds of memory.
     if sum(data.count(byte) for byte in _BEFORE_VALUES) > MAX_VALUES:
         raise scene_error(
             file,
@@ -45,21 +58,6 @@ def json_object(file: Path, purpose: str) -> dict[str, Any]:
         )
     try:
         # Some editors begin a file with a byte order mark.
-        content = json.loads(data.decode("utf-8-sig"))
-    except (ValueError, RecursionError) as error:
-        raise scene_error(file, f"not valid JSON ({error}); write it again") from None
-    if not isinstance(content, dict):
-        raise scene_error(file, f"expected a JSON object, not {type(content).__name__}; {purpose}")
-    return content
-
-
-def numbers(content: dict[str, Any], key: str, count: int, where: object) -> list[float]:
-    """The ``count`` finite numbers that ``content`` lists under ``key``; else DevrfError."""
-    values = content.get(key)
-    if not isinstance(values, list) or len(values) != count:
-        raise scene_error(where, f'expected {count} numbers as "{key}", not {abbreviated(values)}')
-    found = [number(value) for value in values]
-    kept = [value for value in found if value is not None]
-    if len(kept) < count:
-        raise scene_error(where, f'"{key}" holds NaN, inf or text; give {count} finite numbers')
-    return kept
+        return kind.validate_json(data.removeprefix(codecs.BOM_UTF8))
+    except ValidationError as error:
+        raise first_error(error, f"{file}: ") from None

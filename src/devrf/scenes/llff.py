@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
+from dataclasses import KW_ONLY, replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Annotated
 
 import torch
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from devrf.scenes.capture_folders import chosen_dynamic
@@ -16,77 +18,55 @@ from devrf.scenes.forward_bounds import forward_bounds, reference_space
 from devrf.scenes.image_files import Size, image_size
 from devrf.scenes.image_folders import image_folder, listed_images
 from devrf.scenes.images import load_images
+from devrf.scenes.json_files import Positive
 from devrf.scenes.llff_poses import PosedSet, read_dynamic_poses, read_static_poses
 from devrf.scenes.paths import existing_folder, scene_folder
-from devrf.scenes.scene import Background, Capture, Scene, Views
-from devrf.scenes.validation import check_choice, check_count, number, scene_error
+from devrf.scenes.reader import Count, Holdout, SceneReader
+from devrf.scenes.scene import Capture, Scene, Views
+from devrf.scenes.validation import scene_error
 from devrf.scenes.view_folders import ViewFolder, flow_files, view_folders
 
 log = logging.getLogger(__name__)
 
-FlowSource = Literal["files", "none"]
 
-
-def read_llff(
-    root: str | Path,
-    *,
-    name: str | None = None,
-    dynamic: str | None = None,
-    downscale: int = 4,
-    background: Background = "white",
-    test_view: int = -1,
-    holdout: int = 8,
-    near: float = 1.0,
-    flow: FlowSource = "files",
-    train_views: int | None = None,
-    frames: int | None = None,
-) -> Scene:
-    """Read a scene that cameras face from one side: ``static/`` and ``dynamic_<V>views/``.
+@dataclass(frozen=True)
+class LlffReader(SceneReader):
+    """Reads a scene that cameras face from one side: ``static/`` and ``dynamic_<V>views/``.
 
     The world's unit is 0.75 of the least depth of the static cameras, their average pose its
-    origin and axes (x right, y up, −z forward). The scene's space is NDC of that camera.
+    origin and axes (x right, y up, −z forward). The scene's space is NDC of that camera. Images
+    come from ``images_<downscale>`` where it is there; else larger ones are made smaller.
 
-    Args:
-        root: the scene's folder.
-        name: short name; None takes the folder's.
+    Attributes:
         dynamic: which ``dynamic_*views`` folder, where there are several.
-        downscale: integer factor ≥ 1: ``images_<downscale>`` where it is there; else larger
-            images, made smaller by area averages.
-        background: what is behind the mattes of RGBA images; RGB images are used as they are.
         test_view: the fixed view to hold out: 4 is ``view4``, −1 the last, −2 the last but one.
-        holdout: every so manieth static image is held out, the first one included.
+        holdout: every ``holdout``-th static image is held out, the first one included.
         near: distance of the near plane from the average camera, in the world's unit; the
             nearest point of the static scene is at 1/0.75.
-        flow: "files" reads backward flow where there is any; "none" does not.
         train_views: train on the first so many of the views that are not held out; None: all.
-        frames: keep so many frames, evenly spread, first and last included; None: all.
-
-    Raises:
-        DevrfError: a file or an option is wrong; the message names it.
     """
-    check_count("data.downscale", downscale, 1)
-    check_count("data.holdout", holdout, 2)
-    check_count("data.train_views", train_views, 1)
-    check_count("data.frames", frames, 2)
-    check_choice("data.background", background, get_args(Background))
-    check_choice("data.flow", flow, get_args(FlowSource))
-    plane = number(near)
-    if plane is None or plane <= 0:
-        raise scene_error("data.near", f"expected a distance above 0, not {near!r}")
-    folder = scene_folder(root)
 
-    static = _static(existing_folder(folder / "static"), folder, downscale, holdout)
-    moving = chosen_dynamic(folder, dynamic)
-    dynamic_ = _dynamic(moving, folder, downscale, test_view, train_views, frames, flow)
-    space = reference_space(static.train.cameras, plane)
-    everyone = [static.train, dynamic_.train]
-    bounds = forward_bounds(everyone, space, "all that the cameras see (forward-facing)")
-    # The held-out cameras need not see inside the box, but they have to look the same way.
-    forward_bounds([static.test, dynamic_.test], space, "")
-    _warn_of_cameras_beyond(plane, [*everyone, static.test, dynamic_.test])
-    return Scene(
-        name or folder.resolve().name, "forward", static, dynamic_, bounds, background, space
-    )
+    _: KW_ONLY
+    dynamic: str | None = None
+    downscale: Count = 4
+    test_view: Annotated[int, Field(strict=True)] = -1
+    holdout: Holdout = 8
+    near: Positive = 1.0
+    train_views: Count | None = None
+
+    def read(self) -> Scene:
+        """See :meth:`devrf.scenes.reader.SceneReader.read`."""
+        folder = scene_folder(self.root)
+        static = _static(existing_folder(folder / "static"), folder, self.downscale, self.holdout)
+        dynamic = _dynamic(self, chosen_dynamic(folder, self.dynamic), folder)
+        space = reference_space(static.train.cameras, self.near)
+        learned, held_out = [static.train, dynamic.train], [static.test, dynamic.test]
+        bounds = forward_bounds(learned, space, "all that the cameras see (forward-facing)")
+        # The held-out cameras need not see inside the box, but they have to look the same way.
+        forward_bounds(held_out, space, "")
+        _warn_of_cameras_beyond(self.near, learned + held_out)
+        name = self.name_of(folder)
+        return Scene(name, "forward", static, dynamic, bounds, self.background, space)
 
 
 def _static(folder: Path, root: Path, downscale: int, holdout: int) -> Capture:
@@ -109,7 +89,7 @@ def _static(folder: Path, root: Path, downscale: int, holdout: int) -> Capture:
         torch.zeros(count),
         torch.arange(count),
         _names(images, root),
-        ambiguous_orientation=loaded.doubtful,
+        ambiguous_orientation=loaded.ambiguous_orientation,
     )
     order = torch.arange(count)
     train, test = views[order[order % holdout != 0]], views[order[order % holdout == 0]]
@@ -121,16 +101,8 @@ def _numbered(views: Views) -> Views:
     return replace(views, view=torch.arange(len(views)))
 
 
-def _dynamic(
-    folder: Path,
-    root: Path,
-    downscale: int,
-    test_view: int,
-    train_views: int | None,
-    frames: int | None,
-    flow: FlowSource,
-) -> Capture:
-    views = view_folders(folder, downscale)
+def _dynamic(options: LlffReader, folder: Path, root: Path) -> Capture:
+    views = view_folders(folder, options.downscale)
     posed = read_dynamic_poses(folder)
     if len(posed) < len(views):
         raise scene_error(
@@ -139,17 +111,17 @@ def _dynamic(
             f"view{len(views)}; the last rows are those of the fixed cameras",
         )
     posed = posed.last(len(views))
-    test, train = _chosen_views(folder, len(views), test_view, train_views)
-    total = len(views[0].images)
+    test, train = _chosen_views(folder, len(views), options.test_view, options.train_views)
+    total, frames = len(views[0].images), options.frames
     kept = torch.arange(total)
     if frames is not None and frames < total:
         kept = torch.linspace(0, total - 1, frames).round().long()
     train_set, test_set = (
         _moving([views[v] for v in chosen], posed, chosen, kept, root) for chosen in (train, [test])
     )
-    if flow == "files" and len(kept) < total:
-        log.info("flow files dropped: with data.frames=%s neighbouring frames are left out", frames)
-    elif flow == "files":
+    if options.wants_flow_files and len(kept) < total:
+        log.info("flow files dropped: data.frames=%s leaves out neighbours", frames)
+    elif options.wants_flow_files:
         train_set = _with_flow(train_set, [views[v] for v in train], posed.sizes[train[0]])
     return Capture(train_set, test_set)
 
@@ -158,11 +130,10 @@ def _chosen_views(
     folder: Path, count: int, test_view: int, train_views: int | None
 ) -> tuple[int, list[int]]:
     """Positions of the held-out view and of the views to learn from."""
-    whole = isinstance(test_view, int) and not isinstance(test_view, bool)
-    if not whole or test_view == 0 or not -count <= test_view <= count:
+    if test_view == 0 or not -count <= test_view <= count:
         raise scene_error(
             "data.test_view",
-            f"{test_view!r} is none of the {count} views in {folder}; give 1 … "
+            f"{test_view} is none of the {count} views in {folder}; give 1 … "
             f"{count}, or -1 for the last one",
         )
     test = test_view - 1 if test_view > 0 else count + test_view
@@ -195,7 +166,7 @@ def _moving(
         times.float().repeat_interleave(len(folders)),
         view,
         _names(images, root),
-        ambiguous_orientation=loaded.doubtful,
+        ambiguous_orientation=loaded.ambiguous_orientation,
     )
 
 

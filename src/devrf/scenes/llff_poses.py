@@ -56,14 +56,8 @@ class PosedSet:
 
     def last(self, count: int) -> PosedSet:
         """The last ``count`` cameras."""
-        return replace(
-            self,
-            poses=self.poses[-count:],
-            size=self.size[-count:],
-            focal=self.focal[-count:],
-            center=self.center[-count:],
-            bounds=self.bounds[-count:],
-        )
+        rows = ("poses", "size", "focal", "center", "bounds")
+        return replace(self, **{name: getattr(self, name)[-count:] for name in rows})
 
     def normalised(self) -> PosedSet:
         """The set in units of 0.75 · its least depth, its average pose the identity.

@@ -1,7 +1,7 @@
 """Masks beside images (nerfstudio's ``mask_path``): grey files, black where they leave out.
 
-What a mask leaves out is either nobody's business (a passer-by, a tripod: nerfstudio's meaning)
-or known to be background (a person cut out). A file does not say which; the user does.
+What a mask leaves out is either to be ignored (a passer-by, a tripod: nerfstudio's meaning) or
+known to be background (everything around a person). A file does not say which; the user does.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def _check_size(
 def cutting_out(
     paths: Sequence[Path | None], cameras: Sequence[Size | None], names: Sequence[Path]
 ) -> Finish | None:
-    """What makes masks the mattes of their images, the lesser of mask and alpha; None: no masks.
+    """What makes masks the alpha of their images, the lesser of the two; None: no masks.
 
     Args:
         paths: N masks.
@@ -107,7 +107,7 @@ def cutting_out(
             names[list(paths).index(None)],
             "has no mask_path although others have; with data.masks=matte give every image a mask",
         )
-    log.info("masks of %d images are their mattes", len(masks))
+    log.info("masks of %d images are their alpha masks", len(masks))
 
     def finish(index: int, image: Grey) -> Grey:
         height, width = image.shape[:2]
@@ -119,7 +119,7 @@ def cutting_out(
     return finish
 
 
-def counted_pixels(
+def valid_pixels(
     paths: Sequence[Path | None],
     image: tuple[int, int],
     size: tuple[int, int],
@@ -127,12 +127,12 @@ def counted_pixels(
     lenses: Sequence[Lens],
     names: Sequence[Path],
 ) -> Tensor | None:
-    """Which pixels count, after downscaling and undistortion; None: all of them.
+    """Which pixels are valid, after downscaling and undistortion; None: all of them.
 
-    A pixel counts if all that it is made of does.
+    A pixel is valid if all source pixels that it is made of are.
 
     Args:
-        paths: N masks; None for an image that counts as a whole.
+        paths: N masks; None for an image that is valid as a whole.
         image: (width, height) of the images' files.
         size: (width, height) after downscaling.
         cameras: N sizes that the cameras are for, or None.

@@ -3,140 +3,136 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    TypeAdapter,
+    ValidationError,
+)
+from pydantic.dataclasses import dataclass
 
-from devrf.scenes.bounds import box_of_frusta, inward_bounds
+from devrf.scenes.bounds import box_of_frusta
 from devrf.scenes.holdout import every_nth
 from devrf.scenes.image_folders import image_folder
-from devrf.scenes.json_files import json_object, numbers
+from devrf.scenes.json_files import Name, Number, Positive, Vector3, read_json
 from devrf.scenes.layout import fewer, load_layout, without_static_set
 from devrf.scenes.nerfies_camera import read_camera
-from devrf.scenes.options import check_options
 from devrf.scenes.paths import scene_folder
 from devrf.scenes.poses import FARTHEST
-from devrf.scenes.scene import Background, Scene
+from devrf.scenes.reader import Count, EstimatedFlow, Holdout, InwardReader, Time
+from devrf.scenes.scene import Scene
 from devrf.scenes.splits import in_motion
 from devrf.scenes.transforms import Transforms, listed_image
-from devrf.scenes.validation import abbreviated, check_count, number, scene_error
+from devrf.scenes.validation import abbreviated, first_error, scene_error
 
 log = logging.getLogger(__name__)
 
 DATASET, METADATA, SCENE = "dataset.json", "metadata.json", "scene.json"
 
 
-def read_nerfies(
-    root: str | Path,
-    *,
-    name: str | None = None,
-    downscale: int = 1,
-    background: Background = "white",
-    bound_scale: float | str = "auto",
-    near: float | None = None,
-    far: float | None = None,
-    box: list[list[float]] | None = None,
-    frames: int | None = None,
-    holdout: int = 8,
-    static_until: float = 1.0,
-) -> Scene:
-    """Read ``dataset.json``, ``metadata.json``, ``scene.json``, ``camera/`` and ``rgb/<n>x/``.
+def _distinct(ids: list[str]) -> list[str]:
+    if len(set(ids)) < len(ids):
+        raise ValueError("expected a list of distinct ids; correct it")
+    return ids
 
-    World units are those of ``scene.json``: (position − center) · scale. The time of an image
-    is its ``time_id`` (HyperNeRF), else its ``warp_id``, brought to [0, 1]. Images are
-    undistorted. There is no static set: the images up to ``static_until`` stand in for one.
 
-    Args:
-        root: the scene's folder.
-        name: short name; None takes the folder's.
-        downscale: integer factor ≥ 1: images come from ``rgb/<downscale>x``, or from a larger
-            folder and are made smaller.
-        background: what is behind the mattes of RGBA images; RGB images are used as they are.
-        bound_scale: "auto" (room for motion from silhouettes) or a number ≥ 1 by which the
-            tightened canonical box is enlarged.
-        near: distance in world units before which nothing is; None: what scene.json says.
-        far: distance in world units behind which nothing is; None: what scene.json says.
-        box: [[x, y, z], [x, y, z]] in world units; None: what the cameras look at, or, without
-            mattes, all that they see between near and far.
-        frames: keep so many times, evenly spread, first and last included; None: all.
-        holdout: without ``val_ids``, one of so many images is held out.
-        static_until: the latest time in [0, 1] of an image that counts as static.
+Ids = Annotated[list[Name], Field(fail_fast=True), AfterValidator(_distinct)]
+Length = Annotated[Positive, Field(le=FARTHEST)]
 
-    Raises:
-        DevrfError: a file or an option is wrong; the message names it.
+
+class _World(BaseModel):
+    """``scene.json``: the frame of reference, (position − center) · scale.
+
+    ``near`` and ``far`` are in world units, scaled already.
     """
-    given_box = check_options(
-        downscale=downscale,
-        background=background,
-        bound_scale=bound_scale,
-        near=near,
-        far=far,
-        box=box,
-        frames=frames,
-        static_until=static_until,
-    )
-    check_count("data.holdout", holdout, 2)
-    folder = scene_folder(root)
-    world = _world(folder / SCENE)
-    items, train, test = _items(folder / DATASET, holdout)
-    images = image_folder(folder / "rgb", downscale, full="1x", reduced="{}x")
-    transforms = _transforms(folder, items, images.path, world)
-    layout = without_static_set(
-        in_motion(transforms[train]), in_motion(transforms[test]), static_until
-    )
-    layout, _ = fewer(layout, None, frames)
-    static, dynamic = load_layout(layout, folder, images.downscale)
-    near, far = world.near if near is None else near, world.far if far is None else far
-    if given_box is None and not static.train.has_alpha and 0 <= near < far:
-        # Without mattes the backdrop is to be learned too.
-        given_box = box_of_frusta(static.train.cameras, near, far)
-    bounds = inward_bounds(
-        static.train,
-        dynamic.train,
-        [static.train, static.test, dynamic.train, dynamic.test],
-        bound_scale=bound_scale,
-        near=near,
-        far=far,
-        box=given_box,
-    )
-    return Scene(name or folder.resolve().name, "inward", static, dynamic, bounds, background)
+
+    center: Vector3
+    scale: Length
+    near: Length
+    far: Length
+
+
+class _Dataset(BaseModel):
+    """``dataset.json``: the ids of the images; numbers are taken for text."""
+
+    model_config = ConfigDict(coerce_numbers_to_str=True)
+
+    count: int | None = None
+    ids: Ids | None = None
+    train_ids: Ids | None = None
+    val_ids: Ids | None = None
+
+
+class _Moment(BaseModel):
+    """An entry of ``metadata.json``: when an image was taken, on some scale."""
+
+    time_id: Number | None = None
+    warp_id: Number | None = None
+
+
+_WORLD, _DATASET = TypeAdapter(_World), TypeAdapter(_Dataset)
+_ENTRIES: TypeAdapter[dict[str, Any]] = TypeAdapter(dict[str, Any])
 
 
 @dataclass(frozen=True)
-class _World:
-    """The frame of reference: (position − center) · scale; near and far are scaled already."""
+class NerfiesReader(InwardReader):
+    """Reads ``dataset.json``, ``metadata.json``, ``scene.json``, ``camera/`` and ``rgb/<n>x/``.
 
-    center: tuple[float, ...]
-    scale: float
-    near: float
-    far: float
+    World units are those of ``scene.json``: (position − center) · scale; it gives near and far,
+    too. The time of an image is its ``time_id`` (HyperNeRF), else its ``warp_id``, brought to
+    [0, 1]. Images come from ``rgb/<downscale>x``, or from a larger folder and are made smaller;
+    they are undistorted. Without alpha masks the box is all that the cameras see
+    between near and far.
 
+    Attributes:
+        holdout: without ``val_ids``, one of so many images is held out.
+        static_until: the latest time of an image that counts as static: there is no static set.
+    """
 
-def _world(file: Path) -> _World:
-    content = json_object(file, "it says where the scene is; set data.root to its folder")
-    found = {}
-    for key in ("scale", "near", "far"):
-        value = number(content.get(key))
-        if value is None or not 0 < value <= FARTHEST:
-            raise scene_error(
-                file,
-                f"{key} is {abbreviated(content.get(key))}, expected a number above 0, and no "
-                f"more than {FARTHEST:g}; correct it",
-            )
-        found[key] = value
-    return _World(tuple(numbers(content, "center", 3, file)), **found)
+    _: KW_ONLY
+    downscale: Count = 4
+    flow: EstimatedFlow = "auto"
+    holdout: Holdout = 8
+    static_until: Time = 1.0
+
+    def read(self) -> Scene:
+        """See :meth:`devrf.scenes.reader.SceneReader.read`."""
+        folder = scene_folder(self.root)
+        world = read_json(
+            folder / SCENE, _WORLD, "it says where the scene is; set data.root to its folder"
+        )
+        items, train, test = _items(folder / DATASET, self.holdout)
+        images = image_folder(folder / "rgb", self.downscale, full="1x", reduced="{}x")
+        transforms = _transforms(folder, items, images.path, world)
+        layout = without_static_set(
+            in_motion(transforms[train]), in_motion(transforms[test]), self.static_until
+        )
+        layout, _ = fewer(layout, None, self.frames)
+        static, dynamic = load_layout(layout, folder, images.downscale)
+        near = world.near if self.near is None else self.near
+        far = world.far if self.far is None else self.far
+        box = self.box
+        if box is None and not static.train.has_alpha and 0 <= near < far:
+            # Without alpha masks the backdrop is to be learned too.
+            seen = box_of_frusta(static.train.cameras, near, far)
+            box = [seen.low, seen.high]
+        return replace(self, near=near, far=far, box=box).scene(folder, static, dynamic)
 
 
 def _items(file: Path, holdout: int) -> tuple[list[str], list[int], list[int]]:
     """The ids of the images, and the positions of those to learn from and those held out."""
-    content = json_object(file, "it lists the images; add it")
-    ids, train, val = (_ids(content, key, file) for key in ("ids", "train_ids", "val_ids"))
-    count = content.get("count", len(ids))
-    if ids and count != len(ids):
+    listed = read_json(file, _DATASET, "it lists the images; add it")
+    ids, train, val = listed.ids or [], listed.train_ids or [], listed.val_ids or []
+    if ids and listed.count not in (None, len(ids)):
         raise scene_error(
-            file, f'"count" is {abbreviated(count)}, but "ids" lists {len(ids)} images; correct it'
+            file, f'"count" is {listed.count}, but "ids" lists {len(ids)} images; correct it'
         )
     items = ids or list(dict.fromkeys(train + val))
     position = {item: i for i, item in enumerate(items)}
@@ -165,14 +161,6 @@ def _items(file: Path, holdout: int) -> tuple[list[str], list[int], list[int]]:
     return items, learned, [position[item] for item in val]
 
 
-def _ids(content: dict[str, Any], key: str, file: Path) -> list[str]:
-    values = content.get(key) or []
-    known = isinstance(values, list) and all(isinstance(v, str | int) and v != "" for v in values)
-    if not known or len(set(map(str, values))) < len(values):
-        raise scene_error(file, f'expected a list of distinct ids as "{key}"; correct it')
-    return [str(value) for value in values]
-
-
 def _transforms(folder: Path, items: list[str], images: Path, world: _World) -> Transforms:
     file = folder / DATASET
     cameras = [read_camera(folder, item, world.center, world.scale) for item in items]
@@ -187,23 +175,21 @@ def _transforms(folder: Path, items: list[str], images: Path, world: _World) -> 
 
 def _times(file: Path, items: list[str]) -> tuple[float, ...]:
     """When each image was taken, from 0 (the first of all) to 1 (the last)."""
-    content = json_object(file, "it says when each image was taken; add it")
-    entries = []
+    content = read_json(file, _ENTRIES, "it says when each image was taken; add it")
+    moments = []
     for item in items:
-        entry = content.get(item)
-        if not isinstance(entry, dict):
+        if item not in content:
             raise scene_error(file, f"says nothing of image {abbreviated(item)}; add its warp_id")
-        entries.append(entry)
-    key = "time_id" if all("time_id" in entry for entry in entries) else "warp_id"
+        try:
+            moments.append(_Moment.model_validate(content[item]))
+        except ValidationError as error:
+            raise first_error(error, f"{file}: {item}.") from None
+    key = "warp_id" if any(moment.time_id is None for moment in moments) else "time_id"
     ids = []
-    for item, entry in zip(items, entries, strict=True):
-        value = number(entry.get(key))
+    for item, moment in zip(items, moments, strict=True):
+        value = getattr(moment, key)
         if value is None:
-            raise scene_error(
-                file,
-                f"{key} of image {abbreviated(item)} is {abbreviated(entry.get(key))}, "
-                "expected a number",
-            )
+            raise scene_error(file, f"image {abbreviated(item)} has no {key}; add it")
         ids.append(value)
     first, last = min(ids), max(ids)
     if first == last:

@@ -4,23 +4,22 @@ from __future__ import annotations
 
 import logging
 import os
+from dataclasses import KW_ONLY
 from pathlib import Path
-from typing import Any, get_args
 
 import torch
+from pydantic.dataclasses import dataclass
 from torch import Tensor
 
-from devrf.scenes.bounds import inward_bounds
 from devrf.scenes.holdout import every_nth
-from devrf.scenes.json_files import json_object
 from devrf.scenes.layout import Layout, fewer, load_layout, without_static_set
 from devrf.scenes.masks import Masks
-from devrf.scenes.options import check_options
 from devrf.scenes.paths import scene_folder
-from devrf.scenes.scene import Background, Scene
+from devrf.scenes.reader import Count, EstimatedFlow, Holdout, InwardReader, Time
+from devrf.scenes.scene import Scene
 from devrf.scenes.splits import at_rest, distinct_poses, in_motion
-from devrf.scenes.transforms import Transforms, listed_image, read_transforms
-from devrf.scenes.validation import abbreviated, check_choice, check_count, scene_error
+from devrf.scenes.transforms import Transforms, listed_image, posed_images, read_listing
+from devrf.scenes.validation import abbreviated, scene_error
 
 log = logging.getLogger(__name__)
 
@@ -30,83 +29,42 @@ _SEVERAL = 3
 _AT_REST = 1e-6
 
 
-def read_nerfstudio(
-    root: str | Path,
-    *,
-    name: str | None = None,
-    downscale: int = 1,
-    background: Background = "white",
-    bound_scale: float | str = "auto",
-    near: float | None = None,
-    far: float | None = None,
-    box: list[list[float]] | None = None,
-    train_views: int | None = None,
-    frames: int | None = None,
-    holdout: int = 8,
-    static_until: float | None = None,
-    masks: Masks = "ignore",
-) -> Scene:
-    """Read a scene that cameras look in at, from ``transforms.json`` and images.
+@dataclass(frozen=True)
+class NerfstudioReader(InwardReader):
+    """Reads ``transforms.json`` and images.
 
     The file may lie in ``root``, with a ``time`` in [0, 1] on every frame, or in
     ``root/static`` and, with times, in ``root/dynamic``. Cameras may stand still or move.
     Held-out images are those in ``test_filenames`` (else ``val_filenames``), else every
     ``holdout``-th. Images are undistorted; the world is that of the file's poses.
 
-    A frame's ``mask_path`` is a grey image, black where the mask leaves pixels out, of the size
-    of the image or of its camera. In nerfstudio's meaning these pixels say nothing (people who
-    walk by): "ignore" neither learns from them nor scores them, and the fields show there what
-    other images say. "matte" takes them for background (a person who was cut out), as an alpha
-    channel would be taken: that also shows where the scene is and where it moves.
+    A frame's ``mask_path`` is a grey image of the size of the image or of its camera, black
+    where pixels are left out. In nerfstudio's meaning these pixels say nothing (people who walk
+    by): ``ignore`` neither learns from them nor scores them, and the fields show there what
+    other images say. ``matte`` takes them for background (a person who was cut out), as an
+    alpha channel would be taken: that also shows where the scene is and where it moves.
 
-    Args:
-        root: the scene's folder.
-        name: short name; None takes the folder's.
-        downscale: integer factor ≥ 1 by which images are made smaller.
-        background: what is behind the mattes of RGBA images; RGB images are used as they are.
-        bound_scale: "auto" (room for motion from silhouettes) or a number ≥ 1 by which the
-            tightened canonical box is enlarged.
-        near: distance in world units before which nothing is; None: from the cameras.
-        far: distance in world units behind which nothing is; None: from the cameras.
-        box: [[x, y, z], [x, y, z]] in world units; None: from the cameras.
+    Attributes:
         train_views: train on the first so many dynamic views; None: all.
-        frames: keep so many times, evenly spread, first and last included; None: all.
         holdout: without lists in the file, one of so many images is held out.
         static_until: in one file, the latest time of an image that counts as static; None: 0
             where several images are of time 0, else 1.
-        masks: what the masks of the frames are taken for: "ignore", "matte", or "none" to leave
-            them alone.
-
-    Raises:
-        DevrfError: a file or an option is wrong; the message names it.
+        masks: what the masks of the frames are taken for; ``none`` leaves them alone.
     """
-    given_box = check_options(
-        downscale=downscale,
-        background=background,
-        bound_scale=bound_scale,
-        near=near,
-        far=far,
-        box=box,
-        frames=frames,
-        static_until=static_until,
-        train_views=train_views,
-    )
-    check_count("data.holdout", holdout, 2)
-    check_choice("data.masks", masks, get_args(Masks))
-    folder = scene_folder(root)
-    masked = masks != "none"
-    layout, _ = fewer(_layout(folder, holdout, static_until, masked), train_views, frames)
-    static, dynamic = load_layout(layout, folder, downscale, masks)
-    bounds = inward_bounds(
-        static.train,
-        dynamic.train,
-        [static.train, static.test, dynamic.train, dynamic.test],
-        bound_scale=bound_scale,
-        near=near,
-        far=far,
-        box=given_box,
-    )
-    return Scene(name or folder.resolve().name, "inward", static, dynamic, bounds, background)
+
+    _: KW_ONLY
+    flow: EstimatedFlow = "auto"
+    train_views: Count | None = None
+    holdout: Holdout = 8
+    static_until: Time | None = None
+    masks: Masks = "ignore"
+
+    def read(self) -> Scene:
+        """See :meth:`devrf.scenes.reader.SceneReader.read`."""
+        folder = scene_folder(self.root)
+        layout = _layout(folder, self.holdout, self.static_until, self.masks != "none")
+        layout, _ = fewer(layout, self.train_views, self.frames)
+        return self.scene(folder, *load_layout(layout, folder, self.downscale, self.masks))
 
 
 def _layout(root: Path, holdout: int, static_until: float | None, masked: bool) -> Layout:
@@ -138,11 +96,11 @@ def _with_times(train: Transforms, test: Transforms) -> tuple[Transforms, Transf
 def _train_and_test(
     file: Path, root: Path, holdout: int, masked: bool
 ) -> tuple[Transforms, Transforms]:
-    transforms = read_transforms(file, root, masked=masked)
+    listing = read_listing(file)
+    transforms = posed_images(listing, file, root, masked=masked)
     count = len(transforms.images)
-    content = json_object(file, "every capture needs its posed images")
     listed = {
-        split: _listed(content, f"{split}_filenames", transforms, root)
+        split: _listed(getattr(listing, f"{split}_filenames"), split, transforms, root)
         for split in ("train", "val", "test")
     }
     test = listed["test"] or listed["val"]
@@ -162,19 +120,17 @@ def _train_and_test(
     return transforms[train], transforms[test]
 
 
-def _listed(content: dict[str, Any], key: str, transforms: Transforms, root: Path) -> list[int]:
-    """Positions in the file, ascending, of the images that it lists under ``key``."""
-    names = content.get(key) or []
-    if not isinstance(names, list) or not all(isinstance(name, str) and name for name in names):
-        raise scene_error(transforms.file, f"expected a list of file paths as {key}; correct it")
+def _listed(names: list[str] | None, split: str, transforms: Transforms, root: Path) -> list[int]:
+    """Positions in the file, ascending, of the images that it lists for a split."""
     position = {image: i for i, image in enumerate(transforms.images)}
     found = []
-    for name in names:
+    for name in names or []:
         image = listed_image(name, transforms.file, root)
         if image not in position:
             raise scene_error(
                 transforms.file,
-                f"{key} lists {abbreviated(name)}, which is in none of the frames; correct it",
+                f"{split}_filenames lists {abbreviated(name)}, which is in none of the frames; "
+                "correct it",
             )
         found.append(position[image])
     return sorted(set(found))

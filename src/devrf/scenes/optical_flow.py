@@ -7,13 +7,15 @@ import time
 from pathlib import Path
 from typing import Literal, get_args
 
+import cv2
+import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import grid_sample
 
 from devrf.geometry.clock import FrameClock
 from devrf.scenes.flow_cache import content_key, load_flow, save_flow
 from devrf.scenes.flow_estimators import estimator
+from devrf.scenes.resampling import LONGEST_SIDE
 from devrf.scenes.scene import OpticalFlow, Views
 from devrf.scenes.validation import check_choice, scene_error
 
@@ -24,7 +26,7 @@ FlowMethod = Literal["dis", "raft"]
 # A vector is trusted when going there and back ends this near: 1 px, and 5 % of its length.
 CLOSED_PIXELS = 1.0
 CLOSED_SHARE = 0.05
-MATTE_THRESHOLD = 127
+ALPHA_THRESHOLD = 127
 
 
 def estimate_flow(views: Views, method: FlowMethod, cache: Path | None = None) -> OpticalFlow:
@@ -33,7 +35,7 @@ def estimate_flow(views: Views, method: FlowMethod, cache: Path | None = None) -
     A fixed camera's images follow one another by time; a moving camera's images (each its own
     view) are taken as one sequence. Images are compared on white. A vector is valid where the
     forward flow leads back, |b(x) + f(x + b(x))| < 1 px + 5 % · |b(x)|, where it stays in the
-    image, and on the matte where there is one.
+    image, and on the alpha mask where there is one.
 
     Args:
         views: N images of the scene in motion.
@@ -42,14 +44,20 @@ def estimate_flow(views: Views, method: FlowMethod, cache: Path | None = None) -
             it belongs to other images or is damaged.
 
     Raises:
-        DevrfError: an unknown method, its library or weights are missing, or the images have
-            no two distinct times.
+        DevrfError: an unknown method, its library or weights are missing, the images have no
+            two distinct times, or are too large.
     """
     check_choice("data.flow", method, get_args(FlowMethod))
     pairs = frame_pairs(views)
     if not pairs:
         raise scene_error(
             "data.flow", "no view has two consecutive frames to estimate flow between"
+        )
+    if max(views.width, views.height) > LONGEST_SIDE:
+        raise scene_error(
+            "data.flow",
+            f"cannot be estimated between images of more than {LONGEST_SIDE} px a side; use a "
+            "larger data.downscale, or set data.flow=none",
         )
     key = content_key(views, method)
     if cache is not None:
@@ -66,7 +74,7 @@ def estimate_flow(views: Views, method: FlowMethod, cache: Path | None = None) -
         backward, forward = between(now, before), between(before, now)
         valid = consistent(backward, forward)
         if views.has_alpha:
-            valid &= views.pixels[image, ..., 3].cpu() > MATTE_THRESHOLD
+            valid &= views.pixels[image, ..., 3].cpu() > ALPHA_THRESHOLD
         flow.valid[image] = valid
         flow.vectors[image] = backward * valid[..., None]
         if (done + 1) % 100 == 0:
@@ -118,16 +126,12 @@ def consistent(backward: Tensor, forward: Tensor) -> Tensor:
     height, width = backward.shape[:2]
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     end = torch.stack([x, y], dim=-1) + backward
-    size = torch.tensor([width, height])
-    inside = ((end >= 0) & (end <= size - 1)).all(dim=-1)
-    grid = end / (size - 1) * 2 - 1
-    back: Tensor = grid_sample(
-        forward.permute(2, 0, 1)[None],
-        grid[None],
-        mode="bilinear",
-        padding_mode="border",
-        align_corners=True,
-    )[0].permute(1, 2, 0)
+    inside = ((end >= 0) & (end <= end.new_tensor([width - 1, height - 1]))).all(dim=-1)
+    at_x, at_y = (np.ascontiguousarray(end[..., axis]) for axis in (0, 1))
+    found = cv2.remap(
+        forward.numpy(), at_x, at_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    back = torch.from_numpy(np.asarray(found, dtype=np.float32))
     miss: Tensor = torch.linalg.vector_norm(backward + back, dim=-1)
     length: Tensor = torch.linalg.vector_norm(backward, dim=-1)
     # NaN compares false: what is not a number is not trusted.

@@ -13,7 +13,7 @@ def scene_folder(root: str | Path) -> Path:
     """The folder that the user calls ``root``, with ``~`` filled in; else DevrfError."""
     try:
         return existing_folder(Path(root).expanduser())
-    except RuntimeError as error:  # nobody of that name has a home
+    except RuntimeError as error:  # there is no user of that name
         raise scene_error(
             "data.root", f"{abbreviated(str(root))} is not a path ({error})"
         ) from None

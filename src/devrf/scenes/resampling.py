@@ -1,48 +1,37 @@
-"""Making images and optical flow smaller by exact area averages."""
+"""Images and optical flow on another raster: area averages, bilinear look-up."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import cv2
 import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float32]
+Pixels = npt.NDArray[np.uint8]
 
-
-def _averaged(values: Array, target: int) -> Array:
-    """Means (target, …) of ``values`` (size, …) over ``target`` equal stretches of its first axis.
-
-    Differences of the running integral at the stretches' ends, which need not fall on cells.
-    """
-    size = len(values)
-    integral = np.zeros((size + 1, *values.shape[1:]))
-    np.cumsum(values, axis=0, dtype=np.float64, out=integral[1:])
-    ends = np.linspace(0, size, target + 1)
-    cell = np.minimum(ends.astype(np.int64), size - 1)
-    share = (ends - cell).reshape(-1, *[1] * (values.ndim - 1))
-    at_ends = integral[cell] * (1 - share) + integral[cell + 1] * share
-    return np.asarray(np.diff(at_ends, axis=0) * (target / size), dtype=np.float32)
+# OpenCV addresses the pixels of an image to look up with 16 bits.
+LONGEST_SIDE = 2**15 - 2
 
 
 def area_average(image: Array, width: int, height: int) -> Array:
     """The mean of ``image`` over each cell of a coarser raster.
 
     Args:
-        image: (H, W, C) float32.
+        image: (H, W, C) float32, at most 4 channels.
         width: number of columns of the result, ≤ W; need not divide it.
         height: number of rows of the result, ≤ H; need not divide it.
 
     Returns:
-        (height, width, C) float32; cells of W/width × H/height source pixels, fractions counted.
+        (height, width, C) float32; cells of W/width × H/height source pixels, fractions included.
     """
-    rows, columns, channels = image.shape
-    if rows % height == 0 and columns % width == 0:
-        cells = image.reshape(height, rows // height, width, columns // width, channels)
-        return np.asarray(cells.mean(axis=(1, 3), dtype=np.float32))
-    return _averaged(_averaged(image, height).swapaxes(0, 1), width).swapaxes(0, 1)
+    mean = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(mean, dtype=np.float32).reshape(height, width, image.shape[2])
 
 
-def shrink_pixels(image: npt.NDArray[np.uint8], width: int, height: int) -> npt.NDArray[np.uint8]:
-    """An 8-bit image averaged over areas; colours count by their alpha.
+def shrink_pixels(image: Pixels, width: int, height: int) -> Pixels:
+    """An 8-bit image averaged over areas; colours are weighted by their alpha.
 
     Args:
         image: (H, W, 1, 3 or 4) uint8, alpha not premultiplied.
@@ -52,18 +41,41 @@ def shrink_pixels(image: npt.NDArray[np.uint8], width: int, height: int) -> npt.
     Returns:
         (height, width, 1, 3 or 4) uint8, alpha not premultiplied; black where alpha is 0.
     """
+    return _weighted_by_alpha(image, lambda values: area_average(values, width, height))
+
+
+def look_up_pixels(image: Pixels, source: Array) -> Pixels:
+    """An 8-bit image looked up elsewhere, bilinearly; colours are weighted by their alpha.
+
+    Args:
+        image: (H, W, 1, 3 or 4) uint8, alpha not premultiplied; sides up to LONGEST_SIDE.
+        source: (H', W', 2) x, y in pixels of ``image``, where a pixel's centre is at i + 0.5.
+
+    Returns:
+        (H', W', 1, 3 or 4) uint8, alpha not premultiplied; black where alpha is 0. Places outside
+        take the nearest pixel of the border.
+    """
+    x, y = (np.ascontiguousarray(source[..., axis] - np.float32(0.5)) for axis in (0, 1))
+
+    def looked_up(values: Array) -> Array:
+        found = cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(found, dtype=np.float32).reshape(*x.shape, image.shape[2])
+
+    return _weighted_by_alpha(image, looked_up)
+
+
+def _weighted_by_alpha(image: Pixels, linear: Callable[[Array], Array]) -> Pixels:
+    """A linear filter of an 8-bit image, rounded."""
     values = image.astype(np.float32)
-    if image.shape[2] == 4:
+    if image.shape[2] != 4:
+        found = linear(values)
+    else:
         # Colours behind a zero alpha are arbitrary: premultiplied, they cannot bleed in.
         values[..., :3] *= values[..., 3:]
-        mean = area_average(values, width, height)
-        alpha = mean[..., 3:]
-        mean[..., :3] = np.divide(
-            mean[..., :3], alpha, out=np.zeros_like(mean[..., :3]), where=alpha > 0
-        )
-    else:
-        mean = area_average(values, width, height)
-    return (mean + 0.5).clip(0, 255).astype(np.uint8)
+        found = linear(values)
+        color, alpha = found[..., :3], found[..., 3:]
+        found[..., :3] = np.divide(color, alpha, out=np.zeros_like(color), where=alpha > 0)
+    return (found + 0.5).clip(0, 255).astype(np.uint8)
 
 
 def shrink_flow(

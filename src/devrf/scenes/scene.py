@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, replace
-from typing import Literal
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -48,7 +49,8 @@ class Views:
             ray hits nothing; None where it is unknown.
         ambiguous_orientation: (N,) bool, files whose EXIF orientation says that they are to be seen
             turned, which nothing confirms or refutes: they are as they are stored. None: none.
-        valid_mask: (N, H, W) bool, the pixels that are learned from and scored. None: all of them.
+        valid_mask: (N, H, W) bool, the pixels that are learned from and scored; the others are
+            ignored. None: all of them.
         frames: (N,) int64, the frame of the scene's clock that is nearest to each image's time;
             None until the images are those of a :class:`Scene`.
     """
@@ -84,40 +86,30 @@ class Views:
 
     def __getitem__(self, index: Tensor) -> Views:
         """The views at positions ``index`` (K,) int64."""
-        return Views(
-            self.pixels[index],
-            self.cameras[index],
-            self.times[index],
-            self.view[index],
-            tuple(self.names[i] for i in index.tolist()),
-            None
-            if self.flow is None
-            else OpticalFlow(self.flow.vectors[index], self.flow.valid[index]),
-            None if self.depth is None else self.depth[index],
-            None if self.ambiguous_orientation is None else self.ambiguous_orientation[index],
-            None if self.valid_mask is None else self.valid_mask[index],
-            None if self.frames is None else self.frames[index],
+        return replace(
+            self._mapped(lambda of_views: of_views[index]),
+            names=tuple(self.names[i] for i in index.tolist()),
         )
 
     def valid_mask_of(self, image: int) -> Tensor | None:
-        """(H, W) bool on the host, the pixels of an image that count; None: all of them."""
+        """(H, W) bool on the host, the valid pixels of an image; None: all of them."""
         return None if self.valid_mask is None else self.valid_mask[image].cpu()
 
     def to(self, device: torch.device | str) -> Views:
         """The same views on ``device``; images stay uint8."""
-        return replace(
-            self,
-            pixels=self.pixels.to(device),
-            cameras=self.cameras.to(device),
-            times=self.times.to(device),
-            view=self.view.to(device),
-            flow=None
-            if self.flow is None
-            else OpticalFlow(self.flow.vectors.to(device), self.flow.valid.to(device)),
-            depth=None if self.depth is None else self.depth.to(device),
-            valid_mask=None if self.valid_mask is None else self.valid_mask.to(device),
-            frames=None if self.frames is None else self.frames.to(device),
-        )
+        return self._mapped(lambda of_views: of_views.to(device))
+
+    def _mapped(self, change: Callable[[Any], Any]) -> Views:
+        """The views with ``change`` made to all tensors and cameras."""
+        flow = self.flow
+        changed = {
+            field.name: change(getattr(self, field.name))
+            for field in fields(self)
+            if field.name not in ("names", "flow") and getattr(self, field.name) is not None
+        }
+        if flow is not None:
+            changed["flow"] = OpticalFlow(change(flow.vectors), change(flow.valid))
+        return replace(self, **changed)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The box of everything that moves, carved from the dynamic views' mattes (visual hulls).
+"""The box of everything that moves, carved from the dynamic views' alpha masks (visual hulls).
 
 A hull from a few views holds the object and more: the box is an outer bound.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -22,7 +23,7 @@ Array = npt.NDArray[Any]
 
 OUTSIDE, INSIDE, UNSEEN = 0, 1, 2
 # A pixel belongs to the silhouette when at least half of it is covered.
-MATTE_THRESHOLD = 127
+ALPHA_THRESHOLD = 127
 
 
 def motion_box(views: Views, box: Box, *, resolution: int = 64, search: float = 1.5) -> Box | None:
@@ -41,7 +42,7 @@ def motion_box(views: Views, box: Box, *, resolution: int = 64, search: float = 
 
     Returns:
         The box in world units, a grid cell wider than the hulls on each side and not larger
-        than the searched box; None without mattes, with fewer than two different cameras at
+        than the searched box; None without alpha masks, with fewer than two different cameras at
         some time, or when all hulls are empty.
     """
     frames = _frames(views)
@@ -75,7 +76,7 @@ def motion_box(views: Views, box: Box, *, resolution: int = 64, search: float = 
 
 
 def _frames(views: Views) -> list[list[int]] | None:
-    """The images of each time, or None when mattes or a second camera are missing somewhere."""
+    """The images of each time; None when alpha masks or a second camera are missing."""
     if not views.has_alpha or len(views.times) == 0 or float(views.times.max()) == 0:
         return None
     clock = FrameClock.from_times(views.times)
@@ -101,10 +102,10 @@ def _reach(views: Views, area: Box, cell: float) -> int:
 def _silhouettes(views: Views, reach: int) -> Array:
     """(N, H·W + 1) uint8: whether a pixel is INSIDE or OUTSIDE the dilated silhouette.
 
-    Pixels that do not count are UNSEEN. The last entry stands for all that is beyond the image:
+    Pixels that are not valid are UNSEEN. The last entry stands for all that is beyond the image:
     OUTSIDE, or UNSEEN where the image's border cuts the silhouette or the whole object off.
     """
-    matte = views.pixels[..., 3].cpu().numpy() > MATTE_THRESHOLD
+    matte = views.pixels[..., 3].cpu().numpy() > ALPHA_THRESHOLD
     count, height, width = matte.shape
     unknown = np.zeros_like(matte) if views.valid_mask is None else ~views.valid_mask.cpu().numpy()
     matte &= ~unknown
@@ -120,17 +121,8 @@ def _silhouettes(views: Views, reach: int) -> Array:
 
 def _dilated(masks: Array, reach: int) -> Array:
     """Masks (N, H, W) grown by ``reach`` pixels to each side, as a square."""
-    for axis in (1, 2):
-        done = 0
-        # A step of up to 2·done + 1 leaves no gap: doubling reaches far in a few passes.
-        while done < reach:
-            step = min(max(1, done), reach - done)
-            grown = masks.copy()
-            source, target = np.moveaxis(masks, axis, 0), np.moveaxis(grown, axis, 0)
-            target[step:] |= source[:-step]
-            target[:-step] |= source[step:]
-            masks, done = grown, done + step
-    return masks
+    square = np.ones((2 * reach + 1,) * 2, dtype=np.uint8)
+    return np.stack([cv2.dilate(mask, square) for mask in masks.astype(np.uint8)])
 
 
 def _pixel_index(views: Views, image: int, points: Tensor) -> Array:

@@ -14,9 +14,9 @@ from torch import Tensor
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
 from devrf.scenes.images import load_images
-from devrf.scenes.masks import Masks, counted_pixels, cutting_out
+from devrf.scenes.masks import Masks, cutting_out, valid_pixels
 from devrf.scenes.scene import Views
-from devrf.scenes.transforms import Transforms, read_transforms
+from devrf.scenes.transforms import Transforms
 from devrf.scenes.undistortion import as_pinhole
 from devrf.scenes.validation import scene_error
 
@@ -81,21 +81,11 @@ def distinct_poses(poses: Tensor) -> Tensor:
     return torch.tensor(numbers, dtype=torch.int64)
 
 
-def static_split(file: Path, root: Path) -> Split:
-    """The split of a scene at rest that ``file`` lists; see :func:`at_rest`."""
-    return at_rest(read_transforms(file, root))
-
-
 def at_rest(transforms: Transforms) -> Split:
     """A split of a scene at rest: every image its own view, time 0 unless the file says more."""
     count = len(transforms.images)
     times = torch.zeros(count) if transforms.times is None else torch.tensor(transforms.times)
     return Split(transforms, times, torch.arange(count), False, torch.arange(count))
-
-
-def dynamic_split(file: Path, root: Path) -> Split:
-    """The split of a scene in motion that ``file`` lists; see :func:`in_motion`."""
-    return in_motion(read_transforms(file, root))
 
 
 def in_motion(transforms: Transforms) -> Split:
@@ -191,8 +181,8 @@ def load_views(split: Split, root: Path, downscale: int, masks: Masks = "none") 
     known = [split.transforms.intrinsics[i] for i in used.tolist()]
     sizes = [inner.size for inner in known]
     listed = [split.transforms.masks[i] for i in used.tolist()] if split.transforms.masks else []
-    mattes = cutting_out(listed, sizes, files) if masks == "matte" else None
-    loaded = load_images(files, downscale, sizes, mattes)
+    finish = cutting_out(listed, sizes, files) if masks == "matte" else None
+    loaded = load_images(files, downscale, sizes, finish)
     height, width = loaded.pixels.shape[1:3]
     distorted = [
         inner.lens(loaded.width, loaded.height, file).scaled(
@@ -202,7 +192,7 @@ def load_views(split: Split, root: Path, downscale: int, masks: Masks = "none") 
     ]
     valid_mask = None
     if masks == "ignore":
-        valid_mask = counted_pixels(
+        valid_mask = valid_pixels(
             listed, (loaded.width, loaded.height), (width, height), sizes, distorted, files
         )
     # Undistorted after the images are made smaller: a tenth of the work for the same picture.
@@ -221,6 +211,6 @@ def load_views(split: Split, root: Path, downscale: int, masks: Masks = "none") 
         split.times[used],
         split.view[used],
         names,
-        ambiguous_orientation=loaded.doubtful,
+        ambiguous_orientation=loaded.ambiguous_orientation,
         valid_mask=valid_mask,
     )

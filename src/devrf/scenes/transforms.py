@@ -10,19 +10,64 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import torch
+from pydantic import AfterValidator, Field, TypeAdapter
 from torch import Tensor
 
 from devrf.scenes.image_files import find_image
-from devrf.scenes.intrinsics import Intrinsics, frame_intrinsics, read_intrinsics
-from devrf.scenes.json_files import json_object
+from devrf.scenes.intrinsics import CameraKeys, Intrinsics, frame_intrinsics, intrinsics_of
+from devrf.scenes.json_files import Name, Number, Vector4, read_json
 from devrf.scenes.paths import inside
 from devrf.scenes.poses import FARTHEST, in_reach, is_rotation
-from devrf.scenes.validation import abbreviated, number, scene_error
+from devrf.scenes.validation import scene_error
 
 TIME_TOLERANCE = 1e-6
+
+
+def _time(time: float) -> float:
+    if not -TIME_TOLERANCE <= time <= 1 + TIME_TOLERANCE:
+        raise ValueError(f"{time:g} is outside [0, 1]; rescale the times")
+    return min(max(time, 0.0), 1.0)
+
+
+class Frame(CameraKeys):
+    """One posed image.
+
+    Attributes:
+        file_path: the image, relative to the file's folder, with or without its suffix.
+        transform_matrix: 4×4 or 3×4 camera-to-world, OpenGL axes, world units.
+        time: in [0, 1]; None where no frame has one.
+        mask_path: a grey image, relative to the file's folder.
+    """
+
+    file_path: Name
+    transform_matrix: Annotated[list[Vector4], Field(fail_fast=True, min_length=3, max_length=4)]
+    time: Annotated[Number, AfterValidator(_time)] | None = None
+    mask_path: Name | None = None
+
+
+FileNames = Annotated[list[Name], Field(fail_fast=True)]
+
+
+class TransformsFile(CameraKeys):
+    """What a transforms file says.
+
+    Attributes:
+        frames: the posed images.
+        train_filenames: images to learn from, as nerfstudio lists them; None: no list.
+        val_filenames: images held out while a run goes on.
+        test_filenames: images held out to the end.
+    """
+
+    frames: Annotated[list[Frame], Field(fail_fast=True, min_length=1)]
+    train_filenames: FileNames | None = None
+    val_filenames: FileNames | None = None
+    test_filenames: FileNames | None = None
+
+
+_FILE = TypeAdapter(TransformsFile)
 
 
 @dataclass(frozen=True)
@@ -58,78 +103,53 @@ class Transforms:
         )
 
 
-def read_transforms(file: Path, root: Path, *, masked: bool = False) -> Transforms:
-    """Read one split, or one file of all images.
-
-    Args:
-        file: a ``transforms*.json``; its image paths are relative to its folder.
-        root: the scene's folder, which no image path may leave.
-        masked: whether ``mask_path`` is read, too.
+def read_listing(file: Path) -> TransformsFile:
+    """What a transforms file says, each value checked by itself.
 
     Raises:
         DevrfError: the file is missing, is no JSON, lacks a key, holds no frames, or holds a
-            value that is none (NaN poses, times outside [0, 1], a field of view of 0 …).
+            wrong value (NaN poses, times outside [0, 1], negative focal lengths …).
     """
-    content = json_object(file, "every capture needs its posed images")
-    frames = content.get("frames")
-    if not isinstance(frames, list) or not frames:
-        raise scene_error(file, 'expected a non-empty list "frames"; add the posed images')
-    for index, frame in enumerate(frames):
-        if not isinstance(frame, dict):
-            raise scene_error(
-                f"{file}: frames[{index}]",
-                f"expected an object, not {type(frame).__name__}; correct it",
-            )
+    return read_json(file, _FILE, "every capture needs its posed images")
+
+
+def read_transforms(file: Path, root: Path) -> Transforms:
+    """One split, or one file of all images; see :func:`read_listing` and :func:`posed_images`."""
+    return posed_images(read_listing(file), file, root)
+
+
+def posed_images(
+    listing: TransformsFile, file: Path, root: Path, *, masked: bool = False
+) -> Transforms:
+    """The posed images that a transforms file lists.
+
+    Args:
+        listing: what the file says.
+        file: where it is; its image paths are relative to its folder.
+        root: the scene's folder, which no image path may leave.
+        masked: whether ``mask_path`` is followed, too.
+
+    Raises:
+        DevrfError: an image is missing, a pose is no rigid transform, or only some frames have
+            a time.
+    """
+    frames = listing.frames
     where = [f"{file}: frames[{index}]" for index in range(len(frames))]
-    times = [_time(frame, place) for frame, place in zip(frames, where, strict=True)]
+    times = [frame.time for frame in frames]
     known = [t for t in times if t is not None]
     if known and len(known) < len(times):
         raise scene_error(
             where[times.index(None)],
             'has no "time" although others have; give every frame its time, or none',
         )
-    poses = _poses(frames, where)
     return Transforms(
         file,
-        _intrinsics(content, frames, where, file),
-        tuple(_image(frame, place, file, root) for frame, place in zip(frames, where, strict=True)),
-        poses.float(),
+        _intrinsics(listing, where, file),
+        tuple(listed_image(frame.file_path, file, root) for frame in frames),
+        _poses(frames, where).float(),
         tuple(known) or None,
-        tuple(_mask(f, place, file, root) for f, place in zip(frames, where, strict=True))
-        if masked
-        else None,
+        tuple(_mask(frame, file, root) for frame in frames) if masked else None,
     )
-
-
-def _intrinsics(
-    content: dict[str, Any], frames: list[dict[str, Any]], where: list[str], file: Path
-) -> tuple[Intrinsics, ...]:
-    own = [frame_intrinsics(content, f, place) for f, place in zip(frames, where, strict=True)]
-    if None not in own:
-        return tuple(lens for lens in own if lens is not None)
-    shared = read_intrinsics(content, file)
-    return tuple(shared if lens is None else lens for lens in own)
-
-
-def _image(frame: dict[str, Any], where: str, file: Path, root: Path) -> Path:
-    name = frame.get("file_path")
-    if not isinstance(name, str) or not name:
-        raise scene_error(where, 'has no "file_path"; add the image\'s path')
-    return listed_image(name, file, root)
-
-
-def _mask(frame: dict[str, Any], where: str, file: Path, root: Path) -> Path | None:
-    name = frame.get("mask_path")
-    if name is None:
-        return None
-    if not isinstance(name, str) or not name:
-        raise scene_error(
-            where, f"mask_path is {abbreviated(name)}, expected a file's path; correct it"
-        )
-    path = inside(root, file.parent, name, file)
-    if not os.path.isfile(path):
-        raise scene_error(path, "no such mask; correct mask_path, or set data.masks=none")
-    return path
 
 
 def listed_image(name: str, file: Path, root: Path) -> Path:
@@ -137,10 +157,26 @@ def listed_image(name: str, file: Path, root: Path) -> Path:
     return find_image(inside(root, file.parent, name, file))
 
 
-def _poses(frames: list[dict[str, Any]], where: list[str]) -> Tensor:
+def _intrinsics(listing: TransformsFile, where: list[str], file: Path) -> tuple[Intrinsics, ...]:
+    own = [frame_intrinsics(listing, f, at) for f, at in zip(listing.frames, where, strict=True)]
+    if None not in own:
+        return tuple(lens for lens in own if lens is not None)
+    shared = intrinsics_of(listing, file)
+    return tuple(shared if lens is None else lens for lens in own)
+
+
+def _mask(frame: Frame, file: Path, root: Path) -> Path | None:
+    if frame.mask_path is None:
+        return None
+    path = inside(root, file.parent, frame.mask_path, file)
+    if not os.path.isfile(path):
+        raise scene_error(path, "no such mask; correct mask_path, or set data.masks=none")
+    return path
+
+
+def _poses(frames: list[Frame], where: list[str]) -> Tensor:
     """(N, 3, 4) float64 camera-to-world."""
-    rows = [_pose(frame, place) for frame, place in zip(frames, where, strict=True)]
-    poses = torch.tensor(rows, dtype=torch.float64)
+    poses = torch.tensor([frame.transform_matrix[:3] for frame in frames], dtype=torch.float64)
     for bad, what in (
         (
             ~is_rotation(poses[:, :, :3]),
@@ -155,28 +191,3 @@ def _poses(frames: list[dict[str, Any]], where: list[str]) -> Tensor:
         if bool(bad.any()):
             raise scene_error(where[int(bad.nonzero()[0])], f"transform_matrix {what}")
     return poses
-
-
-def _pose(frame: dict[str, Any], where: str) -> list[list[float]]:
-    if "transform_matrix" not in frame:
-        raise scene_error(where, 'has no "transform_matrix"; add the 4x4 camera-to-world matrix')
-    matrix = frame["transform_matrix"]
-    sized = isinstance(matrix, list) and len(matrix) in (3, 4)
-    if not sized or not all(isinstance(row, list) and len(row) == 4 for row in matrix):
-        raise scene_error(where, "transform_matrix is not 4x4 or 3x4; give camera-to-world rows")
-    rows = [[number(value) for value in row] for row in matrix[:3]]
-    pose = [[value for value in row if value is not None] for row in rows]
-    if any(len(row) < 4 for row in pose):
-        raise scene_error(where, "transform_matrix holds NaN, inf or text; give finite numbers")
-    return pose
-
-
-def _time(frame: dict[str, Any], where: str) -> float | None:
-    if "time" not in frame:
-        return None
-    time = number(frame["time"])
-    if time is None or not -TIME_TOLERANCE <= time <= 1 + TIME_TOLERANCE:
-        raise scene_error(
-            where, f"time is {abbreviated(frame['time'])}, outside [0, 1]; rescale the times"
-        )
-    return min(max(time, 0.0), 1.0)

@@ -7,12 +7,12 @@ from functools import lru_cache
 
 import torch
 from torch import Tensor
-from torch.nn.functional import grid_sample
 
 from devrf.scenes.lens import Lens
+from devrf.scenes.resampling import LONGEST_SIDE, look_up_pixels
 from devrf.scenes.validation import scene_error
 
-# A lens that needs a longer focal length than this to fill its image is no such lens.
+# A lens that has to be zoomed by more than this to fill its image is given up as folded.
 _LONGEST = 2.0
 _HALVINGS = 24
 
@@ -34,13 +34,20 @@ def as_pinhole(
         The pixels, and N lenses without distortion and skew.
 
     Raises:
-        DevrfError: a distortion is so strong that the image folds over.
+        DevrfError: a distortion is so strong that the image folds over, or the image is wider
+            or higher than 32,766 px.
     """
     height, width = pixels.shape[1:3]
     plain = list(lenses)
     for row, lens in enumerate(lenses):
         if lens.pinhole:
             continue
+        if max(width, height) > LONGEST_SIDE:
+            raise scene_error(
+                names[row],
+                f"{width}x{height} px, at most {LONGEST_SIDE} px a side can be undistorted; "
+                "use a larger data.downscale",
+            )
         view = _pinhole_view(lens, width, height)
         if view is None:
             raise scene_error(
@@ -49,69 +56,30 @@ def as_pinhole(
                 "folds over; correct it, or undistort the images first",
             )
         plain[row], source = view
-        pixels[row] = resample(pixels[row], source)
+        pixels[row] = torch.from_numpy(look_up_pixels(pixels[row].numpy(), source.numpy()))
     return pixels, tuple(plain)
-
-
-def resample(image: Tensor, source: Tensor) -> Tensor:
-    """An image looked up elsewhere, bilinearly; colours count by their alpha.
-
-    Args:
-        image: (H, W, 1, 3 or 4) uint8, alpha not premultiplied.
-        source: (H', W', 2) x, y in pixels of ``image``, where a pixel's centre is at i + 0.5.
-
-    Returns:
-        (H', W', 1, 3 or 4) uint8, alpha not premultiplied; black where alpha is 0. Places outside
-        take the nearest pixel of the border.
-    """
-    height, width, channels = image.shape
-    values = image.float()
-    if channels == 4:
-        # Colours behind a zero alpha are arbitrary: premultiplied, they cannot bleed in.
-        values[..., :3] *= values[..., 3:]
-    grid = source * (2 / source.new_tensor([width, height])) - 1
-    taken = grid_sample(
-        values.permute(2, 0, 1)[None],
-        grid.float()[None],
-        mode="bilinear",
-        padding_mode="border",
-        align_corners=False,
-    )[0].permute(1, 2, 0)
-    if channels == 4:
-        alpha = taken[..., 3:]
-        color = torch.where(alpha > 0, taken[..., :3] / alpha, torch.zeros_like(alpha))
-        taken = torch.cat([color, alpha], dim=-1)
-    return (taken + 0.5).clamp(0, 255).to(torch.uint8)
 
 
 # One lens for all images is the rule; several take turns at most.
 @lru_cache(maxsize=4)
 def _pinhole_view(lens: Lens, width: int, height: int) -> tuple[Lens, Tensor] | None:
     """The pinhole and, for each of its pixels, where the lens has it (H, W, 2); None: folded."""
-    zoom = _zoom(lens, width, height)
+    centres = _centres(width, height)
+    zoom = _zoom(lens, centres)
     if zoom is None:
         return None
     (fx, fy), center = lens.focal, lens.center
     plain = Lens((fx * zoom, fy * zoom), center)
-    x, y = torch.arange(width) + 0.5, torch.arange(height) + 0.5
-    pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).double()
-    directions = _directions(plain, pixels)
+    directions = _directions(plain, centres)
     if not bool(lens.distortion.upright(directions).all()):
         return None
     return plain, _on_lens(lens, directions).float()
 
 
-def _zoom(lens: Lens, width: int, height: int) -> float | None:
+def _zoom(lens: Lens, centres: Tensor) -> float | None:
     """The least factor ≥ 1 of the focal lengths at which the lens saw the whole border."""
-    x, y = torch.arange(width) + 0.5, torch.arange(height) + 0.5
-    border = torch.cat(
-        [
-            torch.stack([x, torch.full_like(x, 0.5)], dim=-1),
-            torch.stack([x, torch.full_like(x, height - 0.5)], dim=-1),
-            torch.stack([torch.full_like(y, 0.5), y], dim=-1),
-            torch.stack([torch.full_like(y, width - 0.5), y], dim=-1),
-        ]
-    ).double()
+    height, width = centres.shape[:2]
+    border = torch.cat([centres[0], centres[-1], centres[:, 0], centres[:, -1]])
     directions = _directions(Lens(lens.focal, lens.center), border)
     size = border.new_tensor([width, height])
 
@@ -129,6 +97,12 @@ def _zoom(lens: Lens, width: int, height: int) -> float | None:
         middle = (low + high) / 2
         low, high = (low, middle) if seen(middle) else (middle, high)
     return high
+
+
+def _centres(width: int, height: int) -> Tensor:
+    """(H, W, 2) float64 x, y of the pixels' centres."""
+    x, y = torch.arange(width) + 0.5, torch.arange(height) + 0.5
+    return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).double()
 
 
 def _directions(pinhole: Lens, pixels: Tensor) -> Tensor:

@@ -6,6 +6,8 @@ import math
 import reprlib
 from collections.abc import Iterable
 
+from pydantic import ValidationError
+
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 
@@ -33,6 +35,30 @@ def scene_error(where: object, what: str) -> DevrfError:
         c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in line
     )
     return DevrfError(_shortened(printable, LONGEST_MESSAGE))
+
+
+def first_error(error: ValidationError, where: str) -> DevrfError:
+    """The first thing that pydantic found wrong: key, expectation, and the value that was given.
+
+    Args:
+        error: what a model or an adapter raised.
+        where: what comes before the key: ``FILE: `` for values in a file, ``data.`` for options.
+    """
+    found = error.errors(include_url=False)[0]
+    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in found["loc"])
+    place = f"{where}{key.removeprefix('.')}" if key else where.rstrip(": .")
+    if found["type"] == "json_invalid":
+        return scene_error(place, f"not valid JSON ({found['ctx']['error']}); write it again")
+    if found["type"] == "missing":
+        return scene_error(place, "is missing; add it")
+    if found["type"] == "unexpected_keyword_argument":
+        return scene_error(place, "no such option; correct its name")
+    if found["type"] == "value_error":  # raised by a validator of ours
+        return scene_error(place, str(found["ctx"]["error"]))
+    expected = found["msg"].removeprefix("Input ").replace(" after validation", "")
+    # Of lists that are too short or too long, the message says the length itself.
+    given = "" if ", not " in expected else f", not {abbreviated(found['input'])}"
+    return scene_error(place, f"{expected[0].lower()}{expected[1:]}{given}; correct it")
 
 
 def abbreviated(value: object) -> str:
@@ -81,25 +107,12 @@ def check_choice(key: str, value: object, choices: Iterable[str]) -> None:
         raise scene_error(key, f"expected one of {', '.join(allowed)}, not {value!r}")
 
 
-def check_count(key: str, value: object, least: int) -> None:
-    """DevrfError unless ``value`` is None or a whole number of at least ``least``."""
-    if value is None:
-        return
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise scene_error(key, f"expected a whole number of at least {least}, not {value!r}")
-
-
-def check_bound_scale(value: object) -> None:
-    """DevrfError unless ``value`` is "auto" or a number ≥ 1."""
-    scale = number(value)
-    if value != "auto" and (scale is None or scale < 1):
-        raise scene_error(
-            "data.bound_scale", f'expected "auto" or a number of at least 1, not {value!r}'
-        )
-
-
 def checked_box(value: object) -> Box:
-    """The box of ``[[x, y, z], [x, y, z]]``: its low and high corner in world units."""
+    """The box of ``[[x, y, z], [x, y, z]]``: its low and high corner in world units.
+
+    Raises:
+        DevrfError: it is something else, or holds no volume.
+    """
     try:
         low, high = ([float(v) for v in corner] for corner in value)  # type: ignore[attr-defined]
         if not all(math.isfinite(v) for v in (*low, *high)):

@@ -14,12 +14,12 @@ from devrf.scenes.scene import Views
 def visual_hull(views: Views, box: Box, shape: tuple[int, int, int]) -> Tensor:
     """The visual hull of one state of the scene, on a grid.
 
-    A grid point is outside when any view that has it in the picture sees no matte within half
+    A grid point is outside when any view that has it in the picture sees no alpha mask within half
     a grid cell of it; so the hull holds everything, and more where no view looks, or where its
-    pixels do not count.
+    pixels are not valid.
 
     Args:
-        views: images with mattes that all show the same state.
+        views: images with alpha masks that all show the same state.
         box: where the grid is, world units; its corners sit on the box's corners.
         shape: grid points along x, y, z.
 

@@ -5,22 +5,49 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """A path to write to that becomes ``path`` when the block ends well, and vanishes else."""
+    """A path to write to that becomes ``path`` when the block ends well, and vanishes otherwise.
+
+    The content is on the disk before it has its name: after a kill or a power failure at any
+    moment the earlier file or the new one is there, whole.
+
+    Args:
+        path: the file; its folder is made.
+
+    Raises:
+        OSError: naming ``path``: it cannot be written.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     # The suffix stays last: writers tell the format by it.
     partial = path.with_name(f".partial-{path.name}")
     try:
         yield partial
+        with partial.open("rb+") as file:
+            os.fsync(file.fileno())
         os.replace(partial, path)
+        _sync_folder(path.parent)
+    except OSError as error:
+        if error.errno is None or str(error.filename or partial) != str(partial):
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         partial.unlink(missing_ok=True)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Put a new name in ``folder`` on the disk, where the system can."""
+    with suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
 
 
 def write_json(path: Path, values: dict[str, Any]) -> None:

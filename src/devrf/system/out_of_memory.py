@@ -1,4 +1,4 @@
-"""When memory runs out: how it shows, and what can be given back."""
+"""When memory runs out: how errors say so, and how to free what is cached."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import torch
 from devrf.errors import DevrfError
 from devrf.system.machine import free_memory
 
-# What torch's allocators and its libraries say, oneDNN without a word of memory; on a GPU the
-# error has a class of its own.
-SAID = (
+# What torch's allocators and its libraries say (oneDNN does not mention memory). On a GPU the error
+# has a class of its own.
+MESSAGES = (
     "out of memory",
     "can't allocate memory",
     "bad_alloc",
@@ -25,20 +25,20 @@ UNITS = {"b": 1, "bytes": 1, "kib": 2**10, "mib": 2**20, "gib": 2**30, "tib": 2*
 
 
 class OutOfMemoryError(DevrfError):
-    """Memory has run out, and whatever could be done about it has been done."""
+    """Memory has run out, and smaller batches did not help."""
 
 
 def is_oom(error: BaseException) -> bool:
     """Whether an error says that memory has run out, on a GPU or on the host."""
     if isinstance(error, MemoryError | torch.OutOfMemoryError):
         return True
-    return isinstance(error, RuntimeError) and any(words in str(error) for words in SAID)
+    return isinstance(error, RuntimeError) and any(words in str(error) for words in MESSAGES)
 
 
 def free_cache(device: torch.device) -> None:
-    """Give back what is held without being used.
+    """Free what torch keeps without using it.
 
-    What an error's traceback holds is not: call this after the ``except`` block.
+    What an error's traceback holds stays: call this after the ``except`` block.
     """
     gc.collect()
     if device.type == "cuda":
@@ -46,22 +46,14 @@ def free_cache(device: torch.device) -> None:
 
 
 def numbers(said: str, device: torch.device) -> str:
-    """What was asked for and what there is, in words.
-
-    Args:
-        said: what the error said.
-        device: where memory ran out.
-    """
-    asked, free = ASKED.search(said), free_memory(device)
-    parts = []
-    if asked and asked.group(2).lower() in UNITS:
-        parts.append(f"{gib(float(asked.group(1)) * UNITS[asked.group(2).lower()])} GiB more asked")
-    if free is not None:
-        parts.append(f"{gib(free)} GiB free")
-    return f"{', '.join(parts)} on {device}" if parts else str(device)
+    """What was asked for, if the error ``said`` so, and what is free on ``device``, in words."""
+    asked, free = ASKED.search(said), f"{gib(free_memory(device))} GiB free on {device}"
+    if not asked or asked.group(2).lower() not in UNITS:
+        return free
+    return f"{gib(float(asked.group(1)) * UNITS[asked.group(2).lower()])} GiB more asked, {free}"
 
 
 def gib(count: float) -> str:
-    """Bytes as a number of GiB with two digits that tell: 21.3, 1.2, 0.034."""
+    """Bytes as a number of GiB with two significant digits or more: 21.3, 1.2, 0.034."""
     value = count / 2**30
     return f"{value:.1f}" if value >= 1 else f"{value:.2g}"

@@ -1,4 +1,4 @@
-"""What a process that trains asks of the system."""
+"""Settings of the C library and the system for a process that trains."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ def tune_for_cpu() -> None:
     """Keep threads from spinning long and freed memory from going back to the kernel.
 
     Threads that wait for one another by spinning, as they do by default, are a hundred times
-    slower where something else is running; threads that sleep at once gain nothing over one
-    thread. A short spin is fast on an idle machine and harmless on a busy one. And a training
-    step allocates and frees the same dozens of megabytes again and again: handed back
-    each time, every page of them would be mapped and zeroed anew, a tenth of the run.
+    slower on a busy machine; threads that sleep at once gain nothing over one thread. A short spin
+    is fast on an idle machine and harmless on a busy one. And a training step allocates and frees
+    the same dozens of megabytes again and again: if they went back to the kernel each time, every
+    page would be mapped and zeroed anew, a tenth of the run.
 
     Of no effect once torch is loaded, on a GPU, or where the C library is not glibc.
     """
@@ -36,7 +36,7 @@ def tune_for_cpu() -> None:
 
 
 def forget_peak_memory() -> None:
-    """Let the system measure this process's peak memory anew, where it can (Linux)."""
+    """Restart the system's measurement of this process's peak memory, where it can (Linux)."""
     try:
         Path("/proc/self/clear_refs").write_text("5")
     except OSError:

@@ -1,4 +1,4 @@
-"""Signals that ask a run to end, and who answers them."""
+"""Signals that ask a run to end, and what answers them."""
 
 from __future__ import annotations
 
@@ -7,17 +7,13 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import Any
+from typing import NoReturn
 
 # Ctrl-C, the system's request to end, and what SLURM sends some time before it does.
-ASKING = tuple(
-    getattr(signal, name)
-    for name in ("SIGINT", "SIGTERM", "SIGUSR1", "SIGUSR2")
-    if hasattr(signal, name)
-)
+NAMES = ("SIGINT", "SIGTERM", "SIGUSR1", "SIGUSR2")
+STOP_SIGNALS = tuple(getattr(signal, name) for name in NAMES if hasattr(signal, name))
 
 Answer = Callable[[int], None]
-Setting = Callable[[int, FrameType | None], Any] | int | None  # what Python keeps for a signal
 
 
 class Interrupted(SystemExit):
@@ -34,8 +30,8 @@ class Interrupted(SystemExit):
         self.said = said
 
 
-def end_at_once(number: int) -> None:
-    """Answer a signal by ending the run where it stands; what is half-written vanishes.
+def end_at_once(number: int) -> NoReturn:
+    """Answer a signal by ending the run where it stands; half-written files are removed.
 
     Raises:
         Interrupted: always.
@@ -44,6 +40,8 @@ def end_at_once(number: int) -> None:
 
 
 class _Handler:
+    """A handler of ours, so that a block within another may take its signals."""
+
     def __init__(self, answer: Answer) -> None:
         self.answer = answer
 
@@ -53,22 +51,20 @@ class _Handler:
 
 @contextmanager
 def answered_by(answer: Answer) -> Iterator[Callable[[], None]]:
-    """Answer signals by ``answer(number)`` within the block; what answered before returns after.
+    """Answer signals by ``answer(number)`` within the block; the earlier handlers return after it.
 
-    A signal that somebody else answers, or that is ignored, stays theirs: a launcher that
-    requeues its job does it by a handler of its own. Of no effect outside the main thread.
+    A signal that is ignored or has another program's handler keeps it: a launcher that requeues
+    its job does so by a handler of its own. Of no effect outside the main thread.
 
     Yields:
-        A function that takes the block's signals back, should a library have taken them since.
+        A function that takes the block's signals back from a library that has taken them since.
     """
-    taken: dict[int, Setting] = {}
-    if threading.current_thread() is threading.main_thread():
-        for number in ASKING:
-            before = signal.getsignal(number)
-            free = before in (signal.SIG_DFL, signal.default_int_handler)
-            if free or isinstance(before, _Handler):
-                taken[number] = before
     handler = _Handler(answer)
+    before = {number: signal.getsignal(number) for number in STOP_SIGNALS}
+    if threading.current_thread() is not threading.main_thread():
+        before = {}
+    defaults = (signal.SIG_DFL, signal.default_int_handler)
+    taken = {n: was for n, was in before.items() if was in defaults or isinstance(was, _Handler)}
 
     def take() -> None:
         for number in taken:
@@ -78,5 +74,5 @@ def answered_by(answer: Answer) -> Iterator[Callable[[], None]]:
     try:
         yield take
     finally:
-        for number, before in taken.items():
-            signal.signal(number, before)
+        for number, was in taken.items():
+            signal.signal(number, was)

@@ -15,10 +15,10 @@ from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.color_decoder import ColorDecoder, SigmoidColor
 from devrf.methods.devrf.free_space import view_count_weight
-from devrf.methods.devrf.schedules import CanonicalSchedule
 from devrf.methods.devrf.settings import Precision
 from devrf.scenes.scene import Scene
 
@@ -37,7 +37,7 @@ SEARCHED = CanonicalSchedule(
 )
 
 
-class SweepMonitor(Callback):
+class Watch(Callback):
     """Keeps what was logged and which grids there were after each Lightning step."""
 
     def __init__(self) -> None:
@@ -46,7 +46,7 @@ class SweepMonitor(Callback):
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, *_: Any) -> None:
         self.loss.append(float(trainer.callback_metrics[f"{pl_module.capture}/loss"]))
-        decoder = type(pl_module.model.canonical.decoder).__name__
+        decoder = type(pl_module.scene_model.canonical.decoder).__name__
         self.seen.append((pl_module.phase.kind, pl_module.resolution, decoder))
 
 
@@ -56,8 +56,8 @@ def test_two_steps_learn_something(
     stage, fit = CanonicalStage(CARVED, SMALL), trainer(max_steps=2)
     fit.fit(stage, datamodule=datamodule)
     assert stage.iteration == fit.global_step == 2
-    assert stage.model.canonical.density.values.abs().max() > 0
-    assert stage.model.canonical.color.values.abs().max() > 0
+    assert stage.scene_model.canonical.density.values.abs().max() > 0
+    assert stage.scene_model.canonical.color.values.abs().max() > 0
 
 
 @pytest.mark.parametrize(
@@ -84,12 +84,14 @@ def test_the_color_network_learns_in_the_chosen_precision(
         return forward(self, *args)
 
     monkeypatch.setattr(ColorDecoder, "forward", watched)
-    monkeypatch.setattr("devrf.engine.stage.multiplies_bfloat16", lambda device: made_for_it)
+    monkeypatch.setattr(
+        "devrf.methods.devrf.voxel_stage.multiplies_bfloat16", lambda device: made_for_it
+    )
     stage = CanonicalStage(CARVED, SMALL, decoder_precision=asked)
     trainer(max_steps=2).fit(stage, datamodule=datamodule)
     assert used == {expected}
-    assert {value.dtype for value in stage.model.canonical.parameters()} == {torch.float32}
-    assert stage.model.canonical.color.values.abs().max() > 0
+    assert {value.dtype for value in stage.scene_model.canonical.parameters()} == {torch.float32}
+    assert stage.scene_model.canonical.color.values.abs().max() > 0
 
 
 def test_all_in_reduced_precision_is_refused(
@@ -103,13 +105,13 @@ def test_all_in_reduced_precision_is_refused(
 def test_the_whole_schedule_is_run_and_the_loss_falls(
     datamodule: SceneDataModule, trainer: Callable[..., Trainer]
 ) -> None:
-    watch, stage = SweepMonitor(), CanonicalStage(CARVED, SMALL, iterations_per_step=7)
+    watch, stage = Watch(), CanonicalStage(CARVED, SMALL, iterations_per_step=7)
     fit = trainer(watch, max_epochs=1)
     fit.fit(stage, datamodule=datamodule)
     # Seven at a time, never across the growth at 20: 7 + 7 + 6, then 5 · 7 + 5.
     assert len(watch.seen) == 9 and stage.iteration == fit.global_step == 60
     coarse, fine = {seen[1] for seen in watch.seen[:3]}, {seen[1] for seen in watch.seen[3:]}
-    box = stage.model.canonical.box
+    box = stage.scene_model.canonical.box
     assert coarse == {box.grid_shape(16**3 // 2)} and fine == {box.grid_shape(16**3)}
     assert sum(watch.loss[-2:]) / 2 < 0.6 * watch.loss[0]
 
@@ -117,12 +119,12 @@ def test_the_whole_schedule_is_run_and_the_loss_falls(
 def test_the_search_hands_over_to_a_radiance_field_with_room_for_motion(
     datamodule: SceneDataModule, tiny_scene: Scene, trainer: Callable[..., Trainer]
 ) -> None:
-    watch, stage = SweepMonitor(), CanonicalStage(SEARCHED, SMALL)
+    watch, stage = Watch(), CanonicalStage(SEARCHED, SMALL)
     trainer(watch, max_epochs=1).fit(stage, datamodule=datamodule)
     kinds = [(kind, decoder) for kind, _, decoder in watch.seen]
     assert kinds == [("search", SigmoidColor.__name__)] * 30 + [("fine", ColorDecoder.__name__)] * 2
     assert watch.loss[29] < 0.6 * watch.loss[0]
-    motion, box = tiny_scene.bounds.motion, stage.model.canonical.box
+    motion, box = tiny_scene.bounds.motion, stage.scene_model.canonical.box
     assert motion is not None and box.union(motion) == box
     # The search's box was the whole rest box: it has been tightened.
     assert box.volume < tiny_scene.bounds.box.scaled(1.05).union(motion).volume
@@ -137,7 +139,7 @@ def test_a_search_that_finds_nothing_says_what_to_check(
 
 
 def test_afterwards_what_is_not_occupied_is_empty(learned: tuple[CanonicalStage, Trainer]) -> None:
-    model = learned[0].model
+    model = learned[0].scene_model
     alpha = model.canonical.voxel_alpha(1.0)
     assert model.occupancy.mask.shape == alpha.shape
     assert alpha[~model.occupancy.mask].max() < 1.1e-6
@@ -198,7 +200,7 @@ def test_no_matter_is_possible_before_a_lens(
     datamodule._scene = replace(tiny_scene, bounds=bounds)
     stage = CanonicalStage(CanonicalSchedule(2, 16, False, 2, 8, (), rays=16), SMALL)
     trainer(max_steps=1).fit(stage, datamodule=datamodule)
-    occupancy = stage.model.occupancy
+    occupancy = stage.scene_model.occupancy
     points = bounds.box.grid_points((16, 16, 16), torch.zeros(())).reshape(-1, 3)
     nearest = torch.cdist(points, tiny_scene.static.train.cameras.positions).amin(dim=1)
     assert torch.equal(occupancy.mask.flatten(), nearest > 3.0)

@@ -9,12 +9,13 @@ from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.geometry.rays import Rays
 from devrf.methods.devrf.architecture import Architecture
-from devrf.methods.devrf.compact_state import compact_state, expanded_state
+from devrf.methods.devrf.compact_state import expanded_state
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import RenderSettings
 from devrf.metrics.image import psnr
 from devrf.rendering.occupancy import Occupancy, dilate
+from devrf.rendering.renderer import Renderer
 
 SIDE, MOTION = 24, 18
 TIMES = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -24,9 +25,8 @@ TIMES = (0.0, 0.25, 0.5, 0.75, 1.0)
 def model(cube: Box) -> DeVRFModel:
     """A speckled ball that travels along x and swells, smoothly, through empty space."""
     torch.manual_seed(0)
-    canonical = Architecture(channels=4, width=8, frequencies=1).radiance_field(
-        cube, SIDE**3, SIDE**3
-    )
+    build = Architecture(channels=4, width=8, frequencies=1)
+    canonical = build.radiance_field(cube, SIDE**3, SIDE**3)
     points = cube.grid_points((SIDE, SIDE, SIDE), torch.empty(0))
     solid = (points - torch.tensor([-0.4, 0.0, 0.0])).norm(dim=-1) < 0.3
     with torch.no_grad():
@@ -40,19 +40,13 @@ def model(cube: Box) -> DeVRFModel:
         deformation.to_canonical[frame, ..., 0] = -way
         deformation.to_time[frame, ..., 0] = way
     settings = RenderSettings(step=0.5, alpha_threshold=1e-3, near=0.0, far=9.0)
-    return DeVRFModel(canonical, Occupancy(dilate(solid, 1), cube), settings, deformation)
+    return DeVRFModel(build, canonical, Occupancy(dilate(solid, 1), cube), settings, deformation)
 
 
-def restored(model: DeVRFModel, cube: Box) -> DeVRFModel:
+def restored(model: DeVRFModel) -> DeVRFModel:
     """Another model that is given what the checkpoint of ``model`` would hold."""
-    build = Architecture(channels=4, width=8, frequencies=1)
-    other = DeVRFModel(
-        build.radiance_field(cube, 8, 8),
-        Occupancy.full((2, 2, 2), cube),
-        model.settings,
-        DeformationField(cube, FrameClock((0.0, 1.0)), voxels=8),
-    )
-    other.load_state_dict(expanded_state(compact_state(model)))
+    other = DeVRFModel.from_config(model.config())
+    other.load_stored_state(model.stored_state())
     return other
 
 
@@ -62,20 +56,20 @@ def picture(model: DeVRFModel, time: float) -> torch.Tensor:
     )
     origins = torch.stack([x, y, torch.full_like(x, 3.0)], dim=-1).view(-1, 3)
     d = torch.tensor([[0.0, 0.0, -1.0]]).expand(len(origins), 3)
-    return model.picture(Rays(origins, d, d), time, torch.ones(3)).color.view(40, 30, 3)
+    return Renderer(model).picture(Rays(origins, d, d), time, 1.0).color.view(40, 30, 3)
 
 
 @pytest.mark.parametrize("time", [0.0, 0.25, 0.4, 0.625, 1.0])
-def test_what_is_seen_stays_the_same_at_frames_and_between(model, cube, time):
-    before, after = picture(model, time), picture(restored(model, cube), time)
+def test_what_is_seen_stays_the_same_at_frames_and_between(model, time):
+    before, after = picture(model, time), picture(restored(model), time)
     assert (before < 0.9).any()  # the ball is in the picture
     # Against a truth that the model reaches at 40 dB, this is a loss of less than 0.05 dB.
     assert psnr(after, before) > 60
 
 
-def test_nothing_appears_in_empty_space(model, cube):
+def test_nothing_appears_in_empty_space(model):
     # Where the ball was at rest, and between its places, points must not lead back to it.
-    after = restored(model, cube)
+    after = restored(model)
     for time in (0.6, 1.0):
         occupied, expected = after.occupancy_at(time).mask, model.occupancy_at(time).mask
         assert not (occupied & ~dilate(expected, 1)).any()
@@ -84,7 +78,7 @@ def test_nothing_appears_in_empty_space(model, cube):
 def test_the_state_takes_a_fraction_of_the_memory(model):
     full = sum(v.numel() * 4 for v in model.state_dict().values() if torch.is_tensor(v))
     small = 0
-    for value in compact_state(model).values():
+    for value in model.stored_state().values():
         parts = value.values() if isinstance(value, dict) else [value]
         small += sum(v.numel() * v.element_size() for v in parts if torch.is_tensor(v))
     assert small < 0.3 * full
@@ -95,8 +89,8 @@ def test_a_full_state_passes_through(model):
     assert expanded_state(state) == state
 
 
-def test_what_a_half_cannot_hold_stays_as_it_is(model, cube):
+def test_what_a_half_cannot_hold_stays_as_it_is(model):
     with torch.no_grad():
         model.canonical.density.values[12, 12, 12] = 1e5
-    after = restored(model, cube)
+    after = restored(model)
     assert torch.equal(after.canonical.density.values, model.canonical.density.values)

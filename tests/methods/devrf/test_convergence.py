@@ -11,9 +11,9 @@ from lightning import Trainer
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
-from devrf.methods.devrf.convergence import settled
+from devrf.methods.devrf.convergence import ConvergenceMonitor, converged
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
-from devrf.methods.devrf.schedules import DeformationSchedule
 from devrf.methods.devrf.settings import MotionSettings
 
 SCHEDULE = DeformationSchedule(sides=(4, 6), iterations_per_frame=(12, 8), rays=64)
@@ -31,7 +31,7 @@ SCHEDULE = DeformationSchedule(sides=(4, 6), iterations_per_frame=(12, 8), rays=
     ],
 )
 def test_by_hand(losses: list[float], done: bool) -> None:
-    assert settled(losses, gain=0.02) is done
+    assert converged(losses, min_rel_improvement=0.02) is done
 
 
 @pytest.fixture
@@ -51,12 +51,21 @@ def learn(
     return run
 
 
-def test_a_frame_that_has_settled_is_left(learn: Callable[..., DeformationStage]) -> None:
+def test_a_frame_that_has_converged_is_left(learn: Callable[..., DeformationStage]) -> None:
     # No step takes off all of the loss: each visit ends after the three steps that tell.
     hasty = learn(1.0)
     visits = 2 * 2
     assert hasty.iteration - hasty.skipped == visits * 3 * 2
     assert hasty.iteration == hasty.total_iterations == 60
+
+
+def test_frames_that_are_learned_together_converge_together() -> None:
+    both = ConvergenceMonitor(2, 0.1)
+    steps = [[1.0, 1.0], [1.0, 0.5], [1.0, 0.25], [1.0, 0.25], [1.0, 0.25]]
+    assert [both.add(losses) for losses in steps] == [False, False, False, False, True]
+    assert both.losses[1] == [1.0, 0.5, 0.25, 0.25, 0.25]
+    never = ConvergenceMonitor(1, None)
+    assert not any(never.add([1.0]) for _ in range(9))
 
 
 def test_nothing_is_left_out_unless_asked(learn: Callable[..., DeformationStage]) -> None:

@@ -1,9 +1,6 @@
-"""The 4D deformation field: identity at rest, 4-linear between frames, growth, slices."""
+"""The 4D deformation field: identity at rest, 4-linear between frames, growth."""
 
 from __future__ import annotations
-
-import copy
-from typing import Any
 
 import pytest
 import torch
@@ -74,10 +71,9 @@ def test_one_grid_stands_for_the_two_frames_around_a_time(
 ) -> None:
     x = points(100, rng)
     for time in (0.0, 0.1, 0.3, 1.0):
-        grid = field.blended(field.to_time, time)
-        found = x + interpolate(grid, field.box.to_grid(x, field.shape))
-        torch.testing.assert_close(found, field.unwarp(x, time))
-    assert field.blended(field.to_time, 0.6).data_ptr() == field.to_time[2].data_ptr()
+        found = x + interpolate(field.blended(time), field.box.to_grid(x, field.shape))
+        torch.testing.assert_close(found, field.warp(x, time))
+    assert field.blended(0.6).data_ptr() == field.to_canonical[2].data_ptr()
 
 
 def test_every_frame_is_met_exactly_at_its_grid_points(field: DeformationField) -> None:
@@ -87,37 +83,6 @@ def test_every_frame_is_met_exactly_at_its_grid_points(field: DeformationField) 
         torch.testing.assert_close(field.warp(corners, time), moved)
         moved = corners + field.to_time[k].reshape(-1, 3)
         torch.testing.assert_close(field.unwarp(corners, time), moved)
-
-
-def test_a_slice_trains_its_frame_in_place_and_no_other(field: DeformationField) -> None:
-    before = field.to_canonical.clone(), field.to_time.clone()
-    leaves = field.slice(2)
-    optimizer = torch.optim.SGD(leaves, lr=1.0)
-    torch.stack([leaf.sum() for leaf in leaves]).sum().backward()
-    optimizer.step()
-    for now, was in zip((field.to_canonical, field.to_time), before, strict=True):
-        torch.testing.assert_close(now[2], was[2] - 1)
-        assert torch.equal(now[[0, 1, 3]], was[[0, 1, 3]])
-        assert not now.requires_grad
-
-
-@pytest.mark.parametrize("frame", [0, 4, -1])
-def test_the_rest_frame_and_frames_that_are_not_there_cannot_be_trained(
-    field: DeformationField, frame: int
-) -> None:
-    with pytest.raises(IndexError, match="only 1 to 3"):
-        field.slice(frame)
-
-
-def test_carry_copies_the_frame_before_in_both_directions(field: DeformationField) -> None:
-    before = field.to_canonical.clone(), field.to_time.clone()
-    field.carry(2)
-    for now, was in zip((field.to_canonical, field.to_time), before, strict=True):
-        assert torch.equal(now[2], was[1])
-        assert torch.equal(now[[0, 1, 3]], was[[0, 1, 3]])
-    # A copy, not a view: what happens to frame 2 later is its own affair.
-    field.to_canonical[2] += 1
-    assert torch.equal(field.to_canonical[1], before[0][1])
 
 
 def test_resizing_keeps_a_linear_motion_exactly_and_frames_never_trained_zero(
@@ -158,59 +123,24 @@ def test_a_stored_field_of_other_shape_clock_and_box_loads_bit_equal(
 
 
 def test_all_that_is_learned_is_in_the_state_dict(field: DeformationField) -> None:
-    assert {"to_canonical", "to_time"} <= set(field.state_dict())
-    # No optimiser may take the frames from the module: they are trained slice by slice.
+    assert {"frames.to_canonical", "frames.to_time"} <= set(field.state_dict())
+    # No optimiser may take the frames from the module: they are trained frame by frame.
     assert list(field.parameters()) == []
 
 
 @pytest.mark.parametrize("half", [False, True])
-def test_frames_that_rest_elsewhere_are_taken_out_as_the_field_works(
+def test_frames_that_rest_elsewhere_move_points_as_before(
     field: DeformationField, rng: torch.Generator, half: bool
 ) -> None:
     x, times = points(50, rng), (0.1, 0.2, 0.77)
-    expected = [(field.warp(x, t), field.blended(field.to_canonical, t)) for t in times]
-    field.rest(on_host=True, half=half)
+    expected = [(field.warp(x, t), field.blended(t)) for t in times]
+    field.frames.offload(on_host=True, half=half)
     close = {"atol": 2e-3, "rtol": 1e-3} if half else {"atol": 0.0, "rtol": 0.0}
     for time, (moved, grid) in zip(times, expected, strict=True):
         torch.testing.assert_close(field.warp(x, time), moved, **close)
-        torch.testing.assert_close(field.blended(field.to_canonical, time), grid, **close)
-    # Wherever the module goes, its frames stay as they are.
+        torch.testing.assert_close(field.blended(time), grid, **close)
+    # Wherever the module goes, its frames stay as they are; points are moved as it works.
     resting = field.to_time
     field.double()
-    assert field.to_time is resting and resting.dtype == (torch.half if half else torch.float)
+    assert field.to_time is resting
     assert field.warp(x.double(), 0.77).dtype == torch.float64
-    field.float().resize(27)
-    assert field.to_time.dtype == resting.dtype and field.shape == (3, 3, 3)
-
-
-def test_a_frame_is_read_changed_and_written_back(field: DeformationField) -> None:
-    before = field.to_canonical.clone(), field.to_time.clone()
-    pair = torch.empty(*field.shape, 3), torch.empty(*field.shape, 3)
-    field.read(2, pair)
-    assert torch.equal(pair[0], before[0][2]) and torch.equal(pair[1], before[1][2])
-    pair[0].add_(1)
-    assert torch.equal(field.to_canonical, before[0])
-    field.write(2, pair)
-    assert torch.equal(field.to_canonical[2], before[0][2] + 1)
-    assert torch.equal(field.to_canonical[[0, 1, 3]], before[0][[0, 1, 3]])
-    assert torch.equal(field.to_time, before[1])
-    with pytest.raises(IndexError, match="only 1 to 3"):
-        field.write(0, pair)
-
-
-def test_what_is_on_its_way_counts_no_more_once_it_has_been_written(
-    field: DeformationField,
-) -> None:
-    pair, stream = (field.to_canonical[1], field.to_time[1]), object()
-    field._coming = {1: (pair, stream), 2: (pair, stream)}  # type: ignore[dict-item]
-    field.write(1, pair)
-    assert list(field._coming) == [2]
-    field.resize(4**3)
-    assert field._coming == {}
-
-
-def test_what_is_on_its_way_from_the_host_is_not_copied(field: DeformationField) -> None:
-    stream: Any = (number for number in ())  # like a stream, nothing that can be copied
-    field._coming = {1: ((field.to_time[1], field.to_time[1]), stream)}
-    assert copy.deepcopy(field)._coming == {}
-    field._coming = {}

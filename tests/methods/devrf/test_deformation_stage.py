@@ -15,16 +15,16 @@ from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import score
-from devrf.methods.devrf.compact_state import compact_state, expanded_state
+from devrf.methods.devrf.compact_state import expanded_state
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
-from devrf.methods.devrf.renderer import Renderer
-from devrf.methods.devrf.schedules import DeformationSchedule
 from devrf.methods.devrf.settings import DEFORMATION_LOSS, MotionSettings
 from devrf.ops.total_variation import total_variation
+from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene
 
 SHORT = DeformationSchedule(sides=(4, 8), iterations_per_frame=(20, 10), rays=256)
-FAST = MotionSettings(learning_rate=5e-3, views="all", pixels="useful")
+FAST = MotionSettings(learning_rate=5e-3, views="all", pixels="occupied")
 
 
 def test_two_steps_move_the_first_frame_only(
@@ -39,7 +39,7 @@ def test_two_steps_move_the_first_frame_only(
     assert stage.field.to_canonical[1].abs().max() < 2.5e-3
     for frames in (stage.field.to_canonical, stage.field.to_time):
         assert not frames[0].any() and not frames[2].any()
-    for name, value in stage.model.canonical.named_parameters():
+    for name, value in stage.scene_model.canonical.named_parameters():
         assert torch.equal(value, before[name])
 
 
@@ -54,13 +54,13 @@ def test_a_whole_schedule_sees_the_motion_better_than_the_rest_pose(
     fit = trainer(max_epochs=1)
     fit.fit(stage, datamodule=datamodule)
     assert stage.iteration == stage.total_iterations == 180
-    assert stage.resolution == stage.model.canonical.box.grid_shape(8**3)
+    assert stage.resolution == stage.scene_model.canonical.box.grid_shape(8**3)
     for frames in (stage.field.to_canonical, stage.field.to_time):
         assert not frames[0].any()
         assert (frames[1:].abs().amax(dim=(1, 2, 3, 4)) > 1e-3).all()
     # Two views of three frames: at rest there is nothing to win.
-    player, train = Renderer(stage.model), tiny_scene.dynamic.train
-    views = [score(player, train, k, "white") for k in range(6)]
+    renderer, train = Renderer(stage.scene_model), tiny_scene.dynamic.train
+    views = [score(renderer, train, k, "white") for k in range(6)]
     gains = [view.psnr - view.rest_pose_psnr for view in views]
     assert gains[:2] == [0.0, 0.0]
     assert min(gains[2:]) > 0.5 and sum(gains[2:]) / 4 > 1
@@ -73,11 +73,11 @@ class Peak(Callback):
     values: Tensor
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: Any, *args: Any) -> None:
-        pl_module.visits[0].forward.data[1, 1, 1] = 0.5
-        self.values = pl_module.visits[0].forward.detach().clone().requires_grad_()
+        pl_module.active[0].forward.data[1, 1, 1] = 0.5
+        self.values = pl_module.active[0].forward.detach().clone().requires_grad_()
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, *args: Any) -> None:
-        self.mean = pl_module.optimizer.state[pl_module.visits[0].forward]["mean"].clone()
+        self.mean = pl_module.optimizer.state[pl_module.active[0].forward]["mean"].clone()
 
 
 def test_total_variation_alone_smooths_both_directions(
@@ -95,20 +95,20 @@ def test_total_variation_alone_smooths_both_directions(
 
 
 class Look(Callback):
-    """Notes the frame's slices, and what others see of them, in the midst of a visit."""
+    """Notes the active frame's slices, and what others see of them while it is learned."""
 
     def __init__(self) -> None:
         self.seen: list[tuple[Tensor, Tensor, Tensor]] = []
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, *args: Any) -> None:
-        name = "scene_model.deformation.to_time"
-        frame, learned = pl_module.visits[0].frame, pl_module.visits[0].forward.detach().clone()
+        name = "scene_model.deformation.frames.to_time"
+        frame, learned = pl_module.active[0].number, pl_module.active[0].forward.detach().clone()
         stored = pl_module.state_dict()[name][frame].clone()
-        field = pl_module.model.deformation
+        field = pl_module.current_model().deformation
         self.seen.append((learned, stored, field.to_time[frame].clone()))
 
 
-def test_whoever_looks_in_the_midst_of_a_visit_sees_what_it_has_learned(
+def test_state_and_model_hold_what_an_active_frame_has_learned(
     rest: LoadedCheckpoint, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
 ) -> None:
     stage, look = DeformationStage(rest, SHORT, FAST, iterations_per_step=7), Look()
@@ -117,10 +117,10 @@ def test_whoever_looks_in_the_midst_of_a_visit_sees_what_it_has_learned(
     for learned, stored, seen in look.seen:
         assert learned.any()
         assert torch.equal(stored, learned) and torch.equal(seen, learned)
-    # The last visit is put back, and what happens to the field later is its own affair.
+    # The last frame was written back; the field is no longer tied to it.
     assert torch.equal(stage.field.to_time[2], look.seen[-1][0])
     stage.field.to_time[2] += 1
-    assert torch.equal(stage.model.deformation.to_time[2], look.seen[-1][0] + 1)
+    assert torch.equal(stage.scene_model.deformation.to_time[2], look.seen[-1][0] + 1)
 
 
 @pytest.mark.parametrize("half", [False, True])
@@ -140,9 +140,9 @@ def test_where_the_field_rests_changes_what_is_learned_by_its_rounding_alone(
         assert stage.field.to_time.dtype == (torch.float16 if rounded else torch.float32)
         fields.append(stage.field.to_canonical.float())
         # What is kept of it, and pictures of it, do not depend on how it rests.
-        model = expanded_state(compact_state(stage.model))
-        assert model["deformation.to_time"].dtype == torch.float32
-        assert score(Renderer(stage.model), tiny_scene.dynamic.train, 5, "white").psnr > 10
+        state = expanded_state(stage.scene_model.stored_state())
+        assert state["deformation.frames.to_time"].dtype == torch.float32
+        assert score(Renderer(stage.scene_model), tiny_scene.dynamic.train, 5, "white").psnr > 10
     if half:
         assert not torch.equal(*fields)
         torch.testing.assert_close(*fields, atol=0.05, rtol=0)

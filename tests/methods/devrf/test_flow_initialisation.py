@@ -51,10 +51,10 @@ def test_wrong_flow_of_a_few_pixels_is_outvoted() -> None:
     assert (moved - tracks.canonical - SHIFT).norm(dim=1).median() < 0.05
 
 
-def test_without_tracks_the_frame_stays_where_it_was_carried_to() -> None:
+def test_without_tracks_the_frame_stays_where_the_one_before_is() -> None:
     field = DeformationField(BOX, FrameClock((0.0, 0.5, 1.0)), voxels=4**3)
     field.to_canonical[1] = 0.25
-    field.carry(2)
+    field.frames.copy_previous(2)
     nothing = Tracks(torch.zeros(0, 3), torch.zeros(0, dtype=torch.long), torch.zeros(0, 2))
     start_from_tracks(field, 2, nothing, three_cameras())
     assert torch.equal(field.to_canonical[2], field.to_canonical[1])

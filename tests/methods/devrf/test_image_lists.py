@@ -14,15 +14,17 @@ from devrf.methods.devrf import image_lists as module
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.image_lists import ListRenderer
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.renderer import Renderer
-from devrf.methods.devrf.volume_rendering import RenderSettings, render
-from devrf.ops.choice import using
+from devrf.methods.devrf.settings import RenderSettings
+from devrf.methods.devrf.volume_rendering import render
+from devrf.ops.dispatch import using
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.rendered_image import RenderedImage
+from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene
 
 WHITE = torch.ones(3)
 Same = Callable[[RenderedImage, RenderedImage], None]
+Picture = Callable[[DeVRFModel, Rays, float, torch.Tensor], RenderedImage]
 
 
 @pytest.fixture
@@ -31,22 +33,22 @@ def searches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     capacities: list[int] = []
     inner: Callable[..., object] = module.search
 
-    def valid_mask(*arguments: object, capacity: int, **named: object) -> object:
+    def counted(*arguments: object, capacity: int, **named: object) -> object:
         capacities.append(capacity)
         return inner(*arguments, capacity=capacity, **named)
 
-    monkeypatch.setattr(module, "search", valid_mask)
+    monkeypatch.setattr(module, "search", counted)
     return capacities
 
 
 @pytest.mark.parametrize("time", [0.0, 0.4, 0.7])
 def test_what_the_renderer_shows(
-    moving: DeVRFModel, tiny_scene: Scene, time: float, same: Same
+    moving: DeVRFModel, tiny_scene: Scene, time: float, same: Same, reference: Picture
 ) -> None:
-    rays, ready = tiny_scene.dynamic.test.cameras.image_rays(0), Renderer(moving).ready(time)
+    rays, view = tiny_scene.dynamic.test.cameras.image_rays(0), moving.at(time)
     renderer = ListRenderer(moving.canonical, moving.settings, half=True)  # not on a CPU
-    seen = renderer.picture(rays, ready.occupancy, ready.displacement, WHITE)
-    same(seen, moving.picture(rays, time, WHITE))
+    seen = renderer.picture(rays, view.occupancy, view.displacement, WHITE)
+    same(seen, reference(moving, rays, time, WHITE))
     assert int((seen.opacity > 0.5).sum()) > 20
 
 
@@ -89,14 +91,14 @@ def test_rays_that_meet_nothing(moving: DeVRFModel) -> None:
 
 @pytest.mark.skipif(os.environ["TRITON_INTERPRET"] != "1", reason="needs Triton's interpreter")
 @pytest.mark.parametrize("time", [0.0, 0.7])
-def test_the_player_shows_the_same_with_triton(
+def test_the_renderer_shows_the_same_with_triton(
     moving: DeVRFModel, tiny_scene: Scene, searches: list[int], time: float, same: Same
 ) -> None:
     pytest.importorskip("triton")
-    player, cameras = Renderer(moving), tiny_scene.dynamic.test.cameras.resized(5, 4)
+    renderer, cameras = Renderer(moving), tiny_scene.dynamic.test.cameras.resized(5, 4)
     with using("torch"):
-        plain = player.view(cameras, 0, time, 1.0)
+        plain = renderer.view(cameras, 0, time, 1.0)
     assert not searches
     with using("triton"):
-        same(player.view(cameras, 0, time, 1.0), plain)
+        same(renderer.view(cameras, 0, time, 1.0), plain)
     assert searches and (plain.opacity > 0.5).any()

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 import torch
 
+from devrf.data.batch import RayBatch
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.geometry.rays import Rays
+from devrf.methods.devrf import view
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.deformation_field import DeformationField
-from devrf.methods.devrf.model import DeVRFModel, deformed_occupancy
+from devrf.methods.devrf.deformed_occupancy import deformed_occupancy
+from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import RenderSettings
 from devrf.rendering.occupancy import Occupancy, dilate
+from devrf.rendering.rendered_image import RenderedImage
+from devrf.rendering.renderer import Renderer
 
 SIDE = 11
 SETTINGS = RenderSettings(step=0.5, alpha_threshold=1e-3, near=0.0, far=9.0)
@@ -23,7 +30,8 @@ def model(cube: Box) -> DeVRFModel:
     """A red ball-like block in the middle that moves by +0.4 along x until t = 1."""
     mask = torch.zeros(SIDE, SIDE, SIDE, dtype=torch.bool)
     mask[5:7, 4:7, 4:7] = True
-    canonical = Architecture().search_field(cube, SIDE**3)
+    build = Architecture()
+    canonical = build.search_field(cube, SIDE**3)
     with torch.no_grad():
         canonical.density.values[mask] = 40.0
         canonical.color.values.copy_(torch.tensor([9.0, -9.0, -9.0]).expand(11, 11, 11, 3))
@@ -31,7 +39,7 @@ def model(cube: Box) -> DeVRFModel:
     for frame, way in ((1, 0.2), (2, 0.4)):
         deformation.to_canonical[frame, ..., 0] = -way
         deformation.to_time[frame, ..., 0] = way
-    return DeVRFModel(canonical, Occupancy(dilate(mask, 1), cube), SETTINGS, deformation)
+    return DeVRFModel(build, canonical, Occupancy(dilate(mask, 1), cube), SETTINGS, deformation)
 
 
 def looking_down(count: int) -> Rays:
@@ -42,10 +50,14 @@ def looking_down(count: int) -> Rays:
     return Rays(origins, d, d)
 
 
+def picture(model: DeVRFModel, rays: Rays, time: float, background: float = 1.0) -> RenderedImage:
+    return Renderer(model).picture(rays, time, background)
+
+
 def middle(model: DeVRFModel, time: float) -> float:
     """Where along x the block is seen at ``time``."""
     rays = looking_down(191)
-    opacity = model.picture(rays, time, torch.zeros(3)).opacity
+    opacity = picture(model, rays, time, 0.0).opacity
     assert 20 < float(opacity.sum()) < 60
     return float((rays.origins[:, 0] * opacity).sum() / opacity.sum())
 
@@ -58,8 +70,8 @@ def test_the_block_is_seen_where_it_has_moved(model: DeVRFModel, time: float, wa
 
 def test_at_rest_nothing_is_warped(model: DeVRFModel) -> None:
     assert model.warp(0.0) is None and model.occupancy_at(0.0) is model.occupancy
-    moving, model.deformation = model.picture(looking_down(31), 0.0, torch.ones(3)), None
-    still = model.picture(looking_down(31), 0.7, torch.ones(3))
+    moving, model.deformation = picture(model, looking_down(31), 0.0), None
+    still = picture(model, looking_down(31), 0.7)
     assert torch.equal(moving.color, still.color) and torch.equal(moving.depth, still.depth)
 
 
@@ -71,17 +83,17 @@ def test_occupancy_moves_with_the_matter(model: DeVRFModel) -> None:
 
 def test_deformed_occupancy_by_hand(model: DeVRFModel) -> None:
     shift = torch.tensor([0.0, 0.4, 0.0])
-    found = deformed_occupancy(model, lambda points: points + shift)
+    found = deformed_occupancy(model.occupancy, model.canonical, lambda points: points + shift)
     assert torch.equal(found.mask, dilate(torch.roll(model.occupancy.mask, -2, dims=1), 1))
     assert found.box == model.canonical.box
 
 
-def test_chunks_do_not_show(model: DeVRFModel) -> None:
-    whole = model.picture(looking_down(50), 0.5, torch.ones(3))
-    parts = model.picture(looking_down(50), 0.5, torch.ones(3), chunk=7)
-    torch.testing.assert_close(parts.color, whole.color)
-    torch.testing.assert_close(parts.depth, whole.depth)
-    torch.testing.assert_close(parts.opacity, whole.opacity)
+def test_chunks_do_not_show(
+    model: DeVRFModel, monkeypatch: pytest.MonkeyPatch, same: Callable[..., None]
+) -> None:
+    whole = picture(model, looking_down(50), 0.5)
+    monkeypatch.setattr(view, "ON_CPU", 7)
+    same(picture(model, looking_down(50), 0.5), whole)
 
 
 def test_depth_is_the_distance_of_the_face_and_zero_beside_it(model: DeVRFModel) -> None:
@@ -89,16 +101,60 @@ def test_depth_is_the_distance_of_the_face_and_zero_beside_it(model: DeVRFModel)
         torch.tensor([[0.1, 0.0, 3.0], [-0.9, 0.0, 3.0]]),
         *[torch.tensor([[0.0, 0.0, -1.0]] * 2)] * 2,
     )
-    picture = model.picture(rays, 0.0, torch.ones(3))
+    seen = picture(model, rays, 0.0)
     # The block ends between the grid points 0.2 and 0.4 of z.
-    assert 2.6 <= picture.depth[0].item() <= 2.8
-    assert picture.depth[1].item() == 0
-    torch.testing.assert_close(picture.color[1], torch.ones(3))
-    assert picture.color[0, 0] > 0.99 and picture.color[0, 1] < 0.01
+    assert 2.6 <= seen.depth[0].item() <= 2.8
+    assert seen.depth[1].item() == 0
+    torch.testing.assert_close(seen.color[1], torch.ones(3))
+    assert seen.color[0, 0] > 0.99 and seen.color[0, 1] < 0.01
 
 
-def test_the_rest_state_is_the_same_at_every_time(model: DeVRFModel) -> None:
-    rest = model.at_rest()
-    assert middle(rest, 1.0) == middle(model, 0.0)
-    # It shares the fields: what is learned later shows in both.
-    assert rest.canonical is model.canonical and model.deformation is not None
+@pytest.fixture
+def batch() -> RayBatch:
+    """Fifteen rays at three times in turn, each with a background of its own."""
+    rays, frame = looking_down(15), torch.arange(15) % 3
+    return RayBatch(
+        rays=rays,
+        color=torch.zeros(15, 3),
+        alpha=None,
+        background=torch.linspace(0, 1, 45).view(15, 3),
+        time=frame / 2,
+        frame=frame,
+        image=torch.zeros(15, dtype=torch.long),
+        pixel=torch.zeros(15, 2),
+        flow=None,
+        flow_valid=None,
+    )
+
+
+def test_a_batch_is_seen_ray_by_ray_at_its_own_time(
+    model: DeVRFModel, batch: RayBatch, reference: Callable[..., RenderedImage]
+) -> None:
+    seen = model(batch)
+    for time in (0.0, 0.5, 1.0):
+        own = (batch.time == time).nonzero()[:, 0]
+        alone = reference(model, batch.rays[own], time, batch.background[own])
+        torch.testing.assert_close(seen.color[own], alone.color)
+        torch.testing.assert_close(seen.depth[own], alone.depth)
+        torch.testing.assert_close(seen.transmittance[own], 1 - alone.opacity)
+        assert alone.opacity.max() > 0.9
+    # Samples stand in the order of the batch's rays.
+    ray = seen.samples.ray
+    assert seen.samples.rays == 15 and torch.equal(ray, ray.sort().values)
+    torch.testing.assert_close(seen.samples.points[:, 0], batch.rays.origins[ray, 0])
+    moved = seen.samples.points[:, 0] - seen.canonical[:, 0]
+    torch.testing.assert_close(moved, 0.4 * batch.time[ray], atol=1e-5, rtol=0)
+    terms = model.loss_terms(seen, batch)
+    terms["color"].backward()
+    assert model.canonical.density.values.grad is not None
+    assert model.canonical.density.values.grad.any()
+
+
+def test_a_model_built_from_its_config_takes_its_state(model: DeVRFModel) -> None:
+    other = DeVRFModel.from_config(model.config())
+    other.load_stored_state(model.state_dict())
+    assert other.config() == model.config() and other.size == model.size
+    assert other.moves and other.box == model.box
+    rays = looking_down(31)
+    for time in (0.0, 0.8):
+        assert torch.equal(picture(other, rays, time).color, picture(model, rays, time).color)

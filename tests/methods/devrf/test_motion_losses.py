@@ -17,9 +17,9 @@ from devrf.methods.devrf.motion_losses import (
     cycle,
     flow,
     induced_flow,
-    total_variation_weight,
 )
-from devrf.methods.devrf.volume_rendering import RenderOutput
+from devrf.methods.devrf.smoothing import total_variation_weight
+from devrf.methods.devrf.volume_rendering import VoxelOutput
 from devrf.rendering.sampling import Samples
 from devrf.scenes.procedural import Material, ProceduralScene
 from devrf.scenes.scene import Scene
@@ -31,10 +31,10 @@ def seen(
     points: Tensor,
     canonical: Tensor,
     weight: Tensor,
-) -> RenderOutput:
+) -> VoxelOutput:
     """An output that holds what the motion terms look at."""
     rays = len(batch.rays)
-    return RenderOutput(
+    return VoxelOutput(
         color=torch.zeros(rays, 3),
         depth=torch.zeros(rays),
         transmittance=torch.zeros(rays),
@@ -66,6 +66,8 @@ def by_hand() -> MotionPrediction:
         color=torch.zeros(2, 3),
         alpha=None,
         background=torch.zeros(3),
+        time=torch.ones(2),
+        frame=torch.ones(2, dtype=torch.long),
         image=image,
         pixel=pixel,
         flow=torch.tensor([[-1.0, 0.5], [9.0, 9.0]]),
@@ -167,8 +169,7 @@ def test_induced_flow_of_the_exact_motion_is_the_exact_flow(
 
 
 def test_total_variation_weight_by_hand() -> None:
-    assert total_variation_weight(1.0, 160, 8192) == pytest.approx(160 / 128 / 8192 / 6)
-    assert total_variation_weight(2.0, 64, 100) == pytest.approx(2 * 0.5 / 100 / 6)
+    assert total_variation_weight(2.0, 64, 100) == pytest.approx(1 / 600)
 
 
 def test_motion_terms_name_the_papers() -> None:

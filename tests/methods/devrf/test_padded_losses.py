@@ -13,7 +13,7 @@ from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.methods.devrf.grid_warp import GridWarp
 from devrf.methods.devrf.motion_losses import MOTION_TERMS, MotionPrediction
-from devrf.methods.devrf.volume_rendering import RenderOutput
+from devrf.methods.devrf.volume_rendering import VoxelOutput
 from devrf.rendering.sampling import Samples
 
 RAYS = 6
@@ -40,18 +40,19 @@ class Case:
         pose = torch.cat([upright, position[..., None]], dim=2)
         cameras = Cameras(pose, 20 + draw(7, 2, 2), 8 + draw(8, 2, 2), 16, 16)
         flow_valid = torch.tensor([True, False, True, True, False, True])
-        # What is not valid may be anything.
-        flow = torch.where(flow_valid[:, None], 4 * draw(9, RAYS, 2), torch.nan)
+        flow = torch.where(flow_valid[:, None], 4 * draw(9, RAYS, 2), 0.0)
         image, pixel = torch.tensor([1, 1, 0, 1, 0, 1]), 16 * draw(10, RAYS, 2)
         self.batch = RayBatch(
-            cameras.rays(image, pixel),
-            draw(11, RAYS, 3),
-            draw(12, RAYS),
-            torch.zeros(3),
-            image,
-            pixel,
-            flow,
-            flow_valid,
+            rays=cameras.rays(image, pixel),
+            color=draw(11, RAYS, 3),
+            alpha=draw(12, RAYS),
+            background=torch.zeros(3),
+            time=torch.ones(RAYS),
+            frame=torch.ones(RAYS, dtype=torch.long),
+            image=image,
+            pixel=pixel,
+            flow=flow,
+            flow_valid=flow_valid,
         )
         self.cameras = cameras
 
@@ -72,14 +73,14 @@ class Case:
             canonical = torch.cat([canonical, elsewhere])
             weight = torch.cat([weight, weight.new_zeros(self.padding)])
             present = torch.arange(len(ray)) < len(self.ray)
-        output = RenderOutput(
-            draw(14, RAYS, 3),
-            draw(15, RAYS),
-            draw(16, RAYS),
-            Samples(ray, draw(17, len(ray)), points, RAYS, present),
-            canonical,
-            weight,
-            color,
+        output = VoxelOutput(
+            color=draw(14, RAYS, 3),
+            depth=draw(15, RAYS),
+            transmittance=draw(16, RAYS),
+            samples=Samples(ray, draw(17, len(ray)), points, RAYS, present),
+            canonical=canonical,
+            weight=weight,
+            sample_color=color,
         )
         return MotionPrediction(
             output,

@@ -20,7 +20,7 @@ from devrf.methods.devrf.photometric_losses import (
     matte,
     per_sample_color,
 )
-from devrf.methods.devrf.volume_rendering import RenderOutput
+from devrf.methods.devrf.volume_rendering import VoxelOutput
 from devrf.methods.weighted_loss import WeightedLoss
 from devrf.rendering.sampling import Samples
 
@@ -34,7 +34,7 @@ def prediction() -> Prediction:
     sample_color = torch.tensor(
         [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.5, 0.5, 0.5]], requires_grad=True
     )
-    output = RenderOutput(
+    output = VoxelOutput(
         color=torch.tensor([[0.5, 0.25, 0.0], [0.0, 0.0, 0.0], [0.4, 0.4, 0.4]]),
         depth=torch.zeros(3),
         transmittance=torch.tensor([0.25, 1.0, 0.2]),
@@ -48,6 +48,8 @@ def prediction() -> Prediction:
         color=torch.tensor([[1.0, 0.25, 0.0], [0.0, 0.0, 0.6], [0.4, 0.4, 0.1]]),
         alpha=torch.tensor([1.0, 0.0, 0.5]),
         background=torch.zeros(3),
+        time=torch.zeros(3),
+        frame=torch.zeros(3, dtype=torch.long),
         image=torch.zeros(3, dtype=torch.long),
         pixel=torch.zeros(3, 2),
         flow=None,

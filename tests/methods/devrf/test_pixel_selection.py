@@ -20,8 +20,10 @@ def test_no_pixel_that_meets_matter_is_left_out(cube: Box, width: int, height: i
     mask = torch.zeros(20, 20, 20, dtype=torch.bool)
     mask[3, 14, 9] = mask[12:14, 5, 5:8] = True
     occupancy = Occupancy(dilate(mask, 1), cube)
+    build = Architecture()
     model = DeVRFModel(
-        Architecture().search_field(cube, 20**3),
+        build,
+        build.search_field(cube, 20**3),
         occupancy,
         RenderSettings(step=0.5, alpha_threshold=1e-3, near=0.1, far=9.0),
     )

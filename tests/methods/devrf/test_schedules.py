@@ -9,13 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from devrf.engine.phase import in_words
 from devrf.errors import DevrfError
-from devrf.methods.devrf.schedules import (
-    CanonicalPhase,
-    CanonicalSchedule,
-    DeformationPhase,
-    DeformationSchedule,
-)
+from devrf.methods.devrf.canonical_schedule import CanonicalPhase, CanonicalSchedule
+from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule
 
 
 def canonical_phases(schedule: CanonicalSchedule) -> list[CanonicalPhase]:
@@ -84,9 +81,9 @@ def test_deformation_forward_facing_is_the_papers() -> None:
     assert schedule.growths(40) == [8000, 16000, 20000, 22000]
 
 
-def test_frames_are_carried_at_the_coarsest_level_only() -> None:
+def test_frames_start_from_the_one_before_at_the_coarsest_level_only() -> None:
     for phase in deformation_phases(DeformationSchedule(), 6):
-        assert phase.carries == (phase.level == 0 and phase.frames[0] >= 2)
+        assert phase.init_from_previous == (phase.level == 0 and phase.frames[0] >= 2)
 
 
 def test_without_coarse_to_fine_every_share_goes_to_the_finest_grid() -> None:
@@ -121,11 +118,11 @@ def test_frames_of_two_stretches_are_visited_together() -> None:
     ]
     assert schedule.total(14) == 112 and schedule.growths(14) == [84]
     phases = deformation_phases(schedule, 14)
-    assert [p.carries for p in phases] == [False] + [True] * 12 + [False] * 7
-    # Nobody has learned frame 6 at level 1 when frame 7 is.
-    assert [p.follows for p in phases] == [True] * 13 + [False] + [True] * 6
-    assert (schedule.beside(0, 14), schedule.beside(1, 14)) == (1, 2)
-    assert (phases[0].in_words, phases[14].in_words) == ("frame 1", "frames 1, 8")
+    assert [p.init_from_previous for p in phases] == [False] + [True] * 12 + [False] * 7
+    # Frame 6 has not been learned at level 1 when frame 7 is.
+    assert [p.has_previous for p in phases] == [True] * 13 + [False] + [True] * 6
+    assert (schedule.max_parallel_frames(0, 14), schedule.max_parallel_frames(1, 14)) == (1, 2)
+    assert tuple(in_words(phases[k].frames) for k in (0, 14)) == ("frame 1", "frames 1, 8")
 
 
 @pytest.mark.parametrize(
@@ -147,7 +144,7 @@ def test_stretches_of_all_kinds(frames: int, at_once: int, visits: list[tuple[in
     )
     found = [visit for visit in course(schedule, frames) if visit[0] == 1]
     assert [visited for _, visited, _, _ in found] == visits
-    assert schedule.beside(1, frames) == max(len(visit) for visit in visits)
+    assert schedule.max_parallel_frames(1, frames) == max(len(visit) for visit in visits)
     assert schedule.total(frames) - frames == 3 * max(2, -(-frames // at_once))
 
 
@@ -166,7 +163,7 @@ def test_without_coarse_to_fine_the_finest_level_says_how_many() -> None:
         sides=(4, 6), iterations_per_frame=(2, 1), coarse_to_fine=False, parallel_frames=(1, 2)
     )
     assert course(schedule, 4) == [(0, (2,), 0, 3), (0, (1, 3), 3, 6)]
-    assert not any(phase.carries for phase in deformation_phases(schedule, 4))
+    assert not any(phase.init_from_previous for phase in deformation_phases(schedule, 4))
     # From rest, several may begin at once.
     assert replace(schedule, rays=9).parallel_frames == (2,)
 
@@ -224,7 +221,7 @@ def test_deformation_phases_tile_every_schedule(
     assert begun == [0, *schedule.growths(frames)]
     for level in range(depth):
         most = max(len(p.frames) for p in phases if p.level == level)
-        assert most == schedule.beside(level, frames)
+        assert most == schedule.max_parallel_frames(level, frames)
     assert schedule.phase(schedule.total(frames) + 3, frames) == phases[-1]
 
 

@@ -11,9 +11,10 @@ from devrf.geometry.rays import Rays
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.grid_warp import GridWarp
-from devrf.methods.devrf.static_shape import render_in_lists
-from devrf.methods.devrf.volume_rendering import RenderOutput, RenderSettings, render
-from devrf.ops.choice import Kind, using
+from devrf.methods.devrf.settings import RenderSettings
+from devrf.methods.devrf.static_shape import render_static
+from devrf.methods.devrf.volume_rendering import VoxelOutput, render
+from devrf.ops.dispatch import Kind, using
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.sample_capacity import SampleCapacity
 from devrf.rendering.sampling import most_steps, steps_through
@@ -56,18 +57,18 @@ class World:
     def leaves(self) -> list[Tensor]:
         return [*self.field.parameters(), *self.slices]
 
-    def exactly(self) -> RenderOutput:
+    def exactly(self) -> VoxelOutput:
         return render(self.rays, self.field, self.occupancy, SETTINGS, self.behind, self.warp)
 
-    def listed(self, room: SampleCapacity) -> RenderOutput:
-        return render_in_lists(
+    def listed(self, capacity: SampleCapacity) -> VoxelOutput:
+        return render_static(
             self.rays,
             self.field,
             self.occupancy,
             SETTINGS,
             self.behind,
             self.warp if self.slices else None,
-            room,
+            capacity,
         )
 
 
@@ -77,24 +78,24 @@ def spacious() -> SampleCapacity:
 
 def fitting() -> SampleCapacity:
     """Just enough: the interpreter takes its time over padding, too."""
-    room = spacious()
-    room.visible = room.heavy = 240
-    return room
+    capacity = spacious()
+    capacity.visible = capacity.significant = 240
+    return capacity
 
 
-def learn(output: RenderOutput, leaves: list[Tensor]) -> list[Tensor]:
+def learn(output: VoxelOutput, leaves: list[Tensor]) -> list[Tensor]:
     """Gradients of :func:`worth`."""
     return list(torch.autograd.grad(worth(output), leaves))
 
 
-def worth(output: RenderOutput) -> Tensor:
+def worth(output: VoxelOutput) -> Tensor:
     """Something that every part of the output has a share in."""
     tilt = torch.linspace(-1, 1, RAYS, dtype=output.color.dtype)
     by_sample = output.weight * (output.sample_color.sum(1) + output.canonical.sum(1).square())
     return (output.color.sum(1) * tilt + output.transmittance * tilt).sum() + by_sample.sum()
 
 
-def kept(output: RenderOutput) -> slice | Tensor:
+def kept(output: VoxelOutput) -> slice | Tensor:
     present = output.samples.present
     return slice(None) if present is None else present.nonzero()[:, 0]
 
@@ -150,60 +151,60 @@ def test_gradients_that_are_there_are_added_to_in_place(kind: Kind) -> None:
 
 
 def test_padding_is_no_sample_and_the_room_is_told() -> None:
-    world, room = World(torch.float64, 1), spacious()
+    world, capacity = World(torch.float64, 1), spacious()
     with using("torch"):
-        exact, listed = world.exactly(), world.listed(room)
+        exact, listed = world.exactly(), world.listed(capacity)
     present = listed.samples.present
-    assert present is not None and len(present) == room.heavy
+    assert present is not None and len(present) == capacity.significant
     assert int(present.sum()) == len(exact.samples)
     assert not listed.weight[~present].any()
     assert bool(torch.isfinite(listed.canonical).all() & torch.isfinite(listed.sample_color).all())
     assert int(listed.samples.ray.min()) >= 0 and int(listed.samples.ray.max()) < RAYS
     # The most that was needed, until somebody looks.
-    room.note(torch.tensor(3), torch.tensor(2))
-    room.visible = room.heavy = 4096
-    assert room.measure()
+    capacity.note(torch.tensor(3), torch.tensor(2))
+    capacity.visible = capacity.significant = 4096
+    assert capacity.measure()
     spare = SampleCapacity.SPARE * len(exact.samples)
-    assert spare <= room.heavy < spare + SampleCapacity.GRAIN
+    assert spare <= capacity.significant < spare + SampleCapacity.GRAIN
 
 
 def test_lists_that_are_too_short_lose_the_last_rays_alone_and_grow(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    world, room = World(torch.float64, 1), spacious()
+    world, capacity = World(torch.float64, 1), spacious()
     with using("torch"), caplog.at_level("INFO", logger="devrf"):
         exact = world.exactly()
-        room.heavy = half = len(exact.samples) // 2
-        cut = world.listed(room)
+        capacity.significant = half = len(exact.samples) // 2
+        cut = world.listed(capacity)
         whole = exact.samples.ray[half - 1]
         torch.testing.assert_close(cut.color[:whole], exact.color[:whole])
         assert not torch.allclose(cut.color, exact.color)
-        assert not room.look() and room.look()  # asked, then answered
-        again = world.listed(room)
+        assert not capacity.poll() and capacity.poll()  # asked, then answered
+        again = world.listed(capacity)
         torch.testing.assert_close(again.color, exact.color)
         assert torch.equal(cut.transmittance, exact.transmittance)
-        room.visible = room.heavy = half
-        cut = world.listed(room)
+        capacity.visible = capacity.significant = half
+        cut = world.listed(capacity)
         assert torch.equal(cut.color[0], exact.color[0])
         assert torch.equal(cut.color[-1], world.behind[-1])
     assert sum("lists grow" in line for line in caplog.messages) == 1
 
 
 def test_room_grows_by_half_at_least_and_shrinks_only_from_great_waste() -> None:
-    room = SampleCapacity(64, torch.device("cpu"))
-    room.visible, room.heavy = 4096, 1024
+    capacity = SampleCapacity(64, torch.device("cpu"))
+    capacity.visible, capacity.significant = 4096, 1024
 
-    def needing(visible: int, heavy: int) -> tuple[int, int]:
-        room.note(torch.tensor(visible), torch.tensor(heavy))
-        room.look(), room.look()
-        return room.visible, room.heavy
+    def needing(visible: int, significant: int) -> tuple[int, int]:
+        capacity.note(torch.tensor(visible), torch.tensor(significant))
+        capacity.poll(), capacity.poll()
+        return capacity.visible, capacity.significant
 
     assert needing(4097, 800) == (6144, 1024)
     assert needing(20000, 1024) == (25088, 1024)  # 1.25 times what was needed, in 256s
     assert needing(6000, 512) == (25088, 1024)
     assert needing(1000, 100) == (5120, 512)
-    room.note(torch.tensor(900), torch.tensor(400))
-    assert room.measure() and (room.visible, room.heavy) == (1280, 512)
+    capacity.note(torch.tensor(900), torch.tensor(400))
+    assert capacity.measure() and (capacity.visible, capacity.significant) == (1280, 512)
     assert needing(4000, 4000) == (5120, 5120)
 
 

@@ -13,7 +13,8 @@ from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField
-from devrf.methods.devrf.volume_rendering import RenderSettings, render
+from devrf.methods.devrf.settings import RenderSettings
+from devrf.methods.devrf.volume_rendering import render
 from devrf.rendering.occupancy import Occupancy
 
 SIDE = 21

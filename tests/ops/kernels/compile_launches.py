@@ -21,7 +21,7 @@ from triton.compiler import ASTSource
 from triton.runtime.jit import JITFunction
 
 import devrf.ops.kernels
-from devrf.ops import choice
+from devrf.ops import dispatch
 from devrf.ops.selfcheck import CASES, Draw, interpolation, sample_search, warped_depths
 
 POINTERS = {
@@ -78,9 +78,9 @@ def kernel_names() -> set[str]:
 def main(capabilities: list[int]) -> None:
     names = kernel_names()
     JITFunction.run = record
-    choice.reaches = lambda device: True
+    dispatch.reaches = lambda device: True
     draw = Draw(torch.device("cpu"))
-    with choice.using("triton"):
+    with dispatch.using("triton"):
         for case in CASES:
             case(draw)
         # What the check leaves out: other rows of channels, and no displacement.

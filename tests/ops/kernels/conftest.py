@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from devrf.ops.choice import using
+from devrf.ops.dispatch import using
 
 Both = Callable[[Callable[[], Sequence[Tensor]]], None]
 

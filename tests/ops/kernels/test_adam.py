@@ -35,7 +35,7 @@ def test_steps(
     skip_zero: bool,
     paced: bool,
 ) -> None:
-    start, pace = 2 * draw(*shape), draw(*shape[:3], 1).abs() if paced else None
+    start, factors = 2 * draw(*shape), draw(*shape[:3], 1).abs() if paced else None
     # About half of the entries without a gradient, others in each step.
     gradients = [draw(*shape).clamp(min=0) for _ in range(2)]
 
@@ -44,7 +44,7 @@ def test_steps(
         mean, square = torch.zeros_like(start), torch.zeros_like(start)
         for number, gradient in enumerate(gradients, start=1):
             grad = gradient.clone()
-            how = rule(device, number, skip_zero=skip_zero, pace=pace)
+            how = rule(device, number, skip_zero=skip_zero, per_voxel_lr=factors)
             if smooth is None:
                 adam_step(values, grad, mean, square, how)
             else:

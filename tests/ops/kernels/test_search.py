@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from devrf.geometry.box import Box
-from devrf.ops.choice import using
+from devrf.ops.dispatch import using
 from devrf.ops.search import PackedSamples, Thresholds, find_samples
 
 Draw = Callable[..., Tensor]
@@ -50,8 +50,8 @@ def search(
 def test_the_same_samples(draw: Draw, agree: Both, frames: int) -> None:
     look = search(draw, frames)
     found = look()
-    used, heavy = int(found.first[-1]), int(found.heavy.sum())
-    assert 10 < used < 200 and 0 < heavy < used and not found.overflow
+    used, significant = int(found.first[-1]), int(found.significant.sum())
+    assert 10 < used < 200 and 0 < significant < used and not found.overflow
     agree(lambda: astuple(look()))
 
 

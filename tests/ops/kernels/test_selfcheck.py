@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from devrf.errors import DevrfError
-from devrf.ops import choice, selfcheck
-from devrf.ops.choice import passes_check
+from devrf.ops import dispatch, selfcheck
+from devrf.ops.dispatch import passes_check
 from devrf.ops.selfcheck import check_kernels
 
 
@@ -45,7 +45,7 @@ def test_a_broken_kernel_is_found_and_pytorch_runs_instead(
     monkeypatch.setattr(selfcheck, "CASES", (selfcheck.compositing,))
     with pytest.raises(DevrfError, match="compositing: off by 0.00"):
         check_kernels(device)
-    with caplog.at_level(logging.WARNING, logger=choice.__name__):
+    with caplog.at_level(logging.WARNING, logger=dispatch.__name__):
         assert not passes_check(device) and not passes_check(device)
     (record,) = caplog.records
     assert "compositing: off by" in record.getMessage()

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from devrf.ops.choice import using
+from devrf.ops.dispatch import using
 from devrf.ops.trilinear import interpolate
 
 Draw = Callable[..., Tensor]

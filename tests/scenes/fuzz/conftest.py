@@ -19,48 +19,12 @@ from hypothesis.strategies import DrawFn, SearchStrategy
 from devrf.errors import DevrfError
 from devrf.scenes.scene import Scene
 
-NUMBERS = [
-    0,
-    -1,
-    1,
-    2,
-    0.5,
-    -0.0,
-    1e-3,
-    5e-324,
-    1e-30,
-    1e5,
-    1e9,
-    1e20,
-    1e38,
-    1e300,
-    2**31,
-    2**63,
-    10**400,
-    float("nan"),
-    float("inf"),
-    float("-inf"),
-]
-TEXTS = [
-    "",
-    "a",
-    ".",
-    "..",
-    "/",
-    "../../secret",
-    "/etc/passwd",
-    "~",
-    "a\0b",
-    "\ud800",
-    "\x1b[2J\r\n",
-    "train/r_000",
-    "./train/r_000.png",
-    "images/0.png",
-    "000001",
-    "OPENCV",
-    "\U0001f916",
-    "x" * 5000,
-]
+SMALL_NUMBERS = [0, -1, 1, 2, 0.5, -0.0, 1e-3, 5e-324, 1e-30]
+LARGE_NUMBERS = [1e5, 1e9, 1e20, 1e38, 1e300, 2**31, 2**63, 10**400]
+NUMBERS = [*SMALL_NUMBERS, *LARGE_NUMBERS, float("nan"), float("inf"), float("-inf")]
+PATHS = ["../../secret", "/etc/passwd", "train/r_000", "./train/r_000.png", "images/0.png"]
+ODD_TEXTS = ["a\0b", "\ud800", "\x1b[2J\r\n", "\U0001f916", "x" * 5000]
+TEXTS = ["", "a", ".", "..", "/", "~", "000001", "OPENCV", *PATHS, *ODD_TEXTS]
 # Texts, so that every draw is a value of its own.
 CONTAINERS = [
     "[]",
@@ -150,33 +114,10 @@ def damaged_bytes(draw: DrawFn, data: bytes) -> bytes:
 
 
 LENGTHS = st.sampled_from([-1, 0, 1, 2, 3, 5, 14, 17, 2**31, 2**63, 10**15, 10**30])
-DESCRIPTIONS = st.sampled_from(
-    [
-        "<f8",
-        ">f4",
-        "<f2",
-        "|b1",
-        "|u1",
-        "<i8",
-        "<c16",
-        "|O",
-        "<U5",
-        "|S0",
-        "|V8",
-        "<M8[s]",
-        "f",
-        "",
-        "<f16",
-        "|S1000000000",
-        None,
-        3,
-        [],
-        [("a", "<f8")],
-        [("a", "|O")],
-        ("<f8", (2,)),
-        {"a": 1},
-    ]
-)
+PLAIN_TYPES = ["<f8", ">f4", "<f2", "|b1", "|u1", "<i8", "<c16", "<f16", "f"]
+OTHER_TYPES = ["|O", "<U5", "|S0", "|V8", "<M8[s]", "", "|S1000000000", ("<f8", (2,))]
+NO_TYPES = [None, 3, [], [("a", "<f8")], [("a", "|O")], {"a": 1}]
+DESCRIPTIONS = st.sampled_from([*PLAIN_TYPES, *OTHER_TYPES, *NO_TYPES])
 
 
 @st.composite
@@ -198,20 +139,9 @@ def headed_npy(draw: DrawFn, values: np.ndarray) -> bytes:
                 "descr": DESCRIPTIONS,
             }.get(key, JSON_VALUES)
         )
-    text = (
-        draw(
-            st.sampled_from(
-                [
-                    *[repr(header)] * 4,
-                    repr(header)[:-1],
-                    "(" * 150,
-                    "-" * 5000 + "1",
-                    "\t{",
-                ]
-            )
-        ).encode("latin-1", "replace")[:65000]
-        + b"\n"
-    )
+    whole = repr(header)
+    drawn = draw(st.sampled_from([*[whole] * 4, whole[:-1], "(" * 150, "-" * 5000 + "1", "\t{"]))
+    text = drawn.encode("latin-1", "replace")[:65000] + b"\n"
     version = draw(st.sampled_from([b"\1\0"] * 8 + [b"\2\0", b"\3\0", b"\0\0", b"\xff\xff"]))
     size = len(text).to_bytes(2 if version == b"\1\0" else 4, "little")
     return b"\x93NUMPY" + version + size + text + values.tobytes()
@@ -309,7 +239,7 @@ class Verdicts:
 
 
 @pytest.fixture
-def verdicts(tmp_path: Path) -> Verdicts:
+def verdicts(tmp_path) -> Verdicts:
     """The verdicts on files below ``tmp_path``."""
     return Verdicts(tmp_path)
 

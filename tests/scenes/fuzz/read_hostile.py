@@ -14,16 +14,18 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from pydantic import TypeAdapter
+
 from devrf.errors import DevrfError
 from devrf.scenes.array_files import read_numbers
 from devrf.scenes.flow_cache import load_flow
 from devrf.scenes.flow_files import read_flow_file
 from devrf.scenes.images import load_images
-from devrf.scenes.json_files import json_object
+from devrf.scenes.json_files import read_json
 from devrf.scenes.transforms import read_transforms
 
 READERS: dict[str, Callable[[Path], Any]] = {
-    "json": lambda path: json_object(path, "it is tested"),
+    "json": lambda path: read_json(path, TypeAdapter(dict[str, Any]), "it is tested"),
     "transforms": lambda path: read_transforms(path, path.parent),
     "npy": lambda path: read_numbers(path, "cameras"),
     "flow": lambda path: read_flow_file(path, width=6, height=4),

@@ -1,7 +1,6 @@
-"""Thousands of damaged files for every parser: each is read, or refused in one clear line.
+"""Damaged files for every parser: each is read, or refused in one clear line.
 
-The table says how many inputs each parser is given, and how many of them it has to refuse at
-least; the last test adds these up.
+A thousand inputs in all, or as many as DEVRF_FUZZ_INPUTS says; the table shares them out.
 """
 
 from __future__ import annotations
@@ -14,7 +13,6 @@ import shutil
 import sys
 import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -80,15 +78,11 @@ def transforms_bytes(fixture: Fixture) -> Prepared:
 def static_poses(fixture: Fixture) -> Prepared:
     folder, damage = fixture("llff_folder"), fixture("damage")
     file = folder.static / "poses_bounds.npy"
-    values = np.load(file)
-    inputs = st.one_of(
-        damage.bytes(file.read_bytes()), damage.header(values), damage.array(values).map(npy)
-    )
 
     def read(data: bytes) -> Any:
         return read_static_poses(written(file, data).parent).normalised().cameras(24, 16)
 
-    return inputs, read
+    return damaged_array(damage, np.load(file)), read
 
 
 def shared_intrinsics(fixture: Fixture) -> Prepared:
@@ -96,10 +90,9 @@ def shared_intrinsics(fixture: Fixture) -> Prepared:
     rows = np.load(folder.static / "poses_bounds.npy")
     np.save(folder.static / "poses_bounds.npy", np.delete(rows, [4, 9, 14], axis=1))
     file, values = folder.static / "hwf_cxcy.npy", np.array([64, 96, 80, 80, 48.0, 32.0])
-    inputs = st.one_of(
-        damage.bytes(npy(values)), damage.header(values), damage.array(values).map(npy)
-    )
-    return inputs, lambda data: read_static_poses(written(file, data).parent).cameras(24, 16)
+    return damaged_array(damage, values), lambda data: read_static_poses(
+        written(file, data).parent
+    ).cameras(24, 16)
 
 
 def moving_poses(fixture: Fixture) -> Prepared:
@@ -108,11 +101,7 @@ def moving_poses(fixture: Fixture) -> Prepared:
     whole = [file.read_bytes() for file in files]
 
     def of(k: int) -> SearchStrategy[Any]:
-        values = np.load(files[k])
-        damaged = st.one_of(
-            damage.bytes(whole[k]), damage.header(values), damage.array(values).map(npy)
-        )
-        return st.tuples(st.just(k), damaged)
+        return st.tuples(st.just(k), damaged_array(damage, np.load(files[k])))
 
     def read(drawn: tuple[int, bytes]) -> Any:
         for k, file in enumerate(files):
@@ -120,6 +109,12 @@ def moving_poses(fixture: Fixture) -> Prepared:
         return read_dynamic_poses(folder.dynamic).cameras(24, 16)
 
     return st.one_of(of(0), of(1)), read
+
+
+def damaged_array(damage: Any, values: np.ndarray) -> SearchStrategy[bytes]:
+    return st.one_of(
+        damage.bytes(npy(values)), damage.header(values), damage.array(values).map(npy)
+    )
 
 
 def npy(values: np.ndarray) -> bytes:
@@ -296,9 +291,13 @@ def nerfies_lists(fixture: Fixture) -> Prepared:
     def read(drawn: tuple[str, str]) -> Any:
         for name, text in whole.items():
             written(root / name, drawn[1] if name == drawn[0] else text)
-        return NerfiesDataModule(root, downscale=1, flow="none", bound_scale=1.5).load()
+        return read_nerfies(root)
 
     return inputs, read
+
+
+def read_nerfies(root: Path) -> Any:
+    return NerfiesDataModule(root, downscale=1, flow="none", bound_scale=1.5).load()
 
 
 # --- whole scenes
@@ -323,23 +322,14 @@ def nerfstudio(fixture: Fixture) -> Prepared:
     root = nerfstudio_folder(fixture)
     file = root / "transforms.json"
     content = json.loads(file.read_text())
-    return fixture("damage").json(content), lambda text: NerfstudioDataModule(
-        written(file, text).parent, flow="none", bound_scale=1.5
-    ).load()
+    return fixture("damage").json(content), lambda text: read_nerfstudio(written(file, text).parent)
 
 
-CHANGES = [
-    "gone",
-    "empty",
-    "folder",
-    "loop",
-    "dangling",
-    "pipe",
-    "half",
-    "rubbish",
-    "damaged",
-    "swapped",
-]
+def read_nerfstudio(root: Path) -> Any:
+    return NerfstudioDataModule(root, flow="none", bound_scale=1.5).load()
+
+
+CHANGES = "gone empty folder loop dangling pipe half rubbish damaged swapped".split()
 
 
 def scene_files(
@@ -429,74 +419,41 @@ def forward(fixture: Fixture) -> Path:
     return root
 
 
-@dataclass(frozen=True)
-class Parser:
-    """What is read, how many damaged inputs it is given, and how many it has to refuse."""
-
-    name: str
-    inputs: int
-    refused: int
-    prepare: Callable[[Fixture], Prepared]
+INPUTS = int(os.environ.get("DEVRF_FUZZ_INPUTS", "1000"))
 
 
-PARSERS = (
-    Parser("values of transforms.json", 2600, 1800, transforms_values),
-    Parser("text of transforms.json", 1300, 1100, transforms_bytes),
-    Parser("poses_bounds.npy", 1700, 1400, static_poses),
-    Parser("hwf_cxcy.npy", 600, 500, shared_intrinsics),
-    Parser("poses.npy and bds.npy", 1300, 1100, moving_poses),
-    Parser("optical flow", 1800, 1450, flow),
-    Parser("cached optical flow", 700, 550, cached_flow),
-    Parser("png", 1000, 850, images("PNG RGBA", "PNG P", "PNG RGB")),
-    Parser("jpeg and webp", 700, 400, images("JPEG RGB", "WEBP RGBA", "JPEG CMYK")),
-    Parser("photos", 300, 100, photos),
-    Parser("masks", 300, 200, masks),
-    Parser("camera of nerfies", 800, 650, nerfies_camera),
-    Parser("lists of nerfies", 400, 280, nerfies_lists),
-    Parser("nerfstudio", 300, 220, nerfstudio),
-    Parser(
-        "files of an inward-facing scene",
-        120,
-        80,
-        scene_files(
-            with_flow,
-            lambda root: InwardFacingDataModule(root, flow="files", bound_scale=1.5).load(),
-        ),
+def inward_files(root: Path) -> Any:
+    return InwardFacingDataModule(root, flow="files", bound_scale=1.5).load()
+
+
+# What is read, how large a part of all inputs it gets (in 1,000), and how they are made.
+PARSERS: dict[str, tuple[int, Callable[[Fixture], Prepared]]] = {
+    "values of transforms.json": (190, transforms_values),
+    "text of transforms.json": (90, transforms_bytes),
+    "poses_bounds.npy": (110, static_poses),
+    "hwf_cxcy.npy": (40, shared_intrinsics),
+    "poses.npy and bds.npy": (80, moving_poses),
+    "optical flow": (110, flow),
+    "cached optical flow": (50, cached_flow),
+    "png": (70, images("PNG RGBA", "PNG P", "PNG RGB")),
+    "jpeg and webp": (50, images("JPEG RGB", "WEBP RGBA", "JPEG CMYK")),
+    "photos": (20, photos),
+    "masks": (20, masks),
+    "camera of nerfies": (50, nerfies_camera),
+    "lists of nerfies": (30, nerfies_lists),
+    "nerfstudio": (30, nerfstudio),
+    "files of an inward-facing scene": (12, scene_files(with_flow, inward_files)),
+    "files of D-NeRF's layout": (
+        12,
+        scene_files(lambda fixture: fixture("single_folder"), inward_files),
     ),
-    Parser(
-        "files of D-NeRF's layout",
-        80,
-        55,
-        scene_files(
-            lambda fixture: fixture("single_folder"),
-            lambda root: InwardFacingDataModule(root, flow="files", bound_scale=1.5).load(),
-        ),
-    ),
-    Parser(
-        "files of a forward-facing scene",
-        120,
-        80,
+    "files of a forward-facing scene": (
+        12,
         scene_files(forward, lambda root: ForwardFacingDataModule(root, flow="files").load()),
     ),
-    Parser(
-        "files of nerfstudio",
-        80,
-        30,
-        scene_files(
-            nerfstudio_folder,
-            lambda root: NerfstudioDataModule(root, flow="none", bound_scale=1.5).load(),
-        ),
-    ),
-    Parser(
-        "files of nerfies",
-        80,
-        50,
-        scene_files(
-            nerfies_folder,
-            lambda root: NerfiesDataModule(root, downscale=1, flow="none", bound_scale=1.5).load(),
-        ),
-    ),
-)
+    "files of nerfstudio": (12, scene_files(nerfstudio_folder, read_nerfstudio)),
+    "files of nerfies": (12, scene_files(nerfies_folder, read_nerfies)),
+}
 
 
 def most_memory() -> int:
@@ -505,14 +462,13 @@ def most_memory() -> int:
     return peak if sys.platform == "darwin" else peak * 1024
 
 
-@pytest.mark.parametrize("parser", PARSERS, ids=lambda parser: parser.name)
+@pytest.mark.parametrize("parser", PARSERS)
 @pytest.mark.filterwarnings("ignore")
-def test_damaged_input_is_read_or_refused(
-    parser: Parser, request: pytest.FixtureRequest, verdicts: Any
-) -> None:
-    inputs, read = parser.prepare(request.getfixturevalue)
+def test_damaged_input_is_read_or_refused(parser, request, verdicts):
+    share, prepare = PARSERS[parser]
+    inputs, read = prepare(request.getfixturevalue)
 
-    @settings(max_examples=parser.inputs, suppress_health_check=list(HealthCheck))
+    @settings(max_examples=max(1, INPUTS * share // 1000), suppress_health_check=list(HealthCheck))
     @given(inputs)
     def each(drawn: Any) -> None:
         verdicts.of(lambda: read(drawn))
@@ -520,8 +476,5 @@ def test_damaged_input_is_read_or_refused(
     before = most_memory()
     each()
     assert most_memory() - before < 2**30
-    assert verdicts.refused >= parser.refused, (verdicts.refused, verdicts.read)
-
-
-def test_ten_thousand_inputs_are_refused() -> None:
-    assert sum(parser.refused for parser in PARSERS) >= 10_000
+    # Damage that no parser notices would test nothing.
+    assert verdicts.refused >= (verdicts.refused + verdicts.read) / 5

@@ -97,7 +97,7 @@ VECTORS = npy((4, 6, 2), "<f4", bytes(192))
 MASK = npy((4, 6), "|b1", bytes(24))
 KEY = npy((), "<U64", "".join("0" * 64).encode("utf-32-le"))
 # Just under the number of values that a file may hold, each as large as a value can be.
-DENSEST = '{"a":[' + ",".join(["[" * 200 + "]" * 200] * 19_000) + "]}"
+DENSEST = '{"a":[' + ",".join(["[" * 150 + "]" * 150] * 26_000) + "]}"
 
 # What reads each, what the message says (None: it is read), and how the file is made.
 CASES: dict[str, tuple[str, str | None, Callable[[Path], Path]]] = {
@@ -111,7 +111,7 @@ CASES: dict[str, tuple[str, str | None, Callable[[Path], Path]]] = {
     "json of a million levels": ("json", "not valid JSON", lambda p: text(p, "[" * 1_000_000)),
     "a number of 50 million digits": (
         "json",
-        "expected a JSON object",
+        "should be an object",
         lambda p: text(p, "0." + "1" * 50_000_000),
     ),
     "90,000 images that are not there": (
@@ -185,7 +185,7 @@ CASES: dict[str, tuple[str, str | None, Callable[[Path], Path]]] = {
 
 
 @pytest.fixture(scope="module")
-def verdicts(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
+def verdicts(tmp_path_factory) -> Iterator[dict[str, Any]]:
     """What became of each case: message, seconds, bytes; the process is killed when it hangs."""
     folder = tmp_path_factory.mktemp("hostile")
     listed = [
@@ -207,14 +207,14 @@ def verdicts(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_it_costs_little(name: str, verdicts: dict[str, Any]) -> None:
+def test_it_costs_little(name, verdicts):
     message, took, grown = verdicts[name]
     said = CASES[name][1]
     assert message is None if said is None else said in message
     assert grown < GIB and took < 20
 
 
-def test_the_cases_are_what_they_are_called(tmp_path: Path) -> None:
+def test_the_cases_are_what_they_are_called(tmp_path):
     """The archives made by hand are whole ones, and unpack to what was put in."""
     path = npz(tmp_path / "f.npz", {"flow": VECTORS, "mask": MASK}, zeros=1)
     import zipfile

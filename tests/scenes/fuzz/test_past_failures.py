@@ -9,21 +9,23 @@ import time
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
+from pydantic import TypeAdapter
 
 from devrf.errors import DevrfError
 from devrf.scenes.array_files import read_numbers
-from devrf.scenes.blender import read_blender
+from devrf.scenes.blender import BlenderReader
 from devrf.scenes.flow_cache import load_flow
 from devrf.scenes.flow_files import read_flow_file
 from devrf.scenes.images import load_images
-from devrf.scenes.json_files import json_object
-from devrf.scenes.llff import read_llff
-from devrf.scenes.nerfies import read_nerfies
+from devrf.scenes.json_files import read_json
+from devrf.scenes.llff import LlffReader
+from devrf.scenes.nerfies import NerfiesReader
 
 TRAIN = "static/transforms_train.json"
 
@@ -53,7 +55,7 @@ def moved(places: Callable[[list[float]], list[float]]) -> Callable[[dict[str, A
 
 
 DEEP: list[Any] = []
-for _ in range(400):
+for _ in range(100):
     DEEP = [DEEP]
 
 
@@ -75,29 +77,27 @@ for _ in range(400):
         pytest.param(moved(lambda p: [v * 1e-30 for v in p]), "data.box", id="tiny scene"),
         # Longer than a terminal, or deeper than the stack, once shown in the message.
         pytest.param(lambda c: c.update(camera_model="x" * 10**5), "xxx", id="long name"),
-        pytest.param(lambda c: c.update(fl_x=DEEP), "fl_x is [[", id="deep value"),
+        pytest.param(lambda c: c.update(fl_x=DEEP), "not [[[...]]]", id="deep value"),
         pytest.param(
             frames(lambda f: f.update(file_path="x" * 10**5)), "no such image", id="long path"
         ),
         pytest.param(
-            frames(lambda f: f.update(file_path="\x1b[2J\ud800")), "not a path", id="unwritable"
+            frames(lambda f: f.update(file_path="\x1b[2J\ud800")), "not valid JSON", id="unwritable"
         ),
         pytest.param(
             frames(lambda f: f.update(file_path="\x1b[2J")), "\\x1b[2J", id="terminal commands"
         ),
     ],
 )
-def test_values_of_a_transforms_file(
-    scene_folder: Any, change: Callable[[dict[str, Any]], None], said: str
-) -> None:
+def test_values_of_a_transforms_file(scene_folder, change, said):
     scene_folder.edit(scene_folder.root / TRAIN, change)
-    assert said in refused(lambda: read_blender(scene_folder.root))
+    assert said in refused(lambda: BlenderReader(scene_folder.root).read())
 
 
-def test_a_byte_order_mark_is_no_mistake(tmp_path: Path) -> None:
+def test_a_byte_order_mark_is_no_mistake(tmp_path):
     file = tmp_path / "a.json"
     file.write_bytes(b'\xef\xbb\xbf{"a": 1, "a": 2}')
-    assert json_object(file, "it is tested") == {"a": 2}
+    assert read_json(file, TypeAdapter(dict[str, int]), "it is tested") == {"a": 2}
 
 
 ROWS = "static/poses_bounds.npy"
@@ -114,11 +114,11 @@ ROWS = "static/poses_bounds.npy"
         ((2, 3), 1e8, "too far from the others"),
     ],
 )
-def test_values_of_llff_poses(llff_folder: Any, place: Any, value: float, said: str) -> None:
+def test_values_of_llff_poses(llff_folder, place, value, said):
     rows = np.load(llff_folder.root / ROWS)
     rows[place] = value
     llff_folder.save(ROWS, rows)
-    assert said in refused(lambda: read_llff(llff_folder.root))
+    assert said in refused(lambda: LlffReader(llff_folder.root).read())
 
 
 def header(text: str, data: bytes = bytes(200)) -> bytes:
@@ -140,7 +140,7 @@ HEADERS = {
 
 
 @pytest.mark.parametrize("text", HEADERS.values(), ids=HEADERS)
-def test_headers_of_arrays(tmp_path: Path, text: str) -> None:
+def test_headers_of_arrays(tmp_path, text):
     npy, npz, cache = tmp_path / "a.npy", tmp_path / "a.npz", tmp_path / "cache.npz"
     npy.write_bytes(header(text))
     for path, names in ((npz, ("flow", "mask")), (cache, ("key", "vectors", "valid"))):
@@ -157,9 +157,7 @@ def arrays() -> dict[str, np.ndarray]:
     return {"flow": np.ones((4, 6, 2), np.float32), "mask": np.ones((4, 6), bool)}
 
 
-def test_a_member_that_goes_by_the_name_of_an_array(
-    tmp_path: Path, arrays: dict[str, np.ndarray]
-) -> None:
+def test_a_member_that_goes_by_the_name_of_an_array(tmp_path, arrays):
     """numpy prefers ``flow`` to ``flow.npy``, whose header alone had been looked at."""
     path = tmp_path / "f.npz"
     np.savez(path, **arrays)
@@ -168,7 +166,7 @@ def test_a_member_that_goes_by_the_name_of_an_array(
     assert read_flow_file(path, width=6, height=4)[1].all()
 
 
-def test_two_members_of_one_name(tmp_path: Path, arrays: dict[str, np.ndarray]) -> None:
+def test_two_members_of_one_name(tmp_path, arrays):
     path = tmp_path / "f.npz"
     np.savez(path, **arrays)
     with zipfile.ZipFile(path, "a") as archive, pytest.warns(UserWarning, match="Duplicate"):
@@ -176,7 +174,7 @@ def test_two_members_of_one_name(tmp_path: Path, arrays: dict[str, np.ndarray]) 
     assert 'more than one array "mask"' in refused(lambda: read_flow_file(path, 6, 4))
 
 
-def test_a_compression_that_numpy_does_not_write(tmp_path: Path) -> None:
+def test_a_compression_that_numpy_does_not_write(tmp_path):
     """LZMA takes as much memory as its own header asks for."""
     path = tmp_path / "f.npz"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_LZMA) as archive:
@@ -185,9 +183,7 @@ def test_a_compression_that_numpy_does_not_write(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("value", [1e30, 1e300, 11.0])
-def test_vectors_longer_than_the_image_are_not_trusted(
-    tmp_path: Path, arrays: dict[str, np.ndarray], value: float
-) -> None:
+def test_vectors_longer_than_the_image_are_not_trusted(tmp_path, arrays, value):
     vectors = arrays["flow"].astype(np.float64)
     vectors[1, 2, 0] = -value
     np.savez(tmp_path / "f.npz", flow=vectors, mask=arrays["mask"])
@@ -196,26 +192,26 @@ def test_vectors_longer_than_the_image_are_not_trusted(
 
 
 @pytest.mark.parametrize("frame", ["001", "002"])
-def test_a_pipe_in_the_place_of_a_flow_file(llff_folder: Any, frame: str) -> None:
+def test_a_pipe_in_the_place_of_a_flow_file(llff_folder, frame):
     """Opening it waits for ever for somebody who writes."""
     for other in ("001", "002"):
         llff_folder.flow(1, other, 0.5)
     path = llff_folder.dynamic / f"view1/images_4_flow/{frame}_bwd.npz"
     path.unlink()
     os.mkfifo(path)
-    flow = read_llff(llff_folder.root).dynamic.train.flow
+    flow = LlffReader(llff_folder.root).read().dynamic.train.flow
     assert flow is not None and int(flow.valid.flatten(1).any(dim=1).sum()) == 1
 
 
 @pytest.mark.parametrize("kind", ["BMP", "GIF", "TIFF", "EPS", "PDF"])
-def test_other_formats_under_the_name_of_a_png(tmp_path: Path, kind: str) -> None:
+def test_other_formats_under_the_name_of_a_png(tmp_path, kind):
     """Pillow would start Ghostscript for some of them."""
     path = tmp_path / "a.png"
     Image.new("RGB", (16, 16)).save(path, kind)
     assert f"{path}: not a readable image" in refused(lambda: load_images([path], 1))
 
 
-def test_many_ids_are_looked_up_at_once(tmp_path: Path) -> None:
+def test_many_ids_are_looked_up_at_once(tmp_path):
     """Once the square of their number: minutes."""
     (tmp_path / "rgb/1x").mkdir(parents=True)
     ids = [f"{i:06d}" for i in range(40_000)]
@@ -225,15 +221,15 @@ def test_many_ids_are_looked_up_at_once(tmp_path: Path) -> None:
     }.items():
         (tmp_path / f"{name}.json").write_text(json.dumps(content))
     start = time.perf_counter()
-    assert "camera/000000.json: no such file" in refused(lambda: read_nerfies(tmp_path))
+    assert "camera/000000.json: no such file" in refused(lambda: NerfiesReader(tmp_path).read())
     assert time.perf_counter() - start < 10
 
 
-def test_a_home_that_is_not_there() -> None:
-    assert refused(lambda: read_blender("~nobody-of-that-name/x")).startswith("data.root: ")
+def test_a_home_that_is_not_there():
+    assert refused(lambda: BlenderReader("~nobody-of-that-name/x").read()).startswith("data.root: ")
 
 
-def test_a_folder_that_may_not_be_listed(llff_folder: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_that_may_not_be_listed(llff_folder, monkeypatch):
     closed, listed = llff_folder.static / "images_4", Path.iterdir
 
     def iterdir(path: Path) -> Any:
@@ -243,12 +239,12 @@ def test_a_folder_that_may_not_be_listed(llff_folder: Any, monkeypatch: pytest.M
 
     monkeypatch.setattr(Path, "iterdir", iterdir)
     assert f"{closed}: cannot be listed (Permission denied)" in refused(
-        lambda: read_llff(llff_folder.root)
+        lambda: LlffReader(llff_folder.root).read()
     )
 
 
-def test_more_than_fits_into_memory(scene_folder: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_than_fits_into_memory(scene_folder, monkeypatch):
     shutil.rmtree(scene_folder.static)
-    monkeypatch.setattr("devrf.scenes.memory._machine_memory", lambda: 2**10)
+    monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(total=2**10))
     images = sorted((scene_folder.dynamic / "train").iterdir())
     assert "6 images of 32x24 px take 0.0 GiB" in refused(lambda: load_images(images, 1))

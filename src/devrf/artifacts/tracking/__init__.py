@@ -1,6 +1,6 @@
 """Trackers: loggers that take pictures, videos and tables beside curves.
 
-What knows a tracker by name stands in this folder; everyone else asks :func:`trackers`.
+Only this folder knows trackers by name; other code asks :func:`trackers`.
 """
 
 from __future__ import annotations

@@ -11,7 +11,9 @@ from devrf.methods.devrf.color_decoder import ColorDecoder, SigmoidColor
 
 @dataclass(frozen=True)
 class Architecture:
-    """Sizes of the canonical field (method §2); the defaults are the paper's, inward-facing.
+    """Sizes of the canonical field; the defaults are the paper's, inward-facing.
+
+    See docs/method.md#canonical-field.
 
     Attributes:
         channels: features per voxel.

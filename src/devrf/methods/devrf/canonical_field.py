@@ -14,7 +14,7 @@ from devrf.methods.devrf.voxel_grid import VoxelGrid
 
 
 class CanonicalField(nn.Module):
-    """A voxel radiance field over a box (method §2).
+    """A voxel radiance field over a box (docs/method.md#canonical-field).
 
     Attributes:
         density: raw densities (X, Y, Z, 1), before the softplus.

@@ -33,7 +33,9 @@ class CanonicalPhase:
 
 @dataclass(frozen=True)
 class CanonicalSchedule:
-    """The canonical stage's course (method §2); the defaults are the paper's, inward-facing.
+    """The canonical stage's course; the defaults are the paper's, inward-facing.
+
+    See docs/method.md#canonical-stage.
 
     Attributes:
         search_iterations: length of the coarse geometry search; 0 leaves it out.

@@ -39,7 +39,7 @@ from devrf.methods.devrf.smoothing import total_variation_weight
 from devrf.methods.devrf.voxel_stage import VoxelStage
 from devrf.methods.weighted_loss import WeightedLoss
 from devrf.ops.adam import GridAdam
-from devrf.ops.choice import triton_runs
+from devrf.ops.dispatch import triton_runs
 from devrf.rendering.occupancy import Occupancy, bounding_box, dilate
 from devrf.scenes.scene import CaptureName, Views
 from devrf.system.profiling import span
@@ -178,6 +178,11 @@ class CanonicalStage(VoxelStage):
             model.canonical.resize(phase.voxels)
             self.update_occupancy()
         self.pool = canonical_pool(views, model, everywhere=phase.kind == "search")
+        if not len(self.pool):
+            raise DevrfError(
+                f"the field has become empty by iteration {self.iteration}: check data.background, "
+                "data.box and data.near, or lower schedule.rates.density"
+            )
         self.setup_optimizer(views.cameras)
 
     def _begin_fine(self, phase: CanonicalPhase) -> None:
@@ -239,7 +244,7 @@ class CanonicalStage(VoxelStage):
             self.optimizer.replace(
                 group,
                 list(grid.parameters()),
-                pace=per_voxel_lr,
+                per_voxel_lr=per_voxel_lr,
                 skip_zero=not searching,
                 smoothing=smoothing,
                 touched_only=True,

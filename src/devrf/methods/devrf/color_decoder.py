@@ -21,7 +21,7 @@ class SigmoidColor(nn.Module):
 
 
 class ColorDecoder(nn.Module):
-    """A shallow network: feature ⊕ d ⊕ sin(2^k d), cos(2^k d) → RGB (method §2, Colour).
+    """A shallow network: feature ⊕ d ⊕ sin(2^k d), cos(2^k d) → RGB (docs/method.md#colour).
 
     The first layer is split: what depends on the direction alone is computed once a ray, not
     once a sample.

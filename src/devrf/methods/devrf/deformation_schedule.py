@@ -43,7 +43,9 @@ class DeformationPhase:
 
 @dataclass(frozen=True)
 class DeformationSchedule:
-    """The deformation stage's course (method §3); the defaults are the paper's, inward-facing.
+    """The deformation stage's course; the defaults are the paper's, inward-facing.
+
+    See docs/method.md#coarse-to-fine.
 
     Within a level the frames are visited one after another. A level has one share of
     iterations for each of T frames; frame 0 is the identity and needs none, so frame 1 takes

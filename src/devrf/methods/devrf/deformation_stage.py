@@ -33,7 +33,7 @@ from devrf.methods.devrf.smoothing import total_variation_weight
 from devrf.methods.devrf.voxel_stage import VoxelStage
 from devrf.methods.weighted_loss import WeightedLoss
 from devrf.ops.adam import GridAdam
-from devrf.ops.choice import triton_runs
+from devrf.ops.dispatch import triton_runs
 from devrf.scenes.scene import CaptureName, Views
 from devrf.system.profiling import span
 
@@ -159,7 +159,7 @@ class DeformationStage(VoxelStage):
                 frame.number,
                 self.scene_model,
                 frame.occupancy,
-                occupied_only=self.motion.pixels == "useful",
+                occupied_only=self.motion.pixels == "occupied",
                 join_views=self.motion.views == "all",
             )
 

@@ -1,4 +1,4 @@
-"""Where the displacements of all frames rest: on the device if they fit there beside all else."""
+"""How much memory the displacements of all frames take, and whether a GPU has room for them."""
 
 from __future__ import annotations
 
@@ -13,9 +13,48 @@ from devrf.methods.devrf.settings import MotionSettings
 
 log = logging.getLogger(__name__)
 
-# Of the memory that is free, the share that the frames may take: the rest is for batches,
-# gradients and moments.
-SHARE = 0.5
+Shape = tuple[int, int, int]
+
+# A displacement: three float32.
+DISPLACEMENT = 12
+# Grids of one frame while it is learned: both directions and the forward one of the frame before
+# (3), gradients (2), Adam moments (4), and the copy that a rollback returns to (2).
+ACTIVE_GRIDS = 11
+# The share of a GPU's free memory that frames may take. The rest is for images, the canonical
+# field and batches.
+FRAMES_SHARE = 0.75
+
+
+def resident_bytes(frames: int, shape: Shape, half: bool) -> int:
+    """Bytes of the displacements of all frames in both directions.
+
+    Args:
+        frames: number of frames T.
+        shape: grid points along x, y, z.
+        half: whether they are stored in half precision.
+    """
+    x, y, z = shape
+    return 2 * frames * x * y * z * DISPLACEMENT // (2 if half else 1)
+
+
+def active_bytes(shape: Shape) -> int:
+    """Bytes of one frame, on a grid of ``shape``, while it is learned."""
+    x, y, z = shape
+    return ACTIVE_GRIDS * x * y * z * DISPLACEMENT
+
+
+def fits_on_device(free: int, frames: int, shape: Shape, *, half: bool, parallel: int) -> bool:
+    """Whether a GPU has room for all frames beside everything else that the stage needs.
+
+    Args:
+        free: bytes free on the GPU.
+        frames: number of frames T.
+        shape: grid points of the finest level.
+        half: whether the frames are stored in half precision.
+        parallel: how many frames are learned at the same time.
+    """
+    needed = resident_bytes(frames, shape, half) + parallel * active_bytes(shape)
+    return needed <= FRAMES_SHARE * free
 
 
 def rest_on_host(
@@ -25,8 +64,8 @@ def rest_on_host(
 
     Args:
         trainer: trains the stage; of several processes each keeps them on its device.
-        model: the field that is learned.
-        schedule: the finest grid.
+        model: has a deformation field.
+        schedule: how fine its grids become.
         motion: what was asked for.
     """
     device = trainer.strategy.root_device
@@ -34,18 +73,13 @@ def rest_on_host(
         return False
     if motion.store == "host":
         return True
-    if device.type != "cuda" or model.deformation is None:
+    if device.type != "cuda":
         return False
+    assert model.deformation is not None
     free, _ = torch.cuda.mem_get_info(device)
-    shape = model.box.grid_shape(schedule.sides[-1] ** 3)
-    frames = len(model.deformation.clock)
-    too_much = resident_bytes(frames, shape, half=motion.store_half) > SHARE * free
-    if too_much:
+    frames, shape = len(model.deformation.clock), model.box.grid_shape(schedule.sides[-1] ** 3)
+    parallel = schedule.max_parallel_frames(-1, frames)
+    fits = fits_on_device(free, frames, shape, half=motion.store_half, parallel=parallel)
+    if not fits:
         log.info("motion: %.1f GB are free on the GPU; the frames rest on the host", free / 1e9)
-    return too_much
-
-
-def resident_bytes(frames: int, shape: tuple[int, int, int], *, half: bool) -> int:
-    """Bytes of the displacements of all frames, in both directions."""
-    x, y, z = shape
-    return 2 * frames * x * y * z * 3 * (2 if half else 4)
+    return not fits

@@ -1,4 +1,4 @@
-"""A warp made of grids: points of a moment to canonical space, or back."""
+"""A warp made of grids: points at one time to canonical space, or back."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from devrf.ops.trilinear import interpolate, kept_gradient
 class GridWarp:
     """x → x + Δ(x); Δ is trilinear in each of its grids, and linear between two of them.
 
-    It is one of many: whoever only needs to move points takes any function of points. What is in
-    it is there for those who look up displacement and density in one pass.
+    Code that only moves points takes any function of points as a warp; the kernels that look up
+    displacement and density in one pass need the slices.
 
     Attributes:
         slices: displacements (X, Y, Z, 3) in the box's units: one frame's, or those of the two
-            frames between which a moment lies; none leaves every point where it is.
+            frames between which a time lies; none leaves every point where it is.
         box: where the grids live; beyond it they go on as on its border.
         weight: share of the second of two frames, in [0, 1].
     """

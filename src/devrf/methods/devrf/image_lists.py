@@ -65,13 +65,13 @@ class ListRenderer:
             delta=field.step_in_base_voxels(settings.step),
         )
         weight, left = composite_segments(depth, found.first)
-        chosen = select(found.heavy[:count], found.first, count)
-        heavy = chosen.index[: int(chosen.total)]
+        chosen = select(found.significant[:count], found.first, count)
+        significant = chosen.index[: int(chosen.total)]
         precision = torch.float16 if self.half and depth.is_cuda else torch.float32
-        color = field.rgb(canonical[heavy], rays.viewdirs, found.ray[heavy], precision)
-        distance = found.distance[heavy, None]
+        color = field.rgb(canonical[significant], rays.viewdirs, found.ray[significant], precision)
+        distance = found.distance[significant, None]
         seen = sum_segments(
-            weight[heavy],
+            weight[significant],
             torch.cat([color, distance, torch.ones_like(distance)], dim=1),
             chosen.first,
         )

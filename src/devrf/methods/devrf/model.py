@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import asdict
 from typing import Any, ClassVar
 
@@ -42,6 +42,7 @@ class DeVRFModel(DynamicModel):
     """
 
     name: ClassVar[str] = "devrf"
+    losses: ClassVar[tuple[str, ...]] = tuple(PHOTOMETRIC_TERMS)
 
     def __init__(
         self,
@@ -116,11 +117,13 @@ class DeVRFModel(DynamicModel):
             places.append(place)
         return joined(outputs, places)
 
-    def loss_terms(self, output: RenderOutput, batch: RayBatch) -> dict[str, Tensor]:
+    def loss_terms(
+        self, output: RenderOutput, batch: RayBatch, names: Collection[str]
+    ) -> dict[str, Tensor]:
         """The photometric terms; those of motion need the frame before (``motion_losses``)."""
         assert isinstance(output, VoxelOutput)
         prediction = Prediction(output, batch)
-        return {name: term(prediction) for name, term in PHOTOMETRIC_TERMS.items()}
+        return {name: PHOTOMETRIC_TERMS[name](prediction) for name in names}
 
     def parts(self) -> dict[str, Iterable[nn.Parameter]]:
         """The canonical field; the deformation is learned frame by frame, by its own stage."""

@@ -1,4 +1,4 @@
-"""Terms that tie the deformation field together (method §3, Losses)."""
+"""Terms that tie the deformation field together (docs/method.md#motion-losses)."""
 
 from __future__ import annotations
 

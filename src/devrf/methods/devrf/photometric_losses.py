@@ -1,4 +1,4 @@
-"""Terms that compare what rays see with the images (method §2, Losses)."""
+"""Terms that compare what rays see with the images (docs/method.md#photometric-losses)."""
 
 from __future__ import annotations
 

@@ -46,15 +46,12 @@ def rays_hit_occupied(
 
 
 def canonical_pool(views: Views, model: DeVRFModel, *, everywhere: bool) -> PixelPool:
-    """The pixels of the static images to draw from.
+    """The pixels of the static images to draw from; none where nothing is occupied.
 
     Args:
         views: the static training views, on the model's device.
         model: the canonical field and its occupancy.
         everywhere: all pixels; else those whose rays meet something that may be occupied.
-
-    Raises:
-        DevrfError: nothing is occupied.
     """
     device = model.device
     images = torch.arange(len(views), device=device)
@@ -62,13 +59,7 @@ def canonical_pool(views: Views, model: DeVRFModel, *, everywhere: bool) -> Pixe
         return all_pixels(views, images)
     cameras = views.cameras.to(device)
     hit = [rays_hit_occupied(cameras, k, model, model.occupancy) for k in range(len(views))]
-    pool = wanted_pixels(views, images, torch.stack(hit))
-    if not len(pool):
-        raise DevrfError(
-            "the canonical field has become empty: check data.background, data.box and "
-            "data.near, or lower schedule.rates.density"
-        )
-    return pool
+    return wanted_pixels(views, images, torch.stack(hit))
 
 
 @torch.no_grad()

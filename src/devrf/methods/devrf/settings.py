@@ -24,7 +24,7 @@ DEFORMATION_LOSS = {
 
 @dataclass(frozen=True)
 class CanonicalRates:
-    """Base learning rates of the canonical stage (method §2, Optimiser).
+    """Base learning rates of the canonical stage (docs/method.md#optimiser).
 
     Attributes:
         density: of the density grid.
@@ -65,8 +65,8 @@ class MotionSettings:
             that one value serves scenes of any scale.
         views: ``one`` draws a batch from one view of the frame, the views taking turns;
             ``all`` draws it from all of them.
-        pixels: ``all`` draws from whole images; ``useful`` from the pixels that show the matte
-            or whose rays meet what the present field has moved there.
+        pixels: ``all`` draws from whole images; ``occupied`` from the pixels of the
+            alpha mask and those whose rays hit what the present field has moved there.
         occupancy_every: iterations after which the frame's occupancy is looked up anew.
         start: where a frame starts from at the coarsest level: ``previous`` is the result of
             the frame before it; ``flow`` moves that along the observed optical flow, so that
@@ -82,7 +82,7 @@ class MotionSettings:
     learning_rate: float = 1e-3
     unit: Literal["world", "box"] = "world"
     views: Literal["one", "all"] = "one"
-    pixels: Literal["all", "useful"] = "all"
+    pixels: Literal["all", "occupied"] = "all"
     occupancy_every: int = 25
     start: Literal["previous", "flow"] = "previous"
     store: Literal["auto", "device", "host"] = "auto"

@@ -21,8 +21,8 @@ from devrf.ops.trilinear import kept_gradient
 from devrf.ops.warped_depth import warped_depth
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.sample_capacity import SampleCapacity
-from devrf.rendering.sampling import Samples, march, most_steps, steps_through
-from devrf.system.profiling import measured, span, tally
+from devrf.rendering.sampling import Samples, most_steps, steps_through
+from devrf.system.profiling import span
 
 
 def render_static(
@@ -35,7 +35,7 @@ def render_static(
     capacity: SampleCapacity,
     precision: torch.dtype = torch.float32,
 ) -> VoxelOutput:
-    """What ``render`` gives, in lists of ``capacity.significant`` places (method §2).
+    """What ``render`` gives, in lists of ``capacity.significant`` places.
 
     Gradients of grids that have one already (``grad``) are added to it in place.
 
@@ -72,10 +72,8 @@ def render_static(
     with span("compositing"):
         weight, transmittance = composite_segments(tau, found.first)
     with span("sampling"):
-        chosen = select(found.heavy, found.first, capacity.significant)
+        chosen = select(found.significant, found.first, capacity.significant)
         capacity.note(found.total, chosen.total)
-        tally("reached", found.total)
-        tally("heavy", chosen.total)
         samples, present = _listed(found, chosen, len(rays))
         canonical = canonical.index_select(0, chosen.index)
         weight = torch.where(present, weight.index_select(0, chosen.index), 0.0)
@@ -107,9 +105,6 @@ def _search(
 ) -> PackedSamples:
     """The samples that can be seen, in lists of ``capacity`` places."""
     stretch = {"step": field.step_length(settings.step), "near": settings.near, "far": settings.far}
-    if measured():
-        # The kernel looks at these at most: it ends with the ray. It does not say at how many.
-        tally("tested", len(march(rays, field.box, occupancy, **stretch)))
     return search(
         rays,
         steps_through(rays, field.box, **stretch),

@@ -14,9 +14,9 @@ from devrf.methods.devrf.grid_warp import GridWarp
 from devrf.methods.devrf.image_lists import ListRenderer
 from devrf.methods.devrf.motion_losses import induced_flow
 from devrf.methods.devrf.volume_rendering import render
-from devrf.ops.choice import triton_runs
 from devrf.ops.compositing import sum_by_ray
 from devrf.ops.corners import shape_of
+from devrf.ops.dispatch import triton_runs
 from devrf.ops.resampling import resample
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.rendered_image import RenderedImage

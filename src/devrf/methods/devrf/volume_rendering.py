@@ -15,7 +15,7 @@ from devrf.ops.compositing import composite, sum_by_ray, transmittances
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.output import RenderOutput
 from devrf.rendering.sampling import Samples, march
-from devrf.system.profiling import span, tally
+from devrf.system.profiling import span
 
 Warp = Callable[[Tensor], Tensor]
 
@@ -121,7 +121,9 @@ def render(
     warp: Warp | None = None,
     precision: torch.dtype = torch.float32,
 ) -> VoxelOutput:
-    """Colours and depths of rays: C = Σ w_i c_i + T_end · background (method §2).
+    """Colours and depths of rays: C = Σ w_i c_i + T_end · background.
+
+    See docs/method.md#compositing.
 
     Args:
         rays: R rays.
@@ -159,7 +161,6 @@ def render(
         significant = _at_least(weight.detach(), settings.alpha_threshold)
         samples, canonical = samples[significant], canonical.index_select(0, significant)
         weight = weight.index_select(0, significant)
-        tally("heavy", len(samples))
     with span("decoder"):
         color = field.rgb(canonical, rays.viewdirs, samples.ray, precision)
     with span("compositing"):
@@ -182,20 +183,17 @@ def _visible(
     samples: Samples, field: CanonicalField, delta: float, threshold: float, warp: Warp | None
 ) -> tuple[Samples, Tensor, Tensor]:
     """The samples that are neither empty nor hidden, their canonical positions, and their τ."""
-    tally("tested", len(samples))
     canonical = _warped(samples, warp)
     with span("density"):
         tau = field.optical_depth(canonical, delta)
     with span("sampling"):
         opaque = _at_least(-torch.expm1(-tau), threshold)
         ray, tau = samples.ray.index_select(0, opaque), tau.index_select(0, opaque)
-        tally("opaque", len(opaque))
     with span("compositing"):
         left = transmittances(tau, ray, samples.rays)
     with span("sampling"):
         reached = _at_least(left, STOP)
         kept = opaque.index_select(0, reached)
-        tally("reached", len(kept))
         return samples[kept], canonical.index_select(0, kept), tau.index_select(0, reached)
 
 

@@ -13,7 +13,6 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from devrf.ops.adam_step import AdamRule
 from devrf.ops.kernels.launch import launch
 from devrf.ops.kernels.numbers import opacity
 
@@ -28,8 +27,13 @@ def step_in_one_pass(
     gradient: Tensor,
     mean: Tensor,
     square: Tensor,
-    rule: AdamRule,
     *,
+    rate: Tensor,
+    step: Tensor,
+    betas: tuple[float, float],
+    eps: float,
+    skip_zero: bool,
+    per_voxel_lr: Tensor | None,
     clear: bool = True,
     smoothing: float = 0.0,
     touched_only: bool = False,
@@ -37,7 +41,7 @@ def step_in_one_pass(
     """As devrf.ops.adam_step: adam_step if ``into`` is ``values``, else smooth_adam_step."""
     smooth = into is not values
     length = _row(values) if smooth else values.numel()
-    beta1, beta2 = rule.betas
+    beta1, beta2 = betas
     launch(
         adam_kernel,
         _programs(values, length),
@@ -47,23 +51,23 @@ def step_in_one_pass(
         gradient,
         mean,
         square,
-        values if rule.pace is None else rule.pace.contiguous(),
-        rule.rate,
-        rule.step,
+        values if per_voxel_lr is None else per_voxel_lr.contiguous(),
+        rate,
+        step,
         length,
         *(values.shape[:2] if smooth else (1, 1)),
         1 - beta1,
         1 - beta2,
         -math.log(beta1),
         -math.log(beta2),
-        rule.eps,
+        eps,
         smoothing,
-        PACED=rule.pace is not None,
-        SKIP_ZERO=rule.skip_zero,
+        PER_VOXEL_LR=per_voxel_lr is not None,
+        SKIP_ZERO=skip_zero,
         CLEAR=clear,
         SMOOTH=smooth,
-        TOUCHED_ONLY=touched_only or rule.skip_zero,
-        CHANNELS=values.shape[-1] if smooth or rule.pace is not None else 1,
+        TOUCHED_ONLY=touched_only or skip_zero,
+        CHANNELS=values.shape[-1] if smooth or per_voxel_lr is not None else 1,
         WIDE=_is_wide(values),
         BLOCK=_block(length),
     )
@@ -175,7 +179,7 @@ def adam_kernel(
     gradient,
     mean,
     square,
-    pace,
+    per_voxel_lr,
     rate,
     step,
     length,
@@ -187,7 +191,7 @@ def adam_kernel(
     decay2,
     eps,
     smoothing,
-    PACED: tl.constexpr,
+    PER_VOXEL_LR: tl.constexpr,
     SKIP_ZERO: tl.constexpr,
     CLEAR: tl.constexpr,
     SMOOTH: tl.constexpr,
@@ -222,6 +226,6 @@ def adam_kernel(
     time = tl.load(step).to(tl.float32)
     size = tl.load(rate).to(tl.float32) / opacity(time * decay1)
     move = size * m / (tl.sqrt(s / opacity(time * decay2)) + eps)
-    if PACED:
-        move *= tl.load(pace + at // CHANNELS, mask=active, other=0.0)
+    if PER_VOXEL_LR:
+        move *= tl.load(per_voxel_lr + at // CHANNELS, mask=active, other=0.0)
     tl.store(into + at, tl.where(active, own - move, own), mask=written)

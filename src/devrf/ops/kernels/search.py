@@ -19,7 +19,6 @@ from devrf.ops.kernels.cells import cell, scalar_at
 from devrf.ops.kernels.launch import launch
 from devrf.ops.kernels.numbers import opacity, softplus
 from devrf.ops.kernels.warped_depth import displaced
-from devrf.ops.search import PackedSamples, Thresholds
 
 # Samples that a program looks at together: one for each thread of its only warp.
 LANES = 32
@@ -42,13 +41,16 @@ def find_samples_on_device(
     box: Corners,
     shift: float,
     delta: float,
-    thresholds: Thresholds,
-) -> PackedSamples:
-    """As devrf.ops.search.find_samples, with nothing that waits for the device."""
+    thresholds: tuple[float, float, float],
+) -> tuple[Tensor, ...]:
+    """The tensors of devrf.ops.search.find_samples' result, without waiting for the device.
+
+    ``thresholds`` are those of opacity, of transmittance and of weight, in this order.
+    """
     device, rays = origins.device, len(origins)
     origins, directions = origins.contiguous(), directions.contiguous()
     entry, density = entry.contiguous(), density.contiguous()
-    # What is not there is stood in for by what is: the kernel does not look at it.
+    # The kernel takes two slices; with fewer the density fills in, and is not read as a slice.
     before, after = (frame.contiguous() for frame in ([*slices, density, density])[:2])
     stride = triton.cdiv(longest, LANES) * LANES
     marks = torch.empty(rays, stride, dtype=torch.uint8, device=device)
@@ -56,7 +58,7 @@ def find_samples_on_device(
     ray = torch.empty(capacity, dtype=torch.int64, device=device)
     distance = torch.empty(capacity, dtype=torch.float32, device=device)
     points = torch.empty(capacity, 3, dtype=torch.float32, device=device)
-    heavy = torch.empty(capacity, dtype=torch.uint8, device=device)
+    significant = torch.empty(capacity, dtype=torch.uint8, device=device)
     ends = torch.zeros(rays + 1, dtype=torch.int64, device=device)
     launch(
         march_kernel,
@@ -79,9 +81,7 @@ def find_samples_on_device(
         weight,
         shift,
         delta,
-        thresholds.alpha,
-        thresholds.weight,
-        thresholds.stop,
+        *thresholds,
         *mask_box.low,
         *scales(mask_box, shape_of(mask)),
         *box.low,
@@ -109,7 +109,7 @@ def find_samples_on_device(
         ray,
         distance,
         points,
-        heavy,
+        significant,
         stride,
         capacity,
         step,
@@ -124,14 +124,14 @@ def find_samples_on_device(
         ray,
         distance,
         points,
-        heavy,
+        significant,
         rays,
         capacity,
         BLOCK=PADDING_BLOCK,
     )
     total = ends[-1]
     overflow = (total > capacity) | (count > longest).any()
-    return PackedSamples(ray, distance, points, heavy.view(torch.bool), first, total, overflow)
+    return ray, distance, points, significant.view(torch.bool), first, total, overflow
 
 
 @triton.jit
@@ -192,8 +192,8 @@ def march_kernel(
     shift,
     delta,
     alpha_threshold,
-    weight_threshold,
     stop,
+    weight_threshold,
     mask_low_x,
     mask_low_y,
     mask_low_z,
@@ -221,7 +221,7 @@ def march_kernel(
     SLICES: tl.constexpr,
     LANES: tl.constexpr,
 ):
-    """Marks a ray's samples: 0 dropped, 1 kept, 2 heavy; counts them; says how far it looked."""
+    """Marks each sample of a ray (0 dropped, 1 kept, 2 significant); counts kept and looked at."""
     ray = tl.program_id(0)
     ox = tl.load(origins + ray * 3)
     oy = tl.load(origins + ray * 3 + 1)
@@ -282,8 +282,8 @@ def march_kernel(
             tau = tl.where(opaque, tl.minimum(tau, 32.0), 0.0)
             left = tl.exp(-(depth + tl.cumsum(tau, 0) - tau))
             seen = opaque & (left >= stop)
-            heavy = seen & (left * alpha >= weight_threshold)
-            mark = (seen.to(tl.int32) + heavy.to(tl.int32)).to(tl.uint8)
+            significant = seen & (left * alpha >= weight_threshold)
+            mark = (seen.to(tl.int32) + significant.to(tl.int32)).to(tl.uint8)
             number += tl.sum(seen.to(tl.int32), 0)
             depth += tl.sum(tau, 0)
         tl.store(into + sample, mark)
@@ -303,7 +303,7 @@ def list_kernel(
     rays,
     distances,
     points,
-    heavy,
+    significant,
     stride,
     capacity,
     step,
@@ -335,13 +335,13 @@ def list_kernel(
         tl.store(points + place * 3, ox + dx * at, mask=fits)
         tl.store(points + place * 3 + 1, oy + dy * at, mask=fits)
         tl.store(points + place * 3 + 2, oz + dz * at, mask=fits)
-        tl.store(heavy + place, (mark > 1).to(tl.uint8), mask=fits)
+        tl.store(significant + place, (mark > 1).to(tl.uint8), mask=fits)
         free += tl.sum(kept, 0)
         looked += LANES
 
 
 @triton.jit(do_not_specialize=["count", "capacity"])
-def pad_kernel(first, rays, distances, points, heavy, count, capacity, BLOCK: tl.constexpr):
+def pad_kernel(first, rays, distances, points, significant, count, capacity, BLOCK: tl.constexpr):
     """Fills the places that no sample of the ``count`` rays has taken."""
     place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     empty = (place >= tl.load(first + count)) & (place < capacity)
@@ -352,4 +352,4 @@ def pad_kernel(first, rays, distances, points, heavy, count, capacity, BLOCK: tl
     tl.store(points + at, nothing, mask=empty)
     tl.store(points + at + 1, nothing, mask=empty)
     tl.store(points + at + 2, nothing, mask=empty)
-    tl.store(heavy + place, nothing.to(tl.uint8), mask=empty)
+    tl.store(significant + place, nothing.to(tl.uint8), mask=empty)

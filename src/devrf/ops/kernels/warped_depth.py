@@ -36,7 +36,7 @@ def warped_depth_in_one_pass(
 ) -> tuple[Tensor, Tensor]:
     """As devrf.ops.warped_depth.warped_depth; a gradient buffer for each slice, or None."""
     density = density.contiguous()
-    # What is not there is stood in for by what is: the kernel does not look at it.
+    # The kernel takes two slices; with fewer the density fills in, and is not read as a slice.
     before, after = (frame.contiguous() for frame in ([*slices, density, density])[:2])
     buffers = (density_gradient, *([*slice_gradients, None, None])[:2])
     numbers = (

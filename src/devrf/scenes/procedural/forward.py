@@ -30,7 +30,7 @@ _STEPS = 400
 class ProceduralForwardScene:
     """A recipe; calling it renders the scene. The same recipe always gives the same scene.
 
-    The world is the one that :func:`devrf.scenes.llff.read_llff` makes: the static cameras'
+    The world is the one that :class:`devrf.scenes.llff.LlffReader` makes: the static cameras'
     average pose is the identity, and nothing is nearer to a camera than 1/0.75. Wrong values
     raise :class:`~devrf.errors.DevrfError` when the recipe is called.
 

@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from devrf.errors import DevrfError
-from devrf.ops import choice, selfcheck
-from devrf.ops.choice import passes_check, triton_runs, using
+from devrf.ops import dispatch
+from devrf.ops.dispatch import passes_check, triton_runs, using
 
 CPU = torch.zeros(1)
 
@@ -27,7 +27,7 @@ def unchecked(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 class OnGpu:
-    """What the choice looks at in a tensor on a GPU."""
+    """What the dispatch looks at in a tensor on a GPU."""
 
     is_cuda = True
     device = torch.device("cuda", 0)
@@ -42,7 +42,7 @@ def test_on_a_cpu_it_is_pytorch() -> None:
 
 def test_on_a_gpu_it_is_triton_where_the_check_passes(monkeypatch: pytest.MonkeyPatch) -> None:
     looked: list[torch.device] = []
-    monkeypatch.setattr(selfcheck, "check_kernels", looked.append)
+    monkeypatch.setattr(dispatch, "_checks", [looked.append])
     gpu = OnGpu()
     assert triton_runs(gpu) and triton_runs(gpu)  # type: ignore[arg-type]
     assert looked == [gpu.device]
@@ -52,7 +52,7 @@ def test_on_a_gpu_it_is_triton_where_the_check_passes(monkeypatch: pytest.Monkey
 def test_where_the_order_of_sums_must_be_fixed_it_is_pytorch(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(choice, "passes_check", lambda device: True)
+    monkeypatch.setattr(dispatch, "passes_check", lambda device: True)
     assert triton_runs(OnGpu())  # type: ignore[arg-type]
     monkeypatch.setattr(torch, "are_deterministic_algorithms_enabled", lambda: True)
     assert not triton_runs(OnGpu())  # type: ignore[arg-type]
@@ -66,7 +66,7 @@ def test_a_failed_check_is_said_once(
     def broken(device: torch.device) -> None:
         raise RuntimeError("no compiler\nmany lines")
 
-    monkeypatch.setattr(selfcheck, "check_kernels", broken)
+    monkeypatch.setattr(dispatch, "_checks", [broken])
     with caplog.at_level(logging.WARNING):
         assert not any(triton_runs(OnGpu()) for _ in range(3))  # type: ignore[arg-type]
     (record,) = caplog.records
@@ -77,8 +77,8 @@ def test_a_failed_check_is_said_once(
 
 
 def test_what_was_asked_for_holds_inside_and_not_after(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(choice, "reaches", lambda device: True)
-    monkeypatch.setattr(choice, "find_spec", lambda name: True)
+    monkeypatch.setattr(dispatch, "reaches", lambda device: True)
+    monkeypatch.setattr(dispatch, "find_spec", lambda name: True)
     with using("triton"):
         assert triton_runs(CPU)
         with using("torch"):
@@ -87,29 +87,28 @@ def test_what_was_asked_for_holds_inside_and_not_after(monkeypatch: pytest.Monke
     assert not triton_runs(CPU)
 
 
-def test_triton_on_a_cpu_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(choice, "find_spec", lambda name: True)
-    with using("triton"), pytest.raises(DevrfError) as refusal:
-        triton_runs(CPU)
-    assert str(refusal.value) == (
-        "kernels: triton needs a CUDA device, and these tensors are on the cpu: choose kernels=auto"
-    )
-
-
-def test_triton_refuses_other_numbers_than_float32(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(choice, "find_spec", lambda name: True)
-    with using("triton"), pytest.raises(DevrfError, match="float32, not on torch.float64"):
-        triton_runs(OnGpu(torch.float64))  # type: ignore[arg-type]
-
-
-def test_triton_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(choice, "find_spec", lambda name: None)
-    with using("triton"), pytest.raises(DevrfError, match="pip install triton"):
-        triton_runs(CPU)
+@pytest.mark.parametrize(
+    ("tensor", "installed", "expected"),
+    [
+        (
+            CPU,
+            True,
+            "triton needs a CUDA device, and these tensors are on the cpu: choose kernels=auto",
+        ),
+        (OnGpu(torch.float64), True, "float32, not on torch.float64"),
+        (CPU, None, "triton is not installed: pip install triton"),
+    ],
+)
+def test_triton_that_cannot_run_is_refused_with_the_reason(
+    monkeypatch: pytest.MonkeyPatch, tensor: torch.Tensor, installed: bool | None, expected: str
+) -> None:
+    monkeypatch.setattr(dispatch, "find_spec", lambda name: installed)
+    with using("triton"), pytest.raises(DevrfError, match=f"kernels: .*{expected}"):
+        triton_runs(tensor)
 
 
 def test_nothing_loads_triton_before_it_is_needed() -> None:
-    modules = sorted(Path(choice.__file__).parent.glob("*.py"))
+    modules = sorted(Path(dispatch.__file__).parent.glob("*.py"))
     assert len(modules) > 5
     for module in modules:
         for statement in ast.parse(module.read_text()).body:

@@ -1,14 +1,17 @@
-"""Which implementation of a kernel runs: plain PyTorch, or Triton on a CUDA device.
+"""Which implementation of an operation runs: its plain PyTorch twin, or Triton on a CUDA device.
 
 A function of this package asks :func:`triton_runs` once, when it is called. Its backward pass,
 which autograd may run in a thread of its own, belongs to the implementation that was chosen then.
+
+This module knows none of the operations. The check that a device must pass before Triton runs on
+it compares all of them, so it is registered from above (``devrf.ops.__init__``).
 """
 
 from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache
@@ -23,8 +26,10 @@ from devrf.errors import DevrfError
 log = logging.getLogger(__name__)
 
 Kind = Literal["auto", "torch", "triton"]
+Check = Callable[[torch.device], None]
 
 _chosen: ContextVar[Kind] = ContextVar("kernels", default="auto")
+_checks: list[Check] = []
 
 
 @contextmanager
@@ -50,7 +55,7 @@ def using(kind: Kind) -> Iterator[None]:
 
 
 def triton_runs(*tensors: Tensor) -> bool:
-    """Shall Triton work on these tensors?
+    """Whether Triton works on these tensors.
 
     Raises:
         DevrfError: Triton was asked for and cannot do it.
@@ -84,23 +89,30 @@ def triton_runs(*tensors: Tensor) -> bool:
 
 
 def reaches(device: torch.device) -> bool:
-    """Can Triton work there? On a CPU only its interpreter can, which is for tests."""
+    """Whether Triton can work there; on a CPU only its interpreter can, which is for tests."""
     return device.type == "cuda" or os.environ.get("TRITON_INTERPRET") == "1"
+
+
+def register_check(check: Check) -> None:
+    """Make ``check`` one that a device must pass before ``auto`` runs Triton there.
+
+    Args:
+        check: raises where Triton's results on the device differ from the twins'.
+    """
+    _checks.append(check)
 
 
 @cache
 def passes_check(device: torch.device) -> bool:
-    """Do the Triton kernels give what PyTorch gives on this device?
+    """Whether the Triton kernels give what PyTorch gives on this device.
 
-    Looked at once in a process, in milliseconds once the kernels are compiled. It waits for the
-    device, so it must have happened before a CUDA graph is captured. If they do not, one warning
-    says why.
+    Run once in a process, in milliseconds once the kernels are compiled. It waits for the
+    device, so it must have happened before a CUDA graph is captured. Where a check fails, one
+    warning says why.
     """
-    # The check runs every function of this package, each of which asks this module.
-    from devrf.ops.selfcheck import check_kernels
-
     try:
-        check_kernels(device)
+        for check in _checks:
+            check(device)
     except Exception as error:
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
         log.warning(

@@ -1,4 +1,4 @@
-"""What an inspection says of a scene, as data and in words."""
+"""The facts of a scene, as data and as text."""
 
 from __future__ import annotations
 
@@ -9,40 +9,30 @@ import pytest
 import torch
 from rich.console import Console
 
-from devrf.artifacts.advice import Advice
-from devrf.artifacts.inspection import FlowFacts, TimesFacts, inspect_scene
-from devrf.artifacts.inspection_text import plain, size, tables
-from devrf.cli.memory import Budget, StageMemory
+from devrf.artifacts.inspection.advice import Advice
+from devrf.artifacts.inspection.report import FlowFacts, TimesFacts, inspect_scene
+from devrf.artifacts.inspection.text import inspection_text
+from devrf.artifacts.tables import as_text
 from devrf.geometry.box import Box
 from devrf.scenes.scene import OpticalFlow, Scene
-
-BUDGET = Budget(
-    scene={"images": 3_000_000},
-    canonical=StageMemory({"density and features": 40_000_000}, {"a batch": 2_000_000}),
-    deformation=StageMemory({"displacements": 1_600_000_000}, {"a batch": 5_000_000}),
-    fields={"displacements": 1_600_000_000},
-    checkpoint={"displacements": 1_600_000_000},
-    files={},
-)
 
 
 def test_the_sets_of_a_scene(tiny_scene: Scene) -> None:
     found = inspect_scene(tiny_scene)
-    assert (found.name, found.kind, found.background) == ("robot", "inward", "white")
     counts = [(f.name, f.images, f.views, f.frames) for f in found.sets]
     assert counts == [
-        ("static train", 8, 8, 1),
-        ("static test", 2, 2, 1),
-        ("dynamic train", 6, 2, 3),
-        ("dynamic test", 3, 1, 3),
+        ("static training set", 8, 8, 1),
+        ("static test set", 2, 2, 1),
+        ("dynamic training set", 6, 2, 3),
+        ("dynamic test set", 3, 1, 3),
     ]
-    assert {(f.width, f.height, f.left_out) for f in found.sets} == {(24, 18, None)}
+    assert {(f.width, f.height, f.masked_share) for f in found.sets} == {(24, 18, None)}
     alpha = tiny_scene.static.test.pixels[..., 3]
-    assert found.sets[1].mattes == pytest.approx(float((alpha > 127).float().mean()))
+    assert found.sets[1].alpha_share == pytest.approx(float((alpha > 127).float().mean()))
 
 
 def test_cameras_by_hand(tiny_scene: Scene) -> None:
-    # A box 3 away from the middle of the cameras' sphere along x, seen from there and from 1 up.
+    # One camera at the origin and seven 4 away, around a box whose middle is 3 away along x.
     pose = torch.eye(3, 4).repeat(8, 1, 1)
     pose[:, 2, 3] = torch.tensor([0.0] + 7 * [4.0])
     views = tiny_scene.static.train
@@ -86,37 +76,24 @@ def test_flow_by_hand(tiny_scene: Scene) -> None:
     valid[later, :9] = True  # half of each image that has a frame before it
     vectors[later[0]] = torch.tensor([3.0, 4.0])
     vectors[later[1:]] = torch.tensor([0.0, 1.0])
-    matte = tiny_scene.dynamic.train.pixels[later, ..., 3] > 127
+    alpha = tiny_scene.dynamic.train.pixels[later, ..., 3] > 127
     found = inspect_scene(with_flow(tiny_scene, OpticalFlow(vectors, valid))).flow
-    share = float((matte & valid[later]).sum()) / float(matte.sum())
+    share = float((alpha & valid[later]).sum()) / float(alpha.sum())
     assert found == FlowFacts(4, 0.5, pytest.approx(share), pytest.approx(2.0), pytest.approx(5.0))
+    assert inspect_scene(with_flow(tiny_scene, None)).flow is None
 
 
-def test_no_flow(tiny_scene: Scene) -> None:
-    found = inspect_scene(with_flow(tiny_scene, None))
-    assert found.flow is None
-    assert "  optical flow     none" in plain(found, BUDGET).splitlines()
-
-
-def test_in_words(tiny_scene: Scene) -> None:
+def test_the_report_on_a_terminal_and_in_a_log(tiny_scene: Scene) -> None:
     advice = (Advice("r_001.png", "one [colour] all over", "look at it"),)
     found = replace(inspect_scene(tiny_scene), advice=advice)
-    text = plain(found, BUDGET)
-    assert "robot, inward-facing, white background" in text
-    assert "3 from 0 to 1, evenly spaced" in text
-    assert "24 x 18" in text
-    assert "deformation stage" in text and "1.6 GB" in text and "42 MB" in text
-    assert text.endswith("problems found: 1\n  r_001.png: one [colour] all over; look at it")
+    report = inspection_text(found, [("checkpoint", "1.6 GB", "displacements 1.6 GB")])
     console = Console(width=160, record=True, file=io.StringIO())
-    console.print(tables(found, BUDGET))
-    shown = console.export_text()
-    for words in ("static train", "1.6 GB", "one [colour] all over; look at it"):
-        assert words in shown
-
-
-@pytest.mark.parametrize(
-    ("count", "words"),
-    [(12, "12 B"), (3_400, "3.4 kB"), (25e6, "25 MB"), (2.84e9, "2.8 GB"), (46e9, "46 GB")],
-)
-def test_sizes_in_words(count: float, words: str) -> None:
-    assert size(count) == words
+    console.print(report)
+    log = as_text(report)
+    for shown in (console.export_text(), log):
+        for part in ("robot, inward-facing", "static train", "24 x 18", "1.6 GB", str(advice[0])):
+            assert part in shown
+    # Aligned columns, no line broken, no trailing space.
+    rows = [line for line in log.splitlines() if "24 x 18" in line]
+    assert len(rows) == 4 and len({line.index("24 x 18") for line in rows}) == 1
+    assert all(line == line.rstrip() for line in log.splitlines())

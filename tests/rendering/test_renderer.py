@@ -1,4 +1,4 @@
-"""A player shows what the model shows, and does nothing twice."""
+"""A renderer shows what the model shows, and does nothing twice."""
 
 from __future__ import annotations
 
@@ -7,14 +7,16 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from devrf.methods.devrf import renderer as module
+from devrf.geometry.rays import Rays
+from devrf.methods.devrf import view as module
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.renderer import Renderer
 from devrf.rendering.rendered_image import RenderedImage
+from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene
 
 WHITE = torch.ones(3)
 Same = Callable[[RenderedImage, RenderedImage], None]
+Picture = Callable[[DeVRFModel, Rays, float, torch.Tensor], RenderedImage]
 
 
 @pytest.fixture
@@ -23,59 +25,58 @@ def looks(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     found: list[int] = []
     inner: Callable[..., object] = module.occupancy_through
 
-    def valid_mask(*arguments: object) -> object:
+    def counted(*arguments: object) -> object:
         found.append(1)
         return inner(*arguments)
 
-    monkeypatch.setattr(module, "occupancy_through", valid_mask)
+    monkeypatch.setattr(module, "occupancy_through", counted)
     return found
 
 
 @pytest.mark.parametrize("time", [0.0, 0.4, 0.55, 1.0])
 def test_it_shows_what_the_model_shows(
-    moving: DeVRFModel, tiny_scene: Scene, time: float, same: Same
+    moving: DeVRFModel, tiny_scene: Scene, time: float, same: Same, reference: Picture
 ) -> None:
     cameras = tiny_scene.dynamic.test.cameras
     seen = Renderer(moving).view(cameras, 1, time, 1.0)
-    same(seen, moving.picture(cameras.image_rays(1), time, WHITE))
+    same(seen, reference(moving, cameras.image_rays(1), time, WHITE))
     assert 20 < int((seen.opacity > 0.5).sum()) < 24 * 18 / 2
     assert not seen.color.requires_grad
 
 
-def test_a_moment_is_where_the_model_says(moving: DeVRFModel) -> None:
-    ready = Renderer(moving).ready(0.4)
-    assert torch.equal(ready.occupancy.mask, moving.occupancy_at(0.4).mask)
-    points = torch.rand(50, 3) * 2 - 1
-    warp = moving.warp(0.4)
-    assert ready.warp is not None and warp is not None
-    torch.testing.assert_close(ready.warp(points), warp(points))
-    rest = Renderer(moving).ready(0.0)
-    assert rest.occupancy is moving.occupancy and rest.warp is rest.displacement is None
+def test_a_view_has_the_occupancy_and_displacement_of_its_time(moving: DeVRFModel) -> None:
+    view = moving.at(0.4)
+    assert torch.equal(view.occupancy.mask, moving.occupancy_at(0.4).mask)
+    assert not view.at_rest and view.displacement is not None
+    assert moving.deformation is not None
+    torch.testing.assert_close(view.displacement, moving.deformation.to_canonical[1])
+    rest = moving.at(0.0)
+    assert rest.at_rest and rest.occupancy is moving.occupancy and rest.displacement is None
 
 
 def test_the_times_asked_for_last_are_kept(moving: DeVRFModel, looks: list[int]) -> None:
-    player = Renderer(moving, times=2)
+    renderer = Renderer(moving, times=2)
     for time in (0.4, 0.7, 0.4, 0.7, 0.4):
-        player.ready(time)
+        renderer.at(time)
     assert len(looks) == 2
-    player.ready(0.9)
-    player.ready(0.4)
+    renderer.at(0.9)
+    renderer.at(0.4)
     assert len(looks) == 3
-    player.ready(0.7)  # had to make room for 0.9
+    renderer.at(0.7)  # had to make room for 0.9
     assert len(looks) == 4
 
 
 def test_a_stream_is_made_picture_by_picture(
-    moving: DeVRFModel, tiny_scene: Scene, looks: list[int], same: Same
+    moving: DeVRFModel, tiny_scene: Scene, looks: list[int], same: Same, reference: Picture
 ) -> None:
-    cameras, player = tiny_scene.dynamic.test.cameras, Renderer(moving)
-    stream = player.stream(cameras, [0.4, 0.4, 1.0], 0.0)
+    cameras, renderer = tiny_scene.dynamic.test.cameras, Renderer(moving)
+    stream = renderer.stream(cameras, [0.4, 0.4, 1.0], 0.0)
     assert len(looks) == 0
     first = next(stream)
     assert len(looks) == 1
-    same(first, moving.picture(cameras.image_rays(0), 0.4, torch.zeros(3)))
+    same(first, reference(moving, cameras.image_rays(0), 0.4, torch.zeros(3)))
     _, last = stream
-    same(last, player.view(cameras, 2, 1.0, torch.zeros(3)))
+    same(last, renderer.view(cameras, 2, 1.0, torch.zeros(3)))
     assert len(looks) == 2
 
 

@@ -1,0 +1,106 @@
+"""What the benchmarks share: a composed run, its learned scene, and how results are reported.
+
+To be imported before torch, which reads how threads wait when it is loaded.
+"""
+
+from __future__ import annotations
+
+from devrf.system.process import tune_for_cpu
+
+tune_for_cpu()
+
+import argparse
+import json
+import logging
+import platform
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import OmegaConf, open_dict, read_write
+
+from devrf.checkpoints.checkpoint import LoadedCheckpoint
+from devrf.cli.config import config_folder, register_resolvers
+from devrf.cli.config_check import check_config
+from devrf.cli.context import RunContext
+from devrf.cli.steps import run_stage
+from devrf.errors import DevrfError
+from devrf.ops.dispatch import using
+
+
+def parser(description: str | None, *, overrides: bool = True) -> argparse.ArgumentParser:
+    """A command line with ``--json`` and, as its other words, overrides of devrf's config."""
+    made = argparse.ArgumentParser(description=description)
+    if overrides:
+        made.add_argument("overrides", nargs="*", help="of devrf's config: experiment=quickstart")
+    made.add_argument("--json", type=Path, help="where the results are written")
+    return made
+
+
+def open_run(overrides: Sequence[str]) -> RunContext:
+    """The run that ``python -m devrf OVERRIDES`` would work on, in the same folder.
+
+    Raises:
+        DevrfError: a setting that does not exist or does not fit, or several processes.
+    """
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    register_resolvers()
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        config = compose("config", overrides=list(overrides), return_hydra_config=True)
+    HydraConfig.instance().set_config(config)
+    folder = Path(config.hydra.run.dir)
+    with read_write(config.hydra), open_dict(config.hydra):
+        config.hydra.runtime.output_dir = str(folder.absolute())
+    HydraConfig.instance().set_config(config)  # which keeps a copy
+    task = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+    check_config(task)
+    run = RunContext(task, folder)
+    if getattr(run.strategy, "world_size", 1) > 1:
+        raise DevrfError("trainer: benchmarks measure one process; leave out trainer=ddp")
+    return run
+
+
+def learned_scene(run: RunContext) -> LoadedCheckpoint:
+    """The scene that the run's checkpoints hold; what they lack is learned, and kept, first."""
+    if run.config.ckpt is None:
+        for stage in run.learning_stages:
+            if not run.own_checkpoint(stage).exists():
+                config = run.config.copy()
+                config.stage = stage
+                run.folder.mkdir(parents=True, exist_ok=True)
+                run_stage(config, run.folder)
+    return run.load()
+
+
+def implementation(run: RunContext) -> AbstractContextManager[None]:
+    """Runs what is inside with the run's ``kernels=``."""
+    return using(run.config.kernels)
+
+
+def report(rows: Sequence[dict[str, Any]], into: Path, device: torch.device, **about: Any) -> None:
+    """Print rows as a table, and write them with all their digits as JSON.
+
+    Args:
+        rows: results by column; a column that a row lacks is left empty there.
+        into: the JSON file; its folder is made.
+        device: what was measured.
+        about: what else the file says.
+    """
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else platform.processor()
+    machine = {"device": name or device.type, "torch": torch.__version__}
+    into.parent.mkdir(parents=True, exist_ok=True)
+    into.write_text(json.dumps({**machine, **about, "rows": list(rows)}, indent=2) + "\n")
+    table = pd.DataFrame(rows).astype(object).map(_shown)
+    print(table.to_markdown(index=False, disable_numparse=True))
+    print(f"written to {into}")
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, float):
+        return "" if value != value else f"{value:.3g}"
+    return str(value)

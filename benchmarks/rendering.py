@@ -1,0 +1,73 @@
+"""Frames a second of held-out views, at a time seen for the first time and at one seen before.
+
+What is known of a time (where matter is then, how it is displaced) is computed once and kept, so
+that a still camera path is faster than a film in which each frame has a time of its own.
+"""
+
+from __future__ import annotations
+
+from harness import implementation, learned_scene, open_run, parser, report
+
+# isort: split
+from statistics import median
+from typing import Any
+
+import torch
+from torch.utils.benchmark import Timer
+
+from devrf.cli.messages import report_user_errors
+from devrf.evaluation.held_out import background_value
+from devrf.rendering.renderer import Renderer
+from devrf.scenes.scene import Views
+
+
+def main() -> None:
+    """Render some held-out views of the run that the command line describes."""
+    arguments = parser(__doc__)
+    arguments.add_argument("--views", type=int, default=5, help="how many, from first to last")
+    given = arguments.parse_args()
+    with report_user_errors():
+        run = open_run(given.overrides)
+        model = learned_scene(run).model.to(run.device)
+        views, background = run.scene.dynamic.test, background_value(run.scene.background)
+        ways = {"float32": Renderer(model)}
+        if run.device.type == "cuda":
+            ways["float16 decoder"] = Renderer(model, half=True)
+        with implementation(run):
+            rows = [
+                {"decoder": name, **frames_a_second(renderer, views, given.views, background)}
+                for name, renderer in ways.items()
+            ]
+        into = given.json or run.folder / "benchmark_rendering.json"
+        report(rows, into, run.device, scene=run.scene.name, overrides=given.overrides)
+
+
+def frames_a_second(
+    renderer: Renderer, views: Views, count: int, background: float
+) -> dict[str, Any]:
+    """The medians over ``count`` of the views, evenly spaced."""
+    first: list[float] = []
+    again: list[float] = []
+    threads = torch.get_num_threads()
+    for index in torch.linspace(0, len(views) - 1, count).round().int().tolist():
+        camera = views.cameras, index, float(views.times[index]), background
+        timer = Timer(
+            "renderer.view(*camera)",
+            globals={"renderer": renderer, "camera": camera},
+            num_threads=threads,
+        )
+        renderer.view(*camera)  # kernels are compiled, lists find their length
+        renderer.at.cache_clear()
+        first.append(timer.timeit(1).median)
+        again.append(timer.timeit(3).median)
+    return {
+        "width": views.width,
+        "height": views.height,
+        "views": count,
+        "new time": 1 / median(first),
+        "same time": 1 / median(again),
+    }
+
+
+if __name__ == "__main__":
+    main()

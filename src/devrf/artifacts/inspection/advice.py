@@ -1,0 +1,43 @@
+"""Advice on a scene that can be read, and names for the sets of images that it is about."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from devrf.scenes.scene import Scene, Views
+
+
+@dataclass(frozen=True)
+class Advice:
+    """One thing that will make the result worse than it could be.
+
+    Attributes:
+        where: the file, the view or the part of the scene.
+        what: what was found there.
+        remedy: what to do.
+    """
+
+    where: str
+    what: str
+    remedy: str
+
+    def __str__(self) -> str:
+        return f"{self.where}: {self.what}; {self.remedy}"
+
+
+def image_sets(scene: Scene) -> dict[str, Views]:
+    """The four sets of images by the names that a report gives them; empty ones are left out."""
+    sets = {
+        "static training set": scene.static.train,
+        "static test set": scene.static.test,
+        "dynamic training set": scene.dynamic.train,
+        "dynamic test set": scene.dynamic.test,
+    }
+    return {name: views for name, views in sets.items() if len(views)}
+
+
+def listed(names: Sequence[str], most: int = 3) -> str:
+    """The first ``most`` names, and how many more there are."""
+    more = len(names) - most
+    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")

@@ -1,0 +1,92 @@
+"""Where a scene's box and cameras are in the world, and which way is up."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from devrf.geometry.box import Box
+from devrf.geometry.cameras import Cameras
+from devrf.scenes.scene import Scene
+
+# NDC depth at which an endless frustum is cut off: twice the near plane's distance. Behind
+# that lies more world than could be drawn beside the cameras.
+NDC_CUT = 0.0
+# Mean square sine of the angle between x axes under which cameras stand side by side.
+SIDE_BY_SIDE = 1e-3
+# A camera looking down more steeply than this (degrees) belongs to no side of the scene.
+STEEP = 75.0
+
+
+def box_points(scene: Scene, box: Box, shape: tuple[int, int, int]) -> Tensor:
+    """A grid (X, Y, Z, 3) over a box of the scene, in world units.
+
+    Args:
+        scene: its space maps the box into the world; an NDC box is cut off before infinity.
+        box: a box in the fields' space.
+        shape: grid points along x, y, z; the outer ones lie on the box's faces.
+    """
+    if scene.kind == "forward":
+        box = Box.of(list(box.low), [*box.high[:2], min(box.high[2], NDC_CUT)])
+    points = box.grid_points(shape, scene.static.train.cameras.focal)
+    return scene.space.to_world(points)
+
+
+def box_middle(scene: Scene) -> Tensor:
+    """The middle (3,) of the scene's box in world units (of its finite part in NDC)."""
+    return box_points(scene, scene.bounds.box, (3, 3, 3))[1, 1, 1]
+
+
+def common_up(cameras: Cameras) -> Tensor | None:
+    """The direction (3,) that is up for cameras held level; None where they do not agree.
+
+    A camera may look up or down, but its own x axis stays level: up is the direction most
+    nearly at right angles to all x axes.
+    """
+    pose = cameras.camera_to_world.double().cpu()
+    mean = pose[:, :, 1].mean(dim=0)
+    spread, axes = torch.linalg.eigh(pose[:, :, 0].T @ pose[:, :, 0] / len(pose))
+    side_by_side = float(spread[1]) < SIDE_BY_SIDE
+    # Cameras side by side share one x axis, which leaves a circle of directions.
+    up = mean if side_by_side else axes[:, 0] * torch.sign(axes[:, 0] @ mean)
+    if not side_by_side and float(spread[0]) >= 0.5 * float(spread[1]):
+        return None
+    return None if float(up @ mean) < 0.1 else normalize(up, dim=0).float()
+
+
+def horizontal_axes(up: Tensor, near: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Unit vectors east and north (3,), at right angles to ``up`` and to each other.
+
+    Args:
+        up: (3,) unit vector.
+        near: (3,) direction that east is to be near to; None: the most level world axis.
+    """
+    near = torch.eye(3).to(up)[int(up.abs().argmin())] if near is None else near
+    east = normalize(near - (near @ up) * up, dim=0)
+    return east, torch.linalg.cross(up, east)
+
+
+def widest_gap(cameras: Cameras, middle: Tensor) -> float | None:
+    """The widest angle in degrees, seen from above, in which no camera stands.
+
+    Args:
+        cameras: cameras around the scene.
+        middle: (3,) the point that they surround, world units.
+
+    Returns:
+        360 for a single side; None where up is not known or most cameras look from above.
+    """
+    up = common_up(cameras)
+    if up is None:
+        return None
+    toward = normalize(cameras.positions - middle, dim=1)
+    toward = toward[(toward @ up).abs() < math.sin(math.radians(STEEP))]
+    if len(toward) < len(cameras) / 2:
+        return None
+    east, north = horizontal_axes(up)
+    angle = torch.atan2(toward @ north, toward @ east).sort().values
+    gaps = torch.cat([angle.diff(), angle[:1] + 2 * math.pi - angle[-1:]])
+    return math.degrees(float(gaps.max()))

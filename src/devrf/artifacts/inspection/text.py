@@ -1,0 +1,98 @@
+"""An inspection as text: tables of facts, and a line for each piece of advice."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich.console import Group, RenderableType
+from rich.text import Text
+
+from devrf.artifacts.inspection.report import FlowFacts, Inspection, ViewsFacts
+from devrf.artifacts.tables import titled_table
+from devrf.geometry.box import Box
+
+HEADING = (
+    "set",
+    "images",
+    "views x times",
+    "size",
+    "alpha masks",
+    "masks",
+    "focal length",
+    "distance",
+)
+
+
+def inspection_text(found: Inspection, requirements: Sequence[Sequence[str]]) -> RenderableType:
+    """The whole report for a terminal (:func:`devrf.artifacts.tables.as_text` for a log).
+
+    Args:
+        found: the facts.
+        requirements: what a run will need: rows of a name, an amount and its largest parts.
+    """
+    count = len(found.advice)
+    verdict = f"problems found: {count}" if count else "no problems found"
+    return Group(
+        titled_table("what was found", _facts(found)),
+        titled_table("images", [_images(facts) for facts in found.sets], HEADING),
+        titled_table("what a run will need, estimated", requirements),
+        Text(verdict, style="bold yellow" if count else "bold green"),
+        *(
+            Text.assemble((f"  {a.where}", "yellow"), f": {a.what}; ", (a.remedy, "italic"))
+            for a in found.advice
+        ),
+    )
+
+
+def _facts(found: Inspection) -> list[tuple[str, str]]:
+    scene, bounds, times = found.scene, found.scene.bounds, found.times
+    unit = "NDC" if scene.kind == "forward" else "world units"
+    spacing = "evenly spaced" if times.even else "unevenly spaced"
+    motion = "" if bounds.motion is None else f"{_box(bounds.motion)}, "
+    rows = [
+        ("scene", f"{scene.name}, {scene.kind}-facing, {scene.background} background"),
+        ("times", f"{times.count} from {times.first:g} to {times.last:g}, {spacing}"),
+        ("near, far", f"{bounds.near:.4g}, {bounds.far:.4g} ({unit})"),
+        ("box", _box(bounds.box)),
+        ("room for motion", f"{motion}{bounds.source}"),
+        ("optical flow", _flow(found.flow)),
+    ]
+    if found.gap is not None:
+        rows.insert(2, ("static views", f"widest sector without one: {found.gap:.0f} degrees"))
+    return rows
+
+
+def _box(box: Box) -> str:
+    low, high = (" ".join(f"{v:.3g}" for v in corner) for corner in (box.low, box.high))
+    return f"[{low}] to [{high}]"
+
+
+def _flow(flow: FlowFacts | None) -> str:
+    if flow is None:
+        return "none"
+    inside = flow.valid_in_alpha
+    in_alpha = "" if inside is None else f" ({_percent(inside)} of the alpha masks)"
+    return (
+        f"{flow.images} images, valid on {_percent(flow.valid)} of the pixels{in_alpha}, "
+        f"mean {flow.mean:.1f} px, longest {flow.longest:.1f} px"
+    )
+
+
+def _images(facts: ViewsFacts) -> tuple[str, ...]:
+    least, most = facts.focal
+    near, mean, far = facts.distance
+    alpha, masked = facts.alpha_share, facts.masked_share
+    return (
+        facts.name,
+        str(facts.images),
+        f"{facts.views} x {facts.frames}",
+        f"{facts.width} x {facts.height}",
+        "no" if alpha is None else f"cover {_percent(alpha)}",
+        "no" if masked is None else f"leave out {_percent(masked)}",
+        f"{least:.0f} px" if most - least < 0.5 else f"{least:.0f} to {most:.0f} px",
+        f"{mean:.3g}" if far - near < 0.01 * mean else f"{near:.3g} to {far:.3g}",
+    )
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %"

@@ -1,0 +1,311 @@
+"""Trains any method on rays, as a stage of a protocol says."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from devrf.checkpoints.checkpoint import LoadedCheckpoint
+from devrf.data.batch import Pixels, RayBatch, background_color, concatenated, gather_batch
+from devrf.data.pool import PixelPool, all_pixels
+from devrf.engine.ddp import rays_per_rank
+from devrf.engine.parallel_batch import ParallelBatch
+from devrf.engine.phase import Phase
+from devrf.engine.stage import ScheduledStage
+from devrf.errors import DevrfError
+from devrf.methods.base import DynamicModel
+from devrf.methods.protocol import ProtocolStage
+from devrf.ops.adam import GridAdam
+from devrf.rendering.output import RenderOutput
+from devrf.scenes.dynamic_only import dynamic_only
+from devrf.scenes.scene import CaptureName, Scene, Views
+from devrf.system.profiling import span
+
+
+@dataclass(frozen=True)
+class RayPhase:
+    """The whole of a ray stage: one phase.
+
+    Attributes:
+        start: 0.
+        stop: one past the last iteration.
+    """
+
+    start: int
+    stop: int
+    kind: Literal["rays"] = "rays"
+    frames: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class RaySchedule:
+    """How long a method learns, on how many rays, and how fast.
+
+    Attributes:
+        iterations: of the whole protocol; each of its stages takes a share.
+        rays: of a batch.
+        learning_rate: of Adam at the first iteration of a stage.
+        final_learning_rate: at its last; exponential in between.
+        betas: of Adam.
+        eps: of Adam.
+        curriculum: share of a stage during which frames are added in the order of their times.
+        iterations_per_step: optimiser iterations in one Lightning step.
+    """
+
+    iterations: int
+    rays: int
+    learning_rate: float
+    final_learning_rate: float
+    betas: Sequence[float] = (0.9, 0.999)
+    eps: float = 1e-8
+    curriculum: float = 0.0
+    iterations_per_step: int = 10
+
+    def __post_init__(self) -> None:
+        for name in ("iterations", "rays", "iterations_per_step"):
+            if getattr(self, name) < 1:
+                raise DevrfError(
+                    f"ray_stage.schedule.{name}: expected at least 1, not {getattr(self, name)}"
+                )
+        if not 0 <= self.curriculum < 1:
+            raise DevrfError(
+                f"ray_stage.schedule.curriculum: expected 0 or more, below 1, not {self.curriculum}"
+            )
+
+
+class RayStage(ScheduledStage):
+    """Learns a :class:`~devrf.methods.base.DynamicModel` from random rays of all its images.
+
+    A batch's rays have times of their own. Of a stage that learns from both captures a fixed share
+    of each batch is static, whatever the numbers of images.
+    """
+
+    rate_keys = "ray_stage.schedule.learning_rate or the weights of ray_stage.loss"
+    memory_keys = ("ray_stage.schedule.rays",)
+    scene_model: DynamicModel
+
+    def __init__(
+        self,
+        model: DynamicModel,
+        schedule: RaySchedule,
+        loss: Mapping[str, float],
+        step: ProtocolStage,
+        static_share: float = 0.5,
+        rest: LoadedCheckpoint | None = None,
+    ) -> None:
+        """Build the stage.
+
+        Args:
+            model: what is learned; not used where the stage builds on ``rest``.
+            schedule: iterations, rays and rates.
+            loss: weights of the method's loss terms; a term of weight 0 is not computed.
+            step: which data trains which parts.
+            static_share: share of static rays in a batch of both captures.
+            rest: what an earlier stage learned, to go on with.
+        """
+        super().__init__(schedule.iterations_per_step)
+        self.name, self.capture, self.step_of_protocol = step.name, step.capture, step
+        self.schedule, self.static_share = schedule, static_share
+        self.weights = {name: weight for name, weight in loss.items() if weight}
+        self.scene_model = model
+        self._ready = rest is not None
+        if rest is not None:
+            self.scene_model = rest.model
+            self.earlier_records = rest.metadata.records
+        for name in loss:
+            if name not in self.scene_model.losses:
+                known = ", ".join(self.scene_model.losses)
+                raise DevrfError(
+                    f"ray_stage.loss: {self.scene_model.name} has no term {name!r}; it has {known}"
+                )
+        if not self.weights:
+            raise DevrfError("ray_stage.loss: every weight is zero; at least one term must count")
+        self.pools: list[FramePool] = []
+        self._optimizer: GridAdam | None = None
+
+    @property
+    def total_iterations(self) -> int:
+        """The stage's share of the schedule."""
+        return max(1, round(self.schedule.iterations * self.step_of_protocol.iterations))
+
+    @property
+    def resolution(self) -> tuple[int, ...]:
+        """None: there is no grid that grows."""
+        return ()
+
+    @property
+    def optimizer(self) -> GridAdam:
+        """Adam over the parts that are not frozen."""
+        assert self._optimizer is not None, "the stage has not been set up"
+        return self._optimizer
+
+    def phase_at(self, iteration: int) -> RayPhase:
+        """The one phase there is."""
+        return RayPhase(0, self.total_iterations)
+
+    def learning_rate_factor(self, iteration: int) -> float:
+        """(final / initial)^(n / (N − 1)) at iteration n of N."""
+        schedule, last = self.schedule, max(self.total_iterations - 1, 1)
+        ratio = schedule.final_learning_rate / schedule.learning_rate
+        return float(ratio ** (min(iteration, last) / last))
+
+    def setup(self, stage: str) -> None:
+        """Give the model what it needs of the scene, and make the optimiser."""
+        super().setup(stage)
+        if not self._ready:
+            self.scene_model.setup(self._scene_of_stage())
+            self._ready = True
+        self.scene_model.freeze(self.step_of_protocol.frozen)
+        if self._optimizer is not None:
+            return
+        schedule, groups = self.schedule, self.scene_model.param_groups()
+        for group in groups:
+            rate = schedule.learning_rate * group.pop("rate", 1.0)
+            group.update(lr=rate, base_lr=rate)
+        first, second = schedule.betas
+        self._optimizer = GridAdam(groups, betas=(first, second), eps=schedule.eps)
+
+    def _scene_of_stage(self) -> Scene:
+        """The scene; without its static set if no stage of the protocol learns from it."""
+        alone = self.capture == "dynamic" and self.step_of_protocol.builds_on is None
+        return dynamic_only(self.scene) if alone else self.scene
+
+    def enter(self, phase: Phase) -> None:
+        """Gather the pixels to draw from."""
+        self.phase = phase
+        views = [self._training_views(name) for name in self._captures]
+        self.pools = [FramePool.of(one) for one in views]
+        groups = self.optimizer.param_groups
+        self.bind(self.schedule.rays, [[p for group in groups for p in group["params"]]])
+
+    @property
+    def _captures(self) -> tuple[CaptureName, ...]:
+        return ("static", "dynamic") if self.capture == "both" else (self.capture,)
+
+    def _training_views(self, capture: CaptureName) -> Views:
+        views: Views = self.trainer.datamodule.training_views(  # type: ignore[attr-defined]
+            capture, self.device
+        )
+        return views
+
+    def prepare(self) -> None:
+        """Let the model follow the schedule."""
+        self.scene_model.on_iteration(self.iteration, self.total_iterations)
+
+    def draw(self, batch: ParallelBatch) -> Pixels:
+        """Random pixels: of the static images first, where both captures are learned from.
+
+        Images are numbered through, the static ones first.
+        """
+        with span("batch"):
+            rays = rays_per_rank(self.schedule.rays)
+            counts = [rays]
+            if len(self.pools) > 1:
+                counts = [round(rays * self.static_share), rays - round(rays * self.static_share)]
+            images, flats, offset = [], [], 0
+            for pool, count in zip(self.pools, counts, strict=True):
+                image, flat = pool.draw(count, self._shown_frames(pool), self.generator)
+                images.append(image + offset)
+                flats.append(flat)
+                offset += pool.images
+            background = background_color(self.scene.background, rays, self.generator)
+            return Pixels(torch.cat(images), torch.cat(flats), background)
+
+    def _shown_frames(self, pool: FramePool) -> int:
+        """How many frames the curriculum shows by now."""
+        share = self.schedule.curriculum * self.total_iterations
+        if self.iteration >= share:
+            return pool.frames
+        return min(pool.frames, max(3, int(pool.frames * self.iteration / share)))
+
+    def loss(
+        self, batch: ParallelBatch, views: Views | tuple[Views, ...], pixels: Pixels
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Render a batch and weigh the method's loss terms."""
+        with span("batch"):
+            rays = self._gather(views, pixels)
+        output = self.scene_model(rays)
+        with span("losses"):
+            values = self.scene_model.loss_terms(output, rays, self.weights)
+            total = torch.stack([self.weights[name] * value for name, value in values.items()])
+            terms = {name: value.detach() for name, value in values.items()}
+            return total.sum(), {**terms, **_visibility(output, rays)}
+
+    def _gather(self, views: Views | tuple[Views, ...], pixels: Pixels) -> RayBatch:
+        """The batch of pixels, in the order of their images' captures."""
+        space, parts, offset = self.scene_model.space, [], 0
+        for one in views if isinstance(views, tuple) else (views,):
+            own = (pixels.image >= offset) & (pixels.image < offset + len(one))
+            place, background = own.nonzero()[:, 0], pixels.background
+            parts.append(
+                gather_batch(
+                    one,
+                    pixels.image[place] - offset,
+                    pixels.flat[place],
+                    background if background.dim() == 1 else background[place],
+                    space,
+                )
+            )
+            offset += len(one)
+        return parts[0] if len(parts) == 1 else concatenated(parts)
+
+    def phase_state(self) -> dict[str, Any]:
+        """Nothing: the images tell which pixels there are."""
+        return {}
+
+    def restore(self, phase: Phase, kept: dict[str, Any]) -> None:
+        """Go on with ``phase``, the model being loaded."""
+        self.enter(phase)
+
+
+@dataclass(frozen=True)
+class FramePool:
+    """The valid pixels of some images, in the order of their frames.
+
+    Attributes:
+        pool: the pixels.
+        ends: how many pixels the first k + 1 frames have, for each k.
+        images: how many images there are.
+    """
+
+    pool: PixelPool
+    ends: tuple[int, ...]
+    images: int
+
+    @staticmethod
+    def of(views: Views) -> FramePool:
+        """All valid pixels of some views."""
+        assert views.frames is not None
+        everything = all_pixels(views, torch.arange(len(views), device=views.frames.device))
+        frame = views.frames[everything.image.long()]
+        order = frame.argsort(stable=True)
+        _, counts = torch.unique(frame, return_counts=True)
+        return FramePool(
+            PixelPool(everything.image[order], everything.flat[order]),
+            tuple(counts.cumsum(0).tolist()),
+            len(views),
+        )
+
+    @property
+    def frames(self) -> int:
+        """How many frames there are."""
+        return len(self.ends)
+
+    def draw(self, count: int, frames: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """``count`` pixels of the first so many ``frames``, with replacement: image and number."""
+        pool = self.pool
+        pick = torch.randint(
+            self.ends[frames - 1], (count,), device=pool.image.device, generator=generator
+        )
+        return pool.image[pick].long(), pool.flat[pick].long()
+
+
+@torch.no_grad()
+def _visibility(output: RenderOutput, batch: RayBatch) -> dict[str, Tensor]:
+    """How much is seen, and how much should be: means over rays in [0, 1]."""
+    seen = {"opacity": 1 - output.transmittance.mean()}
+    return seen if batch.alpha is None else {**seen, "coverage": batch.alpha.mean()}

@@ -1,0 +1,27 @@
+"""A scene as methods see it that know its dynamic views alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from devrf.geometry.ndc import NormalizedDevice
+from devrf.scenes.bounds import inward_bounds
+from devrf.scenes.forward_bounds import forward_bounds
+from devrf.scenes.scene import Capture, Scene
+
+
+def dynamic_only(scene: Scene) -> Scene:
+    """The scene without its static set: the dynamic images of time 0 stand in for it.
+
+    Bounds are found anew, from the dynamic training cameras alone.
+
+    Raises:
+        DevrfError: these cameras do not say where the scene is.
+    """
+    views, held_out = scene.dynamic.train, scene.dynamic.test
+    at_rest = [v[(v.times == v.times.min()).nonzero()[:, 0]] for v in (views, held_out)]
+    if isinstance(scene.space, NormalizedDevice):
+        bounds = forward_bounds([views], scene.space, "all that the dynamic cameras see")
+    else:
+        bounds = inward_bounds(views, views, [views, held_out])
+    return replace(scene, static=Capture(*at_rest), bounds=bounds)

@@ -1,0 +1,136 @@
+"""What the readers of all layouts share: their options, each declared and checked once."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import KW_ONLY
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import ConfigDict, Field, PlainValidator, ValidationError, model_validator
+from pydantic.dataclasses import dataclass
+
+from devrf.scenes.bounds import inward_bounds
+from devrf.scenes.json_files import Number
+from devrf.scenes.scene import Background, Capture, Scene
+from devrf.scenes.validation import LARGEST, checked_box, first_error
+
+FlowSource = Literal["auto", "files", "dis", "raft", "none"]
+# Of layouts that have no place for flow files.
+EstimatedFlow = Literal["auto", "dis", "raft", "none"]
+
+Count = Annotated[int, Field(strict=True, ge=1)]
+SeveralFrames = Annotated[int, Field(strict=True, ge=2)]
+# One image of so many is held out.
+Holdout = Annotated[int, Field(strict=True, ge=2)]
+Time = Annotated[Number, Field(ge=0, le=1)]
+
+
+def _bound_scale(value: object) -> object:
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    # NaN compares false.
+    if value != "auto" and not (number and 1 <= value < LARGEST):  # type: ignore[operator]
+        raise ValueError(f'expected "auto" or a number of at least 1, not {value!r}')
+    return value
+
+
+def _box(value: Any) -> list[list[float]] | None:
+    if value is None:
+        return None
+    box = checked_box(value)
+    return [list(box.low), list(box.high)]
+
+
+BoundScale = Annotated[float | str, PlainValidator(_bound_scale)]
+Corners = Annotated[Sequence[Sequence[float]] | None, PlainValidator(_box)]
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class SceneReader(ABC):
+    """Where a scene is on disk and how it is to be read.
+
+    Attributes:
+        root: the scene's folder.
+        name: short name; None takes the folder's.
+        downscale: integer factor ≥ 1 by which images and flow are made smaller.
+        background: what is behind the alpha masks of RGBA images; RGB images are used as they are.
+        flow: ``files`` reads the scene's backward flow where there is any, ``dis`` and ``raft``
+            estimate it, ``none`` does without; ``auto`` reads the files, else estimates with
+            DIS unless the cameras jump from frame to frame.
+        flow_cache: an ``.npz`` that keeps estimated flow; None estimates it every time.
+        frames: keep so many times, evenly spread, first and last included; None: all.
+
+    Raises:
+        DevrfError: an option is wrong; the message names it.
+    """
+
+    root: str | Path
+    _: KW_ONLY
+    name: str | None = None
+    downscale: Count = 1
+    background: Background = "white"
+    flow: FlowSource = "auto"
+    flow_cache: str | Path | None = None
+    frames: SeveralFrames | None = None
+
+    @abstractmethod
+    def read(self) -> Scene:
+        """Read the scene, with flow from files where they are asked for.
+
+        Raises:
+            DevrfError: a file is wrong, or does not go with an option; the message names it.
+        """
+
+    @property
+    def wants_flow_files(self) -> bool:
+        """Whether flow is to be read from files."""
+        return self.flow in ("auto", "files")
+
+    def name_of(self, folder: Path) -> str:
+        """The scene's name, its folder's where none was given."""
+        return self.name or folder.resolve().name
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _in_one_line(cls, value: Any, validate: Any) -> Any:
+        try:
+            return validate(value)
+        except ValidationError as error:
+            raise first_error(error, "data.") from None
+
+
+@dataclass(frozen=True)
+class InwardReader(SceneReader):
+    """Options of scenes that cameras look in at.
+
+    Attributes:
+        bound_scale: ``auto`` (room for motion from silhouettes) or a number ≥ 1 by which the
+            tightened canonical box is enlarged.
+        near: distance in world units before which nothing is; None: from the cameras.
+        far: distance in world units behind which nothing is; None: from the cameras.
+        box: [[x, y, z], [x, y, z]] in world units; None: from the cameras.
+    """
+
+    _: KW_ONLY
+    bound_scale: BoundScale = "auto"
+    near: Number | None = None
+    far: Number | None = None
+    box: Corners = None
+
+    def scene(self, folder: Path, static: Capture, dynamic: Capture) -> Scene:
+        """The scene of two captures that were read from ``folder``, its bounds found.
+
+        Raises:
+            DevrfError: what :func:`devrf.scenes.bounds.inward_bounds` raises.
+        """
+        bounds = inward_bounds(
+            static.train,
+            dynamic.train,
+            [static.train, static.test, dynamic.train, dynamic.test],
+            bound_scale=self.bound_scale,
+            near=self.near,
+            far=self.far,
+            box=None if self.box is None else checked_box(self.box),
+        )
+        return Scene(self.name_of(folder), "inward", static, dynamic, bounds, self.background)

@@ -1,0 +1,109 @@
+"""The scripts in ``benchmarks/``, on a tiny run."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import runpy
+import shutil
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from hydra.core.hydra_config import HydraConfig
+
+FOLDER = Path(__file__).parents[2] / "benchmarks"
+
+
+@pytest.fixture
+def benchmark(monkeypatch, tmp_path):
+    """``benchmark(script, *arguments)``: what the script writes, run in a folder of the test's."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(FOLDER)
+    monkeypatch.setattr(HydraConfig.instance(), "cfg", HydraConfig.instance().cfg)
+
+    def run(script, *arguments):
+        monkeypatch.setattr(sys, "argv", [script, *arguments, "--json", "found.json"])
+        runpy.run_path(str(FOLDER / f"{script}.py"), run_name="__main__")
+        return json.loads((tmp_path / "found.json").read_text())
+
+    return run
+
+
+def test_training_at_each_resolution_with_what_was_learned(
+    benchmark, tmp_path, tiny, trained, capsys
+):
+    shutil.copytree(trained[0] / "checkpoints", tmp_path / "run" / "checkpoints")
+    before = (tmp_path / "run" / "checkpoints" / "deformation.ckpt").read_bytes()
+    found = benchmark(
+        "training",
+        *tiny,
+        "schedule.canonical.search_iterations=20",
+        "hydra.run.dir=run",
+        "--seconds=0.05",
+    )
+    assert found["scene"] == "robot"
+    rows = found["rows"]
+    assert [(row["stage"], row["phase"].split()[0]) for row in rows] == [
+        ("canonical", "search"),
+        ("canonical", "fine"),
+        ("canonical", "fine"),
+        ("deformation", "level"),
+        ("deformation", "level"),
+    ]
+    sides = [int(row["grid"].split("x")[0]) for row in rows]
+    assert sides[1] < sides[2] and sides[3] < sides[4]
+    for row in rows:
+        assert row["ms"] > 0 and row["backward"] > 0 and row["optimiser"] > 0
+        assert (row["warp"] > 0) == (row["stage"] == "deformation")
+    assert "| fine" in capsys.readouterr().out
+    # Nothing was learned on the way.
+    assert (tmp_path / "run" / "checkpoints" / "deformation.ckpt").read_bytes() == before
+
+
+def test_rendering_learns_first_what_no_checkpoint_has(benchmark, tmp_path, tiny):
+    found = benchmark("rendering", *tiny, "hydra.run.dir=run", "--views=2")
+    (row,) = found["rows"]
+    assert (row["width"], row["height"], row["views"]) == (24, 20, 2)
+    assert row["new time"] > 0 and row["same time"] > 0
+    assert (tmp_path / "run" / "checkpoints" / "deformation.ckpt").exists()
+
+
+def test_every_operation(benchmark):
+    found = benchmark("kernels", "--side=6", "--rays=4", "--seconds=0.01")
+    assert len(found["rows"]) == 8 and all(row["torch ms"] > 0 for row in found["rows"])
+
+
+def test_a_part_counts_without_the_parts_inside_it(monkeypatch):
+    monkeypatch.syspath_prepend(FOLDER)
+    training = importlib.import_module("training")
+
+    def work():
+        with training.record_function("losses"):
+            time.sleep(0.01)
+            with training.record_function("warp"):
+                time.sleep(0.04)
+        time.sleep(0.02)
+
+    spent = training.parts(work, cuda=False)
+    assert spent["losses"] < spent["overhead"] < spent["warp"]
+    assert spent["losses"] >= 9 and spent["warp"] >= 39 and spent["backward"] == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["data.widht=3"], "data.widht: no such key; did you mean data.width?"),
+        (["ckpt=no.ckpt"], "no.ckpt: no such checkpoint"),
+        (["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2"], "leave out trainer=ddp"),
+    ],
+)
+def test_what_cannot_be_measured_is_said_in_one_line(
+    benchmark, tmp_path, tiny, capsys, arguments, expected
+):
+    with pytest.raises(SystemExit) as stop:
+        benchmark("training", *tiny, *arguments)
+    said = capsys.readouterr().err
+    assert stop.value.code == 2 and said.count("\n") == 1 and expected in said
+    assert not list(tmp_path.iterdir())

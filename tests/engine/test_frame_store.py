@@ -1,0 +1,108 @@
+"""Displacements of all frames: read, changed, written back, and kept elsewhere meanwhile."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from devrf.engine.frame_store import FrameStore
+
+SHAPE = (3, 2, 4)
+OTHERS = [0, 1, 3]
+
+
+@pytest.fixture
+def store() -> FrameStore:
+    """Four frames; 1 to 3 filled at random, frame 0 as it was built."""
+    store = FrameStore(4, SHAPE)
+    store.to_canonical[1:].normal_()
+    store.to_time[1:].normal_()
+    return store
+
+
+def both(store: FrameStore) -> tuple[Tensor, Tensor]:
+    """Copies of all frames in both directions."""
+    return store.to_canonical.clone(), store.to_time.clone()
+
+
+def pair() -> tuple[Tensor, Tensor]:
+    """Memory for a frame in both directions."""
+    return torch.empty(*SHAPE, 3), torch.empty(*SHAPE, 3)
+
+
+def test_a_frame_is_read_changed_and_written_back(store: FrameStore) -> None:
+    (backward, forward), frame, before = both(store), pair(), torch.empty(*SHAPE, 3)
+    store.read(2, frame)
+    store.read_forward(1, before)
+    assert torch.equal(frame[0], backward[2]) and torch.equal(frame[1], forward[2])
+    assert torch.equal(before, forward[1])
+    frame[0].add_(1)
+    assert torch.equal(store.to_canonical, backward)  # a copy, until it is written back
+    store.write(2, frame)
+    assert torch.equal(store.to_canonical[2], backward[2] + 1)
+    assert torch.equal(store.to_canonical[OTHERS], backward[OTHERS])
+    assert torch.equal(store.to_time, forward)
+
+
+@pytest.mark.parametrize("frame", [0, 4, -1])
+def test_the_rest_frame_and_frames_that_are_not_there_cannot_be_trained(
+    store: FrameStore, frame: int
+) -> None:
+    with pytest.raises(IndexError, match="only 1 to 3"):
+        store.write(frame, pair())
+
+
+def test_a_frame_starts_from_the_one_before_it_in_both_directions(store: FrameStore) -> None:
+    before = both(store)
+    store.copy_previous(2)
+    for now, was in zip(both(store), before, strict=True):
+        assert torch.equal(now[2], was[1])
+        assert torch.equal(now[OTHERS], was[OTHERS])
+    # A copy, not a view.
+    store.to_canonical[2] += 1
+    assert torch.equal(store.to_canonical[1], before[0][1])
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_offloaded_frames_stay_as_they_are_and_are_read_in_single_precision(
+    store: FrameStore, half: bool
+) -> None:
+    exact, frame = both(store), pair()
+    store.offload(on_host=True, half=half)
+    dtype = torch.float16 if half else torch.float32
+    assert store.to_time.dtype == store.to_canonical.dtype == dtype
+    store.read(3, frame)
+    for found, whole in zip(frame, exact, strict=True):
+        assert found.dtype == torch.float32
+        torch.testing.assert_close(found, whole[3], rtol=1 / 2048 if half else 0, atol=1e-7)
+    resting = store.to_time
+    store.to(torch.float64)
+    assert store.to_time is resting and store.here.dtype == torch.float64
+    store.float().resize((5, 5, 5))
+    assert store.to_time.shape == (4, 5, 5, 5, 3) and store.to_time.dtype == dtype
+
+
+def test_what_was_fetched_counts_no_more_once_it_has_been_written(store: FrameStore) -> None:
+    fetched: Any = ((store.to_canonical[1], store.to_time[1]), object())
+    store._fetched = {1: fetched, 2: fetched}
+    store.write(1, pair())
+    assert list(store._fetched) == [2]
+    store.resize((4, 4, 4))
+    assert store._fetched == {}
+
+
+def test_what_is_on_its_way_from_the_host_is_not_copied(store: FrameStore) -> None:
+    stream: Any = (number for number in ())  # like a stream, nothing that can be copied
+    store._fetched = {1: ((store.to_time[1], store.to_time[1]), stream)}
+    assert copy.deepcopy(store)._fetched == {}
+
+
+def test_a_stored_state_of_another_shape_is_taken(store: FrameStore) -> None:
+    other = FrameStore(2, (5, 5, 5))
+    other.load_state_dict(store.state_dict())
+    assert torch.equal(other.to_time, store.to_time)
+    assert torch.equal(other.to_canonical, store.to_canonical)

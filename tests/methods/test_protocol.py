@@ -1,0 +1,39 @@
+"""Protocols: which data trains which part."""
+
+from __future__ import annotations
+
+import pytest
+
+from devrf.errors import DevrfError
+from devrf.methods.protocol import Protocol
+
+STATIC = {"capture": "static", "iterations": 0.4}
+MOVING = {"capture": "dynamic", "iterations": 0.6, "frozen": ["canonical"]}
+
+
+def test_stages_keep_their_order() -> None:
+    protocol = Protocol(
+        "two_stage", {"canonical": STATIC, "deformation": {**MOVING, "builds_on": "canonical"}}
+    )
+    assert [step.name for step in protocol.steps] == ["canonical", "deformation"]
+    assert protocol["deformation"].frozen == ["canonical"]
+    assert protocol["deformation"].builds_on == "canonical"
+
+
+@pytest.mark.parametrize(
+    ("stages", "said"),
+    [
+        ({"a": {**STATIC, "builds_on": "b"}, "b": MOVING}, r"stages\.a\.builds_on: .* not 'b'"),
+        ({"a": {"capture": "all"}}, r"stages\.a\.capture: expected static, dynamic or both"),
+        ({"a": {**STATIC, "iterations": 0}}, r"stages\.a\.iterations: expected a share above 0"),
+        ({"a": {**STATIC, "frames": 3}}, r"stages: .*'frames'"),
+    ],
+)
+def test_what_cannot_be_is_named(stages: dict[str, dict[str, object]], said: str) -> None:
+    with pytest.raises(DevrfError, match=f"protocol.{said}"):
+        Protocol("mine", stages)
+
+
+def test_a_joint_batch_has_rays_of_both_captures() -> None:
+    with pytest.raises(DevrfError, match="protocol.static_share: expected between 0 and 1"):
+        Protocol("joint", {"joint": {"capture": "both"}}, static_share=1.0)
