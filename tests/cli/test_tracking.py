@@ -1,4 +1,4 @@
-"""One run is one tracked run, and holds what whoever watches wants to see; all on this machine."""
+"""One run is one tracked run, and holds curves, pictures and scores; all on this machine."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where optical flow comes from when nobody says."""
+"""Where optical flow comes from when nothing is said."""
 
 from __future__ import annotations
 
