@@ -1,4 +1,4 @@
-"""What tests of every room share: one thread, seeded numbers, one tiny scene."""
+"""What tests of every package share: one thread, seeded numbers, one tiny scene."""
 
 from __future__ import annotations
 

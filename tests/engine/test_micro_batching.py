@@ -17,7 +17,7 @@ from devrf.callbacks import DivergenceGuard, PeriodicCheckpoint
 from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, LoadedCheckpoint
 from devrf.data.batch import Pixels
 from devrf.data.datamodule import SceneDataModule
-from devrf.engine import micro_batching as parts_module
+from devrf.engine import micro_batching as module
 from devrf.engine.micro_batching import MicroBatching
 from devrf.engine.stage import ScheduledStage
 from devrf.errors import DevrfError
@@ -48,8 +48,8 @@ BY_RAY = {"render": 1.0, "per_sample_color": 0.1, "entropy": 0.01}
 
 
 @pytest.fixture
-def room(monkeypatch: pytest.MonkeyPatch) -> Callable[[int, int], list[int]]:
-    """``room(rays, from_call)``: rendering more rays at once fails from a call on; rays seen."""
+def memory_for(monkeypatch: pytest.MonkeyPatch) -> Callable[[int, int], list[int]]:
+    """``memory_for(rays, from_call)``: more rays at once fail from a call on; the rays of each."""
 
     def limit(rays: int, from_call: int = 0) -> list[int]:
         calls: list[int] = []
@@ -97,10 +97,10 @@ def assert_alike(one: ScheduledStage, other: ScheduledStage) -> None:
 
 @pytest.mark.parametrize(("rays", "parts"), [(32, 2), (16, 4), (8, 8)])
 def test_the_canonical_stage_learns_the_same_in_parts(
-    fit, room, caplog: pytest.LogCaptureFixture, rays: int, parts: int
+    fit, memory_for, caplog: pytest.LogCaptureFixture, rays: int, parts: int
 ) -> None:
     whole = fit(canonical())
-    calls = room(rays)
+    calls = memory_for(rays)
     with caplog.at_level(logging.WARNING, logger="devrf"):
         divided = fit(canonical())
     assert divided.loop.micro_batching.count == parts
@@ -112,20 +112,22 @@ def test_the_canonical_stage_learns_the_same_in_parts(
     assert said[-1].endswith(f"batches are taken in {parts} parts from now on")
 
 
-def test_the_deformation_stage_learns_the_same_in_parts(fit, room, rest: LoadedCheckpoint) -> None:
+def test_the_deformation_stage_learns_the_same_in_parts(
+    fit, memory_for, rest: LoadedCheckpoint
+) -> None:
     whole = fit(moving(rest))
-    room(16, from_call=5)
+    memory_for(16, from_call=5)
     divided = fit(moving(rest))
     assert divided.loop.micro_batching.count == 4
     assert_alike(divided, whole)
 
 
 def test_a_frame_that_runs_short_takes_nothing_from_the_one_beside_it(
-    fit, room, rest: LoadedCheckpoint, four_frames: SceneDataModule
+    fit, memory_for, rest: LoadedCheckpoint, four_frames: SceneDataModule
 ) -> None:
     whole = fit(moving(rest, TOGETHER), data=four_frames)
     # Four iterations of one frame, one of two; then the second of them runs short.
-    calls = room(32, from_call=4 + 2 + 1)
+    calls = memory_for(32, from_call=4 + 2 + 1)
     divided = fit(moving(rest, TOGETHER), data=four_frames)
     assert (
         divided.loop.micro_batching.count == 2 and calls == [64] * 8 + [32] * 2 + [32] * 2 * 2 * 2
@@ -134,9 +136,9 @@ def test_a_frame_that_runs_short_takes_nothing_from_the_one_beside_it(
 
 
 def test_a_frame_that_never_has_room_ends_the_stage(
-    fit, room, rest: LoadedCheckpoint, four_frames: SceneDataModule
+    fit, memory_for, rest: LoadedCheckpoint, four_frames: SceneDataModule
 ) -> None:
-    room(4, from_call=4 + 2 + 1)
+    memory_for(4, from_call=4 + 2 + 1)
     stage = moving(rest, TOGETHER)
     with pytest.raises(DevrfError, match=r"at iteration 5 of 8 \(frames 1, 3, ") as caught:
         fit(stage, data=four_frames)
@@ -166,18 +168,18 @@ def test_memory_that_runs_out_at_the_backward_pass_does_no_harm(
     assert_alike(failing, whole)
 
 
-def test_the_parts_are_remembered(fit, room, tmp_path: Path) -> None:
-    room(32)
+def test_the_parts_are_remembered(fit, memory_for, tmp_path: Path) -> None:
+    memory_for(32)
     saving = PeriodicCheckpoint(tmp_path, every_seconds=0, share=1.0)
     fit(canonical(), saving)
-    calls = room(64)
+    calls = memory_for(64)
     again = canonical()
     fit(again, ckpt_path=str(tmp_path / "canonical-progress-4.ckpt"))
     assert again.loop.micro_batching.count == 2 and set(calls) == {32}
 
 
-def test_memory_that_never_suffices_ends_the_stage_saved(fit, room, tmp_path: Path) -> None:
-    calls = room(4, from_call=6)  # enough for the first six iterations
+def test_memory_that_never_suffices_ends_the_stage_saved(fit, memory_for, tmp_path: Path) -> None:
+    calls = memory_for(4, from_call=6)  # enough for the first six iterations
     stage = canonical()
     with pytest.raises(DevrfError) as caught:
         fit(stage, DivergenceGuard(), PeriodicCheckpoint(tmp_path, every_seconds=1000))
@@ -188,14 +190,14 @@ def test_memory_that_never_suffices_ends_the_stage_saved(fit, room, tmp_path: Pa
     assert calls[6:] == [64, 32, 16, 8]
     assert [path.name for path in tmp_path.iterdir()] == ["canonical-progress-6.ckpt"]
     # Where there is more memory it goes on.
-    room(64)
+    memory_for(64)
     again = canonical()
     fit(again, ckpt_path=str(tmp_path / "canonical-progress-6.ckpt"))
     assert again.iteration == 8 and again.abort_reason is None
 
 
-def test_before_the_first_iteration_nothing_is_logged(fit, room, tmp_path: Path) -> None:
-    room(4)
+def test_before_the_first_iteration_nothing_is_logged(fit, memory_for, tmp_path: Path) -> None:
+    memory_for(4)
     with pytest.raises(DevrfError, match="at iteration 0 of 8"):
         fit(canonical(), DivergenceGuard(), PeriodicCheckpoint(tmp_path, every_seconds=1000))
 
@@ -212,7 +214,7 @@ def test_other_errors_pass_through(fit, monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_one_of_several_processes_says_so_and_ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parts_module, "world_size", lambda: 2)
+    monkeypatch.setattr(module, "world_size", lambda: 2)
 
     def loss(pixels: Pixels) -> Any:
         raise MemoryError

@@ -2,8 +2,23 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import asdict
+
 import pytest
 from hydra.utils import instantiate
+
+from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule
+from devrf.methods.devrf.settings import (
+    DEFORMATION_LOSS,
+    FINE_LOSS,
+    SEARCH_LOSS,
+    CanonicalRates,
+    MotionSettings,
+    Sampling,
+)
 
 ROOT = "data.root=scene"
 
@@ -14,67 +29,19 @@ def paper(composed):
     return composed("experiment=paper_inward", ROOT)
 
 
-def test_canonical_schedule(paper):
-    schedule = instantiate(paper.schedule.canonical, _convert_="all")
-    assert schedule.search_iterations == 5_000
-    assert schedule.search_side == 100
-    assert schedule.iterations == 20_000
-    assert schedule.side == 160
-    assert schedule.doublings == [1000, 2000, 3000, 4000]
-    assert schedule.rays == 8192
-    assert not schedule.carve
-
-
-def test_canonical_phases(paper):
-    schedule = instantiate(paper.schedule.canonical, _convert_="all")
-    search, *fine = schedule.phases
-    assert (search.kind, search.start, search.stop, search.voxels) == ("search", 0, 5000, 100**3)
-    assert [p.voxels for p in fine] == [160**3 // 2**k for k in (4, 3, 2, 1, 0)]
-    assert [p.start - 5000 for p in fine] == [0, 1000, 2000, 3000, 4000]
-    assert schedule.total == 25_000
-    # A tenth over every 20 000 iterations.
-    assert schedule.learning_rate_factor(5000) == 1.0
-    assert schedule.learning_rate_factor(25_000) == pytest.approx(0.1)
-
-
-def test_deformation_schedule(paper):
-    schedule = instantiate(paper.schedule.deformation, _convert_="all")
-    assert schedule.sides == [10, 20, 40, 80, 160]
-    assert schedule.iterations_per_frame == [200, 100, 100, 50, 50]
-    assert schedule.rays == 8192
-    assert schedule.total(frames=50) == 25_000
-    assert schedule.growths(frames=50) == [10_000, 15_000, 20_000, 22_500]
-
-
-def test_deformation_learning_rates(paper):
-    schedule = instantiate(paper.schedule.deformation, _convert_="all")
-    motion = instantiate(paper.schedule.motion)
+def test_rates_and_batches(paper):
+    rates, motion = instantiate(paper.schedule.rates), instantiate(paper.schedule.motion)
+    assert (rates.density, rates.color, rates.decoder) == (0.1, 0.1, 1e-3)
     assert (motion.learning_rate, motion.unit) == (1e-3, "world")
-    first, last = (schedule.phase(i, frames=50) for i in (0, 24_999))
-    assert motion.learning_rate * first.learning_rate_factor == pytest.approx(1e-3)
-    assert motion.learning_rate * last.learning_rate_factor == pytest.approx(1e-4)
-
-
-def test_a_batch_is_all_pixels_of_one_view(paper):
-    motion = instantiate(paper.schedule.motion)
+    # A batch is drawn from all pixels of one view.
     assert (motion.views, motion.pixels) == ("one", "all")
 
 
-def test_canonical_learning_rates(paper):
-    rates = instantiate(paper.schedule.rates)
-    assert (rates.density, rates.color, rates.decoder) == (0.1, 0.1, 1e-3)
-
-
-def test_field(paper):
-    field = instantiate(paper.field)
+def test_field_and_sampling(paper):
+    field, sampling = instantiate(paper.field), instantiate(paper.sampling)
     assert (field.channels, field.width, field.frequencies) == (12, 128, 4)
     assert (field.alpha_init, field.search_alpha_init) == (1e-2, 1e-6)
-
-
-def test_sampling(paper):
-    sampling = instantiate(paper.sampling)
-    assert sampling.step == 0.5
-    assert sampling.alpha_threshold == 1e-4
+    assert (sampling.step, sampling.alpha_threshold) == (0.5, 1e-4)
     assert sampling.occupancy_threshold == 1e-3
 
 
@@ -93,16 +60,11 @@ def test_loss_weights(paper):
 
 def test_the_config_says_what_the_code_defaults_to(paper):
     """Plain Lightning code that states nothing gets the paper's stages too."""
-    from devrf.methods.devrf.architecture import Architecture
-    from devrf.methods.devrf.settings import (
-        DEFORMATION_LOSS,
-        FINE_LOSS,
-        SEARCH_LOSS,
-        CanonicalRates,
-        MotionSettings,
-        Sampling,
-    )
-
+    schedules = {"canonical": CanonicalSchedule(), "deformation": DeformationSchedule()}
+    for key, default in schedules.items():
+        found = instantiate(paper.schedule[key], _convert_="all")
+        # As text, in which lists are tuples.
+        assert json.dumps(asdict(found)) == json.dumps(asdict(default))
     assert instantiate(paper.field) == Architecture()
     assert instantiate(paper.sampling) == Sampling()
     assert instantiate(paper.schedule.rates) == CanonicalRates()

@@ -82,7 +82,7 @@ def _track(
                 if value is not None
             }
         )
-        tracker.show_table("metrics", [{"stage": name, **row} for name, row in scores.items()])
+        tracker.show_table("metrics", [{"section": name, **scores[name]} for name in frames])
         tracker.show_table("frames", frame_rows(frames))
 
 

@@ -159,11 +159,6 @@ def test_held_out_views_are_seen_and_scored(
     assert 0 < scores["test/static/ssim"] < 1
 
 
-def test_an_unknown_loss_term_is_named() -> None:
-    with pytest.raises(DevrfError, match="unknown term 'colour'"):
-        CanonicalStage(fine_loss={"colour": 1.0})
-
-
 def test_share_of_views_by_hand() -> None:
     # Two cameras at the origin, along −z and along +x, with a right angle of view.
     poses = torch.eye(3, 4).repeat(2, 1, 1)
@@ -174,23 +169,6 @@ def test_share_of_views_by_hand() -> None:
     share = view_count_weight(cameras, points.view(2, 2, 1, 3))
     # Seen by one, one, both (on their edges), none: none counts as one.
     assert share.flatten().tolist() == [0.5, 0.5, 1.0, 0.5]
-
-
-def test_the_default_stage_is_the_papers() -> None:
-    stage = CanonicalStage()
-    assert stage.total_iterations == 25000
-    assert (stage.rates.density, stage.rates.color, stage.rates.decoder) == (0.1, 0.1, 1e-3)
-    assert stage.sampling.step == 0.5 and stage.sampling.alpha_threshold == 1e-4
-    assert stage.losses["search"].weights == {
-        "color": 1.0,
-        "per_sample_color": 0.1,
-        "entropy": 0.01,
-    }
-    assert stage.losses["fine"].weights == {
-        "color": 1.0,
-        "per_sample_color": 0.01,
-        "entropy": 0.001,
-    }
 
 
 def test_no_matter_is_possible_before_a_lens(

@@ -10,7 +10,9 @@ import torch
 from devrf.data.batch import RayBatch
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
+from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.rays import Rays
+from devrf.geometry.space import WORLD, Space
 from devrf.methods.devrf import view
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.deformation_field import DeformationField
@@ -150,11 +152,13 @@ def test_a_batch_is_seen_ray_by_ray_at_its_own_time(
     assert model.canonical.density.values.grad.any()
 
 
-def test_a_model_built_from_its_config_takes_its_state(model: DeVRFModel) -> None:
+@pytest.mark.parametrize("space", [WORLD, NormalizedDevice(8, 6, (40.0, 40.0), near=2.0)])
+def test_a_model_built_from_its_config_takes_its_state(model: DeVRFModel, space: Space) -> None:
+    model.space = space
     other = DeVRFModel.from_config(model.config())
     other.load_stored_state(model.state_dict())
     assert other.config() == model.config() and other.size == model.size
-    assert other.moves and other.box == model.box
+    assert other.moves and other.box == model.box and other.space == space
     rays = looking_down(31)
     for time in (0.0, 0.8):
         assert torch.equal(picture(other, rays, time).color, picture(model, rays, time).color)

@@ -12,7 +12,6 @@ from devrf.data.batch import RayBatch, gather_batch
 from devrf.data.correspondence import previous_images
 from devrf.geometry.cameras import Cameras
 from devrf.methods.devrf.motion_losses import (
-    MOTION_TERMS,
     MotionPrediction,
     cycle,
     flow,
@@ -170,8 +169,3 @@ def test_induced_flow_of_the_exact_motion_is_the_exact_flow(
 
 def test_total_variation_weight_by_hand() -> None:
     assert total_variation_weight(2.0, 64, 100) == pytest.approx(1 / 600)
-
-
-def test_motion_terms_name_the_papers() -> None:
-    assert {"render", "cycle", "flow", "per_sample_color", "entropy"} <= set(MOTION_TERMS)
-    assert "color" not in MOTION_TERMS

@@ -72,13 +72,13 @@ class World:
         )
 
 
-def spacious() -> SampleCapacity:
+def ample() -> SampleCapacity:
     return SampleCapacity(RAYS, torch.device("cpu"))
 
 
 def fitting() -> SampleCapacity:
     """Just enough: the interpreter takes its time over padding, too."""
-    capacity = spacious()
+    capacity = ample()
     capacity.visible = capacity.significant = 240
     return capacity
 
@@ -105,7 +105,7 @@ def kept(output: VoxelOutput) -> slice | Tensor:
 def test_lists_of_fixed_length_see_and_learn_the_same(frames: int, planes: int | None) -> None:
     world = World(torch.float64, frames, planes)
     with using("torch"):
-        exact, listed = world.exactly(), world.listed(spacious())
+        exact, listed = world.exactly(), world.listed(ample())
     assert 50 < len(exact.samples) < len(listed.samples)
     chosen = kept(listed)
     close = {"atol": 1e-12, "rtol": 1e-10}
@@ -150,8 +150,8 @@ def test_gradients_that_are_there_are_added_to_in_place(kind: Kind) -> None:
         torch.testing.assert_close(there, 1 + change, atol=1e-5, rtol=1e-4)
 
 
-def test_padding_is_no_sample_and_the_room_is_told() -> None:
-    world, capacity = World(torch.float64, 1), spacious()
+def test_padding_is_no_sample_and_the_capacity_is_told() -> None:
+    world, capacity = World(torch.float64, 1), ample()
     with using("torch"):
         exact, listed = world.exactly(), world.listed(capacity)
     present = listed.samples.present
@@ -160,7 +160,7 @@ def test_padding_is_no_sample_and_the_room_is_told() -> None:
     assert not listed.weight[~present].any()
     assert bool(torch.isfinite(listed.canonical).all() & torch.isfinite(listed.sample_color).all())
     assert int(listed.samples.ray.min()) >= 0 and int(listed.samples.ray.max()) < RAYS
-    # The most that was needed, until somebody looks.
+    # The most that was needed, until it is measured.
     capacity.note(torch.tensor(3), torch.tensor(2))
     capacity.visible = capacity.significant = 4096
     assert capacity.measure()
@@ -171,7 +171,7 @@ def test_padding_is_no_sample_and_the_room_is_told() -> None:
 def test_lists_that_are_too_short_lose_the_last_rays_alone_and_grow(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    world, capacity = World(torch.float64, 1), spacious()
+    world, capacity = World(torch.float64, 1), ample()
     with using("torch"), caplog.at_level("INFO", logger="devrf"):
         exact = world.exactly()
         capacity.significant = half = len(exact.samples) // 2
@@ -188,24 +188,6 @@ def test_lists_that_are_too_short_lose_the_last_rays_alone_and_grow(
         assert torch.equal(cut.color[0], exact.color[0])
         assert torch.equal(cut.color[-1], world.behind[-1])
     assert sum("lists grow" in line for line in caplog.messages) == 1
-
-
-def test_room_grows_by_half_at_least_and_shrinks_only_from_great_waste() -> None:
-    capacity = SampleCapacity(64, torch.device("cpu"))
-    capacity.visible, capacity.significant = 4096, 1024
-
-    def needing(visible: int, significant: int) -> tuple[int, int]:
-        capacity.note(torch.tensor(visible), torch.tensor(significant))
-        capacity.poll(), capacity.poll()
-        return capacity.visible, capacity.significant
-
-    assert needing(4097, 800) == (6144, 1024)
-    assert needing(20000, 1024) == (25088, 1024)  # 1.25 times what was needed, in 256s
-    assert needing(6000, 512) == (25088, 1024)
-    assert needing(1000, 100) == (5120, 512)
-    capacity.note(torch.tensor(900), torch.tensor(400))
-    assert capacity.measure() and (capacity.visible, capacity.significant) == (1280, 512)
-    assert needing(4000, 4000) == (5120, 5120)
 
 
 @pytest.mark.parametrize("planes", [None, 9])

@@ -1,0 +1,68 @@
+"""What every method shares: its parts are learned, or stay as they are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import pytest
+import torch
+from torch import nn
+
+from devrf.data.batch import RayBatch
+from devrf.errors import DevrfError
+from devrf.methods.base import DynamicModel
+from devrf.rendering.output import RenderOutput
+from devrf.rendering.view import View
+
+
+class Toy(DynamicModel):
+    """Two parts of a few numbers."""
+
+    name = "toy"
+
+    def __init__(self, width: int = 3) -> None:
+        super().__init__()
+        self.canonical, self.deformation = nn.Linear(width, 3), nn.Linear(2, 1)
+
+    def config(self) -> dict[str, Any]:
+        return {"width": self.canonical.in_features}
+
+    def forward(self, batch: RayBatch) -> RenderOutput:
+        raise NotImplementedError
+
+    def parts(self) -> dict[str, Iterable[nn.Parameter]]:
+        return {
+            "canonical": self.canonical.parameters(),
+            "deformation": self.deformation.parameters(),
+        }
+
+    def at(self, time: float, *, half: bool = False) -> View:
+        raise NotImplementedError
+
+
+def test_frozen_parts_are_in_no_group_and_the_others_learn() -> None:
+    model = Toy()
+    assert [group["name"] for group in model.param_groups()] == ["canonical", "deformation"]
+    model.freeze(["canonical"])
+    (group,) = model.param_groups()
+    assert group["name"] == "deformation" and len(group["params"]) == 2
+    assert not any(p.requires_grad for p in model.canonical.parameters())
+    model.freeze([])  # of another stage
+    assert len(model.param_groups()) == 2
+
+
+def test_an_unknown_part_is_named_with_those_there_are() -> None:
+    model = Toy()
+    with pytest.raises(DevrfError, match="toy has no part 'rest'; it has canonical, deformation"):
+        model.freeze(["canonical", "rest"])
+    assert all(p.requires_grad for p in model.parameters())  # nothing half-done
+
+
+def test_it_is_built_from_its_config_and_takes_its_state() -> None:
+    model = Toy(width=5)
+    other = Toy.from_config(model.config())
+    other.load_stored_state(model.stored_state())
+    assert other.size == model.size == (5 * 3 + 3) + (2 + 1)
+    for one, same in zip(model.parameters(), other.parameters(), strict=True):
+        assert torch.equal(one, same)
