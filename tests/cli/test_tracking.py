@@ -1,8 +1,4 @@
-<<<<<<< HEAD
 """A run is one tracked run with curves, pictures, videos and tables, all on this machine."""
-=======
-"""One run is one tracked run, and holds curves, pictures and scores; all on this machine."""
->>>>>>> coretests
 
 from __future__ import annotations
 

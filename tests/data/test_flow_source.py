@@ -1,8 +1,4 @@
-<<<<<<< HEAD
 """Where optical flow comes from when the user does not say."""
-=======
-"""Where optical flow comes from when nothing is said."""
->>>>>>> coretests
 
 from __future__ import annotations
 
