@@ -81,7 +81,7 @@ class Stray(Callback):
 
     def on_train_end(self, trainer, stage):
         if trainer.global_rank == 1:
-            stage.model.canonical.color.values.data[0, 0, 0] += 1
+            stage.scene_model.canonical.color.values.data[0, 0, 0] += 1
 '''
 
 
