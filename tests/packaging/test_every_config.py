@@ -146,6 +146,7 @@ def test_the_command_line_overrides_the_ablation_and_that_the_experiment(compose
         (["data=inward", "data.root=/scenes/my scene"], "outputs/my_scene/default"),
         (["data=inward", "data.root=x", "data.name=y"], "outputs/y/default"),
         (["ablation=base"], "outputs/robot/default-base"),
+        (["protocol=joint"], "outputs/robot/default-devrf-joint"),
         (["data=inward"], "outputs/scene/default"),
         (["stage=report", "report.into=there"], "there"),
         (["stage=report", "report.runs=no such folder"], "outputs/report"),

@@ -28,11 +28,18 @@ def scene_name(data: Any) -> str:
     return re.sub(r"[^\w.-]+", "_", str(chosen)) or "scene"
 
 
-def run_name(experiment: str | None, ablation: str | None) -> str:
-    """The run's folder name: the experiment, and the ablation unless it is the full method."""
+def run_name(
+    experiment: str | None,
+    ablation: str | None,
+    method: str = "devrf",
+    protocol: str = "two_stage",
+) -> str:
+    """The run's folder name: the experiment, and what else was chosen beside the usual."""
     parts = [experiment or "default"]
     if ablation not in (None, "full"):
         parts.append(str(ablation))
+    if (method, protocol) != ("devrf", "two_stage"):
+        parts += [method, protocol]
     return "-".join(parts)
 
 
