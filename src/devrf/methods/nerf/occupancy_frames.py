@@ -1,0 +1,98 @@
+"""Where something may be at each frame: a bit a cell and frame, so that empty space is skipped."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from devrf.geometry.box import Box
+from devrf.geometry.rays import Rays
+from devrf.methods.nerf.ray_samples import RaySamples
+from devrf.rendering.occupancy import dilate
+from devrf.rendering.sampling import steps_through
+from devrf.scenes.scene import Scene
+from devrf.scenes.visual_hull import visual_hull
+
+
+class OccupancyFrames(nn.Module):
+    """Masks (T, X, Y, Z) of T frames over a box.
+
+    Attributes:
+        mask: (T, X, Y, Z) bool, True where something may be.
+    """
+
+    mask: Tensor
+
+    def __init__(self, frames: int, shape: tuple[int, int, int]) -> None:
+        """Exclude nothing."""
+        super().__init__()
+        self.register_buffer("mask", torch.ones(frames, *shape, dtype=torch.bool))
+
+    @torch.no_grad()
+    def carve(self, scene: Scene, box: Box) -> None:
+        """Take the visual hull of each frame's mattes, grown by a cell; nothing without mattes.
+
+        Args:
+            scene: its training views are looked at; static images show frame 0.
+            box: where the masks live, in world units.
+        """
+        _, *points = self.mask.shape
+        x, y, z = points
+        for views in (scene.static.train, scene.dynamic.train):
+            if not views.has_alpha:
+                continue
+            assert views.frames is not None
+            for frame in torch.unique(views.frames).tolist():
+                shown = views[(views.frames == frame).nonzero()[:, 0]]
+                hull = dilate(visual_hull(shown, box, (x, y, z)), 1)
+                self.mask[frame] &= hull.to(self.mask.device)
+
+    def march(
+        self,
+        rays: Rays,
+        frames: tuple[Tensor, Tensor],
+        box: Box,
+        depths: tuple[float, float],
+        step: float,
+        *,
+        jitter: bool,
+    ) -> RaySamples:
+        """Samples every ``step`` along rays, where something may be at one of two frames.
+
+        Args:
+            rays: R rays in the fields' space.
+            frames: (R,) int64 twice: the frames before and after each ray's time.
+            box: where the masks live, in the fields' space.
+            depths: distances between which rays are sampled.
+            step: in units of the rays' directions.
+            jitter: move all samples of a ray by a random part of a step.
+        """
+        near, far = depths
+        entry, count = steps_through(rays, box, step=step, near=near, far=far)
+        ray = torch.repeat_interleave(count)
+        number = torch.arange(len(ray), device=ray.device) - (count.cumsum(0) - count)[ray]
+        offset = torch.rand_like(entry) if jitter else torch.full_like(entry, 0.5)
+        distance = entry[ray] + (number + offset[ray]) * step
+        cell = self._cells(rays.at(ray, distance), box)
+        flat, cells = self.mask.flatten(1), self.mask[0].numel()
+        met = torch.zeros_like(ray, dtype=torch.bool)
+        for frame in frames:
+            met |= flat.view(-1)[frame[ray] * cells + cell]
+        kept = met.nonzero()[:, 0]
+        return RaySamples.at(rays, ray[kept], distance[kept], step)
+
+    def _cells(self, points: Tensor, box: Box) -> Tensor:
+        """The row-major number (M,) of the grid point nearest to each of ``points`` (M, 3)."""
+        _, x, y, z = self.mask.shape
+        place = box.to_grid(box.nearest(points), (x, y, z)).round().long()
+        return (place[:, 0] * y + place[:, 1]) * z + place[:, 2]
+
+    def _load_from_state_dict(
+        self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
+    ) -> None:
+        stored = state_dict.get(prefix + "mask")
+        if stored is not None and stored.shape != self.mask.shape:
+            self.mask = torch.ones_like(stored, device=self.mask.device)
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
