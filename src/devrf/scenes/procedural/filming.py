@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
@@ -89,18 +87,3 @@ class Filming:
             light=self.light,
             steps=self.steps,
         )
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """PyTorch on one thread inside, on as many as before afterwards.
-
-    Rendering is thousands of small operations: a second thread gains little, and where the cores
-    are shared with others it waits at each of them, which makes a scene take minutes.
-    """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from devrf.scenes.procedural.shape import Material
+
 Rgb = tuple[float, float, float]
 
 
@@ -71,11 +73,27 @@ class PaintedParts:
             edge=table([(p.threshold, p.sharpness) for p in paints]),
         )
 
-    def color(self, rest: Tensor, part: Tensor) -> Tensor:
-        """Albedo (M, 3) of rest points (M, 3) of the parts (M,)."""
+    def color(self, material: Material) -> Tensor:
+        """Albedo (M, 3) of the material."""
+        rest, part = material.rest, material.part
         offset = rest - self.origin.to(rest)[part]
         local = torch.einsum("mji,mj->mi", self.rotation.to(rest)[part], offset)
         pattern = (local * self.wave.to(rest)[part]).cos().prod(dim=-1)
         threshold, sharpness = self.edge.to(rest)[part].unbind(-1)
         share = ((pattern - threshold) * sharpness).sigmoid()[:, None]
         return torch.lerp(self.base.to(rest)[part], self.accent.to(rest)[part], share)
+
+    def outline(self, half: Tensor, middle: Tensor) -> Material:
+        """A grid of points over the boxes around the parts.
+
+        Args:
+            half: (K, 3) half edges along the parts' axes, world units.
+            middle: (K, 3) where in its frame each box has its middle.
+        """
+        steps = torch.linspace(-1, 1, 7)
+        cube = torch.cartesian_prod(steps, steps, steps)
+        local = cube * half[:, None] + middle[:, None]
+        rest = torch.einsum("kij,kmj->kmi", self.rotation.float(), local)
+        rest = rest + self.origin.float()[:, None]
+        part = torch.arange(len(half)).repeat_interleave(len(cube))
+        return Material(rest.reshape(-1, 3), part)
