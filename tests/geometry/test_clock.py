@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 from hypothesis import given
@@ -42,15 +44,18 @@ def test_every_frame_is_found_exactly_in_spite_of_float32(frames: int) -> None:
     assert FrameClock.from_times(times.double()).times == pytest.approx(clock.times, abs=1e-6)
 
 
-def test_from_times_sorts_merges_roundings_and_puts_rest_before() -> None:
-    times = torch.tensor([[1.0, 0.5, 0.25], [0.5 + 1e-7, 0.25, 1.0]])
-    assert FrameClock.from_times(times).times == pytest.approx((0.0, 0.25, 0.5, 1.0))
-
-
-def test_a_time_that_starts_late_does_not_become_the_rest_state() -> None:
-    clock = FrameClock.from_times(torch.tensor([0.2, 0.6]))
-    assert clock.times == pytest.approx((0.0, 0.2, 0.6))
-    assert clock.frames_of(torch.tensor([0.6, 0.2])).tolist() == [2, 1]
+@pytest.mark.parametrize(
+    ("times", "expected"),
+    [
+        ([[1.0, 0.5, 0.25], [0.5 + 1e-7, 0.25, 1.0]], (0.0, 0.25, 0.5, 1.0)),
+        # A capture that starts late does not start at rest.
+        ([0.2, 0.6], (0.0, 0.2, 0.6)),
+    ],
+)
+def test_from_times_sorts_merges_roundings_and_puts_rest_before(
+    times: list[Any], expected: tuple[float, ...]
+) -> None:
+    assert FrameClock.from_times(torch.tensor(times)).times == pytest.approx(expected)
 
 
 def test_frames_of_gives_the_nearest_frame_in_any_shape() -> None:

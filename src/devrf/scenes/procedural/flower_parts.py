@@ -14,8 +14,7 @@ STEM_RADIUS = 0.055
 HEART = 0.14  # radius of the ball in the blossom's middle
 POT_CENTER, POT_RADIUS, POT_HALF_HEIGHT, POT_ROUNDING = -0.83, 0.34, 0.19, 0.06
 
-
-# Part numbers; the leaves' and petals' go on from their first.
+# Part numbers: pot, stem, heart, then the leaves, then the petals.
 POT, FIRST_LEAF, FIRST_PETAL = 0, 3, 6
 
 MAGENTA: Rgb = (0.84, 0.10, 0.45)

@@ -20,7 +20,7 @@ class Swing:
     """A part of a sine that starts at 0: amplitude · (sin(rate · t + phase) − sin(phase)).
 
     Attributes:
-        amplitude: radians, for angles.
+        amplitude: factor of the sine, in radians where the swing is an angle.
         rate: radians per unit of time.
         phase: radians; 0 starts at full speed, −1 starts slowly and is fast later.
     """
