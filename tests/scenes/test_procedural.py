@@ -13,8 +13,8 @@ from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.procedural import Flower, ProceduralForwardScene, ProceduralScene, moved
 from devrf.scenes.procedural.cameras import dynamic_rig
+from devrf.scenes.procedural.filming import Filming
 from devrf.scenes.procedural.march import HIT
-from devrf.scenes.procedural.picture import render
 from devrf.scenes.scene import Scene, Views
 
 # Not square, so that a swap of the axes cannot hide.
@@ -166,9 +166,9 @@ def test_rest_pose_alone_explains_later_frames_badly(inward: Built) -> None:
 
 def test_static_views_show_the_first_frame() -> None:
     cameras, _ = dynamic_rig(2, width=24, height=32, reach=1.3)
-    still = render(Flower(0.0), cameras, 0.7, reach=1.3).pixels
-    assert torch.equal(still, render(Flower(), cameras, 0.0, reach=1.3).pixels)
-    assert not torch.equal(still, render(Flower(), cameras, 0.7, reach=1.3).pixels)
+    still = Filming(Flower(0.0), 1.3).pictures(cameras, 0.7).pixels
+    assert torch.equal(still, Filming(Flower(), 1.3).pictures(cameras, 0.0).pixels)
+    assert not torch.equal(still, Filming(Flower(), 1.3).pictures(cameras, 0.7).pixels)
 
 
 @pytest.mark.parametrize(("width", "height"), [(48, 16), (16, 48)])

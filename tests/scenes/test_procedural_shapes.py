@@ -9,8 +9,8 @@ from torch import Tensor
 from devrf.scenes.procedural import Flower, Material, Plush, Robot, Shape, facing_rig, moved
 from devrf.scenes.procedural.backdrop import FLOOR, WALL, OnStage
 from devrf.scenes.procedural.cameras import dynamic_rig
+from devrf.scenes.procedural.filming import Filming
 from devrf.scenes.procedural.march import HIT
-from devrf.scenes.procedural.picture import render
 from devrf.scenes.procedural.plush import TABLE
 from devrf.scenes.procedural.plush_parts import BASE, REACH
 from devrf.scenes.procedural.truth import extent
@@ -25,10 +25,10 @@ def surface(shape: Shape, time: float) -> Tensor:
     """World points (S, 3) that three cameras see of the shape at ``time``."""
     if isinstance(shape, OnStage):
         cameras, _ = facing_rig.dynamic_rig(3, width=32, height=24)
-        depth = render(shape, cameras, time, reach=9.0, supersample=1, steps=400).depth
+        depth = Filming(shape, 9.0, 1, steps=400).pictures(cameras, time).depth
     else:
         cameras, _ = dynamic_rig(3, width=48, height=48, reach=1.4)
-        depth = render(shape, cameras, time, reach=1.6, supersample=1).depth
+        depth = Filming(shape, 1.6, 1).pictures(cameras, time).depth
     camera, row, column = depth.isfinite().nonzero().unbind(-1)
     rays = cameras.rays(camera, torch.stack([column, row], dim=-1) + 0.5)
     return rays.at(torch.arange(len(rays)), depth[depth.isfinite()])

@@ -5,13 +5,29 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from devrf.geometry.cameras import Cameras
-from devrf.scenes.procedural.march import MAX_STEPS
-from devrf.scenes.procedural.picture import Pictures, render
+from devrf.geometry.rays import Rays
+from devrf.scenes.procedural.march import CHUNK, MAX_STEPS, block_starts, trace
+from devrf.scenes.procedural.shading import shaded
 from devrf.scenes.procedural.shape import Shape
 from devrf.scenes.procedural.truth import backward_flow
 from devrf.scenes.scene import OpticalFlow, Views
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """N images of a shape at one time.
+
+    Attributes:
+        pixels: (N, H, W, 4) uint8 RGBA, alpha not premultiplied.
+        depth: (N, H, W) float32 distance along the ray through each pixel's centre, world
+            units, +inf where it meets nothing.
+    """
+
+    pixels: Tensor
+    depth: Tensor
 
 
 @dataclass(frozen=True)
@@ -19,17 +35,17 @@ class Filming:
     """What is filmed, and how.
 
     Attributes:
-        shape: what all cameras see.
+        shape: what all cameras see, from outside of it.
         reach: radius of a ball about the origin that holds the shape at all times, world units.
-        supersample: n × n rays a pixel.
-        light: share of the lamp in the lighting, 0 … 1.
+        supersample: n: colour and alpha are the mean of n × n rays a pixel.
+        light: share of the lamp in the lighting, 0 (albedo alone) … 1.
         steps: after how many steps a ray counts as a miss.
     """
 
     shape: Shape
     reach: float
-    supersample: int
-    light: float
+    supersample: int = 2
+    light: float = 0.2
     steps: int = MAX_STEPS
 
     def at_rest(self, cameras: Cameras, split: str) -> Views:
@@ -78,12 +94,32 @@ class Filming:
 
     def pictures(self, cameras: Cameras, time: float) -> Pictures:
         """One image from each of N ``cameras`` at ``time``."""
-        return render(
-            self.shape,
-            cameras,
-            time,
-            reach=self.reach,
-            supersample=self.supersample,
-            light=self.light,
-            steps=self.steps,
-        )
+        start = block_starts(self.shape, cameras, time, self.reach)
+        size = start.shape
+        start = start.reshape(-1)
+        depth, image = torch.full_like(start, torch.inf), start.new_zeros(len(start), 4)
+        grid = cameras.pixel_grid()
+        # From a pixel's centre to the centres of its n × n parts.
+        steps = (torch.arange(self.supersample) + 0.5) / self.supersample - 0.5
+        offsets = torch.cartesian_prod(steps, steps)
+        count = len(offsets)
+        live = start.isfinite().nonzero().squeeze(-1)
+        for pixel in torch.split(live, max(CHUNK // count, 1)):
+            camera, center, onset = pixel // len(grid), grid[pixel % len(grid)], start[pixel]
+            depth[pixel] = self._trace(cameras.rays(camera, center), time, onset)
+            parts = (center[:, None] + offsets).reshape(-1, 2)
+            rays = cameras.rays(camera.repeat_interleave(count), parts)
+            distance = self._trace(rays, time, onset.repeat_interleave(count))
+            hit = distance.isfinite().nonzero().squeeze(-1)
+            # Colour times alpha, and alpha: only these may be averaged.
+            samples = start.new_zeros(len(rays), 4)
+            samples[hit, 3] = 1
+            samples[hit, :3] = shaded(self.shape, rays.at(hit, distance[hit]), time, self.light)
+            mean = samples.view(-1, count, 4).mean(dim=1)
+            color = mean[:, :3] / mean[:, 3:].clamp_min(1e-6)
+            image[pixel] = torch.cat([color, mean[:, 3:]], dim=-1)
+        pixels = (image * 255).round().clamp(0, 255).to(torch.uint8)
+        return Pictures(pixels.view(*size, 4), depth.view(size))
+
+    def _trace(self, rays: Rays, time: float, start: Tensor) -> Tensor:
+        return trace(self.shape, rays, time, start, self.reach, self.steps)

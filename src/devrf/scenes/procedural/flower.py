@@ -36,7 +36,7 @@ def _painted() -> PaintedParts:
         frames += [whorl.frame(k) for k in range(whorl.count)]
         paints += [whorl.paints[k % 2] for k in range(whorl.count)]
     axes, origins = zip(*frames, strict=True)
-    return PaintedParts.of(paints, torch.stack(axes), torch.stack(origins))
+    return PaintedParts(paints, torch.stack(axes), torch.stack(origins))
 
 
 _PAINTED = _painted()

@@ -50,7 +50,7 @@ class SolidTable:
         self._rounding = torch.tensor([s.rounding for s in solids])[:, None]
         upright = torch.eye(3, dtype=torch.float64).repeat(len(solids), 1, 1)
         origin = self.center + torch.tensor(base, dtype=torch.float64)
-        self.painted = PaintedParts.of([s.paint for s in solids], upright, origin)
+        self.painted = PaintedParts([s.paint for s in solids], upright, origin)
 
     def distances(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         """Distance (K, M) to each solid of coordinates (K, M) about its centre, along its axes."""
