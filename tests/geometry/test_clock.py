@@ -6,8 +6,6 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
 from devrf.geometry.clock import FrameClock, Moment
 
@@ -67,24 +65,10 @@ def test_frames_of_gives_the_nearest_frame_in_any_shape() -> None:
 
 def test_frames_of_many_frames_takes_no_memory_of_their_square() -> None:
     times = torch.linspace(0, 1, 90_000, dtype=torch.float64)
-    assert FrameClock(tuple(times.tolist())).frames_of(times).tolist() == list(range(90_000))
+    assert torch.equal(FrameClock(tuple(times.tolist())).frames_of(times), torch.arange(90_000))
 
 
 @pytest.mark.parametrize("times", [(0.0,), (0.1, 0.2), (0.0, 0.5, 0.5), (0.0, 0.6, 0.5), ()])
 def test_a_clock_without_rest_or_out_of_order_is_an_error(times: tuple[float, ...]) -> None:
     with pytest.raises(ValueError, match="frame clock"):
         FrameClock(times)
-
-
-@given(
-    st.lists(st.integers(1, 1000), min_size=1, max_size=12, unique=True),
-    st.floats(0, 1, allow_nan=False),
-)
-def test_a_moment_blends_back_to_its_time(ticks: list[int], time: float) -> None:
-    clock = FrameClock((0.0, *(t / 1000 for t in sorted(ticks))))
-    moment = clock.at(time)
-    assert 0 <= moment.weight < 1
-    assert moment.after in (moment.before, moment.before + 1)
-    times = clock.times
-    blended = (1 - moment.weight) * times[moment.before] + moment.weight * times[moment.after]
-    assert blended == pytest.approx(min(time, times[-1]), abs=2e-5)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 import torch
 
-from devrf.geometry.cameras import Cameras
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.rays import Rays
 
@@ -45,18 +44,6 @@ def test_a_ray_by_hand() -> None:
     torch.testing.assert_close(rays.origins, torch.tensor([[1.5, 0.0, -1.0]]))
     torch.testing.assert_close(rays.directions, torch.tensor([[-0.75, 0.0, 2.0]]))
     assert torch.equal(rays.viewdirs, d)
-
-
-def test_rays_start_on_the_near_plane_and_end_at_infinity(rng: torch.Generator) -> None:
-    camera = Cameras(
-        torch.eye(3, 4)[None], torch.tensor([[8.0, 9.0]]), torch.tensor([[8.0, 6.0]]), 16, 12
-    )
-    world = camera.image_rays(0)
-    rays = NDC.rays(world)
-    torch.testing.assert_close(rays.origins[:, 2], torch.full((192,), -1.0))
-    torch.testing.assert_close((rays.origins + rays.directions)[:, 2], torch.ones(192))
-    # From the reference camera itself every ray runs straight along z'.
-    assert rays.directions[:, :2].abs().max() < 1e-6
 
 
 def test_points_of_a_world_ray_lie_on_its_ndc_ray(rng: torch.Generator) -> None:
