@@ -63,7 +63,7 @@ class Box:
         At least two along each axis, since grid corners sit on the box's corners.
         """
         s = self.voxel_size(voxels)
-        # A hair is added so that a cube of 10^3 voxels has side 10 in spite of rounding.
+        # 1e-6 is added so that a cube of 10^3 voxels has side 10 in spite of rounding.
         x, y, z = (max(2, int(edge / s + 1e-6)) for edge in self.size)
         return x, y, z
 

@@ -79,7 +79,7 @@ def read_lpips(network: Network, path: Path) -> Lpips:
             if name.startswith("features.")
         }
         return Lpips(TRUNKS[network], features, heads)
-    except Exception:  # noise in a file makes the unpickler raise whatever it likes
+    except Exception:  # a damaged file makes the unpickler raise any exception
         raise DevrfError(
             f"{path}: not the weights of {network}; expected torchvision's, with names like "
             "features.0.weight"

@@ -12,7 +12,7 @@ from devrf.scenes.procedural.recipe import Recipe
 from devrf.scenes.procedural.robot import Robot
 from devrf.scenes.procedural.shape import BoundedShape
 from devrf.scenes.procedural.truth import extent
-from devrf.scenes.scene import Bounds, Capture, Scene
+from devrf.scenes.scene import Bounds, Scene
 from devrf.scenes.validation import check_choice
 
 SHAPES: dict[str, Callable[[float], BoundedShape]] = {"robot": Robot, "flower": Flower}
@@ -43,11 +43,8 @@ class ProceduralScene(Recipe):
         return Scene(
             name=self.shape,
             kind="inward",
-            static=Capture(film.at_rest(learned, "train"), film.at_rest(tested, "test")),
-            dynamic=Capture(
-                film.moving(watching, self.frames, "train"),
-                film.moving(unseen, self.frames, "test"),
-            ),
+            static=film.at_rest(learned, tested),
+            dynamic=film.moving(watching, unseen, self.frames),
             bounds=Bounds(
                 box=where.rest,
                 near=DISTANCE - reach,

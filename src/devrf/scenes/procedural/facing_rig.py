@@ -18,7 +18,7 @@ _STATIC = (0.45, 0.24)
 _DYNAMIC = (0.36, 0.18)
 _HELD_OUT = (0.07, -0.04)
 _TARGET_DEPTH = 3.4
-# Static cameras are not quite on a plane: hands are not.
+# Static cameras deviate this much from a plane, as hand-held ones do.
 _UNEVEN = 0.05
 
 
@@ -35,9 +35,7 @@ def static_rig(count: int, *, width: int, height: int) -> Cameras:
     angle = math.pi * (3 - math.sqrt(5)) * index
     x, y = _STATIC[0] * radius * angle.cos(), _STATIC[1] * radius * angle.sin()
     positions = torch.stack([x, y, _UNEVEN * (2.0 * index).sin()], dim=-1)
-    cameras = _facing(positions, width, height)
-    poses = cameras.camera_to_world
-    return _single(replace(cameras, camera_to_world=relative_to(average_pose(poses), poses)))
+    return _facing(positions, width, height, centred=True)
 
 
 def dynamic_rig(train: int, *, width: int, height: int) -> tuple[Cameras, Cameras]:
@@ -52,12 +50,12 @@ def dynamic_rig(train: int, *, width: int, height: int) -> tuple[Cameras, Camera
     level = torch.zeros_like(angle)
     around = torch.stack([_DYNAMIC[0] * angle.cos(), _DYNAMIC[1] * angle.sin(), level], dim=-1)
     middle = torch.tensor([[*_HELD_OUT, 0.0]], dtype=torch.float64)
-    return _single(_facing(around, width, height)), _single(_facing(middle, width, height))
+    return _facing(around, width, height), _facing(middle, width, height)
 
 
-def _facing(positions: Tensor, width: int, height: int) -> Cameras:
-    """Cameras at positions (N, 3) that look at the rig's target, y up."""
-    return Cameras.looking_at(
+def _facing(positions: Tensor, width: int, height: int, *, centred: bool = False) -> Cameras:
+    """Float32 cameras at positions (N, 3) float64 that look at the rig's target, y up."""
+    cameras = Cameras.looking_at(
         positions,
         positions.new_tensor([0.0, 0.0, -_TARGET_DEPTH]).expand_as(positions),
         focal=max(width, height) / 2 / math.tan(FIELD_OF_VIEW / 2),
@@ -65,13 +63,12 @@ def _facing(positions: Tensor, width: int, height: int) -> Cameras:
         height=height,
         up=positions.new_tensor([0.0, 1.0, 0.0]),
     )
-
-
-def _single(cameras: Cameras) -> Cameras:
-    """The cameras in single precision."""
+    poses = cameras.camera_to_world
+    if centred:
+        poses = relative_to(average_pose(poses), poses)
     return replace(
         cameras,
-        camera_to_world=cameras.camera_to_world.float(),
+        camera_to_world=poses.float(),
         focal=cameras.focal.float(),
         center=cameras.center.float(),
     )

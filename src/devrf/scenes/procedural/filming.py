@@ -13,7 +13,7 @@ from devrf.scenes.procedural.march import CHUNK, MAX_STEPS, block_starts, trace
 from devrf.scenes.procedural.shading import shaded
 from devrf.scenes.procedural.shape import Shape
 from devrf.scenes.procedural.truth import backward_flow
-from devrf.scenes.scene import OpticalFlow, Views
+from devrf.scenes.scene import Capture, OpticalFlow, Views
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Pictures:
     """N images of a shape at one time.
 
     Attributes:
-        pixels: (N, H, W, 4) uint8 RGBA, alpha not premultiplied.
+        pixels: (N, H, W, 4) uint8 RGBA, alpha not premultiplied; (N, H, W, 3) where opaque.
         depth: (N, H, W) float32 distance along the ray through each pixel's centre, world
             units, +inf where it meets nothing.
     """
@@ -40,6 +40,7 @@ class Filming:
         supersample: n: colour and alpha are the mean of n × n rays a pixel.
         light: share of the lamp in the lighting, 0 (albedo alone) … 1.
         steps: after how many steps a ray counts as a miss.
+        opaque: whether every ray meets something, so that the images need no alpha.
     """
 
     shape: Shape
@@ -47,9 +48,23 @@ class Filming:
     supersample: int = 2
     light: float = 0.2
     steps: int = MAX_STEPS
+    opaque: bool = False
 
-    def at_rest(self, cameras: Cameras, split: str) -> Views:
-        """One image from each of N ``cameras`` at time 0; ``split`` goes into their names."""
+    def at_rest(self, train: Cameras, test: Cameras) -> Capture:
+        """One image from each camera at time 0."""
+        return Capture(self._still(train, "train"), self._still(test, "test"))
+
+    def moving(self, train: Cameras, test: Cameras, frames: int) -> Capture:
+        """All fixed cameras at frame 0, then all at frame 1, …, with the exact backward flow.
+
+        Args:
+            train: V cameras to learn from.
+            test: held-out cameras.
+            frames: number of frames T ≥ 2, at times k / (T − 1).
+        """
+        return Capture(self._moving(train, frames, "train"), self._moving(test, frames, "test"))
+
+    def _still(self, cameras: Cameras, split: str) -> Views:
         pictures = self.pictures(cameras, 0.0)
         return Views(
             pixels=pictures.pixels,
@@ -60,14 +75,7 @@ class Filming:
             depth=pictures.depth,
         )
 
-    def moving(self, cameras: Cameras, frames: int, split: str) -> Views:
-        """All cameras at frame 0, then all at frame 1, …, with the exact backward flow.
-
-        Args:
-            cameras: V fixed cameras.
-            frames: number of frames T ≥ 2, at times k / (T − 1).
-            split: goes into the images' names.
-        """
+    def _moving(self, cameras: Cameras, frames: int, split: str) -> Views:
         times = torch.arange(frames) / (frames - 1)
         clock: list[float] = times.tolist()
         pictures = [self.pictures(cameras, time) for time in clock]
@@ -118,8 +126,10 @@ class Filming:
             mean = samples.view(-1, count, 4).mean(dim=1)
             color = mean[:, :3] / mean[:, 3:].clamp_min(1e-6)
             image[pixel] = torch.cat([color, mean[:, 3:]], dim=-1)
-        pixels = (image * 255).round().clamp(0, 255).to(torch.uint8)
-        return Pictures(pixels.view(*size, 4), depth.view(size))
+        pixels = (image * 255).round().clamp(0, 255).to(torch.uint8).view(*size, 4)
+        if self.opaque:
+            pixels = pixels[..., :3].contiguous()
+        return Pictures(pixels, depth.view(size))
 
     def _trace(self, rays: Rays, time: float, start: Tensor) -> Tensor:
         return trace(self.shape, rays, time, start, self.reach, self.steps)

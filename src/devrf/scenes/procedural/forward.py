@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import torch
 
@@ -13,11 +13,11 @@ from devrf.scenes.procedural.filming import Filming
 from devrf.scenes.procedural.plush import Plush
 from devrf.scenes.procedural.recipe import Recipe
 from devrf.scenes.procedural.shape import Shape
-from devrf.scenes.scene import Capture, Scene, Views
+from devrf.scenes.scene import Scene
 
 # Radius of a ball about the origin that holds all that the cameras see of wall and floor.
 _REACH = 9.0
-# Every so manieth static view is held out, the first one included: as readers of LLFF do it.
+# One static view in so many is held out, the first one included, as readers of LLFF do.
 HOLDOUT = 8
 NEAR = 1.0
 # Rays that creep past the toy have to reach the wall: with 256 steps a few in a million do not.
@@ -29,10 +29,9 @@ class ProceduralForwardScene(Recipe):
     """A soft toy on a pedestal before a painted wall, seen from one side.
 
     The world is the one that :class:`devrf.scenes.llff.LlffReader` makes: the static cameras'
-    average pose is the identity, and nothing is nearer to a camera than 1/0.75. One static view
-    in eight, of more than ``static_views``, is held out.
-
-    The other numbers are those of :class:`~devrf.scenes.procedural.recipe.Recipe`.
+    average pose is the identity, and nothing is nearer to a camera than 1/0.75. Besides
+    ``static_views`` to learn from there are held-out ones, one in eight of all. The other
+    numbers are those of :class:`~devrf.scenes.procedural.recipe.Recipe`.
 
     Attributes:
         name: the scene's name.
@@ -45,7 +44,7 @@ class ProceduralForwardScene(Recipe):
 
     def render(self) -> Scene:
         """The scene, from checked numbers."""
-        film = Filming(self.model(), _REACH, self.supersample, self.light, steps=_STEPS)
+        film = Filming(self.model(), _REACH, self.supersample, self.light, _STEPS, opaque=True)
         size = {"width": self.width, "height": self.height}
         # Of each eight views seven are learned from.
         held_out = -(-self.static_views // (HOLDOUT - 1))
@@ -53,13 +52,8 @@ class ProceduralForwardScene(Recipe):
         order = torch.arange(len(static))
         learned, tested = static[order % HOLDOUT != 0], static[order % HOLDOUT == 0]
         watching, unseen = dynamic_rig(self.train_views, **size)
-        at_rest = Capture(
-            _opaque(film.at_rest(learned, "train")), _opaque(film.at_rest(tested, "test"))
-        )
-        moving = Capture(
-            _opaque(film.moving(watching, self.frames, "train")),
-            _opaque(film.moving(unseen, self.frames, "test")),
-        )
+        at_rest = film.at_rest(learned, tested)
+        moving = film.moving(watching, unseen, self.frames)
         space = reference_space(static, NEAR)
         source = "all that the cameras see (procedural scene)"
         bounds = forward_bounds([at_rest.train, moving.train], space, source)
@@ -68,8 +62,3 @@ class ProceduralForwardScene(Recipe):
     def model(self) -> Shape:
         """The toy and its stage themselves, for exact answers at any point and time."""
         return OnStage(Plush(float(self.speed)))
-
-
-def _opaque(views: Views) -> Views:
-    """The views without their mattes: wall and floor are everywhere."""
-    return replace(views, pixels=views.pixels[..., :3].contiguous())
