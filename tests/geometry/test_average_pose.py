@@ -6,7 +6,7 @@ import math
 
 import torch
 
-from devrf.geometry.average_pose import average_pose, recentred, relative_to
+from devrf.geometry.average_pose import average_pose, relative_to
 
 
 def turned(angle: float, position: list[float]) -> torch.Tensor:
@@ -30,21 +30,17 @@ def test_up_gives_way_where_it_is_not_across() -> None:
     torch.testing.assert_close(average_pose(poses)[:, :3], torch.eye(3, dtype=torch.float64))
 
 
-def test_a_pose_relative_to_itself_is_the_identity() -> None:
+def test_a_pose_relative_to_another() -> None:
     pose = turned(0.7, [1, -2, 5])
-    torch.testing.assert_close(
-        relative_to(pose, pose[None])[0], torch.eye(3, 4, dtype=torch.float64)
-    )
-    # A camera one unit to the right of it, along its own x axis.
-    other = pose.clone()
-    other[:, 3] += pose[:, 0]
-    torch.testing.assert_close(
-        relative_to(pose, other[None])[0, :, 3], torch.tensor([1.0, 0, 0], dtype=torch.float64)
-    )
+    # The second camera is one unit to the right of the first, along its own x axis.
+    beside = torch.cat([pose[:, :3], pose[:, 3:] + pose[:, :1]], dim=1)
+    found = relative_to(pose, torch.stack([pose, beside]))
+    expected = torch.eye(3, 4, dtype=torch.float64).repeat(2, 1, 1)
+    expected[1, 0, 3] = 1
+    torch.testing.assert_close(found, expected)
 
 
-def test_recentring_once_is_enough() -> None:
+def test_poses_relative_to_their_average_have_the_identity_as_average() -> None:
     poses = torch.stack([turned(0.1 * k, [k, k * k, 1 - k]) for k in range(5)])
-    once = recentred(poses)
-    torch.testing.assert_close(average_pose(once), torch.eye(3, 4, dtype=torch.float64))
-    torch.testing.assert_close(recentred(once), once)
+    centred = relative_to(average_pose(poses), poses)
+    torch.testing.assert_close(average_pose(centred), torch.eye(3, 4, dtype=torch.float64))

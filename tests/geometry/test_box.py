@@ -12,8 +12,10 @@ from hypothesis import strategies as st
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
 
+Xyz = tuple[float, float, float]
 
-def ray(origin: tuple[float, float, float], direction: tuple[float, float, float]) -> Rays:
+
+def ray(origin: Xyz, direction: Xyz) -> Rays:
     d = torch.nn.functional.normalize(torch.tensor([direction]), dim=1)
     return Rays(torch.tensor([origin]), d, d)
 
@@ -25,18 +27,19 @@ def test_a_cube_of_side_cubed_voxels_has_that_side(side: int) -> None:
         assert Box((0.0, 0.0, 0.0), (edge, edge, edge)).grid_shape(side**3) == (side,) * 3
 
 
-def test_a_grid_follows_the_box_proportions() -> None:
-    box = Box((0.0, 0.0, 0.0), (4.0, 2.0, 1.0))
-    # s = (8 / 4096)^(1/3) = 1/8.
-    assert box.voxel_size(4096) == pytest.approx(0.125)
-    assert box.grid_shape(4096) == (32, 16, 8)
-    # floor: s = (8 / 1000)^(1/3) = 0.2 gives 20, 10, 5; a few voxels fewer give less.
-    assert box.grid_shape(1000) == (20, 10, 5)
-    assert box.grid_shape(990) == (19, 9, 4)
-
-
-def test_a_grid_has_two_points_along_every_axis_at_least() -> None:
-    assert Box((0.0, 0.0, 0.0), (100.0, 1.0, 1.0)).grid_shape(8) == (43, 2, 2)
+@pytest.mark.parametrize(
+    ("size", "voxels", "shape"),
+    [
+        ((4.0, 2.0, 1.0), 4096, (32, 16, 8)),  # s = (8 / 4096)^(1/3) = 1/8
+        ((4.0, 2.0, 1.0), 1000, (20, 10, 5)),  # s = 0.2
+        ((4.0, 2.0, 1.0), 990, (19, 9, 4)),  # a little more, rounded down
+        ((100.0, 1.0, 1.0), 8, (43, 2, 2)),  # at least two along every axis
+    ],
+)
+def test_a_grid_follows_the_box_proportions(
+    size: Xyz, voxels: int, shape: tuple[int, int, int]
+) -> None:
+    assert Box((0.0, 0.0, 0.0), size).grid_shape(voxels) == shape
 
 
 def test_derived_boxes_by_hand() -> None:
@@ -48,7 +51,7 @@ def test_derived_boxes_by_hand() -> None:
 
 
 @pytest.mark.parametrize("high", [(1.0, 1.0, 0.0), (1.0, -1.0, 1.0), (1.0, math.nan, 1.0)])
-def test_a_flat_or_inverted_box_is_an_error(high: tuple[float, float, float]) -> None:
+def test_a_flat_or_inverted_box_is_an_error(high: Xyz) -> None:
     with pytest.raises(ValueError, match="low < high"):
         Box((0.0, 0.0, 0.0), high)
 
@@ -86,11 +89,7 @@ def test_contains_its_faces_and_nearest_moves_only_what_is_outside() -> None:
     ],
 )
 def test_crossing_by_hand(
-    cube: Box,
-    origin: tuple[float, float, float],
-    direction: tuple[float, float, float],
-    entry: float,
-    leave: float,
+    cube: Box, origin: Xyz, direction: Xyz, entry: float, leave: float
 ) -> None:
     got = cube.crossing(ray(origin, direction))
     assert [float(v) for v in got] == pytest.approx([entry, leave], rel=1e-5)
@@ -104,9 +103,7 @@ def test_crossing_by_hand(
         ((-3.0, 0.0, 0.0), (1.0, 1.0, 0.0)),  # slanted past a corner
     ],
 )
-def test_a_miss_enters_after_it_leaves(
-    cube: Box, origin: tuple[float, float, float], direction: tuple[float, float, float]
-) -> None:
+def test_a_miss_enters_after_it_leaves(cube: Box, origin: Xyz, direction: Xyz) -> None:
     entry, leave = cube.crossing(ray(origin, direction))
     assert float(entry) > float(leave)
 
@@ -125,9 +122,3 @@ def test_the_middle_of_a_crossing_is_inside_and_beyond_it_is_outside(
         at = torch.tensor([(entry + leave) / 2, entry - 0.02, leave + 0.02])
         inside = box.contains(rays.at(torch.zeros(3, dtype=torch.long), at))
         assert inside.tolist() == [True, False, False]
-
-
-def test_box_of_tensors_and_lists_agree() -> None:
-    low, high = [0.0, -1.0, 2.0], [1.0, 0.0, 3.0]
-    assert Box.of(torch.tensor(low), torch.tensor(high)) == Box.of(low, high)
-    assert Box.of(low, high).low == (0.0, -1.0, 2.0)

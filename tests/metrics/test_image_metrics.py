@@ -1,4 +1,4 @@
-"""PSNR and SSIM against hand values and an independent implementation."""
+"""PSNR, SSIM and MS-SSIM against hand values and an independent implementation in float64."""
 
 from __future__ import annotations
 
@@ -7,26 +7,45 @@ import pytest
 import torch
 from torch import Tensor
 
-from devrf.metrics.image import psnr, ssim
+from devrf.metrics.image import ms_ssim, psnr, ssim
+
+EXPONENTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 
 
-def slow_ssim(a: np.ndarray, b: np.ndarray) -> float:
-    """Wang et al. 2004, window by window, in float64: 11×11, σ 1.5, K = (0.01, 0.03)."""
+def blurred(values: np.ndarray) -> np.ndarray:
+    """Gaussian means, 11×11, σ 1.5, of the windows inside (H, W, 3)."""
     along = np.exp(-((np.arange(11) - 5.0) ** 2) / (2 * 1.5**2))
-    window = np.outer(along, along)
-    window /= window.sum()
-    values = []
-    for y in range(a.shape[0] - 10):
-        for x in range(a.shape[1] - 10):
-            for channel in range(3):
-                p = a[y : y + 11, x : x + 11, channel]
-                q = b[y : y + 11, x : x + 11, channel]
-                mp, mq = (window * p).sum(), (window * q).sum()
-                vp, vq = (window * (p - mp) ** 2).sum(), (window * (q - mq) ** 2).sum()
-                cov = (window * (p - mp) * (q - mq)).sum()
-                top = (2 * mp * mq + 0.01**2) * (2 * cov + 0.03**2)
-                values.append(top / ((mp**2 + mq**2 + 0.01**2) * (vp + vq + 0.03**2)))
-    return float(np.mean(values))
+    along /= along.sum()
+    for axis in (0, 1):
+        windows = np.lib.stride_tricks.sliding_window_view(values, 11, axis=axis)
+        values = windows @ along
+    return values
+
+
+def slow_terms(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Wang et al. 2004, K = (0.01, 0.03): similarity at each pixel, and its contrast term."""
+    ma, mb = blurred(a), blurred(b)
+    va, vb = blurred(a * a) - ma**2, blurred(b * b) - mb**2
+    contrast = (2 * (blurred(a * b) - ma * mb) + 0.03**2) / (va + vb + 0.03**2)
+    return (2 * ma * mb + 0.01**2) / (ma**2 + mb**2 + 0.01**2) * contrast, contrast
+
+
+def slow_ssim(prediction: Tensor, truth: Tensor) -> float:
+    return float(slow_terms(prediction.double().numpy(), truth.double().numpy())[0].mean())
+
+
+def slow_ms_ssim(prediction: Tensor, truth: Tensor) -> float:
+    """Wang et al. 2003: contrast and structure at five scales, luminance at the last."""
+    product, pair = 1.0, [prediction.double().numpy(), truth.double().numpy()]
+    for scale, exponent in enumerate(EXPONENTS):
+        similar, contrast = slow_terms(*pair)
+        product *= max((similar if scale == 4 else contrast).mean(), 0.0) ** exponent
+        height, width = (n // 2 for n in pair[0].shape[:2])
+        pair = [
+            x[: height * 2, : width * 2].reshape(height, 2, width, 2, 3).mean(axis=(1, 3))
+            for x in pair
+        ]
+    return product
 
 
 @pytest.fixture
@@ -37,7 +56,15 @@ def image(rng: torch.Generator) -> Tensor:
     return (0.8 * smooth + 0.1 * torch.rand(20, 16, 3, generator=rng)).clamp(0, 1)
 
 
-@pytest.mark.parametrize(("offset", "decibels"), [(0.1, 20.0), (0.01, 40.0), (1.0, 0.0)])
+@pytest.fixture
+def large(rng: torch.Generator) -> Tensor:
+    """Waves of several lengths, 178×190, with some noise."""
+    y, x = torch.meshgrid(torch.arange(178.0), torch.arange(190.0), indexing="ij")
+    waves = torch.stack([(x / 5).sin(), (y / 11).cos(), ((x + y) / 23).sin()], dim=-1)
+    return (0.5 + 0.35 * waves + 0.1 * torch.rand(178, 190, 3, generator=rng)).clamp(0, 1)
+
+
+@pytest.mark.parametrize(("offset", "decibels"), [(0.1, 20), (0.01, 40), (1.0, 0), (0.0, 120)])
 def test_psnr_of_a_constant_offset(offset: float, decibels: float) -> None:
     truth = torch.zeros(5, 4, 3)
     assert psnr(truth + offset, truth) == pytest.approx(decibels, abs=1e-4)
@@ -49,26 +76,21 @@ def test_psnr_is_of_the_mean_square_not_the_mean_of_psnrs() -> None:
     assert psnr(other, truth) == pytest.approx(-10 * np.log10(0.02), abs=1e-4)
 
 
-def test_psnr_of_equal_images_is_finite(image: Tensor) -> None:
-    assert psnr(image, image) == pytest.approx(120)
-
-
-def test_ssim_of_equal_images_is_one(image: Tensor) -> None:
+def test_equal_images_have_a_similarity_of_one(image: Tensor, large: Tensor) -> None:
     assert ssim(image, image) == pytest.approx(1.0, abs=1e-6)
+    assert ms_ssim(large, large) == pytest.approx(1.0, abs=1e-6)
 
 
 def test_ssim_agrees_with_an_independent_implementation(
     image: Tensor, rng: torch.Generator
 ) -> None:
-    for other in (
-        (image + 0.1 * torch.randn(20, 16, 3, generator=rng)).clamp(0, 1),
-        image.flip(0),
-        1 - image,
-        0.5 * image,
-    ):
-        truth = slow_ssim(other.double().numpy(), image.double().numpy())
-        assert ssim(other, image) == pytest.approx(truth, abs=2e-4)
-        assert truth < 0.95
+    noisy = (image + 0.1 * torch.randn(20, 16, 3, generator=rng)).clamp(0, 1)
+    one_window = image[:11, :11], torch.rand(11, 11, 3, generator=rng)
+    pairs = [(other, image) for other in (noisy, image.flip(0), 1 - image, 0.5 * image)]
+    for prediction, truth in (*pairs, one_window):
+        expected = slow_ssim(prediction, truth)
+        assert expected < 0.95
+        assert ssim(prediction, truth) == pytest.approx(expected, abs=2e-4)
 
 
 def test_ssim_of_flat_images_by_hand() -> None:
@@ -77,13 +99,24 @@ def test_ssim_of_flat_images_by_hand() -> None:
     assert ssim(a, b) == pytest.approx(0.2501 / 0.3126, abs=1e-4)
 
 
-def test_ssim_counts_a_single_whole_window(image: Tensor, rng: torch.Generator) -> None:
-    a, b = image[:11, :11], torch.rand(11, 11, 3, generator=rng)
-    truth = slow_ssim(a.double().numpy(), b.double().numpy())
-    assert ssim(a, b) == pytest.approx(truth, abs=2e-4)
-
-
 def test_ssim_of_an_image_smaller_than_the_window_is_still_a_number(image: Tensor) -> None:
     small = image[:8, :9]
     assert ssim(small, small) == pytest.approx(1.0, abs=1e-6)
     assert 0 < ssim(small.flip(0), small) < 0.99
+
+
+def test_ms_ssim_agrees_with_an_independent_implementation(
+    large: Tensor, rng: torch.Generator
+) -> None:
+    noisy = (large + 0.2 * torch.randn(large.shape, generator=rng)).clamp(0, 1)
+    for other in (noisy, 0.6 * large, large.roll(3, dims=1)):
+        expected = slow_ms_ssim(other, large)
+        assert 0.1 < expected < 0.98
+        assert ms_ssim(other, large) == pytest.approx(expected, abs=2e-4)
+    assert slow_ms_ssim(1 - large, large) == ms_ssim(1 - large, large) == 0
+
+
+def test_ms_ssim_of_images_without_five_scales_is_unknown(large: Tensor) -> None:
+    assert ms_ssim(large[:176, :176], large[:176, :176]) == pytest.approx(1.0, abs=1e-6)
+    assert ms_ssim(large[:175], large[:175]) is None
+    assert ms_ssim(large[:, :175], large[:, :175]) is None

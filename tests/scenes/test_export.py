@@ -1,10 +1,11 @@
-"""The published layout on disk: what is written reads back exactly."""
+"""The published layouts on disk: what is written reads back the same."""
 
 from __future__ import annotations
 
 import json
-import shutil
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
@@ -13,9 +14,9 @@ import torch
 
 from devrf.errors import DevrfError
 from devrf.scenes.blender import BlenderReader
-from devrf.scenes.export import export_blender
+from devrf.scenes.export import export, export_blender
 from devrf.scenes.procedural import ProceduralScene
-from devrf.scenes.scene import Capture, Scene
+from devrf.scenes.scene import Scene
 
 
 @pytest.fixture(scope="module")
@@ -25,9 +26,15 @@ def scene() -> Scene:
     )()
 
 
-def test_what_is_exported_reads_back_exactly(scene, tmp_path):
-    export_blender(scene, tmp_path / "new" / "robot")
+def with_train(scene: Scene, **change: Any) -> Scene:
+    """The scene with another moving training capture."""
+    train = replace(scene.dynamic.train, **change)
+    return replace(scene, dynamic=replace(scene.dynamic, train=train))
+
+
+def test_what_is_exported_reads_back_exactly(scene: Scene, tmp_path: Path) -> None:
     root = tmp_path / "new" / "robot"
+    export(scene, root)
     again = BlenderReader(root).read()
     for ours, read in (
         (scene.static.train, again.static.train),
@@ -46,56 +53,55 @@ def test_what_is_exported_reads_back_exactly(scene, tmp_path):
     flows = sorted(p.name for p in (moving / "train_flow").iterdir())
     assert flows == ["002_bwd.npz", "003_bwd.npz", "004_bwd.npz", "005_bwd.npz"]
     # The layout's validation images are test images again.
-    validation = json.loads((moving / "transforms_val.json").read_text())["frames"]
-    test = json.loads((moving / "transforms_test.json").read_text())["frames"]
+    validation, test = (
+        json.loads((moving / f"transforms_{split}.json").read_text())["frames"]
+        for split in ("val", "test")
+    )
     assert [f["transform_matrix"] for f in validation] == [f["transform_matrix"] for f in test]
 
 
-def test_dynamic_images_are_put_in_time_major_order(scene, tmp_path):
-    view_major = torch.tensor([0, 2, 4, 1, 3, 5])
-    shuffled = Capture(scene.dynamic.train[view_major], scene.dynamic.test)
-    export_blender(replace(scene, dynamic=shuffled), tmp_path / "robot")
-    folder = tmp_path / "robot" / "dynamic_2views"
+def test_dynamic_images_are_put_in_time_major_order(scene: Scene, tmp_path: Path) -> None:
+    shuffled = scene.dynamic.train[torch.tensor([0, 2, 4, 1, 3, 5])]
+    export_blender(replace(scene, dynamic=replace(scene.dynamic, train=shuffled)), tmp_path / "new")
+    folder = tmp_path / "new" / "dynamic_2views"
     frames = json.loads((folder / "transforms_train.json").read_text())["frames"]
     assert [frame["time"] for frame in frames] == [0.0, 0.0, 0.5, 0.5, 1.0, 1.0]
-    for k in range(6):
-        image = iio.imread(folder / "train" / f"r_{k:03d}.png")
-        assert np.array_equal(image, scene.dynamic.train.pixels[k].numpy())
+    for k, pixels in enumerate(scene.dynamic.train.pixels):
+        assert np.array_equal(iio.imread(folder / "train" / f"r_{k:03d}.png"), pixels.numpy())
 
 
-def test_without_flow_or_matte(scene, tmp_path):
-    train = replace(scene.dynamic.train, flow=None, pixels=scene.dynamic.train.pixels[..., :3])
-    export_blender(replace(scene, dynamic=Capture(train, scene.dynamic.test)), tmp_path / "robot")
+def test_without_flow_or_matte(scene: Scene, tmp_path: Path) -> None:
+    opaque = scene.dynamic.train.pixels[..., :3]
+    export_blender(with_train(scene, flow=None, pixels=opaque), tmp_path / "robot")
     folder = tmp_path / "robot" / "dynamic_2views"
     assert not (folder / "train_flow").exists()
     image = iio.imread(folder / "train" / "r_000.png")
     assert image.shape == (16, 24, 4) and (image[..., 3] == 255).all()
 
 
-def test_an_empty_folder_is_filled_and_a_used_one_is_kept(scene, tmp_path):
-    (tmp_path / "robot").mkdir()
-    (tmp_path / "empty").mkdir()
-    export_blender(scene, tmp_path / "empty")
-    shutil.rmtree(tmp_path / "empty")
-    (tmp_path / "robot" / "mine.txt").write_text("keep")
-    with pytest.raises(DevrfError, match="robot"):
-        export_blender(scene, tmp_path / "robot")
-    assert [p.name for p in tmp_path.rglob("*") if p.is_file()] == ["mine.txt"]
+def test_an_empty_folder_is_filled_and_a_used_one_is_kept(scene: Scene, tmp_path: Path) -> None:
+    used, empty = tmp_path / "used", tmp_path / "empty"
+    used.mkdir()
+    empty.mkdir()
+    export_blender(scene, empty)
+    assert {p.name for p in empty.iterdir()} == {"static", "dynamic_2views"}
+    (used / "mine.txt").write_text("keep")
+    with pytest.raises(DevrfError, match="used"):
+        export_blender(scene, used)
+    assert [p.name for p in used.iterdir()] == ["mine.txt"]
+    assert {p.name for p in tmp_path.iterdir()} == {"used", "empty"}
 
 
-@pytest.mark.parametrize("wrong", ["focal", "center"])
-def test_intrinsics_beyond_one_angle_leave_nothing_behind(scene, tmp_path, wrong):
-    cameras = scene.dynamic.train.cameras
-    factor = torch.tensor([1.0, 1.01])
-    bent = replace(cameras, **{wrong: getattr(cameras, wrong) * factor})
-    train = replace(scene.dynamic.train, cameras=bent)
-    with pytest.raises(DevrfError, match="camera_angle_x"):
-        export_blender(
-            replace(scene, dynamic=Capture(train, scene.dynamic.test)), tmp_path / "robot"
-        )
+@pytest.mark.parametrize("wrong", ["focal", "center", "kind"])
+def test_what_the_layout_cannot_hold_leaves_nothing_behind(
+    scene: Scene, tmp_path: Path, wrong: str
+) -> None:
+    if wrong == "kind":
+        bad, said = replace(scene, kind="forward"), "inward"
+    else:
+        cameras = scene.dynamic.train.cameras
+        bent = {wrong: getattr(cameras, wrong) * torch.tensor([1.0, 1.01])}
+        bad, said = with_train(scene, cameras=replace(cameras, **bent)), "camera_angle_x"
+    with pytest.raises(DevrfError, match=said):
+        export_blender(bad, tmp_path / "robot")
     assert not list(tmp_path.iterdir())
-
-
-def test_forward_facing_scenes_are_refused(scene, tmp_path):
-    with pytest.raises(DevrfError, match="inward"):
-        export_blender(replace(scene, kind="forward"), tmp_path / "robot")

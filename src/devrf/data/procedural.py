@@ -11,7 +11,7 @@ from devrf.data.rendered import RenderedDataModule
 from devrf.scenes.procedural.builder import ProceduralScene
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ExportableScene(ProceduralScene):
     """The recipe, and where to write the scene.
 

@@ -11,7 +11,7 @@ from devrf.data.rendered import RenderedDataModule
 from devrf.scenes.procedural.forward import ProceduralForwardScene
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ExportableScene(ProceduralForwardScene):
     """The recipe, and where to write the scene.
 

@@ -30,8 +30,3 @@ def relative_to(frame: Tensor, poses: Tensor) -> Tensor:
     turned = frame[:, :3].T @ poses
     turned[:, :, 3] -= frame[:, :3].T @ frame[:, 3]
     return turned
-
-
-def recentred(poses: Tensor) -> Tensor:
-    """Poses (N, 3, 4) in a world in which their :func:`average_pose` is the identity."""
-    return relative_to(average_pose(poses), poses)

@@ -63,32 +63,22 @@ class Box:
         At least two along each axis, since grid corners sit on the box's corners.
         """
         s = self.voxel_size(voxels)
-        # A hair is added so that a cube of 10^3 voxels has side 10 in spite of rounding.
+        # 1e-6 is added so that a cube of 10^3 voxels has side 10 in spite of rounding.
         x, y, z = (max(2, int(edge / s + 1e-6)) for edge in self.size)
         return x, y, z
 
     def scaled(self, factor: float) -> Box:
         """The box grown about its centre by ``factor`` along every axis."""
-        mid = [(a + b) / 2 for a, b in zip(self.low, self.high, strict=True)]
-        half = [edge / 2 * factor for edge in self.size]
-        return Box.of(
-            [m - h for m, h in zip(mid, half, strict=True)],
-            [m + h for m, h in zip(mid, half, strict=True)],
-        )
+        ends = [(m, e / 2 * factor) for m, e in zip(self.middle, self.size, strict=True)]
+        return Box.of([m - half for m, half in ends], [m + half for m, half in ends])
 
     def union(self, other: Box) -> Box:
         """The smallest box that holds both."""
-        return Box.of(
-            [min(a, b) for a, b in zip(self.low, other.low, strict=True)],
-            [max(a, b) for a, b in zip(self.high, other.high, strict=True)],
-        )
+        return Box.of(list(map(min, self.low, other.low)), list(map(max, self.high, other.high)))
 
     def clipped(self, other: Box) -> Box:
         """The part of this box inside ``other``."""
-        return Box.of(
-            [max(a, b) for a, b in zip(self.low, other.low, strict=True)],
-            [min(a, b) for a, b in zip(self.high, other.high, strict=True)],
-        )
+        return Box.of(list(map(max, self.low, other.low)), list(map(min, self.high, other.high)))
 
     def contains(self, points: Tensor) -> Tensor:
         """Mask (...,) of the points (..., 3) inside the box, faces included."""
@@ -97,8 +87,7 @@ class Box:
 
     def nearest(self, points: Tensor) -> Tensor:
         """The nearest points (..., 3) of the box, inside included."""
-        low, high = self.corners(points)
-        return torch.minimum(torch.maximum(points, low), high)
+        return points.clamp(*self.corners(points))
 
     def corners(self, like: Tensor) -> tuple[Tensor, Tensor]:
         """The two corners (3,) as tensors with the dtype and device of ``like``; to be read only.

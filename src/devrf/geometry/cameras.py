@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -37,12 +37,11 @@ class Cameras:
 
     def __getitem__(self, index: Tensor | slice | list[int]) -> Cameras:
         """The cameras at ``index``; always N of them, so an int is not an index."""
-        return Cameras(
-            self.camera_to_world[index],
-            self.focal[index],
-            self.center[index],
-            self.width,
-            self.height,
+        return replace(
+            self,
+            camera_to_world=self.camera_to_world[index],
+            focal=self.focal[index],
+            center=self.center[index],
         )
 
     @property
@@ -120,12 +119,11 @@ class Cameras:
 
     def to(self, device: torch.device | str) -> Cameras:
         """The same cameras on ``device``."""
-        return Cameras(
-            self.camera_to_world.to(device),
-            self.focal.to(device),
-            self.center.to(device),
-            self.width,
-            self.height,
+        return replace(
+            self,
+            camera_to_world=self.camera_to_world.to(device),
+            focal=self.focal.to(device),
+            center=self.center.to(device),
         )
 
     @staticmethod

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from dataclasses import dataclass
 
 import torch
@@ -56,14 +57,12 @@ class FrameClock:
 
     def at(self, time: float) -> Moment:
         """Where ``time`` lies; times outside the clock's range stay on the first or last frame."""
-        if time <= self.times[0] + self.TOLERANCE:
-            return Moment(0, 0, 0.0)
-        for k, (a, b) in enumerate(zip(self.times, self.times[1:], strict=False)):
-            if time < b - self.TOLERANCE:
-                on_frame = time <= a + self.TOLERANCE
-                return Moment(k, k, 0.0) if on_frame else Moment(k, k + 1, (time - a) / (b - a))
-        last = len(self) - 1
-        return Moment(last, last, 0.0)
+        frame = bisect_right(self.times, time, key=lambda t: t - self.TOLERANCE) - 1
+        frame = max(frame, 0)
+        before = self.times[frame]
+        if frame == len(self) - 1 or time <= before + self.TOLERANCE:
+            return Moment(frame, frame, 0.0)
+        return Moment(frame, frame + 1, (time - before) / (self.times[frame + 1] - before))
 
     def frames_of(self, times: Tensor) -> Tensor:
         """The nearest frame of each time: int64, the shape of ``times``."""

@@ -1,4 +1,4 @@
-"""How alike two images are where a mask says so: inside the matte, without the background."""
+"""How alike two images are inside a mask, such as an alpha mask."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from devrf.metrics.image import WINDOW, psnr, ssim_map
 def psnr_masked(prediction: Tensor, truth: Tensor, mask: Tensor) -> float | None:
     """PSNR in dB of the pixels of two (H, W, 3) images in [0, 1] where ``mask`` (H, W) is True.
 
-    None where it is nowhere True.
+    None where the mask is empty.
     """
     return psnr(prediction[mask], truth[mask]) if bool(mask.any()) else None
 

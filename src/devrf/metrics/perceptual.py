@@ -1,4 +1,4 @@
-"""LPIPS: distance of two images in the features of a network that was trained to see.
+"""LPIPS: distance of two images in the features of an image classifier.
 
 Zhang et al. 2018, version 0.1: images in [−1, 1] are shifted and scaled by fixed constants;
 after five of the trunk's layers the features are normalised to unit length over channels; the
@@ -120,7 +120,8 @@ class Lpips(nn.Module):
         """LPIPS of two (H, W, 3) images in [0, 1] where ``mask`` (H, W) is True.
 
         Outside the mask the prediction is taken to be right; the layers' differences,
-        interpolated to the image's size, are averaged inside it. None where that is nowhere.
+        interpolated to the image's size, are averaged inside it. None where it is empty or the
+        images are too small.
         """
         if not bool(mask.any()):
             return None

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from devrf.errors import DevrfError
-from devrf.metrics.perceptual import TRUNKS, Lpips, Trunk
+from devrf.metrics.perceptual import TRUNKS, Lpips
 
 log = logging.getLogger(__name__)
 
@@ -36,9 +36,11 @@ def load_lpips(
     Raises:
         DevrfError: ``weights`` is no file, or holds something else.
     """
-    trunk = TRUNKS[network]
-    cached = Path(torch.hub.get_dir()) / "checkpoints" / trunk.file
-    if weights is None and not cached.is_file():
+    if weights is not None:
+        return read_lpips(network, Path(weights))
+    file = TRUNKS[network].file
+    cached = Path(torch.hub.get_dir()) / "checkpoints" / file
+    if not cached.is_file():
         if not download:
             log.info(
                 "LPIPS is null: no weights in %s; give evaluation.lpips_weights=PATH or "
@@ -46,9 +48,18 @@ def load_lpips(
                 cached,
             )
             return None
-        if not _downloaded(trunk):
+        try:
+            torch.hub.load_state_dict_from_url(
+                f"{PUBLISHED_AT}/{file}",
+                map_location="cpu",
+                progress=False,
+                check_hash=True,
+                weights_only=True,
+            )
+        except (OSError, RuntimeError) as error:  # no network; another file than expected
+            log.info("LPIPS is null: %s/%s: %s", PUBLISHED_AT, file, error)
             return None
-    return read_lpips(network, Path(weights) if weights is not None else cached)
+    return read_lpips(network, cached)
 
 
 def read_lpips(network: Network, path: Path) -> Lpips:
@@ -68,26 +79,11 @@ def read_lpips(network: Network, path: Path) -> Lpips:
             if name.startswith("features.")
         }
         return Lpips(TRUNKS[network], features, heads)
-    except Exception:  # noise in a file makes the unpickler raise whatever it likes
+    except Exception:  # a damaged file makes the unpickler raise any exception
         raise DevrfError(
             f"{path}: not the weights of {network}; expected torchvision's, with names like "
             "features.0.weight"
         ) from None
-
-
-def _downloaded(trunk: Trunk) -> bool:
-    try:
-        torch.hub.load_state_dict_from_url(
-            f"{PUBLISHED_AT}/{trunk.file}",
-            map_location="cpu",
-            progress=False,
-            check_hash=True,
-            weights_only=True,
-        )
-    except (OSError, RuntimeError) as error:  # no network; another file than expected
-        log.info("LPIPS is null: %s/%s: %s", PUBLISHED_AT, trunk.file, error)
-        return False
-    return True
 
 
 def _heads(network: Network) -> list[Tensor]:

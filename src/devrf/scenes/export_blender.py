@@ -48,12 +48,9 @@ def export_blender(scene: Scene, folder: Path) -> None:
 
 def _write_capture(capture: Capture, folder: Path) -> None:
     few = torch.arange(min(_VALIDATION_VIEWS, len(capture.test)))
-    for split, views in (
-        ("train", capture.train),
-        ("val", capture.test[few]),
-        ("test", capture.test),
-    ):
-        _write_split(views, split, folder)
+    _write_split(capture.train, "train", folder)
+    _write_split(capture.test[few], "val", folder)
+    _write_split(capture.test, "test", folder)
     if capture.train.flow is not None:
         # The first images of the views have no earlier one.
         later = (capture.train.times > 0).nonzero().flatten().tolist()

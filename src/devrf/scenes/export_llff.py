@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
 import torch
 from torch import Tensor
 
-from devrf.geometry.cameras import Cameras
 from devrf.scenes.array_files import Numbers
 from devrf.scenes.flow_files import write_flow
 from devrf.scenes.llff_poses import BOUND_FACTOR
@@ -24,8 +25,10 @@ FACTOR = 4
 HOLDOUT = 8
 # Times are not written, but counted: k / (T − 1).
 _TIME_TOLERANCE = 1e-5
-# How far nothing is known to be, in multiples of the least depth.
+# The largest depth where none is known, in multiples of the least one.
 _FAR = 100.0
+
+Flags = np.ndarray[Any, np.dtype[np.bool_]]
 
 
 def export_llff(scene: Scene, folder: Path) -> None:
@@ -47,53 +50,29 @@ def export_llff(scene: Scene, folder: Path) -> None:
     """
     if scene.kind != "forward":
         raise scene_error(scene.name, "only forward-facing scenes fit LLFF's layout")
-    static = _interleaved(scene.static)
+    held_out = _held_out(scene.static)
     views = [*_by_camera(scene.dynamic.train), *_by_camera(scene.dynamic.test)]
     _check_moving(scene.dynamic, views)
-    far = _farthest([static, *views])
+    far = _farthest([scene.static.train, scene.static.test, *views])
     bounds = np.array([1 / BOUND_FACTOR, far])
     with whole_folder(folder) as partial:
-        _write_static(static, bounds, partial / "static")
+        _write_static(scene.static, held_out, bounds, partial / "static")
         _write_moving(views, bounds, partial / f"dynamic_{len(views)}views")
 
 
-def _interleaved(static: Capture) -> Views:
-    """All static views in an order in which every eighth one is a held-out one."""
+def _held_out(static: Capture) -> Flags:
+    """Which of the N static images readers hold out (N,); DevrfError if they would differ."""
     count = len(static.train) + len(static.test)
-    held_out = torch.arange(count) % HOLDOUT == 0
-    if int(held_out.sum()) != len(static.test):
+    held_out: Flags = np.arange(count) % HOLDOUT == 0
+    if held_out.sum() != len(static.test):
         raise scene_error(
             "static",
-            f"the layout holds out every {HOLDOUT}th image, {int(held_out.sum())} of "
+            f"the layout holds out every {HOLDOUT}th image, {held_out.sum()} of "
             f"{count}, but {len(static.test)} are held out here",
         )
     if static.train.pixels.shape[1:] != static.test.pixels.shape[1:]:
         raise scene_error("static", "the layout needs static images of one size and channel count")
-    order = torch.empty(count, dtype=torch.int64)
-    order[~held_out] = torch.arange(len(static.train))
-    order[held_out] = len(static.train) + torch.arange(len(static.test))
-    both = Views(
-        torch.cat([static.train.pixels, static.test.pixels]),
-        _joined(static),
-        torch.zeros(count),
-        torch.arange(count),
-        static.train.names + static.test.names,
-        depth=None
-        if static.train.depth is None or static.test.depth is None
-        else torch.cat([static.train.depth, static.test.depth]),
-    )
-    return both[order]
-
-
-def _joined(static: Capture) -> Cameras:
-    a, b = static.train.cameras, static.test.cameras
-    return Cameras(
-        torch.cat([a.camera_to_world, b.camera_to_world]),
-        torch.cat([a.focal, b.focal]),
-        torch.cat([a.center, b.center]),
-        a.width,
-        a.height,
-    )
+    return held_out
 
 
 def _by_camera(views: Views) -> list[Views]:
@@ -126,9 +105,9 @@ def _check_moving(capture: Capture, views: list[Views]) -> None:
 
 
 def _farthest(everyone: list[Views]) -> float:
-    """The largest distance that is known, or as good as infinity."""
+    """The largest known distance from a camera, else one that is as good as infinity."""
     known = [views.depth[views.depth.isfinite()] for views in everyone if views.depth is not None]
-    return max([_FAR / BOUND_FACTOR if not known else 0.0, *(float(k.max()) for k in known)])
+    return max(float(depth.max()) for depth in known) if known else _FAR / BOUND_FACTOR
 
 
 def _intrinsics(views: Views, factor: int) -> Numbers:
@@ -144,11 +123,13 @@ def _intrinsics(views: Views, factor: int) -> Numbers:
     return np.concatenate([sides, focal], axis=1) * factor
 
 
-def _write_static(views: Views, bounds: Numbers, folder: Path) -> None:
-    right, up, back, position = _double(views.cameras.camera_to_world).transpose(2, 0, 1)
-    matrix = np.stack([-up, right, back, position, _intrinsics(views, FACTOR)], axis=2)
-    rows = np.concatenate([matrix.reshape(-1, 15), np.tile(bounds, (len(views), 1))], axis=1)
-    _write_images(views, folder / f"images_{FACTOR}")
+def _write_static(static: Capture, held_out: Flags, bounds: Numbers, folder: Path) -> None:
+    rows = np.empty((len(held_out), 17))
+    for views, own in ((static.train, ~held_out), (static.test, held_out)):
+        right, up, back, position = _double(views.cameras.camera_to_world).transpose(2, 0, 1)
+        matrix = np.stack([-up, right, back, position, _intrinsics(views, FACTOR)], axis=2)
+        rows[own] = np.hstack([matrix.reshape(-1, 15), np.tile(bounds, (len(views), 1))])
+        _write_images(views, np.flatnonzero(own), folder / f"images_{FACTOR}")
     np.save(folder / "poses_bounds.npy", rows)
 
 
@@ -156,7 +137,7 @@ def _write_moving(views: list[Views], bounds: Numbers, folder: Path) -> None:
     matrices = []
     for number, view in enumerate(views, start=1):
         images = folder / f"view{number}" / f"images_{FACTOR}"
-        _write_images(view, images)
+        _write_images(view, range(len(view)), images)
         if view.flow is not None and number < len(views):
             flow_folder = images.with_name(f"{images.name}_flow")
             write_flow(flow_folder, view.flow, range(1, len(view)))
@@ -172,7 +153,7 @@ def _double(poses: Tensor) -> Numbers:
     return array
 
 
-def _write_images(views: Views, folder: Path) -> None:
-    folder.mkdir(parents=True)
-    for k, pixels in enumerate(views.pixels):
+def _write_images(views: Views, numbers: Iterable[int], folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for k, pixels in zip(numbers, views.pixels, strict=True):
         iio.imwrite(folder / f"{k:03d}.png", pixels.cpu().numpy())

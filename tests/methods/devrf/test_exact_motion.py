@@ -11,7 +11,7 @@ from devrf.geometry.clock import FrameClock
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.scenes.procedural import Flower, Material, Shape
 from devrf.scenes.procedural.cameras import dynamic_rig
-from devrf.scenes.procedural.picture import render
+from devrf.scenes.procedural.filming import Filming
 from devrf.scenes.procedural.robot import solid_motions
 
 BOX = Box((-1.4, -1.4, -1.4), (1.4, 1.4, 1.4))
@@ -39,7 +39,7 @@ def test_a_rigid_part_goes_there_and_back_exactly(rng: torch.Generator) -> None:
 def surface(shape: Shape) -> Tensor:
     """World points of ``shape`` at t = 1 that three cameras see."""
     cameras, _ = dynamic_rig(3, width=80, height=60, reach=1.4)
-    depth = render(shape, cameras, 1.0, reach=1.6, supersample=1, light=0.0).depth
+    depth = Filming(shape, 1.6, 1).pictures(cameras, 1.0).depth
     camera, row, column = depth.isfinite().nonzero().unbind(-1)
     rays = cameras.rays(camera, torch.stack([column, row], dim=-1) + 0.5)
     return rays.at(torch.arange(len(rays)), depth[depth.isfinite()])

@@ -14,12 +14,12 @@ from devrf.scenes.procedural.shape import Material, Shape
 WALL = -4.6
 FLOOR = -1.15
 # The pedestal's centre, outer half edges and rounding.
-_PEDESTAL = (0.0, (FLOOR - 0.72) / 2, -2.6)
+_CENTER = (0.0, (FLOOR - 0.72) / 2, -2.6)
 _HALF = (0.56, (-0.72 - FLOOR) / 2, 0.44)
 _ROUNDING = 0.04
 
-_WALL, _FLOOR, _BOX = 0, 1, 2
-_FIRST = 3  # the shape's own parts come after these
+# Parts: the wall is 0, the floor 1; the shape's own come after the pedestal.
+_PEDESTAL, _FIRST = 2, 3
 
 # Waves of the paint: direction (x, y, z) times angular frequency in radians per world unit, a
 # phase, and how much of it goes into red, green and blue. No two wavelengths have a common
@@ -64,28 +64,27 @@ class OnStage:
 
     def forward(self, material: Material, time: float) -> Tensor:
         """Where the shape goes; the stage stays."""
-        own = Material(material.rest, (material.part - _FIRST).clamp_min(0))
-        moved = self.shape.forward(own, time)
+        moved = self.shape.forward(_of_shape(material), time)
         return torch.where((material.part >= _FIRST)[:, None], moved, material.rest)
 
     def color(self, material: Material) -> Tensor:
         """The shape's paint, or the stage's."""
-        own = Material(material.rest, (material.part - _FIRST).clamp_min(0))
         painted = _mural(material.rest)
         # The pedestal stands out from the floor.
-        painted = torch.where((material.part == _BOX)[:, None], 0.5 * painted, painted)
-        return torch.where((material.part >= _FIRST)[:, None], self.shape.color(own), painted)
+        painted = torch.where((material.part == _PEDESTAL)[:, None], 0.5 * painted, painted)
+        own = self.shape.color(_of_shape(material))
+        return torch.where((material.part >= _FIRST)[:, None], own, painted)
 
-    def outline(self) -> Material:
-        """The points around the shape's parts: the stage has no end."""
-        own = self.shape.outline()
-        return Material(own.rest, own.part + _FIRST)
+
+def _of_shape(material: Material) -> Material:
+    """The material with the shape's own part numbers, where it is of the shape."""
+    return Material(material.rest, (material.part - _FIRST).clamp_min(0))
 
 
 def _still(points: Tensor) -> Tensor:
     """Distances (3, M) to wall, floor and pedestal."""
     x, y, z = points.unbind(-1)
-    a, b, c = _PEDESTAL
+    a, b, c = _CENTER
     return torch.stack([z - WALL, y - FLOOR, rounded_box(x - a, y - b, z - c, _HALF, _ROUNDING)])
 
 

@@ -23,8 +23,7 @@ def static_rig(
 ) -> tuple[Cameras, Cameras]:
     """Training and held-out cameras, spread evenly from a little below the horizon upwards.
 
-    The held-out ones are every so manieth of one Fibonacci lattice, so they lie between the
-    others.
+    All are points of one Fibonacci lattice; the held-out ones lie evenly between the others.
 
     Args:
         train: number of training cameras.

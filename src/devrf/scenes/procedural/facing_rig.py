@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from devrf.geometry.average_pose import recentred
+from devrf.geometry.average_pose import average_pose, relative_to
 from devrf.geometry.cameras import Cameras
 
 FIELD_OF_VIEW = 1.05  # radians across the image's longer side
@@ -17,7 +18,7 @@ _STATIC = (0.45, 0.24)
 _DYNAMIC = (0.36, 0.18)
 _HELD_OUT = (0.07, -0.04)
 _TARGET_DEPTH = 3.4
-# Static cameras are not quite on a plane: hands are not.
+# Static cameras deviate this much from a plane, as hand-held ones do.
 _UNEVEN = 0.05
 
 
@@ -32,17 +33,9 @@ def static_rig(count: int, *, width: int, height: int) -> Cameras:
     index = torch.arange(count, dtype=torch.float64)
     radius = ((index + 0.5) / count).sqrt()
     angle = math.pi * (3 - math.sqrt(5)) * index
-    poses = _facing(
-        torch.stack(
-            [
-                _STATIC[0] * radius * angle.cos(),
-                _STATIC[1] * radius * angle.sin(),
-                _UNEVEN * (2.0 * index).sin(),
-            ],
-            dim=-1,
-        )
-    )
-    return _cameras(recentred(poses), width, height)
+    x, y = _STATIC[0] * radius * angle.cos(), _STATIC[1] * radius * angle.sin()
+    positions = torch.stack([x, y, _UNEVEN * (2.0 * index).sin()], dim=-1)
+    return _facing(positions, width, height, centred=True)
 
 
 def dynamic_rig(train: int, *, width: int, height: int) -> tuple[Cameras, Cameras]:
@@ -57,29 +50,25 @@ def dynamic_rig(train: int, *, width: int, height: int) -> tuple[Cameras, Camera
     level = torch.zeros_like(angle)
     around = torch.stack([_DYNAMIC[0] * angle.cos(), _DYNAMIC[1] * angle.sin(), level], dim=-1)
     middle = torch.tensor([[*_HELD_OUT, 0.0]], dtype=torch.float64)
-    return (
-        _cameras(_facing(around), width, height),
-        _cameras(_facing(middle), width, height),
+    return _facing(around, width, height), _facing(middle, width, height)
+
+
+def _facing(positions: Tensor, width: int, height: int, *, centred: bool = False) -> Cameras:
+    """Float32 cameras at positions (N, 3) float64 that look at the rig's target, y up."""
+    cameras = Cameras.looking_at(
+        positions,
+        positions.new_tensor([0.0, 0.0, -_TARGET_DEPTH]).expand_as(positions),
+        focal=max(width, height) / 2 / math.tan(FIELD_OF_VIEW / 2),
+        width=width,
+        height=height,
+        up=positions.new_tensor([0.0, 1.0, 0.0]),
     )
-
-
-def _facing(positions: Tensor) -> Tensor:
-    """Poses (N, 3, 4) at positions (N, 3) that look at the rig's target, y up."""
-    target = positions.new_tensor([0.0, 0.0, -_TARGET_DEPTH]).expand_as(positions)
-    up = positions.new_tensor([0.0, 1.0, 0.0])
-    return Cameras.looking_at(
-        positions, target, focal=1.0, width=1, height=1, up=up
-    ).camera_to_world
-
-
-def _cameras(poses: Tensor, width: int, height: int) -> Cameras:
-    """Cameras in single precision with the rig's field of view."""
-    focal = max(width, height) / 2 / math.tan(FIELD_OF_VIEW / 2)
-    count = len(poses)
-    return Cameras(
-        poses.float(),
-        torch.full((count, 2), focal),
-        torch.tensor([width / 2, height / 2]).repeat(count, 1),
-        width,
-        height,
+    poses = cameras.camera_to_world
+    if centred:
+        poses = relative_to(average_pose(poses), poses)
+    return replace(
+        cameras,
+        camera_to_world=poses.float(),
+        focal=cameras.focal.float(),
+        center=cameras.center.float(),
     )

@@ -5,8 +5,7 @@ Lengths in world units, angles in radians.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
+from devrf.scenes.procedural.blades import Leaf, Whorl
 from devrf.scenes.procedural.texture import Paint, Rgb
 
 BASE = -0.66  # height at which the stem leaves the soil: the centre of the bending
@@ -15,54 +14,8 @@ STEM_RADIUS = 0.055
 HEART = 0.14  # radius of the ball in the blossom's middle
 POT_CENTER, POT_RADIUS, POT_HALF_HEIGHT, POT_ROUNDING = -0.83, 0.34, 0.19, 0.06
 
-
-@dataclass(frozen=True)
-class Whorl:
-    """A ring of equal petals that open and close together.
-
-    Attributes:
-        count: number of petals.
-        hinge: distance of their hinges from the blossom's axis.
-        elevation: angle above the horizon at which they stand at rest.
-        opening: by how much their tips turn downward when ``open`` is 1.
-        half_length: half of a petal's length.
-        half_width: half of a petal's width.
-        thickness: its half thickness.
-        paints: colours of the petals with even and with odd numbers.
-    """
-
-    count: int
-    hinge: float
-    elevation: float
-    opening: float
-    half_length: float
-    half_width: float
-    thickness: float
-    paints: tuple[Paint, Paint]
-
-
-@dataclass(frozen=True)
-class Leaf:
-    """A leaf on the stem.
-
-    Attributes:
-        height: where it leaves the stem.
-        azimuth: direction in which it points.
-        elevation: angle above the horizon.
-        half_length: half of its length.
-        half_width: half of its width.
-        paint: its texture.
-    """
-
-    height: float
-    azimuth: float
-    elevation: float
-    half_length: float
-    half_width: float
-    paint: Paint
-
-
-LEAF_THICKNESS = 0.02
+# Part numbers: pot, stem, heart, then the leaves, then the petals.
+POT, FIRST_LEAF, FIRST_PETAL = 0, 3, 6
 
 MAGENTA: Rgb = (0.84, 0.10, 0.45)
 ROSE: Rgb = (0.98, 0.62, 0.75)
@@ -79,7 +32,9 @@ BLUE: Rgb = (0.13, 0.35, 0.62)
 
 # A petal's paint starts at its hinge: cos is 1 there, so that the accent glows at the heart.
 OUTER = Whorl(
+    first_part=FIRST_PETAL,
     count=8,
+    height=HEAD,
     hinge=0.10,
     elevation=0.62,
     opening=0.8,
@@ -89,7 +44,9 @@ OUTER = Whorl(
     paints=(Paint(MAGENTA, ROSE, (0.3, 0, 0), 0.1, 5), Paint(VIOLET, LILAC, (0.3, 0, 0), 0.1, 5)),
 )
 INNER = Whorl(
+    first_part=FIRST_PETAL + OUTER.count,
     count=6,
+    height=HEAD,
     hinge=0.07,
     elevation=1.05,
     opening=0.5,
@@ -101,9 +58,9 @@ INNER = Whorl(
 WHORLS = (OUTER, INNER)
 
 LEAVES = (
-    Leaf(-0.50, 0.5, 0.55, 0.27, 0.12, Paint(LEAF_GREEN, SPRING, (0.22, 0, 0), 0.2)),
-    Leaf(-0.32, 3.4, 0.60, 0.25, 0.11, Paint(SPRING, LEAF_GREEN, (0, 0.2, 0), 0.2)),
-    Leaf(-0.16, 1.9, 0.65, 0.20, 0.10, Paint(LEAF_GREEN, SPRING, (0.18, 0, 0), 0.1)),
+    Leaf(-0.50, 0.5, 0.55, 0.27, 0.12, 0.02, Paint(LEAF_GREEN, SPRING, (0.22, 0, 0), 0.2)),
+    Leaf(-0.32, 3.4, 0.60, 0.25, 0.11, 0.02, Paint(SPRING, LEAF_GREEN, (0, 0.2, 0), 0.2)),
+    Leaf(-0.16, 1.9, 0.65, 0.20, 0.10, 0.02, Paint(LEAF_GREEN, SPRING, (0.18, 0, 0), 0.1)),
 )
 
 POT_PAINT = Paint(TERRACOTTA, CREAM, (0, 0, 0.26), 0.3)

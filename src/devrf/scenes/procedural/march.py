@@ -98,12 +98,12 @@ def _march_cones(
             break
         free = shape.distance(axes.at(active, distance), time)
         onward = (distance + free) / (1 + theta)
-        # Within a cone or so of the surface the rays had better go their own ways.
+        # About a cone's width from the surface, each ray goes on by itself.
         near = free < 2 * theta * distance
         result[active[near]] = distance[near]
         keep = (~near & (onward < leave[active])).nonzero().squeeze(-1)
         active, distance = active[keep], onward[keep]
-    # Cones that still creep along a silhouette hand over where they are.
+    # Rays of cones that still creep along a silhouette start where these are.
     result[active] = distance
     return result
 

@@ -8,6 +8,7 @@ space, and :func:`stretch` says by how much at most it lengthens anything.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
@@ -16,19 +17,22 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Swing:
-    """A part of a sine that starts at 0: sin(rate · t + phase) − sin(phase).
+    """A part of a sine that starts at 0: amplitude · (sin(rate · t + phase) − sin(phase)).
 
     Attributes:
+        amplitude: factor of the sine, in radians where the swing is an angle.
         rate: radians per unit of time.
         phase: radians; 0 starts at full speed, −1 starts slowly and is fast later.
     """
 
+    amplitude: float
     rate: float
     phase: float
 
-    def __call__(self, time: float) -> float:
-        """The swing at ``time``."""
-        return math.sin(self.rate * time + self.phase) - math.sin(self.phase)
+    def __call__(self, speed: float, time: float) -> float:
+        """``speed`` times the swing at ``time``."""
+        swing = math.sin(self.rate * time + self.phase) - math.sin(self.phase)
+        return speed * self.amplitude * swing
 
 
 def rotation(axis: tuple[float, float, float], angle: float) -> Tensor:
@@ -48,19 +52,6 @@ def turn(a: Tensor, b: Tensor, angle: Tensor | float) -> tuple[Tensor, Tensor]:
     return cos * a - sin * b, sin * a + cos * b
 
 
-def smooth_ramp(value: Tensor, start: float, end: float) -> Tensor:
-    """0 up to ``start``, 1 from ``end`` on, between them 3u² − 2u³."""
-    u = ((value - start) / (end - start)).clamp(0, 1)
-    return u * u * (3 - 2 * u)
-
-
-def ramp_shear(start: float, end: float) -> float:
-    """The largest ρ · d/dρ of ``smooth_ramp(ρ, start, end)``: the shear of a unit angle."""
-    u = torch.linspace(0, 1, 1001, dtype=torch.float64)
-    rho = start + (end - start) * u
-    return float((rho * 6 * u * (1 - u) / (end - start)).max())
-
-
 def stretch(shear: float) -> float:
     """The largest singular value of I + w nᵀ with w ⟂ n, |n| = 1, |w| = ``shear``.
 
@@ -68,3 +59,58 @@ def stretch(shear: float) -> float:
     much steeper.
     """
     return (shear + math.sqrt(shear * shear + 4)) / 2
+
+
+class Bending:
+    """Turns about the origin by angles that build up with the distance ρ from it.
+
+    The angle is 0 up to the ramp's start, the whole swing from its end on, and in between
+    3u² − 2u³ of it.
+    """
+
+    def __init__(
+        self, ramp: tuple[float, float], turns: tuple[tuple[int, int, Swing], ...]
+    ) -> None:
+        """Bend between the distances ``ramp``.
+
+        Args:
+            ramp: start and end, world units.
+            turns: in the order in which they are made, each from one axis (0, 1, 2) towards
+                another, with its angle in radians.
+        """
+        self._ramp = ramp
+        self._turns = turns
+        start, end = ramp
+        u = torch.linspace(0, 1, 1001, dtype=torch.float64)
+        rho = start + (end - start) * u
+        # The largest ρ · d(angle)/dρ for an angle of 1.
+        self._shear = float((rho * 6 * u * (1 - u) / (end - start)).max())
+
+    def bent(self, points: Tensor, speed: float, time: float) -> Tensor:
+        """Where rest points (M, 3) are at ``time``."""
+        return self._turned(points, [(a, b, swing(speed, time)) for a, b, swing in self._turns])
+
+    def unbent(self, points: Tensor, speed: float, time: float) -> Tensor:
+        """The exact inverse of :meth:`bent`."""
+        back = reversed(self._turns)
+        return self._turned(points, [(a, b, -swing(speed, time)) for a, b, swing in back])
+
+    def stretch(self, speed: float, time: float) -> float:
+        """The most by which bending, or undoing it, lengthens anything."""
+        angles = sum(abs(swing(speed, time)) for _, _, swing in self._turns)
+        return stretch(angles * self._shear)
+
+    def _turned(self, points: Tensor, turns: Iterable[tuple[int, int, float]]) -> Tensor:
+        axes = list(points.unbind(-1))
+        start, end = self._ramp
+        u = ((length(points) - start) / (end - start)).clamp(0, 1)
+        ramp = u * u * (3 - 2 * u)
+        for a, b, angle in turns:
+            axes[a], axes[b] = turn(axes[a], axes[b], angle * ramp)
+        return torch.stack(axes, dim=-1)
+
+
+def length(points: Tensor) -> Tensor:
+    """Distance (M,) of points (M, 3) from the origin."""
+    x, y, z = points.unbind(-1)
+    return (x * x + y * y + z * z).sqrt()

@@ -6,30 +6,22 @@ World axes as a forward-facing scene has them: x right, y up, the cameras look a
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from devrf.scenes.procedural.motion import Swing, ramp_shear, smooth_ramp, stretch, turn
+from devrf.scenes.procedural.motion import Bending, Swing
 from devrf.scenes.procedural.plush_parts import BASE, REACH, SOLIDS
-from devrf.scenes.procedural.sdf import rounded_box
 from devrf.scenes.procedural.shape import Material
-from devrf.scenes.procedural.texture import PaintedParts
+from devrf.scenes.procedural.solids import SolidTable
 
-# Where along the distance from the toy's base bending and twisting build up: the feet stand
-# still, ears and head turn as one.
-_RAMP = (0.3, 1.15)
-_SHEAR = ramp_shear(*_RAMP)
-_BEND, _BEND_SWING = 0.30, Swing(3.0, -0.5)
-_TWIST, _TWIST_SWING = 0.45, Swing(2.0, 0.0)
+# Twisting and bending build up from the toy's base: the feet stand still, ears and head turn
+# as one.
+_BENDING = Bending((0.3, 1.15), ((2, 0, Swing(0.45, 2.0, 0.0)), (0, 1, Swing(0.30, 3.0, -0.5))))
 # Logarithm of the height's factor: it is squashed first and stretched later.
-_SQUASH, _SQUASH_SWING = -0.12, Swing(4.0, 0.0)
-
-# (3, K, 1) and (K, 1): they broadcast against coordinates (K, M).
-_CENTER = torch.tensor([s.center for s in SOLIDS]).T[..., None]
-_HALF = torch.tensor([s.half for s in SOLIDS]).T[..., None]
-_ROUNDING = torch.tensor([s.rounding for s in SOLIDS])[:, None]
+_SQUASH = Swing(-0.12, 4.0, 0.0)
+TABLE = SolidTable(SOLIDS, BASE)
 
 
 @dataclass(frozen=True)
@@ -45,14 +37,6 @@ class Plush:
     """
 
     speed: float = 1.0
-    _paints: PaintedParts = field(init=False, repr=False, compare=False)
-
-    def __post_init__(self) -> None:
-        center = torch.tensor([s.center for s in SOLIDS], dtype=torch.float64)
-        origin = center + torch.tensor(BASE, dtype=torch.float64)
-        upright = torch.eye(3, dtype=torch.float64).repeat(len(SOLIDS), 1, 1)
-        paints = PaintedParts.of([s.paint for s in SOLIDS], upright, origin)
-        object.__setattr__(self, "_paints", paints)
 
     def distance(self, points: Tensor, time: float) -> Tensor:
         """A lower bound (M,): distances at rest over the most that the motion stretches.
@@ -60,11 +44,14 @@ class Plush:
         Far from the toy it is the distance to a ball around it, which is cheap.
         """
         base = points.new_tensor(BASE)
-        reach = REACH * self._longest(time)
+        reach = self.reach(time)
         ball: Tensor = (points - base).norm(dim=-1) - reach
         near = (ball < 0.1 * reach).nonzero().squeeze(-1)
         local = self._at_rest(points[near] - base, time)
-        ball[near] = self._slack(time) * self._distances(local).amin(dim=0)
+        # Back to rest, lengths grow by no more than 1/s up and √s across.
+        height = self._height(time)
+        longer = _BENDING.stretch(self.speed, time) * max(1 / height, math.sqrt(height))
+        ball[near] = 1 / longer * self._distances(local).amin(dim=0)
         return ball
 
     def material(self, points: Tensor, time: float) -> Material:
@@ -78,60 +65,29 @@ class Plush:
         base = material.rest.new_tensor(BASE)
         height = self._height(time)
         x, y, z = (material.rest - base).unbind(-1)
-        x, y, z = x / math.sqrt(height), y * height, z / math.sqrt(height)
-        bend, twist = self._angles(time)
-        ramp = smooth_ramp((x * x + y * y + z * z).sqrt(), *_RAMP)
-        z, x = turn(z, x, twist * ramp)
-        x, y = turn(x, y, bend * ramp)
-        return torch.stack([x, y, z], dim=-1) + base
+        squashed = torch.stack([x / math.sqrt(height), y * height, z / math.sqrt(height)], dim=-1)
+        return _BENDING.bent(squashed, self.speed, time) + base
 
     def color(self, material: Material) -> Tensor:
         """The solids' paints."""
-        return self._paints.color(material.rest, material.part)
+        return TABLE.painted.color(material)
 
-    def outline(self) -> Material:
-        """A grid of points over the box around each solid."""
-        steps = torch.linspace(-1, 1, 7)
-        cube = torch.cartesian_prod(steps, steps, steps)
-        box = (_CENTER + cube.T[:, None] * _HALF).permute(1, 2, 0)
-        part = torch.arange(len(SOLIDS))[:, None].expand(-1, len(cube))
-        rest = box.reshape(-1, 3) + torch.tensor(BASE)
-        return Material(rest, part.reshape(-1))
+    def reach(self, time: float) -> float:
+        """Radius of a ball about the base that holds the toy at ``time``, world units."""
+        height = self._height(time)
+        return REACH * max(height, 1 / math.sqrt(height))
 
     def _height(self, time: float) -> float:
         """s: how high the toy is, relative to rest."""
-        return math.exp(self.speed * _SQUASH * _SQUASH_SWING(time))
-
-    def _longest(self, time: float) -> float:
-        """The most that squashing lengthens anything."""
-        height = self._height(time)
-        return max(height, 1 / math.sqrt(height))
-
-    def _angles(self, time: float) -> tuple[float, float]:
-        """Full bending and twisting angles at ``time``, radians."""
-        bend = self.speed * _BEND * _BEND_SWING(time)
-        return bend, self.speed * _TWIST * _TWIST_SWING(time)
-
-    def _slack(self, time: float) -> float:
-        """A distance at rest times this is safe at ``time``."""
-        bend, twist = self._angles(time)
-        height = self._height(time)
-        # Back to rest, lengths grow by no more than 1/s up and √s across.
-        return 1 / (stretch((abs(bend) + abs(twist)) * _SHEAR) * max(1 / height, math.sqrt(height)))
+        return math.exp(_SQUASH(self.speed, time))
 
     def _at_rest(self, local: Tensor, time: float) -> Tensor:
         """Rest positions (M, 3) of points (M, 3), both relative to the base."""
-        x, y, z = local.unbind(-1)
-        bend, twist = self._angles(time)
         height = self._height(time)
-        ramp = smooth_ramp((x * x + y * y + z * z).sqrt(), *_RAMP)
-        x, y = turn(x, y, -bend * ramp)
-        z, x = turn(z, x, -twist * ramp)
+        x, y, z = _BENDING.unbent(local, self.speed, time).unbind(-1)
         wide = math.sqrt(height)
         return torch.stack([x * wide, y / height, z * wide], dim=-1)
 
     def _distances(self, local: Tensor) -> Tensor:
         """Distance (K, M) at rest to each solid, of points (M, 3) relative to the base."""
-        x, y, z = local.T[:, None] - _CENTER.to(local)
-        width, height, depth = _HALF.to(local)
-        return rounded_box(x, y, z, (width, height, depth), _ROUNDING.to(local))
+        return TABLE.distances(*(local.T[:, None] - TABLE.center.to(local).T[..., None]))

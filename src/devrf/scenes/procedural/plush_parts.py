@@ -2,33 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
+from devrf.scenes.procedural.solids import Solid, Xyz
 from devrf.scenes.procedural.texture import Paint, Rgb
-
-Xyz = tuple[float, float, float]
 
 # Where the toy stands: x right, y up, the cameras look along −z from about the origin.
 BASE: Xyz = (0.0, -0.72, -2.6)
 # Radius of a ball about the base that holds the toy at rest.
 REACH = 1.5
-
-
-@dataclass(frozen=True)
-class Solid:
-    """A rounded box.
-
-    Attributes:
-        center: its centre at rest relative to the base; the paint's origin too.
-        half: outer half edges.
-        rounding: radius of its edges.
-        paint: its texture.
-    """
-
-    center: Xyz
-    half: Xyz
-    rounding: float
-    paint: Paint
 
 
 ROSE: Rgb = (0.93, 0.55, 0.62)

@@ -1,7 +1,15 @@
-"""Checks of the numbers that a procedural scene is made from."""
+"""The numbers that every procedural scene is made from, and the checks of them."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+
+from devrf.scenes.scene import Scene
 from devrf.scenes.validation import MIN_SIDE, number, scene_error
 
 _LARGEST_SIDE = 4096
@@ -16,26 +24,76 @@ _COUNTS = {
     "frames": (2, _MOST),
     "supersample": (1, 16),
 }
+# Further than at this speed the flower folds into itself, the robot goes through its own body
+# and the toy is squashed to pieces.
+_FASTEST = 2.0
 
 
-def check_recipe(recipe: object, *, fastest: float) -> None:
-    """DevrfError unless all numbers of ``recipe`` are in range.
+@dataclass(frozen=True, kw_only=True)
+class Recipe(ABC):
+    """Calling a recipe renders its scene. The same recipe always gives the same scene.
 
-    Args:
-        recipe: its attributes ``width``, ``frames``, … where it has them, ``speed``, ``light``.
-        fastest: the largest speed at which the shape stays whole.
+    Attributes:
+        width: image width in pixels.
+        height: image height in pixels.
+        static_views: training views of the scene at rest.
+        train_views: fixed cameras that watch the scene move (V); one more is held out.
+        frames: number of frames T, at times k / (T − 1).
+        speed: scales how far everything moves; 0 is still.
+        supersample: n × n rays a pixel.
+        light: share of the lamp in the lighting, 0 … 1: how much motion changes the colours.
     """
-    for key, (least, most) in _COUNTS.items():
-        if not hasattr(recipe, key):
-            continue
-        value = getattr(recipe, key)
-        if isinstance(value, bool) or not isinstance(value, int):
-            raise scene_error(f"data.{key}", f"must be a whole number, not {value!r}")
-        if not least <= value <= most:
-            bound = f"at least {least}" if value < least else f"at most {most}"
-            raise scene_error(f"data.{key}", f"must be {bound}, not {value}")
-    for key, highest in (("speed", fastest), ("light", 1.0)):
-        given = getattr(recipe, key)
-        amount = number(given)
-        if amount is None or not 0 <= amount <= highest:
-            raise scene_error(f"data.{key}", f"must be a number in 0 … {highest:g}, not {given!r}")
+
+    width: int = 96
+    height: int = 96
+    static_views: int = 36
+    train_views: int = 4
+    frames: int = 14
+    speed: float = 1.0
+    supersample: int = 2
+    light: float = 0.2
+
+    def __call__(self) -> Scene:
+        """Render everything.
+
+        Raises:
+            DevrfError: an argument is out of range.
+        """
+        # Not in __post_init__: Hydra would wrap the error in one of its own, many lines long.
+        self._check()
+        with _one_thread():
+            return self.render()
+
+    @abstractmethod
+    def render(self) -> Scene:
+        """The scene, from checked numbers."""
+
+    def _check(self) -> None:
+        for key, (least, most) in _COUNTS.items():
+            value = getattr(self, key, least)
+            if isinstance(value, bool) or not isinstance(value, int):
+                raise scene_error(f"data.{key}", f"must be a whole number, not {value!r}")
+            if not least <= value <= most:
+                bound = f"at least {least}" if value < least else f"at most {most}"
+                raise scene_error(f"data.{key}", f"must be {bound}, not {value}")
+        for key, highest in (("speed", _FASTEST), ("light", 1.0)):
+            given = getattr(self, key)
+            amount = number(given)
+            if amount is None or not 0 <= amount <= highest:
+                expected = f"must be a number in 0 … {highest:g}, not {given!r}"
+                raise scene_error(f"data.{key}", expected)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """PyTorch on one thread inside, on as many as before afterwards.
+
+    Rendering is thousands of small operations: a second thread gains little, and where the cores
+    are shared with others it waits at each of them, which makes a scene take minutes.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 
 import torch
@@ -10,13 +10,10 @@ from torch import Tensor
 
 from devrf.scenes.procedural.motion import rotation
 from devrf.scenes.procedural.robot_body import JOINTS, SOLIDS
-from devrf.scenes.procedural.sdf import rounded_box
 from devrf.scenes.procedural.shape import Material
-from devrf.scenes.procedural.texture import PaintedParts
+from devrf.scenes.procedural.solids import SolidTable
 
-# (3, K, 1) and (K, 1): they broadcast against coordinates (K, M).
-_HALF = torch.tensor([s.half for s in SOLIDS]).T[..., None]
-_ROUNDING = torch.tensor([s.rounding for s in SOLIDS])[:, None]
+_TABLE = SolidTable(SOLIDS)
 
 
 @lru_cache(maxsize=256)
@@ -24,10 +21,9 @@ def solid_motions(speed: float, time: float) -> Tensor:
     """M_k(time), world ← rest, of the K solids: (K, 3, 4) float64; identity at time 0."""
     links = {"": torch.eye(4, dtype=torch.float64)}
     for joint in JOINTS:
-        angle = speed * joint.amplitude * joint.swing(time)
         pivot = torch.tensor(joint.pivot, dtype=torch.float64)
         hinge = torch.eye(4, dtype=torch.float64)
-        hinge[:3, :3] = rotation(joint.axis, angle)
+        hinge[:3, :3] = rotation(joint.axis, joint.swing(speed, time))
         hinge[:3, 3] = pivot - hinge[:3, :3] @ pivot
         links[joint.name] = links[joint.parent] @ hinge
     return torch.stack([links[solid.link][:3] for solid in SOLIDS])
@@ -40,9 +36,8 @@ def _into_solids(speed: float, time: float) -> tuple[Tensor, Tensor]:
     All the x rows come first, then all y, then all z: one product serves every solid.
     """
     motion = solid_motions(speed, time)
-    center = torch.tensor([solid.center for solid in SOLIDS], dtype=torch.float64)
     backward = motion[:, :, :3].transpose(1, 2)
-    offset = -(backward @ motion[:, :, 3:]).squeeze(-1) - center
+    offset = -(backward @ motion[:, :, 3:]).squeeze(-1) - _TABLE.center
     matrix = backward.transpose(0, 1).reshape(-1, 3)
     return matrix.float(), offset.T.reshape(-1, 1).float()
 
@@ -58,13 +53,6 @@ class Robot:
     """
 
     speed: float = 1.0
-    _paints: PaintedParts = field(init=False, repr=False, compare=False)
-
-    def __post_init__(self) -> None:
-        center = torch.tensor([s.center for s in SOLIDS], dtype=torch.float64)
-        upright = torch.eye(3, dtype=torch.float64).repeat(len(SOLIDS), 1, 1)
-        paints = PaintedParts.of([s.paint for s in SOLIDS], upright, center)
-        object.__setattr__(self, "_paints", paints)
 
     def distance(self, points: Tensor, time: float) -> Tensor:
         """Exact distance (M,) outside of the nearest solid."""
@@ -84,20 +72,14 @@ class Robot:
 
     def color(self, material: Material) -> Tensor:
         """The solids' paints."""
-        return self._paints.color(material.rest, material.part)
+        return _TABLE.painted.color(material)
 
     def outline(self) -> Material:
-        """The solids' eight corners each: rigid motion keeps a solid inside of its corners."""
-        signs = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3)
-        center = torch.tensor([s.center for s in SOLIDS])
-        corners = center[:, None] + signs * _HALF.permute(1, 2, 0)
-        part = torch.arange(len(SOLIDS))[:, None].expand(-1, 8)
-        return Material(corners.reshape(-1, 3), part.reshape(-1))
+        """Points around the solids: rigid motion keeps a solid inside of its box."""
+        return _TABLE.outline()
 
     def _distances(self, points: Tensor, time: float) -> Tensor:
         """Distance (K, M) to each solid."""
         matrix, offset = _into_solids(self.speed, time)
         local = torch.addmm(offset.to(points), matrix.to(points), points.T)
-        x, y, z = local.view(3, len(SOLIDS), -1)
-        width, depth, height = _HALF.to(points)
-        return rounded_box(x, y, z, (width, depth, height), _ROUNDING.to(points))
+        return _TABLE.distances(*local.view(3, len(SOLIDS), -1))

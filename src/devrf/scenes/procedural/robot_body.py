@@ -9,67 +9,45 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from devrf.scenes.procedural.motion import Swing
+from devrf.scenes.procedural.solids import Solid, Xyz
 from devrf.scenes.procedural.texture import Paint, Rgb
-
-Xyz = tuple[float, float, float]
 
 X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
 class Joint:
-    """A hinge: angle(t) = speed · amplitude · swing(t) about ``axis`` through ``pivot``.
+    """A hinge: it turns by speed · swing(t) about ``axis`` through ``pivot``.
 
     Attributes:
         name: of the link that it moves.
         parent: the link that carries it, "" for the world.
         pivot: a point on the axis at rest.
         axis: unit direction of the axis at rest.
-        amplitude: angle for a swing of 1.
-        swing: how the angle grows with time.
+        swing: how its angle grows with time.
     """
 
     name: str
     parent: str
     pivot: Xyz
     axis: Xyz
-    amplitude: float
     swing: Swing
-
-
-@dataclass(frozen=True)
-class Solid:
-    """A rounded box that moves rigidly with a link.
-
-    Attributes:
-        link: name of the joint that moves it, "" for the world.
-        center: its centre at rest; the paint's origin too.
-        half: outer half edges.
-        rounding: radius of its edges; capsules and balls are boxes with large ones.
-        paint: its texture.
-    """
-
-    link: str
-    center: Xyz
-    half: Xyz
-    rounding: float
-    paint: Paint
 
 
 # A parent stands before its children.
 JOINTS = (
-    Joint("lean", "", (0, 0, -0.14), X, 0.20, Swing(2.0, 0.0)),
-    Joint("torso", "lean", (0, 0, -0.14), Z, 0.95, Swing(1.2, -0.5)),
-    Joint("nod", "torso", (0, 0, 0.44), Y, -0.3, Swing(1.8, 0.0)),
-    Joint("head", "nod", (0, 0, 0.44), Z, -0.7, Swing(2.4, 0.0)),
-    Joint("left shoulder", "torso", (0.34, 0, 0.3), Y, -0.9, Swing(1.7, 0.1)),
-    Joint("left swing", "left shoulder", (0.34, 0, 0.3), Z, -0.3, Swing(1.6, -1.0)),
-    Joint("left elbow", "left swing", (0.62, 0, 0.3), Y, -0.6, Swing(2.2, -1.3)),
-    Joint("right shoulder", "torso", (-0.34, 0, 0.3), Y, -0.9, Swing(1.5, 0.0)),
-    Joint("right swing", "right shoulder", (-0.34, 0, 0.3), Z, 0.35, Swing(1.8, -1.0)),
-    Joint("right elbow", "right swing", (-0.62, 0, 0.3), Z, 0.6, Swing(2.2, -1.2)),
-    Joint("right hip", "", (-0.17, 0, -0.32), X, -1.2, Swing(1.3, 0.0)),
-    Joint("right knee", "right hip", (-0.17, 0, -0.63), X, 0.75, Swing(2.2, -0.8)),
+    Joint("lean", "", (0, 0, -0.14), X, Swing(0.20, 2.0, 0.0)),
+    Joint("torso", "lean", (0, 0, -0.14), Z, Swing(0.95, 1.2, -0.5)),
+    Joint("nod", "torso", (0, 0, 0.44), Y, Swing(-0.3, 1.8, 0.0)),
+    Joint("head", "nod", (0, 0, 0.44), Z, Swing(-0.7, 2.4, 0.0)),
+    Joint("left shoulder", "torso", (0.34, 0, 0.3), Y, Swing(-0.9, 1.7, 0.1)),
+    Joint("left swing", "left shoulder", (0.34, 0, 0.3), Z, Swing(-0.3, 1.6, -1.0)),
+    Joint("left elbow", "left swing", (0.62, 0, 0.3), Y, Swing(-0.6, 2.2, -1.3)),
+    Joint("right shoulder", "torso", (-0.34, 0, 0.3), Y, Swing(-0.9, 1.5, 0.0)),
+    Joint("right swing", "right shoulder", (-0.34, 0, 0.3), Z, Swing(0.35, 1.8, -1.0)),
+    Joint("right elbow", "right swing", (-0.62, 0, 0.3), Z, Swing(0.6, 2.2, -1.2)),
+    Joint("right hip", "", (-0.17, 0, -0.32), X, Swing(-1.2, 1.3, 0.0)),
+    Joint("right knee", "right hip", (-0.17, 0, -0.63), X, Swing(0.75, 2.2, -0.8)),
 )
 
 ORANGE: Rgb = (0.95, 0.47, 0.10)
@@ -94,35 +72,35 @@ def _plain(color: Rgb) -> Paint:
 def _arm(side: float, name: str, upper: Paint, lower: Paint, hand: Paint) -> tuple[Solid, ...]:
     """An arm stretched out along x; ``side`` is +1 on the left, −1 on the right."""
     return (
-        Solid(f"{name} swing", (side * 0.34, 0, 0.3), (0.12, 0.12, 0.12), 0.12, _plain(STEEL)),
-        Solid(f"{name} swing", (side * 0.49, 0, 0.3), (0.18, 0.09, 0.09), 0.08, upper),
-        Solid(f"{name} elbow", (side * 0.76, 0, 0.3), (0.18, 0.105, 0.105), 0.08, lower),
-        Solid(f"{name} elbow", (side * 0.98, 0, 0.3), (0.11, 0.08, 0.12), 0.07, hand),
+        Solid((side * 0.34, 0, 0.3), (0.12, 0.12, 0.12), 0.12, _plain(STEEL), f"{name} swing"),
+        Solid((side * 0.49, 0, 0.3), (0.18, 0.09, 0.09), 0.08, upper, f"{name} swing"),
+        Solid((side * 0.76, 0, 0.3), (0.18, 0.105, 0.105), 0.08, lower, f"{name} elbow"),
+        Solid((side * 0.98, 0, 0.3), (0.11, 0.08, 0.12), 0.07, hand, f"{name} elbow"),
     )
 
 
 def _leg(side: float, thigh: str, shin: str, paint: Paint, foot: Paint) -> tuple[Solid, ...]:
     """A leg that stands along z, with its two links' names."""
     return (
-        Solid(thigh, (side * 0.17, 0, -0.47), (0.115, 0.115, 0.20), 0.09, paint),
-        Solid(shin, (side * 0.17, 0, -0.77), (0.105, 0.105, 0.18), 0.08, paint),
-        Solid(shin, (side * 0.17, -0.06, -0.97), (0.13, 0.21, 0.085), 0.07, foot),
+        Solid((side * 0.17, 0, -0.47), (0.115, 0.115, 0.20), 0.09, paint, thigh),
+        Solid((side * 0.17, 0, -0.77), (0.105, 0.105, 0.18), 0.08, paint, shin),
+        Solid((side * 0.17, -0.06, -0.97), (0.13, 0.21, 0.085), 0.07, foot, shin),
     )
 
 
 _BODY = (
-    Solid("", (0, 0, -0.25), (0.29, 0.19, 0.12), 0.08, Paint(NAVY, SKY, (0.28, 0, 0), 0.3)),
-    Solid("torso", (0, 0, 0.15), (0.31, 0.21, 0.29), 0.09, Paint(ORANGE, CREAM, (0, 0, 0.28), 0.2)),
-    Solid("torso", (0, -0.20, 0.17), (0.17, 0.05, 0.14), 0.04, Paint(NAVY, YELLOW, (0.3, 0, 0.26))),
-    Solid("torso", (0, 0.25, 0.16), (0.22, 0.11, 0.22), 0.07, Paint(PURPLE, PINK, (0.28, 0, 0.28))),
+    Solid((0, 0, -0.25), (0.29, 0.19, 0.12), 0.08, Paint(NAVY, SKY, (0.28, 0, 0), 0.3)),
+    Solid((0, 0, 0.15), (0.31, 0.21, 0.29), 0.09, Paint(ORANGE, CREAM, (0, 0, 0.28), 0.2), "torso"),
+    Solid((0, -0.20, 0.17), (0.17, 0.05, 0.14), 0.04, Paint(NAVY, YELLOW, (0.3, 0, 0.26)), "torso"),
+    Solid((0, 0.25, 0.16), (0.22, 0.11, 0.22), 0.07, Paint(PURPLE, PINK, (0.28, 0, 0.28)), "torso"),
 )
 _HEAD = (
-    Solid("head", (0, 0, 0.64), (0.26, 0.22, 0.19), 0.09, Paint(TEAL, LIME, (0.32, 0.32, 0), 0.35)),
-    Solid("head", (0, -0.20, 0.66), (0.20, 0.05, 0.10), 0.05, _plain(CREAM)),
-    Solid("head", (0.09, -0.23, 0.66), (0.06, 0.05, 0.06), 0.05, _plain(INK)),
-    Solid("head", (-0.09, -0.23, 0.66), (0.06, 0.05, 0.06), 0.05, _plain(INK)),
-    Solid("head", (0, 0, 0.88), (0.035, 0.035, 0.09), 0.035, _plain(STEEL)),
-    Solid("head", (0, 0, 0.99), (0.08, 0.08, 0.08), 0.08, _plain(RED)),
+    Solid((0, 0, 0.64), (0.26, 0.22, 0.19), 0.09, Paint(TEAL, LIME, (0.32, 0.32, 0), 0.35), "head"),
+    Solid((0, -0.20, 0.66), (0.20, 0.05, 0.10), 0.05, _plain(CREAM), "head"),
+    Solid((0.09, -0.23, 0.66), (0.06, 0.05, 0.06), 0.05, _plain(INK), "head"),
+    Solid((-0.09, -0.23, 0.66), (0.06, 0.05, 0.06), 0.05, _plain(INK), "head"),
+    Solid((0, 0, 0.88), (0.035, 0.035, 0.09), 0.035, _plain(STEEL), "head"),
+    Solid((0, 0, 0.99), (0.08, 0.08, 0.08), 0.08, _plain(RED), "head"),
 )
 
 SOLIDS = (

@@ -13,12 +13,6 @@ from torch import Tensor
 Length = float | Tensor
 
 
-def _corner(x: Tensor, y: Tensor) -> Tensor:
-    """Distance to the quadrant x ≤ 0, y ≤ 0 (negative inside it)."""
-    outside = torch.hypot(x.clamp_min(0), y.clamp_min(0))
-    return outside + torch.maximum(x, y).clamp_max(0)
-
-
 def sphere(x: Tensor, y: Tensor, z: Tensor, radius: Length) -> Tensor:
     """A ball of ``radius`` about the origin."""
     return (x * x + y * y + z * z).sqrt() - radius
@@ -42,8 +36,9 @@ def rounded_cylinder(
     x: Tensor, y: Tensor, z: Tensor, radius: float, half_height: float, rounding: float
 ) -> Tensor:
     """An upright cylinder about z with outer ``radius`` and ``half_height``, rims rounded."""
-    across = torch.hypot(x, y) - (radius - rounding)
-    return _corner(across, z.abs() - (half_height - rounding)) - rounding
+    across, up = torch.hypot(x, y) - (radius - rounding), z.abs() - (half_height - rounding)
+    outside = torch.hypot(across.clamp_min(0), up.clamp_min(0))
+    return outside + torch.maximum(across, up).clamp_max(0) - rounding
 
 
 def blade(

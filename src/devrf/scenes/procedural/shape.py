@@ -20,9 +20,6 @@ class Material:
     rest: Tensor
     part: Tensor
 
-    def __len__(self) -> int:
-        return self.rest.shape[0]
-
 
 class Shape(Protocol):
     """A textured solid that deforms; at t = 0 it is at rest."""
@@ -48,6 +45,10 @@ class Shape(Protocol):
     def color(self, material: Material) -> Tensor:
         """Albedo (M, 3) in [0, 1]: it depends on the material alone, so it moves with it."""
         ...
+
+
+class BoundedShape(Shape, Protocol):
+    """A shape that ends somewhere."""
 
     def outline(self) -> Material:
         """Material points around every part, so that their bounding box holds the object."""

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from devrf.scenes.procedural.shape import Material
+
 Rgb = tuple[float, float, float]
 
 
@@ -35,47 +37,51 @@ class Paint:
     sharpness: float = 6.0
 
 
-@dataclass(frozen=True)
 class PaintedParts:
-    """The paints of K parts and the frames they are painted in.
+    """The paints of K parts in the parts' own frames.
 
     Attributes:
         rotation: (K, 3, 3) axes of each part as columns, world ← part, at rest.
         origin: (K, 3) origin of each part at rest, world units.
-        base: (K, 3) colours.
-        accent: (K, 3) colours.
-        wave: (K, 3) angular frequencies along the part's axes, radians per world unit.
-        edge: (K, 2) threshold and sharpness.
     """
 
-    rotation: Tensor
-    origin: Tensor
-    base: Tensor
-    accent: Tensor
-    wave: Tensor
-    edge: Tensor
-
-    @staticmethod
-    def of(paints: Sequence[Paint], rotation: Tensor, origin: Tensor) -> PaintedParts:
+    def __init__(self, paints: Sequence[Paint], rotation: Tensor, origin: Tensor) -> None:
         """The table of ``paints`` (K of them) in frames (K, 3, 3), (K, 3)."""
 
         def table(rows: list[tuple[float, ...]]) -> Tensor:
             return torch.tensor(rows, dtype=torch.float64)
 
-        return PaintedParts(
-            rotation=rotation,
-            origin=origin,
-            base=table([p.base for p in paints]),
-            accent=table([p.accent for p in paints]),
-            wave=table([tuple(2 * math.pi / q if q else 0.0 for q in p.periods) for p in paints]),
-            edge=table([(p.threshold, p.sharpness) for p in paints]),
+        self.rotation = rotation
+        self.origin = origin
+        self._base = table([p.base for p in paints])
+        self._accent = table([p.accent for p in paints])
+        # Radians per world unit along the part's axes.
+        self._wave = table(
+            [tuple(2 * math.pi / q if q else 0.0 for q in p.periods) for p in paints]
         )
+        self._edge = table([(p.threshold, p.sharpness) for p in paints])
 
-    def color(self, rest: Tensor, part: Tensor) -> Tensor:
-        """Albedo (M, 3) of rest points (M, 3) of the parts (M,)."""
+    def color(self, material: Material) -> Tensor:
+        """Albedo (M, 3) of the material."""
+        rest, part = material.rest, material.part
         offset = rest - self.origin.to(rest)[part]
         local = torch.einsum("mji,mj->mi", self.rotation.to(rest)[part], offset)
-        pattern = (local * self.wave.to(rest)[part]).cos().prod(dim=-1)
-        threshold, sharpness = self.edge.to(rest)[part].unbind(-1)
+        pattern = (local * self._wave.to(rest)[part]).cos().prod(dim=-1)
+        threshold, sharpness = self._edge.to(rest)[part].unbind(-1)
         share = ((pattern - threshold) * sharpness).sigmoid()[:, None]
-        return torch.lerp(self.base.to(rest)[part], self.accent.to(rest)[part], share)
+        return torch.lerp(self._base.to(rest)[part], self._accent.to(rest)[part], share)
+
+    def outline(self, half: Tensor, middle: Tensor) -> Material:
+        """A grid of points over the boxes around the parts.
+
+        Args:
+            half: (K, 3) half edges along the parts' axes, world units.
+            middle: (K, 3) where in its frame each box has its middle.
+        """
+        steps = torch.linspace(-1, 1, 7)
+        cube = torch.cartesian_prod(steps, steps, steps)
+        local = cube * half[:, None] + middle[:, None]
+        rest = torch.einsum("kij,kmj->kmi", self.rotation.float(), local)
+        rest = rest + self.origin.float()[:, None]
+        part = torch.arange(len(half)).repeat_interleave(len(cube))
+        return Material(rest.reshape(-1, 3), part)

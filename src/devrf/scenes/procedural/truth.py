@@ -9,7 +9,7 @@ from torch import Tensor
 
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
-from devrf.scenes.procedural.shape import Shape
+from devrf.scenes.procedural.shape import BoundedShape, Shape
 from devrf.scenes.scene import OpticalFlow
 
 # Motion is sampled at this many times; the margin covers what happens between them.
@@ -32,7 +32,7 @@ class Extent:
     reach: float
 
 
-def extent(shape: Shape) -> Extent:
+def extent(shape: BoundedShape) -> Extent:
     """Where ``shape`` is, from the paths of the points around its parts."""
     outline = shape.outline()
     times = torch.linspace(0, 1, _TIMES).tolist()
