@@ -1,4 +1,4 @@
-"""A batch that is taken in parts teaches the same; memory that never suffices ends the stage."""
+"""Micro-batches learn what whole batches learn; too little memory for any ends the stage."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def moving(rest: LoadedCheckpoint, schedule: DeformationSchedule = MOVING) -> De
 
 
 def assert_alike(one: ScheduledStage, other: ScheduledStage) -> None:
-    """Equal up to rounding; Adam's first steps make much of little, but not in eight of them."""
+    """Equal up to rounding, which Adam's first steps amplify."""
     for name, value in one.state_dict().items():
         if isinstance(value, torch.Tensor) and value.is_floating_point():
             torch.testing.assert_close(value, other.state_dict()[name], rtol=1e-3, atol=1e-4)
@@ -127,9 +127,8 @@ def test_a_frame_that_runs_short_takes_nothing_from_the_one_beside_it(
     # Four iterations of one frame, one of two; then the second of them runs short.
     calls = room(32, from_call=4 + 2 + 1)
     divided = fit(moving(rest, TOGETHER), data=four_frames)
-    assert (
-        divided.loop.micro_batching.count == 2 and calls == [64] * 8 + [32] * 2 + [32] * 2 * 2 * 2
-    )
+    assert divided.loop.micro_batching.count == 2
+    assert calls == [64] * 8 + [32] * 2 + [32] * 2 * 2 * 2
     assert_alike(divided, whole)
 
 

@@ -36,10 +36,6 @@ class OnGpu:
         self.dtype = dtype
 
 
-def test_on_a_cpu_it_is_pytorch() -> None:
-    assert not triton_runs(CPU)
-
-
 def test_on_a_gpu_it_is_triton_where_the_check_passes(monkeypatch: pytest.MonkeyPatch) -> None:
     looked: list[torch.device] = []
     monkeypatch.setattr(dispatch, "_checks", [looked.append])
@@ -70,10 +66,8 @@ def test_a_failed_check_is_said_once(
     with caplog.at_level(logging.WARNING):
         assert not any(triton_runs(OnGpu()) for _ in range(3))  # type: ignore[arg-type]
     (record,) = caplog.records
-    assert record.getMessage() == (
-        "kernels: plain PyTorch runs on cuda:0, since the Triton kernels failed their check there "
-        "(RuntimeError: no compiler)"
-    )
+    assert "plain PyTorch runs on cuda:0" in record.getMessage()
+    assert record.getMessage().endswith("(RuntimeError: no compiler)")
 
 
 def test_what_was_asked_for_holds_inside_and_not_after(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -85,16 +79,14 @@ def test_what_was_asked_for_holds_inside_and_not_after(monkeypatch: pytest.Monke
             assert not triton_runs(OnGpu())  # type: ignore[arg-type]
         assert triton_runs(CPU)
     assert not triton_runs(CPU)
+    with pytest.raises(DevrfError, match="kernels: expected auto, torch or triton, not 'cuda'"):
+        using("cuda").__enter__()  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
     ("tensor", "installed", "expected"),
     [
-        (
-            CPU,
-            True,
-            "triton needs a CUDA device, and these tensors are on the cpu: choose kernels=auto",
-        ),
+        (CPU, True, "needs a CUDA device, and these tensors are on the cpu: choose kernels=auto"),
         (OnGpu(torch.float64), True, "float32, not on torch.float64"),
         (CPU, None, "triton is not installed: pip install triton"),
     ],
@@ -116,9 +108,3 @@ def test_nothing_loads_triton_before_it_is_needed() -> None:
                 assert not any("triton" in name.name for name in statement.names), module
             if isinstance(statement, ast.ImportFrom):
                 assert "kernels" not in str(statement.module), module
-
-
-def test_another_kind_is_refused() -> None:
-    with pytest.raises(DevrfError, match="kernels: expected auto, torch or triton, not 'cuda'"):
-        with using("cuda"):  # type: ignore[arg-type]
-            pass
