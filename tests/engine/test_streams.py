@@ -70,9 +70,7 @@ def streams(monkeypatch: pytest.MonkeyPatch) -> Streams:
     return Streams(monkeypatch)
 
 
-def test_streams_fork_before_the_first_piece_and_join_after_the_last(
-    streams: Streams,
-) -> None:
+def test_streams_fork_before_the_first_piece_and_join_after_the_last(streams: Streams) -> None:
     parallel = StreamParallel()
     expected = [
         "stream 1 waits for present",
@@ -220,28 +218,3 @@ def test_flow_initialises_only_frames_whose_predecessor_was_learned(
     trainer(max_epochs=1).fit(stage, datamodule=four_frames)
     # Not frame 2, which comes first: flow leads there from frame 1, not yet learned.
     assert followed == [1, 3]
-
-
-def test_a_phase_continues_until_all_of_its_frames_have_converged(
-    rest: LoadedCheckpoint,
-    four_frames: SceneDataModule,
-    trainer: Callable[..., Trainer],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    asked: list[list[float]] = []
-    # Frame 2 at once. Of the others neither; the first, but not the second; both.
-    answers = iter([True, False, True, False, True, True])
-
-    def converged(losses: list[float], gain: float) -> bool:
-        asked.append(list(losses))
-        return next(answers)
-
-    monkeypatch.setattr("devrf.methods.devrf.convergence.converged", converged)
-    stage = DeformationStage(
-        rest, TOGETHER, MotionSettings(min_rel_improvement=0.01), iterations_per_step=2
-    )
-    trainer(max_epochs=1).fit(stage, datamodule=four_frames)
-    assert (stage.iteration, stage.skipped) == (16, 6 + 2)
-    # Each with its own frame's losses.
-    assert [len(losses) for losses in asked] == [1, 1, 2, 2, 3, 3]
-    assert asked[2] == asked[4][:2] != asked[3] == asked[5][:2]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from typing import Literal, Protocol
+from typing import Literal
 
 import torch
 
@@ -19,26 +19,6 @@ Graphs = Literal["auto", "off"]
 Work = Callable[[], None]
 
 
-class Graph(Protocol):
-    """Captured work."""
-
-    def replay(self) -> None:
-        """Run the captured work again."""
-        ...
-
-
-class Capturer(Protocol):
-    """Captures work in a graph."""
-
-    def warm_up(self, work: Work) -> None:
-        """Run ``work`` in the way that has to precede its capture."""
-        ...
-
-    def capture(self, work: Work) -> Graph:
-        """A graph of ``work``; capturing does not run it."""
-        ...
-
-
 class CudaGraphCapture:
     """Captures on a CUDA device."""
 
@@ -46,7 +26,10 @@ class CudaGraphCapture:
         self.device = device
 
     def warm_up(self, work: Work) -> None:
-        """Run ``work`` on a side stream: autograd nodes must not refer to the default stream."""
+        """Run ``work`` before its capture, on a side stream.
+
+        Autograd nodes that it creates must not refer to the default stream.
+        """
         present = torch.cuda.current_stream(self.device)
         side = torch.cuda.Stream(self.device)  # type: ignore[no-untyped-call]
         side.wait_stream(present)
@@ -54,8 +37,8 @@ class CudaGraphCapture:
             work()
         present.wait_stream(side)
 
-    def capture(self, work: Work) -> Graph:
-        """Capture ``work`` with a memory pool of its own."""
+    def capture(self, work: Work) -> torch.cuda.CUDAGraph:
+        """A graph of ``work``, with a memory pool of its own; capturing does not run it."""
         before = torch.cuda.current_stream(self.device)
         graph = torch.cuda.CUDAGraph()
         try:
@@ -79,7 +62,7 @@ class GraphedStep:
     # Kernels are compiled, and library workspaces and constants allocated, before the capture.
     WARM_UP = 3
 
-    def __init__(self, work: Work, capturer: Capturer | None) -> None:
+    def __init__(self, work: Work, capturer: CudaGraphCapture | None) -> None:
         """Prepare to run ``work``, which must not wait for the device.
 
         Args:
@@ -89,7 +72,7 @@ class GraphedStep:
         self._work = work
         self._capturer = capturer
         self._calls = 0
-        self._graph: Graph | None = None
+        self._graph: torch.cuda.CUDAGraph | None = None
         self.failed = False
 
     @property
@@ -110,7 +93,7 @@ class GraphedStep:
         else:
             self._work()
 
-    def _try(self, capturer: Capturer) -> None:
+    def _try(self, capturer: CudaGraphCapture) -> None:
         try:
             self._graph = capturer.capture(self._work)
         except Exception as error:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import torch
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
 
-from devrf.data.batch import Pixels
 from devrf.engine.ddp import average_gradients, rays_per_rank, world_size
-from devrf.engine.graphs import Capturer, CudaGraphCapture, GraphedStep, Graphs
+from devrf.engine.graphs import CudaGraphCapture, GraphedStep, Graphs
 from devrf.engine.metric_accumulator import MetricAccumulator
 from devrf.engine.micro_batching import MicroBatching
 from devrf.engine.parallel_batch import ParallelBatch
@@ -23,28 +22,8 @@ from devrf.system.out_of_memory import OutOfMemoryError
 from devrf.system.profiling import measured, span
 from devrf.system.speed import wait
 
-
-class Learner(Protocol):
-    """What the loop needs of a stage."""
-
-    @property
-    def optimizer(self) -> GridAdam:
-        """The optimiser of the parameters of all batches."""
-        ...
-
-    def draw(self, batch: ParallelBatch) -> Pixels:
-        """The pixels of a batch's next iteration."""
-        ...
-
-    def loss(
-        self, batch: ParallelBatch, views: Any, pixels: Pixels
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """The weighted loss () of a batch's pixels of ``views``, and its terms () by name."""
-        ...
-
-    def manual_backward(self, loss: Tensor) -> Any:
-        """Add the gradients of a loss to the present ones."""
-        ...
+if TYPE_CHECKING:
+    from devrf.engine.stage import ScheduledStage
 
 
 class Loop:
@@ -104,30 +83,30 @@ class Loop:
         """Drop batches, metrics and the captured graph with its memory."""
         self.batches, self.metrics, self._graphed = [], MetricAccumulator(), None
 
-    def step(self, learner: Learner, views: Any, optimizer: LightningOptimizer) -> None:
+    def step(self, stage: ScheduledStage, views: Any, optimizer: LightningOptimizer) -> None:
         """Run one iteration.
 
         Args:
-            learner: the stage.
+            stage: draws pixels and computes their loss.
             views: the images of all pixels.
-            optimizer: the learner's, wrapped by Lightning, which calls callbacks before it steps;
-                with static shapes before the whole iteration.
+            optimizer: the stage's, wrapped by Lightning, which calls callbacks before it steps
+                (with static shapes: before the whole iteration).
 
         Raises:
             OutOfMemoryError: the smallest micro-batch does not fit; no parameter has changed.
         """
         for batch in self.batches:
-            batch.take(learner.draw(batch))
+            batch.take(stage.draw(batch))
         try:
             if self.capacities:
-                self._static_step(learner, views, optimizer)
+                self._static_step(stage, views, optimizer)
             else:
                 optimizer.zero_grad()
-                self._accumulate(learner, views)
+                self._accumulate(stage, views)
                 with span("optimiser"):
                     optimizer.step()
         except OutOfMemoryError:
-            optimizer.zero_grad()  # gradients of the batches that did fit
+            optimizer.zero_grad()  # of the batches that did fit
             raise
 
     def poll(self) -> None:
@@ -140,27 +119,29 @@ class Loop:
         for batch in self.batches:
             batch.capacity = SampleCapacity(rays, self._device)
 
-    def _accumulate(self, learner: Learner, views: Any) -> None:
+    def _accumulate(self, stage: ScheduledStage, views: Any) -> None:
         """Compute the gradients of all batches; add losses and terms to the metrics."""
-        pieces = [partial(self._gradients, batch, learner, views) for batch in self.batches]
+        pieces = [partial(self._gradients, batch, stage, views) for batch in self.batches]
         found = self._streams(pieces, self._device)
-        groups = learner.optimizer.param_groups
+        groups = stage.optimizer.param_groups
         average_gradients(p for group in groups for p in group["params"])
         self.metrics.add(found)
 
-    def _gradients(self, batch: ParallelBatch, learner: Learner, views: Any) -> dict[str, Tensor]:
+    def _gradients(
+        self, batch: ParallelBatch, stage: ScheduledStage, views: Any
+    ) -> dict[str, Tensor]:
         """Compute the gradients of one batch; its loss and terms by name."""
         assert batch.pixels is not None
 
         def backward(total: Tensor) -> None:
             with span("backward"):
-                learner.manual_backward(total)
+                stage.manual_backward(total)
 
         total, terms = self.micro_batching.gradients(
-            lambda pixels: learner.loss(batch, views, pixels),
+            lambda pixels: stage.loss(batch, views, pixels),
             batch.pixels,
             backward,
-            lambda: self._divided(batch, learner.optimizer),
+            lambda: self._divided(batch, stage.optimizer),
         )
         return {"loss": total.detach(), **terms}
 
@@ -172,19 +153,21 @@ class Loop:
             self._make_capacities()
             self._graphed = None
 
-    def _static_step(self, learner: Learner, views: Any, optimizer: LightningOptimizer) -> None:
+    def _static_step(
+        self, stage: ScheduledStage, views: Any, optimizer: LightningOptimizer
+    ) -> None:
         """An iteration with static shapes: the same work on the same tensors, with other pixels."""
 
         def work() -> None:
-            self._accumulate(learner, views)
+            self._accumulate(stage, views)
             with span("optimiser"):
-                learner.optimizer.apply()
+                stage.optimizer.apply()
 
         if self._graphed is None:
             self._graphed = GraphedStep(work, self._capturer())
         graphed = self._graphed  # the attribute is reset if memory runs out in the step
         # A profiler cannot attribute a replayed graph to parts.
-        with learner.optimizer.stepping_by(work if measured() else graphed):
+        with stage.optimizer.stepping_by(work if measured() else graphed):
             optimizer.step()
         if graphed.is_warm:
             for capacity in self.capacities:
@@ -192,7 +175,7 @@ class Loop:
         if graphed.failed:
             self.graphs = "off"  # one warning is enough
 
-    def _capturer(self) -> Capturer | None:
+    def _capturer(self) -> CudaGraphCapture | None:
         """Captures iterations; None unless there is exactly one process, on a GPU."""
         possible = self.graphs == "auto" and self._device.type == "cuda" and world_size() == 1
         return CudaGraphCapture(self._device) if possible else None

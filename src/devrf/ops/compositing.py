@@ -33,11 +33,7 @@ def composite(depth: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
         weights (S,) and end transmittance (R,), differentiable once in ``depth``.
     """
     if triton_runs(depth):
-        from devrf.ops.kernels.compositing import Composite
-
-        first = torch.searchsorted(ray, torch.arange(rays + 1, device=ray.device))
-        weights, end = Composite.apply(depth.contiguous(), first)  # type: ignore[no-untyped-call]
-        return weights, end
+        return composite_segments(depth, _firsts(ray, rays))
     weights, end = _Composite.apply(depth, ray, rays)  # type: ignore[no-untyped-call]
     return weights, end
 
@@ -96,7 +92,7 @@ def transmittances(depth: Tensor, ray: Tensor, rays: int) -> Tensor:
 
     Plain PyTorch on all devices: Triton's search computes it itself.
     """
-    first, _ = _segments(ray, rays)
+    first = _firsts(ray, rays)[:-1]
     reached = _running_sum(depth)
     return torch.exp(reached[first[ray]] - reached[:-1]).to(depth.dtype)
 
@@ -112,7 +108,8 @@ def sum_by_ray(values: Tensor, ray: Tensor, rays: int) -> Tensor:
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, depth: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
-        first, last = _segments(ray, rays)
+        edges = _firsts(ray, rays)
+        first, last = edges[:-1], edges[1:]
         reached = _running_sum(depth)
         transmittance = torch.exp(reached[first[ray]] - reached[:-1]).to(depth.dtype)
         weights = transmittance * -torch.expm1(-depth)
@@ -130,10 +127,9 @@ class _Composite(torch.autograd.Function):
         return own - behind - (grad_end * end)[ray], None, None
 
 
-def _segments(ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
-    """First sample and one past the last sample of every ray, (R,) each."""
-    edges = torch.searchsorted(ray, torch.arange(rays + 1, device=ray.device))
-    return edges[:-1], edges[1:]
+def _firsts(ray: Tensor, rays: int) -> Tensor:
+    """The first sample of every ray, and the number of samples (R + 1,)."""
+    return torch.searchsorted(ray, torch.arange(rays + 1, device=ray.device))
 
 
 def _rays_of(first: Tensor, samples: int) -> Tensor:

@@ -67,13 +67,7 @@ def most_steps(box: Box, *, step: float, near: float, far: float) -> int:
 
 @torch.no_grad()
 def march(
-    rays: Rays,
-    box: Box,
-    occupancy: Occupancy,
-    *,
-    step: float,
-    near: float,
-    far: float,
+    rays: Rays, box: Box, occupancy: Occupancy, *, step: float, near: float, far: float
 ) -> Samples:
     """Samples every ``step`` along rays between their entry into the box and their exit.
 

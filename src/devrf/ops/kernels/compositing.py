@@ -122,13 +122,7 @@ def composite_backward_kernel(
 
 @triton.jit
 def sum_kernel(
-    weights,
-    values,
-    first,
-    sums,
-    CHANNELS: tl.constexpr,
-    PADDED: tl.constexpr,
-    BLOCK: tl.constexpr,
+    weights, values, first, sums, CHANNELS: tl.constexpr, PADDED: tl.constexpr, BLOCK: tl.constexpr
 ):
     """Σ w_i·c_i along a ray."""
     ray = tl.program_id(0).to(tl.int64)

@@ -151,10 +151,7 @@ def interpolate_backward_kernel(
         place = row[:, None] * CHANNELS + channel[None, :]
         if NEEDS_GRID:
             tl.atomic_add(
-                grid_gradient + place,
-                (wx * wy * wz)[:, None] * change,
-                mask=changed,
-                sem="relaxed",
+                grid_gradient + place, (wx * wy * wz)[:, None] * change, mask=changed, sem="relaxed"
             )
         if NEEDS_COORDS:
             value = tl.load(grid + place, mask=wanted, other=0.0)
