@@ -120,11 +120,11 @@ def test_the_deformation_stage_learns_the_same_in_parts(fit, room, rest: LoadedC
     assert_alike(divided, whole)
 
 
-def test_a_frame_that_runs_short_takes_nothing_from_the_one_beside_it(
+def test_memory_that_runs_out_for_one_frame_changes_nothing_for_a_parallel_one(
     fit, room, rest: LoadedCheckpoint, four_frames: SceneDataModule
 ) -> None:
     whole = fit(moving(rest, TOGETHER), data=four_frames)
-    # Four iterations of one frame, one of two; then the second of them runs short.
+    # Four iterations of one frame, one of two frames; then the second of them does not fit.
     calls = room(32, from_call=4 + 2 + 1)
     divided = fit(moving(rest, TOGETHER), data=four_frames)
     assert divided.loop.micro_batching.count == 2
@@ -132,7 +132,7 @@ def test_a_frame_that_runs_short_takes_nothing_from_the_one_beside_it(
     assert_alike(divided, whole)
 
 
-def test_a_frame_that_never_has_room_ends_the_stage(
+def test_a_frame_that_never_fits_ends_the_stage(
     fit, room, rest: LoadedCheckpoint, four_frames: SceneDataModule
 ) -> None:
     room(4, from_call=4 + 2 + 1)
@@ -142,12 +142,12 @@ def test_a_frame_that_never_has_room_ends_the_stage(
     assert "schedule.deformation.rays or schedule.deformation.parallel_frames, or" in str(
         caught.value
     )
-    # What the first frame's batch would have taught is gone with the other's.
+    # The gradients of the first frame's batch are dropped with the other's.
     gradients = [p.grad for group in stage.optimizer.param_groups for p in group["params"]]
     assert gradients == [None] * 4 and stage.iteration == 5
 
 
-def test_memory_that_runs_out_at_the_backward_pass_does_no_harm(
+def test_memory_that_runs_out_in_the_backward_pass_changes_nothing(
     fit, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole, failing = fit(canonical()), canonical()
@@ -165,7 +165,7 @@ def test_memory_that_runs_out_at_the_backward_pass_does_no_harm(
     assert_alike(failing, whole)
 
 
-def test_the_parts_are_remembered(fit, room, tmp_path: Path) -> None:
+def test_the_number_of_micro_batches_is_resumed(fit, room, tmp_path: Path) -> None:
     room(32)
     saving = PeriodicCheckpoint(tmp_path, every_seconds=0, share=1.0)
     fit(canonical(), saving)
@@ -210,7 +210,7 @@ def test_other_errors_pass_through(fit, monkeypatch: pytest.MonkeyPatch) -> None
         fit(stage)
 
 
-def test_one_of_several_processes_says_so_and_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_of_several_processes_ends_with_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(parts_module, "world_size", lambda: 2)
 
     def loss(pixels: Pixels) -> Any:
@@ -221,7 +221,7 @@ def test_one_of_several_processes_says_so_and_ends(monkeypatch: pytest.MonkeyPat
         MicroBatching().gradients(loss, pixels, lambda total: None, lambda: None)
 
 
-def test_parts_are_the_batch_in_order(rng: torch.Generator) -> None:
+def test_micro_batches_are_the_batch_in_order(rng: torch.Generator) -> None:
     pixels = Pixels(
         torch.randint(6, (7,), generator=rng), torch.arange(7) * 5, torch.rand(7, 3, generator=rng)
     )

@@ -91,7 +91,7 @@ def test_the_rate_may_be_a_tensor_that_changes() -> None:
     assert parameter.item() == pytest.approx(-0.75)
 
 
-def test_a_restored_optimizer_goes_on_where_it_stopped(rng: torch.Generator) -> None:
+def test_a_restored_optimizer_continues_exactly(rng: torch.Generator) -> None:
     grads = gradients(rng, 6)
     whole, resumed = (torch.zeros(SHAPE, dtype=torch.float64, requires_grad=True) for _ in range(2))
     run(GridAdam([whole], lr=0.1), whole, grads)
@@ -101,7 +101,7 @@ def test_a_restored_optimizer_goes_on_where_it_stopped(rng: torch.Generator) -> 
     torch.testing.assert_close(run(second, resumed, grads[3:]), whole.detach())
 
 
-def test_a_parameter_without_gradient_stands_still_and_the_closure_is_asked() -> None:
+def test_a_parameter_without_gradient_is_not_moved_and_the_closure_is_called() -> None:
     parameter = torch.ones(1, 1, 1, 1, requires_grad=True)
     other = torch.ones(1, 1, 1, 1, requires_grad=True)
     optimizer = GridAdam([parameter, other], lr=0.1)
@@ -167,7 +167,7 @@ def test_kept_gradients_stay_where_they_are_and_are_zero_after_a_step() -> None:
     assert other.grad is not None
 
 
-def test_what_is_forgotten_starts_afresh_in_the_same_memory() -> None:
+def test_forget_zeroes_moments_in_the_same_memory() -> None:
     parameter = torch.zeros(1, 1, 1, 1, requires_grad=True)
     optimizer = GridAdam([parameter], lr=0.1)
     optimizer.forget(0)
@@ -179,7 +179,7 @@ def test_what_is_forgotten_starts_afresh_in_the_same_memory() -> None:
     assert parameter.item() == pytest.approx(-0.2)
 
 
-def test_other_work_may_stand_in_for_the_step_after_the_rates_are_set() -> None:
+def test_other_work_may_replace_the_step_after_the_rates_are_set() -> None:
     parameter = torch.zeros(1, 1, 1, 1, requires_grad=True)
     optimizer, order = GridAdam([parameter], lr=0.5), []
 

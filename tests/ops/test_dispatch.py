@@ -1,4 +1,4 @@
-"""Which implementation runs, and what happens where Triton cannot."""
+"""Which implementation runs, and which error is raised where Triton cannot."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CPU = torch.zeros(1)
 
 @pytest.fixture(autouse=True)
 def unchecked(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """No device has been looked at, and Triton's interpreter is off."""
+    """No device has been checked yet, and Triton's interpreter is off."""
     monkeypatch.delenv("TRITON_INTERPRET")
     passes_check.cache_clear()
     yield
@@ -27,7 +27,7 @@ def unchecked(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 class OnGpu:
-    """What the dispatch looks at in a tensor on a GPU."""
+    """The attributes of a tensor on a GPU that the dispatch reads."""
 
     is_cuda = True
     device = torch.device("cuda", 0)
@@ -56,7 +56,7 @@ def test_where_the_order_of_sums_must_be_fixed_it_is_pytorch(
         triton_runs(OnGpu())  # type: ignore[arg-type]
 
 
-def test_a_failed_check_is_said_once(
+def test_a_failed_check_is_logged_once(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def broken(device: torch.device) -> None:
@@ -70,7 +70,9 @@ def test_a_failed_check_is_said_once(
     assert record.getMessage().endswith("(RuntimeError: no compiler)")
 
 
-def test_what_was_asked_for_holds_inside_and_not_after(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_chosen_implementation_holds_inside_the_context_only(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(dispatch, "reaches", lambda device: True)
     monkeypatch.setattr(dispatch, "find_spec", lambda name: True)
     with using("triton"):

@@ -38,14 +38,6 @@ def test_is_exact_at_every_grid_point_of_a_grid_with_unequal_sides(rng: torch.Ge
     assert torch.equal(interpolate(grid, points), grid.reshape(-1, 2))
 
 
-def test_reproduces_a_linear_function_everywhere_inside(rng: torch.Generator) -> None:
-    axes = [torch.arange(n, dtype=torch.float64) for n in (4, 3, 6)]
-    points = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
-    slope = torch.tensor([[2.0, -1.0], [0.5, 3.0], [-4.0, 0.25]], dtype=torch.float64)
-    coords = torch.rand(200, 3, generator=rng, dtype=torch.float64) * torch.tensor([3.0, 2.0, 5.0])
-    torch.testing.assert_close(interpolate(points @ slope + 7, coords), coords @ slope + 7)
-
-
 def test_outside_the_border_goes_on(rng: torch.Generator) -> None:
     grid = torch.randn(3, 3, 3, 1, generator=rng)
     coords = torch.tensor([[-5.0, 1.0, 1.0], [9.0, 1.0, 1.0], [1.0, -0.01, 7.0]])

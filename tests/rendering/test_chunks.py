@@ -1,4 +1,4 @@
-"""Pictures come out the same with less memory."""
+"""Images are the same with less memory."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_errors_that_smaller_chunks_do_not_prevent(
     assert tried == sizes
 
 
-def test_a_picture_is_the_same_with_less_memory(
+def test_an_image_is_the_same_with_less_memory(
     rest, tiny_scene, same, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rays = tiny_scene.static.test.cameras.image_rays(0)

@@ -1,4 +1,4 @@
-"""Marching along rays against a slow twin that looks at every sample."""
+"""Marching along rays, compared with testing every sample."""
 
 from __future__ import annotations
 

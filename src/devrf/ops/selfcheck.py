@@ -144,7 +144,7 @@ def compositing(draw: Draw) -> Results:
 
 
 def total_variation(draw: Draw) -> Results:
-    """The gradient is added, everywhere and to what is touched."""
+    """The gradient added to entries that have one, and to all."""
     grid, gradient = 2 * draw(4, 3, 5, 3), draw(4, 3, 5, 3).clamp(min=0)
     add_total_variation_gradient(grid, gradient, 0.3, touched_only=True)
     before = gradient.clone()
@@ -153,7 +153,7 @@ def total_variation(draw: Draw) -> Results:
 
 
 def adam(draw: Draw) -> Results:
-    """Steps with and without what is optional."""
+    """Steps with and without the optional settings."""
     results: list[Tensor] = []
     for skip_zero in (False, True):
         factors = draw(4, 3, 5, 1).abs()

@@ -96,25 +96,24 @@ class WarpedDepth(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, warped_gradient: Tensor, tau_gradient: Tensor) -> tuple[Any, ...]:
         points, density, before, after, warped = ctx.saved_tensors
-        asked = (ctx.needs_input_grad[1:4], ctx.buffers, (True, ctx.slices > 0, ctx.slices > 1))
-        needs, into = [], []
-        gradients: list[Tensor | None] = [None, None, None]
-        for n, (grid, own, buffer, used) in enumerate(
-            zip((density, before, after), *asked, strict=True)
+        used = (True, ctx.slices > 0, ctx.slices > 1)
+        needs, gradients, into = [], [], []
+        for grid, asked, buffer, is_used in zip(
+            (density, before, after), ctx.needs_input_grad[1:4], ctx.buffers, used, strict=True
         ):
-            needs.append(used and (own or buffer is not None))
-            if needs[n] and buffer is None:
-                gradients[n] = torch.zeros_like(grid)
-            into.append(buffer if needs[n] and buffer is not None else gradients[n])
+            need = is_used and (asked or buffer is not None)
+            own = torch.zeros_like(grid) if need and buffer is None else None
+            needs.append(need)
+            gradients.append(own)
+            # Any pointer where no gradient is needed.
+            into.append(grid if not need else buffer if own is None else own)
         upstream = (warped_gradient.contiguous(), tau_gradient.contiguous())
         launch(
             warped_depth_backward_kernel,
             triton.cdiv(len(points), BLOCK),
             points,
             *(points, density, warped, *upstream),
-            # A pointer that is not used, where no gradient is needed.
-            *(density if one is None else one for one in into),
-            *(len(points), *ctx.numbers),
+            *(*into, len(points), *ctx.numbers),
             NEEDS_DENSITY=needs[0],
             NEEDS_BEFORE=needs[1],
             NEEDS_AFTER=needs[2],
