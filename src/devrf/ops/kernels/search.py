@@ -120,21 +120,10 @@ def occupied(mask, cx, cy, cz, x, y, z, here):
     return tl.load(mask + (i * y + j) * z + k, mask=here, other=0) != 0
 
 
-@triton.jit(
-    do_not_specialize=[
-        "longest",
-        "stride",
-        "mask_x",
-        "mask_y",
-        "mask_z",
-        "slice_x",
-        "slice_y",
-        "slice_z",
-        "density_x",
-        "density_y",
-        "density_z",
-    ]
-)
+SIZES = [f"{grid}_{axis}" for grid in ("mask", "slice", "density") for axis in "xyz"]
+
+
+@triton.jit(do_not_specialize=["longest", "stride", *SIZES])
 def march_kernel(
     origins,
     directions,
