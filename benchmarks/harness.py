@@ -1,6 +1,6 @@
-"""What the benchmarks share: a composed run, its learned scene, and how results are reported.
+"""Shared by the benchmarks: a composed run, its learned scene, and the report of results.
 
-To be imported before torch, which reads how threads wait when it is loaded.
+Import it before torch, which reads its threading options when it is loaded.
 """
 
 from __future__ import annotations
@@ -34,19 +34,21 @@ from devrf.ops.dispatch import using
 
 
 def parser(description: str | None, *, overrides: bool = True) -> argparse.ArgumentParser:
-    """A command line with ``--json`` and, as its other words, overrides of devrf's config."""
-    made = argparse.ArgumentParser(description=description)
+    """A command line with ``--json`` and, if ``overrides``, overrides of devrf's config."""
+    arguments = argparse.ArgumentParser(description=description)
     if overrides:
-        made.add_argument("overrides", nargs="*", help="of devrf's config: experiment=quickstart")
-    made.add_argument("--json", type=Path, help="where the results are written")
-    return made
+        arguments.add_argument(
+            "overrides", nargs="*", help="of devrf's config: experiment=quickstart"
+        )
+    arguments.add_argument("--json", type=Path, help="where the results are written")
+    return arguments
 
 
 def open_run(overrides: Sequence[str]) -> RunContext:
-    """The run that ``python -m devrf OVERRIDES`` would work on, in the same folder.
+    """The run of ``python -m devrf OVERRIDES``, in the same folder.
 
     Raises:
-        DevrfError: a setting that does not exist or does not fit, or several processes.
+        DevrfError: a setting is unknown or invalid, or asks for several processes.
     """
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     register_resolvers()
@@ -66,7 +68,7 @@ def open_run(overrides: Sequence[str]) -> RunContext:
 
 
 def learned_scene(run: RunContext) -> LoadedCheckpoint:
-    """The scene that the run's checkpoints hold; what they lack is learned, and kept, first."""
+    """The scene in the run's checkpoints; stages that lack one are trained first."""
     if run.config.ckpt is None:
         for stage in run.learning_stages:
             if not run.own_checkpoint(stage).exists():
@@ -78,18 +80,18 @@ def learned_scene(run: RunContext) -> LoadedCheckpoint:
 
 
 def implementation(run: RunContext) -> AbstractContextManager[None]:
-    """Runs what is inside with the run's ``kernels=``."""
+    """A context with the run's ``kernels=``."""
     return using(run.config.kernels)
 
 
 def report(rows: Sequence[dict[str, Any]], into: Path, device: torch.device, **about: Any) -> None:
-    """Print rows as a table, and write them with all their digits as JSON.
+    """Print rows as a table, and write them in full precision as JSON.
 
     Args:
-        rows: results by column; a column that a row lacks is left empty there.
-        into: the JSON file; its folder is made.
-        device: what was measured.
-        about: what else the file says.
+        rows: results by column; missing columns of a row stay empty.
+        into: the JSON file; its folder is created.
+        device: the device that was measured.
+        about: further entries of the file.
     """
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else platform.processor()
     machine = {"device": name or device.type, "torch": torch.__version__}

@@ -1,4 +1,4 @@
-"""Milliseconds of each hot operation: its PyTorch twin, and Triton's kernel where CUDA is there.
+"""Milliseconds of each hot operation: in PyTorch, and in Triton on a CUDA device.
 
 On random grids and rays of a given size; operations with gradients are timed forward and backward.
 """
@@ -32,7 +32,7 @@ SAMPLES_PER_RAY = 32
 
 
 def main() -> None:
-    """Time every operation with every implementation that runs on the device."""
+    """Time every operation in every implementation that runs on the device."""
     arguments = parser(__doc__, overrides=False)
     arguments.add_argument("--side", type=int, default=160, help="grid points along each axis")
     arguments.add_argument("--rays", type=int, default=8192, help=f"of {SAMPLES_PER_RAY} samples")
@@ -56,7 +56,7 @@ def main() -> None:
 
 
 def milliseconds(work: Callable[[], object], kind: Kind, seconds: float) -> float:
-    """The median of calls with one implementation; the first, which compiles, is left out."""
+    """The median over calls of one implementation, without the first, which compiles."""
     with using(kind):
         work()
         timer = Timer("work()", globals={"work": work}, num_threads=torch.get_num_threads())
@@ -126,7 +126,7 @@ def operations(side: int, rays: int, device: torch.device) -> Mapping[str, Calla
 
 
 def with_gradients(operation: Callable[..., Tensor], *given: Tensor) -> Callable[[], object]:
-    """Forward and backward: the gradients of all that is given."""
+    """Forward and backward, with the gradients of all ``given`` tensors."""
     leaves = [tensor.clone().requires_grad_() for tensor in given]
 
     def work() -> object:

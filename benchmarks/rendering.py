@@ -1,7 +1,7 @@
-"""Frames a second of held-out views, at a time seen for the first time and at one seen before.
+"""Frames a second of held-out views, at a new time and again at the same time.
 
-What is known of a time (where matter is then, how it is displaced) is computed once and kept, so
-that a still camera path is faster than a film in which each frame has a time of its own.
+A time's occupancy and displacements are computed once and cached, so that a camera path at one time
+renders faster than a film in which each frame has another time.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def frames_a_second(
             globals={"renderer": renderer, "camera": camera},
             num_threads=threads,
         )
-        renderer.view(*camera)  # kernels are compiled, lists find their length
+        renderer.view(*camera)  # compiles kernels
         renderer.at.cache_clear()
         first.append(timer.timeit(1).median)
         again.append(timer.timeit(3).median)

@@ -1,7 +1,7 @@
-"""Milliseconds of a training iteration at each resolution of both stages, as a whole and by part.
+"""Milliseconds of a training iteration at each resolution of both stages, in total and by part.
 
-The scene that the run has learned is resampled to each resolution, so that rays meet what they
-meet at the end of training; the run's checkpoints are not changed.
+The learned scene is resampled to each resolution, so that rays meet as many occupied cells as at
+the end of training; the run's checkpoints are not changed.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from devrf.methods.devrf.model import DeVRFModel
 from devrf.system.profiling import Part
 
 PARTS = get_args(Part)
-# What lies between the parts: the loop itself, and the framework around it.
+# Time outside all parts: the loop, and Lightning around it.
 OVERHEAD = "overhead"
 Row = dict[str, Any]
 
@@ -55,7 +55,7 @@ def main() -> None:
 
 
 def canonical_rows(run: RunContext, stored: LoadedCheckpoint, seconds: float) -> list[Row]:
-    """A row for the search, at its beginning, and one for each resolution of the fine part."""
+    """A row for the search, at its beginning, and one for each fine resolution."""
 
     def build() -> CanonicalStage:
         stage: CanonicalStage = instantiate(run.config.canonical, _convert_="all")
@@ -91,10 +91,10 @@ def measure(
 
 
 class MeasurePhases(Callback):
-    """Stands in for ``GridUpscaling``: enters one phase of each resolution and measures it there.
+    """Replaces ``GridUpscaling``: enters and measures one phase of each resolution.
 
     Attributes:
-        rows: one for each resolution, fine to coarse: a field that was made coarse stays so.
+        rows: one for each resolution, fine to coarse: fields are resampled downwards only.
     """
 
     def __init__(self, kind: str, learned: DeVRFModel | None, seconds: float) -> None:
@@ -104,7 +104,7 @@ class MeasurePhases(Callback):
     def on_train_batch_start(
         self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int
     ) -> None:
-        """Measure everything before the first step, which is the last one too."""
+        """Measure everything before the first step, which is also the last."""
         assert isinstance(pl_module, ScheduledStage)
         if self._learned is not None:
             give_fields(pl_module, copy.deepcopy(self._learned).to(pl_module.device))
@@ -130,7 +130,7 @@ def one_phase_of_each_resolution(stage: ScheduledStage) -> dict[str, Phase]:
 
 
 def give_fields(stage: ScheduledStage, learned: DeVRFModel) -> None:
-    """Put learned fields in place of the stage's own, as though its last phase had just ended."""
+    """Give a stage learned fields, as at the end of its last phase."""
     last = stage.phase_at(stage.total_iterations)
     model = stage.scene_model
     assert isinstance(model, DeVRFModel)
@@ -145,7 +145,7 @@ def give_fields(stage: ScheduledStage, learned: DeVRFModel) -> None:
 
 
 def measure_phase(stage: ScheduledStage, phase: Phase, views: Any, seconds: float) -> Row:
-    """What an iteration of ``phase`` takes: undisturbed, then part by part in one more step."""
+    """Time and memory of an iteration of ``phase``; then, under a profiler, its time by part."""
     stage.iteration = phase.start
     stage.enter(phase)
     count = min(stage.iterations_per_step, phase.stop - phase.start)
@@ -158,7 +158,7 @@ def measure_phase(stage: ScheduledStage, phase: Phase, views: Any, seconds: floa
             raise DevrfError(stage.abort_reason)
 
     cuda = stage.device.type == "cuda"
-    for _ in range(3):  # kernels are compiled, lists find their length, the graph is captured
+    for _ in range(3):  # compiles kernels, adapts capacities, captures the graph
         step()
     if cuda:
         torch.cuda.reset_peak_memory_stats(stage.device)
@@ -173,15 +173,15 @@ def measure_phase(stage: ScheduledStage, phase: Phase, views: Any, seconds: floa
     if cuda:
         row["gb"] = torch.cuda.max_memory_allocated(stage.device) / 1e9
     row |= {part: ms / count for part, ms in parts(step, cuda=cuda).items()}
-    stage.iteration = phase.start  # where the phase entered is the right one
+    stage.iteration = phase.start  # of the phase that was entered
     return row
 
 
 def parts(work: Callable[[], None], *, cuda: bool) -> dict[str, float]:
-    """Milliseconds of ``work`` by part, each without the parts inside it.
+    """Milliseconds of ``work`` by part, each without the parts nested in it.
 
-    On a CUDA device: of its kernels, charged to the part that launched them. Autograd launches
-    from a thread of its own, in which no part is named: all there is ``backward``.
+    On a CUDA device: of the kernels that a part launched. Autograd launches from its own thread,
+    without named parts: all of it counts as ``backward``.
     """
     activities = [ProfilerActivity.CPU, *([ProfilerActivity.CUDA] if cuda else [])]
     with profile(activities=activities) as profiled, record_function(OVERHEAD):

@@ -1,4 +1,4 @@
-"""Several processes: what they exchange, by hand, in a group of two."""
+"""Data parallelism: what two processes exchange, by hand."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from devrf.methods.devrf.canonical_stage import CanonicalStage
 
 
 def conversation(number: int, port: int, answer: Connection) -> None:
-    """What process ``number`` of two finds."""
+    """Send what the functions under test return in process ``number`` of two."""
     torch.set_num_threads(1)
     address = f"tcp://127.0.0.1:{port}"
     distributed.init_process_group("gloo", init_method=address, rank=number, world_size=2)
     found: dict[str, Any] = {"rank": rank(), "size": world_size(), "rays": rays_per_rank(7)}
 
-    # The first has met nothing with its second parameter, neither with the third.
+    # Process 0 has no gradient of the second parameter, neither process one of the third.
     parameters = [torch.zeros(2), torch.zeros(3, 1), torch.zeros(1)]
     parameters[0].grad = torch.tensor([1.0, 4.0]) * (number + 1)
     if number == 1:
@@ -68,11 +68,11 @@ def conversation(number: int, port: int, answer: Connection) -> None:
 
 @pytest.fixture(scope="module")
 def found() -> list[dict[str, Any]]:
-    """What each of two processes found."""
+    """What each of two processes sends."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    # A fork has loaded everything already.
+    # Forked, which saves the imports.
     fork = multiprocessing.get_context("fork")
     pipes = [fork.Pipe(duplex=False) for _ in range(2)]
     processes = [
@@ -91,33 +91,24 @@ def found() -> list[dict[str, Any]]:
             process.kill()
 
 
-def test_each_has_its_number_and_its_rays_rounded_up(found: list[dict[str, Any]]) -> None:
-    assert [(one["rank"], one["size"], one["rays"]) for one in found] == [(0, 2, 4), (1, 2, 4)]
-
-
-def test_a_missing_gradient_counts_as_zero(found: list[dict[str, Any]]) -> None:
-    for one in found:
+def test_two_processes(found: list[dict[str, Any]]) -> None:
+    for number, one in enumerate(found):
+        # 7 rays in two shares, rounded up.
+        assert (one["rank"], one["size"], one["rays"]) == (number, 2, 4)
+        # Means; a missing gradient counts as zero.
         assert one["gradients"] == [[1.5, 6.0], [1.0, 0.0, -4.0], [0.0]]
-
-
-def test_logged_values_are_means(found: list[dict[str, Any]]) -> None:
-    assert [one["means"] for one in found] == [[[1.5, 1.0]]] * 2
-
-
-def test_what_the_first_has_is_taken_whatever_its_type_and_layout(
-    found: list[dict[str, Any]],
-) -> None:
-    for one in found:
+        assert one["means"] == [[1.5, 1.0]]
+        # The tensors of process 0, of any type and layout.
         assert one["first"] == [[True, False, True], [[0, 3], [1, 4], [2, 5]], 5]
 
 
 @pytest.mark.parametrize("case", ["value", "order", "shape", "missing"])
-def test_fields_that_differ_are_named_by_all(found: list[dict[str, Any]], case: str) -> None:
+def test_every_process_names_tensors_that_differ(found: list[dict[str, Any]], case: str) -> None:
     for one in found:
         assert "the processes have learned different fields (other)" in one[case]
 
 
-def test_one_process_gives_back_what_it_is_given() -> None:
+def test_one_process_changes_nothing() -> None:
     parameter = torch.zeros(2, requires_grad=True)
     average_gradients([parameter])
     assert parameter.grad is None

@@ -1,4 +1,4 @@
-"""Displacements of all frames: read, changed, written back, and kept elsewhere meanwhile."""
+"""The store of all frames' displacements: read, write, resize, offload."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_offloaded_frames_stay_as_they_are_and_are_read_in_single_precision(
     assert store.to_time.shape == (4, 5, 5, 5, 3) and store.to_time.dtype == dtype
 
 
-def test_what_was_fetched_counts_no_more_once_it_has_been_written(store: FrameStore) -> None:
+def test_a_prefetched_frame_is_discarded_once_it_has_been_written(store: FrameStore) -> None:
     fetched: Any = ((store.to_canonical[1], store.to_time[1]), object())
     store._fetched = {1: fetched, 2: fetched}
     store.write(1, pair())
@@ -95,8 +95,8 @@ def test_what_was_fetched_counts_no_more_once_it_has_been_written(store: FrameSt
     assert store._fetched == {}
 
 
-def test_what_is_on_its_way_from_the_host_is_not_copied(store: FrameStore) -> None:
-    stream: Any = (number for number in ())  # like a stream, nothing that can be copied
+def test_prefetched_frames_are_not_copied(store: FrameStore) -> None:
+    stream: Any = (number for number in ())  # cannot be copied, like a stream
     store._fetched = {1: ((store.to_time[1], store.to_time[1]), stream)}
     assert copy.deepcopy(store)._fetched == {}
 

@@ -1,4 +1,4 @@
-"""A batch that is taken in parts teaches the same; memory that never suffices ends the stage."""
+"""Micro-batches learn what whole batches learn; too little memory for any ends the stage."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from devrf.callbacks import DivergenceGuard, PeriodicCheckpoint
 from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, LoadedCheckpoint
 from devrf.data.batch import Pixels
 from devrf.data.datamodule import SceneDataModule
-from devrf.engine import micro_batching as module
 from devrf.engine.micro_batching import MicroBatching
 from devrf.engine.stage import ScheduledStage
 from devrf.errors import DevrfError
@@ -89,27 +88,27 @@ def moving(rest: LoadedCheckpoint, schedule: DeformationSchedule = MOVING) -> De
 
 
 def assert_alike(one: ScheduledStage, other: ScheduledStage) -> None:
-    """Equal up to rounding; Adam's first steps make much of little, but not in eight of them."""
+    """Equal up to rounding, which Adam's first steps amplify."""
     for name, value in one.state_dict().items():
         if isinstance(value, torch.Tensor) and value.is_floating_point():
             torch.testing.assert_close(value, other.state_dict()[name], rtol=1e-3, atol=1e-4)
 
 
-@pytest.mark.parametrize(("rays", "parts"), [(32, 2), (16, 4), (8, 8)])
 def test_the_canonical_stage_learns_the_same_in_parts(
-    fit, memory_for, caplog: pytest.LogCaptureFixture, rays: int, parts: int
+    fit, memory_for, caplog: pytest.LogCaptureFixture
 ) -> None:
     whole = fit(canonical())
-    calls = memory_for(rays)
+    calls = memory_for(8)
     with caplog.at_level(logging.WARNING, logger="devrf"):
         divided = fit(canonical())
-    assert divided.loop.micro_batching.count == parts
-    assert calls[-parts:] == [rays] * parts
+    assert divided.loop.micro_batching.count == 8
+    assert calls[:5] == [64, 32, 16, 8, 8] and calls[-8:] == [8] * 8
     assert_alike(divided, whole)
     said = [line for line in caplog.messages if "out of memory" in line]
-    assert len(said) == {2: 1, 4: 2, 8: 3}[parts]  # once for each division
+    assert [line.split(": ")[-1] for line in said] == [
+        f"batches are taken in {parts} parts from now on" for parts in (2, 4, 8)
+    ]
     assert "2.5 GiB more asked" in said[0] and "GiB free on cpu" in said[0]
-    assert said[-1].endswith(f"batches are taken in {parts} parts from now on")
 
 
 def test_the_deformation_stage_learns_the_same_in_parts(
@@ -122,20 +121,19 @@ def test_the_deformation_stage_learns_the_same_in_parts(
     assert_alike(divided, whole)
 
 
-def test_a_frame_that_runs_short_takes_nothing_from_the_one_beside_it(
+def test_memory_that_runs_out_for_one_frame_changes_nothing_for_a_parallel_one(
     fit, memory_for, rest: LoadedCheckpoint, four_frames: SceneDataModule
 ) -> None:
     whole = fit(moving(rest, TOGETHER), data=four_frames)
-    # Four iterations of one frame, one of two; then the second of them runs short.
+    # Four iterations of one frame, one of two frames; then the second of them does not fit.
     calls = memory_for(32, from_call=4 + 2 + 1)
     divided = fit(moving(rest, TOGETHER), data=four_frames)
-    assert (
-        divided.loop.micro_batching.count == 2 and calls == [64] * 8 + [32] * 2 + [32] * 2 * 2 * 2
-    )
+    assert divided.loop.micro_batching.count == 2
+    assert calls == [64] * 8 + [32] * 2 + [32] * 2 * 2 * 2
     assert_alike(divided, whole)
 
 
-def test_a_frame_that_never_has_room_ends_the_stage(
+def test_a_frame_that_never_fits_ends_the_stage(
     fit, memory_for, rest: LoadedCheckpoint, four_frames: SceneDataModule
 ) -> None:
     memory_for(4, from_call=4 + 2 + 1)
@@ -145,12 +143,12 @@ def test_a_frame_that_never_has_room_ends_the_stage(
     assert "schedule.deformation.rays or schedule.deformation.parallel_frames, or" in str(
         caught.value
     )
-    # What the first frame's batch would have taught is gone with the other's.
+    # The gradients of the first frame's batch are dropped with the other's.
     gradients = [p.grad for group in stage.optimizer.param_groups for p in group["params"]]
     assert gradients == [None] * 4 and stage.iteration == 5
 
 
-def test_memory_that_runs_out_at_the_backward_pass_does_no_harm(
+def test_memory_that_runs_out_in_the_backward_pass_changes_nothing(
     fit, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole, failing = fit(canonical()), canonical()
@@ -168,7 +166,7 @@ def test_memory_that_runs_out_at_the_backward_pass_does_no_harm(
     assert_alike(failing, whole)
 
 
-def test_the_parts_are_remembered(fit, memory_for, tmp_path: Path) -> None:
+def test_the_number_of_micro_batches_is_resumed(fit, memory_for, tmp_path: Path) -> None:
     memory_for(32)
     saving = PeriodicCheckpoint(tmp_path, every_seconds=0, share=1.0)
     fit(canonical(), saving)
@@ -213,8 +211,8 @@ def test_other_errors_pass_through(fit, monkeypatch: pytest.MonkeyPatch) -> None
         fit(stage)
 
 
-def test_one_of_several_processes_says_so_and_ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "world_size", lambda: 2)
+def test_one_of_several_processes_ends_with_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parts_module, "world_size", lambda: 2)
 
     def loss(pixels: Pixels) -> Any:
         raise MemoryError
@@ -224,7 +222,7 @@ def test_one_of_several_processes_says_so_and_ends(monkeypatch: pytest.MonkeyPat
         MicroBatching().gradients(loss, pixels, lambda total: None, lambda: None)
 
 
-def test_parts_are_the_batch_in_order(rng: torch.Generator) -> None:
+def test_micro_batches_are_the_batch_in_order(rng: torch.Generator) -> None:
     pixels = Pixels(
         torch.randint(6, (7,), generator=rng), torch.arange(7) * 5, torch.rand(7, 3, generator=rng)
     )

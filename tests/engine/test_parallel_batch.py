@@ -1,4 +1,4 @@
-"""What belongs to each batch of an iteration, by hand."""
+"""Pixels and metrics of the batches of an iteration, by hand."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_means_of_all_batches_and_the_loss_of_each() -> None:
     means, losses = metrics.take(2)
     assert {name: float(mean) for name, mean in means.items()} == {"render": 6.0, "loss": 6.0}
     assert losses.tolist() == [4.0, 8.0]
-    # What was taken is gone, and what was given stays.
+    # The sums start again; returned means do not change.
     metrics.add(
         [
             {"render": torch.tensor(0.0), "loss": torch.tensor(1.0)},

@@ -1,10 +1,10 @@
-"""Frames that are visited together learn as if each were alone; a GPU is told to do so at once."""
+"""Streams wait for each other; frames learned in parallel learn what they learn alone."""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -37,7 +37,7 @@ class Stream:
 
 
 class Streams:
-    """Stands in for CUDA's streams: writes down who waits for whom, and where work is done."""
+    """A stand-in for CUDA's streams: records which waits for which, and where pieces run."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.noted: list[str] = []
@@ -70,29 +70,25 @@ def streams(monkeypatch: pytest.MonkeyPatch) -> Streams:
     return Streams(monkeypatch)
 
 
-def test_all_wait_before_the_first_piece_and_are_waited_for_after_the_last(
-    streams: Streams,
-) -> None:
-    together, expected = (
-        StreamParallel(),
-        [
-            "stream 1 waits for present",
-            "stream 2 waits for present",
-            "a on present",
-            "b on stream 1",
-            "c on stream 2",
-            "present waits for stream 1",
-            "present waits for stream 2",
-        ],
-    )
-    assert together([streams.piece(name) for name in "abc"], GPU) == ["a", "b", "c"]
+def test_streams_fork_before_the_first_piece_and_join_after_the_last(streams: Streams) -> None:
+    parallel = StreamParallel()
+    expected = [
+        "stream 1 waits for present",
+        "stream 2 waits for present",
+        "a on present",
+        "b on stream 1",
+        "c on stream 2",
+        "present waits for stream 1",
+        "present waits for stream 2",
+    ]
+    assert parallel([streams.piece(name) for name in "abc"], GPU) == ["a", "b", "c"]
     assert streams.noted == expected
     # The same streams each time.
-    together([streams.piece(name) for name in "abc"], GPU)
+    parallel([streams.piece(name) for name in "abc"], GPU)
     assert streams.noted == 2 * expected and streams.made == 2
 
 
-def test_streams_come_together_again_after_a_piece_has_failed(streams: Streams) -> None:
+def test_streams_join_after_a_piece_has_failed(streams: Streams) -> None:
     def failing() -> str:
         raise ZeroDivisionError
 
@@ -105,23 +101,26 @@ def test_streams_come_together_again_after_a_piece_has_failed(streams: Streams) 
     ]
 
 
-@pytest.mark.parametrize(("count", "device"), [(1, GPU), (3, CPU)])
-def test_one_alone_and_those_on_a_cpu_need_no_streams(
-    streams: Streams, count: int, device: torch.device
+@pytest.mark.parametrize(
+    ("count", "device", "context"),
+    [
+        (1, GPU, nullcontext()),
+        (3, CPU, nullcontext()),
+        (2, GPU, profile(activities=[ProfilerActivity.CPU])),
+    ],
+    ids=["a single piece", "on a CPU", "under a profiler"],
+)
+def test_pieces_that_run_one_by_one(
+    streams: Streams, count: int, device: torch.device, context: AbstractContextManager[Any]
 ) -> None:
-    StreamParallel()([streams.piece(str(k)) for k in range(count)], device)
+    with context:
+        StreamParallel()([streams.piece(str(k)) for k in range(count)], device)
     assert streams.noted == [f"{k} on present" for k in range(count)]
-
-
-def test_what_is_measured_is_done_one_by_one(streams: Streams) -> None:
-    with profile(activities=[ProfilerActivity.CPU]):
-        StreamParallel()([streams.piece(name) for name in "ab"], GPU)
-    assert streams.noted == ["a on present", "b on present"]
 
 
 @dataclass(frozen=True)
 class Alone(DeformationSchedule):
-    """Visits one frame alone where it would be visited together with another."""
+    """Learns one frame alone where it would be learned in parallel with another."""
 
     frame: int = 0
 
@@ -144,7 +143,7 @@ TOGETHER = Alone(
     ],
     ids=["views by turns", "useful pixels"],
 )
-def test_a_frame_learns_beside_another_what_it_learns_alone(
+def test_a_frame_learns_in_parallel_what_it_learns_alone(
     rest: LoadedCheckpoint,
     four_frames: SceneDataModule,
     trainer: Callable[..., Trainer],
@@ -177,7 +176,7 @@ def test_a_frame_learns_beside_another_what_it_learns_alone(
 
 
 class Before(Callback):
-    """Notes level and frames of each visit, and sees what each frame knows of the one before."""
+    """Records level and frames of each phase; checks each frame's copy of the frame before."""
 
     def __init__(self) -> None:
         self.visited: list[tuple[int, ...]] = []
@@ -192,7 +191,7 @@ class Before(Callback):
             assert bool(neighbour.any()) == (frame.number > 1)
 
 
-def test_what_a_frame_knows_of_the_one_before_it(
+def test_each_frame_has_a_copy_of_the_frame_before_it(
     rest: LoadedCheckpoint, four_frames: SceneDataModule, trainer: Callable[..., Trainer]
 ) -> None:
     schedule = DeformationSchedule(
@@ -200,12 +199,12 @@ def test_what_a_frame_knows_of_the_one_before_it(
     )
     stage, before = DeformationStage(rest, schedule), Before()
     trainer(before, max_epochs=1).fit(stage, datamodule=four_frames)
-    # One by one; then in two visits, that to the second stretch alone first.
+    # One by one; then in two phases: frame 2 alone, frames 1 and 3 in parallel.
     assert before.visited == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 1, 3)]
     assert stage.iteration == stage.total_iterations == 12 + 4
 
 
-def test_from_rest_the_first_of_a_stretch_follows_no_flow(
+def test_flow_initialises_only_frames_whose_predecessor_was_learned(
     rest: LoadedCheckpoint,
     four_frames: SceneDataModule,
     trainer: Callable[..., Trainer],
@@ -217,30 +216,5 @@ def test_from_rest_the_first_of_a_stretch_follows_no_flow(
     )
     stage = DeformationStage(rest, TOGETHER, MotionSettings(start="flow"))
     trainer(max_epochs=1).fit(stage, datamodule=four_frames)
-    # Frame 1 was not learned yet: it could not tell where its parts have gone in frame 2.
+    # Not frame 2, which comes first: flow leads there from frame 1, not yet learned.
     assert followed == [1, 3]
-
-
-def test_a_visit_goes_on_while_one_of_its_frames_has_something_to_gain(
-    rest: LoadedCheckpoint,
-    four_frames: SceneDataModule,
-    trainer: Callable[..., Trainer],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    asked: list[list[float]] = []
-    # Frame 2 at once. Of the others neither; the first, but not the second; both.
-    answers = iter([True, False, True, False, True, True])
-
-    def converged(losses: list[float], gain: float) -> bool:
-        asked.append(list(losses))
-        return next(answers)
-
-    monkeypatch.setattr("devrf.methods.devrf.convergence.converged", converged)
-    stage = DeformationStage(
-        rest, TOGETHER, MotionSettings(min_rel_improvement=0.01), iterations_per_step=2
-    )
-    trainer(max_epochs=1).fit(stage, datamodule=four_frames)
-    assert (stage.iteration, stage.skipped) == (16, 6 + 2)
-    # Each with its own frame's losses.
-    assert [len(losses) for losses in asked] == [1, 1, 2, 2, 3, 3]
-    assert asked[2] == asked[4][:2] != asked[3] == asked[5][:2]

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from devrf.ops.adam_step import AdamRule, adam_step, smooth_adam_step
-from devrf.ops.total_variation import add_total_variation_gradient
 
 
 def rule(step: int = 1, **options: Any) -> AdamRule:
@@ -49,30 +48,10 @@ def test_smoothing_of_what_is_touched_leaves_the_rest(skip_zero: bool) -> None:
     values, into, gradient = peak(), torch.empty(2, 2, 2, 1), torch.zeros(2, 2, 2, 1)
     gradient[1, 1, 1] = 1.0
     mean, square = torch.zeros_like(values), torch.zeros_like(values)
-    smooth_adam_step(
-        values,
-        into,
-        gradient,
-        mean,
-        square,
-        rule(skip_zero=skip_zero),
-        smoothing=0.5,
-        touched_only=True,
-    )
+    tensors = (values, into, gradient, mean, square)
+    smooth_adam_step(*tensors, rule(skip_zero=skip_zero), smoothing=0.5, touched_only=True)
     assert mean[1, 1, 1].item() == pytest.approx(0.25)
     assert mean.count_nonzero() == 1 and not gradient.any()
     expected = peak()
     expected[1, 1, 1] = 4.9
     torch.testing.assert_close(into, expected)
-
-
-def test_is_the_two_steps_it_stands_for(rng: torch.Generator) -> None:
-    values, gradient, mean = (torch.randn(3, 4, 2, 3, generator=rng) for _ in range(3))
-    square, factors = (torch.rand(3, 4, 2, c, generator=rng) for c in (3, 1))
-    into, how = torch.empty_like(values), rule(4, per_voxel_lr=factors)
-    expected = [t.clone() for t in (values, gradient, mean, square)]
-    add_total_variation_gradient(expected[0].clone(), expected[1], 0.3)
-    adam_step(expected[0], expected[1], expected[2], expected[3], how)
-    smooth_adam_step(values, into, gradient, mean, square, how, smoothing=0.3)
-    for ours, truth in zip((into, gradient, mean, square), expected, strict=True):
-        torch.testing.assert_close(ours, truth)

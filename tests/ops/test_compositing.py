@@ -1,4 +1,4 @@
-"""Compositing against values computed by hand, a slow twin, and its gradients."""
+"""Compositing against values computed by hand, and its gradients."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import math
 
 import pytest
 import torch
-from torch import Tensor
 from torch.autograd import gradcheck
 
 from devrf.ops.compositing import (
@@ -23,42 +22,15 @@ RAY = torch.tensor([0, 0, 0, 2, 2])
 FIRST = torch.tensor([0, 3, 3, 5])
 
 
-def slowly(depth: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
-    """w_i = T_i α_i with T_i = Π (1 − α_j), one sample after another."""
-    left = [torch.ones((), dtype=depth.dtype) for _ in range(rays)]
-    weights = []
-    for tau, r in zip(depth, ray.tolist(), strict=True):
-        alpha = 1 - torch.exp(-tau)
-        weights.append(left[r] * alpha)
-        left[r] = left[r] * (1 - alpha)
-    return torch.stack(weights), torch.stack(left)
-
-
-def test_halves_on_one_ray() -> None:
-    weights, end = composite(torch.full((2,), math.log(2)), torch.tensor([0, 0]), 1)
-    torch.testing.assert_close(weights, torch.tensor([0.5, 0.25]))
-    torch.testing.assert_close(end, torch.tensor([0.25]))
-
-
 def test_opacities_by_hand_on_two_rays_with_an_empty_one_between() -> None:
     alpha = torch.tensor([0.5, 0.2, 0.1, 0.25, 0.6])
-    weights, end = composite(-torch.log1p(-alpha), RAY, 3)
-    # 0.5, 0.5·0.2, 0.5·0.8·0.1; then afresh 0.25, 0.75·0.6.
+    depth = -torch.log1p(-alpha)
+    weights, end = composite(depth, RAY, 3)
+    # 0.5, 0.5·0.2, 0.5·0.8·0.1; on the last ray 0.25, 0.75·0.6.
     torch.testing.assert_close(weights, torch.tensor([0.5, 0.1, 0.04, 0.25, 0.45]))
     torch.testing.assert_close(end, torch.tensor([0.36, 1.0, 0.3]))
-
-
-def test_an_opaque_sample_hides_everything_behind_it() -> None:
-    weights, end = composite(torch.tensor([100.0, 1.0, 5.0]), torch.tensor([0, 0, 0]), 1)
-    torch.testing.assert_close(weights, torch.tensor([1.0, 0.0, 0.0]))
-    assert end.item() < 1e-30
-
-
-def test_agrees_with_the_product_formula(rng: torch.Generator) -> None:
-    ray = torch.randint(20, (200,), generator=rng).sort().values
-    depth = torch.rand(200, generator=rng, dtype=torch.float64)
-    for ours, truth in zip(composite(depth, ray, 20), slowly(depth, ray, 20), strict=True):
-        torch.testing.assert_close(ours, truth)
+    before = transmittances(depth, RAY, 3)
+    torch.testing.assert_close(before, torch.tensor([1.0, 0.5, 0.4, 1.0, 0.75]))
 
 
 def test_a_faint_ray_keeps_its_digits_behind_many_opaque_ones() -> None:
@@ -76,16 +48,6 @@ def test_gradients(rng: torch.Generator) -> None:
     assert gradcheck(lambda tau: composite(tau, RAY, 3), (depth,))
 
 
-def test_gradient_by_hand_of_what_is_behind() -> None:
-    # dw_2/dτ_1 = −w_2 and dT_end/dτ_i = −T_end.
-    depth = torch.full((2,), math.log(2), requires_grad=True)
-    weights, _ = composite(depth, torch.tensor([0, 0]), 1)
-    (grad,) = torch.autograd.grad(weights[1], depth)
-    torch.testing.assert_close(grad, torch.tensor([-0.25, 0.25]))
-    (grad,) = torch.autograd.grad(composite(depth, torch.tensor([0, 0]), 1)[1].sum(), depth)
-    torch.testing.assert_close(grad, torch.tensor([-0.25, -0.25]))
-
-
 def test_rays_without_samples_let_everything_through() -> None:
     empty = torch.zeros(0, requires_grad=True)
     weights, end = composite(empty, torch.zeros(0, dtype=torch.long), 3)
@@ -100,12 +62,6 @@ def test_sum_by_ray_of_scalars_and_vectors() -> None:
     assert torch.equal(sum_by_ray(values, RAY, 4), torch.tensor([7.0, 0.0, 24.0, 0.0]))
     pairs = torch.stack([values, -values], dim=1)
     assert torch.equal(sum_by_ray(pairs, RAY, 3)[2], torch.tensor([24.0, -24.0]))
-
-
-def test_transmittance_before_each_sample_by_hand() -> None:
-    alpha = torch.tensor([0.5, 0.2, 0.1, 0.25, 0.6])
-    before = transmittances(-torch.log1p(-alpha), RAY, 3)
-    torch.testing.assert_close(before, torch.tensor([1.0, 0.5, 0.4, 1.0, 0.75]))
 
 
 def test_segments_are_the_same_rays_and_padding_is_nothing(rng: torch.Generator) -> None:
@@ -131,11 +87,7 @@ def test_sums_of_segments_by_hand() -> None:
     assert torch.equal(sums, torch.tensor([[3.0, 5.0], [0.0, 0.0], [8.0, 5.0]]))
 
 
-@pytest.mark.parametrize("count", [0, 1, 2, 3, 7, 8, 1000])
+@pytest.mark.parametrize("count", [0, 1, 7, 8, 1000])
 def test_running_sums_by_doubling(rng: torch.Generator, count: int) -> None:
     values = torch.rand(count, generator=rng, dtype=torch.float64)
     torch.testing.assert_close(sum_by_doubling(values), values.cumsum(0), rtol=1e-14, atol=0)
-
-
-def test_running_sums_by_doubling_in_full() -> None:
-    assert sum_by_doubling(torch.tensor([1.0, 2.0, 4.0, 8.0, 16.0])).tolist() == [1, 3, 7, 15, 31]

@@ -1,4 +1,4 @@
-"""Which implementation runs, and what happens where Triton cannot."""
+"""Which implementation runs, and which error is raised where Triton cannot."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CPU = torch.zeros(1)
 
 @pytest.fixture(autouse=True)
 def unchecked(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """No device has been looked at, and Triton's interpreter is off."""
+    """No device has been checked yet, and Triton's interpreter is off."""
     monkeypatch.delenv("TRITON_INTERPRET")
     passes_check.cache_clear()
     yield
@@ -27,17 +27,13 @@ def unchecked(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 class OnGpu:
-    """What the dispatch looks at in a tensor on a GPU."""
+    """The attributes of a tensor on a GPU that the dispatch reads."""
 
     is_cuda = True
     device = torch.device("cuda", 0)
 
     def __init__(self, dtype: torch.dtype = torch.float32) -> None:
         self.dtype = dtype
-
-
-def test_on_a_cpu_it_is_pytorch() -> None:
-    assert not triton_runs(CPU)
 
 
 def test_on_a_gpu_it_is_triton_where_the_check_passes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -60,7 +56,7 @@ def test_where_the_order_of_sums_must_be_fixed_it_is_pytorch(
         triton_runs(OnGpu())  # type: ignore[arg-type]
 
 
-def test_a_failed_check_is_said_once(
+def test_a_failed_check_is_logged_once(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def broken(device: torch.device) -> None:
@@ -70,13 +66,13 @@ def test_a_failed_check_is_said_once(
     with caplog.at_level(logging.WARNING):
         assert not any(triton_runs(OnGpu()) for _ in range(3))  # type: ignore[arg-type]
     (record,) = caplog.records
-    assert record.getMessage() == (
-        "kernels: plain PyTorch runs on cuda:0, since the Triton kernels failed their check there "
-        "(RuntimeError: no compiler)"
-    )
+    assert "plain PyTorch runs on cuda:0" in record.getMessage()
+    assert record.getMessage().endswith("(RuntimeError: no compiler)")
 
 
-def test_what_was_asked_for_holds_inside_and_not_after(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_chosen_implementation_holds_inside_the_context_only(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(dispatch, "reaches", lambda device: True)
     monkeypatch.setattr(dispatch, "find_spec", lambda name: True)
     with using("triton"):
@@ -85,16 +81,14 @@ def test_what_was_asked_for_holds_inside_and_not_after(monkeypatch: pytest.Monke
             assert not triton_runs(OnGpu())  # type: ignore[arg-type]
         assert triton_runs(CPU)
     assert not triton_runs(CPU)
+    with pytest.raises(DevrfError, match="kernels: expected auto, torch or triton, not 'cuda'"):
+        using("cuda").__enter__()  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
     ("tensor", "installed", "expected"),
     [
-        (
-            CPU,
-            True,
-            "triton needs a CUDA device, and these tensors are on the cpu: choose kernels=auto",
-        ),
+        (CPU, True, "needs a CUDA device, and these tensors are on the cpu: choose kernels=auto"),
         (OnGpu(torch.float64), True, "float32, not on torch.float64"),
         (CPU, None, "triton is not installed: pip install triton"),
     ],
@@ -116,9 +110,3 @@ def test_nothing_loads_triton_before_it_is_needed() -> None:
                 assert not any("triton" in name.name for name in statement.names), module
             if isinstance(statement, ast.ImportFrom):
                 assert "kernels" not in str(statement.module), module
-
-
-def test_another_kind_is_refused() -> None:
-    with pytest.raises(DevrfError, match="kernels: expected auto, torch or triton, not 'cuda'"):
-        with using("cuda"):  # type: ignore[arg-type]
-            pass

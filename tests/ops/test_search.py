@@ -46,7 +46,7 @@ def along_x(**changed: Any) -> PackedSamples:
 
 def test_by_hand() -> None:
     found = along_x()
-    # The empty one is dropped, and so is what stands behind the opaque one.
+    # The empty sample and the one behind the opaque one are dropped.
     assert found.ray.tolist() == [0, 0, 0, 2, 2, 2]
     assert found.distance.tolist() == [1, 2, 3, 0, 0, 0]
     assert found.points[:3].tolist() == [[1, 0, 0], [2, 0, 0], [3, 0, 0]]
@@ -56,13 +56,13 @@ def test_by_hand() -> None:
     assert found.total == 3 and not found.overflow
 
 
-def test_weight_decides_what_is_heavy() -> None:
+def test_the_threshold_of_weight_decides_what_is_significant() -> None:
     found = along_x(thresholds=Thresholds(alpha=0.01, stop=1e-4, weight=0.3))
     assert found.significant.tolist() == [True, False, False, False, False, False]
 
 
-def test_what_was_dropped_hides_nothing() -> None:
-    # Without the opaque cell the last one is seen, with a quarter of the ray left before it.
+def test_unoccupied_samples_do_not_hide_others() -> None:
+    # Without the opaque cell the last sample is visible, at a transmittance of 1/4.
     mask = torch.ones(5, 2, 2, dtype=torch.bool)
     mask[3] = False
     found = along_x(mask=mask, thresholds=Thresholds(alpha=0.01, stop=0.25, weight=0.125))
@@ -70,8 +70,8 @@ def test_what_was_dropped_hides_nothing() -> None:
     assert found.significant[:3].all()
 
 
-def test_a_displacement_leads_elsewhere() -> None:
-    # Every point sees what lies one further on.
+def test_densities_are_read_at_displaced_points() -> None:
+    # Each point is moved by 1 along x.
     ahead = torch.tensor([1.0, 0.0, 0.0]).expand(2, 2, 2, 3).contiguous()
     assert along_x(slices=[ahead]).distance[:3].tolist() == [0, 1, 2]
     halves = [torch.zeros(2, 2, 2, 3), 2 * ahead]
@@ -86,7 +86,7 @@ def test_the_tail_that_does_not_fit_is_dropped(capacity: int) -> None:
     assert found.total == 3 and found.overflow
 
 
-def test_a_ray_longer_than_promised_is_cut_and_it_is_said() -> None:
+def test_a_ray_longer_than_the_bound_is_cut_with_overflow() -> None:
     found = along_x(longest=2)
     assert found.total == 1 and found.overflow
 

@@ -38,14 +38,6 @@ def test_is_exact_at_every_grid_point_of_a_grid_with_unequal_sides(rng: torch.Ge
     assert torch.equal(interpolate(grid, points), grid.reshape(-1, 2))
 
 
-def test_reproduces_a_linear_function_everywhere_inside(rng: torch.Generator) -> None:
-    axes = [torch.arange(n, dtype=torch.float64) for n in (4, 3, 6)]
-    points = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
-    slope = torch.tensor([[2.0, -1.0], [0.5, 3.0], [-4.0, 0.25]], dtype=torch.float64)
-    coords = torch.rand(200, 3, generator=rng, dtype=torch.float64) * torch.tensor([3.0, 2.0, 5.0])
-    torch.testing.assert_close(interpolate(points @ slope + 7, coords), coords @ slope + 7)
-
-
 def test_outside_the_border_goes_on(rng: torch.Generator) -> None:
     grid = torch.randn(3, 3, 3, 1, generator=rng)
     coords = torch.tensor([[-5.0, 1.0, 1.0], [9.0, 1.0, 1.0], [1.0, -0.01, 7.0]])
@@ -53,34 +45,15 @@ def test_outside_the_border_goes_on(rng: torch.Generator) -> None:
     torch.testing.assert_close(interpolate(grid, coords), expected)
 
 
-def test_outside_the_position_has_no_gradient_along_the_axis_it_left(
-    rng: torch.Generator,
-) -> None:
-    grid = torch.randn(3, 3, 3, 1, generator=rng)
-    coords = torch.tensor([[-1.0, 0.5, 0.5], [0.5, 4.0, 0.5]], requires_grad=True)
-    interpolate(grid, coords).sum().backward()
-    assert coords.grad is not None
-    assert coords.grad[0, 0] == 0 and coords.grad[1, 1] == 0
-    assert (coords.grad[0, 1:] != 0).all() and (coords.grad[1, [0, 2]] != 0).all()
-
-
 def test_gradients_of_values_and_positions(rng: torch.Generator) -> None:
     grid = torch.randn(3, 4, 3, 2, generator=rng, dtype=torch.float64, requires_grad=True)
-    # Off the grid planes, where the slope jumps; one point outside.
+    # Off the grid planes, where the slope jumps; two points in one cell, one outside.
     coords = torch.tensor(
-        [[0.3, 1.2, 0.7], [1.6, 2.9, 1.1], [0.2, 0.4, 1.9], [1.4, -0.5, 2.6]],
+        [[0.3, 1.2, 0.7], [1.6, 2.9, 1.1], [0.2, 1.4, 0.9], [1.4, -0.5, 2.6]],
         dtype=torch.float64,
         requires_grad=True,
     )
     assert gradcheck(interpolate, (grid, coords))
-
-
-def test_a_value_that_two_points_share_gets_both_gradients() -> None:
-    grid = torch.zeros(2, 2, 2, 1, requires_grad=True)
-    interpolate(grid, torch.tensor([[0.25, 0.0, 0.0], [0.5, 0.0, 0.0]])).sum().backward()
-    assert grid.grad is not None
-    assert grid.grad[0, 0, 0].item() == pytest.approx(0.75 + 0.5)
-    assert grid.grad[1, 0, 0].item() == pytest.approx(0.25 + 0.5)
 
 
 @pytest.mark.parametrize("channels", [1, 4])

@@ -1,4 +1,4 @@
-"""Pictures come out the same with less memory."""
+"""Images are the same with less memory."""
 
 from __future__ import annotations
 
@@ -42,27 +42,25 @@ def test_fewer_rays_at_once_when_memory_runs_out(
     assert caplog.messages[-1].startswith("out of memory: pictures are rendered ")
 
 
-def test_in_the_end_the_error_is_told(rays: Rays) -> None:
+@pytest.mark.parametrize(
+    ("error", "sizes"),
+    [(torch.OutOfMemoryError("CUDA out of memory."), [512, FEWEST]), (RuntimeError("ours"), [512])],
+)
+def test_errors_that_smaller_chunks_do_not_prevent(
+    rays: Rays, error: Exception, sizes: list[int]
+) -> None:
     tried: list[int] = []
 
-    def see(some: Rays) -> None:
+    def render(some: Rays) -> None:
         tried.append(len(some))
-        raise torch.OutOfMemoryError("CUDA out of memory.")
+        raise error
 
-    with pytest.raises(torch.OutOfMemoryError):
-        in_chunks(see, rays, 512)
-    assert tried == [512, FEWEST]
-
-
-def test_other_errors_are_not_retried(rays: Rays) -> None:
-    def see(some: Rays) -> None:
-        raise RuntimeError("ours")
-
-    with pytest.raises(RuntimeError, match="ours"):
-        in_chunks(see, rays, 512)
+    with pytest.raises(type(error), match=str(error)):
+        in_chunks(render, rays, 512)
+    assert tried == sizes
 
 
-def test_a_picture_is_the_same_with_less_memory(
+def test_an_image_is_the_same_with_less_memory(
     rest, tiny_scene, same, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rays = tiny_scene.static.test.cameras.image_rays(0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 
@@ -52,21 +54,23 @@ def test_nothing_within_reach_of_a_point_means_no_occupied_cell_is(rng: torch.Ge
     assert occupancy.near(points)[found].all()
 
 
-def test_bounding_box_by_hand(cube: Box) -> None:
+@pytest.mark.parametrize(
+    ("cells", "expected"),
+    [
+        # Cells are 0.5, 0.5 and 0.25 wide.
+        ([(1, 2, 3), (3, 3, 6)], ((-0.5, 0.0, -0.25), (0.5, 0.5, 0.5))),
+        # A single grid point: a cell on both sides of it, as far as there are any.
+        ([(2, 2, 4)], ((-0.5, -0.5, -0.25), (0.5, 0.5, 0.25))),
+        ([(0, 0, 0)], ((-1.0, -1.0, -1.0), (-0.5, -0.5, -0.75))),
+        ([(4, 4, 8)], ((0.5, 0.5, 0.75), (1.0, 1.0, 1.0))),
+        ([], None),
+    ],
+)
+def test_bounding_box_by_hand(cube: Box, cells: list[tuple[int, int, int]], expected: Any) -> None:
     mask = torch.zeros(5, 5, 9, dtype=torch.bool)
-    mask[1, 2, 3] = mask[3, 3, 6] = True
-    # Cells are 0.5, 0.5 and 0.25 wide.
-    assert bounding_box(mask, cube) == Box((-0.5, 0.0, -0.25), (0.5, 0.5, 0.5))
-
-
-@pytest.mark.parametrize(("at", "low", "high"), [(2, -0.5, 0.5), (0, -1.0, -0.5), (4, 0.5, 1.0)])
-def test_a_single_cell_gets_a_box_with_room(cube: Box, at: int, low: float, high: float) -> None:
-    box = bounding_box(single((5, 5, 5), (at, at, at)), cube)
-    assert box == Box((low,) * 3, (high,) * 3)
-
-
-def test_an_empty_mask_has_no_bounding_box(cube: Box) -> None:
-    assert bounding_box(torch.zeros(4, 4, 4, dtype=torch.bool), cube) is None
+    for cell in cells:
+        mask[cell] = True
+    assert bounding_box(mask, cube) == (expected and Box(*expected))
 
 
 def test_a_stored_mask_of_other_shape_and_box_loads_with_its_vicinity(

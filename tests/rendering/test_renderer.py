@@ -1,4 +1,4 @@
-"""A renderer shows what the model shows, and does nothing twice."""
+"""A renderer renders what the model renders, and computes each time's view once."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Picture = Callable[[DeVRFModel, Rays, float, torch.Tensor], RenderedImage]
 
 @pytest.fixture
 def looks(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Grows by one wherever a moment's occupancy is looked for."""
+    """Has an entry for each time that an occupancy was computed."""
     found: list[int] = []
     inner: Callable[..., object] = module.occupancy_through
 
@@ -34,7 +34,7 @@ def looks(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 @pytest.mark.parametrize("time", [0.0, 0.4, 0.55, 1.0])
-def test_it_shows_what_the_model_shows(
+def test_it_renders_what_the_model_renders(
     moving: DeVRFModel, tiny_scene: Scene, time: float, same: Same, reference: Picture
 ) -> None:
     cameras = tiny_scene.dynamic.test.cameras
@@ -54,7 +54,7 @@ def test_a_view_has_the_occupancy_and_displacement_of_its_time(moving: DeVRFMode
     assert rest.at_rest and rest.occupancy is moving.occupancy and rest.displacement is None
 
 
-def test_the_times_asked_for_last_are_kept(moving: DeVRFModel, looks: list[int]) -> None:
+def test_the_views_of_the_last_times_are_cached(moving: DeVRFModel, looks: list[int]) -> None:
     renderer = Renderer(moving, times=2)
     for time in (0.4, 0.7, 0.4, 0.7, 0.4):
         renderer.at(time)
@@ -62,11 +62,11 @@ def test_the_times_asked_for_last_are_kept(moving: DeVRFModel, looks: list[int])
     renderer.at(0.9)
     renderer.at(0.4)
     assert len(looks) == 3
-    renderer.at(0.7)  # had to make room for 0.9
+    renderer.at(0.7)  # replaced by 0.9
     assert len(looks) == 4
 
 
-def test_a_stream_is_made_picture_by_picture(
+def test_a_stream_is_rendered_image_by_image(
     moving: DeVRFModel, tiny_scene: Scene, looks: list[int], same: Same, reference: Picture
 ) -> None:
     cameras, renderer = tiny_scene.dynamic.test.cameras, Renderer(moving)

@@ -1,6 +1,6 @@
-"""Several processes learn one scene: each draws its share of the rays, all take the same step.
+"""Data parallelism: several processes draw their shares of a batch and take the same step.
 
-With one process everything here gives back what it is given.
+With one process the functions of this module change nothing and return their arguments.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import torch
+from lightning import Trainer
 from lightning.pytorch.strategies import DDPStrategy
 from torch import Tensor, distributed
 
@@ -18,18 +19,18 @@ from devrf.errors import DevrfError
 
 
 class ManualDDP(DDPStrategy):
-    """Data parallelism for stages whose parameters come and go.
+    """Data parallelism for stages whose parameters are replaced during training.
 
-    torch's wrapper for distributed modules ties itself to the parameters that it finds first;
-    here grids grow, and the frame that is learned is a slice of a buffer. So nothing is wrapped:
-    the stage averages the gradients itself, with :func:`average_gradients`. A term that is a
-    mean over what its rays have met (cycle, flow) becomes a mean of the processes' means.
+    ``DistributedDataParallel`` registers the parameters it finds at the beginning, but grids grow,
+    and the frame that is learned is a slice of a buffer. So the module is not wrapped; the stage
+    averages gradients itself, with :func:`average_gradients`. A loss term that is a mean over a
+    subset of the rays (cycle, flow) becomes a mean of the processes' means.
 
-    With a trainer of your own, ``Trainer(strategy=ManualDDP(), devices=4)``.
+    With a trainer of your own: ``Trainer(strategy=ManualDDP(), devices=4)``.
     """
 
     def __init__(self, process_group_backend: str | None = None) -> None:
-        """Say how processes talk.
+        """Choose the backend of torch.distributed.
 
         Args:
             process_group_backend: None: ``nccl`` between GPUs, ``gloo`` between CPUs.
@@ -38,52 +39,65 @@ class ManualDDP(DDPStrategy):
         self._on_terminate: Any = signal.SIG_DFL
 
     def setup_environment(self) -> None:
-        """Begin to talk with the other processes."""
+        """Connect to the other processes, and note the present handler of SIGTERM."""
         super().setup_environment()
         self._on_terminate = signal.getsignal(signal.SIGTERM)
 
     def on_train_start(self) -> None:
-        """Answer SIGTERM as before the trainer ran.
+        """Replace Lightning's handler of SIGTERM by the one that was there before.
 
-        Lightning's own answer is to talk with the other processes at once, whatever they are
-        doing; after that all may wait for one another for good.
+        Lightning's handler communicates with the other processes at once, whatever they are doing;
+        that can deadlock.
         """
         if type(signal.getsignal(signal.SIGTERM)).__module__.startswith("lightning."):
             signal.signal(signal.SIGTERM, self._on_terminate)
 
     def configure_ddp(self) -> None:
-        """Leave the stage as it is."""
+        """Do not wrap the stage."""
 
     def barrier(self, name: str | None = None) -> None:
-        """Wait for all processes; not where one writes a checkpoint, which concerns no other."""
+        """Wait for all processes; except where a single one writes a checkpoint."""
         if name != "Trainer.save_checkpoint":
             super().barrier(name)
 
 
+def check_strategy(trainer: Trainer) -> None:
+    """Check that several processes use :class:`ManualDDP`.
+
+    Raises:
+        DevrfError: they use another strategy.
+    """
+    if trainer.world_size > 1 and not isinstance(trainer.strategy, ManualDDP):
+        raise DevrfError(
+            f"trainer: {trainer.world_size} processes need trainer=ddp (the strategy "
+            "devrf.engine.ddp.ManualDDP)"
+        )
+
+
 def rank() -> int:
-    """The number of this process, from 0."""
-    return distributed.get_rank() if _together() else 0
+    """The index of this process, from 0."""
+    return distributed.get_rank() if _is_distributed() else 0
 
 
 def world_size() -> int:
-    """How many processes learn together."""
-    return distributed.get_world_size() if _together() else 1
+    """The number of processes."""
+    return distributed.get_world_size() if _is_distributed() else 1
 
 
-def _together() -> bool:
+def _is_distributed() -> bool:
     return distributed.is_available() and distributed.is_initialized()
 
 
 def rays_per_rank(rays: int) -> int:
-    """The rays of a batch that each process draws: rounded up, so that all draw as many."""
+    """Rays of a batch that each process draws: rounded up, so that all draw the same number."""
     return -(-rays // world_size())
 
 
 def average_gradients(parameters: Iterable[Tensor]) -> None:
     """Replace each gradient by its mean over the processes.
 
-    A parameter without a gradient counts as one whose gradient is zero, so that all processes
-    exchange the same tensors whatever their rays have met.
+    A missing gradient counts as zero, so that all processes exchange the same tensors whichever
+    parameters their rays have reached.
     """
     size = world_size()
     if size == 1:
@@ -93,15 +107,15 @@ def average_gradients(parameters: Iterable[Tensor]) -> None:
         if parameter.grad is None:
             parameter.grad = torch.zeros_like(parameter)
         gradients.append(parameter.grad)
-    under_way = [distributed.all_reduce(gradient, async_op=True) for gradient in gradients]
-    for work, gradient in zip(under_way, gradients, strict=True):
+    pending = [distributed.all_reduce(gradient, async_op=True) for gradient in gradients]
+    for work, gradient in zip(pending, gradients, strict=True):
         assert work is not None
         work.wait()
         gradient.div_(size)
 
 
 def average(values: Tensor) -> Tensor:
-    """The mean over the processes of each number; all processes give the same shape."""
+    """Means of ``values`` over the processes; all processes pass the same shape."""
     size = world_size()
     if size == 1:
         return values
@@ -112,21 +126,21 @@ def average(values: Tensor) -> Tensor:
 
 @torch.no_grad()
 def broadcast(tensors: Iterable[Tensor]) -> None:
-    """Overwrite tensors, in place, with those of process 0."""
+    """Overwrite tensors in place with those of process 0."""
     if world_size() == 1:
         return
     for tensor in tensors:
-        whole = tensor.detach().contiguous()
-        # As bytes: not every backend knows every type.
-        distributed.broadcast(whole.reshape(-1).view(torch.uint8), src=0)
-        tensor.copy_(whole)
+        dense = tensor.detach().contiguous()
+        # As bytes: not every backend supports every type.
+        distributed.broadcast(dense.reshape(-1).view(torch.uint8), src=0)
+        tensor.copy_(dense)
 
 
 def assert_replicas_equal(tensors: Mapping[str, Tensor]) -> None:
-    """See that all processes hold the same tensors, to the last bit.
+    """Check that all processes hold the same tensors, bit for bit.
 
     Raises:
-        DevrfError: naming those that differ.
+        DevrfError: they differ; the message names the tensors.
     """
     if world_size() == 1:
         return

@@ -1,8 +1,8 @@
-"""Where the displacements of all frames rest while a few of them are learned.
+"""Storage for the displacements of all frames while a few of them are learned.
 
 All frames together are large (50 × 160³ × 3 single-precision values are 2.5 GB per direction), and
-few are needed at a time: they may rest on the host, or in half precision. Whatever is read is in
-single precision and on the device that the module is on.
+few are needed at a time: they may be kept on the host, or in half precision. Frames are always
+read in single precision, on the module's device.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class FrameStore(nn.Module):
     Attributes:
         to_canonical: (T, X, Y, Z, 3) backward: points of the frame → canonical space.
         to_time: (T, X, Y, Z, 3) forward: canonical points → the frame.
-        on_host: whether they stay on the host wherever the module goes.
+        on_host: whether they stay on the host when the module is moved.
     """
 
     to_canonical: Tensor
@@ -41,17 +41,15 @@ class FrameStore(nn.Module):
         self.on_host = False
         for name in NAMES:
             self.register_buffer(name, torch.zeros(frames, *shape, 3))
-        # It goes where the module goes, and so tells where that is.
+        # An empty tensor that is moved with the module: its device is the module's.
         self.register_buffer("here", torch.zeros(0), persistent=False)
         self._fetched: dict[int, tuple[Directions, torch.cuda.Stream]] = {}
 
     @torch.no_grad()
     def read(self, frame: int, into: Directions) -> None:
-        """Copy a frame out, without waiting for the device.
+        """Copy a frame's backward and forward displacements ``into`` (X, Y, Z, 3) each.
 
-        Args:
-            frame: which.
-            into: backward and forward displacements (X, Y, Z, 3), overwritten.
+        Does not wait for the device.
         """
         source = (self.to_canonical[frame], self.to_time[frame])
         if frame in self._fetched:
@@ -65,38 +63,38 @@ class FrameStore(nn.Module):
 
     @torch.no_grad()
     def read_forward(self, frame: int, into: Tensor) -> None:
-        """As :meth:`read`, of the forward displacements alone."""
+        """As :meth:`read`, but only the forward displacements."""
         into.copy_(self.to_time[frame], non_blocking=True)
 
     @torch.no_grad()
     def write(self, frame: int, displacements: Directions) -> None:
         """Copy backward and forward ``displacements`` (X, Y, Z, 3) back into a frame.
 
-        Does not wait for the device: :meth:`synchronize` before the host looks at them.
+        Does not wait for the device: call :meth:`synchronize` before the host reads them.
 
         Raises:
-            IndexError: frame 0, which is the rest state, or one that is not there.
+            IndexError: frame 0, which is the rest state, or a frame that does not exist.
         """
         if not 1 <= frame < len(self.to_time):
             last = len(self.to_time) - 1
             raise IndexError(f"frame {frame} cannot be trained: only 1 to {last}")
         for name, value in zip(NAMES, displacements, strict=True):
             getattr(self, name)[frame].copy_(value, non_blocking=True)
-        self._fetched.pop(frame, None)  # what is on its way is of before
+        self._fetched.pop(frame, None)  # it holds the former values
 
     def synchronize(self) -> None:
-        """Wait until the host sees everything that was written."""
+        """Wait until everything that was written has reached the host."""
         if self.on_host and self.here.is_cuda:
             torch.cuda.current_stream(self.here.device).synchronize()
 
     @torch.no_grad()
     def prefetch(self, frames: Sequence[int]) -> None:
-        """Begin to fetch frames from the host, beside other work: they are read next."""
+        """Start copying frames that will be read next from the host, beside other work."""
         if not (self.on_host and self.here.is_cuda):
             return
         device, self._fetched = self.here.device, {}
         side = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
-        # What was written to the frames has to be there first.
+        # Pending writes to the frames must finish first.
         side.wait_stream(torch.cuda.current_stream(device))
         with torch.cuda.stream(side):
             for frame in frames:
@@ -106,7 +104,7 @@ class FrameStore(nn.Module):
 
     @torch.no_grad()
     def copy_previous(self, frame: int) -> None:
-        """Start ``frame`` from the frame before it, in both directions."""
+        """Initialise ``frame`` from the frame before it, in both directions."""
         self.synchronize()
         for name in NAMES:
             getattr(self, name)[frame] = getattr(self, name)[frame - 1]
@@ -118,7 +116,7 @@ class FrameStore(nn.Module):
         for name in NAMES:
             frames = getattr(self, name)
             resized = self._empty((len(frames), *shape, 3), frames.dtype)
-            # Each written to its place: no copy of all.
+            # Frame by frame: no temporary copy of all of them.
             for into, frame in zip(resized, frames, strict=True):
                 into.copy_(resample(frame.to(self.here), shape), non_blocking=True)
             self.synchronize()
@@ -126,11 +124,11 @@ class FrameStore(nn.Module):
 
     @torch.no_grad()
     def offload(self, *, on_host: bool, half: bool) -> None:
-        """Say where the displacements rest, and how.
+        """Choose where and how the displacements are kept.
 
         Args:
-            on_host: keep them on the host, in memory that a CUDA device reaches beside its work.
-            half: keep them in half precision: to 1/2048 of each value.
+            on_host: on the host, in page-locked memory where CUDA is available.
+            half: in half precision: to 1/2048 of each value.
         """
         self.on_host = on_host
         for name in NAMES:
@@ -139,7 +137,7 @@ class FrameStore(nn.Module):
             setattr(self, name, moved.copy_(frames))
 
     def _empty(self, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-        """An uninitialised tensor where displacements rest."""
+        """An uninitialised tensor where displacements are kept."""
         if not self.on_host:
             return torch.empty(shape, dtype=dtype, device=self.here.device)
         if torch.cuda.is_available():
@@ -158,7 +156,7 @@ class FrameStore(nn.Module):
         return self
 
     def __getstate__(self) -> dict[str, Any]:
-        """What a copy takes over: not what is on its way."""
+        """The state of a copy, without frames that are being fetched."""
         return {**self.__dict__, "_fetched": {}}
 
     def _load_from_state_dict(

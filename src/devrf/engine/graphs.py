@@ -1,15 +1,15 @@
-"""Work that is the same each time, replayed from a CUDA graph: Python's part is done once.
+"""Repeated work as a CUDA graph: Python runs it once, later iterations replay its kernels.
 
-A captured graph repeats what was launched, on the tensors that it was launched on. So the work
-must find its input in the same memory each time, leave its results in place, and let no number
-that changes come from Python. devrf.engine.stage sees to that.
+A graph repeats the captured kernel launches on the same memory. The work must therefore read its
+inputs from the same tensors each time, write its results in place, and take no number from Python
+that changes between iterations. :class:`devrf.engine.loop.Loop` meets these conditions.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from typing import Literal, Protocol
+from typing import Literal
 
 import torch
 
@@ -19,26 +19,6 @@ Graphs = Literal["auto", "off"]
 Work = Callable[[], None]
 
 
-class Graph(Protocol):
-    """What was captured."""
-
-    def replay(self) -> None:
-        """Do it once more."""
-        ...
-
-
-class Capturer(Protocol):
-    """How work is captured."""
-
-    def warm_up(self, work: Work) -> None:
-        """Do ``work``, as it has to be done before it is captured."""
-        ...
-
-    def capture(self, work: Work) -> Graph:
-        """A graph of ``work``, which is not done."""
-        ...
-
-
 class CudaGraphCapture:
     """Captures on a CUDA device."""
 
@@ -46,7 +26,10 @@ class CudaGraphCapture:
         self.device = device
 
     def warm_up(self, work: Work) -> None:
-        """Do ``work`` on a stream of its own: nothing that is captured may be tied to another."""
+        """Run ``work`` before its capture, on a side stream.
+
+        Autograd nodes that it creates must not refer to the default stream.
+        """
         present = torch.cuda.current_stream(self.device)
         side = torch.cuda.Stream(self.device)  # type: ignore[no-untyped-call]
         side.wait_stream(present)
@@ -54,51 +37,51 @@ class CudaGraphCapture:
             work()
         present.wait_stream(side)
 
-    def capture(self, work: Work) -> Graph:
-        """Capture ``work``, with memory of its own."""
+    def capture(self, work: Work) -> torch.cuda.CUDAGraph:
+        """A graph of ``work``, with a memory pool of its own; capturing does not run it."""
         before = torch.cuda.current_stream(self.device)
         graph = torch.cuda.CUDAGraph()
         try:
             with torch.cuda.device(self.device), torch.cuda.graph(graph):
                 work()
         finally:
-            # A capture that fails does not leave its own stream by itself.
+            # After a failed capture torch leaves the capturing stream current.
             torch.cuda.set_stream(before)
         return graph
 
 
 class GraphedStep:
-    """Does the same work at each call: as it is for a few times, then from a graph.
+    """Runs the same work at each call: from Python for ``WARM_UP`` calls, then from a graph.
 
-    Where it cannot be captured a warning says why, and it is done as it is ever after.
+    If the capture fails, a warning says why, and every later call runs the work from Python.
 
     Attributes:
-        failed: whether that has happened.
+        failed: whether the capture failed.
     """
 
-    # So that kernels are compiled, libraries have their workspaces, and constants are there.
+    # Kernels are compiled, and library workspaces and constants allocated, before the capture.
     WARM_UP = 3
 
-    def __init__(self, work: Work, capturer: Capturer | None) -> None:
-        """Take on ``work``.
+    def __init__(self, work: Work, capturer: CudaGraphCapture | None) -> None:
+        """Prepare to run ``work``, which must not wait for the device.
 
         Args:
-            work: what to do; it must not wait for the device.
-            capturer: makes a graph of it; None: never.
+            work: what each call runs.
+            capturer: captures it; None: never capture.
         """
         self._work = work
         self._capturer = capturer
         self._calls = 0
-        self._graph: Graph | None = None
+        self._graph: torch.cuda.CUDAGraph | None = None
         self.failed = False
 
     @property
     def is_warm(self) -> bool:
-        """Whether the work has just been done often enough to be captured the next time."""
+        """Whether the last warm-up call has just been made: the next call captures."""
         return self._calls == self.WARM_UP
 
     def __call__(self) -> None:
-        """Do the work once."""
+        """Run the work once."""
         self._calls += 1
         if self._graph is None and self._capturer is not None:
             if self._calls <= self.WARM_UP:
@@ -110,7 +93,7 @@ class GraphedStep:
         else:
             self._work()
 
-    def _try(self, capturer: Capturer) -> None:
+    def _try(self, capturer: CudaGraphCapture) -> None:
         try:
             self._graph = capturer.capture(self._work)
         except Exception as error:

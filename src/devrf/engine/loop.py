@@ -1,18 +1,17 @@
-"""How an iteration is carried out, whatever is learned in it."""
+"""How an iteration is carried out, whichever stage learns in it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import torch
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
 
-from devrf.data.batch import Pixels
 from devrf.engine.ddp import average_gradients, rays_per_rank, world_size
-from devrf.engine.graphs import Capturer, CudaGraphCapture, GraphedStep, Graphs
+from devrf.engine.graphs import CudaGraphCapture, GraphedStep, Graphs
 from devrf.engine.metric_accumulator import MetricAccumulator
 from devrf.engine.micro_batching import MicroBatching
 from devrf.engine.parallel_batch import ParallelBatch
@@ -23,44 +22,23 @@ from devrf.system.out_of_memory import OutOfMemoryError
 from devrf.system.profiling import measured, span
 from devrf.system.speed import wait
 
-
-class Learner(Protocol):
-    """What is learned: a stage."""
-
-    @property
-    def optimizer(self) -> GridAdam:
-        """What steps on the parameters of all batches."""
-        ...
-
-    def draw(self, batch: ParallelBatch) -> Pixels:
-        """The pixels of a batch's coming iteration."""
-        ...
-
-    def loss(
-        self, batch: ParallelBatch, views: Any, pixels: Pixels
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """The weighted loss of a batch's pixels of ``views``, and its terms by name."""
-        ...
-
-    def manual_backward(self, loss: Tensor) -> Any:
-        """Add the gradients of a loss to those that are there."""
-        ...
+if TYPE_CHECKING:
+    from devrf.engine.stage import ScheduledStage
 
 
 class Loop:
-    """Iterations, one after another: each one optimiser step on one batch, or on several.
+    """Runs iterations: one optimiser step each, on one batch or on several independent ones.
 
-    Several independent batches are learned from in parallel. Where memory is short a batch is
-    divided into micro-batches. Where shapes are static, the lists of samples have a fixed length
-    (their ``capacity``); gradients, moments and whatever else goes from one iteration to the next
-    stay in the same memory, and nothing waits for the device. On one GPU each iteration is then a
-    CUDA graph that is replayed.
+    Several batches are processed in parallel. When memory runs out, batches are divided into
+    micro-batches. With static shapes the lists of samples have a fixed length (their ``capacity``),
+    everything that outlives an iteration stays in the same memory, and nothing waits for the
+    device; on one GPU iterations are then replayed from a CUDA graph.
 
     Attributes:
-        graphs: whether static-shape iterations are captured in a CUDA graph where possible.
-        batches: the batches of an iteration; none before :meth:`bind`.
-        micro_batching: how batches are divided when memory runs out.
-        metrics: losses and their terms, over the iterations since they were last taken.
+        graphs: ``off``: never capture iterations in a CUDA graph.
+        batches: the batches of an iteration; empty before :meth:`bind`.
+        micro_batching: divides batches when memory runs out.
+        metrics: losses and their terms since they were last taken.
     """
 
     def __init__(self, graphs: Graphs = "auto") -> None:
@@ -75,7 +53,7 @@ class Loop:
 
     @property
     def capacities(self) -> list[SampleCapacity]:
-        """How long each batch's lists of samples are; none unless shapes are static."""
+        """The lengths of each batch's sample lists; empty unless shapes are static."""
         return [batch.capacity for batch in self.batches if batch.capacity is not None]
 
     def bind(
@@ -86,13 +64,13 @@ class Loop:
         *,
         static_shape: bool,
     ) -> None:
-        """Get ready for iterations on other tensors than before.
+        """Prepare for iterations on other tensors than before.
 
         Args:
-            rays: of a batch, in all processes together.
-            parameters: what is learned from each of the batches of an iteration.
-            optimizer: what steps on them; it has them.
-            static_shape: whether no shape of an iteration may depend on data.
+            rays: rays of a batch, over all processes.
+            parameters: for each batch of an iteration, what is learned from it.
+            optimizer: holds these parameters already.
+            static_shape: whether all shapes must be independent of data.
         """
         self.release()
         self._rays, self._device = rays, parameters[0][0].device
@@ -102,90 +80,94 @@ class Loop:
             optimizer.keep_gradients()
 
     def release(self) -> None:
-        """Drop what only iterations need: a captured one holds memory of its own."""
+        """Drop batches, metrics and the captured graph with its memory."""
         self.batches, self.metrics, self._graphed = [], MetricAccumulator(), None
 
-    def step(self, learner: Learner, views: Any, optimizer: LightningOptimizer) -> None:
-        """One iteration.
+    def step(self, stage: ScheduledStage, views: Any, optimizer: LightningOptimizer) -> None:
+        """Run one iteration.
 
         Args:
-            learner: what is learned.
+            stage: draws pixels and computes their loss.
             views: the images of all pixels.
-            optimizer: the learner's, as Lightning hands it out: callbacks are asked before it
-                steps, or before the whole iteration if its shapes are static.
+            optimizer: the stage's, wrapped by Lightning, which calls callbacks before it steps
+                (with static shapes: before the whole iteration).
 
         Raises:
-            OutOfMemoryError: there is no room for the smallest micro-batch; nothing was learned.
+            OutOfMemoryError: the smallest micro-batch does not fit; no parameter has changed.
         """
         for batch in self.batches:
-            batch.take(learner.draw(batch))
+            batch.take(stage.draw(batch))
         try:
             if self.capacities:
-                self._static_step(learner, views, optimizer)
+                self._static_step(stage, views, optimizer)
             else:
                 optimizer.zero_grad()
-                self._accumulate(learner, views)
+                self._accumulate(stage, views)
                 with span("optimiser"):
                     optimizer.step()
         except OutOfMemoryError:
-            optimizer.zero_grad()  # of batches that had room
+            optimizer.zero_grad()  # of the batches that did fit
             raise
 
     def poll(self) -> None:
-        """Fit the lists to what iterations needed, as far as that is known by now."""
-        if any([capacity.poll() for capacity in self.capacities]):  # a list: all of them are asked
-            self._graphed = None  # captured with lists of another length
+        """Adapt the capacities to the sample counts that have reached the host."""
+        if any([capacity.poll() for capacity in self.capacities]):  # a list: poll all of them
+            self._graphed = None  # it was captured with the former lengths
 
     def _make_capacities(self) -> None:
         rays = -(-rays_per_rank(self._rays) // self.micro_batching.count)
         for batch in self.batches:
             batch.capacity = SampleCapacity(rays, self._device)
 
-    def _accumulate(self, learner: Learner, views: Any) -> None:
-        """The gradients of each batch; losses and terms are added to the metrics."""
-        pieces = [partial(self._gradients, batch, learner, views) for batch in self.batches]
+    def _accumulate(self, stage: ScheduledStage, views: Any) -> None:
+        """Compute the gradients of all batches; add losses and terms to the metrics."""
+        pieces = [partial(self._gradients, batch, stage, views) for batch in self.batches]
         found = self._streams(pieces, self._device)
-        groups = learner.optimizer.param_groups
+        groups = stage.optimizer.param_groups
         average_gradients(p for group in groups for p in group["params"])
         self.metrics.add(found)
 
-    def _gradients(self, batch: ParallelBatch, learner: Learner, views: Any) -> dict[str, Tensor]:
-        """The gradients of one batch, its loss and its terms."""
+    def _gradients(
+        self, batch: ParallelBatch, stage: ScheduledStage, views: Any
+    ) -> dict[str, Tensor]:
+        """Compute the gradients of one batch; its loss and terms by name."""
         assert batch.pixels is not None
 
         def backward(total: Tensor) -> None:
             with span("backward"):
-                learner.manual_backward(total)
+                stage.manual_backward(total)
 
         total, terms = self.micro_batching.gradients(
-            lambda pixels: learner.loss(batch, views, pixels),
+            lambda pixels: stage.loss(batch, views, pixels),
             batch.pixels,
             backward,
-            lambda: self._divided(batch, learner.optimizer),
+            lambda: self._divided(batch, stage.optimizer),
         )
         return {"loss": total.detach(), **terms}
 
     def _divided(self, batch: ParallelBatch, optimizer: GridAdam) -> None:
-        """Begin a batch's iteration anew in smaller parts, which are those of all batches."""
-        wait(self._device)  # other batches may be at work in their lists
+        """Prepare to restart a batch's iteration; later batches use the smaller parts, too."""
+        wait(self._device)  # other streams may still write to their lists
         optimizer.drop_gradients(batch.parameters)
         if self.capacities:
             self._make_capacities()
             self._graphed = None
 
-    def _static_step(self, learner: Learner, views: Any, optimizer: LightningOptimizer) -> None:
-        """An iteration of static shape: the same work on the same tensors, with other pixels."""
+    def _static_step(
+        self, stage: ScheduledStage, views: Any, optimizer: LightningOptimizer
+    ) -> None:
+        """An iteration with static shapes: the same work on the same tensors, with other pixels."""
 
         def work() -> None:
-            self._accumulate(learner, views)
+            self._accumulate(stage, views)
             with span("optimiser"):
-                learner.optimizer.apply()
+                stage.optimizer.apply()
 
         if self._graphed is None:
             self._graphed = GraphedStep(work, self._capturer())
-        graphed = self._graphed  # which is gone if memory runs out on the way
-        # A replayed graph shows none of its parts to a profiler.
-        with learner.optimizer.stepping_by(work if measured() else graphed):
+        graphed = self._graphed  # the attribute is reset if memory runs out in the step
+        # A profiler cannot attribute a replayed graph to parts.
+        with stage.optimizer.stepping_by(work if measured() else graphed):
             optimizer.step()
         if graphed.is_warm:
             for capacity in self.capacities:
@@ -193,7 +175,7 @@ class Loop:
         if graphed.failed:
             self.graphs = "off"  # one warning is enough
 
-    def _capturer(self) -> Capturer | None:
-        """How iterations are captured: on one GPU, if at all."""
+    def _capturer(self) -> CudaGraphCapture | None:
+        """Captures iterations; None unless there is exactly one process, on a GPU."""
         possible = self.graphs == "auto" and self._device.type == "cuda" and world_size() == 1
         return CudaGraphCapture(self._device) if possible else None

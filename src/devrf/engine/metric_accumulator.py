@@ -1,4 +1,4 @@
-"""Losses and their terms, added up over the iterations of a Lightning step."""
+"""Sums of losses and their terms over the iterations of a Lightning step."""
 
 from __future__ import annotations
 
@@ -11,17 +11,14 @@ from devrf.engine.ddp import average
 
 
 class MetricAccumulator:
-    """Sums by name, for each of the parallel batches.
-
-    From the first addition on they stay in the same memory.
-    """
+    """Sums by name for each parallel batch, in the same memory from the first :meth:`add` on."""
 
     def __init__(self) -> None:
         self._names: tuple[str, ...] = ()
         self._values: Tensor | None = None  # (batches, names)
 
     def add(self, found: Sequence[Mapping[str, Tensor]]) -> None:
-        """Add what an iteration has come to: scalars by name for each batch, all the same names."""
+        """Add the values () of an iteration, by name for each batch; all have the same names."""
         self._names = tuple(found[0])
         values = torch.stack([terms[name] for terms in found for name in self._names])
         values = values.view(len(found), len(self._names))
@@ -31,13 +28,15 @@ class MetricAccumulator:
             self._values += values
 
     def take(self, iterations: int) -> tuple[dict[str, Tensor], Tensor]:
-        """The means over some iterations and all processes; the sums begin anew.
+        """The means over ``iterations`` and all processes; the sums are set to zero.
 
         Returns:
-            Of each name the mean over the batches, (); of each batch its ``loss``, (batches,).
+            For each name the mean over the batches, (); for each batch its ``loss``, (batches,).
         """
         assert self._values is not None
         means = average(self._values) / iterations
         self._values.zero_()
-        together = means.mean(dim=0).unbind()
-        return dict(zip(self._names, together, strict=True)), means[:, self._names.index("loss")]
+        over_batches = means.mean(dim=0).unbind()
+        return dict(zip(self._names, over_batches, strict=True)), means[
+            :, self._names.index("loss")
+        ]

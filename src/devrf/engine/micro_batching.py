@@ -1,4 +1,4 @@
-"""A batch of rays taken in parts, when it is too large for the memory."""
+"""Micro-batches: a batch that does not fit into memory is processed in parts."""
 
 from __future__ import annotations
 
@@ -16,17 +16,19 @@ from devrf.system.out_of_memory import OutOfMemoryError, free_cache, is_oom, num
 log = logging.getLogger(__name__)
 
 Terms = dict[str, Tensor]
+Loss = Callable[[Pixels], tuple[Tensor, Terms]]
+Backward = Callable[[Tensor], None]
 
 
 class MicroBatching:
-    """In how many parts a batch is taken: one, until memory runs out.
+    """Accumulates a batch's gradients over ``count`` micro-batches, more when memory runs out.
 
-    The parts of a batch are the same rays in the same order, and each counts by its share of
-    them: sums and means over rays are what they would be, up to rounding. A term that is a mean
-    over what its rays have met (cycle, flow) becomes a mean of the parts' means.
+    Micro-batches have the rays of the batch in the same order, and each is weighted by its share
+    of them: sums and means over rays are unchanged, up to rounding. A term that is a mean over a
+    subset of the rays (cycle, flow) becomes a mean of the micro-batches' means.
 
     Attributes:
-        count: how many parts; once memory ran out, for the rest of the stage.
+        count: micro-batches of a batch: 1, and doubled whenever memory runs out.
     """
 
     MOST = 8
@@ -35,48 +37,43 @@ class MicroBatching:
         self.count = 1
 
     def gradients(
-        self,
-        loss: Callable[[Pixels], tuple[Tensor, Terms]],
-        pixels: Pixels,
-        backward: Callable[[Tensor], None],
-        divided: Callable[[], None],
+        self, loss: Loss, pixels: Pixels, backward: Backward, divided: Callable[[], None]
     ) -> tuple[Tensor, Terms]:
-        """Loss and gradients of one iteration, in as few parts as the memory has room for.
+        """Loss and gradients of one iteration, in as few micro-batches as fit into memory.
 
         Args:
-            loss: gives the loss of pixels and its terms.
+            loss: computes the loss () of pixels and its terms () by name.
             pixels: the batch.
-            backward: adds the gradients of a loss to those that are there.
-            divided: removes the gradients that are there, and whatever is as large as a part.
+            backward: adds the gradients of a loss to the present ones.
+            divided: called after ``count`` was raised: removes the gradients of the failed attempt
+                and resizes what is as large as a micro-batch.
+
+        Returns:
+            The loss of the batch, detached, and its terms.
 
         Raises:
-            OutOfMemoryError: there is no room for the smallest part; nothing has changed.
-            DevrfError: several processes learn together, and one has no room.
+            OutOfMemoryError: the smallest micro-batch does not fit.
+            DevrfError: memory ran out in one of several processes.
         """
         device = pixels.image.device
         while True:
             try:
-                return self._add_up(loss, pixels, backward)
+                return self._accumulate(loss, pixels, backward)
             except (RuntimeError, MemoryError) as error:
-                # What is being captured cannot be begun anew.
+                # A CUDA graph capture cannot be restarted from within.
                 capturing = device.type == "cuda" and torch.cuda.is_current_stream_capturing()
                 if capturing or not is_oom(error):
                     raise
                 said = str(error)
-            # Only now the tensors that the error's traceback held are gone.
+            # Outside the handler, where the error's traceback no longer holds tensors.
             self._divide(said, device, len(pixels))
             divided()
             free_cache(device)
 
-    def _add_up(
-        self,
-        loss: Callable[[Pixels], tuple[Tensor, Terms]],
-        pixels: Pixels,
-        backward: Callable[[Tensor], None],
-    ) -> tuple[Tensor, Terms]:
+    def _accumulate(self, loss: Loss, pixels: Pixels, backward: Backward) -> tuple[Tensor, Terms]:
         sums: Terms = {}
-        for present in range(self.count):
-            start, stop = (len(pixels) * k // self.count for k in (present, present + 1))
+        for part in range(self.count):
+            start, stop = (len(pixels) * k // self.count for k in (part, part + 1))
             total, terms = loss(pixels if self.count == 1 else pixels.between(start, stop))
             if self.count > 1:
                 share = (stop - start) / len(pixels)
@@ -89,9 +86,9 @@ class MicroBatching:
         return sums.pop(""), sums
 
     def _divide(self, said: str, device: torch.device, rays: int) -> None:
-        """Take twice as many parts from now on."""
+        """Double ``count``, if there are enough rays; ``said`` is the allocator's message."""
         if world_size() > 1:
-            # The others wait for this process's gradients by now.
+            # The other processes already wait for this one's gradients.
             raise DevrfError(
                 f"schedule: one of {world_size()} processes is out of memory "
                 f"({numbers(said, device)}); fewer rays, smaller grids or more processes"

@@ -16,9 +16,9 @@ class ParallelBatch:
     """One of the batches that an iteration learns from, independent of the others.
 
     Attributes:
-        number: which one, from 0.
-        parameters: what is learned from it, and from no other.
-        capacity: the length of its lists of samples; None while they are as long as need be.
+        number: its index in the iteration, from 0.
+        parameters: what is learned from it, and from no other batch.
+        capacity: the length of its sample lists; None where their length depends on data.
         pixels: the pixels of the present iteration; None before the first.
     """
 
@@ -28,7 +28,7 @@ class ParallelBatch:
     pixels: Pixels | None = None
 
     def take(self, drawn: Pixels) -> None:
-        """Make ``drawn`` the pixels; in the memory of those before if shapes are static."""
+        """Set the pixels to ``drawn``; with a capacity, copy them into the same memory."""
         if self.capacity is None:
             self.pixels = drawn
         elif self.pixels is None:

@@ -1,4 +1,4 @@
-"""A stretch of a stage's schedule."""
+"""A phase of a stage's schedule."""
 
 from __future__ import annotations
 
@@ -6,14 +6,7 @@ from typing import Protocol
 
 
 class Phase(Protocol):
-    """A stretch of a schedule in which the same tensors are learned.
-
-    Attributes:
-        start: first iteration.
-        stop: one past the last iteration.
-        kind: what is learned, in a word or two: ``search``, ``fine``, ``level 2``.
-        frames: the frames that are learned, ascending; none where all times are learned at once.
-    """
+    """A range of iterations in which the same tensors are learned."""
 
     @property
     def start(self) -> int:
@@ -27,16 +20,16 @@ class Phase(Protocol):
 
     @property
     def kind(self) -> str:
-        """What is learned."""
+        """What is learned, in a word or two: ``search``, ``fine``, ``level 2``."""
         ...
 
     @property
     def frames(self) -> tuple[int, ...]:
-        """The frames that are learned."""
+        """The frames that are learned, ascending; empty where all times are learned at once."""
         ...
 
 
 def in_words(frames: tuple[int, ...]) -> str:
-    """Frames in words: ``frame 3``, or ``frames 3, 10``."""
+    """``frame 3``, or ``frames 3, 10``."""
     noun = "frame" if len(frames) == 1 else "frames"
     return f"{noun} {', '.join(str(frame) for frame in frames)}"

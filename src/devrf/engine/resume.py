@@ -1,40 +1,36 @@
-"""What a checkpoint says beside a stage's tensors, and how a stage goes on from it.
+"""What a checkpoint holds beside a stage's tensors, and how a stage continues from it.
 
-How a run survives being killed, from end to end:
-
-* ``callbacks.PeriodicCheckpoint`` writes a progress file every so often, between two Lightning
-  steps, and when it is asked to stop. It is a Lightning checkpoint: the fields at their present
-  resolution (state_dict), the optimiser (moments, step counts, rates, which entries it skips),
-  Lightning's loop (so that curves go on in step), and what the callbacks remember (seconds,
-  memory).
-* :func:`save` adds the rest: the iteration, the phase that the grids are ready for, every random
-  state, and what the phase works with that its schedule alone does not tell
-  (:meth:`~devrf.engine.stage.ScheduledStage.phase_state`): the pixels to draw from, and the
-  occupancy of the active frames.
-* ``checkpoints.checkpoint_file`` writes it whole or not at all, with a checksum.
-* ``Trainer.fit(ckpt_path=…)`` reads it. The stage is set up as at its beginning and takes its
-  fields' shapes from the file; the optimiser is given the grids, then its state; the random
-  states are set last, when nothing but the next iteration can draw from them.
-* ``cli.resume`` finds the file, and checks that it was made with the settings of today.
-
-A finished stage leaves one checkpoint without any of this, and its progress files go.
+:mod:`devrf.checkpoints.progress` describes the whole way of a run that is stopped and resumed.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from devrf.checkpoints.checkpoint import MODEL, CheckpointMetadata, check_scene, metadata_in
 from devrf.checkpoints.progress import rng_state
 from devrf.errors import DevrfError
+from devrf.rendering.view import Viewable
 
 if TYPE_CHECKING:
     from devrf.engine.stage import ScheduledStage
 
 
+class LearnedModel(Viewable, Protocol):
+    """What a stage learns: a :class:`~devrf.methods.base.DynamicModel`."""
+
+    def config(self) -> dict[str, Any]:
+        """Plain data to build it from."""
+        ...
+
+    def stored_state(self) -> dict[str, Any]:
+        """The state for a finished checkpoint."""
+        ...
+
+
 def metadata(stage: ScheduledStage) -> CheckpointMetadata:
-    """What a checkpoint of the stage says of itself."""
+    """The metadata of a checkpoint of the stage."""
     model = stage.scene_model
     target = f"{type(model).__module__}.{type(model).__qualname__}"
     return CheckpointMetadata(
@@ -50,13 +46,13 @@ def metadata(stage: ScheduledStage) -> CheckpointMetadata:
 
 
 def save(stage: ScheduledStage, checkpoint: dict[str, Any]) -> None:
-    """Add what the tensors do not tell to a checkpoint of Lightning's."""
+    """Add the state that is not in tensors to a checkpoint of Lightning's."""
     checkpoint["devrf"] = metadata(stage).as_data()
-    # Without the optimiser's state it is there to be rendered, not to be gone on from.
+    # Without the optimiser's state a checkpoint is for rendering, not for resuming.
     if "optimizer_states" not in checkpoint:
         if stage.iteration >= stage.total_iterations:
-            small = stage.current_model().stored_state()
-            checkpoint["state_dict"] = {f"{MODEL}{k}": v for k, v in small.items()}
+            compact = stage.current_model().stored_state()
+            checkpoint["state_dict"] = {f"{MODEL}{k}": v for k, v in compact.items()}
         return
     checkpoint["progress"] = {
         "stage": stage.name,
@@ -74,16 +70,16 @@ def save(stage: ScheduledStage, checkpoint: dict[str, Any]) -> None:
 
 
 def load(stage: ScheduledStage, checkpoint: dict[str, Any], path: Path) -> dict[str, Any] | None:
-    """Put a stage where a checkpoint left it; its tensors come next.
+    """Restore a stage's position in its schedule, before its tensors are loaded.
 
     Args:
-        stage: has been set up.
-        checkpoint: the content of a file.
+        stage: the stage, after its setup.
+        checkpoint: the content of the file.
         path: the file, for messages.
 
     Returns:
-        What is left to restore once the tensors are there: ``phase_state`` and ``random``; None
-        of a checkpoint that nothing can be gone on from.
+        What remains to be restored once the tensors are loaded (``phase_state``, ``random``); None
+        for a checkpoint without the optimiser's state.
 
     Raises:
         DevrfError: the checkpoint is of another scene, stage or schedule.

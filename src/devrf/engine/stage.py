@@ -1,11 +1,17 @@
-"""What all stages share: a loop that follows a schedule, and held-out views that are scored."""
+"""What a stage is: a part of training that follows a schedule, run by Lightning.
+
+A schedule is a list of phases. Within a phase the same tensors are learned; between two phases
+grids grow or other frames become active. A subclass of :class:`ScheduledStage` says what is learned
+in each phase, which pixels an iteration draws, and what their loss is. How an iteration is carried
+out is in :mod:`devrf.engine.loop`, how a stopped run continues in :mod:`devrf.engine.resume`.
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -17,72 +23,51 @@ from devrf.checkpoints.checkpoint import CheckpointMetadata
 from devrf.checkpoints.progress import set_rng_state
 from devrf.data.batch import Pixels
 from devrf.engine import resume
-from devrf.engine.ddp import ManualDDP, assert_replicas_equal, broadcast, rank
+from devrf.engine.ddp import assert_replicas_equal, broadcast, check_strategy, rank
 from devrf.engine.graphs import Graphs
 from devrf.engine.loop import Loop
 from devrf.engine.parallel_batch import ParallelBatch
 from devrf.engine.phase import Phase, in_words
+from devrf.engine.resume import LearnedModel
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import score
 from devrf.ops.adam import GridAdam
 from devrf.rendering.renderer import Renderer
-from devrf.rendering.view import Viewable
 from devrf.scenes.scene import CaptureName, Scene
 from devrf.system.out_of_memory import OutOfMemoryError
-
-
-class LearnedModel(Viewable, Protocol):
-    """What a stage learns: a :class:`~devrf.methods.base.DynamicModel`."""
-
-    def config(self) -> dict[str, Any]:
-        """Plain data to build it from."""
-        ...
-
-    def stored_state(self) -> dict[str, Any]:
-        """The state for a finished checkpoint."""
-        ...
 
 
 class ScheduledStage(LightningModule, ABC):
     """A stage whose schedule says what each iteration learns.
 
-    One Lightning step covers several optimiser iterations, so that the framework's own work
-    does not show. The stage never changes its grids by itself: the callback ``GridUpscaling``
-    calls :meth:`enter` where a phase begins, ``LearningRateDecay`` scales the learning rates
-    before every step.
-
-    What an iteration is, and how it is carried out, is the business of
-    :class:`~devrf.engine.loop.Loop`. Callbacks see the same steps and the same rates however an
-    iteration is run.
-
-    A checkpoint with the optimiser's state in it (any of Lightning's that is not ``weights_only``)
-    holds all that it takes to go on: ``Trainer.fit(ckpt_path=…)`` continues as if the run had
-    never stopped (:mod:`devrf.engine.resume`).
+    One Lightning step runs several optimiser iterations, so that Lightning's overhead is
+    negligible. The callback ``GridUpscaling`` calls :meth:`enter` at the beginning of each phase;
+    ``LearningRateDecay`` sets the learning rates before each optimiser step.
 
     Attributes:
-        name: what the stage is called in files, messages and protocols.
+        name: what files, messages and protocols call the stage.
         capture: the part of the scene that is learned from.
         scene_model: what is learned.
-        iteration: where the stage is in its schedule: optimiser iterations done or left out.
-        skipped: how many were left out, since a phase had converged.
-        phase: the stretch of the schedule that the grids are ready for; None before the first.
+        iteration: position in the schedule: optimiser iterations done or skipped.
+        skipped: iterations left out because a phase had converged.
+        phase: the phase that grids and optimiser are ready for; None before the first.
         record: what training took, once a ``TrainingRecord`` callback has measured it.
-        earlier_records: the same of the stages that this one builds on, by name.
-        generator: what pixels are drawn with, on the stage's device. At the beginning of each
-            Lightning step it depends on the seed, the process and the iteration alone.
+        earlier_records: the same for the stages that this one builds on, by name.
+        generator: draws pixels, on the stage's device. Its state at the beginning of a Lightning
+            step follows from the seed, the process, the iteration and the number of rollbacks.
         seed: of the generator.
         training_config: the settings that decide what is learned, by config key; empty for a
             stage that was not built from a config.
         protocol: the name of the protocol that the stage is a part of, if any.
-        num_rollbacks: how often learning went wrong and was rolled back.
-        lr_scale: what the scheduled learning rates are multiplied by; below 1 after a rollback.
+        num_rollbacks: how often training diverged and was rolled back.
+        lr_scale: factor of the scheduled learning rates; below 1 after a rollback.
         abort_reason: why the stage ended before its schedule; None while it has not.
         loop: carries the iterations out.
     """
 
     name: str
     capture: CaptureName | Literal["both"]
-    # Config keys: what memory depends on most, and what to lower when learning goes wrong.
+    # Config keys: what to lower when memory runs out, and what to lower when training diverges.
     memory_keys: tuple[str, ...] = ()
     rate_keys: ClassVar[str] = "the learning rates"
     scene_model: LearnedModel
@@ -106,18 +91,7 @@ class ScheduledStage(LightningModule, ABC):
         self.abort_reason: str | None = None
         self._progress: dict[str, Any] | None = None
 
-    @property
-    def scene(self) -> Scene:
-        """The scene of the trainer's datamodule."""
-        scene: Scene = self.trainer.datamodule.scene  # type: ignore[attr-defined]
-        return scene
-
-    @property
-    def scored_capture(self) -> CaptureName:
-        """The capture whose held-out views tell how well the stage learns."""
-        return "dynamic" if self.capture == "both" else self.capture
-
-    # What a stage says about learning.
+    # What a subclass defines.
 
     @property
     @abstractmethod
@@ -136,104 +110,153 @@ class ScheduledStage(LightningModule, ABC):
 
     @abstractmethod
     def phase_at(self, iteration: int) -> Phase:
-        """The phase of the schedule that ``iteration`` belongs to."""
+        """The phase that contains ``iteration``."""
 
     @abstractmethod
     def learning_rate_factor(self, iteration: int) -> float:
-        """What the base learning rates are multiplied by at ``iteration``."""
+        """Factor of the base learning rates at ``iteration``."""
 
     @abstractmethod
     def enter(self, phase: Phase) -> None:
-        """Make grids and optimiser ready for ``phase``."""
+        """Make grids and optimiser ready for ``phase``; ends with :meth:`bind`."""
 
     @abstractmethod
     def draw(self, batch: ParallelBatch) -> Pixels:
-        """The pixels of a batch's coming iteration, drawn with ``generator``."""
+        """The pixels of a batch's next iteration, drawn with ``generator``."""
 
     @abstractmethod
     def loss(
         self, batch: ParallelBatch, views: Any, pixels: Pixels
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """The weighted loss of a batch's pixels of ``views``, and its terms by name."""
+        """The weighted loss () of a batch's pixels of ``views``, and its terms () by name."""
+
+    @abstractmethod
+    def phase_state(self) -> dict[str, Any]:
+        """State of the present phase that does not follow from the schedule, as plain data."""
+
+    @abstractmethod
+    def restore(self, phase: Phase, kept: dict[str, Any]) -> None:
+        """Continue ``phase`` with the state ``kept``; the model's tensors are loaded."""
+
+    # What a subclass may define.
 
     def prepare(self) -> None:
-        """What an iteration needs beside what is learned in it; it may wait for the device."""
+        """Called before each iteration; may wait for the device."""
 
     def converged(self, losses: Tensor) -> bool:
-        """Whether the present phase has nothing left to gain, so that its rest is left out.
+        """Whether the rest of the present phase can be skipped.
 
         Args:
-            losses: (batches,) mean loss of each batch over the Lightning step that is done.
+            losses: (batches,) mean loss of each batch over the last Lightning step.
         """
         return False
 
     def current_model(self) -> LearnedModel:
-        """The model with all that has been learned so far in its place."""
+        """The model, with everything learned so far written back to it."""
         return self.scene_model
 
-    # What a checkpoint holds beside the tensors.
-
-    @abstractmethod
-    def phase_state(self) -> dict[str, Any]:
-        """What the present phase works with that its schedule does not tell, as plain data."""
-
-    @abstractmethod
-    def restore(self, phase: Phase, kept: dict[str, Any]) -> None:
-        """Go on with ``phase``, where :meth:`phase_state` gave ``kept``; the fields are loaded."""
-
     def resize_to(self, state: dict[str, Tensor]) -> None:
-        """Make modules for the stored ``state``, where the present ones would not take it."""
+        """Give modules the shapes of a stored ``state`` that is about to be loaded."""
+
+    # What subclasses and callbacks use.
+
+    @property
+    def scene(self) -> Scene:
+        """The scene of the trainer's datamodule."""
+        scene: Scene = self.trainer.datamodule.scene  # type: ignore[attr-defined]
+        return scene
+
+    @property
+    def scored_capture(self) -> CaptureName:
+        """The capture whose held-out views measure what was learned."""
+        return "dynamic" if self.capture == "both" else self.capture
+
+    def bind(
+        self, rays: int, parameters: Sequence[Sequence[Tensor]], *, static_shape: bool = False
+    ) -> None:
+        """Prepare the loop for the tensors of a phase: see :meth:`devrf.engine.loop.Loop.bind`."""
+        self.loop.bind(rays, parameters, self.optimizer, static_shape=static_shape)
 
     def metadata(self) -> CheckpointMetadata:
-        """What a checkpoint of the stage says of itself."""
+        """The metadata of a checkpoint of this stage."""
         return resume.metadata(self)
 
-    # Lightning's hooks.
+    def describe(self, iteration: int) -> str:
+        """An iteration of the present phase, with its frames and resolution, for messages."""
+        frames = self.phase.frames if self.phase is not None else ()
+        shape = "x".join(str(n) for n in self.resolution)
+        where = ", ".join([*([in_words(frames)] if frames else []), *([shape] if shape else [])])
+        place = f" ({where})" if where else ""
+        return f"iteration {iteration} of {self.total_iterations}{place}"
+
+    def abort(self, why: str) -> None:
+        """End the stage after the present step; the fit then raises an error that says ``why``."""
+        self.abort_reason = f"{self.name} stage: {why}"
+        self.trainer.should_stop = True
+
+    def rollback(self, iteration: int, lr_scale: float) -> None:
+        """Continue from an earlier iteration of the present phase, whose tensors are back in place.
+
+        Adam's moments start afresh, and other pixels are drawn than the first time.
+
+        Args:
+            iteration: where to continue.
+            lr_scale: further factor of all learning rates from now on.
+        """
+        self.iteration = iteration
+        self.num_rollbacks += 1
+        self.lr_scale *= lr_scale
+        for group in range(len(self.optimizer.param_groups)):
+            self.optimizer.forget(group)
+        self._reseed()
+        self.trainer.should_stop = False
+
+    # Lightning's hooks, in the order in which they are called.
 
     def setup(self, stage: str) -> None:
-        """Make the generator.
+        """Check the trainer and make the generator.
 
         Raises:
-            DevrfError: several processes, and a strategy that cannot follow growing grids; or a
-                precision in which points would not find their voxels.
+            DevrfError: the precision is not 32 bit, or several processes run with a strategy that
+                does not support growing grids.
         """
         if self.trainer.precision != "32-true":
             raise DevrfError(
                 f"trainer.precision: expected 32-true, not {self.trainer.precision}: positions "
                 "need all their digits; decoder_precision=bfloat16 takes fewer for colours alone"
             )
-        if self.trainer.world_size > 1 and not isinstance(self.trainer.strategy, ManualDDP):
-            raise DevrfError(
-                f"trainer: {self.trainer.world_size} processes need trainer=ddp (the strategy "
-                "devrf.engine.ddp.ManualDDP)"
-            )
+        check_strategy(self.trainer)
         self.seed = torch.initial_seed()
-        # Lightning moves the stage there later.
+        # Lightning moves the stage to this device later.
         self.generator = torch.Generator(self.trainer.strategy.root_device)
 
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Restore the position in the schedule and the tensors' shapes; tensors are loaded next."""
+        self._progress = resume.load(self, checkpoint, Path(str(self.trainer.ckpt_path)))
+
     def configure_optimizers(self) -> GridAdam:
-        """The optimiser that :meth:`enter` hands parameters to."""
+        """The optimiser; in a resumed run with the parameters of the phase that was left."""
         if self._progress is not None and self.phase is not None:
             self.restore(self.phase, self._progress["phase_state"])
         return self.optimizer
 
     def on_fit_start(self) -> None:
-        """Begin with the same fields in every process."""
+        """Give every process the same tensors."""
         broadcast([*self.parameters(), *self.buffers()])
 
     def on_train_start(self) -> None:
-        """Draw random numbers from where the run was left: all else is in place by now."""
+        """Restore the random state last, when nothing but iterations draws from it any more."""
         if self._progress is not None:
             set_rng_state(self._progress["random"], self.device)
             self._progress = None
         self._reseed()
 
     def training_step(self, views: Any, batch_idx: int) -> dict[str, Tensor]:
-        """Run iterations up to ``iterations_per_step``, never beyond the present phase.
+        """Run up to ``iterations_per_step`` iterations, all of the present phase.
 
         Returns:
-            The means of the loss and of its terms over these iterations and all batches, by name;
-            empty if memory ran out before the first.
+            Means () of the loss and of its terms by name, over these iterations and all batches;
+            empty if memory ran out in the first.
         """
         if self.phase != self.phase_at(self.iteration):
             raise DevrfError(
@@ -241,23 +264,10 @@ class ScheduledStage(LightningModule, ABC):
                 "entered: add devrf.callbacks.GridUpscaling to the trainer's callbacks"
             )
         assert self.phase is not None
-        optimizer = self.optimizers()
-        assert isinstance(optimizer, LightningOptimizer)
-        stop = min(self.phase.stop, self.total_iterations)
-        count = min(self.iterations_per_step, stop - self.iteration)
-        if self.trainer.max_steps > 0:
-            count = min(count, self.trainer.max_steps - self.trainer.global_step)
-        first = self.iteration
-        for _ in range(count):
-            self.prepare()
-            try:
-                self.loop.step(self, views, optimizer)
-            except OutOfMemoryError as shortage:
-                self.abort(f"{shortage} at {self.describe(self.iteration)}; {self.oom_hint}")
-                break
-            self.iteration += 1
-        done = self.iteration - first
+        first, stop = self.iteration, min(self.phase.stop, self.total_iterations)
+        self._iterate(views, stop - first)
         self.loop.poll()
+        done = self.iteration - first
         if not done:
             self._reseed()
             return {}
@@ -267,14 +277,56 @@ class ScheduledStage(LightningModule, ABC):
             self.iteration = stop
         self._reseed()
         named = {f"{self.capture}/{k}": value for k, value in means.items()}
-        # On the host, where it is wanted: Lightning would put a number on the device, and wait.
+        # A tensor on the host: Lightning would copy a number to the device, and wait.
         self.log_dict({**named, "step": torch.tensor(float(self.iteration))})
         if self.iteration >= self.total_iterations:
             self.trainer.should_stop = True
         return means
 
+    def _iterate(self, views: Any, most: int) -> None:
+        """Run a step's iterations, no more than ``most``; abort if memory runs out."""
+        optimizer = self.optimizers()
+        assert isinstance(optimizer, LightningOptimizer)
+        count = min(self.iterations_per_step, most)
+        if self.trainer.max_steps > 0:
+            count = min(count, self.trainer.max_steps - self.trainer.global_step)
+        for _ in range(count):
+            self.prepare()
+            try:
+                self.loop.step(self, views, optimizer)
+            except OutOfMemoryError as shortage:
+                lower = " or ".join(self.memory_keys)
+                self.abort(
+                    f"{shortage} at {self.describe(self.iteration)}; the same command goes on "
+                    "where there is more memory; with less, begin afresh (resume=false) with "
+                    f"{f'lower {lower}, or ' if lower else ''}higher data.downscale"
+                )
+                return
+            self.iteration += 1
+
+    def _reseed(self) -> None:
+        """Seed the generator for the next step, differently in each process."""
+        mixed = np.random.SeedSequence([self.seed, rank(), self.iteration, self.num_rollbacks])
+        self.generator.manual_seed(int(mixed.generate_state(1, np.uint64)[0]))
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Add the state that is not in tensors."""
+        resume.save(self, checkpoint)
+
+    def on_fit_end(self) -> None:
+        """Check the result.
+
+        Raises:
+            DevrfError: the stage was aborted, or the processes hold different tensors.
+        """
+        if self.abort_reason is not None:
+            raise DevrfError(self.abort_reason)
+        if self.iteration >= self.total_iterations:
+            state = self.state_dict().items()
+            assert_replicas_equal({name: t for name, t in state if isinstance(t, Tensor)})
+
     def test_step(self, index: int, batch_idx: int) -> dict[str, Any]:
-        """Render and score one held-out image; the means are logged.
+        """Render and score one held-out image; the means over all images are logged.
 
         Returns:
             ``view``: the :class:`~devrf.evaluation.held_out.HeldOutView`, for callbacks.
@@ -287,90 +339,6 @@ class ScheduledStage(LightningModule, ABC):
         self.log_dict(means, batch_size=1, sync_dist=True)
         return {"view": view}
 
-    def on_fit_end(self) -> None:
-        """See that every process has come to the same fields.
-
-        Raises:
-            DevrfError: they have not, or the stage was aborted.
-        """
-        if self.abort_reason is not None:
-            raise DevrfError(self.abort_reason)
-        if self.iteration >= self.total_iterations:
-            state = self.state_dict().items()
-            assert_replicas_equal({name: t for name, t in state if isinstance(t, Tensor)})
-
     def teardown(self, stage: str) -> None:
-        """Release what only iterations need."""
+        """Release the memory that only iterations need."""
         self.loop.release()
-
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add what the tensors do not tell."""
-        resume.save(self, checkpoint)
-
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Go where the run was left, and make room for the tensors, which come next."""
-        self._progress = resume.load(self, checkpoint, Path(str(self.trainer.ckpt_path)))
-
-    # When something goes wrong.
-
-    def describe(self, iteration: int) -> str:
-        """An iteration of the present phase, its frames and its resolution, in words."""
-        frames = self.phase.frames if self.phase is not None else ()
-        shape = "x".join(str(n) for n in self.resolution)
-        where = ", ".join([*([in_words(frames)] if frames else []), *([shape] if shape else [])])
-        place = f" ({where})" if where else ""
-        return f"iteration {iteration} of {self.total_iterations}{place}"
-
-    def abort(self, why: str) -> None:
-        """End the stage after the present step.
-
-        Args:
-            why: the line that the fit ends with.
-        """
-        self.abort_reason = f"{self.name} stage: {why}"
-        self.trainer.should_stop = True
-
-    def rollback(self, iteration: int, lr_scale: float) -> None:
-        """Go on from an earlier iteration of the present phase, whose fields have been put back.
-
-        With fresh moments and other random numbers than the first time.
-
-        Args:
-            iteration: where to go on.
-            lr_scale: what all learning rates are multiplied by from now on.
-        """
-        self.iteration = iteration
-        self.num_rollbacks += 1
-        self.lr_scale *= lr_scale
-        for group in range(len(self.optimizer.param_groups)):
-            self.optimizer.forget(group)
-        self._reseed()
-        self.trainer.should_stop = False
-
-    @property
-    def oom_hint(self) -> str:
-        """What to do when memory is short, in words."""
-        lower = f" with lower {' or '.join(self.memory_keys)}," if self.memory_keys else " with"
-        return (
-            "the same command goes on where there is more memory; with less, begin afresh "
-            f"(resume=false){lower} or higher data.downscale"
-        )
-
-    def _reseed(self) -> None:
-        """Seed the generator for the coming iterations, in each process differently."""
-        mixed = np.random.SeedSequence([self.seed, rank(), self.iteration, self.num_rollbacks])
-        self.generator.manual_seed(int(mixed.generate_state(1, np.uint64)[0]))
-
-    def bind(
-        self, rays: int, parameters: Sequence[Sequence[Tensor]], *, static_shape: bool = False
-    ) -> None:
-        """Get the loop ready for iterations on other tensors than before.
-
-        :meth:`enter` calls it once the phase's tensors are there and the optimiser has them.
-
-        Args:
-            rays: of a batch, in all processes together.
-            parameters: what is learned from each of the batches of an iteration.
-            static_shape: whether no shape of an iteration may depend on data.
-        """
-        self.loop.bind(rays, parameters, self.optimizer, static_shape=static_shape)

@@ -1,4 +1,7 @@
-"""Work that a CUDA device does at the same time, since a piece of it is too small to fill it."""
+"""Independent pieces of work at the same time, on several CUDA streams.
+
+A single batch of rays is often too small to occupy a GPU.
+"""
 
 from __future__ import annotations
 
@@ -13,32 +16,34 @@ Result = TypeVar("Result")
 
 
 class StreamParallel:
-    """Does pieces of work that do not depend on one another.
+    """Runs pieces of work that do not depend on one another.
 
-    On a CUDA device the first is done on the present stream, each further one on a stream of its
-    own: those wait for the present one before anything begins, and it waits for them at the end.
-    What was made before the fork is there for all, what they give may be used after the join,
-    and in a captured CUDA graph they are branches.
+    On a CUDA device the first piece runs on the current stream, each further one on a stream of
+    its own. These streams first wait for the current one, and it waits for them at the end. Each
+    piece may therefore use everything computed before, and its results may be used after; in a
+    captured CUDA graph the pieces become parallel branches.
 
-    A piece allocates from its own stream's memory, which is not reused before the next fork; that
-    fork waits for what read it after the join. Autograd runs backward on the stream of the forward
-    pass. Gradients that pieces leave behind must be of different tensors.
+    A side stream has its own memory in the allocator. It is not reused before the next call, which
+    begins by waiting for whatever read the results. Autograd runs the backward pass on the stream
+    of the forward pass, so pieces must accumulate gradients into different tensors.
 
-    On a CPU, whose cores each operation uses already, and where parts are measured, which must
-    not overlap, one piece follows the other.
+    On a CPU, where each operation uses all cores, and under a profiler, which attributes time to
+    parts that must not overlap, the pieces run one after another.
     """
 
     def __init__(self) -> None:
-        # Made once: the allocator keeps the memory of each stream apart.
+        # Reused at each call: the allocator keeps the memory of each stream apart.
         self._streams: list[torch.cuda.Stream] = []
 
     def __call__(
         self, pieces: Sequence[Callable[[], Result]], device: torch.device
     ) -> list[Result]:
-        """What each of some pieces of work on ``device`` gives."""
+        """The results of ``pieces`` on ``device``, in order."""
         if len(pieces) == 1 or device.type != "cuda" or measured():
             return [piece() for piece in pieces]
-        present, streams = torch.cuda.current_stream(device), self._further(len(pieces) - 1, device)
+        while len(self._streams) < len(pieces) - 1:
+            self._streams.append(torch.cuda.Stream(device))  # type: ignore[no-untyped-call]
+        present, streams = torch.cuda.current_stream(device), self._streams[: len(pieces) - 1]
         for stream in streams:
             stream.wait_stream(present)
         try:
@@ -50,8 +55,3 @@ class StreamParallel:
             for stream in streams:
                 present.wait_stream(stream)
         return results
-
-    def _further(self, count: int, device: torch.device) -> list[torch.cuda.Stream]:
-        while len(self._streams) < count:
-            self._streams.append(torch.cuda.Stream(device))  # type: ignore[no-untyped-call]
-        return self._streams[:count]

@@ -1,12 +1,12 @@
-"""The hot operations: plain PyTorch twins that state the equation, and Triton for CUDA devices.
+"""The hot operations: in plain PyTorch, which states the equation, and in Triton for CUDA devices.
 
 Imports go down this list, never up:
 
 | module | functions |
 |---|---|
-| ``selfcheck`` | ``check_kernels``: do both implementations agree on this device? |
+| ``selfcheck`` | ``check_kernels``: compares both implementations on a device |
 | ``adam`` | ``GridAdam``: the optimiser made of ``adam_step``'s steps |
-| ``search`` | ``find_samples``: which samples can be seen; ``select``: some of them |
+| ``search`` | ``find_samples``: visible samples of rays; ``select``: a subset of them |
 | ``adam_step`` | ``adam_step``, ``smooth_adam_step``: one step on one tensor |
 | ``warped_depth`` | ``warped_depth``: points of a moment → canonical positions, optical depths |
 | ``trilinear`` | ``interpolate``: values of a grid between its points |
@@ -18,7 +18,7 @@ Imports go down this list, never up:
 
 Shapes never depend on data in ``warped_depth``, ``find_samples`` (with Triton), ``select``,
 ``composite_segments``, ``sum_segments`` and ``adam_step`` (with Triton, or without ``skip_zero``),
-and nothing in them waits for the device: what a CUDA graph needs. Call each once before capturing,
+and nothing in them waits for the device, as a CUDA graph requires. Call each once before capturing,
 so that kernels are compiled and constants are on the device.
 """
 

@@ -1,4 +1,4 @@
-"""Adam for grids: entries without gradient stand still, each voxel may have its own rate."""
+"""Adam for voxel grids: skips entries without gradient, allows a rate for each voxel."""
 
 from __future__ import annotations
 
@@ -20,19 +20,18 @@ class GridAdam(torch.optim.Optimizer):
     Each parameter group takes, beside ``lr``, ``betas`` and ``eps``:
 
     * ``skip_zero``: an entry whose gradient is exactly zero keeps its value *and its moments*:
-      a voxel that no sample of this batch touched is not moved by what was seen before.
+      momentum does not move a voxel that no sample of this batch touched.
     * ``per_voxel_lr``: None, or a tensor (X, Y, Z, 1) of factors of the learning rate.
-    * ``smoothing``: weight of the total variation of each grid, whose gradient is added to what
-      the backward pass gave.
-    * ``touched_only``: add it to entries alone that have a gradient.
+    * ``smoothing``: weight of the total variation of each grid, whose gradient is added to that
+      of the backward pass.
+    * ``touched_only``: add it only to entries that have a gradient.
 
-    ``lr`` may be a tensor () on the parameters' device. A number is put into one at the beginning
-    of :meth:`step`: what :meth:`apply` does then is a matter of the device alone, and may be
-    captured in a CUDA graph.
+    ``lr`` may be a tensor () on the parameters' device. :meth:`step` copies a number into one
+    first; :meth:`apply` then reads nothing from the host and may be captured in a CUDA graph.
 
     Attributes:
-        keeps_gradients: whether gradients are tensors that stay: zero before each iteration,
-            added to by the backward pass, zeroed by the step.
+        keeps_gradients: whether gradients stay in the same memory: zero before each iteration,
+            accumulated by the backward pass, zeroed by the step.
     """
 
     def __init__(
@@ -69,7 +68,7 @@ class GridAdam(torch.optim.Optimizer):
                 rate = self._rates.get(number)
                 if rate is None or rate.device != device:
                     rate = self._rates[number] = torch.zeros((), dtype=torch.float64, device=device)
-                # A fill, not a copy from the host: the device need not wait.
+                # A fill does not wait for the device, unlike a copy from the host.
                 rate.fill_(group["lr"])
         with torch.enable_grad():
             self._work()
@@ -77,10 +76,10 @@ class GridAdam(torch.optim.Optimizer):
 
     @contextmanager
     def stepping_by(self, work: Callable[[], None]) -> Iterator[None]:
-        """Within, :meth:`step` does ``work`` in place of :meth:`apply`, which is part of it.
+        """Inside the context :meth:`step` runs ``work`` in place of :meth:`apply`.
 
-        For work that is done as a whole, like a captured iteration: callbacks that run before
-        a step, and set learning rates, run before all of it.
+        For a whole iteration that contains :meth:`apply`, such as a captured one: callbacks that
+        set learning rates before a step then run before all of it.
         """
         usual, self._work = self._work, work
         try:
@@ -90,7 +89,7 @@ class GridAdam(torch.optim.Optimizer):
 
     @torch.no_grad()
     def apply(self) -> None:
-        """The step itself, at the rates that :meth:`step` has put on the device."""
+        """Step at the rates that :meth:`step` has put on the device."""
         for number, group in enumerate(self.param_groups):
             rate = group["lr"] if isinstance(group["lr"], Tensor) else self._rates.get(number)
             for parameter in group["params"]:
@@ -105,14 +104,8 @@ class GridAdam(torch.optim.Optimizer):
             parameter.grad = torch.zeros_like(parameter)
         gradient, state = parameter.grad, self._state_of(parameter)
         state["steps"] += 1
-        rule = AdamRule(
-            rate,
-            state["steps"],
-            group["betas"],
-            group["eps"],
-            group["skip_zero"],
-            group["per_voxel_lr"],
-        )
+        options = {name: group[name] for name in ("betas", "eps", "skip_zero", "per_voxel_lr")}
+        rule = AdamRule(rate, state["steps"], **options)
         moments = state["mean"], state["square"]
         tensors = (parameter, gradient, *moments)
         if smoothing and not touched_only and triton_runs(*tensors):
@@ -125,27 +118,27 @@ class GridAdam(torch.optim.Optimizer):
         adam_step(parameter, gradient, *moments, rule, clear=self.keeps_gradients)
 
     def _state_of(self, parameter: Tensor) -> dict[str, Any]:
-        """How many steps the parameter has taken () and its moments, made when first asked."""
+        """The parameter's number of steps () and its moments; zero at first."""
         state: dict[str, Any] = self.state[parameter]
         if not state:
-            # Not "step": a loaded state of that name would stay where it was loaded.
+            # Not "step": torch leaves a loaded entry of that name on the device it was loaded to.
             state["steps"] = torch.zeros((), dtype=torch.float64, device=parameter.device)
             state["mean"] = torch.zeros_like(parameter)
             state["square"] = torch.zeros_like(parameter)
         return state
 
     def _spare_of(self, parameter: Tensor) -> Tensor:
-        """Where a parameter's smoothed values are written before they take its place."""
+        """A buffer for the parameter's smoothed values."""
         if parameter not in self._spare:
             self._spare[parameter] = torch.empty_like(parameter, requires_grad=False)
         return self._spare[parameter]
 
     def zero_grad(self, set_to_none: bool = True) -> None:
-        """Remove all gradients; zero them where they are tensors that stay."""
+        """Remove all gradients; with ``keeps_gradients`` set them to zero."""
         super().zero_grad(set_to_none and not self.keeps_gradients)
 
     def drop_gradients(self, parameters: Iterable[Tensor]) -> None:
-        """As :meth:`zero_grad`, of some parameters."""
+        """As :meth:`zero_grad`, for some of the parameters."""
         for parameter in parameters:
             if self.keeps_gradients and parameter.grad is not None:
                 parameter.grad.zero_()
@@ -153,7 +146,7 @@ class GridAdam(torch.optim.Optimizer):
                 parameter.grad = None
 
     def keep_gradients(self) -> None:
-        """Let gradients be tensors that stay, those of later parameters too."""
+        """Keep gradients in the same memory from now on, for later parameters too."""
         self.keeps_gradients = True
         for group in self.param_groups:
             for parameter in group["params"]:
@@ -161,23 +154,22 @@ class GridAdam(torch.optim.Optimizer):
                     parameter.grad = torch.zeros_like(parameter)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Take up the state of a run that was left, on the device of the parameters."""
+        """Restore a state, on the parameters' device."""
         super().load_state_dict(state_dict)
         for state in self.state.values():
-            # torch makes every number of a state one of its parameter's type.
+            # torch has converted it to the parameter's type.
             state["steps"] = state["steps"].double()
         for group in self.param_groups:
             if group["per_voxel_lr"] is not None:
                 group["per_voxel_lr"] = group["per_voxel_lr"].to(group["params"][0].device)
 
     def replace(self, group: int, parameters: Sequence[Tensor], **settings: Any) -> None:
-        """Give a group other parameters (a resized grid) with fresh moments.
+        """Give a group other parameters, such as a resized grid, with zero moments.
 
         Args:
-            group: its number.
-            parameters: what it is to step on.
-            settings: settings of the group that change with them; ``per_voxel_lr`` is None
-                unless it is given.
+            group: its index.
+            parameters: the new parameters.
+            settings: further settings of the group; ``per_voxel_lr`` is None unless given.
         """
         for old in self.param_groups[group]["params"]:
             self.state.pop(old, None)
@@ -188,7 +180,7 @@ class GridAdam(torch.optim.Optimizer):
             self.keep_gradients()
 
     def forget(self, group: int) -> None:
-        """Begin a group afresh on the same parameters, whose memory holds something else now."""
+        """Zero a group's moments, step counts and gradients; its parameters stay."""
         for parameter in self.param_groups[group]["params"]:
             for value in self.state.get(parameter, {}).values():
                 value.zero_()

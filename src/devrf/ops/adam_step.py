@@ -1,7 +1,7 @@
 """One step of Adam on one tensor, with the total variation of a grid in the same pass.
 
-The learning rate and the number of the step are tensors on the device, so that a captured CUDA
-graph steps on as they change.
+The learning rate and the step number are tensors on the device: a captured CUDA graph uses their
+present values.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from devrf.ops.total_variation import add_total_variation_gradient
 
 @dataclass(frozen=True)
 class AdamRule:
-    """How Adam steps (Kingma & Ba 2015), with what voxel grids need.
+    """Settings of a step of Adam (Kingma & Ba 2015), with additions for voxel grids.
 
     Attributes:
         rate: () learning rate, on the device.
-        step: () number of this step, 1 for the first one, on the device.
+        step: () number of this step, 1 for the first, on the device.
         betas: decay of the mean and of the square.
-        eps: what is added to the square's root.
+        eps: added to the root of the square.
         skip_zero: an entry whose gradient is exactly zero keeps its value *and its moments*.
-        per_voxel_lr: None, or factors (X, Y, Z, 1) of the learning rate, voxel by voxel.
+        per_voxel_lr: None, or factors (X, Y, Z, 1) of the learning rate.
     """
 
     rate: Tensor
@@ -46,7 +46,7 @@ def adam_step(
     *,
     clear: bool = True,
 ) -> None:
-    """Step in place; with ``clear`` the gradient is zero afterwards, ready to be added to.
+    """Step in place.
 
     ``m ← β₁m + (1 − β₁)g``, ``s ← β₂s + (1 − β₂)g²``,
     ``v ← v − rate·per_voxel_lr · (m / (1 − β₁ᵗ)) / (√(s / (1 − β₂ᵗ)) + ε)``.
@@ -56,8 +56,8 @@ def adam_step(
         gradient: the same shape.
         mean: first moments, the same shape, changed in place.
         square: second moments, likewise.
-        rule: how to step.
-        clear: whether to zero the gradient.
+        rule: the settings.
+        clear: whether to set the gradient to zero afterwards.
     """
     tensors = (values, gradient, mean, square)
     if all(tensor.is_contiguous() for tensor in tensors) and triton_runs(*tensors):
@@ -81,37 +81,28 @@ def smooth_adam_step(
     smoothing: float,
     touched_only: bool = False,
 ) -> None:
-    """As :func:`adam_step`, the gradient of the total variation added in the same pass.
+    """As :func:`adam_step`, with the gradient of the total variation added in the same pass.
 
-    That gradient needs the neighbours' old values, and the neighbours are stepped by others at
-    the same time: the new values go to a second buffer, which takes its turn as ``values`` in the
-    next step. This moves fewer bytes than a pass of its own for the total variation would.
+    That gradient depends on the neighbours' old values, so the new values are written to a second
+    tensor. This moves fewer bytes than a separate pass for the total variation.
 
     Args:
         values: (X, Y, Z, C), contiguous; read only.
-        into: the new values, another tensor of the same shape, written everywhere.
+        into: another tensor of the same shape for the new values, written everywhere.
         gradient: the same shape; zero afterwards.
         mean: first moments, the same shape, changed in place.
         square: second moments, likewise.
-        rule: how to step. With ``skip_zero``, what counts is the gradient as it was given.
+        rule: the settings; ``skip_zero`` refers to ``gradient`` alone.
         smoothing: weight of the total variation, as for
             :func:`~devrf.ops.total_variation.add_total_variation_gradient`.
-        touched_only: smooth only entries whose given gradient is not zero.
+        touched_only: smooth only entries whose ``gradient`` is not zero.
     """
     tensors = (values, into, gradient, mean, square)
     if all(tensor.is_contiguous() for tensor in tensors) and triton_runs(*tensors):
         from devrf.ops.kernels.adam import step_in_one_pass
 
-        step_in_one_pass(
-            values,
-            into,
-            gradient,
-            mean,
-            square,
-            **vars(rule),
-            smoothing=smoothing,
-            touched_only=touched_only,
-        )
+        options = {**vars(rule), "smoothing": smoothing, "touched_only": touched_only}
+        step_in_one_pass(*tensors, **options)
         return
     smooth = torch.zeros_like(gradient)
     add_total_variation_gradient(values, smooth, smoothing)
@@ -141,7 +132,7 @@ def _step_all(values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, rule: 
 def _step_touched(
     values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, rule: AdamRule
 ) -> None:
-    """As :func:`_step_all` on the rows with a gradient: most of a grid is not touched."""
+    """As :func:`_step_all`, only on rows with a gradient: most of a grid has none."""
     beta1, beta2 = rule.betas
     channels = values.shape[-1]
     flat_grad = grad.reshape(-1, channels).contiguous()
@@ -165,10 +156,10 @@ def _step_touched(
 
 
 def _touched_rows(table: Tensor) -> Tensor:
-    """The rows (K,) of a table (N, C) that are not zero; some that are may be among them.
+    """The rows (K,) of a table (N, C) that are not zero; rows of −0 may be among them.
 
-    Bits are put together word by word, two floats at a time if they come in pairs: a third of the
-    time that it takes to compare each with zero.
+    The bits of a row are combined word by word, if possible two floats at a time: this takes a
+    third of the time of comparing each number with zero.
     """
     size = table.element_size()
     pairs = table.shape[1] * size % 8 == 0 == table.storage_offset() * size % 8
@@ -180,6 +171,6 @@ def _touched_rows(table: Tensor) -> Tensor:
 
 
 def _step_size(rule: AdamRule) -> tuple[Tensor, Tensor]:
-    """Learning rate with the mean's bias correction, and the square's correction."""
+    """Learning rate with the mean's bias correction, and the square's bias correction."""
     first, second = (-torch.expm1(rule.step * math.log(beta)) for beta in rule.betas)
     return rule.rate / first, second

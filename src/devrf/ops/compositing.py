@@ -1,10 +1,10 @@
 """Volume rendering along rays whose samples lie one after another in memory.
 
-Everything is written in optical depths τ = σ·δ, for which opacity is α = 1 − exp(−τ) and
-transmittance T_i = Π_{j<i} (1 − α_j) = exp(−Σ_{j<i} τ_j): no logarithm of a vanishing number.
+Formulas use optical depths τ = σ·δ: opacity is α = 1 − exp(−τ), transmittance
+T_i = Π_{j<i} (1 − α_j) = exp(−Σ_{j<i} τ_j), without logarithms of numbers near zero.
 
-A ray's samples are given either by the ray of each sample, or by where each ray begins in a list
-that may end in padding (devrf.ops.search).
+A ray's samples are given either by the ray of each sample, or by the place where each ray begins in
+a list that may end in padding (devrf.ops.search).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from devrf.ops.dispatch import triton_runs
 
 
 def composite(depth: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
-    """Weights of samples and what is left of each ray behind them (Max 1995).
+    """Weights of samples, and each ray's transmittance behind them (Max 1995).
 
     ``w_i = T_i α_i`` and ``T_end = exp(−Σ_i τ_i)``; for example τ = (ln 2, ln 2) on one ray
     gives w = (1/2, 1/4) and T_end = 1/4.
@@ -27,23 +27,19 @@ def composite(depth: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
     Args:
         depth: (S,) optical depths τ ≥ 0 of the samples, front to back within each ray.
         ray: (S,) int64, ascending: the ray of each sample.
-        rays: how many rays there are; a ray may have no sample.
+        rays: R; a ray may have no sample.
 
     Returns:
         weights (S,) and end transmittance (R,), differentiable once in ``depth``.
     """
     if triton_runs(depth):
-        from devrf.ops.kernels.compositing import Composite
-
-        first = torch.searchsorted(ray, torch.arange(rays + 1, device=ray.device))
-        weights, end = Composite.apply(depth.contiguous(), first)  # type: ignore[no-untyped-call]
-        return weights, end
+        return composite_segments(depth, _firsts(ray, rays))
     weights, end = _Composite.apply(depth, ray, rays)  # type: ignore[no-untyped-call]
     return weights, end
 
 
 def composite_segments(depth: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
-    """As :func:`composite`, for rays given by where they begin.
+    """As :func:`composite`, for rays given by the places where they begin.
 
     Args:
         depth: (S,) optical depths, front to back within each ray; padding at the end.
@@ -63,14 +59,14 @@ def composite_segments(depth: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
         return weights, end
     rays = len(first) - 1
     ray = _rays_of(first, len(depth))
-    # The padding makes one ray more, on which there is nothing.
+    # Padding forms one more ray, of zero depth.
     tau = torch.where(ray < rays, depth, torch.zeros_like(depth))
     weights, end = _Composite.apply(tau, ray, rays + 1)  # type: ignore[no-untyped-call]
     return weights, end[:-1]
 
 
 def sum_segments(weights: Tensor, values: Tensor, first: Tensor) -> Tensor:
-    """Sums (R, C) of ``w_i · c_i`` over each ray's samples; padding counts for nothing.
+    """Sums (R, C) of ``w_i · c_i`` over each ray's samples, without the padding.
 
     Args:
         weights: (S,) w.
@@ -92,11 +88,11 @@ def sum_segments(weights: Tensor, values: Tensor, first: Tensor) -> Tensor:
 
 
 def transmittances(depth: Tensor, ray: Tensor, rays: int) -> Tensor:
-    """T_i (S,): what is left of each sample's ray before it; arguments as :func:`composite`.
+    """Transmittance T_i (S,) before each sample; arguments as for :func:`composite`.
 
-    Plain PyTorch everywhere: a search with devrf.ops.search does not need it.
+    Plain PyTorch on all devices: Triton's search computes it itself.
     """
-    first, _ = _segments(ray, rays)
+    first = _firsts(ray, rays)[:-1]
     reached = _running_sum(depth)
     return torch.exp(reached[first[ray]] - reached[:-1]).to(depth.dtype)
 
@@ -104,7 +100,7 @@ def transmittances(depth: Tensor, ray: Tensor, rays: int) -> Tensor:
 def sum_by_ray(values: Tensor, ray: Tensor, rays: int) -> Tensor:
     """Sums (R, C) or (R,) of per-sample ``values`` (S, C) or (S,) over each ray.
 
-    Plain PyTorch everywhere: it is one kernel already, and ``ray`` need not ascend.
+    Plain PyTorch on all devices: it is a single kernel. ``ray`` need not ascend.
     """
     return values.new_zeros((rays, *values.shape[1:])).index_add(0, ray, values)
 
@@ -112,7 +108,8 @@ def sum_by_ray(values: Tensor, ray: Tensor, rays: int) -> Tensor:
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, depth: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
-        first, last = _segments(ray, rays)
+        edges = _firsts(ray, rays)
+        first, last = edges[:-1], edges[1:]
         reached = _running_sum(depth)
         transmittance = torch.exp(reached[first[ray]] - reached[:-1]).to(depth.dtype)
         weights = transmittance * -torch.expm1(-depth)
@@ -130,10 +127,9 @@ class _Composite(torch.autograd.Function):
         return own - behind - (grad_end * end)[ray], None, None
 
 
-def _segments(ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
-    """First sample and one past the last sample of every ray, (R,) each."""
-    edges = torch.searchsorted(ray, torch.arange(rays + 1, device=ray.device))
-    return edges[:-1], edges[1:]
+def _firsts(ray: Tensor, rays: int) -> Tensor:
+    """The first sample of every ray, and the number of samples (R + 1,)."""
+    return torch.searchsorted(ray, torch.arange(rays + 1, device=ray.device))
 
 
 def _rays_of(first: Tensor, samples: int) -> Tensor:
@@ -143,7 +139,7 @@ def _rays_of(first: Tensor, samples: int) -> Tensor:
 
 
 def _running_sum(values: Tensor) -> Tensor:
-    """Sums (S + 1,) of all values before each place, over all rays at once.
+    """Sums (S + 1,) of all values before each place, over all rays.
 
     In double precision: a ray's own sum is the difference of two of these, which may be large.
     """
@@ -156,9 +152,9 @@ def _running_sum(values: Tensor) -> Tensor:
 
 
 def sum_by_doubling(values: Tensor) -> Tensor:
-    """Running sums (S,) in ⌈log₂ S⌉ passes, whose additions always come in the same order.
+    """Running sums (S,) in ⌈log₂ S⌉ passes, with additions in a fixed order.
 
-    On a GPU ``cumsum`` adds in the order in which its blocks happen to finish.
+    On a GPU ``cumsum`` adds in the order in which its blocks finish.
     """
     reach = 1
     while reach < len(values):

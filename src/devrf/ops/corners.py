@@ -1,7 +1,7 @@
-"""Grids whose corners sit on a box's corners: from positions to grid coordinates.
+"""Grids whose corners coincide with a box's corners: from positions to grid coordinates.
 
-Numbers that depend on the box alone are made once and kept on the device: a tensor made from
-Python's numbers at every step would make the device wait for the host.
+Numbers that depend only on the box are cached on the device: to make a tensor from Python numbers
+at every step, the host would wait for the device.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class Corners(Protocol):
 def to_grid(points: Tensor, box: Corners, shape: Shape) -> Tensor:
     """Grid coordinates (M, 3) of ``points`` (M, 3): 0 on the low faces, shape − 1 on the high.
 
-    Differentiable in ``points``. Makes no tensor from Python's numbers after the first call with
-    the same box and shape.
+    Differentiable in ``points``. Copies nothing from the host after the first call with the same
+    box and shape.
     """
     low, scale = _on_device(box.low, box.high, shape, points.dtype, points.device)
     return (points - low) * scale
@@ -52,7 +52,7 @@ def shape_of(grid: Tensor) -> Shape:
 
 @lru_cache(maxsize=256)
 def _scale(low: Triple, high: Triple, shape: Shape, dtype: torch.dtype) -> Tensor:
-    # Tensors made in inference mode could not be used for training later.
+    # A cached tensor made in inference mode could not be used for training later.
     with torch.inference_mode(False):
         extent = torch.tensor(shape, dtype=dtype) - 1
         return extent / (torch.tensor(high, dtype=dtype) - torch.tensor(low, dtype=dtype))

@@ -1,10 +1,10 @@
-"""Which implementation of an operation runs: its plain PyTorch twin, or Triton on a CUDA device.
+"""The choice of an operation's implementation: plain PyTorch, or Triton on a CUDA device.
 
-A function of this package asks :func:`triton_runs` once, when it is called. Its backward pass,
-which autograd may run in a thread of its own, belongs to the implementation that was chosen then.
+A function of this package calls :func:`triton_runs` once; its backward pass, which autograd may run
+in another thread, belongs to the same implementation.
 
-This module knows none of the operations. The check that a device must pass before Triton runs on
-it compares all of them, so it is registered from above (``devrf.ops.__init__``).
+This module imports none of the operations. The check that a device must pass before Triton runs on
+it compares all of them, so ``devrf.ops.__init__`` registers it here.
 """
 
 from __future__ import annotations
@@ -34,13 +34,12 @@ _checks: list[Check] = []
 
 @contextmanager
 def using(kind: Kind) -> Iterator[None]:
-    """Run everything inside with one implementation.
+    """Choose the implementation of all operations inside the context.
 
     Args:
-        kind: ``auto`` takes Triton for float32 tensors on a CUDA device where Triton is installed
-            and has passed a check on that device, plain PyTorch for all others and where torch
-            is told to be deterministic (Triton's kernels add in no fixed order); ``torch`` and
-            ``triton`` insist. A thread that is started inside begins with ``auto``.
+        kind: ``torch``, ``triton`` or ``auto``: Triton for float32 tensors on a CUDA device where
+            its kernels pass their check, unless torch is to be deterministic (the kernels add in
+            no fixed order); else PyTorch. A thread started inside the context has ``auto``.
 
     Raises:
         DevrfError: ``kind`` is none of the three.
@@ -55,10 +54,10 @@ def using(kind: Kind) -> Iterator[None]:
 
 
 def triton_runs(*tensors: Tensor) -> bool:
-    """Whether Triton works on these tensors.
+    """Whether to use Triton for an operation on these tensors.
 
     Raises:
-        DevrfError: Triton was asked for and cannot do it.
+        DevrfError: ``triton`` was chosen and cannot run.
     """
     kind = _chosen.get()
     if kind == "torch":
@@ -89,26 +88,21 @@ def triton_runs(*tensors: Tensor) -> bool:
 
 
 def reaches(device: torch.device) -> bool:
-    """Whether Triton can work there; on a CPU only its interpreter can, which is for tests."""
+    """Whether Triton can run there; on a CPU only its interpreter can, for tests."""
     return device.type == "cuda" or os.environ.get("TRITON_INTERPRET") == "1"
 
 
 def register_check(check: Check) -> None:
-    """Make ``check`` one that a device must pass before ``auto`` runs Triton there.
-
-    Args:
-        check: raises where Triton's results on the device differ from the twins'.
-    """
+    """Add a check that a device must pass before ``auto`` runs Triton there; it raises if not."""
     _checks.append(check)
 
 
 @cache
 def passes_check(device: torch.device) -> bool:
-    """Whether the Triton kernels give what PyTorch gives on this device.
+    """Whether the Triton kernels agree with PyTorch on this device; if not, a warning says why.
 
-    Run once in a process, in milliseconds once the kernels are compiled. It waits for the
-    device, so it must have happened before a CUDA graph is captured. Where a check fails, one
-    warning says why.
+    The check runs once in a process and takes milliseconds after compilation. It waits for the
+    device, so it must precede the capture of a CUDA graph.
     """
     try:
         for check in _checks:

@@ -1,7 +1,7 @@
-"""Which samples of which rays can be seen: the search that comes before every gradient.
+"""The visible samples of rays, found without gradients before a batch is rendered.
 
-Lists have a fixed length, and how much of them is used is known to the device alone: a loop
-built on them never waits for the device, and can be captured in a CUDA graph.
+Lists have a fixed length, and only the device knows how much of them is used: a loop built on them
+never waits for the device, and can be captured in a CUDA graph.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from devrf.ops.warped_depth import warped_depth
 
 @dataclass(frozen=True)
 class Thresholds:
-    """What is too faint to be seen.
+    """Thresholds of visibility.
 
     Attributes:
         alpha: a sample of lower opacity is dropped.
-        stop: a sample is dropped if less than this of its ray is left before it.
+        stop: a sample is dropped if the transmittance before it is lower.
         weight: a sample of lower weight T·α is not significant.
     """
 
@@ -42,10 +42,10 @@ class PackedSamples:
         ray: (C,) int64, the ray of each sample; R in the padding.
         distance: (C,) along the ray, in units of its direction; 0 in the padding.
         points: (C, 3) positions; 0 in the padding.
-        significant: (C,) bool, whether the sample weighs enough for its colour to matter.
-        first: (R + 1,) int64, where each ray's samples begin; the last entry is how many of the
-            C places are used.
-        total: () int64, how many samples there were to find; more than C if some were dropped.
+        significant: (C,) bool, whether the sample's weight is high enough to need its colour.
+        first: (R + 1,) int64, the place where each ray's samples begin; the last entry is the
+            number of places used.
+        total: () int64, the number of visible samples; more than C if some were dropped.
         overflow: () bool, whether any were dropped.
     """
 
@@ -63,10 +63,9 @@ class SampleSubset:
     """Some of the samples of a list, in a list of length K.
 
     Attributes:
-        index: (K,) int64, their places in the list they come from; in the padding any place.
-        first: (R + 1,) int64, where each ray's samples begin among them; the last entry is how
-            many of the K places are used.
-        total: () int64, how many there were; more than K if some were dropped.
+        index: (K,) int64, their places in the original list; any place in the padding.
+        first: (R + 1,) int64, as in :class:`PackedSamples`, for the new list.
+        total: () int64, the number of selected samples; more than K if some were dropped.
         overflow: () bool, whether any were dropped.
     """
 
@@ -96,54 +95,41 @@ def find_samples(
     delta: float,
     thresholds: Thresholds,
 ) -> PackedSamples:
-    """Samples that can be seen, at ``entry + k·step``, k = 0 … count − 1.
+    """Visible samples among those at ``entry + k·step``, k = 0 … count − 1.
 
     A sample is kept if the grid point nearest to it is occupied, its opacity is no less than
     ``thresholds.alpha``, and the transmittance before it, over the samples in front of it that
-    pass both tests, is no less than ``thresholds.stop``. It is significant if its weight is no
-    less than ``thresholds.weight`` too. No gradient, and with Triton no waiting for the device.
+    pass both tests, is no less than ``thresholds.stop``. It is significant if also its weight is
+    no less than ``thresholds.weight``. Without gradients; Triton does not wait for the device.
 
     Args:
         origins: (R, 3) of rays in the box's units.
         directions: (R, 3) of rays.
         entry: (R,) distance of each ray's first sample, in units of its direction.
-        count: (R,) how many samples each ray has; int64 or int32.
-        mask: (X, Y, Z) bool, True where something may be at the time of the rays.
+        count: (R,) number of samples of each ray; int64 or int32.
+        mask: (X, Y, Z) bool, the occupancy at the time of the rays.
         density: raw densities; as ``slices``, ``weight``, ``box``, ``shift`` and ``delta`` for
             :func:`~devrf.ops.warped_depth.warped_depth`.
         slices: displacements: none, one, or two.
         weight: of the second slice.
         step: distance between samples, in units of the rays' directions.
-        longest: an upper bound of ``count``; a ray with more is cut there.
-        capacity: C, the length of the lists. What does not fit is dropped from their end.
-        mask_box: where the mask lives; outside it everything is empty.
-        box: where density and displacements live.
-        shift: what is added to a raw density.
+        longest: an upper bound of ``count``; further samples of a ray are dropped.
+        capacity: C, the length of the lists; samples that do not fit are dropped.
+        mask_box: the box of the mask; outside it everything is empty.
+        box: the box of density and displacements.
+        shift: added to a raw density.
         delta: the length of a step in base voxels.
-        thresholds: what is too faint.
+        thresholds: thresholds of visibility.
 
     Returns:
-        The samples; ``overflow`` tells whether ``capacity`` or ``longest`` was too small.
+        The samples; ``overflow`` is True if ``capacity`` or ``longest`` was too small.
     """
     if triton_runs(origins, directions, entry, density, *slices):
         from devrf.ops.kernels.search import find_samples_on_device
 
         found = find_samples_on_device(
-            origins,
-            directions,
-            entry,
-            count,
-            mask,
-            density,
-            slices,
-            weight,
-            step,
-            longest,
-            capacity,
-            mask_box,
-            box,
-            shift,
-            delta,
+            *(origins, directions, entry, count, mask, density, slices, weight),
+            *(step, longest, capacity, mask_box, box, shift, delta),
             (thresholds.alpha, thresholds.stop, thresholds.weight),
         )
         return PackedSamples(*found)
@@ -178,7 +164,7 @@ def find_samples(
 
 
 def _occupied(mask: Tensor, coords: Tensor) -> Tensor:
-    """Mask (M,): is the grid point nearest to each coordinate (M, 3) on the grid and True?"""
+    """Mask (M,): whether the grid point nearest to coordinates (M, 3) exists and is True."""
     x, y, z = mask.shape
     i, j, k = coords.round().to(torch.int32).unbind(-1)
     inside = (i >= 0) & (i < x) & (j >= 0) & (j < y) & (k >= 0) & (k < z)
@@ -188,22 +174,22 @@ def _occupied(mask: Tensor, coords: Tensor) -> Tensor:
 
 @torch.no_grad()
 def select(flags: Tensor, first: Tensor, capacity: int) -> SampleSubset:
-    """The samples with a flag, without waiting for the device; the same on any device.
+    """The samples with a flag, without waiting for the device.
 
-    Padding repeats places of the list, each another one, so that a gradient that is gathered
-    from there does not queue up at one of them. It belongs to no ray.
+    Padding indexes different places of the list, so that atomic additions of its gradients do not
+    collide at one of them. It belongs to no ray.
 
     Args:
-        flags: (C,) bool, none in the padding.
-        first: (R + 1,) where each ray's samples begin.
-        capacity: K ≤ C, the length of the new list. What does not fit is dropped from its end.
+        flags: (C,) bool, False in the padding.
+        first: (R + 1,) places where each ray's samples begin.
+        capacity: K ≤ C, the length of the new list; samples that do not fit are dropped.
     """
     if capacity > len(flags):
         raise ValueError(f"{capacity} of {len(flags)} samples cannot be selected")
     place = torch.arange(len(flags), device=flags.device)
     running = pad(flags.cumsum(0), (1, 0))
     total = running[-1]
-    # One place more takes all that is not wanted.
+    # One extra place receives everything that is not selected.
     target = torch.where(flags, running[:-1], capacity).clamp_(max=capacity)
     index = torch.arange(capacity + 1, device=flags.device).scatter_(0, target, place)
     return SampleSubset(

@@ -1,7 +1,7 @@
-"""Do the Triton kernels give what PyTorch gives? Every function on small random input.
+"""Compares the Triton kernels with PyTorch on a device, on small random inputs.
 
-The tests compare the same pairs in Triton's interpreter; this looks at the device, the driver and
-the compiler of the machine that a run is on.
+The tests compare the same pairs in Triton's interpreter; this check covers the device, the driver
+and the compiler of the machine that runs.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from devrf.ops.trilinear import interpolate
 from devrf.ops.warped_depth import warped_depth
 
 Results = tuple[Tensor, ...]
-# Sums of floats in another order, and the hardware's exponential.
+# Covers another order of summation, and the hardware's exponential.
 TOLERANCE = 1e-4
 
 
 class Draw:
-    """Random numbers on a device, from a generator of their own: a run's are not disturbed."""
+    """Random numbers on a device, from a separate generator: the run's is not advanced."""
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
@@ -70,7 +70,7 @@ def _run(case: Callable[[Draw], Results], kind: Kind, device: torch.device) -> l
 
 
 def interpolation(draw: Draw, channels: Sequence[int] = (3, 12)) -> Results:
-    """Values and both gradients, of rows that cannot and that can be loaded in fours."""
+    """Values and both gradients, for rows with and without vector loads."""
     results: list[Tensor] = []
     for width in channels:
         grid, coords = draw.leaf(4, 3, 5, width), (2 + 3 * draw(50, 3)).requires_grad_()
@@ -144,7 +144,7 @@ def compositing(draw: Draw) -> Results:
 
 
 def total_variation(draw: Draw) -> Results:
-    """The gradient is added, everywhere and to what is touched."""
+    """The gradient added to entries that have one, and to all."""
     grid, gradient = 2 * draw(4, 3, 5, 3), draw(4, 3, 5, 3).clamp(min=0)
     add_total_variation_gradient(grid, gradient, 0.3, touched_only=True)
     before = gradient.clone()
@@ -153,7 +153,7 @@ def total_variation(draw: Draw) -> Results:
 
 
 def adam(draw: Draw) -> Results:
-    """Steps with and without what is optional."""
+    """Steps with and without the optional settings."""
     results: list[Tensor] = []
     for skip_zero in (False, True):
         factors = draw(4, 3, 5, 1).abs()

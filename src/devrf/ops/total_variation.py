@@ -30,14 +30,14 @@ def add_total_variation_gradient(
 ) -> None:
     """Add ``weight`` · ∂ total_variation(grid) / ∂ grid to ``gradient`` in place.
 
-    The derivative at a voxel is Σ_neighbours clamp(v − v', −1, 1); it is added without building
-    a graph, since the penalty touches every voxel at every step.
+    The derivative at a voxel is Σ_neighbours clamp(v − v', −1, 1); in closed form, because an
+    autograd graph over every voxel at every step would be slow.
 
     Args:
         grid: (X, Y, Z, C).
         gradient: the same shape.
         weight: factor of the penalty.
-        touched_only: add to entries that are not zero alone.
+        touched_only: add only to entries that are not zero.
     """
     if grid.is_contiguous() and gradient.is_contiguous() and triton_runs(grid, gradient):
         from devrf.ops.kernels.adam import add_gradient_in_one_pass

@@ -1,7 +1,7 @@
 """Trilinear interpolation of a channels-last grid, with gradients to values and positions.
 
-The eight corners of a cell are consecutive rows of memory apart, so a look-up is a weighted sum
-of eight rows: exactly what an embedding bag does, in one pass and without intermediate copies.
+A look-up is a weighted sum of eight rows of a table, as an embedding bag computes it: in one pass
+and without intermediate copies.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ def interpolate(grid: Tensor, coords: Tensor, *, gradient: Tensor | None = None)
     Args:
         grid: (X, Y, Z, C), at least two points along each axis.
         coords: (M, 3) in grid units: 0 … X − 1, 0 … Y − 1, 0 … Z − 1.
-        gradient: None, or a contiguous tensor (X, Y, Z, C) that the grid's gradient is added to
-            in the backward pass, instead of being returned to autograd as a tensor of its own.
-            For a grid that requires gradients and of which few points are touched.
+        gradient: None, or a contiguous tensor (X, Y, Z, C) to which the backward pass adds the
+            grid's gradient, instead of returning it to autograd: faster where few points of a
+            large grid are touched.
 
     Returns:
         (M, C), differentiable once in ``grid`` and ``coords``.
@@ -48,10 +48,9 @@ def interpolate(grid: Tensor, coords: Tensor, *, gradient: Tensor | None = None)
 
 
 def kept_gradient(leaf: Tensor) -> Tensor | None:
-    """What the gradient of ``leaf`` is to be added to: the gradient that it has, if it has one.
+    """The gradient that ``leaf`` already has, if any: ``gradient`` of :func:`interpolate`.
 
-    As autograd would add it, but without a tensor of the grid's size in between. For
-    ``gradient`` of :func:`interpolate`.
+    Autograd would add to it, too, but with a temporary tensor of the grid's size.
     """
     return leaf.grad if leaf.requires_grad and leaf.is_leaf else None
 
@@ -111,10 +110,10 @@ def _corner_rows(first: Tensor, shape: Shape) -> Tensor:
 def _steps(shape: Shape, device: torch.device) -> Tensor:
     """Rows (8,) of a cell's corners from its first one.
 
-    Kept on the device: made anew at every step, they would make the device wait for the host.
+    Cached on the device: to copy them there at every step, the host would wait for the device.
     """
     steps = [(a * shape[1] + b) * shape[2] + c for a in (0, 1) for b in (0, 1) for c in (0, 1)]
-    # A tensor made in inference mode could not be used for training later.
+    # A cached tensor made in inference mode could not be used for training later.
     with torch.inference_mode(False):
         return torch.tensor(steps, dtype=torch.int32).to(device)
 
@@ -137,7 +136,7 @@ def _corner_weights(axes: list[Pair]) -> Tensor:
 
 
 def _pulls(rows: Tensor, table: Tensor, grad: Tensor) -> Tensor:
-    """What the weight of each corner is worth, (8, M): its row times the gradient (M, C)."""
+    """∂/∂(weight of each corner), (8, M): its row times the gradient (M, C)."""
     corners = table.index_select(0, rows.t().reshape(-1)).view(8, *grad.shape)
     if grad.shape[1] == 1:
         return corners[..., 0] * grad[:, 0]
@@ -145,7 +144,7 @@ def _pulls(rows: Tensor, table: Tensor, grad: Tensor) -> Tensor:
 
 
 def _slopes(pulls: Tensor, fraction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """How Σ weights · pulls rises along x, y and z, (M,) each; corners are joined axis by axis.
+    """Slopes of Σ weights · pulls along x, y and z, (M,) each; interpolated axis by axis.
 
     Args:
         pulls: (8, M) in the order of the corners' rows.

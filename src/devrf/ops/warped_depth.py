@@ -1,4 +1,4 @@
-"""From points of a moment to optical depths in canonical space, in one pass."""
+"""From points at one time to optical depths in canonical space, in one pass."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ def warped_depth(
     density_gradient: Tensor | None = None,
     slice_gradients: Sequence[Tensor | None] = (),
 ) -> tuple[Tensor, Tensor]:
-    """Where points lie in canonical space, and how opaque it is there.
+    """Canonical positions of points, and optical depths there.
 
     ``q = x + Δ(x)`` and ``τ = softplus(v(q) + b)·δ``, where Δ and v are trilinear, and
     ``Δ = (1 − w)·Δ_0 + w·Δ_1`` between two frames. All grids have their corners on one box;
-    beyond it they go on as on the border.
+    outside it they continue with their values at the border.
 
     Args:
         points: (M, 3) x in the box's units. They get no gradient.
         density: (X, Y, Z, 1) raw densities v.
         slices: displacements in the box's units, (X', Y', Z', 3) each: none for the rest state,
-            one frame, or the two frames between which the moment lies.
+            one frame, or the two frames around the time of the points.
         weight: w of the second frame, in [0, 1].
-        box: where the grids live.
-        shift: b, what is added to a raw density.
+        box: the box of the grids.
+        shift: b, added to a raw density.
         delta: δ, the length of a step in base voxels.
         density_gradient: as ``gradient`` of :func:`~devrf.ops.trilinear.interpolate`.
         slice_gradients: the same for each of ``slices``, or None; empty for none at all.

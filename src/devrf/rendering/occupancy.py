@@ -1,4 +1,4 @@
-"""Where something may be: a bit a cell, so that empty space is never sampled."""
+"""Occupancy: a mask of the cells that may contain matter, so that empty space is not sampled."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ class Occupancy(nn.Module):
     """A mask (X, Y, Z) over a box; a point is looked up at its nearest grid point.
 
     Attributes:
-        mask: (X, Y, Z) bool, True where something may be.
-        vicinity: the mask grown by ``REACH`` grid points, for stretches of a ray.
-        box: where the mask lives; outside it everything is empty.
+        mask: (X, Y, Z) bool, True where there may be matter.
+        vicinity: the mask dilated by ``REACH`` grid points, to test segments of a ray at once.
+        box: the box of the mask; outside it everything is empty.
     """
 
     mask: Tensor
@@ -33,12 +33,12 @@ class Occupancy(nn.Module):
 
     @staticmethod
     def full(shape: tuple[int, int, int], box: Box) -> Occupancy:
-        """A mask that excludes nothing inside the box."""
+        """A mask that is True in the whole box."""
         return Occupancy(torch.ones(shape, dtype=torch.bool), box)
 
     @property
     def reach(self) -> float:
-        """Shortest distance, in the box's units, that the vicinity surely grows the mask by."""
+        """Distance in the box's units by which the vicinity exceeds the mask at least."""
         cells = zip(self.box.size, self.mask.shape, strict=True)
         return (self.REACH - 0.5) * min(edge / (n - 1) for edge, n in cells)
 
@@ -48,16 +48,16 @@ class Occupancy(nn.Module):
         return float(self.mask.float().mean())
 
     def at(self, points: Tensor) -> Tensor:
-        """Mask (M,): may something be at ``points`` (M, 3)?"""
+        """Mask (M,): whether there may be matter at ``points`` (M, 3)."""
         return self._look_up(self.mask, points)
 
     def near(self, points: Tensor) -> Tensor:
-        """Mask (M,): may something be within :attr:`reach` of ``points`` (M, 3)?"""
+        """Mask (M,): whether there may be matter within :attr:`reach` of ``points`` (M, 3)."""
         return self._look_up(self.vicinity, self.box.nearest(points))
 
     def _look_up(self, mask: Tensor, points: Tensor) -> Tensor:
         x, y, z = mask.shape
-        # Axis by axis: whole vectors are several times faster than rows of three.
+        # Axis by axis: several times faster than rows of three.
         along = self.box.to_grid(points, (x, y, z)).round_().to(torch.int32).t().contiguous()
         inside = torch.ones_like(along[0], dtype=torch.bool)
         row = torch.zeros_like(along[0])
@@ -67,13 +67,13 @@ class Occupancy(nn.Module):
         return mask.view(-1).index_select(0, row.mul_(inside)) & inside
 
     def replace(self, mask: Tensor, box: Box | None = None) -> None:
-        """Take another mask, of any shape, over another box if one is given."""
+        """Replace the mask by one of any shape, and the box if one is given."""
         self.mask = mask
         self.vicinity = dilate(mask, self.REACH)
         self.box = box or self.box
 
     def refill(self, other: Occupancy) -> None:
-        """Become another occupancy of the same shape and box, in the same memory."""
+        """Copy another occupancy of the same shape and box into the same memory."""
         self.mask.copy_(other.mask)
         self.vicinity.copy_(other.vicinity)
 
@@ -86,7 +86,7 @@ class Occupancy(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     def get_extra_state(self) -> dict[str, Any]:
-        """The box, as plain numbers."""
+        """The box as plain numbers."""
         return {"low": list(self.box.low), "high": list(self.box.high)}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
@@ -97,8 +97,7 @@ class Occupancy(nn.Module):
 def dilate(mask: Tensor, radius: int) -> Tensor:
     """The mask (X, Y, Z) grown by ``radius`` grid points along every axis and diagonal."""
     grown = mask
-    # A cube grows along one axis after another; bits shifted onto each other are quicker than
-    # any pooling.
+    # One axis after another, by shifted copies: faster than pooling.
     for axis in range(3):
         before, grown = grown, grown.clone()
         for shift in range(1, min(radius, mask.shape[axis] - 1) + 1):

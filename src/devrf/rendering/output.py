@@ -1,4 +1,4 @@
-"""What rays see: the output of every method's renderer."""
+"""The output of every method's renderer."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from torch import Tensor
 
 @dataclass(frozen=True, kw_only=True)
 class RenderOutput:
-    """What R rays see.
+    """The rendering of R rays.
 
     Attributes:
         color: (R, 3) RGB, composited on the background: C = Σ w_i c_i + T_end · background.
-        depth: (R,) mean distance of what is seen along the ray; 0 where nothing is.
-        transmittance: (R,) T_end, what is left of the ray behind the last sample.
+        depth: (R,) mean distance of the samples, weighted by w_i; 0 where all weights are.
+        transmittance: (R,) T_end, behind the last sample.
         extras: further tensors by name, for the losses of the method that rendered.
     """
 

@@ -1,4 +1,4 @@
-"""What rays see, to be looked at: without gradients, and without what the losses ask for."""
+"""A rendered image: colours, depths and opacities, without gradients."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from devrf.rendering.output import RenderOutput
 
 @dataclass(frozen=True)
 class RenderedImage:
-    """What R rays see, to be looked at.
+    """The rendering of R rays: an image, or a part of one.
 
     Attributes:
         color: (R, 3) RGB in [0, 1].
-        depth: (R,) mean distance of what is seen along the ray; 0 where nothing is.
+        depth: (R,) mean distance of the visible samples along the ray; 0 where there are none.
         opacity: (R,) in [0, 1], 1 − T_end.
     """
 
@@ -27,12 +27,12 @@ class RenderedImage:
 
     @staticmethod
     def of(output: RenderOutput) -> RenderedImage:
-        """What there is to look at in a renderer's output."""
+        """The image in a renderer's output."""
         return RenderedImage(output.color, output.depth, 1 - output.transmittance)
 
     @staticmethod
     def joined(parts: Sequence[RenderedImage]) -> RenderedImage:
-        """What all rays of some images see, one image after another."""
+        """The rays of several parts, one part after another."""
         return RenderedImage(
             torch.cat([part.color for part in parts]),
             torch.cat([part.depth for part in parts]),

@@ -16,14 +16,13 @@ from devrf.rendering.view import Viewable
 
 
 class Renderer:
-    """Shows a learned scene of any method, without gradients.
+    """Renders a learned scene of any method, without gradients.
 
-    The views of the times that it was asked for last are kept: what is learned afterwards is not
-    seen at these times.
+    Views of the last few times are cached: changes of the model do not show at these times.
 
     Attributes:
         model: the scene.
-        device: where it is, and where images are rendered.
+        device: its device, on which images are rendered.
         at: time in [0, 1] → the :class:`~devrf.rendering.view.View` of that time, cached.
     """
 
@@ -31,9 +30,9 @@ class Renderer:
         """Prepare to render.
 
         Args:
-            model: a learned scene; it should not be moved to another device afterwards.
-            times: how many times are kept.
-            half: let networks work in half precision, on a CUDA device only.
+            model: a learned scene, not to be moved to another device afterwards.
+            times: number of cached times.
+            half: run networks in half precision, on a CUDA device only.
         """
         self.model = model
         self.device = model.device
@@ -41,7 +40,7 @@ class Renderer:
 
     @torch.no_grad()
     def picture(self, rays: Rays, time: float, background: float | Tensor) -> RenderedImage:
-        """What R rays see at ``time``.
+        """Render R rays at ``time``.
 
         Args:
             rays: R rays in world space, on any device.

@@ -1,4 +1,4 @@
-"""How long the lists of a batch's samples are, where their length must not depend on data."""
+"""The fixed length of a batch's sample lists, where shapes must not depend on data."""
 
 from __future__ import annotations
 
@@ -11,25 +11,27 @@ log = logging.getLogger(__name__)
 
 
 class SampleCapacity:
-    """The length of the lists that a batch's samples are written to; it follows what is needed.
+    """The lengths of the lists of a batch's samples, adapted to the numbers that were needed.
 
-    A list that was too short has lost the samples of the batch's last rays. That is seen a few
-    steps later, without the host ever waiting for the device, and the lists grow.
+    A list that was too short has lost the samples of the batch's last rays. The host learns this a
+    few steps later, without waiting for the device, and lengthens the lists.
 
     Attributes:
-        visible: places for the samples that can be seen.
-        significant: places for those whose colour counts; no more than ``visible``.
+        visible: length of the list of visible samples.
+        significant: length of the list of those whose colour is needed; at most ``visible``.
     """
 
-    # Places for each ray before anything is known; spare places beyond what was needed.
+    # Initial places for each ray.
     VISIBLE, SIGNIFICANT = 64, 16
+    # A list that was too short gets SPARE times what was needed, and grows at least by GROWTH.
     SPARE, GROWTH = 1.25, 1.5
-    # Lists that are this many times longer than need be are shortened: fog clears.
+    # A list is shortened if it is this many times too long: fog clears during training.
     WASTE = 4
+    # Lengths are multiples of this.
     GRAIN = 256
 
     def __init__(self, rays: int, device: torch.device) -> None:
-        """Make room for batches of ``rays`` on ``device``."""
+        """Initial lengths for batches of ``rays`` on ``device``."""
         self.visible, self.significant = (
             _rounded(rays * n) for n in (self.VISIBLE, self.SIGNIFICANT)
         )
@@ -39,18 +41,18 @@ class SampleCapacity:
         self._asked = self._said = False
 
     def note(self, visible: Tensor, significant: Tensor) -> None:
-        """Remember, on the device, how many samples () there were to find."""
+        """Record on the device how many samples () a batch had."""
         torch.maximum(self._needed, torch.stack([visible, significant]), out=self._needed)
 
     def measure(self) -> bool:
-        """Wait for what was noted, and fit the lists to it; whether their length has changed."""
+        """Wait for the recorded numbers and adapt the lengths; True if they have changed."""
         visible, significant = self._needed.tolist()
         self._needed.zero_()
         self._asked = False
         return self._fit(visible, significant, waste=1)
 
     def poll(self) -> bool:
-        """As :meth:`measure`, without waiting: what was noted counts at a later call."""
+        """As :meth:`measure`, without waiting: recorded numbers take effect at a later call."""
         if not self._asked:
             self._seen.copy_(self._needed, non_blocking=True)
             self._needed.zero_()
@@ -73,9 +75,7 @@ class SampleCapacity:
             log.info(
                 "a batch had %d samples, %d of them to be coloured, for %d and %d places: its "
                 "last rays lost theirs, and the lists grow",
-                visible,
-                significant,
-                *before,
+                *(visible, significant, *before),
             )
         self.visible = self._length(self.visible, visible, waste)
         self.significant = min(self._length(self.significant, significant, waste), self.visible)

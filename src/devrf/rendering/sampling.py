@@ -1,4 +1,4 @@
-"""From rays to the sample points worth looking at."""
+"""Sample points along rays, in occupied space only."""
 
 from __future__ import annotations
 
@@ -14,16 +14,15 @@ from devrf.rendering.occupancy import Occupancy
 
 @dataclass(frozen=True)
 class Samples:
-    """S samples of R rays, one after another: ascending by ray, then front to back.
+    """S samples of R rays: ascending by ray, then front to back.
 
     Attributes:
         ray: (S,) int64, the ray of each sample.
         distance: (S,) along the ray, in units of its direction.
         points: (S, 3) positions in the fields' space.
-        rays: R, how many rays there are.
-        present: None, or (S,) bool where the list is longer than need be: which places are
-            samples. The others have no weight; what else stands there is finite, but means
-            nothing.
+        rays: R.
+        present: None, or (S,) bool where the list ends in padding: which places are samples.
+            Padding has weight zero; its other values are finite and meaningless.
     """
 
     ray: Tensor
@@ -49,43 +48,35 @@ class Samples:
 def steps_through(
     rays: Rays, box: Box, *, step: float, near: float, far: float
 ) -> tuple[Tensor, Tensor]:
-    """Where the samples of R rays begin, and how many fit: arguments as :func:`march`.
+    """Distance (R,) of each ray's first sample, and number (R,) int64 of samples up to its exit.
 
-    Returns:
-        distance (R,) of each ray's first sample, and how many (R,) int64 there are up to its exit.
+    Arguments as for :func:`march`.
     """
     entry, leave = box.crossing(rays)
     entry, leave = entry.clamp(min=near), leave.clamp(max=far)
-    # The sample on the way out counts: in NDC it is the last plane, which closes the scene.
+    # Including a sample exactly at the exit: in NDC it is the last plane, behind the whole scene.
     count = torch.where(leave >= entry, ((leave - entry) / step + 1e-3).floor() + 1, 0.0)
     return entry, count.long()
 
 
 def most_steps(box: Box, *, step: float, near: float, far: float) -> int:
-    """No ray has more samples, whose direction is at least of length 1: arguments as above."""
+    """Upper bound of the samples of a ray whose direction has length 1 or more."""
     diagonal = sum(edge**2 for edge in box.size) ** 0.5
     return int(min(far - near, diagonal) / step) + 2
 
 
 @torch.no_grad()
 def march(
-    rays: Rays,
-    box: Box,
-    occupancy: Occupancy,
-    *,
-    step: float,
-    near: float,
-    far: float,
+    rays: Rays, box: Box, occupancy: Occupancy, *, step: float, near: float, far: float
 ) -> Samples:
     """Samples every ``step`` along rays between their entry into the box and their exit.
 
-    Empty space is skipped in two strides: whole stretches of a ray with nothing near them,
-    then single samples.
+    Empty space is skipped in two passes: first whole segments of a ray, then single samples.
 
     Args:
         rays: R rays.
-        box: where samples may be.
-        occupancy: where something may be.
+        box: the box that contains all samples.
+        occupancy: tells which cells are sampled.
         step: distance between samples, in units of the rays' directions.
         near: distance before which nothing is sampled.
         far: distance behind which nothing is sampled.
@@ -94,17 +85,17 @@ def march(
         The samples in occupied cells; the k-th of a ray is at entry + k·step.
     """
     entry, count = steps_through(rays, box, step=step, near=near, far=far)
-    per_stretch = max(1, int(2 * _reach(rays, occupancy) / step))
-    stretches = (count + per_stretch - 1) // per_stretch
-    ray = torch.repeat_interleave(stretches)
-    first = stretches.cumsum(0) - stretches
+    per_segment = max(1, int(2 * _reach(rays, occupancy) / step))
+    segments = (count + per_segment - 1) // per_segment
+    ray = torch.repeat_interleave(segments)
+    first = segments.cumsum(0) - segments
     start = torch.arange(len(ray), device=ray.device).sub_(first.index_select(0, ray))
-    start *= per_stretch
-    middle = entry.index_select(0, ray) + step * (start + (per_stretch - 1) / 2)
+    start *= per_segment
+    middle = entry.index_select(0, ray) + step * (start + (per_segment - 1) / 2)
     kept = occupancy.near(rays.at(ray, middle)).nonzero()[:, 0]
     ray, start = ray.index_select(0, kept), start.index_select(0, kept)
-    number = (start[:, None] + torch.arange(per_stretch, device=ray.device)).reshape(-1)
-    ray = ray.repeat_interleave(per_stretch)
+    number = (start[:, None] + torch.arange(per_segment, device=ray.device)).reshape(-1)
+    ray = ray.repeat_interleave(per_segment)
     distance = entry.index_select(0, ray).add_(number, alpha=step)
     points = rays.at(ray, distance)
     met = occupancy.at(points) & (number < count.index_select(0, ray))
@@ -118,7 +109,7 @@ def march(
 
 
 def _reach(rays: Rays, occupancy: Occupancy) -> float:
-    """The vicinity's reach in units of the rays' directions, which in NDC are no unit vectors."""
+    """The vicinity's reach in units of the rays' directions, whose length in NDC is not 1."""
     lengths = rays.directions.norm(dim=1)
     return occupancy.reach / max(float(lengths.amax()), 1e-9) if len(rays) else occupancy.reach
 
@@ -127,7 +118,7 @@ def _reach(rays: Rays, occupancy: Occupancy) -> float:
 def hits(
     rays: Rays, box: Box, occupancy: Occupancy, *, near: float, far: float, chunk: int = 65536
 ) -> Tensor:
-    """Mask (R,): which rays pass within reach of anything occupied."""
+    """Mask (R,): which rays pass within reach of an occupied cell."""
     return torch.cat(
         [
             _hits(rays[k : k + chunk], box, occupancy, near, far)

@@ -1,4 +1,4 @@
-"""A scene at one moment: all that films, stills, evaluation and the viewer ask of a method."""
+"""A scene at one time: what films, stills, evaluation and the viewer need of a method."""
 
 from __future__ import annotations
 
@@ -15,25 +15,20 @@ from devrf.rendering.rendered_image import RenderedImage
 
 
 class View(Protocol):
-    """A scene at one time, ready to be looked at from anywhere.
-
-    Attributes:
-        chunk: rays that are best rendered at once on the scene's device.
-        at_rest: whether it shows what the scene shows at time 0.
-    """
+    """A scene at one time, ready to be rendered from anywhere."""
 
     @property
     def chunk(self) -> int:
-        """Rays that are best rendered at once."""
+        """The number of rays to render at once on the scene's device."""
         ...
 
     @property
     def at_rest(self) -> bool:
-        """Whether this is the rest state."""
+        """Whether the scene is in its rest state, as at time 0."""
         ...
 
     def render(self, rays: Rays, background: Tensor) -> RenderedImage:
-        """What R rays see, without gradients.
+        """Render R rays without gradients.
 
         Args:
             rays: R rays in the space of the scene's fields, on its device.
@@ -44,12 +39,12 @@ class View(Protocol):
 
 @runtime_checkable
 class MovingView(View, Protocol):
-    """A view that knows where what it shows was at another time."""
+    """A view that knows how its points move between two times."""
 
     def induced_flow(
         self, rays: Rays, pixels: Tensor, cameras: Cameras, time: float
     ) -> tuple[Tensor, Tensor]:
-        """How what R rays see moved in the image between ``time`` and the view's own time.
+        """Optical flow of R rays between ``time`` and the view's own time.
 
         Args:
             rays: R rays in the space of the scene's fields.
@@ -65,26 +60,26 @@ class MovingView(View, Protocol):
 
 
 class Viewable(Protocol):
-    """A scene that can be looked at: a :class:`~devrf.methods.base.DynamicModel`."""
+    """A scene that can be rendered: a :class:`~devrf.methods.base.DynamicModel`."""
 
     @property
     def box(self) -> Box:
-        """What holds the scene, in the space of its fields."""
+        """The scene's bounds, in the space of its fields."""
         ...
 
     @property
     def space(self) -> Space:
-        """The space that its fields live in."""
+        """The space of its fields."""
         ...
 
     @property
     def depth_limits(self) -> tuple[float, float]:
-        """Distances before and behind which nothing is sampled, in the space of the fields."""
+        """Distances before and behind which nothing is sampled, in the space of its fields."""
         ...
 
     @property
     def device(self) -> torch.device:
-        """Where it is."""
+        """The device of its tensors."""
         ...
 
     def at(self, time: float, *, half: bool = False) -> View:
@@ -92,6 +87,6 @@ class Viewable(Protocol):
 
         Args:
             time: in [0, 1].
-            half: let networks work in half precision where device and method can.
+            half: run networks in half precision where device and method allow it.
         """
         ...

@@ -71,23 +71,16 @@ def test_a_ray_longer_than_promised_is_cut(draw: Draw, agree: Both) -> None:
     agree(lambda: astuple(look()))
 
 
-def test_no_rays(draw: Draw, agree: Both) -> None:
-    look = search(draw, rays=0)
+@pytest.mark.parametrize(
+    ("rays", "occupied", "stop"),
+    [(0, True, 0.01), (6, False, 0.01), (3, True, 0.0), (3, True, 1.0)],
+    ids=["no rays", "nothing occupied", "rays never end", "rays end at once"],
+)
+def test_extremes(draw: Draw, agree: Both, rays: int, occupied: bool, stop: float) -> None:
+    thresholds = Thresholds(alpha=0.02, stop=stop, weight=0.05)
+    mask = draw(5, 4, 6) > (-0.3 if occupied else 2)
+    look = search(draw, 1, rays, mask=mask, thresholds=thresholds)
     agree(lambda: astuple(look()))
-
-
-def test_nothing_occupied(draw: Draw, agree: Both) -> None:
-    look = search(draw, mask=draw(5, 4, 6) > 2)
-    with using("triton"):
-        found = look()
-    assert found.total == 0 and (found.ray == 6).all() and not found.overflow
-    agree(lambda: astuple(look()))
-
-
-def test_rays_that_never_end_and_rays_that_end_at_once(draw: Draw, agree: Both) -> None:
-    for stop in (0.0, 1.0):
-        look = search(draw, 0, 3, thresholds=Thresholds(alpha=0.02, stop=stop, weight=0.05))
-        agree(lambda look=look: astuple(look()))  # type: ignore[misc]
 
 
 def test_points_halfway_between_grid_points(draw: Draw, agree: Both, device: torch.device) -> None:

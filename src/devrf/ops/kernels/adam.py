@@ -1,8 +1,8 @@
-"""Adam in one pass over a tensor, the total variation of a grid included; and that alone.
+"""Adam in one pass over a tensor, with or without a grid's total variation; and that alone.
 
 Each number is read and written once: value, gradient and two moments in, value and two moments
-out. A zero is only written where there was a gradient, and with ``SKIP_ZERO`` in place nothing
-else is read or written but there.
+out. Gradients are zeroed only where they were not zero; with ``SKIP_ZERO`` the moments, too, are
+read and written only there.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from devrf.ops.kernels.launch import launch
 from devrf.ops.kernels.numbers import opacity
 
 THREADS = 128
-# Most numbers of a program: 8 for each of its 128 threads.
+# Numbers of a program at most: 8 for each of its 128 threads.
 LARGEST = 1024
 
 
@@ -42,26 +42,15 @@ def step_in_one_pass(
     smooth = into is not values
     length = _row(values) if smooth else values.numel()
     beta1, beta2 = betas
+    factors = values if per_voxel_lr is None else per_voxel_lr.contiguous()
+    shape = values.shape[:2] if smooth else (1, 1)
+    decay = (1 - beta1, 1 - beta2, -math.log(beta1), -math.log(beta2))
     launch(
         adam_kernel,
         _programs(values, length),
         values,
-        values,
-        into,
-        gradient,
-        mean,
-        square,
-        values if per_voxel_lr is None else per_voxel_lr.contiguous(),
-        rate,
-        step,
-        length,
-        *(values.shape[:2] if smooth else (1, 1)),
-        1 - beta1,
-        1 - beta2,
-        -math.log(beta1),
-        -math.log(beta2),
-        eps,
-        smoothing,
+        *(values, into, gradient, mean, square, factors, rate, step),
+        *(length, *shape, *decay, eps, smoothing),
         PER_VOXEL_LR=per_voxel_lr is not None,
         SKIP_ZERO=skip_zero,
         CLEAR=clear,
@@ -82,11 +71,7 @@ def add_gradient_in_one_pass(
         total_variation_kernel,
         _programs(grid, length),
         grid,
-        grid,
-        gradient,
-        length,
-        *grid.shape[:2],
-        weight,
+        *(grid, gradient, length, *grid.shape[:2], weight),
         TOUCHED_ONLY=touched_only,
         CHANNELS=grid.shape[3],
         WIDE=_is_wide(grid),
@@ -110,7 +95,7 @@ def _programs(values: Tensor, length: int) -> int:
 
 
 def _is_wide(values: Tensor) -> bool:
-    """Do places in the tensor need 64 bits?"""
+    """Whether indices into the tensor need 64 bits."""
     return values.numel() >= 2**31 - LARGEST
 
 
@@ -118,7 +103,7 @@ def _is_wide(values: Tensor) -> bool:
 def piece(length, WIDE: tl.constexpr, BLOCK: tl.constexpr):
     """This program's row, and its numbers within the row.
 
-    A program stays in one row, so that nothing is divided number by number but by constants.
+    A program stays in one row: no division for each number, except by constants.
     """
     program = tl.program_id(0).to(tl.int64) if WIDE else tl.program_id(0)
     pieces = tl.cdiv(length, BLOCK)
@@ -135,7 +120,7 @@ def pull(values, at, own, stride, there):
 @triton.jit
 def slope_of_variation(values, at, own, here, row, number, length, x, y, CHANNELS: tl.constexpr):
     """Σ over the six neighbours of clamp(v − v', −1, 1)."""
-    # Spread over the block here, since Triton's interpreter cannot spread a truth value.
+    # Broadcast to the block here: Triton's interpreter cannot broadcast a boolean scalar.
     i = row // y + number * 0
     j = row % y + number * 0
     total = pull(values, at, own, CHANNELS, here & (number + CHANNELS < length))
@@ -207,7 +192,7 @@ def adam_kernel(
     g = tl.load(gradient + at, mask=here, other=0.0)
     touched = here & (g != 0.0)
     active = touched if SKIP_ZERO else here
-    # Smoothed values go to another tensor, and there everywhere.
+    # Smoothed values go to another tensor, all of which is written.
     written = here if SMOOTH else active
     own = tl.load(values + at, mask=written, other=0.0)
     if CLEAR:

@@ -1,4 +1,4 @@
-"""Where a point lies in a grid: its cell, the cell's eight corners, and their weights.
+"""The cell of a grid that a point lies in, the cell's eight corners, and their weights.
 
 Corner number c lies at ``(c >> 2, (c >> 1) & 1, c & 1)`` in the cell: bit 4 for x, 2 for y, 1
 for z.
@@ -14,7 +14,7 @@ import triton.language as tl
 def cell(coordinate, points):
     """Lower corner (int32) and fraction in the cell, along an axis of ``points`` grid points.
 
-    A coordinate outside is clamped to the grid; one that is no number counts as 0.
+    A coordinate outside is clamped to the grid; NaN counts as 0.
     """
     last = points - 1.0
     clamped = tl.where(coordinate > 0.0, tl.minimum(coordinate, last), 0.0)
@@ -42,12 +42,35 @@ def share(fraction, UPPER: tl.constexpr):
 
 
 @triton.jit
+def corner_weight(fx, fy, fz, CORNER: tl.constexpr):
+    """Trilinear weight of a cell's corner."""
+    return share(fx, CORNER & 4) * share(fy, CORNER & 2) * share(fz, CORNER & 1)
+
+
+@triton.jit
+def load_vectors(vectors, at, here):
+    """The components x, y, z of vectors that begin at places ``at``; 0 where not ``here``."""
+    x = tl.load(vectors + at, mask=here, other=0.0)
+    y = tl.load(vectors + at + 1, mask=here, other=0.0)
+    z = tl.load(vectors + at + 2, mask=here, other=0.0)
+    return x, y, z
+
+
+@triton.jit
+def store_vectors(vectors, at, x, y, z, here):
+    """The reverse of :func:`load_vectors`."""
+    tl.store(vectors + at, x, mask=here)
+    tl.store(vectors + at + 1, y, mask=here)
+    tl.store(vectors + at + 2, z, mask=here)
+
+
+@triton.jit
 def scalar_at(grid, i, j, k, fx, fy, fz, y, z, here):
     """Trilinear value of a grid (X, y, z, 1) in the cell (i, j, k)."""
     value = fx * 0.0
     for corner in tl.static_range(8):
         row = corner_row(i, j, k, y, z, corner)
-        weight = share(fx, corner & 4) * share(fy, corner & 2) * share(fz, corner & 1)
+        weight = corner_weight(fx, fy, fz, corner)
         value += weight * tl.load(grid + row, mask=here, other=0.0)
     return value
 

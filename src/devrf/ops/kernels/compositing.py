@@ -1,8 +1,8 @@
-"""Compositing and its backward pass: one program goes along one ray.
+"""Compositing and its backward pass: one program for each ray.
 
-Sums stay within a ray, so that float32 is enough. A sum over what lies before a sample is a sum
-over its neighbour and on, never a sum less the sample itself, which would cancel behind an opaque
-one.
+Sums stay within a ray, so that float32 suffices. The sum over the samples before one is accumulated
+from its neighbour on, never as an inclusive sum minus the sample itself: behind an opaque sample
+that difference would cancel.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from torch.autograd.function import once_differentiable
 from devrf.ops.kernels.launch import launch
 from devrf.ops.kernels.numbers import opacity
 
-# Samples that a program looks at together: one for each thread of its only warp.
-BLOCK = 32
+# A program is one warp, which processes a block of samples at a time, one for each thread.
+WARP = {"BLOCK": 32, "num_warps": 1}
 
 
 class Composite(torch.autograd.Function):
@@ -29,19 +29,8 @@ class Composite(torch.autograd.Function):
     def forward(ctx: Any, depth: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
         rays = len(first) - 1
         weights, transmittance = torch.zeros_like(depth), torch.zeros_like(depth)
-        end = torch.empty(rays, dtype=depth.dtype, device=depth.device)
-        launch(
-            composite_kernel,
-            rays,
-            depth,
-            depth,
-            first,
-            weights,
-            transmittance,
-            end,
-            BLOCK=BLOCK,
-            num_warps=1,
-        )
+        end = depth.new_empty(rays)
+        launch(composite_kernel, rays, depth, depth, first, weights, transmittance, end, **WARP)
         ctx.save_for_backward(first, weights, transmittance, end)
         return weights, end
 
@@ -50,20 +39,9 @@ class Composite(torch.autograd.Function):
     def backward(ctx: Any, weights_gradient: Tensor, end_gradient: Tensor) -> tuple[Tensor, None]:
         first, weights, transmittance, end = ctx.saved_tensors
         into = torch.zeros_like(weights)
-        launch(
-            composite_backward_kernel,
-            len(end),
-            into,
-            first,
-            weights,
-            transmittance,
-            end,
-            weights_gradient.contiguous(),
-            end_gradient.contiguous(),
-            into,
-            BLOCK=BLOCK,
-            num_warps=1,
-        )
+        known = (first, weights, transmittance, end)
+        upstream = (weights_gradient.contiguous(), end_gradient.contiguous())
+        launch(composite_backward_kernel, len(end), into, *known, *upstream, into, **WARP)
         return into, None
 
 
@@ -72,46 +50,26 @@ class SumSegments(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, weights: Tensor, values: Tensor, first: Tensor) -> Tensor:
-        rays, channels = len(first) - 1, values.shape[1]
+        rays = len(first) - 1
         ctx.save_for_backward(weights, values, first)
-        sums = torch.empty(rays, channels, dtype=values.dtype, device=values.device)
-        launch(
-            sum_kernel,
-            rays,
-            values,
-            weights,
-            values,
-            first,
-            sums,
-            CHANNELS=channels,
-            PADDED=triton.next_power_of_2(channels),
-            BLOCK=BLOCK,
-            num_warps=1,
-        )
+        sums = values.new_empty(rays, values.shape[1])
+        launch(sum_kernel, rays, values, weights, values, first, sums, **_width(values), **WARP)
         return sums
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, Tensor, None]:
         weights, values, first = ctx.saved_tensors
-        into_weights, into_values = torch.zeros_like(weights), torch.zeros_like(values)
-        rays, channels = len(first) - 1, values.shape[1]
-        launch(
-            sum_backward_kernel,
-            rays,
-            values,
-            weights,
-            values,
-            first,
-            upstream.contiguous(),
-            into_weights,
-            into_values,
-            CHANNELS=channels,
-            PADDED=triton.next_power_of_2(channels),
-            BLOCK=BLOCK,
-            num_warps=1,
-        )
-        return into_weights, into_values, None
+        given = (weights, values, first, upstream.contiguous())
+        into = (torch.zeros_like(weights), torch.zeros_like(values))
+        sizes = {**_width(values), **WARP}
+        launch(sum_backward_kernel, len(first) - 1, values, *given, *into, **sizes)
+        return *into, None
+
+
+def _width(values: Tensor) -> dict[str, int]:
+    channels = values.shape[1]
+    return {"CHANNELS": channels, "PADDED": triton.next_power_of_2(channels)}
 
 
 @triton.jit
@@ -164,13 +122,7 @@ def composite_backward_kernel(
 
 @triton.jit
 def sum_kernel(
-    weights,
-    values,
-    first,
-    sums,
-    CHANNELS: tl.constexpr,
-    PADDED: tl.constexpr,
-    BLOCK: tl.constexpr,
+    weights, values, first, sums, CHANNELS: tl.constexpr, PADDED: tl.constexpr, BLOCK: tl.constexpr
 ):
     """Σ w_i·c_i along a ray."""
     ray = tl.program_id(0).to(tl.int64)

@@ -1,4 +1,4 @@
-"""How a kernel is started."""
+"""Launching a kernel."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from torch import Tensor
 
 
 def launch(kernel: Any, programs: int, on: Tensor, *args: Any, **constants: Any) -> None:
-    """Start ``programs`` programs of a kernel on the device of a tensor; none if there are none.
+    """Launch a kernel.
 
     Args:
         kernel: a Triton kernel.
-        programs: how many; each does its own part.
+        programs: size of the grid; 0 launches nothing.
         on: a tensor on the device to run on, which need not be the current one.
         args: the kernel's arguments.
         constants: its constants, and Triton's options.
     """
     if programs:
         with torch.cuda.device_of(on):
-            # Said here, since releases of Triton differ in what they do if it is not.
+            # Explicit, because its default differs between releases of Triton.
             kernel[(programs,)](*args, **constants, enable_fp_fusion=True)

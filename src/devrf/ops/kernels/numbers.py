@@ -1,7 +1,7 @@
-"""Functions of one number that keep their digits where the plain formula cancels.
+"""Functions of one number that stay accurate where the plain formula cancels.
 
-The hardware's exponential is good to about 1e-7 of its value, its logarithm to 1e-7 in absolute
-terms only; so the logarithm is done without.
+The hardware's exponential has a relative error of about 1e-7, its logarithm an absolute one of
+1e-7; so no logarithm is used.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""The search for samples that can be seen: one program marches along one ray.
+"""The search for visible samples: one program marches along one ray.
 
-The first kernel looks at a ray's samples, a warp's worth at a time, until the ray ends or nothing
-is left of it. It leaves a byte for each sample and a count for each ray. Sums of the counts say
-where each ray's samples go; the second kernel writes them there, the third fills the rest.
+The first kernel tests a ray's samples, 32 at a time, until the ray ends or its transmittance falls
+below the threshold. It writes a byte for each sample and a count for each ray. The counts' running
+sum is where each ray's samples begin; the second kernel writes them there, the third the padding.
 """
 
 from __future__ import annotations
@@ -15,13 +15,14 @@ import triton.language as tl
 from torch import Tensor
 
 from devrf.ops.corners import Corners, scales, shape_of
-from devrf.ops.kernels.cells import cell, scalar_at
+from devrf.ops.kernels.cells import cell, scalar_at, store_vectors
 from devrf.ops.kernels.launch import launch
 from devrf.ops.kernels.numbers import opacity, softplus
 from devrf.ops.kernels.warped_depth import displaced
 
-# Samples that a program looks at together: one for each thread of its only warp.
+# A program is one warp, which tests one sample for each of its threads at a time.
 LANES = 32
+WARP = {"LANES": LANES, "num_warps": 1}
 PADDING_BLOCK = 1024
 
 
@@ -50,7 +51,7 @@ def find_samples_on_device(
     device, rays = origins.device, len(origins)
     origins, directions = origins.contiguous(), directions.contiguous()
     entry, density = entry.contiguous(), density.contiguous()
-    # The kernel takes two slices; with fewer the density fills in, and is not read as a slice.
+    # The kernel takes two slices; the density stands in for missing ones, which are not read.
     before, after = (frame.contiguous() for frame in ([*slices, density, density])[:2])
     stride = triton.cdiv(longest, LANES) * LANES
     marks = torch.empty(rays, stride, dtype=torch.uint8, device=device)
@@ -60,85 +61,46 @@ def find_samples_on_device(
     points = torch.empty(capacity, 3, dtype=torch.float32, device=device)
     significant = torch.empty(capacity, dtype=torch.uint8, device=device)
     ends = torch.zeros(rays + 1, dtype=torch.int64, device=device)
+    along = (origins, directions, entry)
+    shapes = (shape_of(mask), shape_of(before), shape_of(density))
     launch(
         march_kernel,
         rays,
         origins,
-        origins,
-        directions,
-        entry,
-        count.contiguous(),
-        mask.contiguous().view(torch.uint8),
-        density,
-        before,
-        after,
-        marks,
-        kept,
-        reached,
-        longest,
-        stride,
-        step,
-        weight,
-        shift,
-        delta,
-        *thresholds,
-        *mask_box.low,
-        *scales(mask_box, shape_of(mask)),
-        *box.low,
-        *scales(box, shape_of(before)),
-        *scales(box, shape_of(density)),
-        *shape_of(mask),
-        *shape_of(before),
-        *shape_of(density),
+        *(*along, count.contiguous()),
+        *(mask.contiguous().view(torch.uint8), density, before, after),
+        *(marks, kept, reached, longest, stride),
+        *(step, weight, shift, delta, *thresholds),
+        *(*mask_box.low, *scales(mask_box, shapes[0])),
+        *(*box.low, *scales(box, shapes[1]), *scales(box, shapes[2])),
+        *(points for shape in shapes for points in shape),
         SLICES=len(slices),
-        LANES=LANES,
-        num_warps=1,
+        **WARP,
     )
     torch.cumsum(kept, 0, out=ends[1:])
     first = ends.clamp(max=capacity)
-    launch(
-        list_kernel,
-        rays,
-        origins,
-        origins,
-        directions,
-        entry,
-        marks,
-        reached,
-        first,
-        ray,
-        distance,
-        points,
-        significant,
-        stride,
-        capacity,
-        step,
-        LANES=LANES,
-        num_warps=1,
-    )
-    launch(
-        pad_kernel,
-        triton.cdiv(capacity, PADDING_BLOCK),
-        origins,
-        first,
-        ray,
-        distance,
-        points,
-        significant,
-        rays,
-        capacity,
-        BLOCK=PADDING_BLOCK,
-    )
+    found = (ray, distance, points, significant)
+    counts = (marks, reached, first)
+    launch(list_kernel, rays, origins, *along, *counts, *found, stride, capacity, step, **WARP)
+    programs = triton.cdiv(capacity, PADDING_BLOCK)
+    launch(pad_kernel, programs, origins, first, *found, rays, capacity, BLOCK=PADDING_BLOCK)
     total = ends[-1]
     overflow = (total > capacity) | (count > longest).any()
     return ray, distance, points, significant.view(torch.bool), first, total, overflow
 
 
 @triton.jit
+def vector(vectors, number):
+    """The components of one vector."""
+    at = vectors + number * 3
+    return tl.load(at), tl.load(at + 1), tl.load(at + 2)
+
+
+@triton.jit
 def nearest(coordinate, points):
     """The nearest grid point along an axis, halves to the even one; −1 or ``points`` outside.
 
-    One that is no number is outside.
+    NaN is outside.
     """
     coordinate = tl.where(coordinate > -1.0, tl.minimum(coordinate, points * 1.0), -1.0)
     low = tl.floor(coordinate)
@@ -158,21 +120,10 @@ def occupied(mask, cx, cy, cz, x, y, z, here):
     return tl.load(mask + (i * y + j) * z + k, mask=here, other=0) != 0
 
 
-@triton.jit(
-    do_not_specialize=[
-        "longest",
-        "stride",
-        "mask_x",
-        "mask_y",
-        "mask_z",
-        "slice_x",
-        "slice_y",
-        "slice_z",
-        "density_x",
-        "density_y",
-        "density_z",
-    ]
-)
+SIZES = [f"{grid}_{axis}" for grid in ("mask", "slice", "density") for axis in "xyz"]
+
+
+@triton.jit(do_not_specialize=["longest", "stride", *SIZES])
 def march_kernel(
     origins,
     directions,
@@ -221,23 +172,19 @@ def march_kernel(
     SLICES: tl.constexpr,
     LANES: tl.constexpr,
 ):
-    """Marks each sample of a ray (0 dropped, 1 kept, 2 significant); counts kept and looked at."""
+    """Marks each sample of a ray (0 dropped, 1 kept, 2 significant); counts kept and tested."""
     ray = tl.program_id(0)
-    ox = tl.load(origins + ray * 3)
-    oy = tl.load(origins + ray * 3 + 1)
-    oz = tl.load(origins + ray * 3 + 2)
-    dx = tl.load(directions + ray * 3)
-    dy = tl.load(directions + ray * 3 + 1)
-    dz = tl.load(directions + ray * 3 + 2)
+    ox, oy, oz = vector(origins, ray)
+    dx, dy, dz = vector(directions, ray)
     begin = tl.load(entry + ray)
     samples = tl.minimum(tl.load(count + ray).to(tl.int32), longest)
     into = marks + ray.to(tl.int64) * stride
     lane = tl.arange(0, LANES)
-    looked = 0
+    tested = 0
     number = 0
     depth = 0.0
-    while (looked < samples) & (tl.exp(-depth) >= stop):
-        sample = looked + lane
+    while (tested < samples) & (tl.exp(-depth) >= stop):
+        sample = tested + lane
         at = begin + step * sample.to(tl.float32)
         px = ox + dx * at
         py = oy + dy * at
@@ -278,7 +225,7 @@ def march_kernel(
             tau = softplus(raw + shift) * delta
             alpha = opacity(tau)
             opaque = there & (alpha >= alpha_threshold)
-            # Behind exp(−32) nothing is left; a longer sum would cost the digits of a shorter.
+            # Nothing is visible behind exp(−32); a larger sum would cost precision.
             tau = tl.where(opaque, tl.minimum(tau, 32.0), 0.0)
             left = tl.exp(-(depth + tl.cumsum(tau, 0) - tau))
             seen = opaque & (left >= stop)
@@ -287,9 +234,9 @@ def march_kernel(
             number += tl.sum(seen.to(tl.int32), 0)
             depth += tl.sum(tau, 0)
         tl.store(into + sample, mark)
-        looked += LANES
+        tested += LANES
     tl.store(kept + ray, number)
-    tl.store(reached + ray, looked)
+    tl.store(reached + ray, tested)
 
 
 @triton.jit(do_not_specialize=["stride", "capacity"])
@@ -309,22 +256,18 @@ def list_kernel(
     step,
     LANES: tl.constexpr,
 ):
-    """Writes a ray's marked samples one after another, from ``first`` on."""
+    """Writes a ray's kept samples one after another, from ``first`` on."""
     ray = tl.program_id(0)
-    ox = tl.load(origins + ray * 3)
-    oy = tl.load(origins + ray * 3 + 1)
-    oz = tl.load(origins + ray * 3 + 2)
-    dx = tl.load(directions + ray * 3)
-    dy = tl.load(directions + ray * 3 + 1)
-    dz = tl.load(directions + ray * 3 + 2)
+    ox, oy, oz = vector(origins, ray)
+    dx, dy, dz = vector(directions, ray)
     begin = tl.load(entry + ray)
     end = tl.load(reached + ray)
     free = tl.load(first + ray)
     from_ = marks + ray.to(tl.int64) * stride
     lane = tl.arange(0, LANES)
-    looked = 0
-    while (looked < end) & (free < capacity):
-        sample = looked + lane
+    tested = 0
+    while (tested < end) & (free < capacity):
+        sample = tested + lane
         mark = tl.load(from_ + sample).to(tl.int32)
         kept = (mark > 0).to(tl.int32)
         place = free + tl.cumsum(kept, 0) - kept
@@ -332,24 +275,20 @@ def list_kernel(
         at = begin + step * sample.to(tl.float32)
         tl.store(rays + place, (lane * 0 + ray).to(tl.int64), mask=fits)
         tl.store(distances + place, at, mask=fits)
-        tl.store(points + place * 3, ox + dx * at, mask=fits)
-        tl.store(points + place * 3 + 1, oy + dy * at, mask=fits)
-        tl.store(points + place * 3 + 2, oz + dz * at, mask=fits)
+        store_vectors(points, place * 3, ox + dx * at, oy + dy * at, oz + dz * at, fits)
         tl.store(significant + place, (mark > 1).to(tl.uint8), mask=fits)
         free += tl.sum(kept, 0)
-        looked += LANES
+        tested += LANES
 
 
 @triton.jit(do_not_specialize=["count", "capacity"])
 def pad_kernel(first, rays, distances, points, significant, count, capacity, BLOCK: tl.constexpr):
-    """Fills the places that no sample of the ``count`` rays has taken."""
+    """Fills the places behind the samples of the ``count`` rays."""
     place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     empty = (place >= tl.load(first + count)) & (place < capacity)
     nothing = tl.zeros((BLOCK,), dtype=tl.float32)
     at = place.to(tl.int64) * 3
     tl.store(rays + place, (place * 0 + count).to(tl.int64), mask=empty)
     tl.store(distances + place, nothing, mask=empty)
-    tl.store(points + at, nothing, mask=empty)
-    tl.store(points + at + 1, nothing, mask=empty)
-    tl.store(points + at + 2, nothing, mask=empty)
+    store_vectors(points, at, nothing, nothing, nothing, empty)
     tl.store(significant + place, nothing.to(tl.uint8), mask=empty)

@@ -1,8 +1,8 @@
 """Trilinear interpolation of a channels-last grid: rows of channels are loaded as vectors.
 
-A program does a block of points. A point's channels lie side by side in a tile whose width is
-the next power of two, so that threads next to each other read next to each other: four numbers
-each if rows can be cut in fours, else one.
+A program processes a block of points. Their channels form a tile whose width is the next power of
+two, so that neighbouring threads read neighbouring numbers: four each if the number of channels is
+a multiple of four, else one.
 """
 
 from __future__ import annotations
@@ -15,7 +15,15 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from devrf.ops.kernels.cells import cell, corner_row, inside, share
+from devrf.ops.kernels.cells import (
+    cell,
+    corner_row,
+    corner_weight,
+    inside,
+    load_vectors,
+    share,
+    store_vectors,
+)
 from devrf.ops.kernels.launch import launch
 
 THREADS = 128
@@ -28,21 +36,11 @@ class Interpolate(torch.autograd.Function):
     def forward(ctx: Any, grid: Tensor, coords: Tensor, gradient: Tensor | None) -> Tensor:
         ctx.save_for_backward(grid, coords)
         ctx.gradient = gradient
-        channels = grid.shape[3]
-        out = torch.empty(len(coords), channels, dtype=grid.dtype, device=grid.device)
-        padded, block = _tile(channels)
+        count, tile = len(coords), _tile(grid.shape[3])
+        out = grid.new_empty(count, grid.shape[3])
+        programs = triton.cdiv(count, tile["BLOCK"])
         launch(
-            interpolate_kernel,
-            triton.cdiv(len(coords), block),
-            grid,
-            grid,
-            coords,
-            out,
-            len(coords),
-            *grid.shape[:3],
-            CHANNELS=channels,
-            PADDED=padded,
-            BLOCK=block,
+            interpolate_kernel, programs, grid, grid, coords, out, count, *grid.shape[:3], **tile
         )
         return out
 
@@ -56,33 +54,27 @@ class Interpolate(torch.autograd.Function):
         if needs_grid:
             into = torch.zeros_like(grid) if ctx.gradient is None else ctx.gradient
         coords_gradient = torch.empty_like(coords) if needs_coords else None
-        channels = grid.shape[3]
-        padded, block = _tile(channels)
+        count, tile = len(coords), _tile(grid.shape[3])
         launch(
             interpolate_backward_kernel,
-            triton.cdiv(len(coords), block),
+            triton.cdiv(count, tile["BLOCK"]),
             grid,
-            grid,
-            coords,
-            upstream.contiguous(),
+            *(grid, coords, upstream.contiguous()),
             grid if into is None else into,
             coords if coords_gradient is None else coords_gradient,
-            len(coords),
-            *grid.shape[:3],
+            *(count, *grid.shape[:3]),
             NEEDS_GRID=needs_grid,
             NEEDS_COORDS=needs_coords,
-            CHANNELS=channels,
-            PADDED=padded,
-            BLOCK=block,
+            **tile,
         )
         return into if ctx.gradient is None else None, coords_gradient, None
 
 
-def _tile(channels: int) -> tuple[int, int]:
-    """Width of a tile for that many channels, and how many points it holds."""
+def _tile(channels: int) -> dict[str, int]:
+    """Constants of a kernel: channels, width of a tile, and how many points it holds."""
     padded = triton.next_power_of_2(channels)
     numbers = THREADS * (4 if channels % 4 == 0 else 1)
-    return padded, max(1, numbers // padded)
+    return {"CHANNELS": channels, "PADDED": padded, "BLOCK": max(1, numbers // padded)}
 
 
 @triton.jit(do_not_specialize=["count", "x", "y", "z"])
@@ -101,16 +93,16 @@ def interpolate_kernel(
     """out[m] = Σ_corners weight · grid[corner]."""
     point = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = point < count
-    at = coords + point.to(tl.int64) * 3
-    i, fx = cell(tl.load(at, mask=here, other=0.0), x)
-    j, fy = cell(tl.load(at + 1, mask=here, other=0.0), y)
-    k, fz = cell(tl.load(at + 2, mask=here, other=0.0), z)
+    cx, cy, cz = load_vectors(coords, point.to(tl.int64) * 3, here)
+    i, fx = cell(cx, x)
+    j, fy = cell(cy, y)
+    k, fz = cell(cz, z)
     channel = tl.arange(0, PADDED)
     wanted = here[:, None] & (channel < CHANNELS)[None, :]
     total = tl.zeros((BLOCK, PADDED), dtype=tl.float32)
     for corner in tl.static_range(8):
         row = corner_row(i, j, k, y, z, corner)
-        weight = share(fx, corner & 4) * share(fy, corner & 2) * share(fz, corner & 1)
+        weight = corner_weight(fx, fy, fz, corner)
         place = row[:, None] * CHANNELS + channel[None, :]
         total += weight[:, None] * tl.load(grid + place, mask=wanted, other=0.0)
     into = point.to(tl.int64)[:, None] * CHANNELS + channel[None, :]
@@ -138,9 +130,7 @@ def interpolate_backward_kernel(
     point = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = point < count
     at = point.to(tl.int64) * 3
-    cx = tl.load(coords + at, mask=here, other=0.0)
-    cy = tl.load(coords + at + 1, mask=here, other=0.0)
-    cz = tl.load(coords + at + 2, mask=here, other=0.0)
+    cx, cy, cz = load_vectors(coords, at, here)
     i, fx = cell(cx, x)
     j, fy = cell(cy, y)
     k, fz = cell(cz, z)
@@ -148,7 +138,7 @@ def interpolate_backward_kernel(
     wanted = here[:, None] & (channel < CHANNELS)[None, :]
     from_ = point.to(tl.int64)[:, None] * CHANNELS + channel[None, :]
     change = tl.load(upstream + from_, mask=wanted, other=0.0)
-    # Padding has no gradient: adding its zeros to one place would make a queue there.
+    # Padding has no gradient; atomic additions of its zeros to one place would be serialised.
     changed = wanted & (tl.max(tl.abs(change), axis=1) > 0.0)[:, None]
     along_x = fx * 0.0
     along_y = fx * 0.0
@@ -161,10 +151,7 @@ def interpolate_backward_kernel(
         place = row[:, None] * CHANNELS + channel[None, :]
         if NEEDS_GRID:
             tl.atomic_add(
-                grid_gradient + place,
-                (wx * wy * wz)[:, None] * change,
-                mask=changed,
-                sem="relaxed",
+                grid_gradient + place, (wx * wy * wz)[:, None] * change, mask=changed, sem="relaxed"
             )
         if NEEDS_COORDS:
             value = tl.load(grid + place, mask=wanted, other=0.0)
@@ -173,6 +160,7 @@ def interpolate_backward_kernel(
             along_y += wx * wz * (agreed if corner & 2 else -agreed)
             along_z += wx * wy * (agreed if corner & 1 else -agreed)
     if NEEDS_COORDS:
-        tl.store(coords_gradient + at, along_x * inside(cx, x), mask=here)
-        tl.store(coords_gradient + at + 1, along_y * inside(cy, y), mask=here)
-        tl.store(coords_gradient + at + 2, along_z * inside(cz, z), mask=here)
+        along_x *= inside(cx, x)
+        along_y *= inside(cy, y)
+        along_z *= inside(cz, z)
+        store_vectors(coords_gradient, at, along_x, along_y, along_z, here)

@@ -1,7 +1,7 @@
 """Warp, density and optical depth of points in one pass; their gradients in another.
 
-A thread does a point: the three components of a displacement lie in one sector of memory, and the
-grids' rows that neighbours along a ray share come from the cache.
+A thread processes a point: the three components of a displacement lie in one sector of memory, and
+neighbouring points of a ray find the grid rows that they share in the cache.
 """
 
 from __future__ import annotations
@@ -16,7 +16,16 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from devrf.ops.corners import Corners, scales, shape_of
-from devrf.ops.kernels.cells import cell, corner_row, inside, scalar_at, scalar_slope, share
+from devrf.ops.kernels.cells import (
+    cell,
+    corner_row,
+    corner_weight,
+    inside,
+    load_vectors,
+    scalar_at,
+    scalar_slope,
+    store_vectors,
+)
 from devrf.ops.kernels.launch import launch
 from devrf.ops.kernels.numbers import sigmoid, softplus
 
@@ -36,7 +45,7 @@ def warped_depth_in_one_pass(
 ) -> tuple[Tensor, Tensor]:
     """As devrf.ops.warped_depth.warped_depth; a gradient buffer for each slice, or None."""
     density = density.contiguous()
-    # The kernel takes two slices; with fewer the density fills in, and is not read as a slice.
+    # The kernel takes two slices; the density stands in for missing ones, which are not read.
     before, after = (frame.contiguous() for frame in ([*slices, density, density])[:2])
     buffers = (density_gradient, *([*slice_gradients, None, None])[:2])
     numbers = (
@@ -70,20 +79,12 @@ class WarpedDepth(torch.autograd.Function):
         buffers: tuple[Tensor | None, ...],
     ) -> tuple[Tensor, Tensor]:
         count = len(points)
-        warped = torch.empty_like(points)
-        tau = torch.empty(count, dtype=points.dtype, device=points.device)
+        warped, tau = torch.empty_like(points), points.new_empty(count)
         launch(
             warped_depth_kernel,
             triton.cdiv(count, BLOCK),
             points,
-            points,
-            density,
-            before,
-            after,
-            warped,
-            tau,
-            count,
-            *numbers,
+            *(points, density, before, after, warped, tau, count, *numbers),
             SLICES=slices,
             BLOCK=BLOCK,
         )
@@ -95,41 +96,31 @@ class WarpedDepth(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, warped_gradient: Tensor, tau_gradient: Tensor) -> tuple[Any, ...]:
         points, density, before, after, warped = ctx.saved_tensors
-        grids = (density, before, after)
         used = (True, ctx.slices > 0, ctx.slices > 1)
-        needs = [
-            there and (asked or buffer is not None)
-            for there, asked, buffer in zip(
-                used, ctx.needs_input_grad[1:4], ctx.buffers, strict=True
-            )
-        ]
-        own = [
-            torch.zeros_like(grid) if need and buffer is None else None
-            for grid, need, buffer in zip(grids, needs, ctx.buffers, strict=True)
-        ]
-        into = [
-            grid if not need else buffer if buffer is not None else fresh
-            for grid, need, buffer, fresh in zip(grids, needs, ctx.buffers, own, strict=True)
-        ]
+        needs, gradients, into = [], [], []
+        for grid, asked, buffer, is_used in zip(
+            (density, before, after), ctx.needs_input_grad[1:4], ctx.buffers, used, strict=True
+        ):
+            need = is_used and (asked or buffer is not None)
+            own = torch.zeros_like(grid) if need and buffer is None else None
+            needs.append(need)
+            gradients.append(own)
+            # Any pointer where no gradient is needed.
+            into.append(grid if not need else buffer if own is None else own)
+        upstream = (warped_gradient.contiguous(), tau_gradient.contiguous())
         launch(
             warped_depth_backward_kernel,
             triton.cdiv(len(points), BLOCK),
             points,
-            points,
-            density,
-            warped,
-            warped_gradient.contiguous(),
-            tau_gradient.contiguous(),
-            *into,
-            len(points),
-            *ctx.numbers,
+            *(points, density, warped, *upstream),
+            *(*into, len(points), *ctx.numbers),
             NEEDS_DENSITY=needs[0],
             NEEDS_BEFORE=needs[1],
             NEEDS_AFTER=needs[2],
             TWO=ctx.slices > 1,
             BLOCK=BLOCK,
         )
-        return None, *own, None, None, None
+        return None, *gradients, None, None, None
 
 
 @triton.jit
@@ -140,14 +131,13 @@ def displaced(before, after, weight, px, py, pz, cx, cy, cz, x, y, z, here, SLIC
     k, fz = cell(cz, z)
     for corner in tl.static_range(8):
         place = corner_row(i, j, k, y, z, corner) * 3
-        part = share(fx, corner & 4) * share(fy, corner & 2) * share(fz, corner & 1)
-        dx = tl.load(before + place, mask=here, other=0.0)
-        dy = tl.load(before + place + 1, mask=here, other=0.0)
-        dz = tl.load(before + place + 2, mask=here, other=0.0)
+        part = corner_weight(fx, fy, fz, corner)
+        dx, dy, dz = load_vectors(before, place, here)
         if SLICES == 2:
-            dx += weight * (tl.load(after + place, mask=here, other=0.0) - dx)
-            dy += weight * (tl.load(after + place + 1, mask=here, other=0.0) - dy)
-            dz += weight * (tl.load(after + place + 2, mask=here, other=0.0) - dz)
+            ex, ey, ez = load_vectors(after, place, here)
+            dx += weight * (ex - dx)
+            dy += weight * (ey - dy)
+            dz += weight * (ez - dz)
         px += part * dx
         py += part * dy
         pz += part * dz
@@ -191,9 +181,7 @@ def warped_depth_kernel(
     point = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = point < count
     at = point.to(tl.int64) * 3
-    qx = tl.load(points + at, mask=here, other=0.0)
-    qy = tl.load(points + at + 1, mask=here, other=0.0)
-    qz = tl.load(points + at + 2, mask=here, other=0.0)
+    qx, qy, qz = load_vectors(points, at, here)
     if SLICES > 0:
         qx, qy, qz = displaced(
             before,
@@ -211,9 +199,7 @@ def warped_depth_kernel(
             here,
             SLICES,
         )
-    tl.store(warped + at, qx, mask=here)
-    tl.store(warped + at + 1, qy, mask=here)
-    tl.store(warped + at + 2, qz, mask=here)
+    store_vectors(warped, at, qx, qy, qz, here)
     i, fx = cell((qx - low_x) * density_scale_x, density_x)
     j, fy = cell((qy - low_y) * density_scale_y, density_y)
     k, fz = cell((qz - low_z) * density_scale_z, density_z)
@@ -260,9 +246,10 @@ def warped_depth_backward_kernel(
     point = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = point < count
     at = point.to(tl.int64) * 3
-    cx = (tl.load(warped + at, mask=here, other=0.0) - low_x) * density_scale_x
-    cy = (tl.load(warped + at + 1, mask=here, other=0.0) - low_y) * density_scale_y
-    cz = (tl.load(warped + at + 2, mask=here, other=0.0) - low_z) * density_scale_z
+    qx, qy, qz = load_vectors(warped, at, here)
+    cx = (qx - low_x) * density_scale_x
+    cy = (qy - low_y) * density_scale_y
+    cz = (qz - low_z) * density_scale_z
     i, fx = cell(cx, density_x)
     j, fy = cell(cy, density_y)
     k, fz = cell(cz, density_z)
@@ -273,62 +260,40 @@ def warped_depth_backward_kernel(
     if NEEDS_DENSITY:
         for corner in tl.static_range(8):
             row = corner_row(i, j, k, density_y, density_z, corner)
-            part = share(fx, corner & 4) * share(fy, corner & 2) * share(fz, corner & 1)
-            # Padding has no gradient: adding its zeros to one place would make a queue there.
+            part = corner_weight(fx, fy, fz, corner)
+            # Padding has no gradient; atomic additions of its zeros would be serialised.
             tl.atomic_add(
                 density_into + row, part * change, mask=here & (change != 0.0), sem="relaxed"
             )
     if NEEDS_BEFORE or NEEDS_AFTER:
-        gx = tl.load(warped_gradient + at, mask=here, other=0.0)
-        gy = tl.load(warped_gradient + at + 1, mask=here, other=0.0)
-        gz = tl.load(warped_gradient + at + 2, mask=here, other=0.0)
+        gx, gy, gz = load_vectors(warped_gradient, at, here)
         gx += change * along_x * inside(cx, density_x) * density_scale_x
         gy += change * along_y * inside(cy, density_y) * density_scale_y
         gz += change * along_z * inside(cz, density_z) * density_scale_z
-        px = (tl.load(points + at, mask=here, other=0.0) - low_x) * slice_scale_x
-        py = (tl.load(points + at + 1, mask=here, other=0.0) - low_y) * slice_scale_y
-        pz = (tl.load(points + at + 2, mask=here, other=0.0) - low_z) * slice_scale_z
+        px, py, pz = load_vectors(points, at, here)
+        px = (px - low_x) * slice_scale_x
+        py = (py - low_y) * slice_scale_y
+        pz = (pz - low_z) * slice_scale_z
         if NEEDS_BEFORE:
             own = 1.0 - weight if TWO else 1.0
-            scatter_displacement(
-                before_into,
-                px,
-                py,
-                pz,
-                gx * own,
-                gy * own,
-                gz * own,
-                slice_x,
-                slice_y,
-                slice_z,
-                here,
-            )
+            scatter(before_into, own, px, py, pz, gx, gy, gz, slice_x, slice_y, slice_z, here)
         if NEEDS_AFTER:
-            scatter_displacement(
-                after_into,
-                px,
-                py,
-                pz,
-                gx * weight,
-                gy * weight,
-                gz * weight,
-                slice_x,
-                slice_y,
-                slice_z,
-                here,
-            )
+            scatter(after_into, weight, px, py, pz, gx, gy, gz, slice_x, slice_y, slice_z, here)
 
 
 @triton.jit
-def scatter_displacement(into, cx, cy, cz, gx, gy, gz, x, y, z, here):
-    """Add the gradients (gx, gy, gz) of a displacement at grid coordinates to eight rows."""
+def scatter(into, weight, cx, cy, cz, gx, gy, gz, x, y, z, here):
+    """Add ``weight`` times the gradients (gx, gy, gz) at grid coordinates to eight rows."""
     i, fx = cell(cx, x)
     j, fy = cell(cy, y)
     k, fz = cell(cz, z)
+    gx = gx * weight
+    gy = gy * weight
+    gz = gz * weight
     here = here & ((gx != 0.0) | (gy != 0.0) | (gz != 0.0))
     for corner in tl.static_range(8):
         place = corner_row(i, j, k, y, z, corner) * 3
-        part = share(fx, corner & 4) * share(fy, corner & 2) * share(fz, corner & 1)
+        part = corner_weight(fx, fy, fz, corner)
         tl.atomic_add(into + place, part * gx, mask=here, sem="relaxed")
         tl.atomic_add(into + place + 1, part * gy, mask=here, sem="relaxed")
         tl.atomic_add(into + place + 2, part * gz, mask=here, sem="relaxed")
