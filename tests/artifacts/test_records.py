@@ -11,20 +11,8 @@ import pytest
 import torch
 
 import devrf
-from devrf.artifacts.records import (
-    git_revision,
-    mean_scores,
-    parameter_count,
-    peak_host_memory,
-    provenance,
-    write_frames,
-)
-from devrf.checkpoints.checkpoint import LoadedCheckpoint
+from devrf.artifacts.records import git_revision, mean_scores, provenance, write_frames
 from devrf.evaluation.held_out import HeldOutView
-from devrf.geometry.clock import FrameClock
-from devrf.methods.devrf.deformation_field import DeformationField
-
-HOST = torch.device("cpu")
 
 
 def view(name: str, time: float, psnr: float, **further: float | None) -> HeldOutView:
@@ -61,31 +49,13 @@ def test_frames_read_back(tmp_path: Path) -> None:
     assert {(row["depth_error"], row["flow_error"]) for row in rows[1:]} == {("", "1.5")}
 
 
-def test_provenance_is_plain_data(rest: LoadedCheckpoint) -> None:
-    found = provenance(rest.model, HOST)
+def test_provenance_is_plain_data() -> None:
+    found = provenance(12, torch.device("cpu"))
     assert json.loads(json.dumps(found)) == found
-    assert {"lightning", "python", "git", "parameters", "peak_host_gb"} < set(found)
+    assert {"lightning", "python", "git", "peak_host_gb"} < set(found)
     assert found["devrf"] == devrf.__version__ and found["torch"] == torch.__version__
-    assert found["device"]
+    assert found["device"] and found["parameters"] == 12
     assert found["date"].endswith("+00:00")
-
-
-def test_learned_values_are_counted_by_hand(rest: LoadedCheckpoint) -> None:
-    model = rest.model
-    grids = [model.canonical.density.values, model.canonical.color.values]
-    decoder = sum(p.numel() for p in model.canonical.decoder.parameters())
-    at_rest = sum(grid.numel() for grid in grids) + decoder
-    assert parameter_count(model) == at_rest
-    field = DeformationField(model.canonical.box, FrameClock((0.0, 0.5, 1.0)), voxels=27)
-    model.deformation = field
-    # Three frames, to canonical space and back, three coordinates a voxel.
-    voxels = field.shape[0] * field.shape[1] * field.shape[2]
-    assert parameter_count(model) == at_rest + 3 * 2 * 3 * voxels
-
-
-def test_peak_memory_is_that_of_a_process_with_torch() -> None:
-    peak = peak_host_memory()
-    assert peak is None or 0.05 < peak < 100
 
 
 def test_the_revision_is_that_of_a_checkout(tmp_path: Path) -> None:
