@@ -20,9 +20,9 @@ from devrf.artifacts.colors import (
     flow_wheel,
     to_bytes,
 )
-from devrf.artifacts.contact_sheet import GAP, write_contact_sheet
+from devrf.artifacts.contact_sheet import write_contact_sheet
 from devrf.artifacts.film import WATCHABLE, FilmSettings, film_bytes, pictures, write_video
-from devrf.artifacts.images import short_name
+from devrf.artifacts.images import GAP, short_name
 from devrf.evaluation.held_out import HeldOutView
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras

@@ -10,9 +10,9 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
+from devrf.artifacts.images import evenly
 from devrf.artifacts.inspection.camera_plot import box_edges, compass, frusta, scene_lines
 from devrf.artifacts.inspection.picture import (
-    evenly,
     flow_scale,
     inspection_figure,
     sample_images,

@@ -15,7 +15,7 @@ from PIL import Image
 from torch import Tensor
 
 from devrf.artifacts.colors import flow_colors, flow_wheel, to_bytes
-from devrf.artifacts.images import short_name
+from devrf.artifacts.images import evenly, short_name
 from devrf.artifacts.inspection.camera_plot import draw_cameras, first_images
 from devrf.scenes.optical_flow import frame_pairs
 from devrf.scenes.scene import OpticalFlow, Scene, Views
@@ -166,11 +166,6 @@ def sample_images(views: Views) -> list[list[int]]:
         own = [image for image in order if int(views.view[image]) == numbers[k]]
         rows.append([own[j] for j in evenly(len(own), COLUMNS)])
     return rows
-
-
-def evenly(count: int, most: int) -> list[int]:
-    """At most ``most`` of the positions 0 … count − 1, evenly spread, both ends among them."""
-    return [round(k) for k in np.linspace(0, count - 1, min(count, most))]
 
 
 def flow_scale(flow: OpticalFlow) -> float:
