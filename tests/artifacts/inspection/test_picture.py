@@ -54,14 +54,14 @@ def captions(figure: Figure) -> list[str]:
 
 
 def headings(figure: Figure) -> str:
-    return "\n".join(text.get_text() for text in figure.texts)
+    return "\n".join(part.get_suptitle() for part in figure.subfigs)
 
 
 def test_the_page_of_a_scene(tiny_scene: Scene) -> None:
     figure = inspection_figure(tiny_scene)
     for part in ("robot, inward-facing", "set: 8 images", "2 fixed views, 3 times", "Optical flow"):
         assert part in headings(figure)
-    (legend,) = figure.legends
+    (legend,) = figure.subfigs[0].legends
     labels = [text.get_text() for text in legend.get_texts()]
     assert {"box", "room for motion", "static views (8)", "dynamic views (2)"} <= set(labels)
     plan = {text.get_text() for text in figure.axes[1].texts}

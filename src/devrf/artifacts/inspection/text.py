@@ -11,16 +11,7 @@ from devrf.artifacts.inspection.report import FlowFacts, Inspection, ViewsFacts
 from devrf.artifacts.tables import titled_table
 from devrf.geometry.box import Box
 
-HEADING = (
-    "set",
-    "images",
-    "views x times",
-    "size",
-    "alpha masks",
-    "masks",
-    "focal length",
-    "distance",
-)
+HEADING = "set,images,views x times,size,alpha masks,masks,focal length,distance".split(",")
 
 
 def inspection_text(found: Inspection, requirements: Sequence[Sequence[str]]) -> RenderableType:
@@ -46,12 +37,12 @@ def inspection_text(found: Inspection, requirements: Sequence[Sequence[str]]) ->
 
 def _facts(found: Inspection) -> list[tuple[str, str]]:
     scene, bounds, times = found.scene, found.scene.bounds, found.times
+    spacing = "evenly spaced" if found.even else "unevenly spaced"
     unit = "NDC" if scene.kind == "forward" else "world units"
-    spacing = "evenly spaced" if times.even else "unevenly spaced"
     motion = "" if bounds.motion is None else f"{_box(bounds.motion)}, "
     rows = [
         ("scene", f"{scene.name}, {scene.kind}-facing, {scene.background} background"),
-        ("times", f"{times.count} from {times.first:g} to {times.last:g}, {spacing}"),
+        ("times", f"{len(times)} from {times[0]:g} to {times[-1]:g}, {spacing}"),
         ("near, far", f"{bounds.near:.4g}, {bounds.far:.4g} ({unit})"),
         ("box", _box(bounds.box)),
         ("room for motion", f"{motion}{bounds.source}"),
@@ -81,12 +72,12 @@ def _flow(flow: FlowFacts | None) -> str:
 def _images(facts: ViewsFacts) -> tuple[str, ...]:
     least, most = facts.focal
     near, mean, far = facts.distance
-    alpha, masked = facts.alpha_share, facts.masked_share
+    alpha, masked, views = facts.alpha_share, facts.masked_share, facts.views
     return (
         facts.name,
-        str(facts.images),
-        f"{facts.views} x {facts.frames}",
-        f"{facts.width} x {facts.height}",
+        str(len(views)),
+        f"{facts.cameras} x {facts.frames}",
+        f"{views.width} x {views.height}",
         "no" if alpha is None else f"cover {_percent(alpha)}",
         "no" if masked is None else f"leave out {_percent(masked)}",
         f"{least:.0f} px" if most - least < 0.5 else f"{least:.0f} to {most:.0f} px",
