@@ -63,7 +63,8 @@ def inspection_figure(scene: Scene) -> Figure:
     heights = [CAMERAS, *(HEADING + len(rows) * (tile + CAPTION) for _, rows in sections)]
     with matplotlib.rc_context(STYLE):
         figure = Figure((WIDTH, sum(heights)), dpi=100)
-        cameras, *parts = figure.subfigures(len(heights), height_ratios=heights)
+        areas = figure.subfigures(len(heights), squeeze=False, height_ratios=heights)
+        cameras, *parts = areas.flat
         _title(cameras, f"{scene.name}, {scene.kind}-facing", fontsize=24, fontweight="bold")
         side = cameras.add_axes((0, 0.1, 0.49, 0.78), projection="3d", title="in perspective")
         plan = cameras.add_axes((0.53, 0.13, 0.43, 0.75))

@@ -110,7 +110,7 @@ def _views_facts(name: str, views: Views, middle: Tensor) -> ViewsFacts:
     return ViewsFacts(
         name,
         views,
-        cameras=len(views.view.unique()),
+        cameras=len(set(views.view.tolist())),
         frames=len(_distinct_times(views)),
         alpha_share=None if alpha is None else mean_share(alpha),
         masked_share=None if masked is None else mean_share(masked),
