@@ -22,14 +22,10 @@ from devrf.artifacts.colors import (
 )
 from devrf.artifacts.contact_sheet import write_contact_sheet
 from devrf.artifacts.film import WATCHABLE, FilmSettings, film_bytes, pictures, write_video
-from devrf.artifacts.images import GAP, short_name
+from devrf.artifacts.images import GAP, evenly, short_name
 from devrf.evaluation.held_out import HeldOutView
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
-from devrf.methods.devrf.architecture import Architecture
-from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.settings import RenderSettings
-from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.renderer import Renderer
 
 
@@ -54,9 +50,8 @@ def test_depth_is_bright_near_dark_far_and_white_where_nothing_is() -> None:
 
 
 def test_no_error_is_black_and_more_is_brighter_up_to_the_full_one() -> None:
-    truth = torch.zeros(1, 4, 3)
     prediction = torch.tensor([0.0, 0.1, 0.25, 0.9])[None, :, None].expand(1, 4, 3)
-    light = error_colors(prediction, truth).sum(dim=-1)[0]
+    light = error_colors(prediction, torch.zeros(1, 4, 3)).sum(dim=-1)[0]
     assert light[0] < 0.1
     assert light[0] < light[1] < light[2] and light[2] == light[3]
 
@@ -111,7 +106,9 @@ def test_a_contact_sheet_shows_prediction_truth_and_error_of_spread_views(
             assert label.min() < 50 and label.max() == 255
 
 
-def test_of_a_long_name_the_end_is_shown() -> None:
+def test_names_and_positions() -> None:
+    assert evenly(3, 6) == [0, 1, 2]
+    assert evenly(50, 6) == [0, 10, 20, 29, 39, 49]
     assert short_name("folder/r_000.png") == "r_000.png"
     assert short_name(30 * "a" + "_000.png") == "…" + 21 * "a" + "_000.png"
 
@@ -162,23 +159,13 @@ def test_an_orbit_circles_the_box_at_the_cameras_distance(cube: Box) -> None:
     torch.testing.assert_close(cameras.forwards, toward)
 
 
-def test_pictures_show_colour_beside_depth_while_time_runs(cube: Box) -> None:
-    build = Architecture()
-    canonical = build.search_field(cube, 5**3)
-    with torch.no_grad():
-        canonical.density.values[2, 2, 2] = 60.0
-        canonical.color.values.copy_(torch.tensor([9.0, -9.0, -9.0]).expand(5, 5, 5, 3))
-    settings = RenderSettings(0.5, 1e-4, 0.0, 9.0)
-    model = DeVRFModel(build, canonical, Occupancy.full((5, 5, 5), cube), settings)
-    shown = list(pictures(Renderer(model), ring(3), 1.0))
-    assert len(shown) == 3
-    for image in shown:
-        assert image.shape == (10, 30, 3)
-        # A red thing in the middle, white around it; its depth is not white.
-        assert image[5, 7, 0] > 0.95 and image[5, 7, 1] < 0.05
-        torch.testing.assert_close(image[0, 0], torch.ones(3))
-        torch.testing.assert_close(image[0, 15], torch.ones(3))
-        assert image[5, 22].min() < 0.9
+def test_pictures_show_colour_beside_depth_while_time_runs(moving, reference) -> None:
+    camera = ring(1)
+    shown = list(pictures(Renderer(moving), camera[[0, 0, 0]], 1.0))
+    assert [tuple(image.shape) for image in shown] == [(10, 30, 3)] * 3
+    for image, time in zip(shown, (0.0, 0.5, 1.0), strict=True):
+        seen = reference(moving, camera.image_rays(0), time, torch.ones(3))
+        torch.testing.assert_close(image[:, :15].reshape(-1, 3), seen.color, atol=1e-5, rtol=0)
 
 
 def test_a_video_is_no_larger_than_was_said(rest, tiny_scene, tmp_path):
