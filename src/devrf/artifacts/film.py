@@ -68,13 +68,9 @@ def pictures(renderer: Renderer, cameras: Cameras, background: float) -> Iterato
 
 
 def write_video(path: Path, images: Iterator[Tensor], fps: int, *, least: int = WATCHABLE) -> None:
-    """Write images (H, W, 3) in [0, 1] of one size as an mp4 (H.264).
+    """Write images (H, W, 3) in [0, 1] of one size as an mp4 (H.264), ``fps`` a second.
 
-    Args:
-        path: the file.
-        images: one after another.
-        fps: images a second.
-        least: images of less than this height are enlarged by a whole factor.
+    Images less than ``least`` pixels high are enlarged by a whole factor.
     """
     with atomic_write(path) as partial:
         writer = imageio.get_writer(

@@ -115,13 +115,9 @@ def number(value: Any) -> float:
 
 
 def metric_over_time(path: Path, metric: str) -> pd.Series:
-    """A metric of the held-out dynamic images by time in [0, 1], means where views share a time.
+    """A column of a run's ``frames.csv`` by time in [0, 1]: means over the dynamic test views.
 
-    Empty where the run's ``frames.csv`` has none.
-
-    Args:
-        path: the run's folder.
-        metric: a column of ``frames.csv``: ``psnr``.
+    Empty where the run has no such values.
     """
     try:
         frames = pd.read_csv(path / "frames.csv")

@@ -25,7 +25,7 @@ class Column:
         higher_is_better: else lower is.
         digits: after the point; None: a time in the unit that reads best.
         of_hardware: whether values of different devices cannot be compared.
-        why_missing: why no run may have it.
+        why_missing: the explanation where no run has a value.
     """
 
     title: str
@@ -110,8 +110,8 @@ def tabulate(found: Collection, published_scenes: PublishedScenes = "matching") 
 
     Args:
         found: finished runs and failures.
-        published_scenes: which of the paper's rows stand beside them: those of the scenes that
-            were run, all, or none.
+        published_scenes: which of the paper's rows to show: of the scenes that were run, all, or
+            none.
     """
     scored = found.runs[PSNR.key].map(number).notna()
     runs = labelled(found.runs[scored])

@@ -11,8 +11,7 @@ from rich.console import Console
 
 from devrf.artifacts.inspection.advice import Advice
 from devrf.artifacts.inspection.report import FlowFacts, inspect_scene
-from devrf.artifacts.inspection.text import inspection_text
-from devrf.artifacts.tables import as_text
+from devrf.artifacts.inspection.text import as_text, inspection_text
 from devrf.geometry.box import Box
 from devrf.scenes.scene import OpticalFlow, Scene
 

@@ -1,4 +1,4 @@
-"""What a scene holds, as data: found without training."""
+"""Facts of a scene, found without training."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class FlowFacts:
 
 @dataclass(frozen=True)
 class Inspection:
-    """All that is known of a scene before anything is learned.
+    """Facts of a scene, and what may be wrong with it.
 
     Attributes:
         scene: the scene itself: name, kind, background, bounds.
