@@ -66,13 +66,10 @@ def test_failures_alone_are_a_report(runs, failed):
     ).path.read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("damaged", [False, True])
-def test_no_runs_are_an_error_and_nothing_is_written(runs, damaged):
-    if damaged:
-        (runs / "metrics.json").write_text("{")
-    with pytest.raises(DevrfError, match="report.runs: no finished run below") as error:
+def test_damaged_runs_alone_are_an_error_and_nothing_is_written(runs):
+    (runs / "metrics.json").write_text("{")
+    with pytest.raises(DevrfError, match="report.runs: no finished run below .*damaged"):
         write_report(ReportSettings(runs))
-    assert ("damaged" in str(error.value)) == damaged and "\n" not in str(error.value)
     assert not (runs / "report").exists()
 
 
