@@ -96,14 +96,14 @@ def collect(folder: Path) -> Collection:
             (place / "failure.json", "failed", _failed),
             (place / "metrics.json", "finished", _finished),
         ):
+            if not file.is_file():
+                continue
             try:
-                record = read(file.read_bytes()) if file.is_file() else {}
+                record = read(file.read_bytes())
             except (OSError, ValidationError) as error:
                 skipped.append(f"{file}: skipped; {_reason(error)}")
-                continue
-            if record:
-                own = {"folder": name, "path": place, "status": status}
-                records[status].append({**record, **own})
+            else:
+                records[status].append({**record, "folder": name, "path": place, "status": status})
     runs, failures = _frame(records["finished"]), _frame(records["failed"])
     return Collection(folder, runs, failures, tuple(skipped))
 
