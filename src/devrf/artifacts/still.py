@@ -43,9 +43,9 @@ class StillSettings:
         Raises:
             DevrfError: the scene has no such camera.
         """
-        held_out = self.view == "held_out"
-        captured = scene.dynamic.test if held_out else scene.static.train
-        index = 0 if self.view == "held_out" else self.view
+        captured, index = scene.dynamic.test, 0
+        if isinstance(self.view, int):
+            captured, index = scene.static.train, self.view
         if not 0 <= index < len(captured):
             some = f"expected held_out or 0 to {len(scene.static.train) - 1}, not {self.view}"
             raise DevrfError(f"still.view: {some}")
