@@ -20,16 +20,12 @@ from devrf.artifacts.colors import (
     flow_wheel,
     to_bytes,
 )
-from devrf.artifacts.contact_sheet import GAP, write_contact_sheet
+from devrf.artifacts.contact_sheet import write_contact_sheet
 from devrf.artifacts.film import WATCHABLE, FilmSettings, film_bytes, pictures, write_video
-from devrf.artifacts.images import short_name
+from devrf.artifacts.images import GAP, evenly, short_name
 from devrf.evaluation.held_out import HeldOutView
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
-from devrf.methods.devrf.architecture import Architecture
-from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.settings import RenderSettings
-from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.renderer import Renderer
 
 
@@ -45,20 +41,14 @@ def test_bytes_are_rounded_and_clamped() -> None:
 def test_depth_is_bright_near_dark_far_and_white_where_nothing_is() -> None:
     depth = torch.tensor([[1.0, 1.5, 2.0, 3.0, 0.0]])
     opacity = torch.tensor([[1.0, 1.0, 1.0, 1.0, 0.0]])
-    colors = depth_colors(depth, opacity, near=1.0, far=2.0)
-    assert colors.shape == (1, 5, 3)
-    light = colors[0].mean(dim=1)
-    assert light[0] > light[1] > light[2]
-    torch.testing.assert_close(colors[0, 3], colors[0, 2])
-    assert torch.equal(colors[0, 4], torch.ones(3))
+    light = depth_colors(depth, opacity, near=1.0, far=2.0)[0].mean(dim=1)
+    assert light[4] == 1 > light[0] > light[1] > light[2] == light[3]
 
 
-def test_no_error_is_black_and_more_is_brighter_up_to_the_full_one() -> None:
-    truth = torch.zeros(1, 4, 3)
+def test_errors_are_black_to_white_up_to_a_quarter() -> None:
     prediction = torch.tensor([0.0, 0.1, 0.25, 0.9])[None, :, None].expand(1, 4, 3)
-    light = error_colors(prediction, truth).sum(dim=-1)[0]
-    assert light[0] < 0.1
-    assert light[0] < light[1] < light[2] and light[2] == light[3]
+    light = error_colors(prediction, torch.zeros(1, 4, 3)).mean(dim=-1)[0]
+    assert light[0] < 0.05 < light[1] < 0.95 < light[2] == light[3]
 
 
 def test_flow_as_colours() -> None:
@@ -111,7 +101,9 @@ def test_a_contact_sheet_shows_prediction_truth_and_error_of_spread_views(
             assert label.min() < 50 and label.max() == 255
 
 
-def test_of_a_long_name_the_end_is_shown() -> None:
+def test_names_and_positions() -> None:
+    assert evenly(3, 6) == [0, 1, 2]
+    assert evenly(50, 6) == [0, 10, 20, 29, 39, 49]
     assert short_name("folder/r_000.png") == "r_000.png"
     assert short_name(30 * "a" + "_000.png") == "…" + 21 * "a" + "_000.png"
 
@@ -156,29 +148,19 @@ def test_an_orbit_circles_the_box_at_the_cameras_distance(cube: Box) -> None:
     torch.testing.assert_close(cameras.positions.norm(dim=1), torch.full((8,), math.sqrt(10)))
     torch.testing.assert_close(cameras.positions[:, 2], torch.full((8,), math.sqrt(10) / 2))
     # Two turns in eight pictures: a quarter turn each.
-    flat_steps = cameras.positions[:4, :2] * cameras.positions[1:5, :2]
-    torch.testing.assert_close(flat_steps.sum(dim=1), torch.zeros(4), atol=1e-5, rtol=0)
+    steps = cameras.positions[:-1, :2] * cameras.positions[1:, :2]
+    torch.testing.assert_close(steps.sum(dim=1), torch.zeros(7), atol=1e-5, rtol=0)
     toward = torch.nn.functional.normalize(-cameras.positions, dim=1)
     torch.testing.assert_close(cameras.forwards, toward)
 
 
-def test_pictures_show_colour_beside_depth_while_time_runs(cube: Box) -> None:
-    build = Architecture()
-    canonical = build.search_field(cube, 5**3)
-    with torch.no_grad():
-        canonical.density.values[2, 2, 2] = 60.0
-        canonical.color.values.copy_(torch.tensor([9.0, -9.0, -9.0]).expand(5, 5, 5, 3))
-    settings = RenderSettings(0.5, 1e-4, 0.0, 9.0)
-    model = DeVRFModel(build, canonical, Occupancy.full((5, 5, 5), cube), settings)
-    shown = list(pictures(Renderer(model), ring(3), 1.0))
-    assert len(shown) == 3
-    for image in shown:
-        assert image.shape == (10, 30, 3)
-        # A red thing in the middle, white around it; its depth is not white.
-        assert image[5, 7, 0] > 0.95 and image[5, 7, 1] < 0.05
-        torch.testing.assert_close(image[0, 0], torch.ones(3))
-        torch.testing.assert_close(image[0, 15], torch.ones(3))
-        assert image[5, 22].min() < 0.9
+def test_pictures_show_colour_beside_depth_while_time_runs(moving, reference) -> None:
+    camera = ring(1)
+    shown = list(pictures(Renderer(moving), camera[[0, 0, 0]], 1.0))
+    assert [tuple(image.shape) for image in shown] == [(10, 30, 3)] * 3
+    for image, time in zip(shown, (0.0, 0.5, 1.0), strict=True):
+        seen = reference(moving, camera.image_rays(0), time, torch.ones(3))
+        torch.testing.assert_close(image[:, :15].reshape(-1, 3), seen.color, atol=1e-5, rtol=0)
 
 
 def test_a_video_is_no_larger_than_was_said(rest, tiny_scene, tmp_path):

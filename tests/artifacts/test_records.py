@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -11,20 +12,10 @@ import pytest
 import torch
 
 import devrf
-from devrf.artifacts.records import (
-    git_revision,
-    mean_scores,
-    parameter_count,
-    peak_host_memory,
-    provenance,
-    write_frames,
-)
-from devrf.checkpoints.checkpoint import LoadedCheckpoint
+from devrf.artifacts.records import git_revision, mean_scores, provenance, write_frames
 from devrf.evaluation.held_out import HeldOutView
-from devrf.geometry.clock import FrameClock
-from devrf.methods.devrf.deformation_field import DeformationField
 
-HOST = torch.device("cpu")
+METRICS = ["psnr", "ssim", "rest_pose_psnr", "depth_error", "flow_error"]
 
 
 def view(name: str, time: float, psnr: float, **further: float | None) -> HeldOutView:
@@ -49,62 +40,37 @@ def test_means_are_over_what_is_known() -> None:
 def test_frames_read_back(tmp_path: Path) -> None:
     path = tmp_path / "run" / "frames.csv"
     rest = [view("r, 0", 0.0, 20.0, depth_error=0.5, flow_error=None)]
-    moving = [view(f"m{k}", k / 2, 20.0 + k, depth_error=None, flow_error=1.5) for k in range(3)]
+    moving = [view("m", 0.5, 21.0, depth_error=None, flow_error=1.5)]
     write_frames(path, {"static": rest, "dynamic": moving})
     with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    assert [row["capture"] for row in rows] == ["static"] + ["dynamic"] * 3
-    at_rest = {"capture": "static", "name": "r, 0", "time": "0", "psnr": "20", "ssim": "0.5"}
-    assert rows[0] == {**at_rest, "rest_pose_psnr": "9", "depth_error": "0.5", "flow_error": ""}
-    assert [float(row["time"]) for row in rows[1:]] == [0.0, 0.5, 1.0]
-    assert [float(row["psnr"]) for row in rows[1:]] == [20.0, 21.0, 22.0]
-    assert {(row["depth_error"], row["flow_error"]) for row in rows[1:]} == {("", "1.5")}
+        assert list(csv.reader(file)) == [
+            ["capture", "name", "time", *METRICS],
+            ["static", "r, 0", "0", "20", "0.5", "9", "0.5", ""],
+            ["dynamic", "m", "0.5", "21", "0.5", "9", "", "1.5"],
+        ]
 
 
-def test_provenance_is_plain_data(rest: LoadedCheckpoint) -> None:
-    found = provenance(rest.model, HOST)
+def test_provenance_is_plain_data() -> None:
+    found = provenance(12, torch.device("cpu"))
     assert json.loads(json.dumps(found)) == found
-    assert {"lightning", "python", "git", "parameters", "peak_host_gb"} < set(found)
+    assert {"lightning", "python", "git", "peak_host_gb"} < set(found)
     assert found["devrf"] == devrf.__version__ and found["torch"] == torch.__version__
-    assert found["device"]
+    assert found["device"] and found["parameters"] == 12
     assert found["date"].endswith("+00:00")
 
 
-def test_learned_values_are_counted_by_hand(rest: LoadedCheckpoint) -> None:
-    model = rest.model
-    grids = [model.canonical.density.values, model.canonical.color.values]
-    decoder = sum(p.numel() for p in model.canonical.decoder.parameters())
-    at_rest = sum(grid.numel() for grid in grids) + decoder
-    assert parameter_count(model) == at_rest
-    field = DeformationField(model.canonical.box, FrameClock((0.0, 0.5, 1.0)), voxels=27)
-    model.deformation = field
-    # Three frames, to canonical space and back, three coordinates a voxel.
-    voxels = field.shape[0] * field.shape[1] * field.shape[2]
-    assert parameter_count(model) == at_rest + 3 * 2 * 3 * voxels
-
-
-def test_peak_memory_is_that_of_a_process_with_torch() -> None:
-    peak = peak_host_memory()
-    assert peak is None or 0.05 < peak < 100
-
-
+@pytest.mark.skipif(shutil.which("git") is None, reason="git is not installed")
 def test_the_revision_is_that_of_a_checkout(tmp_path: Path) -> None:
-    assert git_revision(tmp_path) is None
-
     def git(*arguments: str) -> str:
-        identity = ["-c", "user.name=a", "-c", "user.email=a@b.c", "-c", "commit.gpgsign=false"]
-        command = ["git", *identity, *arguments]
-        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
-        return done.stdout.strip()
+        command = ["git", "-c", "user.name=a", "-c", "user.email=a@b.c", *arguments]
+        return subprocess.check_output(command, cwd=tmp_path, text=True).strip()
 
-    try:
-        git("init")
-    except FileNotFoundError:
-        pytest.skip("git is not installed")
+    assert git_revision(tmp_path) is None
+    git("init")
     assert git_revision(tmp_path) is None  # nothing committed yet
     (tmp_path / "file").write_text("one")
     git("add", "file")
-    git("commit", "-m", "one")
+    git("-c", "commit.gpgsign=false", "commit", "-m", "one")
     git("tag", "v1")
     head = git("rev-parse", "HEAD")
     assert git_revision(tmp_path) == head

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import re
-from pathlib import Path
-
 import pytest
 
 from devrf.cli.config import config_folder
 from devrf.reporting.published import published
 from devrf.reporting.table import TITLES
 
-PAPER = Path(__file__).parents[3] / "shared" / "paper" / "supplementary.txt"
 SCENES = {"lego": 1, "floating_robot": 1, "daisy": 1, "glove": 2, "kuka": 2, "pig_toy": 3}
 METHODS = {1: 17, 2: 17, 3: 9}
 
@@ -43,39 +39,9 @@ def test_single_cells_as_printed():
 
 
 def test_names_and_numbers():
-    values = published().values.loc["lego"]
+    paper = published()
+    values = paper.values.loc["lego"]
     assert list(values.loc["DeVRF (base)"]) == [17.83, 0.799, 0.206, 4.1, 480.0]
     assert values.loc["D-NeRF-2 stage", "Time"] == pytest.approx(18.5 * 3600)
     assert not [label for label in values.index if "[" in label or "Ours" in label]
-
-
-def test_the_source_is_named():
-    paper = published()
     assert "DeVRF" in paper.title and "Liu" in paper.authors and "NeurIPS 2022" in paper.venue
-    assert paper.hardware == "NVIDIA GeForce RTX 3090"
-
-
-@pytest.mark.skipif(not PAPER.is_file(), reason="the paper's text is not beside the checkout")
-def test_every_cell_is_that_of_the_papers_text():
-    lines = PAPER.read_text(encoding="utf-8").splitlines()
-    found = {}
-    for k, line in enumerate(lines):
-        heading = re.match(r"Table (\d):", line)
-        if not heading:
-            continue
-        # The names of the scenes stand in the first line of tabs, the columns in the second.
-        start = next(i for i in range(k + 1, len(lines)) if "\t" in lines[i])
-        scenes = [name.lower().replace(" ", "_") for name in lines[start].split("\t") if name]
-        for row in lines[start + 2 :]:
-            if "\t" not in row:
-                break
-            method, *cells = row.split("\t")
-            assert len(cells) == 5 * len(scenes)
-            for i, scene in enumerate(scenes):
-                key = (int(heading[1]), scene)
-                found.setdefault(key, []).append((method, *cells[5 * i : 5 * i + 5]))
-    ours = {
-        (SCENES[scene], scene): list(rows[["method", *TITLES]].itertuples(index=False, name=None))
-        for scene, rows in published().texts.groupby("scene", sort=False)
-    }
-    assert ours == found

@@ -7,7 +7,6 @@ import math
 
 import pytest
 
-from devrf.errors import DevrfError
 from devrf.reporting.runs import collect, metric_over_time, number
 
 
@@ -16,27 +15,14 @@ def one(folder):
     return run
 
 
-def written(folder, record):
-    folder.mkdir()
-    (folder / "metrics.json").write_text(json.dumps(record))
-    return one(folder)
-
-
-def test_runs_are_found_at_any_depth_in_the_order_of_their_jobs(runs, ran):
-    for name in ("10_robot", "2_robot", "lego/paper/x", "sweeps/monday/0_robot"):
+def test_finished_runs_are_found_at_any_depth_in_the_order_of_their_jobs(runs, ran):
+    for name in ("10_robot", "2_robot", "lego/paper/x", "sweeps/monday/0_robot", ".cache"):
         ran(name)
-    found = list(collect(runs).runs["folder"])
-    assert found == ["2_robot", "10_robot", "lego/paper/x", "sweeps/monday/0_robot"]
-
-
-def test_only_finished_runs_are_found_and_hidden_folders_passed_over(runs, ran):
-    ran("finished")
-    (runs / "under_way" / "checkpoints").mkdir(parents=True)
+    (runs / "under_way").mkdir()
     (runs / "under_way" / ".partial-metrics.json").write_text("{")
-    (runs / "finished" / ".cache").mkdir()
-    (runs / "finished" / ".cache" / "metrics.json").write_text("{")
     found = collect(runs)
-    assert list(found.runs["folder"]) == ["finished"] and not found.skipped
+    names = ["2_robot", "10_robot", "lego/paper/x", "sweeps/monday/0_robot"]
+    assert list(found.runs["folder"]) == names and not found.skipped
 
 
 def test_a_record_is_read_back(ran):
@@ -53,9 +39,9 @@ def test_a_record_is_read_back(ran):
 
 def test_records_of_earlier_versions_are_devrf_in_two_stages(runs):
     deformation = {"psnr": 29.0, "seconds": 38.0, "back_offs": 1}
-    run = written(
-        runs / "old", {"scene": "x", "canonical": {"psnr": 31}, "deformation": deformation}
-    )
+    record = {"scene": "x", "canonical": {"psnr": 31}, "deformation": deformation}
+    (runs / "metrics.json").write_text(json.dumps(record))
+    run = one(runs)
     assert (run["method"], run["protocol"]) == ("devrf", "two_stage")
     assert (run["static.psnr"], run["dynamic.psnr"]) == (31, 29.0)
     assert run["dynamic.num_rollbacks"] == run["deformation.num_rollbacks"] == 1
@@ -67,10 +53,8 @@ def test_records_of_earlier_versions_are_devrf_in_two_stages(runs):
     ("protocol", "static", "seconds"),
     [("two_stage", 10, 48), ("two_stage", None, math.nan), ("joint", None, 38), ("dynamic", 1, 39)],
 )
-def test_the_time_is_that_of_the_stages_of_the_protocol(runs, protocol, static, seconds):
-    sections = {"static": {"seconds": static}, "dynamic": {"psnr": 29.0, "seconds": 38.0}}
-    record = {"scene": "x", "method": "dnerf", "protocol": protocol, **sections, "run": {}}
-    run = written(runs / "new", record)
+def test_the_time_is_that_of_the_stages_of_the_protocol(ran, protocol, static, seconds):
+    run = one(ran("new", method="dnerf", protocol=protocol, seconds=(static, 38.0)))
     assert (run["method"], run["protocol"]) == ("dnerf", protocol)
     assert run["train_seconds"] == pytest.approx(seconds, nan_ok=True)
 
@@ -119,30 +103,12 @@ def test_damaged_records_are_skipped_with_a_line_that_says_where(runs, ran, cont
         assert any(part in line for part in reason.split("|"))
 
 
-def test_no_folder_is_an_error(tmp_path):
-    with pytest.raises(DevrfError, match="report.runs: no folder .*nowhere"):
-        collect(tmp_path / "nowhere")
-
-
 def test_curves_are_over_the_dynamic_images_views_of_a_time_averaged(ran):
     folder = ran("a", frames=[(1.0, 20.0), (0.0, 30.0), (0.0, 32.0)])
     assert metric_over_time(folder, "psnr").to_dict() == {0.0: 31.0, 1.0: 20.0}
     assert metric_over_time(folder, "ssim").empty and metric_over_time(folder, "nothing").empty
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        b"",
-        b"\xff",
-        b"capture,psnr\ndynamic,3\n",
-        b"a\0b",
-        b"capture,time,psnr\ndynamic,x,3\n",
-        None,
-    ],
-)
-def test_a_run_without_readable_frames_has_no_curve(ran, content):
-    folder = ran("a")
-    if content is not None:
+    assert metric_over_time(ran("b"), "psnr").empty
+    no_number = b"capture,time,psnr\ndynamic,x,3\n"
+    for content in (b"", b"\xff", b"psnr,time\n3,0\n", b"a\0b", no_number):
         (folder / "frames.csv").write_bytes(content)
-    assert metric_over_time(folder, "psnr").empty
+        assert metric_over_time(folder, "psnr").empty

@@ -44,19 +44,16 @@ def test_csv_has_a_row_for_each_run_and_failure_and_every_number(runs, ran, fail
     with (runs / "report" / "report.csv").open(newline="", encoding="utf-8") as file:
         rows = {row["folder"]: row for row in csv.DictReader(file)}
     assert set(rows) == {"a", "at_rest", "7_robot"}
-    one = rows["a"]
-    assert (one["status"], one["scene"]) == ("finished", "robot")
-    assert (one["method"], one["protocol"]) == ("devrf", "two_stage")
-    assert one["row"] == "Ours w/ c2f, tv, cycle, flow" and rows["at_rest"]["row"] == ""
-    assert (one["deformation.psnr"], one["deformation.lpips"]) == ("31.0", "")
-    assert (one["canonical.seconds"], one["deformation.seconds"]) == ("3", "20")
-    assert (one["train_seconds"], one["peak_gpu_gb"]) == ("23.0", "")
-    assert (one["run.seed"], one["run.choices.ablation"]) == ("1", "full")
-    assert one["run.git"] == "0123456789abcdef" and one["run.overrides"] == "seed=1"
-    lost = rows["7_robot"]
-    assert (lost["status"], lost["error"]) == ("failed", "data.frames: expected 2, or more")
-    assert (lost["mistake"], lost["run.overrides"]) == ("true", "data.frames=1 seed=0")
-    assert lost["deformation.psnr"] == "" and lost["run.choices.ablation"] == "base"
+    assert rows["at_rest"]["row"] == ""
+    expected = {"status": "finished", "scene": "robot", "method": "devrf", "protocol": "two_stage"}
+    expected |= {"row": "Ours w/ c2f, tv, cycle, flow", "run.seed": "1", "run.overrides": "seed=1"}
+    expected |= {"deformation.psnr": "31.0", "deformation.lpips": "", "peak_gpu_gb": ""}
+    expected |= {"canonical.seconds": "3", "deformation.seconds": "20", "train_seconds": "23.0"}
+    expected |= {"run.choices.ablation": "full", "run.git": "0123456789abcdef"}
+    assert rows["a"].items() >= expected.items()
+    expected = {"status": "failed", "error": "data.frames: expected 2, or more", "mistake": "true"}
+    expected |= {"run.overrides": "data.frames=1 seed=0", "run.choices.ablation": "base"}
+    assert rows["7_robot"].items() >= {**expected, "deformation.psnr": ""}.items()
 
 
 def test_failures_alone_are_a_report(runs, failed):
@@ -69,24 +66,16 @@ def test_failures_alone_are_a_report(runs, failed):
     ).path.read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("damaged", [False, True])
-def test_no_runs_are_an_error_and_nothing_is_written(runs, damaged):
-    if damaged:
-        (runs / "metrics.json").write_text("{")
-    with pytest.raises(DevrfError, match="report.runs: no finished run below") as error:
+def test_damaged_runs_alone_are_an_error_and_nothing_is_written(runs):
+    (runs / "metrics.json").write_text("{")
+    with pytest.raises(DevrfError, match="report.runs: no finished run below .*damaged"):
         write_report(ReportSettings(runs))
-    assert ("damaged" in str(error.value)) == damaged and "\n" not in str(error.value)
     assert not (runs / "report").exists()
 
 
-@pytest.mark.parametrize(
-    ("module", "absent"),
-    [
-        ("devrf.reporting.write", {"torch", "lightning", "hydra"}),
-        ("devrf.cli.config, devrf.cli.sweep_report", {"torch", "pandas", "matplotlib"}),
-    ],
-)
-def test_imports_are_no_heavier_than_needed(module, absent):
-    script = f"import sys, {module}; assert not {absent} & set(sys.modules)"
+def test_a_sweep_imports_nothing_heavy_before_its_report():
+    modules = "devrf.cli.config, devrf.cli.sweep_report"
+    heavy = {"torch", "pandas", "matplotlib"}
+    script = f"import sys, {modules}; assert not {heavy} & set(sys.modules)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

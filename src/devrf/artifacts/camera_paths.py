@@ -1,10 +1,12 @@
-"""Where the camera of a video goes."""
+"""Camera paths of videos."""
 
 from __future__ import annotations
 
 import math
 
 import torch
+from torch import Tensor
+from torch.nn.functional import normalize
 
 from devrf.artifacts.film import FilmSettings
 from devrf.geometry.box import Box
@@ -16,49 +18,51 @@ def orbit(cameras: Cameras, box: Box, settings: FilmSettings) -> Cameras:
     """Cameras on a circle around a box, looking at its middle.
 
     Args:
-        cameras: the captured cameras: the orbit has their mean distance, their lens, and the
-            direction that is up for them.
+        cameras: the captured cameras: the orbit has their mean distance, focal length and up.
         box: what to look at.
-        settings: how many, how high, how often round.
+        settings: number of frames, elevation, turns.
     """
     middle = torch.tensor(box.middle)
     radius = float((cameras.positions - middle).norm(dim=1).mean())
-    up = torch.nn.functional.normalize(cameras.camera_to_world[:, :, 1].mean(dim=0), dim=0)
+    up = normalize(cameras.camera_to_world[:, :, 1].mean(dim=0), dim=0)
     away = torch.eye(3)[int(up.abs().argmin())]
-    east = torch.nn.functional.normalize(torch.linalg.cross(away, up), dim=0)
-    north = torch.linalg.cross(up, east)
-    angle = torch.arange(settings.frames) * (2 * math.pi * settings.orbit_turns / settings.frames)
+    east = normalize(torch.linalg.cross(away, up), dim=0)
+    axes = torch.stack([east, torch.linalg.cross(up, east)])
     height = math.radians(settings.orbit_elevation)
-    ring = angle.cos()[:, None] * east + angle.sin()[:, None] * north
-    positions = middle + radius * (math.cos(height) * ring + math.sin(height) * up)
-    return Cameras.looking_at(
-        positions,
-        middle.expand_as(positions),
-        focal=float(cameras.focal.mean()),
-        width=cameras.width,
-        height=cameras.height,
-        up=up,
-    )
+    center = middle + radius * math.sin(height) * up
+    return _ring(cameras, center, radius * math.cos(height) * axes, middle, up, settings)
 
 
 def spiral(cameras: Cameras, focus: float, settings: FilmSettings) -> Cameras:
     """Cameras on a small ring before a forward-facing scene, looking at one point in it.
 
     Args:
-        cameras: the captured cameras: the ring lies among them and has their lens.
+        cameras: the captured cameras: the ring lies among them and has their focal length.
         focus: distance of the point they look at, world units.
-        settings: how many, how often round.
+        settings: number of frames, turns.
     """
     pose = cameras.camera_to_world.mean(dim=0)
-    right, up, back = torch.nn.functional.normalize(pose[:, :3], dim=0).unbind(dim=1)
-    middle = pose[:, 3]
-    offsets = (cameras.positions - middle) @ torch.stack([right, up], dim=1)
-    across, along = (offsets.abs().quantile(0.8, dim=0) * 0.9).tolist()
-    turn = torch.arange(settings.frames) * (2 * math.pi * settings.orbit_turns / settings.frames)
-    positions = middle + across * turn.cos()[:, None] * right + along * turn.sin()[:, None] * up
+    right, up, back = normalize(pose[:, :3], dim=0).unbind(dim=1)
+    axes, middle = torch.stack([right, up]), pose[:, 3]
+    offsets = (cameras.positions - middle) @ axes.T
+    radii = 0.9 * offsets.abs().quantile(0.8, dim=0)
+    return _ring(cameras, middle, radii[:, None] * axes, middle - focus * back, up, settings)
+
+
+def _ring(
+    cameras: Cameras,
+    center: Tensor,
+    axes: Tensor,
+    target: Tensor,
+    up: Tensor,
+    settings: FilmSettings,
+) -> Cameras:
+    """Cameras on the ellipse about ``center`` with the half axes (2, 3), looking at ``target``."""
+    angle = torch.arange(settings.frames) * (2 * math.pi * settings.orbit_turns / settings.frames)
+    positions = center + torch.stack([angle.cos(), angle.sin()], dim=1) @ axes
     return Cameras.looking_at(
         positions,
-        (middle - focus * back).expand_as(positions),
+        target.expand_as(positions),
         focal=float(cameras.focal.mean()),
         width=cameras.width,
         height=cameras.height,
@@ -66,14 +70,14 @@ def spiral(cameras: Cameras, focus: float, settings: FilmSettings) -> Cameras:
     )
 
 
-def focus_distance(player: Renderer, cameras: Cameras) -> float:
+def focus_distance(renderer: Renderer, cameras: Cameras) -> float:
     """Median depth along the optical axis, world units, of what the first camera sees at rest."""
-    cameras, space = cameras.to(player.device), player.model.space
+    cameras, space = cameras.to(renderer.device), renderer.model.space
     rays = cameras.image_rays(0)
-    seen = player.picture(rays, 0.0, 1.0)
-    solid = (seen.opacity > 0.5).nonzero()[:, 0]
+    image = renderer.picture(rays, 0.0, 1.0)
+    solid = (image.opacity > 0.5).nonzero()[:, 0]
     if len(solid) == 0:
         return float(cameras.positions.norm(dim=1).mean()) + 1.0
-    points = space.to_world(space.rays(rays).at(solid, seen.depth[solid]))
+    points = space.to_world(space.rays(rays).at(solid, image.depth[solid]))
     _, depth = cameras.project_into(0, points)
     return float(depth.median())

@@ -1,4 +1,4 @@
-"""Numbers as colours, for pictures that people look at."""
+"""Depth, errors and optical flow as colours."""
 
 from __future__ import annotations
 
@@ -8,33 +8,27 @@ import torch
 from kornia.color import ColorMap, apply_colormap, hsv_to_rgb
 from torch import Tensor
 
-# The grey of what is not known: no flow has it, for theirs are white or saturated.
+# Grey level of invalid flow; valid flow is white or coloured.
 UNKNOWN = 0.85
 
 
 def depth_colors(depth: Tensor, opacity: Tensor, near: float, far: float) -> Tensor:
-    """A depth picture: near bright, far dark, nothing white.
+    """Depth as RGB (H, W, 3) in [0, 1]: ``near`` bright, ``far`` dark, empty space white.
 
     Args:
-        depth: (H, W) distances in world units.
+        depth: (H, W) distances, in the unit of ``near`` and ``far``.
         opacity: (H, W) in [0, 1].
         near: the distance shown brightest.
         far: the distance shown darkest.
-
-    Returns:
-        (H, W, 3) RGB in [0, 1].
     """
     closeness = 1 - ((depth - near) / (far - near)).clamp(0, 1)
     colors = _mapped(closeness, "viridis")
     return 1 + opacity[..., None] * (colors - 1)
 
 
-def error_colors(prediction: Tensor, truth: Tensor, full: float = 0.25) -> Tensor:
-    """An error picture (H, W, 3): the mean absolute difference of (H, W, 3) images.
-
-    Black is none; the brightest colour stands for ``full`` or more.
-    """
-    return _mapped(((prediction - truth).abs().mean(dim=-1) / full).clamp(0, 1), "hot")
+def error_colors(prediction: Tensor, truth: Tensor) -> Tensor:
+    """The mean absolute difference of (H, W, 3) images as RGB: 0 is black, 0.25 or more white."""
+    return _mapped((4 * (prediction - truth).abs().mean(dim=-1)).clamp(0, 1), "hot")
 
 
 def flow_colors(vectors: Tensor, valid: Tensor, full: float) -> Tensor:
@@ -57,7 +51,7 @@ def flow_colors(vectors: Tensor, valid: Tensor, full: float) -> Tensor:
 
 
 def flow_wheel(side: int) -> Tensor:
-    """What the colours of :func:`flow_colors` mean: (side, side, 3), white outside the disc."""
+    """The key to :func:`flow_colors` (side, side, 3): a disc of all directions, white outside."""
     at = (torch.arange(side) + 0.5) / side * 2 - 1
     y, x = torch.meshgrid(at, at, indexing="ij")
     vectors = torch.stack([x, y], dim=-1)

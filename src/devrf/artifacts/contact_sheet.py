@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,11 +11,10 @@ from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
 from devrf.artifacts.colors import error_colors
-from devrf.artifacts.images import short_name, write_image
+from devrf.artifacts.images import enlarged, evenly, short_name, side_by_side, write_image
 from devrf.evaluation.held_out import HeldOutView
 
-GAP = 4
-# Narrower images are enlarged by whole pixels, so that their labels are readable.
+# Narrower images are enlarged, so that their labels are readable.
 LEAST_WIDTH = 240
 HEADING = ("prediction", "truth", "error")
 
@@ -27,30 +25,15 @@ def write_contact_sheet(path: Path, views: Sequence[HeldOutView], rows: int = 6)
     Returns:
         The sheet (H, W, 3) in [0, 1].
     """
-    chosen = [views[round(k)] for k in np.linspace(0, len(views) - 1, min(rows, len(views)))]
     parts: list[Tensor] = []
-    for view in chosen:
+    for view in (views[k] for k in evenly(len(views), rows)):
         images = [view.prediction, view.truth, error_colors(view.compared, view.truth)]
-        factor = math.ceil(LEAST_WIDTH / view.truth.shape[1])
-        strip = side_by_side([_enlarged(image, factor) for image in images])
+        strip = side_by_side([enlarged(image, width=LEAST_WIDTH) for image in images])
         labels = (short_name(view.name), f"time {view.time:.2f}", f"PSNR {view.psnr:.2f} dB")
         parts += [strip, _label_row(strip.shape[1], labels)]
     sheet = torch.cat([_label_row(parts[0].shape[1], HEADING), *parts])
     write_image(path, sheet)
     return sheet
-
-
-def side_by_side(images: Sequence[Tensor], gap: int = GAP) -> Tensor:
-    """Images (H, W, 3) of one height in a row, with white between them."""
-    white = torch.ones(images[0].shape[0], gap, 3)
-    parts: list[Tensor] = []
-    for image in images:
-        parts += [white, image] if parts else [image]
-    return torch.cat(parts, dim=1)
-
-
-def _enlarged(image: Tensor, factor: int) -> Tensor:
-    return image.repeat_interleave(factor, dim=0).repeat_interleave(factor, dim=1)
 
 
 def _label_row(width: int, labels: Sequence[str]) -> Tensor:

@@ -13,17 +13,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from devrf.artifacts.colors import depth_colors, to_bytes
+from devrf.artifacts.colors import to_bytes
+from devrf.artifacts.images import enlarged
+from devrf.artifacts.still import still
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
-from devrf.rendering.rendered_image import RenderedImage
 from devrf.rendering.renderer import Renderer
-from devrf.rendering.view import Viewable
 from devrf.system.files import atomic_write
 
-# Small pictures are shown enlarged: a video of 100 pixels is too small to watch.
+# Smaller images are enlarged to this height: a video of 100 pixels is too small to watch.
 WATCHABLE = 240
-# Bytes that a pixel of a video takes, at most: met in scenes of two hundred pixels and less.
+# Upper bound of the bytes of a pixel in a video: measured on images of 200 pixels and less.
 PIXEL = 0.2
 # H.264 has blocks of so many pixels.
 SMALLEST = 16
@@ -31,16 +31,16 @@ SMALLEST = 16
 
 @dataclass(frozen=True)
 class FilmSettings:
-    """What is filmed.
+    """The videos that ``stage=render`` writes.
 
     Attributes:
-        frames: pictures of each video, evenly spread over [0, 1]: times between the captured
+        frames: images of each video, evenly spread over [0, 1]: times between the captured
             frames are rendered like any other.
-        fps: pictures a second.
+        fps: images a second.
         orbit_turns: how often the orbit goes round while time runs once.
         orbit_elevation: degrees above the horizon.
-        height: of the pictures in pixels; None for the captured images' height, with small
-            pictures shown enlarged.
+        height: of the images in pixels; None for the captured images' height, with small
+            images enlarged.
         half: whether the colour network works in half precision, on a CUDA device only.
     """
 
@@ -56,34 +56,21 @@ class FilmSettings:
             raise DevrfError(f"video.height: expected at least {SMALLEST}, not {self.height}")
 
     def sized(self, cameras: Cameras) -> Cameras:
-        """Captured cameras with images of the size that is filmed."""
+        """Captured cameras with images of the video's size."""
         return cameras if self.height is None else cameras.of_height(self.height)
 
 
-def pictures(player: Renderer, cameras: Cameras, background: float) -> Iterator[Tensor]:
+def pictures(renderer: Renderer, cameras: Cameras, background: float) -> Iterator[Tensor]:
     """Colour beside depth (H, 2W, 3) from each of N cameras, while time runs from 0 to 1."""
-    times = [k / max(len(cameras) - 1, 1) for k in range(len(cameras))]
-    seen = player.stream(cameras, times, background)
-    for picture, position in zip(seen, cameras.positions, strict=True):
-        depth = depth_picture(player.model, picture, position, cameras.height)
-        yield torch.cat([picture.color.view(depth.shape).cpu(), depth], dim=1)
-
-
-def depth_picture(model: Viewable, picture: RenderedImage, position: Tensor, height: int) -> Tensor:
-    """How far away things are (H, W, 3), of a whole image that a camera at ``position`` sees."""
-    near, far = model.space.depth_range(model.box, model.depth_limits, position)
-    depth, opacity = picture.depth.view(height, -1), picture.opacity.view(height, -1)
-    return depth_colors(depth.cpu(), opacity.cpu(), near, far)
+    for index in range(len(cameras)):
+        time = index / max(len(cameras) - 1, 1)
+        yield torch.cat(still(renderer, cameras, time, background, index), dim=1)
 
 
 def write_video(path: Path, images: Iterator[Tensor], fps: int, *, least: int = WATCHABLE) -> None:
-    """Write images (H, W, 3) in [0, 1] of one size as an mp4 (H.264).
+    """Write images (H, W, 3) in [0, 1] of one size as an mp4 (H.264), ``fps`` a second.
 
-    Args:
-        path: the file.
-        images: the pictures.
-        fps: pictures a second.
-        least: smaller pictures are enlarged by whole pixels to this height or more.
+    Images less than ``least`` pixels high are enlarged by a whole factor.
     """
     with atomic_write(path) as partial:
         writer = imageio.get_writer(
@@ -92,23 +79,13 @@ def write_video(path: Path, images: Iterator[Tensor], fps: int, *, least: int = 
         # As a context manager of its own it would leave ffmpeg running, and writing, on an error.
         with closing(writer):
             for image in images:
-                writer.append_data(_enlarged(to_bytes(image).numpy(), least))
+                shown = to_bytes(enlarged(image, height=least)).numpy()
+                odd = [(0, side % 2) for side in shown.shape[:2]]  # H.264 needs even sides
+                writer.append_data(np.pad(shown, [*odd, (0, 0)], mode="edge"))
 
 
 def film_bytes(film: FilmSettings, cameras: Cameras) -> int:
-    """About how large a video becomes, colour beside depth; rather less.
-
-    Args:
-        film: what is filmed.
-        cameras: captured cameras with images of the usual size.
-    """
+    """Upper estimate of a video's size in bytes, colour beside depth, for the captured cameras."""
     sized = film.sized(cameras)
     enlarged = max(1, math.ceil(WATCHABLE / sized.height)) if film.height is None else 1
     return round(film.frames * 2 * sized.height * sized.width * enlarged**2 * PIXEL)
-
-
-def _enlarged(image: np.ndarray, least: int) -> np.ndarray:
-    """Enlarged by whole pixels to a height or more, with even sides as H.264 needs."""
-    factor = max(1, math.ceil(least / image.shape[0]))
-    image = image.repeat(factor, axis=0).repeat(factor, axis=1)
-    return np.pad(image, [(0, image.shape[0] % 2), (0, image.shape[1] % 2), (0, 0)], mode="edge")

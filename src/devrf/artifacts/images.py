@@ -1,15 +1,20 @@
-"""Images as files, and their names as labels."""
+"""Images as files, side by side, enlarged; and their names as labels."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import imageio.v3 as iio
+import numpy as np
+import torch
 from torch import Tensor
 
 from devrf.artifacts.colors import to_bytes
 from devrf.system.files import atomic_write
 
+GAP = 4
 # Longest name that fits below a small image, in characters.
 LONGEST_NAME = 30
 
@@ -20,7 +25,24 @@ def write_image(path: Path, image: Tensor) -> None:
         iio.imwrite(partial, to_bytes(image).numpy(), extension=".png")
 
 
+def side_by_side(images: Sequence[Tensor]) -> Tensor:
+    """Images (H, W, 3) of one height in a row, with ``GAP`` white pixels between them."""
+    padded = [torch.nn.functional.pad(image, (0, 0, 0, GAP), value=1.0) for image in images]
+    return torch.cat(padded, dim=1)[:, :-GAP]
+
+
+def enlarged(image: Tensor, *, height: int = 1, width: int = 1) -> Tensor:
+    """An image (H, W, 3) with each pixel repeated, so that it is at least so high and so wide."""
+    factor = max(math.ceil(height / image.shape[0]), math.ceil(width / image.shape[1]))
+    return image.repeat_interleave(factor, dim=0).repeat_interleave(factor, dim=1)
+
+
 def short_name(name: str) -> str:
     """The name of an image's file as a label, without folders; of a long name its end."""
     name = Path(name).name
     return name if len(name) <= LONGEST_NAME else f"…{name[1 - LONGEST_NAME :]}"
+
+
+def evenly(count: int, most: int) -> list[int]:
+    """At most ``most`` of the positions 0 … count − 1, evenly spread, both ends among them."""
+    return [round(k) for k in np.linspace(0, count - 1, min(count, most))]

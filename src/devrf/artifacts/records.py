@@ -8,7 +8,6 @@ import sys
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from statistics import mean
 from typing import Any
 
 import lightning
@@ -27,21 +26,13 @@ def mean_scores(views: Sequence[HeldOutView]) -> dict[str, float | None]:
         Means over the images that have a value, None where no image has; rounded to five digits
         after the point. Without ``rest_pose_psnr``, which is of the dynamic capture only.
     """
-    names = [name for name in views[0].scores if name != "rest_pose_psnr"]
-    means: dict[str, float | None] = {}
-    for name in names:
-        known = [value for view in views if (value := view.scores[name]) is not None]
-        means[name] = round(mean(known), 5) if known else None
-    return means
+    means = pd.DataFrame([view.scores for view in views], dtype=float).mean().round(5)
+    means = means.drop("rest_pose_psnr")
+    return {str(name): None if pd.isna(mean) else float(mean) for name, mean in means.items()}
 
 
 def write_frames(path: Path, captures: Mapping[str, Sequence[HeldOutView]]) -> None:
-    """Write a CSV table with a row for each held-out image: capture, name, time, every metric.
-
-    Args:
-        path: the file.
-        captures: scored images, by the name of their capture.
-    """
+    """Write the :func:`frame_rows` of some captures as CSV."""
     with atomic_write(path) as partial:
         pd.DataFrame(frame_rows(captures)).to_csv(partial, index=False, float_format="%.6g")
 
@@ -49,7 +40,11 @@ def write_frames(path: Path, captures: Mapping[str, Sequence[HeldOutView]]) -> N
 def frame_rows(
     captures: Mapping[str, Sequence[HeldOutView]],
 ) -> list[dict[str, str | float | None]]:
-    """A row for each held-out image: capture, name, time, every metric."""
+    """A row for each held-out image: capture, name, time, every metric.
+
+    Args:
+        captures: scored images, by the name of their capture.
+    """
     return [
         {"capture": capture, "name": view.name, "time": view.time, **view.scores}
         for capture, group in captures.items()
@@ -58,15 +53,15 @@ def frame_rows(
 
 
 def provenance(size: int, device: torch.device) -> dict[str, Any]:
-    """What identifies how numbers were produced, beside the composed config.
+    """How numbers were produced, beside the composed config, as plain data.
 
     Args:
-        size: how many values were learned.
-        device: where.
+        size: number of learned values.
+        device: where they were learned.
 
     Returns:
-        Plain data: versions, device, git revision (None outside a checkout; ``-dirty`` where
-        files were changed), number of parameters, peak memory of this process in GiB, UTC date.
+        Versions, device, git revision, number of parameters, peak memory of this process in GiB,
+        UTC date.
     """
     return {
         "devrf": devrf.__version__,
@@ -93,13 +88,13 @@ def device_name(device: torch.device) -> str:
 
 
 def git_revision(root: Path | None = None) -> str | None:
-    """The commit that the package runs from, if its folder is a checkout of devrf.
+    """The commit of a checkout, ``-dirty`` where files were changed; None outside one.
 
     Args:
         root: the checkout; None: the folder that holds ``src/devrf``.
     """
     root = Path(devrf.__file__).resolve().parents[2] if root is None else root
-    if not (root / ".git").exists():
+    if not (root / ".git").exists():  # a folder above may be another project's checkout
         return None
     command = ["git", "describe", "--always", "--dirty", "--exclude=*", "--abbrev=40"]
     try:

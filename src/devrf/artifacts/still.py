@@ -1,4 +1,4 @@
-"""One picture of a learned scene, in any size, and how far away what it shows is."""
+"""What one camera sees of a learned scene: colour, and depth as colours."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Literal
 
 from torch import Tensor
 
-from devrf.artifacts.film import depth_picture
+from devrf.artifacts.colors import depth_colors
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
 from devrf.rendering.renderer import Renderer
@@ -16,7 +16,7 @@ from devrf.scenes.scene import Scene
 
 @dataclass(frozen=True)
 class StillSettings:
-    """What is pictured.
+    """The image that ``stage=still`` renders.
 
     Attributes:
         view: ``held_out`` for the first held-out camera of the moving scene, or the number of an
@@ -38,13 +38,14 @@ class StillSettings:
             raise DevrfError(f"still.height: expected at least 1, not {self.height}")
 
     def camera(self, scene: Scene) -> Cameras:
-        """The one camera that is meant, with images of the height that is.
+        """The chosen camera, with images of the chosen height.
 
         Raises:
             DevrfError: the scene has no such camera.
         """
-        captured = scene.dynamic.test if self.view == "held_out" else scene.static.train
-        index = 0 if self.view == "held_out" else self.view
+        captured, index = scene.dynamic.test, 0
+        if isinstance(self.view, int):
+            captured, index = scene.static.train, self.view
         if not 0 <= index < len(captured):
             some = f"expected held_out or 0 to {len(scene.static.train) - 1}, not {self.view}"
             raise DevrfError(f"still.view: {some}")
@@ -53,16 +54,20 @@ class StillSettings:
 
 
 def still(
-    player: Renderer, camera: Cameras, time: float, background: float
+    renderer: Renderer, cameras: Cameras, time: float, background: float, index: int = 0
 ) -> tuple[Tensor, Tensor]:
-    """Colour (H, W, 3) and depth as colours (H, W, 3) of what one camera sees, in [0, 1].
+    """Colour (H, W, 3) and depth as colours (H, W, 3) of what a camera sees, in [0, 1].
 
     Args:
-        player: shows the scene.
-        camera: one camera.
+        renderer: of the learned scene.
+        cameras: of which camera ``index`` is used.
         time: in [0, 1].
         background: grey level.
+        index: which of the cameras.
     """
-    seen = player.view(camera, 0, time, background)
-    depth = depth_picture(player.model, seen, camera.positions[0], camera.height)
-    return seen.color.view(depth.shape).clamp(0, 1).cpu(), depth
+    model, shape = renderer.model, (cameras.height, cameras.width)
+    image = renderer.view(cameras, index, time, background)
+    near, far = model.space.depth_range(model.box, model.depth_limits, cameras.positions[index])
+    depth, opacity = image.depth.view(shape).cpu(), image.opacity.view(shape).cpu()
+    color = image.color.view(*shape, 3).clamp(0, 1).cpu()
+    return color, depth_colors(depth, opacity, near, far)

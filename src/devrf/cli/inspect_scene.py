@@ -8,8 +8,7 @@ from rich.console import Console
 from rich.filesize import decimal
 
 from devrf.artifacts.inspection.report import inspect_scene
-from devrf.artifacts.inspection.text import inspection_text
-from devrf.artifacts.tables import as_text
+from devrf.artifacts.inspection.text import as_text, inspection_text
 from devrf.cli.context import RunContext
 from devrf.cli.memory import budget_rows
 from devrf.cli.preflight import requirements

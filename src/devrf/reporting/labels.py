@@ -1,13 +1,13 @@
-"""Which runs share a row of a table, and what the row is called.
+"""Which runs share a row of a table, and the row's label.
 
-Runs of one scene share a row unless they differ in something other than the seed and the folder.
-What tells rows apart becomes part of their label, and nothing else does.
+Runs of one scene share a row if they differ only in seed and folder. A label says only what
+distinguishes its row from the others of the scene.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import pandas as pd
@@ -30,14 +30,22 @@ ABLATIONS = {
     "c2f_tv_cycle": "Ours w/ c2f, tv, cycle",
     "full": "Ours w/ c2f, tv, cycle, flow",
 }
-# Config groups and keys that decide how a run is watched, not what it learns.
-WATCHING = {"logger", "callbacks", "video", "report", "hydra"}
-NOT_OF_A_ROW = {"objective", "seed", "stage"}
+# Config groups and keys that decide what is logged, not what is learned.
+LOGGING = {"logger", "callbacks", "video", "report", "hydra"}
+IGNORED = {"objective", "seed", "stage"}
 CHOICES = "run.choices."
-# What tells rows apart, most telling first; other groups and overrides come by name before LAST.
+# Traits that distinguish rows, most important first; other groups and overrides come before LAST.
 ALWAYS = ("method", "folder")
 FIRST = ("protocol", "views", "experiment", "schedule", "field", "sampling", "loss")
 LAST = ("images", "device", "revision", "version")
+# Traits that every run records: the key, its type, and how it stands in a label.
+RECORDED: tuple[tuple[str, str, type, Callable[[Any], str]], ...] = (
+    ("views", "train_views", int, lambda n: f"{n} view{'s' * (n != 1)}"),
+    ("images", "test_frames", int, lambda n: f"{n} held-out images"),
+    ("device", "device", str, lambda name: f"on {name}"),
+    ("revision", "git", str, lambda git: f"at {git[:9]}{'-dirty' * git.endswith('-dirty')}"),
+    ("version", "devrf", str, lambda version: f"devrf {version}"),
+)
 
 
 def labelled(runs: pd.DataFrame) -> pd.DataFrame:
@@ -48,16 +56,16 @@ def labelled(runs: pd.DataFrame) -> pd.DataFrame:
         label without the protocol; ``line``, the label without the number of views; ``views``,
         the number of dynamic training views (NaN where unknown).
     """
-    told = _telling(runs["scene"], [_traits(run) for run in runs.to_dict("records")])
+    traits = _distinguishing(runs["scene"], [_traits(run) for run in runs.to_dict("records")])
     views = runs.get("run.train_views", pd.Series(None, runs.index, dtype=object))
     found = runs.assign(
-        label=[_label(traits) for traits in told],
-        name=[_label(traits, without="protocol") for traits in told],
-        line=[_label(traits, without="views") for traits in told],
+        label=[_label(own) for own in traits],
+        name=[_label(own, without="protocol") for own in traits],
+        line=[_label(own, without="views") for own in traits],
         views=views.map(number).astype(float),
         by_scene=pd.factorize(runs["scene"])[0],
         by_method=[_rank(method, METHODS) for method in runs["method"]],
-        by_name=[_rank(traits["method"], ABLATIONS.values()) for traits in told],
+        by_name=[_rank(own["method"], ABLATIONS.values()) for own in traits],
     )
     order = ["by_scene", "by_method", "by_name", "views", "label"]
     return found.sort_values(order, kind="stable").drop(columns=order[:3])
@@ -69,7 +77,7 @@ def _rank(name: str, names: Iterable[str]) -> int:
 
 
 def _traits(run: Mapping[str, Any]) -> dict[str, str]:
-    """What is known of how a run was made, each in the words of a label."""
+    """A run's configuration, data, device and version, each as it stands in a label."""
     options = {
         key.removeprefix(CHOICES): option if isinstance(option, str) else ""
         for key, option in run.items()
@@ -80,26 +88,18 @@ def _traits(run: Mapping[str, Any]) -> dict[str, str]:
     for group, option in options.items():
         if option and group != "ablation" and option != run.get(group):
             found[f"={group}" if group in found else group] = f"{group}={option}"
-    if not any(options.values()):  # no other run may be taken for the same
+    if not any(options.values()):  # without its configuration a run shares no row
         found["folder"] = run["folder"]
-    views, images = run.get("run.train_views"), run.get("run.test_frames")
-    device, revision, version = (run.get(f"run.{key}") for key in ("device", "git", "devrf"))
-    if isinstance(views, int):
-        found["views"] = f"{views} view{'s' * (views != 1)}"
-    if isinstance(images, int):
-        found["images"] = f"{images} held-out images"
-    if isinstance(device, str):
-        found["device"] = f"on {device}"
-    if isinstance(revision, str):
-        found["revision"] = f"at {revision[:9]}{'-dirty' * revision.endswith('-dirty')}"
-    if isinstance(version, str):
-        found["version"] = f"devrf {version}"
+    for trait, key, kind, words in RECORDED:
+        value = run.get(f"run.{key}")
+        if isinstance(value, kind):
+            found[trait] = words(value)
     for override in run["run.overrides"]:
         key, _, value = override.lstrip("+~").partition("=")
-        if key not in options and key not in NOT_OF_A_ROW:
+        if key not in options and key not in IGNORED:
             found[f"={key}"] = f"{key}={value}"
     parts = {key: re.split("[./]", key.lstrip("="))[0] for key in found}
-    return {key: text for key, text in found.items() if parts[key] not in WATCHING}
+    return {key: text for key, text in found.items() if parts[key] not in LOGGING}
 
 
 def _method(method: str, ablation: str) -> str:
@@ -109,8 +109,8 @@ def _method(method: str, ablation: str) -> str:
     return name if ablation in ("", "full") else f"{name} ({ablation})"
 
 
-def _telling(scenes: pd.Series, traits: list[dict[str, str]]) -> list[dict[str, str]]:
-    """Of each run the fewest traits, most telling first, that separate what differs in a scene."""
+def _distinguishing(scenes: pd.Series, traits: list[dict[str, str]]) -> list[dict[str, str]]:
+    """Of each run the traits, as few as possible, that separate the different runs of a scene."""
     frame = pd.DataFrame(traits, index=scenes.index, dtype=object).fillna("")
     others = sorted(set(frame) - {*ALWAYS, *FIRST, *LAST})
     keys = (*FIRST, *others, *LAST)
@@ -124,5 +124,5 @@ def _telling(scenes: pd.Series, traits: list[dict[str, str]]) -> list[dict[str, 
     return list(frame[chosen].to_dict("records"))
 
 
-def _label(told: Mapping[str, str], without: str = "") -> str:
-    return "; ".join(text for key, text in told.items() if text and key != without)
+def _label(traits: Mapping[str, str], without: str = "") -> str:
+    return "; ".join(text for key, text in traits.items() if text and key != without)

@@ -19,12 +19,7 @@ PLAIN = Style(str, ("{} ", "{}¹", "{}²", "{}³"))
 
 
 def markdown(table: Table, figures: Mapping[str, str]) -> str:
-    """The whole report.
-
-    Args:
-        table: its contents.
-        figures: links to plots, by what they show.
-    """
+    """The whole report, with links to ``figures``, by what they show."""
     found = table.found
     failed = f", {len(found.failures)} failed" if len(found.failures) else ""
     count = len(found.runs)

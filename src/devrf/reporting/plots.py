@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import pandas as pd
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
+from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
 
 from devrf.reporting.runs import metric_over_time
 from devrf.reporting.table import LPIPS, PSNR, SSIM, TIME, Block, Table
@@ -35,11 +34,17 @@ STYLE: dict[Any, Any] = {
     "lines.linewidth": 1.6,
     "lines.markersize": 4,
 }
-# Markers of the paper's methods; what follows a name is a variant.
-METHODS = ("DeVRF", "D-NeRF", "Nerfies", "HyperNeRF", "NSFF", "Neural Volumes")
-MARKERS = dict(zip(METHODS, "s^vDPX", strict=True))
+# Markers of the paper's methods, and how the names of their variants end.
+MARKERS = {
+    "DeVRF": "s",
+    "D-NeRF": "^",
+    "Nerfies": "v",
+    "HyperNeRF": "D",
+    "NSFF": "P",
+    "Neural Volumes": "X",
+}
 VARIANT = r"-2 ?stage$|-dynamic$| \(base\)$| w/ .*$"
-# Seconds to label on an axis, where it spans more than a factor of a hundred and where less.
+# Seconds to label on an axis, where times span more than a factor of fifty and where less.
 FEW_TICKS = (0.1, 1, 10, 60, 600, 3600, 36000, 360000)
 TICKS = (
     *(0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 30),
@@ -48,15 +53,8 @@ TICKS = (
 )
 
 
-@dataclass(frozen=True)
-class Plot:
-    """A plot.
-
-    Attributes:
-        name: for its files.
-        shows: what is in it, in words.
-        figure: the plot itself.
-    """
+class Plot(NamedTuple):
+    """A plot, the name of its files, and what it shows in words."""
 
     name: str
     shows: str
@@ -70,9 +68,8 @@ def plots(table: Table) -> list[Plot]:
         ("metrics_against_views", "Metrics against dynamic training views", against_views(table)),
     ]
     for scene in table.runs["scene"].unique():
-        file = re.sub(r"[^\w.-]+", "_", scene)
-        shows = f"{scene}: PSNR over time"
-        found.append((f"psnr_over_time_{file}", shows, psnr_over_time(table, scene)))
+        name = re.sub(r"[^\w.-]+", "_", f"psnr_over_time_{scene}")
+        found.append((name, f"{scene}: PSNR over time", psnr_over_time(table, scene)))
     return [Plot(name, shows, figure) for name, shows, figure in found if figure is not None]
 
 
@@ -82,19 +79,17 @@ def psnr_over_time(table: Table, scene: str) -> Figure | None:
 
     None where no run has frames.
     """
-    curves: dict[str, pd.Series] = {}
-    for label, runs in table.runs[table.runs["scene"] == scene].groupby("label", sort=False):
-        of_runs = [metric_over_time(path, "psnr") for path in runs["path"]]
-        curves[label] = pd.concat(of_runs, axis=1, join="inner").mean(axis=1)
-    curves = {label: curve for label, curve in curves.items() if len(curve)}
-    if not curves:
-        return None
     figure = Figure(figsize=(6.4, 3.6), layout="constrained")
     axes = figure.subplots()
-    for label, curve in curves.items():
-        color, dashes = _look(table, label)
-        marker = "o" if len(curve) < 30 else ""
-        axes.plot(curve.index, curve, dashes, color=color, marker=marker, label=label)
+    for label, runs in table.runs[table.runs["scene"] == scene].groupby("label", sort=False):
+        of_runs = [metric_over_time(path, "psnr") for path in runs["path"]]
+        curve = pd.concat(of_runs, axis=1, join="inner").mean(axis=1)
+        if len(curve):
+            color, dashes = _look(table, label)
+            marker = "o" if len(curve) < 30 else ""
+            axes.plot(curve.index, curve, dashes, color=color, marker=marker, label=label)
+    if not axes.has_data():
+        return None
     axes.set(title=scene, xlabel="time", ylabel=f"{PSNR.title} (dB)")
     _legend(figure)
     return figure
@@ -155,19 +150,14 @@ def _points(axes: Axes, table: Table, block: Block) -> None:
         axes.plot(seconds, psnr, "o", color=_look(table, label)[0], markersize=6, label=label)
     for label, seconds, psnr in _seconds_and_psnr(block.published):
         method = re.sub(VARIANT, "", label)
-        look: dict[str, Any] = {
-            "marker": MARKERS.get(method, "o"),
-            "color": GREY,
-            "markerfacecolor": "none",
-        }
-        axes.plot(seconds, psnr, linestyle="", label=f"{method}{PUBLISHED}", **look)
+        look: dict[str, Any] = {"color": GREY, "markerfacecolor": "none"}
+        axes.plot(seconds, psnr, MARKERS[method], label=f"{method}{PUBLISHED}", **look)
     axes.set(title=block.title, xscale="log", xlabel="training time", ylabel=f"{PSNR.title} (dB)")
     low, high = axes.get_xlim()
-    low, high = low / 1.5, high * 1.5
-    axes.set_xlim(low, high)
-    axes.xaxis.set_major_locator(FixedLocator(FEW_TICKS if high > 100 * low else TICKS))
+    axes.set_xlim(low / 1.5, high * 1.5)
+    axes.xaxis.set_major_locator(FixedLocator(FEW_TICKS if high > 50 * low else TICKS))
     axes.xaxis.set_minor_locator(NullLocator())
-    axes.xaxis.set_major_formatter(FuncFormatter(_time))
+    axes.xaxis.set_major_formatter(_time)
 
 
 def _seconds_and_psnr(rows: pd.DataFrame) -> list[tuple[str, float, float]]:
@@ -176,7 +166,8 @@ def _seconds_and_psnr(rows: pd.DataFrame) -> list[tuple[str, float, float]]:
     return list(known[known[TIME.title] > 0].itertuples(name=None))
 
 
-def _time(seconds: float, position: int | None = None) -> str:
+def _time(seconds: float, position: float) -> str:
+    """The label of a tick."""
     for unit, size in (("h", 3600), ("min", 60)):
         if seconds >= size:
             return f"{seconds / size:g} {unit}"

@@ -96,14 +96,14 @@ def collect(folder: Path) -> Collection:
             (place / "failure.json", "failed", _failed),
             (place / "metrics.json", "finished", _finished),
         ):
+            if not file.is_file():
+                continue
             try:
-                record = read(file.read_bytes()) if file.is_file() else {}
+                record = read(file.read_bytes())
             except (OSError, ValidationError) as error:
                 skipped.append(f"{file}: skipped; {_reason(error)}")
-                continue
-            if record:
-                own = {"folder": name, "path": place, "status": status}
-                records[status].append({**record, **own})
+            else:
+                records[status].append({**record, "folder": name, "path": place, "status": status})
     runs, failures = _frame(records["finished"]), _frame(records["failed"])
     return Collection(folder, runs, failures, tuple(skipped))
 
@@ -115,13 +115,9 @@ def number(value: Any) -> float:
 
 
 def metric_over_time(path: Path, metric: str) -> pd.Series:
-    """A metric of the held-out dynamic images by time in [0, 1], means where views share a time.
+    """A column of a run's ``frames.csv`` by time in [0, 1]: means over the dynamic test views.
 
-    Empty where the run's ``frames.csv`` has none.
-
-    Args:
-        path: the run's folder.
-        metric: a column of ``frames.csv``: ``psnr``.
+    Empty where the run has no such values.
     """
     try:
         frames = pd.read_csv(path / "frames.csv")

@@ -1,4 +1,4 @@
-"""What ``report.…`` asks for; light, because every command reads it."""
+"""The settings ``report.…``; without heavy imports, because every command reads them."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ PublishedScenes = Literal["matching", "all", "none"]
 
 @dataclass(frozen=True)
 class ReportSettings:
-    """What is reported.
+    """Settings of ``stage=report``.
 
     Attributes:
         runs: the folder below which finished runs are collected.
         into: the folder that the report is written to; None: ``report`` in ``runs``.
-        published: which of the paper's own rows stand beside them: those of the scenes that
-            were run, all, or none.
+        published: which of the paper's rows to show: of the scenes that were run, all, or none.
     """
 
     runs: str | Path = "outputs"

@@ -1,4 +1,4 @@
-"""The tables' contents: rows of runs averaged, ranked and put beside the paper's, by scene."""
+"""The tables of a report: runs averaged and ranked by scene, beside the paper's rows."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Column:
         higher_is_better: else lower is.
         digits: after the point; None: a time in the unit that reads best.
         of_hardware: whether values of different devices cannot be compared.
-        why_missing: why no run may have it.
+        why_missing: the explanation where no run has a value.
     """
 
     title: str
@@ -52,6 +52,13 @@ GPU = Column("GPU (GB)", "peak_gpu_gb", False, 1, True, "no run is known to have
 TIME = Column("Time", "train_seconds", False, None, True)
 COLUMNS = (PSNR, SSIM, LPIPS, GPU, TIME)
 TITLES = [column.title for column in COLUMNS]
+# How a time below so many seconds is written: the unit's seconds, digits, the unit.
+TIMES = (
+    (9.95, 1, 1, " s"),
+    (99.5, 1, 0, " s"),
+    (99.5 * 60, 60, 1, " min"),
+    (math.inf, 3600, 1, " h"),
+)
 
 
 @dataclass(frozen=True)
@@ -103,8 +110,8 @@ def tabulate(found: Collection, published_scenes: PublishedScenes = "matching") 
 
     Args:
         found: finished runs and failures.
-        published_scenes: which of the paper's rows stand beside them: those of the scenes that
-            were run, all, or none.
+        published_scenes: which of the paper's rows to show: of the scenes that were run, all, or
+            none.
     """
     scored = found.runs[PSNR.key].map(number).notna()
     runs = labelled(found.runs[scored])
@@ -139,14 +146,9 @@ def shown(value: float, column: Column, spread: float = math.nan) -> str:
     """A value with the digits of its column: ``29.42``, ``29.42 ± 0.11``, ``9.2 min``, ``–``."""
     if math.isnan(value):
         return UNKNOWN
-    size, digits, unit = 1.0, column.digits, ""
+    size, digits, unit = 1, column.digits, ""
     if digits is None:
-        if value < 99.5:
-            unit, digits = " s", 0 if value >= 9.95 else 1
-        elif value < 99.5 * 60:
-            size, unit, digits = 60.0, " min", 1
-        else:
-            size, unit, digits = 3600.0, " h", 1
+        _, size, digits, unit = next(row for row in TIMES if value < row[0])
     text = f"{value / size:.{digits}f}"
     if not math.isnan(spread):
         text += f" ± {spread / size:.{digits}f}"
@@ -154,16 +156,14 @@ def shown(value: float, column: Column, spread: float = math.nan) -> str:
 
 
 def ranked(values: pd.Series, column: Column) -> pd.Series:
-    """1, 2, 3 for the best values, else 0; values that look the same share a rank.
+    """1, 2, 3 for the best values, else 0; values with the same text share a rank.
 
-    No value is ranked where all look the same, for none is better than another.
+    No value is ranked where all have the same text.
     """
-    looks = values.map(lambda value: shown(value, column)).where(values.notna())
-    if looks.nunique() < 2:
-        return values.mul(0).fillna(0).astype(int)
-    alike = values.groupby(looks).transform("min")
-    ranks = alike.rank(method="dense", ascending=not column.higher_is_better)
-    return ranks.where(ranks <= 3, 0).astype(int)
+    texts = values.map(lambda value: shown(value, column)).where(values.notna())
+    ranks = values.groupby(texts).transform("min")
+    ranks = ranks.rank(method="dense", ascending=not column.higher_is_better)
+    return ranks.where((ranks <= 3) & (texts.nunique() > 1), 0).astype(int)
 
 
 def _of(frame: pd.DataFrame, scenes: list[str]) -> pd.DataFrame:
@@ -172,14 +172,11 @@ def _of(frame: pd.DataFrame, scenes: list[str]) -> pd.DataFrame:
 
 
 def _cells(rows: pd.DataFrame, spread: pd.DataFrame, devices: pd.Series | None) -> pd.DataFrame:
-    """Cells as a block holds them.
+    """Rows as a block holds them, with their standard deviations (or NaN).
 
-    Args:
-        rows: ``name``, ``protocol``, ``counts`` and every title, by label.
-        spread: standard deviations, NaN where there is none to show.
-        devices: of the runs; memory and time are ranked if they agree. None: nothing is.
+    Memory and time are ranked only if all ``devices`` agree; nothing is without devices.
     """
-    texts, ranks = rows[TITLES].astype(object), rows[TITLES].mul(0).fillna(0).astype(int)
+    texts, ranks = rows[TITLES].astype(object), pd.DataFrame(0, rows.index, TITLES)
     for column in COLUMNS:
         both = zip(rows[column.title], spread[column.title], strict=True)
         texts[column.title] = [shown(value, column, deviation) for value, deviation in both]
@@ -193,7 +190,7 @@ def _cells(rows: pd.DataFrame, spread: pd.DataFrame, devices: pd.Series | None) 
 def _average(runs: pd.DataFrame, rows: pd.DataFrame, scenes: list[str]) -> pd.DataFrame:
     """Means over all scenes of the configurations that were run on all of them.
 
-    Without a spread: what scenes differ in is no uncertainty of a measurement.
+    Without a spread: the difference between scenes is no uncertainty of a measurement.
     """
     groups = rows.groupby("label", sort=False)
     means = _over_scenes(rows[TITLES], scenes).join(groups[["name", "protocol"]].first())

@@ -1,4 +1,4 @@
-"""What every form of the report shares: its sentences, and its cells as text."""
+"""Sentences and cells that Markdown, plain text and LaTeX share."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from devrf.reporting.table import COLUMNS, Block, Table
 
 @dataclass(frozen=True)
 class Style:
-    """How a form writes text.
+    """How a format writes text.
 
     Attributes:
         escape: makes plain text safe in it.
@@ -44,11 +44,7 @@ def printed(table: Table, blocks: Sequence[Block], style: Style) -> pd.DataFrame
 
 
 def _rows(
-    table: Table,
-    blocks: Sequence[Block],
-    frames: Sequence[pd.DataFrame],
-    style: Style,
-    label: str,
+    table: Table, blocks: Sequence[Block], frames: Sequence[pd.DataFrame], style: Style, label: str
 ) -> pd.DataFrame:
     """A row for each label of any frame."""
     cells = [_marked(frame, style) for frame in frames]
@@ -57,31 +53,24 @@ def _rows(
     heads = pd.concat([frame["head"] for frame in frames]).groupby(level=0)
     counts = heads["counts"].agg(lambda sets: set().union(*sets))
     names = heads["name"].first() + counts.map(_repeats)
-    lead = {("", _methods(table)): names.map(lambda name: style.escape(label.format(name)))}
+    heading = "Method" if table.runs["method"].nunique() > 1 else ""
+    lead = {("", heading): names.map(lambda name: style.escape(label.format(name)))}
     if table.rows["protocol"].nunique() > 1:
         lead["", "Protocol"] = heads["protocol"].first().map(style.escape)
     return pd.concat([pd.DataFrame(lead).reindex(found.index), found], axis=1)
 
 
 def _marked(frame: pd.DataFrame, style: Style) -> pd.DataFrame:
-    return pd.DataFrame(
-        {
-            style.escape(column.heading): [
-                style.marks[rank].format(style.escape(text))
-                for text, rank in zip(
-                    frame["text", column.title], frame["rank", column.title], strict=True
-                )
-            ]
-            for column in COLUMNS
-        },
-        index=frame.index,
-        dtype=object,
-    )
+    def mark(rank: int, text: str) -> str:
+        return style.marks[rank].format(style.escape(text))
 
-
-def _methods(table: Table) -> str:
-    """The heading of the labels: none where all rows are of one method."""
-    return "Method" if table.runs["method"].nunique() > 1 else ""
+    columns = {
+        style.escape(column.heading): list(
+            map(mark, frame["rank", column.title], frame["text", column.title])
+        )
+        for column in COLUMNS
+    }
+    return pd.DataFrame(columns, index=frame.index, dtype=object)
 
 
 def _repeats(counts: set[int]) -> str:
@@ -90,7 +79,7 @@ def _repeats(counts: set[int]) -> str:
 
 
 def caption(table: Table) -> str:
-    """What the measured numbers are, and which are marked; without the marks' own names."""
+    """What the measured numbers are, and which of them are marked."""
     devices = table.runs["run.device"].dropna().unique()
     where = f" on {', '.join(devices)}" if len(devices) else ""
     repeated = bool((table.rows["count"] > 1).any())
@@ -103,7 +92,7 @@ def caption(table: Table) -> str:
 
 
 def credit() -> str:
-    """Where the published rows come from and what they are not."""
+    """The source of the published rows."""
     paper = published()
     return (
         f"As published in {paper.authors}: {paper.title}. {paper.venue}; measured by its authors "
@@ -114,10 +103,9 @@ def credit() -> str:
 
 def reasons(found: Collection) -> list[str]:
     """Which runs failed, and why, a line each; overrides that all runs share are left out."""
-    told = [
-        set(typed) for frame in (found.runs, found.failures) for typed in frame["run.overrides"]
-    ]
-    shared = set.intersection(*told) if len(told) > 1 else set()
+    overrides = pd.concat([found.runs["run.overrides"], found.failures["run.overrides"]])
+    typed = [set(own) for own in overrides]
+    shared = set.intersection(*typed) if len(typed) > 1 else set()
     lines: list[str] = []
     for failure in found.failures.to_dict("records"):
         own = [text for text in failure["run.overrides"] if text not in shared]

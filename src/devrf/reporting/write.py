@@ -19,13 +19,7 @@ from devrf.system.files import atomic_write
 
 @dataclass(frozen=True)
 class Report:
-    """A report that was written.
-
-    Attributes:
-        table: its contents.
-        text: the tables, notes and failures for a terminal.
-        path: its ``report.md``; ``report.csv``, ``report.tex`` and ``figures/`` are beside it.
-    """
+    """A written report: its contents, its text for a terminal, and its ``report.md``."""
 
     table: Table
     text: str
@@ -56,8 +50,8 @@ def write_report(settings: ReportSettings) -> Report:
 def csv(table: Table) -> str:
     """A row for each run and failure, with everything that is known of it.
 
-    ``train_seconds`` and ``peak_gpu_gb`` are the tables' Time and GPU; further columns are what
-    ``metrics.json`` holds, by dotted name. What is not known is empty.
+    ``train_seconds`` and ``peak_gpu_gb`` are the tables' Time and GPU; further columns are those
+    of ``metrics.json``, by dotted name. Unknown values are empty.
     """
     runs = table.found.runs.drop(columns="path")
     runs.insert(3, "row", table.runs["label"])

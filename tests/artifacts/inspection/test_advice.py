@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
@@ -16,7 +15,9 @@ from devrf.artifacts.inspection.report import inspect_scene
 from devrf.geometry.box import Box
 from devrf.scenes.bounds import box_from_cameras
 from devrf.scenes.procedural import ProceduralScene
-from devrf.scenes.scene import Capture, OpticalFlow, Scene, Views
+from devrf.scenes.scene import OpticalFlow, Scene, Views
+
+Spoil = Callable[[Scene], Scene]
 
 
 @pytest.fixture(scope="module")
@@ -25,123 +26,98 @@ def healthy(tiny_recipe: ProceduralScene) -> Scene:
     return replace(tiny_recipe, static_views=16)()
 
 
-def with_static(scene: Scene, **changes: Any) -> Scene:
-    return replace(scene, static=replace(scene.static, **changes))
+def changed(name: str, change: Callable[[Views], Views]) -> Spoil:
+    """A scene with one of its sets of images changed: ``static.train``."""
+    capture, part = name.split(".")
+
+    def spoil(scene: Scene) -> Scene:
+        sets = getattr(scene, capture)
+        return replace(scene, **{capture: replace(sets, **{part: change(getattr(sets, part))})})
+
+    return spoil
 
 
-def with_dynamic(scene: Scene, **changes: Any) -> Scene:
-    return replace(scene, dynamic=replace(scene.dynamic, **changes))
+def ambiguous(views: Views) -> Views:
+    return replace(views, ambiguous_orientation=torch.arange(len(views)) == 7)
 
 
-def turned(scene: Scene, degrees: float) -> Scene:
-    """The fourth static camera turned about its own up axis."""
-    views = scene.static.train
-    poses = views.cameras.camera_to_world.clone()
-    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-    turn = torch.tensor([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
-    poses[3, :, :3] = poses[3, :, :3] @ turn
-    cameras = replace(views.cameras, camera_to_world=poses)
-    return with_static(scene, train=replace(views, cameras=cameras))
+def late(views: Views) -> Views:
+    return replace(views, times=0.1 + 0.9 * views.times)
+
+
+def rgb(views: Views) -> Views:
+    return replace(views, pixels=views.pixels[..., :3])
+
+
+def turned(degrees: float) -> Callable[[Views], Views]:
+    """The fourth camera turned about its own up axis."""
+
+    def change(views: Views) -> Views:
+        poses = views.cameras.camera_to_world.clone()
+        c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+        poses[3, :, :3] @= torch.tensor([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+        return replace(views, cameras=replace(views.cameras, camera_to_world=poses))
+
+    return change
+
+
+def painted(image: int | slice, channels: slice, value: list[int]) -> Callable[[Views], Views]:
+    def change(views: Views) -> Views:
+        pixels = views.pixels.clone()
+        pixels[image, ..., channels] = torch.tensor(value, dtype=torch.uint8)
+        return replace(views, pixels=pixels)
+
+    return change
+
+
+def where(test: Callable[[Views], Tensor]) -> Callable[[Views], Views]:
+    return lambda views: views[test(views).nonzero()[:, 0]]
+
+
+def flowing(change: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]) -> Spoil:
+    def flowed(views: Views) -> Views:
+        assert views.flow is not None
+        return replace(views, flow=OpticalFlow(*change(views.flow.vectors, views.flow.valid)))
+
+    return changed("dynamic.train", flowed)
 
 
 def without_alpha(scene: Scene, box: Box | None = None) -> Scene:
-    def opaque(capture: Capture) -> Capture:
-        sets = (capture.train, capture.test)
-        return Capture(*(replace(v, pixels=v.pixels[..., :3]) for v in sets))
-
+    for name in SETS:
+        scene = changed(name, rgb)(scene)
     bounds = replace(scene.bounds, box=box or scene.bounds.box.scaled(0.9))
-    return replace(scene, static=opaque(scene.static), dynamic=opaque(scene.dynamic), bounds=bounds)
-
-
-def painted(views: Views, image: int, value: list[int]) -> Views:
-    pixels = views.pixels.clone()
-    pixels[image] = torch.tensor(value, dtype=torch.uint8)
-    return replace(views, pixels=pixels)
-
-
-def opaque_test_set(scene: Scene) -> Scene:
-    pixels = scene.static.test.pixels.clone()
-    pixels[..., 3] = 255
-    return with_static(scene, test=replace(scene.static.test, pixels=pixels))
-
-
-def rgb_test_set(scene: Scene) -> Scene:
-    test = scene.static.test
-    return with_static(scene, test=replace(test, pixels=test.pixels[..., :3]))
-
-
-def no_test_set(scene: Scene) -> Scene:
-    return with_static(scene, test=scene.static.test[torch.zeros(0, dtype=torch.long)])
-
-
-def late(scene: Scene) -> Scene:
-    train = scene.dynamic.train
-    return with_dynamic(scene, train=replace(train, times=0.1 + 0.9 * train.times))
-
-
-def one_image_missing(scene: Scene) -> Scene:
-    train = scene.dynamic.train
-    kept = ~((train.times == 0.5) & (train.view == 1))
-    assert int(kept.sum()) == len(train) - 1
-    return with_dynamic(scene, train=train[kept.nonzero()[:, 0]])
+    return replace(scene, bounds=bounds)
 
 
 def one_colour(scene: Scene) -> Scene:
-    scene = without_alpha(scene)
-    return with_dynamic(scene, train=painted(scene.dynamic.train, 2, [90, 90, 91]))
+    return changed(MOVING, painted(2, slice(3), [90, 90, 91]))(without_alpha(scene))
 
 
-def empty_alpha(scene: Scene) -> Scene:
-    return with_static(scene, train=painted(scene.static.train, 5, [90, 0, 91, 0]))
+SETS = REST, REST_TEST, MOVING, _ = "static.train", "static.test", "dynamic.train", "dynamic.test"
+PROBLEMS: list[tuple[Spoil, str, str]] = [
+    (changed(REST_TEST, where(lambda v: v.times < 0)), "static test", "no view"),
+    (changed(REST, turned(180)), "static train 003", "looks away"),
+    (changed(REST, turned(75)), "static train 003", "in the picture"),
+    (changed(REST, where(lambda v: v.cameras.positions[:, 0] > 0)), "static training", "sector of"),
+    (one_colour, "frame 001 view 0", "one colour"),
+    (changed(REST, painted(5, slice(4), [90, 0, 91, 0])), "static train 005", "mask is empty"),
+    (changed(REST, ambiguous), "static train 007", "EXIF orientation"),
+    (changed(REST_TEST, rgb), "static test", "without alpha masks"),
+    (changed(REST_TEST, painted(slice(None), slice(3, 4), [255])), "static test", "opaque"),
+    (changed(MOVING, late), "dynamic training", "begins at time 0.1"),
+    (
+        changed(MOVING, where(lambda v: (v.times != 0.5) | (v.view != 1))),
+        "dynamic training",
+        "time 0.5 without view 1",
+    ),
+    (flowing(lambda vectors, valid: (vectors, valid & False)), "optical flow", "on 0.0 %"),
+    (flowing(lambda vectors, valid: (vectors + 25, valid)), "flow of", "the image (24 px)"),
+    (flowing(lambda vectors, valid: (vectors * math.nan, valid)), "flow of", "not a number"),
+]
 
 
-def one_side(scene: Scene) -> Scene:
-    train = scene.static.train
-    return with_static(scene, train=train[(train.cameras.positions[:, 0] > 0).nonzero()[:, 0]])
-
-
-def ambiguous(scene: Scene) -> Scene:
-    marked = torch.arange(len(scene.static.train)) == 7
-    return with_static(scene, train=replace(scene.static.train, ambiguous_orientation=marked))
-
-
-def flowing(change: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]) -> Callable[[Scene], Scene]:
-    def changed(scene: Scene) -> Scene:
-        train = scene.dynamic.train
-        assert train.flow is not None
-        flow = OpticalFlow(*change(train.flow.vectors, train.flow.valid))
-        return with_dynamic(scene, train=replace(train, flow=flow))
-
-    return changed
-
-
-STATIC, DYNAMIC = "static training set", "dynamic training set"
-
-
-@pytest.mark.parametrize(
-    ("spoil", "where", "what"),
-    [
-        (no_test_set, "static test set", "no view"),
-        (lambda scene: turned(scene, 180), "static train 003", "looks away"),
-        (lambda scene: turned(scene, 75), "static train 003", "in the picture"),
-        (one_side, STATIC, "sector of"),
-        (one_colour, "frame 001 view 0", "one colour"),
-        (empty_alpha, "static train 005", "alpha mask is empty"),
-        (ambiguous, "static train 007", "EXIF orientation"),
-        (rgb_test_set, "static test set", "without alpha masks"),
-        (opaque_test_set, "static test set", "opaque everywhere"),
-        (late, DYNAMIC, "begins at time 0.1"),
-        (one_image_missing, DYNAMIC, "time 0.5 without view 1"),
-        (
-            flowing(lambda vectors, valid: (vectors, valid & False)),
-            "optical flow",
-            "valid on 0.0 %",
-        ),
-        (flowing(lambda vectors, valid: (vectors + 25, valid)), "flow of", "the image (24 px)"),
-        (flowing(lambda vectors, valid: (vectors * math.nan, valid)), "flow of", "not a number"),
-    ],
-)
-def test_a_problem(healthy: Scene, spoil: Callable[[Scene], Scene], where: str, what: str) -> None:
+@pytest.mark.parametrize(("spoil", "where", "what"), PROBLEMS)
+def test_a_problem(healthy: Scene, spoil: Spoil, where: str, what: str) -> None:
     (found,) = inspect_scene(spoil(healthy)).advice
     assert where in found.where and what in found.what
     assert str(found) == f"{found.where}: {found.what}; {found.remedy}"
@@ -153,12 +129,13 @@ def test_no_problem(healthy: Scene) -> None:
 
 def test_held_out_views_that_are_learned_from(healthy: Scene) -> None:
     train = healthy.dynamic.train
-    (found,) = inspect_scene(with_dynamic(healthy, test=train[torch.tensor([0, 4])])).advice
+    spoil = changed("dynamic.test", lambda _: train[torch.tensor([0, 4])])
+    (found,) = inspect_scene(spoil(healthy)).advice
     assert found.where == "dynamic test set"
     assert train.names[0] in found.what and train.names[4] in found.what
     # The same camera at another time may be held out.
     test = replace(train[torch.tensor([0])], times=torch.tensor([0.25]))
-    assert inspect_scene(with_dynamic(healthy, test=test)).advice == ()
+    assert inspect_scene(changed("dynamic.test", lambda _: test)(healthy)).advice == ()
 
 
 def test_a_box_that_is_only_guessed(healthy: Scene) -> None:

@@ -1,8 +1,8 @@
-"""Advice on a scene that can be read, and names for the sets of images that it is about."""
+"""Advice on a scene, and the names of the images that it is about."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from devrf.scenes.scene import Scene, Views
@@ -10,7 +10,7 @@ from devrf.scenes.scene import Scene, Views
 
 @dataclass(frozen=True)
 class Advice:
-    """One thing that will make the result worse than it could be.
+    """A problem that lowers quality.
 
     Attributes:
         where: the file, the view or the part of the scene.
@@ -35,6 +35,20 @@ def image_sets(scene: Scene) -> dict[str, Views]:
         "dynamic test set": scene.dynamic.test,
     }
     return {name: views for name, views in sets.items() if len(views)}
+
+
+def images_where(scene: Scene, test: Callable[[Views, int], bool]) -> list[str]:
+    """Names of the images of all sets that pass a test of (views, position), each once.
+
+    Sets may share files.
+    """
+    names = (
+        views.names[k]
+        for views in image_sets(scene).values()
+        for k in range(len(views))
+        if test(views, k)
+    )
+    return list(dict.fromkeys(names))
 
 
 def listed(names: Sequence[str], most: int = 3) -> str:

@@ -1,4 +1,4 @@
-"""What is wrong with where cameras stand and look."""
+"""Problems with the cameras' positions and directions."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from devrf.artifacts.inspection.advice import Advice, image_sets, listed
+from devrf.artifacts.inspection.advice import Advice, images_where, listed
 from devrf.artifacts.inspection.layout import box_middle, box_points, widest_gap
 from devrf.errors import DevrfError
-from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
 from devrf.scenes.bounds import box_from_cameras
 from devrf.scenes.scene import Scene, Views
@@ -23,7 +22,7 @@ SAME = 1e-4
 
 
 def camera_advice(scene: Scene) -> list[Advice]:
-    """All that can be told from the cameras alone."""
+    """Problems that the cameras alone show."""
     return [*_held_out(scene), *_looking_away(scene), *_box_unknown(scene), *_one_side(scene)]
 
 
@@ -60,25 +59,21 @@ def _twins(test: Views, train: Views, middle: Tensor) -> list[str]:
 
 def _looking_away(scene: Scene) -> Iterator[Advice]:
     points = box_points(scene, scene.bounds.box, (9, 9, 9))
-    away, beside = [], []
-    for views in image_sets(scene).values():
-        for k, name in enumerate(views.names):
-            if float(views.cameras.project_into(k, points[4, 4, 4:5])[1]) <= 0:
-                away.append(name)
-            elif not _sees_any(views.cameras, k, points.reshape(-1, 3)):
-                beside.append(name)
+
+    def away(views: Views, k: int) -> bool:
+        return float(views.cameras.project_into(k, points[4, 4, 4:5])[1]) <= 0
+
+    def beside(views: Views, k: int) -> bool:
+        pixels, depth = views.cameras.project_into(k, points.reshape(-1, 3))
+        size = pixels.new_tensor([views.width, views.height])
+        seen = (depth > 0) & ((pixels >= 0) & (pixels <= size)).all(dim=1)
+        return not away(views, k) and not bool(seen.any())
+
     remedy = "check the pose (camera-to-world, x right, y up, looking along -z), or set data.box"
-    if away:
-        yield Advice(listed(away), "looks away from the middle of the box", remedy)
-    if beside:
-        yield Advice(listed(beside), "does not have the box in the picture", remedy)
-
-
-def _sees_any(cameras: Cameras, camera: int, points: Tensor) -> bool:
-    """Whether one of the points (M, 3) falls on the image."""
-    pixels, depth = cameras.project_into(camera, points)
-    size = pixels.new_tensor([cameras.width, cameras.height])
-    return bool(((depth > 0) & ((pixels >= 0) & (pixels <= size)).all(dim=1)).any())
+    if names := images_where(scene, away):
+        yield Advice(listed(names), "looks away from the middle of the box", remedy)
+    if names := images_where(scene, beside):
+        yield Advice(listed(names), "does not have the box in the picture", remedy)
 
 
 def _box_unknown(scene: Scene) -> Iterator[Advice]:

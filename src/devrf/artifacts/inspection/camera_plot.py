@@ -10,12 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.patheffects import withStroke
 from torch import Tensor
 
-from devrf.artifacts.inspection.layout import (
-    box_middle,
-    box_points,
-    common_up,
-    horizontal_axes,
-)
+from devrf.artifacts.inspection.layout import box_middle, box_points, common_up, horizontal_axes
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.scene import Scene, Views
@@ -137,7 +132,7 @@ def _fixed_views(scene: Scene) -> list[tuple[str, int, Tensor, str]]:
 
 
 def _camera_size(scene: Scene) -> float:
-    """Large enough to be seen, and small enough for neighbours not to meet (world units)."""
+    """Height of the drawn pyramids, world units: visible, and less than neighbours are apart."""
     positions = scene.static.train.cameras.positions
     distance = max(float((positions - box_middle(scene)).norm(dim=1).mean()), 1e-6)
     between = torch.cdist(positions, positions).fill_diagonal_(math.inf)

@@ -1,4 +1,4 @@
-"""What is wrong with images, their masks, their times and their optical flow."""
+"""Problems with images, their masks, their times and their optical flow."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 import torch
 from torch import Tensor
 
-from devrf.artifacts.inspection.advice import Advice, image_sets, listed
+from devrf.artifacts.inspection.advice import Advice, image_sets, images_where, listed
 from devrf.geometry.clock import FrameClock
 from devrf.scenes.optical_flow import frame_pairs
 from devrf.scenes.scene import Scene, Views
@@ -23,7 +23,7 @@ MUCH_MASKED = 0.5
 
 
 def image_advice(scene: Scene) -> list[Advice]:
-    """All that images, masks, times and flow tell."""
+    """Problems that images, masks, times and flow show."""
     return [
         *_blank(scene),
         *_turned(scene),
@@ -41,39 +41,40 @@ def mean_share(masks: Iterable[Tensor]) -> float:
 
 
 def _blank(scene: Scene) -> Iterator[Advice]:
-    flat, empty = [], []
-    for views in image_sets(scene).values():
-        for k, name in enumerate(views.names):
-            pixels = views.pixels[k]
-            if views.valid_mask is not None:
-                pixels = pixels[views.valid_mask[k]]
-            if views.has_alpha:
-                # A subject of one colour still has an outline: only an empty mask tells nothing.
-                if int(pixels[..., 3].amax()) <= OPAQUE:
-                    empty.append(name)
-            else:
-                values = pixels.reshape(-1, 3).int()
-                if int((values.amax(dim=0) - values.amin(dim=0)).max()) <= FLAT:
-                    flat.append(name)
-    if flat:
+    if flat := images_where(scene, _is_flat):
         remedy = "look at the file, and leave it out if it is lost"
         yield Advice(listed(flat), "one colour all over", remedy)
-    if empty:
+    if empty := images_where(scene, _is_empty):
         what = "its alpha mask is empty: it shows background only"
         yield Advice(listed(empty), what, "look at the alpha channel, or leave the image out")
 
 
+def _valid_pixels(views: Views, k: int) -> Tensor:
+    """(M, 3 or 4) uint8."""
+    pixels = views.pixels[k]
+    return pixels.flatten(0, 1) if views.valid_mask is None else pixels[views.valid_mask[k]]
+
+
+def _is_flat(views: Views, k: int) -> bool:
+    # With alpha a subject of one colour still has an outline.
+    if views.has_alpha:
+        return False
+    low, high = _valid_pixels(views, k).int().aminmax(dim=0)
+    return int((high - low).max()) <= FLAT
+
+
+def _is_empty(views: Views, k: int) -> bool:
+    return views.has_alpha and int(_valid_pixels(views, k)[:, 3].max()) <= OPAQUE
+
+
+def _is_ambiguous(views: Views, k: int) -> bool:
+    return views.ambiguous_orientation is not None and bool(views.ambiguous_orientation[k])
+
+
 def _turned(scene: Scene) -> Iterator[Advice]:
-    names = [
-        views.names[k]
-        for views in image_sets(scene).values()
-        if views.ambiguous_orientation is not None
-        for k in views.ambiguous_orientation.nonzero()[:, 0].tolist()
-    ]
-    if names:
+    if names := images_where(scene, _is_ambiguous):
         yield Advice(
-            # Without a static set the captures share files.
-            listed(list(dict.fromkeys(names))),
+            listed(names),
             "its EXIF orientation says that it is to be seen turned; it is read as it is stored, "
             "since its camera does not tell",
             "if the cameras were found on turned images, turn the files too "

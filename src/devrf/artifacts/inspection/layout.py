@@ -12,12 +12,12 @@ from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.scene import Scene
 
-# NDC depth at which an endless frustum is cut off: twice the near plane's distance. Behind
-# that lies more world than could be drawn beside the cameras.
+# NDC depth at which an endless frustum is cut off: twice the near plane's distance. More would
+# dwarf the cameras.
 NDC_CUT = 0.0
 # Mean square sine of the angle between x axes under which cameras stand side by side.
 SIDE_BY_SIDE = 1e-3
-# A camera looking down more steeply than this (degrees) belongs to no side of the scene.
+# Cameras that look down more steeply than this (degrees) are left out of the search for gaps.
 STEEP = 75.0
 
 
@@ -77,7 +77,7 @@ def widest_gap(cameras: Cameras, middle: Tensor) -> float | None:
         middle: (3,) the point that they surround, world units.
 
     Returns:
-        360 for a single side; None where up is not known or most cameras look from above.
+        360 for a single direction; None where up is unknown or most cameras look from above.
     """
     up = common_up(cameras)
     if up is None:

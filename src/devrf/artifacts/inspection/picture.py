@@ -3,26 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
 import matplotlib
 import numpy as np
 import torch
-from matplotlib.figure import Figure
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
 from PIL import Image
 from torch import Tensor
 
 from devrf.artifacts.colors import flow_colors, flow_wheel, to_bytes
-from devrf.artifacts.images import short_name
+from devrf.artifacts.images import evenly, short_name
 from devrf.artifacts.inspection.camera_plot import draw_cameras, first_images
 from devrf.scenes.optical_flow import frame_pairs
 from devrf.scenes.scene import OpticalFlow, Scene, Views
 from devrf.system.files import atomic_write
 
-# Sizes in inches, of which each is 100 pixels.
-WIDTH, TITLE, CAMERAS, HEADING, CAPTION, GAP = 16.0, 0.7, 6.6, 0.6, 0.4, 0.15
+# Inches, of which each is 100 pixels: the page's width; the heights of its parts.
+WIDTH, CAMERAS, HEADING, CAPTION = 16.0, 7.2, 0.55, 0.45
 # No image is higher, so that portrait images do not fill a page each.
 TALLEST = 2.8
 COLUMNS = 6
@@ -40,25 +41,10 @@ STYLE: dict[Any, Any] = {
     "xtick.labelsize": 11,
     "ytick.labelsize": 11,
 }
-
-
-Rectangle = tuple[float, float, float, float]
-# An image (H, W, 3) uint8 and its label.
-Tile = tuple[np.ndarray, str]
-
-
-@dataclass(frozen=True)
-class Section:
-    """Rows of tiles below a heading; None leaves a place empty."""
-
-    heading: str
-    rows: Sequence[Sequence[Tile | None]]
-    tile_height: float
-
-    @property
-    def height(self) -> float:
-        """Of the whole section, in inches."""
-        return HEADING + len(self.rows) * (self.tile_height + CAPTION)
+# An image (H, W, 3) uint8 and its label; None leaves a place empty.
+Tile = tuple[np.ndarray, str] | None
+# A heading, and rows of tiles below it.
+Section = tuple[str, Sequence[Sequence[Tile]]]
 
 
 def write_inspection_picture(path: Path, scene: Scene) -> None:
@@ -69,86 +55,77 @@ def write_inspection_picture(path: Path, scene: Scene) -> None:
 
 def inspection_figure(scene: Scene) -> Figure:
     """The page of a scene: 16 inches wide, 100 pixels each."""
-    sections = [_static_section(scene.static.train), *_dynamic_sections(scene.dynamic.train)]
-    height = TITLE + CAMERAS + sum(section.height for section in sections)
+    views = scene.static.train
+    tiles = [(shown(views, k), short_name(views.names[k])) for k in evenly(len(views), COLUMNS)]
+    static = f"Static training set: {len(views)} images", [tiles]
+    sections: list[Section] = [static, *_dynamic_sections(scene.dynamic.train)]
+    tile = min(TALLEST, WIDTH / COLUMNS * views.height / views.width)
+    heights = [CAMERAS, *(HEADING + len(rows) * (tile + CAPTION) for _, rows in sections)]
     with matplotlib.rc_context(STYLE):
-        figure = Figure((WIDTH, height), dpi=100)
-        _write(figure, 0.45, f"{scene.name}, {scene.kind}-facing", fontsize=24, fontweight="bold")
-        _draw_cameras(figure, scene)
-        top = TITLE + CAMERAS
-        for section in sections:
-            _draw_section(figure, section, top)
-            top += section.height
+        figure = Figure((WIDTH, sum(heights)), dpi=100)
+        areas = figure.subfigures(len(heights), squeeze=False, height_ratios=heights)
+        cameras, *parts = areas.flat
+        _title(cameras, f"{scene.name}, {scene.kind}-facing", fontsize=24, fontweight="bold")
+        side = cameras.add_axes((0, 0.1, 0.49, 0.78), projection="3d", title="in perspective")
+        plan = cameras.add_axes((0.53, 0.13, 0.43, 0.75))
+        plan.set_title("from above, in world units from the middle of the box")
+        draw_cameras(scene, side, plan)
+        cameras.legend(loc="lower center", ncols=6, frameon=False)
+        for part, height, (heading, rows) in zip(parts, heights[1:], sections, strict=True):
+            _title(part, heading, fontsize=17)
+            part.subplots_adjust(
+                left=0.01,
+                right=0.99,
+                top=1 - HEADING / height,
+                bottom=CAPTION / height,
+                wspace=0.06,
+                hspace=CAPTION / tile,
+            )
+            places = part.subplots(len(rows), COLUMNS, squeeze=False)
+            for axes, row in zip(places, rows, strict=True):
+                _draw_row(axes, row)
     return figure
 
 
-def _draw_cameras(figure: Figure, scene: Scene) -> None:
-    half, below = (WIDTH - GAP) / 2, TITLE + 0.3
-    side = figure.add_axes(_place(figure, 0, below, half, 5.6), projection="3d")
-    plan = figure.add_axes(_place(figure, half + 0.6, below, half - 1, 5.4))
-    draw_cameras(scene, side, plan)
-    _write(figure, below - 0.05, "in perspective")
-    _write(figure, below - 0.05, "from above, in world units from the middle of the box", half)
-    at = (0.5, 1 - (TITLE + CAMERAS - 0.2) / figure.get_figheight())
-    figure.legend(loc="center", bbox_to_anchor=at, ncols=6, frameon=False)
+def _title(part: SubFigure, text: str, **style: Any) -> None:
+    part.suptitle(text, x=0.01, ha="left", **style)
 
 
-def _draw_section(figure: Figure, section: Section, top: float) -> None:
-    _write(figure, top + HEADING - 0.15, section.heading, fontsize=17)
-    width = (WIDTH - (COLUMNS + 1) * GAP) / COLUMNS
-    for i, row in enumerate(section.rows):
-        below = top + HEADING + i * (section.tile_height + CAPTION)
-        for k, tile in enumerate(row):
-            if tile is not None:
-                left = GAP + k * (width + GAP)
-                axes = figure.add_axes(_place(figure, left, below, width, section.tile_height))
-                axes.imshow(tile[0])
-                axes.set(xticks=[], yticks=[], xlabel=tile[1], anchor="N")
-
-
-def _place(figure: Figure, left: float, top: float, width: float, height: float) -> Rectangle:
-    """Shares of a figure of a rectangle in inches, counted from its top left corner."""
-    page = figure.get_figheight()
-    return left / WIDTH, 1 - (top + height) / page, width / WIDTH, height / page
-
-
-def _write(figure: Figure, top: float, text: str, left: float = 0.0, **style: Any) -> None:
-    figure.text((left + GAP) / WIDTH, 1 - top / figure.get_figheight(), text, **style)
-
-
-def _static_section(views: Views) -> Section:
-    tiles = [(shown(views, k), short_name(views.names[k])) for k in evenly(len(views), COLUMNS)]
-    return Section(f"Static training set: {len(views)} images", [tiles], _tile_height(views))
+def _draw_row(places: Sequence[Axes], tiles: Sequence[Tile]) -> None:
+    for axes, tile in zip_longest(places, tiles):
+        if tile is None:
+            axes.set_axis_off()
+        else:
+            axes.imshow(tile[0])
+            axes.set(xticks=[], yticks=[], xlabel=tile[1], anchor="N")
 
 
 def _dynamic_sections(views: Views) -> list[Section]:
     """Sample images of the dynamic views, and below the flow of the same images."""
-    rows, height = sample_images(views), _tile_height(views)
+    samples = sample_images(views)
     label = {
         k: f"view {int(views.view[k])}, time {float(views.times[k]):.2f}"
-        for row in rows
+        for row in samples
         for k in row
     }
     numbers, times = len(set(views.view.tolist())), len(set(views.times.tolist()))
     motion = "a moving camera" if numbers == len(views) else f"{numbers} fixed views"
-    heading = f"Dynamic training set: {motion}, {times} times"
-    sections = [
-        Section(heading, [[(shown(views, k), label[k]) for k in row] for row in rows], height)
-    ]
+    rows: list[list[Tile]] = [[(shown(views, k), label[k]) for k in row] for row in samples]
+    sections: list[Section] = [(f"Dynamic training set: {motion}, {times} times", rows)]
     if views.flow is None:
         return sections
     longest, flowing = flow_scale(views.flow), {image for image, _ in frame_pairs(views)}
-    tiles = [
+    flow: list[list[Tile]] = [
         [(_flow_image(views.flow, k, longest), label[k]) if k in flowing else None for k in row]
-        for row in rows
+        for row in samples
     ]
     # The first image of a view has no frame before it.
-    tiles[0][0] = (to_bytes(flow_wheel(300)).numpy(), f"rim: {longest:.3g} px or more")
+    flow[0][0] = (to_bytes(flow_wheel(300)).numpy(), f"rim: {longest:.3g} px or more")
     heading = (
         "Optical flow: where each pixel was one frame earlier; the wheel shows the direction, "
         "grey is unknown"
     )
-    return [*sections, Section(heading, tiles, height)]
+    return [*sections, (heading, flow)]
 
 
 def sample_images(views: Views) -> list[list[int]]:
@@ -166,11 +143,6 @@ def sample_images(views: Views) -> list[list[int]]:
         own = [image for image in order if int(views.view[image]) == numbers[k]]
         rows.append([own[j] for j in evenly(len(own), COLUMNS)])
     return rows
-
-
-def evenly(count: int, most: int) -> list[int]:
-    """At most ``most`` of the positions 0 … count − 1, evenly spread, both ends among them."""
-    return [round(k) for k in np.linspace(0, count - 1, min(count, most))]
 
 
 def flow_scale(flow: OpticalFlow) -> float:
@@ -201,7 +173,3 @@ def _smaller(colors: Tensor) -> np.ndarray:
     """Reduced by a whole factor to little more than is shown: a page of full images is large."""
     image = Image.fromarray(to_bytes(colors).numpy())
     return np.asarray(image.reduce(max(1, image.width // 300)))
-
-
-def _tile_height(views: Views) -> float:
-    return min(TALLEST, (WIDTH / COLUMNS - GAP) * views.height / views.width)

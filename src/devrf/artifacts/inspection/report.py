@@ -1,9 +1,10 @@
-"""What a scene holds, as data: found without training."""
+"""Facts of a scene, found without training."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from devrf.artifacts.inspection.advice import Advice, image_sets
@@ -21,11 +22,9 @@ class ViewsFacts:
 
     Attributes:
         name: as in :func:`devrf.artifacts.inspection.advice.image_sets`.
-        images: number of images.
-        views: number of cameras that took them.
+        views: the images.
+        cameras: number of cameras that took them.
         frames: number of distinct times.
-        width: image width in pixels.
-        height: image height in pixels.
         alpha_share: share of the pixels inside alpha masks; None without an alpha channel.
         masked_share: share of the pixels that masks leave out; None without masks.
         focal: least and largest focal length in pixels, both axes.
@@ -34,32 +33,13 @@ class ViewsFacts:
     """
 
     name: str
-    images: int
-    views: int
+    views: Views
+    cameras: int
     frames: int
-    width: int
-    height: int
     alpha_share: float | None
     masked_share: float | None
     focal: tuple[float, float]
     distance: tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class TimesFacts:
-    """The distinct times of the dynamic training views.
-
-    Attributes:
-        count: how many there are.
-        first: the earliest.
-        last: the latest.
-        even: whether they are evenly spaced, to a hundredth of a step.
-    """
-
-    count: int
-    first: float
-    last: float
-    even: bool
 
 
 @dataclass(frozen=True)
@@ -83,21 +63,23 @@ class FlowFacts:
 
 @dataclass(frozen=True)
 class Inspection:
-    """What was found in a scene.
+    """Facts of a scene, and what may be wrong with it.
 
     Attributes:
-        scene: the scene.
-        sets: facts of its four sets of images; an empty set is left out.
-        times: the times of the dynamic training views.
-        gap: widest sector without a static view in degrees, seen from above; None for a
-            forward-facing scene or where it cannot be told.
+        scene: the scene itself: name, kind, background, bounds.
+        sets: one for each set that is not empty.
+        times: the distinct times of the dynamic training views, ascending.
+        even: whether these are evenly spaced, to a hundredth of a step.
+        gap: the widest sector, in degrees from above, without a static training view; None in
+            a forward-facing scene or where it cannot be told.
         flow: optical flow, or None where there is none.
         advice: what may be wrong.
     """
 
     scene: Scene
     sets: tuple[ViewsFacts, ...]
-    times: TimesFacts
+    times: tuple[float, ...]
+    even: bool
     gap: float | None
     flow: FlowFacts | None
     advice: tuple[Advice, ...]
@@ -106,10 +88,13 @@ class Inspection:
 def inspect_scene(scene: Scene) -> Inspection:
     """Find counts, sizes, times, cameras and flow of a scene, and what may be wrong with it."""
     cameras, middle = scene.static.train.cameras, box_middle(scene)
+    times = _distinct_times(scene.dynamic.train)
+    steps = times.diff()
     return Inspection(
         scene,
         sets=tuple(_views_facts(*named, middle) for named in image_sets(scene).items()),
-        times=_times_facts(scene.dynamic.train),
+        times=tuple(times.tolist()),
+        even=torch.allclose(steps, steps.mean(), rtol=0.01, atol=FrameClock.TOLERANCE),
         gap=widest_gap(cameras, middle) if scene.kind == "inward" else None,
         flow=_flow_facts(scene.dynamic.train),
         advice=(*camera_advice(scene), *image_advice(scene)),
@@ -117,39 +102,27 @@ def inspect_scene(scene: Scene) -> Inspection:
 
 
 def _views_facts(name: str, views: Views, middle: Tensor) -> ViewsFacts:
-    focal = views.cameras.focal
     distance = (views.cameras.positions - middle).norm(dim=1)
+    nearest, furthest = distance.aminmax()
+    least, most = views.cameras.focal.aminmax()
     alpha = (image[..., 3] > OPAQUE for image in views.pixels) if views.has_alpha else None
     masked = None if views.valid_mask is None else (~mask for mask in views.valid_mask)
     return ViewsFacts(
-        name=name,
-        images=len(views),
-        views=len(set(views.view.tolist())),
+        name,
+        views,
+        cameras=len(set(views.view.tolist())),
         frames=len(_distinct_times(views)),
-        width=views.width,
-        height=views.height,
         alpha_share=None if alpha is None else mean_share(alpha),
         masked_share=None if masked is None else mean_share(masked),
-        focal=(float(focal.min()), float(focal.max())),
-        distance=(float(distance.min()), float(distance.mean()), float(distance.max())),
+        focal=(float(least), float(most)),
+        distance=(float(nearest), float(distance.mean()), float(furthest)),
     )
 
 
-def _distinct_times(views: Views) -> list[float]:
+def _distinct_times(views: Views) -> Tensor:
     """The times of the views, each once, ascending; equal up to rounding is equal."""
-    kept: list[float] = []
-    for time in sorted(views.times.tolist()):
-        if not kept or time - kept[-1] > FrameClock.TOLERANCE:
-            kept.append(time)
-    return kept
-
-
-def _times_facts(views: Views) -> TimesFacts:
-    times = _distinct_times(views)
-    steps = [b - a for a, b in zip(times, times[1:], strict=False)]
-    mean = sum(steps) / max(len(steps), 1)
-    even = all(abs(step - mean) <= 0.01 * mean + FrameClock.TOLERANCE for step in steps)
-    return TimesFacts(len(times), times[0], times[-1], even)
+    times = views.times.sort().values
+    return times[times.diff(prepend=times.new_tensor([-1.0])) > FrameClock.TOLERANCE]
 
 
 def _flow_facts(views: Views) -> FlowFacts | None:

@@ -2,40 +2,28 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 
-from rich.console import Group, RenderableType
+from rich.console import Console, Group, RenderableType
+from rich.padding import Padding
+from rich.table import Table
 from rich.text import Text
 
 from devrf.artifacts.inspection.report import FlowFacts, Inspection, ViewsFacts
-from devrf.artifacts.tables import titled_table
 from devrf.geometry.box import Box
 
-HEADING = (
-    "set",
-    "images",
-    "views x times",
-    "size",
-    "alpha masks",
-    "masks",
-    "focal length",
-    "distance",
-)
+HEADING = "set,images,views x times,size,alpha masks,masks,focal length,distance".split(",")
 
 
 def inspection_text(found: Inspection, requirements: Sequence[Sequence[str]]) -> RenderableType:
-    """The whole report for a terminal (:func:`devrf.artifacts.tables.as_text` for a log).
-
-    Args:
-        found: the facts.
-        requirements: what a run will need: rows of a name, an amount and its largest parts.
-    """
+    """The report for a terminal; ``requirements`` of a run are rows of a name and an amount."""
     count = len(found.advice)
     verdict = f"problems found: {count}" if count else "no problems found"
     return Group(
-        titled_table("what was found", _facts(found)),
-        titled_table("images", [_images(facts) for facts in found.sets], HEADING),
-        titled_table("what a run will need, estimated", requirements),
+        _titled_table("what was found", _facts(found)),
+        _titled_table("images", [_images(facts) for facts in found.sets], HEADING),
+        _titled_table("what a run will need, estimated", requirements),
         Text(verdict, style="bold yellow" if count else "bold green"),
         *(
             Text.assemble((f"  {a.where}", "yellow"), f": {a.what}; ", (a.remedy, "italic"))
@@ -44,14 +32,33 @@ def inspection_text(found: Inspection, requirements: Sequence[Sequence[str]]) ->
     )
 
 
+def as_text(shown: RenderableType) -> str:
+    """The report for a log: without colours and trailing spaces, no line wrapped."""
+    console = Console(file=io.StringIO(), width=10_000, record=True)
+    console.print(shown)
+    return "\n".join(map(str.rstrip, console.export_text().splitlines()))
+
+
+def _titled_table(
+    title: str, rows: Sequence[Sequence[str]], heading: Sequence[str] | None = None
+) -> RenderableType:
+    """An indented table of text with a title above and an empty line below."""
+    table = Table(box=None, show_header=heading is not None, padding=(0, 2, 0, 0))
+    for k, name in enumerate(heading or [""] * len(rows[0])):
+        table.add_column(name, style="" if k else "cyan")
+    for row in rows:
+        table.add_row(*map(Text, row))  # Text: a name may hold [brackets]
+    return Group(Text(title, style="bold"), Padding(table, (0, 0, 1, 2)))
+
+
 def _facts(found: Inspection) -> list[tuple[str, str]]:
     scene, bounds, times = found.scene, found.scene.bounds, found.times
+    spacing = "evenly spaced" if found.even else "unevenly spaced"
     unit = "NDC" if scene.kind == "forward" else "world units"
-    spacing = "evenly spaced" if times.even else "unevenly spaced"
     motion = "" if bounds.motion is None else f"{_box(bounds.motion)}, "
     rows = [
         ("scene", f"{scene.name}, {scene.kind}-facing, {scene.background} background"),
-        ("times", f"{times.count} from {times.first:g} to {times.last:g}, {spacing}"),
+        ("times", f"{len(times)} from {times[0]:g} to {times[-1]:g}, {spacing}"),
         ("near, far", f"{bounds.near:.4g}, {bounds.far:.4g} ({unit})"),
         ("box", _box(bounds.box)),
         ("room for motion", f"{motion}{bounds.source}"),
@@ -81,12 +88,12 @@ def _flow(flow: FlowFacts | None) -> str:
 def _images(facts: ViewsFacts) -> tuple[str, ...]:
     least, most = facts.focal
     near, mean, far = facts.distance
-    alpha, masked = facts.alpha_share, facts.masked_share
+    alpha, masked, views = facts.alpha_share, facts.masked_share, facts.views
     return (
         facts.name,
-        str(facts.images),
-        f"{facts.views} x {facts.frames}",
-        f"{facts.width} x {facts.height}",
+        str(len(views)),
+        f"{facts.cameras} x {facts.frames}",
+        f"{views.width} x {views.height}",
         "no" if alpha is None else f"cover {_percent(alpha)}",
         "no" if masked is None else f"leave out {_percent(masked)}",
         f"{least:.0f} px" if most - least < 0.5 else f"{least:.0f} to {most:.0f} px",

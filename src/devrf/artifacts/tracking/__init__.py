@@ -17,7 +17,7 @@ Row = Mapping[str, str | float | None]
 
 @runtime_checkable
 class Tracker(Protocol):
-    """A logger that can show more than numbers, and that follows one run across its stages."""
+    """A logger that also shows pictures, videos and tables, of one run across its stages."""
 
     def log_hyperparams(self, params: dict[str, Any]) -> None:
         """Keep the run's composed config."""
@@ -32,10 +32,10 @@ class Tracker(Protocol):
         """Show a table whose columns are the rows' keys, of which there is at least one."""
 
     def conclude(self, values: Mapping[str, float]) -> None:
-        """Keep the numbers that the run has come to."""
+        """Record the run's final numbers."""
 
     def close(self, *, failed: bool) -> None:
-        """End the tracking, if it ever began."""
+        """End the tracking, if it began."""
 
 
 def trackers(loggers: Iterable[Logger]) -> list[Tracker]:

@@ -16,7 +16,7 @@ class TensorBoardTracker(TensorBoardLogger):
     """One set of event files for all stages of a devrf run, added to by each."""
 
     def __init__(self, save_dir: str | Path, name: str = "tensorboard") -> None:
-        """Say where the event files go; the first is written when something is logged.
+        """Choose the folder; the first file is written when something is logged.
 
         Args:
             save_dir: the run's folder.

@@ -37,7 +37,7 @@ class WandbTracker(WandbLogger):
         entity: str | None = None,
         offline: bool = True,
     ) -> None:
-        """Say what the run is called; it begins when the first thing is logged.
+        """Name the run; it begins when something is logged first.
 
         Args:
             save_dir: the run's folder; wandb works in ``wandb/`` below it.
@@ -60,7 +60,7 @@ class WandbTracker(WandbLogger):
             entity=entity,
             offline=offline,
         )
-        # Of no use any more; wandb warns when it is given.
+        # wandb ignores it and warns where it is given.
         self._wandb_init.pop("anonymous", None)
         self._id_file = Path(save_dir) / "wandb" / "run_id"
         if self._id_file.is_file():
@@ -73,13 +73,9 @@ class WandbTracker(WandbLogger):
         Raises:
             DevrfError: wandb could not begin it.
         """
-        begun = self._experiment is not None
-        run = cast("Run", super().experiment) if begun else self._begin()
-        return run
-
-    def _begin(self) -> Run:
         import wandb
 
+        begun = self._experiment is not None
         try:
             run = cast("Run", super().experiment)
         except wandb.errors.Error as error:
@@ -87,7 +83,7 @@ class WandbTracker(WandbLogger):
                 f"logger: wandb cannot begin a run ({error}); leave logger.offline=true, or log "
                 "in with `wandb login`"
             ) from None
-        if self._experiment is not None:
+        if not begun and self._experiment is not None:
             self._id_file.parent.mkdir(exist_ok=True)
             self._id_file.write_text(f"{run.id}\n")
         return run
