@@ -11,7 +11,7 @@ from devrf.geometry.rays import Rays
 from devrf.methods.devrf.grid_warp import GridWarp
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import Precision
-from devrf.methods.devrf.static_shape import render_static
+from devrf.methods.devrf.static_shape.training import render_static
 from devrf.methods.devrf.volume_rendering import VoxelOutput, render
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.sample_capacity import SampleCapacity
