@@ -17,8 +17,8 @@ from devrf.methods.devrf.motion_losses import (
     cycle,
     flow,
     induced_flow,
+    total_variation_weight,
 )
-from devrf.methods.devrf.smoothing import total_variation_weight
 from devrf.methods.devrf.volume_rendering import VoxelOutput
 from devrf.rendering.sampling import Samples
 from devrf.scenes.procedural import Material, ProceduralScene

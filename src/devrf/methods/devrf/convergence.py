@@ -1,4 +1,4 @@
-"""Whether frames that are being learned have anything left to gain."""
+"""Whether the active frames have anything left to gain (docs/method.md#coarse-to-fine)."""
 
 from __future__ import annotations
 
@@ -13,12 +13,7 @@ class ConvergenceMonitor:
     """
 
     def __init__(self, frames: int, min_rel_improvement: float | None) -> None:
-        """Begin with no losses.
-
-        Args:
-            frames: how many are learned together.
-            min_rel_improvement: see :func:`converged`; None: no frame ever converges.
-        """
+        """No losses yet of ``frames`` frames; ``min_rel_improvement`` None: none ever converges."""
         self.losses: list[list[float]] = [[] for _ in range(frames)]
         self._gain = min_rel_improvement
 
@@ -31,14 +26,9 @@ class ConvergenceMonitor:
 
 
 def converged(losses: Sequence[float], min_rel_improvement: float) -> bool:
-    """Whether the last two Lightning steps have gained too little to go on.
+    """Whether the last two steps took less than ``min_rel_improvement`` off the best loss before.
 
     Two, since one may have drawn difficult pixels; at least three steps tell.
-
-    Args:
-        losses: mean loss of each step so far.
-        min_rel_improvement: the share of the loss that two steps must take off the best one
-            before them.
     """
     if len(losses) < 3:
         return False

@@ -25,11 +25,14 @@ from devrf.methods.devrf.deformed_occupancy import deformed_occupancy
 from devrf.methods.devrf.flow_initialisation import follow, start_from_tracks
 from devrf.methods.devrf.frame_memory import rest_on_host
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.motion_losses import MOTION_TERMS, MotionPrediction
+from devrf.methods.devrf.motion_losses import (
+    MOTION_TERMS,
+    MotionPrediction,
+    total_variation_weight,
+)
 from devrf.methods.devrf.photometric_losses import visibility
 from devrf.methods.devrf.pixel_selection import frame_pools, images_of
 from devrf.methods.devrf.settings import DEFORMATION_LOSS, MotionSettings, Precision
-from devrf.methods.devrf.smoothing import total_variation_weight
 from devrf.methods.devrf.voxel_stage import VoxelStage
 from devrf.methods.weighted_loss import WeightedLoss
 from devrf.ops.adam import GridAdam
@@ -274,7 +277,7 @@ class DeformationStage(VoxelStage):
         output = self.render_rays(
             rays.rays, frame.occupancy, rays.background, batch.capacity, frame.warp
         )
-        before = frame.unwarp_previous(looked_up=batch.capacity is not None)
+        before = frame.unwarp_previous(always_interpolate=batch.capacity is not None)
         prediction = MotionPrediction(
             output, rays, frame.unwarp, before, views.cameras, self.previous_images, space
         )
