@@ -11,7 +11,7 @@ from lightning import Trainer
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
-from devrf.methods.devrf.convergence import ConvergenceMonitor, converged
+from devrf.methods.devrf.convergence import converged
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.settings import MotionSettings
@@ -57,15 +57,6 @@ def test_a_frame_that_has_converged_is_left(learn: Callable[..., DeformationStag
     visits = 2 * 2
     assert hasty.iteration - hasty.skipped == visits * 3 * 2
     assert hasty.iteration == hasty.total_iterations == 60
-
-
-def test_frames_that_are_learned_together_converge_together() -> None:
-    both = ConvergenceMonitor(2, 0.1)
-    steps = [[1.0, 1.0], [1.0, 0.5], [1.0, 0.25], [1.0, 0.25], [1.0, 0.25]]
-    assert [both.add(losses) for losses in steps] == [False, False, False, False, True]
-    assert both.losses[1] == [1.0, 0.5, 0.25, 0.25, 0.25]
-    never = ConvergenceMonitor(1, None)
-    assert not any(never.add([1.0]) for _ in range(9))
 
 
 def test_nothing_is_left_out_unless_asked(learn: Callable[..., DeformationStage]) -> None:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from devrf.checkpoints.packing import pack_bits, unpack_bits
 from devrf.data.pool import PixelPool
 from devrf.geometry.box import Box
 from devrf.methods.devrf.deformation_field import DeformationField
@@ -30,6 +32,7 @@ class ActiveFrame:
         box: where all of them live.
         number: the frame; 0 before the first.
         pools: the pixels to learn from; batches are drawn from each in turn.
+        losses: mean loss of each Lightning step since the frame was checked out.
     """
 
     backward: Tensor
@@ -39,6 +42,7 @@ class ActiveFrame:
     box: Box
     number: int = 0
     pools: list[PixelPool] = field(default_factory=list)
+    losses: list[float] = field(default_factory=list)
 
     @staticmethod
     def of(motion: DeformationField, occupancy: Occupancy) -> ActiveFrame:
@@ -76,9 +80,35 @@ class ActiveFrame:
 
     def check_out(self, motion: DeformationField, number: int) -> None:
         """Copy a frame out of the field."""
-        self.number = number
+        self.number, self.losses = number, []
         motion.frames.read(number, self.slices)
         motion.frames.read_forward(number - 1, self.before)
+
+    def state(self, images: Tensor, area: int, *, exact: bool) -> dict[str, Any]:
+        """Occupancy and pixels as plain data, for a progress file.
+
+        Args:
+            images: (K,) the images of the frame.
+            area: pixels of an image.
+            exact: add the displacements, which the field would round.
+        """
+        return {
+            "occupancy": pack_bits(self.occupancy.mask),
+            "shape": list(self.occupancy.mask.shape),
+            "pixels": [pack_bits(pool.mask(images, area)) for pool in self.pools],
+            "displacements": [tensor.detach().cpu() for tensor in self.slices if exact],
+        }
+
+    @torch.no_grad()
+    def load_state(self, state: dict[str, Any], images: Tensor, area: int) -> None:
+        """Restore what :meth:`state` gave; the frame has been checked out."""
+        for tensor, value in zip(self.slices, state["displacements"], strict=False):
+            tensor.copy_(value)
+        device, shape = self.backward.device, (len(images), area)
+        mask = unpack_bits(state["occupancy"], state["shape"], device)
+        self.occupancy.refill(Occupancy(mask, self.box))
+        masks = [unpack_bits(bits, shape, device) for bits in state["pixels"]]
+        self.pools = [PixelPool.of_mask(images, mask) for mask in masks]
 
 
 class ActiveFrames:

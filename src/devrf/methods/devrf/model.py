@@ -29,13 +29,13 @@ from devrf.rendering.output import RenderOutput
 
 
 class DeVRFModel(DynamicModel):
-    """Everything that is needed to see a scene from any view at any time.
+    """A scene, to be rendered from any view at any time.
 
     Attributes:
         architecture: sizes of the canonical field.
         canonical: what the scene looks like at rest.
         occupancy: where something is at rest.
-        deformation: how it moves; None shows the rest state at every time.
+        deformation: V_motion; None shows the rest state at every time.
         settings: how rays are sampled.
         space: the space that the fields live in.
     """
@@ -160,7 +160,7 @@ class DeVRFModel(DynamicModel):
         return super().size + sum(tensor.numel() for tensor in frames)
 
     def stored_state(self) -> dict[str, Any]:
-        """The state with its grids in half precision, in detail only near matter."""
+        """The state with packed grids (``compact_state``)."""
         return compact_state(
             self.state_dict(), self.occupancy, self.canonical, self.deformation, self.occupancy_at
         )
