@@ -48,8 +48,8 @@ log = logging.getLogger(__name__)
 class CanonicalStage(VoxelStage):
     """Learns the canonical field from the static views (docs/method.md#canonical-stage).
 
-    First the coarse geometry (docs/method.md#geometry-search) in the box of the scene's bounds; then
-    the radiance field (docs/method.md#radiance-field) in a box around it that leaves room for
+    First the coarse geometry (docs/method.md#geometry-search) in the box of the scene's bounds;
+    then the radiance field (docs/method.md#radiance-field) in a box around it that leaves room for
     motion, on rays that meet the coarse geometry.
     """
 

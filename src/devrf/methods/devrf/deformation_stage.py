@@ -183,29 +183,24 @@ class DeformationStage(VoxelStage):
             self.bind(self.schedule.rays, slices, static_shape=static_shape)
 
     def _initialise(self, phase: DeformationPhase) -> None:
-        """Start each frame from the one before it; along the observed flow, if that is asked for."""
+        """Start each frame from the one before it; along the observed flow, if asked to."""
         for number in phase.frames:
             if phase.init_from_previous:
                 self.field.frames.copy_previous(number)
             if self._starts_along_flow(phase):
-                self._follow_flow(number)
+                views, model, clock = self.views, self.scene_model, self.field.clock
+                pool, before = all_pixels(views, images_of(views, number)), clock.times[number - 1]
+                tracks = follow(model, views, pool, self.previous_images, before, self.generator)
+                start_from_tracks(self.field, number, tracks, views.cameras, model.space)
+                # Each process has followed pixels of its own.
+                broadcast([self.field.to_canonical[number], self.field.to_time[number]])
 
     def _starts_along_flow(self, phase: DeformationPhase) -> bool:
         asked = self.motion.start == "flow" and self.views.flow is not None
         return asked and phase.level == 0 and phase.has_previous
 
-    def _follow_flow(self, number: int) -> None:
-        """Fit a frame's slices to the flow from the frame before."""
-        views, model = self.views, self.scene_model
-        pool = all_pixels(views, images_of(views, number))
-        before = self.field.clock.times[number - 1]
-        tracks = follow(model, views, pool, self.previous_images, before, self.generator)
-        start_from_tracks(self.field, number, tracks, views.cameras, model.space)
-        # Each process has followed pixels of its own.
-        broadcast([self.field.to_canonical[number], self.field.to_time[number]])
-
     def _prefetch_after(self, phase: DeformationPhase) -> None:
-        """Begin to fetch the frames that come next, unless they are changed before they do."""
+        """Begin to fetch the next phase's frames, unless they change before it begins."""
         following = self.phase_at(phase.stop)
         changed = following.init_from_previous or self._starts_along_flow(following)
         if following.level == phase.level and following != phase and not changed:
