@@ -50,16 +50,6 @@ class Watch(Callback):
         self.seen.append((pl_module.phase.kind, pl_module.resolution, decoder))
 
 
-def test_two_steps_learn_something(
-    datamodule: SceneDataModule, trainer: Callable[..., Trainer]
-) -> None:
-    stage, fit = CanonicalStage(CARVED, SMALL), trainer(max_steps=2)
-    fit.fit(stage, datamodule=datamodule)
-    assert stage.iteration == fit.global_step == 2
-    assert stage.scene_model.canonical.density.values.abs().max() > 0
-    assert stage.scene_model.canonical.color.values.abs().max() > 0
-
-
 @pytest.mark.parametrize(
     ("asked", "made_for_it", "expected"),
     [
@@ -174,23 +164,6 @@ def test_share_of_views_by_hand() -> None:
     share = view_count_weight(cameras, points.view(2, 2, 1, 3))
     # Seen by one, one, both (on their edges), none: none counts as one.
     assert share.flatten().tolist() == [0.5, 0.5, 1.0, 0.5]
-
-
-def test_the_default_stage_is_the_papers() -> None:
-    stage = CanonicalStage()
-    assert stage.total_iterations == 25000
-    assert (stage.rates.density, stage.rates.color, stage.rates.decoder) == (0.1, 0.1, 1e-3)
-    assert stage.sampling.step == 0.5 and stage.sampling.alpha_threshold == 1e-4
-    assert stage.losses["search"].weights == {
-        "color": 1.0,
-        "per_sample_color": 0.1,
-        "entropy": 0.01,
-    }
-    assert stage.losses["fine"].weights == {
-        "color": 1.0,
-        "per_sample_color": 0.01,
-        "entropy": 0.001,
-    }
 
 
 def test_no_matter_is_possible_before_a_lens(

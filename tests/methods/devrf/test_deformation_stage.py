@@ -18,7 +18,7 @@ from devrf.evaluation.held_out import score
 from devrf.methods.devrf.compact_state import expanded_state
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
-from devrf.methods.devrf.settings import DEFORMATION_LOSS, MotionSettings
+from devrf.methods.devrf.settings import MotionSettings
 from devrf.ops.total_variation import total_variation
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene
@@ -161,14 +161,6 @@ def test_stages_built_on_one_rest_do_not_meet(
     assert first.field is not second.field
     assert not second.field.to_time[2].any()
     assert first.field.to_canonical[1].abs().max() > 1e-3
-
-
-def test_defaults_are_the_papers(rest: LoadedCheckpoint) -> None:
-    stage = DeformationStage(rest)
-    assert stage.motion.learning_rate == 1e-3 and stage.motion.unit == "world"
-    assert stage.tv == 1.0
-    weights = {"render": 1.0, "cycle": 100.0, "flow": 0.005, "tv": 1.0}
-    assert {name: DEFORMATION_LOSS[name] for name in weights} == weights
 
 
 def test_an_unknown_loss_term_is_named(rest: LoadedCheckpoint) -> None:

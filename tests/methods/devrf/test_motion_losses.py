@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -12,12 +13,10 @@ from devrf.data.batch import RayBatch, gather_batch
 from devrf.data.correspondence import previous_images
 from devrf.geometry.cameras import Cameras
 from devrf.methods.devrf.motion_losses import (
-    MOTION_TERMS,
     MotionPrediction,
     cycle,
     flow,
     induced_flow,
-    total_variation_weight,
 )
 from devrf.methods.devrf.volume_rendering import VoxelOutput
 from devrf.rendering.sampling import Samples
@@ -46,7 +45,7 @@ def seen(
 
 
 @pytest.fixture
-def by_hand() -> MotionPrediction:
+def by_hand(ray_batch: Callable[..., RayBatch]) -> MotionPrediction:
     """Two rays of image 1, whose flow leads into image 0; three samples before them.
 
     Both cameras are at the origin and look along −z; image 0 has another lens. The motion: at t
@@ -61,11 +60,8 @@ def by_hand() -> MotionPrediction:
     )
     pixel = torch.tensor([[8.5, 6.5], [10.5, 4.5]])
     image = torch.tensor([1, 1])
-    batch = RayBatch(
-        rays=cameras.rays(image, pixel),
-        color=torch.zeros(2, 3),
-        alpha=None,
-        background=torch.zeros(3),
+    batch = ray_batch(
+        cameras.rays(image, pixel),
         time=torch.ones(2),
         frame=torch.ones(2, dtype=torch.long),
         image=image,
@@ -166,12 +162,3 @@ def test_induced_flow_of_the_exact_motion_is_the_exact_flow(
     assert flow(prediction).item() < 1e-3
     swapped = replace(batch, flow=batch.flow.flip(1))
     assert flow(replace(prediction, batch=swapped)).item() > 0.2
-
-
-def test_total_variation_weight_by_hand() -> None:
-    assert total_variation_weight(2.0, 64, 100) == pytest.approx(1 / 600)
-
-
-def test_motion_terms_name_the_papers() -> None:
-    assert {"render", "cycle", "flow", "per_sample_color", "entropy"} <= set(MOTION_TERMS)
-    assert "color" not in MOTION_TERMS
