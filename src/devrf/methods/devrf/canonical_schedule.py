@@ -94,6 +94,6 @@ class CanonicalSchedule:
         return next((p for p in self.phases if iteration < p.stop), self.phases[-1])
 
     def learning_rate_factor(self, iteration: int) -> float:
-        """0.1^(n / decay_iterations), n counted anew from the search's end on."""
+        """0.1^(n / decay_iterations), n from the start of the search or of the radiance field."""
         first = 0 if iteration < self.search_iterations else self.search_iterations
         return float(0.1 ** ((iteration - first) / self.decay_iterations))

@@ -1,4 +1,4 @@
-"""The canonical stage: static views → a voxel radiance field of the rest state."""
+"""The canonical stage: the static capture (docs/method.md#captures) → the scene at rest."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from devrf.engine.graphs import Graphs
 from devrf.engine.parallel_batch import ParallelBatch
 from devrf.engine.phase import Phase
 from devrf.errors import DevrfError
-from devrf.geometry.cameras import Cameras
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.canonical_schedule import CanonicalPhase, CanonicalSchedule
@@ -178,7 +177,7 @@ class CanonicalStage(VoxelStage):
                 f"the field has become empty by iteration {self.iteration}: check data.background, "
                 "data.box and data.near, or lower schedule.rates.density"
             )
-        self.setup_optimizer(views.cameras)
+        self.setup_optimizer()
 
     def _begin_fine(self, phase: CanonicalPhase) -> None:
         """Keep what the search found as the occupancy, and start the radiance field."""
@@ -215,7 +214,7 @@ class CanonicalStage(VoxelStage):
         before = model.occupancy.at(points.view(-1, 3)).view(found.shape)
         model.occupancy.replace(found & before, field.box)
 
-    def setup_optimizer(self, cameras: Cameras) -> None:
+    def setup_optimizer(self) -> None:
         """Give the optimiser the present grids (docs/method.md#optimiser).
 
         In the search the learning rate of each voxel depends on how many views see it; afterwards
@@ -230,7 +229,8 @@ class CanonicalStage(VoxelStage):
         if searching:
             points = field.box.grid_points(field.density.shape, field.density.values)
             points = self.scene.space.to_world(points)
-            per_voxel_lr = view_count_weight(cameras.to(self.device), points)[..., None]
+            cameras = self.scene.static.train.cameras.to(self.device)
+            per_voxel_lr = view_count_weight(cameras, points)[..., None]
         for group, grid in ((0, field.density), (1, field.color)):
             self.optimizer.replace(
                 group,
@@ -291,7 +291,7 @@ class CanonicalStage(VoxelStage):
         mask = unpack_bits(kept["pixels"], (len(images), area), self.device)
         self.pool = PixelPool.of_mask(images, mask)
         self.scene_model.settings = self.render_settings(phase)
-        self.setup_optimizer(self.scene.static.train.cameras)
+        self.setup_optimizer()
 
     @property
     def _images(self) -> tuple[Tensor, int]:

@@ -55,15 +55,11 @@ class DeformationField(nn.Module):
 
     def unwarp(self, points: Tensor, time: float) -> Tensor:
         """q + Δ_f(q, t) (M, 3) of canonical ``points`` q (M, 3) at ``time`` t."""
-        return self.unwarp_at(time)(points)
+        return self._at(self.to_time, time)(points)
 
     def warp_at(self, time: float) -> GridWarp:
         """The map x → x + Δ_b(x, t) at ``time`` t."""
         return self._at(self.to_canonical, time)
-
-    def unwarp_at(self, time: float) -> GridWarp:
-        """The map q → q + Δ_f(q, t) at ``time`` t."""
-        return self._at(self.to_time, time)
 
     def _at(self, frames: Tensor, time: float) -> GridWarp:
         moment = self.clock.at(time)

@@ -1,4 +1,4 @@
-"""The deformation stage: dynamic views + the canonical field → how the scene moves."""
+"""The deformation stage: the dynamic capture and the canonical field → how the scene moves."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from devrf.system.profiling import span
 
 
 class DeformationStage(VoxelStage):
-    """Learns how a known canonical field deforms (docs/method.md#deformation-stage).
+    """Learns from the dynamic views how the scene deforms (docs/method.md#deformation-stage).
 
     Coarse to fine (docs/method.md#coarse-to-fine), frames are learned one after another, or several
     in parallel, each from batches of its own. Only their two slices are trained; the canonical

@@ -77,6 +77,8 @@ class RenderSettings:
 class MotionSettings:
     """How the deformation field is learned, beside its schedule.
 
+    What ``unit``, ``views``, ``pixels`` and ``start`` add to the paper: docs/method.md#departures.
+
     Attributes:
         learning_rate: base rate, in ``unit`` per step: how far a voxel moves at most
             (docs/method.md#motion-learning-rate).

@@ -45,7 +45,7 @@ class VoxelStage(ScheduledStage):
         self.decoder_precision = decoder_precision
 
     def current_model(self) -> DeVRFModel:
-        """The model with all that has been learned so far in its place."""
+        """The model, everything that has been learned so far written back."""
         return self.scene_model
 
     def draw_pixels(self, pool: PixelPool) -> Pixels:
