@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 import torch
@@ -141,17 +142,11 @@ class CanonicalStage(VoxelStage):
             self.render_settings(first),
             space=self.scene.space,
         )
-        groups = (
-            ("density", canonical.density, self.rates.density),
-            ("color", canonical.color, self.rates.color),
-            ("decoder", canonical.decoder, self.rates.decoder),
-        )
-        self._optimizer = GridAdam(
-            [
-                {"params": list(module.parameters()), "lr": rate, "base_lr": rate, "name": name}
-                for name, module, rate in groups
-            ]
-        )
+        groups: list[dict[str, Any]] = []
+        for name, rate in asdict(self.rates).items():
+            learned = list(canonical.get_submodule(name).parameters())
+            groups.append({"params": learned, "lr": rate, "base_lr": rate, "name": name})
+        self._optimizer = GridAdam(groups)
 
     def render_settings(self, phase: CanonicalPhase) -> RenderSettings:
         """How rays are sampled in a phase."""

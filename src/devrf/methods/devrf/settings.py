@@ -24,7 +24,7 @@ DEFORMATION_LOSS = {
 
 @dataclass(frozen=True)
 class CanonicalRates:
-    """Base learning rates of the canonical stage (docs/method.md#optimiser).
+    """Base learning rates of the canonical field's parts, by name (docs/method.md#optimiser).
 
     Attributes:
         density: of the density grid.
