@@ -115,57 +115,38 @@ def test_a_missing_file_says_which_stage_to_run(tmp_path: Path) -> None:
     assert "no such checkpoint" in refusal(tmp_path)
 
 
-@pytest.mark.parametrize(
-    "foreign",
-    [{"state_dict": {}}, {"devrf": "yes", "state_dict": {}}],
-    ids=["other project", "other type"],
-)
+@pytest.mark.parametrize("foreign", [{"state_dict": {}}, {"devrf": "yes", "state_dict": {}}])
 def test_checkpoints_of_others_are_refused(tmp_path: Path, foreign: dict[str, Any]) -> None:
     path = tmp_path / "foreign.ckpt"
     write_checkpoint_file(path, foreign)
     assert "not a devrf checkpoint" in refusal(path)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda data: data["devrf"].pop("scene"),
-        lambda data: data["devrf"]["model"]["architecture"].update(depth=3),
-        lambda data: data["devrf"]["model"]["architecture"].update(channels=5),
-        lambda data: data.pop("state_dict"),
-        lambda data: data.update(state_dict=[1]),
-        lambda data: data["state_dict"].update({"scene_model.occupancy.mask": "all"}),
-        lambda data: data["state_dict"].pop("scene_model.occupancy.mask"),
-        lambda data: data["state_dict"]["scene_model.canonical._extra_state"].pop("voxels"),
-        lambda data: data["state_dict"]["scene_model.canonical._extra_state"].update(low=[9, 9, 9]),
-    ],
-    ids=[
-        "no scene",
-        "unknown size",
-        "other size",
-        "no state",
-        "list for state",
-        "text for mask",
-        "no mask",
-        "no voxels",
-        "no box",
-    ],
-)
+MASK, SIZES = "scene_model.occupancy.mask", "scene_model.canonical._extra_state"
+CONTRADICTIONS: dict[str, Callable[[dict[str, Any]], object]] = {
+    "no scene": lambda data: data["devrf"].pop("scene"),
+    "unknown size": lambda data: data["devrf"]["model"]["architecture"].update(depth=3),
+    "other size": lambda data: data["devrf"]["model"]["architecture"].update(channels=5),
+    "no state": lambda data: data.pop("state_dict"),
+    "list for state": lambda data: data.update(state_dict=[1]),
+    "text for mask": lambda data: data["state_dict"].update({MASK: "all"}),
+    "no mask": lambda data: data["state_dict"].pop(MASK),
+    "no voxels": lambda data: data["state_dict"][SIZES].pop("voxels"),
+    "no box": lambda data: data["state_dict"][SIZES].update(low=[9, 9, 9]),
+}
+
+
+@pytest.mark.parametrize("change", CONTRADICTIONS.values(), ids=list(CONTRADICTIONS))
 def test_a_checkpoint_that_contradicts_itself_is_refused(
     canonical: Path, change: Callable[[dict[str, Any]], object]
 ) -> None:
     refusal(edit(canonical, change))
 
 
-@pytest.mark.parametrize(
-    "target",
-    [
-        "os.system",
-        "devrf.methods.devrf.model.Architecture",
-        "devrf.methods.unheard_of.Model",
-        None,
-    ],
-)
+FOREIGN = ["os.system", "devrf.methods.devrf.model.Architecture", "devrf.methods.no.Model", None]
+
+
+@pytest.mark.parametrize("target", FOREIGN)
 def test_a_file_may_not_choose_which_code_is_run(canonical: Path, target: str | None) -> None:
     path = edit(canonical, lambda data: data["devrf"]["model"].update(_target_=target))
     assert "which is not known here" in refusal(path)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from devrf.checkpoints.packing import pack, unpack
+from devrf.checkpoints.packing import pack, pack_bits, unpack, unpack_bits
 
 
 @pytest.fixture
@@ -89,3 +89,19 @@ def test_parts_that_do_not_fit_are_refused(keep, damage):
     packed = pack(torch.zeros(2, 9, 7, 6, 3), keep, smooth=True)
     with pytest.raises(ValueError, match="as long|larger than"):
         unpack({**packed, **damage})
+
+
+def test_masks_are_packed_to_bits() -> None:
+    mask = torch.rand(3, 5, 7) > 0.5
+    assert pack_bits(mask).numel() == 14  # 105 bits
+    assert torch.equal(unpack_bits(pack_bits(mask), mask.shape), mask)
+
+
+def test_too_few_bits_are_refused() -> None:
+    with pytest.raises(ValueError, match="not as long"):
+        unpack_bits(torch.zeros(2, dtype=torch.uint8), (17,))
+
+
+def test_the_first_cell_is_the_lowest_bit() -> None:
+    mask = torch.tensor([True, False, False, True, False, False, False, False, True])
+    assert pack_bits(mask).tolist() == [0b1001, 1]

@@ -212,7 +212,7 @@ def test_other_errors_pass_through(fit, monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_one_of_several_processes_ends_with_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parts_module, "world_size", lambda: 2)
+    monkeypatch.setattr("devrf.engine.micro_batching.world_size", lambda: 2)
 
     def loss(pixels: Pixels) -> Any:
         raise MemoryError

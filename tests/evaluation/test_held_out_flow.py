@@ -1,4 +1,7 @@
-"""The flow that a scene implies: exact for an exact motion, and by hand for a moving block."""
+"""The flow that a scene implies: by hand for a moving block, and when it is unknown.
+
+That an exact motion implies the exact flow is for the tests of the motion losses.
+"""
 
 from __future__ import annotations
 
@@ -8,102 +11,20 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
 
 from devrf.evaluation.held_out_flow import flow_error, seen_flow
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
-from devrf.geometry.space import WORLD
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import RenderSettings
-from devrf.methods.devrf.view import DeVRFView
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.renderer import Renderer
-from devrf.scenes.procedural import Material, ProceduralScene
-from devrf.scenes.scene import OpticalFlow, Scene, Views
+from devrf.scenes.scene import OpticalFlow, Views
 
 SETTINGS = RenderSettings(step=0.1, alpha_threshold=1e-4, near=0.0, far=99.0)
-STEP = 0.004
-
-
-class ExactField:
-    """The procedural shape at rest: opaque inside, seen every STEP."""
-
-    def __init__(self, scene: Scene, recipe: ProceduralScene) -> None:
-        bounds = scene.bounds
-        self.box = bounds.motion or bounds.box
-        self.shape = recipe.model()
-        self.density = SimpleNamespace(values=torch.zeros(()))
-
-    def step_in_base_voxels(self, step: float) -> float:
-        return 1.0
-
-    def step_length(self, step: float) -> float:
-        return STEP
-
-    def optical_depth(self, points: Tensor, delta: float) -> Tensor:
-        return 20.0 * (self.shape.distance(points, 0.0) < 0)
-
-    def rgb(self, points: Tensor, *_: object) -> Tensor:
-        return torch.zeros_like(points)
-
-
-def exact_renderer(scene: Scene, recipe: ProceduralScene, *, moves: bool = True) -> Any:
-    """What would show a model that knows the shape, and its motion if it ``moves``."""
-    field, shape = ExactField(scene, recipe), recipe.model()
-
-    def unwarp(points: Tensor, time: float) -> Tensor:
-        part = shape.material(points, 0.0).part
-        return shape.forward(Material(points, part), time)
-
-    occupancy = Occupancy.full((12, 12, 12), field.box)
-    lists: Any = SimpleNamespace(field=field, settings=SETTINGS)
-
-    def at(time: float) -> DeVRFView:
-        view: Any = DeVRFView(occupancy, None, lists, WORLD, time)
-        if moves:
-            view._motion = SimpleNamespace(unwarp=unwarp)
-            view._warp = lambda points: shape.material(points, time).rest
-        return view
-
-    device = torch.device("cpu")
-    return SimpleNamespace(model=SimpleNamespace(space=WORLD), device=device, at=at)
-
-
-@pytest.mark.parametrize("index", [1, 2])
-def test_the_exact_motion_of_a_procedural_scene_gives_its_exact_flow(
-    tiny_scene: Scene, tiny_recipe: ProceduralScene, index: int
-) -> None:
-    views = tiny_scene.dynamic.test
-    assert views.flow is not None
-    truth = views.flow.vectors[index][views.flow.valid[index]]
-    assert len(truth) > 40 and truth.norm(dim=1).mean() > 0.5
-    flat = views.flow.valid[index].flatten().nonzero()[:, 0]
-    renderer = exact_renderer(tiny_scene, tiny_recipe)
-    errors = (seen_flow(renderer, views, index, index - 1, flat) - truth).norm(dim=1)
-    # Where parts touch, a canonical point may belong to either: a few pixels go astray.
-    assert errors.quantile(0.85) < 0.03 and errors.median() < 0.01
-    assert flow_error(renderer, views, index) == pytest.approx(float(errors.mean()))
-    # A scene that stays at rest is off by about the flow itself.
-    at_rest = flow_error(exact_renderer(tiny_scene, tiny_recipe, moves=False), views, index)
-    assert at_rest is not None and at_rest > 3 * float(errors.mean())
-
-
-def test_without_flow_or_an_earlier_frame_it_is_unknown(
-    tiny_scene: Scene, tiny_recipe: ProceduralScene
-) -> None:
-    views, renderer = tiny_scene.dynamic.test, exact_renderer(tiny_scene, tiny_recipe)
-    assert flow_error(renderer, views, 0) is None
-    assert flow_error(renderer, replace(views, flow=None), 1) is None
-    assert views.flow is not None
-    nowhere = OpticalFlow(views.flow.vectors, torch.zeros_like(views.flow.valid))
-    assert flow_error(renderer, replace(views, flow=nowhere), 1) is None
-    # A method whose views do not know where points go.
-    renderer.at = lambda time: SimpleNamespace(chunk=1, at_rest=False, render=None)
-    assert flow_error(renderer, views, 1) is None
 
 
 SIDE = 21
@@ -165,3 +86,15 @@ def test_a_scene_without_motion_or_matter_shows_none(block: DeVRFModel) -> None:
     with torch.no_grad():
         block.canonical.density.values.fill_(-400.0)
     assert flow_error(Renderer(block), views, 2) == pytest.approx(5.0)
+
+
+def test_without_flow_or_an_earlier_frame_it_is_unknown(block: DeVRFModel) -> None:
+    views, renderer = filmed_from_above((-3.0, 0.0)), Renderer(block)
+    assert flow_error(renderer, views, 0) is None
+    assert flow_error(renderer, replace(views, flow=None), 1) is None
+    assert views.flow is not None
+    nowhere = OpticalFlow(views.flow.vectors, torch.zeros_like(views.flow.valid))
+    assert flow_error(renderer, replace(views, flow=nowhere), 1) is None
+    # A method whose views have no motion.
+    still: Any = SimpleNamespace(at=lambda time: SimpleNamespace(chunk=1, at_rest=False))
+    assert flow_error(still, views, 1) is None

@@ -1,4 +1,4 @@
-"""Checkpoints that say what they are, checksummed, and read without running code."""
+"""Checkpoints: metadata and a model's state, checksummed, and read without running code."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class StoredModel(Protocol):
 
 @dataclass(frozen=True)
 class CheckpointMetadata:
-    """What a checkpoint says of itself, in plain data.
+    """What a checkpoint holds, in plain data.
 
     Attributes:
         scene: the scene's name.
@@ -44,7 +44,7 @@ class CheckpointMetadata:
         records: what training took, by stage.
         training_config: the settings that decided what was learned, by config key; empty for a
             stage that was not trained from a config.
-        complete: whether the stage's schedule has come to its end.
+        complete: whether the stage has gone through its whole schedule.
     """
 
     scene: str
@@ -75,7 +75,7 @@ class LoadedCheckpoint:
 
 
 class ChecksummedCheckpointIO(CheckpointIO):
-    """How Lightning writes and reads checkpoints here."""
+    """Makes Lightning write and read checkpoint files of this format."""
 
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None
@@ -86,7 +86,7 @@ class ChecksummedCheckpointIO(CheckpointIO):
     def load_checkpoint(
         self, path: str | Path, map_location: Any = None, weights_only: bool | None = None
     ) -> dict[str, Any]:
-        """Read a checkpoint onto the host; whatever the other arguments ask, no code is run."""
+        """Read a checkpoint onto the host, without running code; other arguments are ignored."""
         return read_checkpoint_file(Path(path))
 
     def remove_checkpoint(self, path: str | Path) -> None:
@@ -100,7 +100,7 @@ def save_checkpoint(trainer: Trainer, path: Path, *, weights_only: bool = True) 
     Args:
         trainer: has the stage.
         path: the file.
-        weights_only: False adds all that it takes to go on learning from there.
+        weights_only: False adds all that is needed to go on learning from there.
 
     Raises:
         OSError: the file cannot be written.
@@ -153,7 +153,7 @@ def metadata_in(path: Path, data: dict[str, Any]) -> CheckpointMetadata:
     """The metadata in the content of a checkpoint.
 
     Raises:
-        DevrfError: there is none that is understood here.
+        DevrfError: there is none, or it has other entries.
     """
     if not isinstance(data, dict) or not isinstance(data.get("devrf"), dict):
         raise DevrfError(f"{path}: not a devrf checkpoint; set ckpt to one that devrf wrote")
@@ -166,7 +166,7 @@ def metadata_in(path: Path, data: dict[str, Any]) -> CheckpointMetadata:
 
 
 def _model(path: Path, metadata: CheckpointMetadata, state: dict[str, Any]) -> nn.Module:
-    """Build the model that the metadata describe, and let the stored state fill it."""
+    """The model that the metadata describe, with the stored state."""
     own = {str(k).removeprefix(MODEL): v for k, v in state.items() if str(k).startswith(MODEL)}
     try:
         model: nn.Module = _model_class(path, metadata).from_config(metadata.model)

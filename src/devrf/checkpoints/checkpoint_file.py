@@ -1,12 +1,12 @@
 """Checkpoint files: safetensors with a checksum, written whole or not at all.
 
-The tensors are those of a safetensors file. Its metadata hold the rest of the nested data as JSON,
-behind a seal: the format's number, the bytes of tensor data, and a SHA-256 of all bytes of the file
-but its own digits. So every altered byte is noticed, and no code is ever run.
+A safetensors file whose metadata hold the rest of the nested data as JSON, behind a seal: the
+format's number, the bytes of tensor data, and a SHA-256 of all bytes of the file but its own
+digits. So every altered byte is noticed, and no code is ever run.
 
-The library reads, once the checksum is right. It does not write: ``safetensors.save_file`` needs
-all tensors on the host at once, leaves a file of a random name when it is killed, and does not
-raise OSError where the disk is full.
+The library reads once the checksum is right. It does not write: ``safetensors.save_file`` needs all
+tensors on the host at once, leaves a file of a random name when it is killed, and raises no OSError
+when the disk is full.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from devrf.errors import DevrfError
 from devrf.system.files import atomic_write
 
 FORMAT = 3
-# How the JSON header begins. Before it stand eight bytes that tell its length.
+# How the JSON header begins; eight bytes before it give its length.
 SEAL = re.compile(
     rb'\{"__metadata__": \{"devrf": "(\d+)", "bytes": "(\d+)", "sha256": "([0-9a-f]{64})", '
 )
 UNKNOWN = "0" * 64  # in the digest's place until it is known
-# Bytes of the header: far more than any run has, far less than would fill the memory.
+# Bytes of the header: far more than any run writes, far less than memory holds.
 LONGEST_HEADER = 2**24
 # Format 2, an archive of torch.save, ended in 52 bytes that begin so.
 END_OF_2 = b"\x89devrf\r\n\x02"
@@ -42,7 +42,7 @@ DTYPES |= {torch.bfloat16: "BF16", torch.uint8: "U8", torch.bool: "BOOL"}
 
 
 class OtherFormatError(DevrfError):
-    """A file is whole, but of a format that this version does not read."""
+    """A whole file of a format that this version does not read."""
 
     def __init__(self, path: Path, version: int) -> None:
         age = "newer" if version > FORMAT else "older"
@@ -53,7 +53,7 @@ class OtherFormatError(DevrfError):
 
 
 class _Seal(NamedTuple):
-    """What the beginning of a file says of it; ``place`` is where the digest stands."""
+    """The beginning of a file: format, bytes in all, SHA-256, and where its digits are."""
 
     version: int
     size: int
@@ -129,7 +129,7 @@ def _data(tensor: Tensor) -> memoryview:
 
 
 def _tensor(path: Path, name: str) -> Tensor:
-    """A tensor of a file, copied: what the library maps would change with the file.
+    """A copy of a tensor of a file, which the library maps into memory.
 
     The file is opened anew for each: what is mapped counts as memory until it is closed.
     """
@@ -149,11 +149,7 @@ def _seal(file: BinaryIO) -> _Seal | None:
 
 
 def _check(path: Path) -> None:
-    """Check that a file is as it was written, and of the format that is known here.
-
-    Raises:
-        DevrfError: it is not.
-    """
+    """Raise a DevrfError unless a file is as it was written, and of the present format."""
     with path.open("rb") as file:
         seal, size = _seal(file), path.stat().st_size
         if seal is None:

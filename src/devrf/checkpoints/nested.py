@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 def flatten(value: Any, tensors: dict[str, Tensor], name: str = "") -> Any:
-    """``value`` as JSON, in which objects stand for all that JSON lacks.
+    """``value`` as JSON, with objects for tensors, dicts, tuples and sets.
 
     Args:
         value: nested dicts, lists, tuples and sets of tensors, numbers, strings and None.

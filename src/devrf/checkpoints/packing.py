@@ -1,8 +1,8 @@
-"""Grids as a finished checkpoint holds them: in half precision, in detail only near matter.
+"""Grids as a finished checkpoint holds them, and masks as bits.
 
-Most of a field's voxels lie in empty space. Their values are not seen, but still matter: a
-deformation field has to map points of empty space to empty space, also between frames. So a smooth
-grid is kept twice: thinned out everywhere, in detail near matter.
+Most of a field's voxels lie in empty space. Their values are not seen, but a deformation field has
+to map empty space to empty space, also between frames. So a smooth grid is kept twice, in half
+precision: thinned out everywhere, and in detail near what is occupied.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from devrf.checkpoints.bits import pack_bits, unpack_bits
 from devrf.ops.resampling import resample
 
 # Grid points of the detailed grid to one of the thinned-out grid.
@@ -91,3 +91,21 @@ def unpack(packed: Packed) -> Tensor:
 def _thinned(shape: Sequence[int]) -> tuple[int, int, int]:
     x, y, z = (max(2, math.ceil((points - 1) / THINNING) + 1) for points in shape)
     return x, y, z
+
+
+def pack_bits(mask: Tensor) -> Tensor:
+    """A mask of any shape as bits on the host: (⌈N/8⌉,) uint8."""
+    return torch.from_numpy(np.packbits(mask.cpu().numpy().reshape(-1), bitorder="little"))
+
+
+def unpack_bits(bits: Tensor, shape: Sequence[int], device: torch.device | str = "cpu") -> Tensor:
+    """The mask of ``shape`` that :func:`pack_bits` packed, on ``device``.
+
+    Raises:
+        ValueError: there are too few bits.
+    """
+    cells = math.prod(shape)
+    if 8 * len(bits) < cells:
+        raise ValueError("the stored mask is not as long as it should be")
+    flat = np.unpackbits(bits.cpu().numpy(), count=cells, bitorder="little").astype(bool)
+    return torch.from_numpy(flat).view(*shape).to(device)

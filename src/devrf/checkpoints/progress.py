@@ -1,22 +1,7 @@
-"""Progress files: all that a stage needs to go on exactly where it was left.
+"""Progress files, and the random state in them.
 
-How a run survives being killed, from end to end:
-
-* ``callbacks.PeriodicCheckpoint`` writes a progress file every so often, between two Lightning
-  steps, and when it is asked to stop. It is a Lightning checkpoint: the fields at their present
-  resolution (state_dict), the optimiser (moments, step counts, rates), Lightning's loop (so that
-  curves go on in step), and the state of the callbacks (seconds, memory).
-* ``ScheduledStage.on_save_checkpoint`` adds the iteration, the phase that the grids are ready for,
-  every random state, and the state of the phase that does not follow from the schedule
-  (:meth:`ScheduledStage.phase_state`): the pixels to draw from, and the occupancy of the active
-  frames, as bits.
-* ``checkpoints.checkpoint_file`` writes it whole or not at all, with a checksum.
-* ``cli.resume`` finds the file, and checks that it was made with the present settings.
-* ``Trainer.fit(ckpt_path=…)`` reads it. The stage is set up as at its beginning and takes its
-  fields' shapes from the file; the optimiser is given the grids, then its state; the random
-  states are set last, when nothing but the next iteration can draw from them.
-
-A finished stage leaves one checkpoint without any of this, and its progress files are removed.
+A progress file holds all that a stage needs to go on exactly where it was left
+(:mod:`devrf.engine.resume`).
 """
 
 from __future__ import annotations

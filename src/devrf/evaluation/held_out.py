@@ -1,4 +1,4 @@
-"""Held-out views: rendered, compared with the truth, scored."""
+"""Renders held-out views and compares them with the truth."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from devrf.scenes.scene import Background, Views
 
 @dataclass(frozen=True)
 class HeldOutView:
-    """A held-out image, what the model sees there, and how alike they are at valid pixels.
+    """A held-out image, what the model renders there, and metrics over the valid pixels.
 
     Attributes:
         name: the image's name.
@@ -27,8 +27,8 @@ class HeldOutView:
         prediction: (H, W, 3) RGB in [0, 1].
         psnr: dB.
         ssim: in [−1, 1].
-        rest_pose_psnr: dB that the canonical field alone reaches there.
-        further: what else was measured, by name; None where there is nothing to compare with.
+        rest_pose_psnr: PSNR in dB of the scene at rest, in place of the prediction.
+        further: other metrics by name; None where there is nothing to compare with.
         compared: (H, W, 3) RGB in [0, 1], the prediction at valid pixels, else the truth.
     """
 
@@ -60,16 +60,16 @@ def score(
 ) -> HeldOutView:
     """Render image ``index`` of held-out ``views`` and compare it with the truth.
 
-    Only valid pixels are compared: by PSNR each for itself, by SSIM in windows that lie among
-    them. Other metrics that look at neighbourhoods find the truth beyond them.
+    Only valid pixels are compared, for SSIM in windows of valid pixels alone. For other metrics
+    over neighbourhoods the prediction at other pixels is the truth.
 
     Args:
-        renderer: shows what was learned.
+        renderer: of the learned scene.
         views: the held-out views, on the host.
         index: which of them.
         background: what is behind the matte.
-        suite: measures more than PSNR and SSIM.
-        time: when to look, in [0, 1]; None: at the image's own time.
+        suite: metrics beside PSNR and SSIM.
+        time: the time to render, in [0, 1]; None: the image's own.
     """
     own_time = float(views.times[index])
     time = own_time if time is None else time
@@ -129,8 +129,8 @@ def _psnr(compared: Tensor, truth: Tensor, valid_mask: Tensor | None) -> float:
 def _ssim(compared: Tensor, truth: Tensor, valid_mask: Tensor | None) -> float:
     if valid_mask is None:
         return ssim(compared, truth)
-    # Where no valid region is as wide as a window, windows about valid pixels have to do, and
-    # where these are the image's rim, all windows.
+    # Where no window has valid pixels alone, those centred on valid pixels are taken; where these
+    # are at the image's rim, all windows.
     for measure in (ssim_within, ssim_masked):
         found = measure(compared, truth, valid_mask)
         if found is not None:
@@ -157,7 +157,7 @@ def _image(seen: RenderedImage, views: Views) -> Tensor:
 
 
 def _world_distance(model: Viewable, views: Views, index: int, seen: RenderedImage) -> Tensor:
-    """Depths (H·W,) of a picture as distances from the camera in world units."""
+    """Depths (H·W,) of an image as distances from the camera in world units."""
     rays = views.cameras.image_rays(index)
     own = model.space.rays(rays)
     points = model.space.to_world(own.at(torch.arange(len(own)), seen.depth.cpu()))

@@ -1,4 +1,4 @@
-"""The optical flow that a learned scene implies in a held-out view, against the true one."""
+"""The optical flow that a learned scene implies in a held-out view, against the truth."""
 
 from __future__ import annotations
 
@@ -16,8 +16,7 @@ from devrf.scenes.scene import Views
 def flow_error(renderer: Renderer, views: Views, index: int) -> float | None:
     """Mean end-point error in pixels of image ``index``'s backward flow, where that is known.
 
-    None of a view without flow, or without an earlier frame; or where the method does not know
-    where points go.
+    None without flow or an earlier frame, or if the method's views have no motion.
     """
     if views.flow is None:
         return None
@@ -35,12 +34,10 @@ def flow_error(renderer: Renderer, views: Views, index: int) -> float | None:
 def seen_flow(
     renderer: Renderer, views: Views, index: int, before: int, flat: Tensor, chunk: int = 16384
 ) -> Tensor | None:
-    """The backward flow (P, 2) in pixels that is seen at some pixels of an image.
-
-    Where less than half of a ray is stopped nothing is seen to move: the flow is zero there.
+    """The backward flow (P, 2) in pixels at some pixels of an image; 0 where opacity is below 0.5.
 
     Args:
-        renderer: shows the learned scene.
+        renderer: of the learned scene.
         views: the views, on the host.
         index: the image.
         before: the same view's image one frame earlier.
@@ -48,7 +45,7 @@ def seen_flow(
         chunk: rays rendered at once.
 
     Returns:
-        None where the method does not know where points go.
+        None if the method's views have no motion.
     """
     view = renderer.at(float(views.times[index]))
     if not isinstance(view, MovingView):

@@ -1,4 +1,4 @@
-"""What is measured on a held-out view beside PSNR and SSIM."""
+"""Metrics of held-out views beside PSNR and SSIM."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from devrf.scenes.scene import Views
 
 @dataclass(frozen=True)
 class MetricInput:
-    """What is compared with the truth: one held-out image, on the host.
+    """One held-out image, to be compared with the truth; on the host.
 
     Attributes:
-        renderer: shows what was learned.
+        renderer: of the learned scene.
         views: the held-out views.
         index: which of them.
         prediction: (H, W, 3) RGB in [0, 1]; the truth where pixels are not valid.
@@ -99,13 +99,13 @@ MEASURES: dict[str, Callable[[MetricInput], float | None]] = {
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What is measured on held-out views beside PSNR and SSIM.
+    """The choice of metrics (config group ``evaluation``).
 
     Attributes:
         metrics: names of :data:`MEASURES`; fewer are quicker.
         lpips_network: the network behind LPIPS.
         lpips_weights: a file with that network's weights; None looks in torch's cache.
-        download: whether weights that are nowhere to be found may be downloaded.
+        download: whether weights that are not there may be downloaded.
     """
 
     metrics: Sequence[str] = tuple(MEASURES)
@@ -114,7 +114,7 @@ class Evaluation:
     download: bool = False
 
     def check(self) -> None:
-        """See that what is asked for exists.
+        """Check that the metrics and the file of weights exist.
 
         Raises:
             DevrfError: an unknown metric, or no file of weights where one is given.
@@ -152,5 +152,5 @@ class MetricSuite:
     lpips: Lpips | None = None
 
     def scores(self, inputs: MetricInput) -> dict[str, float | None]:
-        """Each metric of one inputs; None where there is nothing to compare with."""
+        """Each metric by name; None where there is nothing to compare with."""
         return {name: MEASURES[name](inputs) for name in self.metrics}

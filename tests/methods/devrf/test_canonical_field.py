@@ -127,17 +127,3 @@ def test_the_search_field_shows_its_channels_through_a_sigmoid(cube: Box) -> Non
     torch.testing.assert_close(seen, torch.tensor([[0.5, 0.7310586, 0.2689414]]))
     assert list(field.decoder.parameters()) == []
     assert opacity(field, 1.0).item() == pytest.approx(1e-6, rel=1e-3)
-
-
-def test_the_default_architecture_is_the_papers(cube: Box) -> None:
-    field = Architecture().radiance_field(cube, 64, 64)
-    assert field.color.values.shape[-1] == 12
-    assert [p.shape for p in field.decoder.parameters()] == [
-        (128, 12),
-        (128,),
-        (128, 27),
-        (128, 128),
-        (128,),
-        (3, 128),
-        (3,),
-    ]

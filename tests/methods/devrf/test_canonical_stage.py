@@ -50,16 +50,6 @@ class Watch(Callback):
         self.seen.append((pl_module.phase.kind, pl_module.resolution, decoder))
 
 
-def test_two_steps_learn_something(
-    datamodule: SceneDataModule, trainer: Callable[..., Trainer]
-) -> None:
-    stage, fit = CanonicalStage(CARVED, SMALL), trainer(max_steps=2)
-    fit.fit(stage, datamodule=datamodule)
-    assert stage.iteration == fit.global_step == 2
-    assert stage.scene_model.canonical.density.values.abs().max() > 0
-    assert stage.scene_model.canonical.color.values.abs().max() > 0
-
-
 @pytest.mark.parametrize(
     ("asked", "made_for_it", "expected"),
     [

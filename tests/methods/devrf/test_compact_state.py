@@ -9,7 +9,6 @@ from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.geometry.rays import Rays
 from devrf.methods.devrf.architecture import Architecture
-from devrf.methods.devrf.compact_state import expanded_state
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import RenderSettings
@@ -82,11 +81,6 @@ def test_the_state_takes_a_fraction_of_the_memory(model):
         parts = value.values() if isinstance(value, dict) else [value]
         small += sum(v.numel() * v.element_size() for v in parts if torch.is_tensor(v))
     assert small < 0.3 * full
-
-
-def test_a_full_state_passes_through(model):
-    state = model.state_dict()
-    assert expanded_state(state) == state
 
 
 def test_what_a_half_cannot_hold_stays_as_it_is(model):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
 
 import pytest
@@ -11,7 +10,7 @@ from lightning import Trainer
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
-from devrf.methods.devrf.convergence import ConvergenceMonitor, converged
+from devrf.methods.devrf.convergence import converged
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.settings import MotionSettings
@@ -34,42 +33,20 @@ def test_by_hand(losses: list[float], done: bool) -> None:
     assert converged(losses, min_rel_improvement=0.02) is done
 
 
-@pytest.fixture
-def learn(
-    rest: LoadedCheckpoint, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
-) -> Callable[[float | None], DeformationStage]:
-    def run(gain: float | None) -> DeformationStage:
-        stage = DeformationStage(
-            copy.deepcopy(rest),
-            SCHEDULE,
-            MotionSettings(min_rel_improvement=gain),
-            iterations_per_step=2,
-        )
-        trainer(max_epochs=1).fit(stage, datamodule=datamodule)
-        return stage
-
-    return run
-
-
-def test_a_frame_that_has_converged_is_left(learn: Callable[..., DeformationStage]) -> None:
+@pytest.mark.parametrize(("gain", "iterations"), [(None, 60), (1.0, 2 * 2 * 3 * 2)])
+def test_a_frame_that_has_converged_is_left_if_asked(
+    rest: LoadedCheckpoint,
+    datamodule: SceneDataModule,
+    trainer: Callable[..., Trainer],
+    gain: float | None,
+    iterations: int,
+) -> None:
+    motion = MotionSettings(min_rel_improvement=gain)
+    stage = DeformationStage(rest, SCHEDULE, motion, iterations_per_step=2)
+    trainer(max_epochs=1).fit(stage, datamodule=datamodule)
     # No step takes off all of the loss: each visit ends after the three steps that tell.
-    hasty = learn(1.0)
-    visits = 2 * 2
-    assert hasty.iteration - hasty.skipped == visits * 3 * 2
-    assert hasty.iteration == hasty.total_iterations == 60
-
-
-def test_frames_that_are_learned_together_converge_together() -> None:
-    both = ConvergenceMonitor(2, 0.1)
-    steps = [[1.0, 1.0], [1.0, 0.5], [1.0, 0.25], [1.0, 0.25], [1.0, 0.25]]
-    assert [both.add(losses) for losses in steps] == [False, False, False, False, True]
-    assert both.losses[1] == [1.0, 0.5, 0.25, 0.25, 0.25]
-    never = ConvergenceMonitor(1, None)
-    assert not any(never.add([1.0]) for _ in range(9))
-
-
-def test_nothing_is_left_out_unless_asked(learn: Callable[..., DeformationStage]) -> None:
-    assert learn(None).skipped == 0
+    assert stage.iteration - stage.skipped == iterations
+    assert stage.iteration == stage.total_iterations == 60
 
 
 def test_a_gain_is_a_share() -> None:

@@ -13,7 +13,6 @@ from devrf.geometry.clock import FrameClock
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import WORLD, Space
-from devrf.methods.devrf import view
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformed_occupancy import deformed_occupancy
@@ -77,25 +76,11 @@ def test_at_rest_nothing_is_warped(model: DeVRFModel) -> None:
     assert torch.equal(moving.color, still.color) and torch.equal(moving.depth, still.depth)
 
 
-def test_occupancy_moves_with_the_matter(model: DeVRFModel) -> None:
-    moved = model.occupancy_at(1.0).mask
-    # 0.4 is two cells of 0.2; grown by one cell, for what lies between grid points.
-    assert torch.equal(moved, dilate(torch.roll(model.occupancy.mask, 2, dims=0), 1))
-
-
 def test_deformed_occupancy_by_hand(model: DeVRFModel) -> None:
     shift = torch.tensor([0.0, 0.4, 0.0])
     found = deformed_occupancy(model.occupancy, model.canonical, lambda points: points + shift)
     assert torch.equal(found.mask, dilate(torch.roll(model.occupancy.mask, -2, dims=1), 1))
     assert found.box == model.canonical.box
-
-
-def test_chunks_do_not_show(
-    model: DeVRFModel, monkeypatch: pytest.MonkeyPatch, same: Callable[..., None]
-) -> None:
-    whole = picture(model, looking_down(50), 0.5)
-    monkeypatch.setattr(view, "ON_CPU", 7)
-    same(picture(model, looking_down(50), 0.5), whole)
 
 
 def test_depth_is_the_distance_of_the_face_and_zero_beside_it(model: DeVRFModel) -> None:
@@ -111,27 +96,14 @@ def test_depth_is_the_distance_of_the_face_and_zero_beside_it(model: DeVRFModel)
     assert seen.color[0, 0] > 0.99 and seen.color[0, 1] < 0.01
 
 
-@pytest.fixture
-def batch() -> RayBatch:
-    """Fifteen rays at three times in turn, each with a background of its own."""
-    rays, frame = looking_down(15), torch.arange(15) % 3
-    return RayBatch(
-        rays=rays,
-        color=torch.zeros(15, 3),
-        alpha=None,
-        background=torch.linspace(0, 1, 45).view(15, 3),
-        time=frame / 2,
-        frame=frame,
-        image=torch.zeros(15, dtype=torch.long),
-        pixel=torch.zeros(15, 2),
-        flow=None,
-        flow_valid=None,
-    )
-
-
 def test_a_batch_is_seen_ray_by_ray_at_its_own_time(
-    model: DeVRFModel, batch: RayBatch, reference: Callable[..., RenderedImage]
+    model: DeVRFModel,
+    ray_batch: Callable[..., RayBatch],
+    reference: Callable[..., RenderedImage],
 ) -> None:
+    # Each ray has a background of its own.
+    behind, frame = torch.linspace(0, 1, 45).view(15, 3), torch.arange(15) % 3
+    batch = ray_batch(looking_down(15), background=behind, time=frame / 2, frame=frame)
     seen = model(batch)
     for time in (0.0, 0.5, 1.0):
         own = (batch.time == time).nonzero()[:, 0]
@@ -140,16 +112,9 @@ def test_a_batch_is_seen_ray_by_ray_at_its_own_time(
         torch.testing.assert_close(seen.depth[own], alone.depth)
         torch.testing.assert_close(seen.transmittance[own], 1 - alone.opacity)
         assert alone.opacity.max() > 0.9
-    # Samples stand in the order of the batch's rays.
-    ray = seen.samples.ray
-    assert seen.samples.rays == 15 and torch.equal(ray, ray.sort().values)
-    torch.testing.assert_close(seen.samples.points[:, 0], batch.rays.origins[ray, 0])
-    moved = seen.samples.points[:, 0] - seen.canonical[:, 0]
-    torch.testing.assert_close(moved, 0.4 * batch.time[ray], atol=1e-5, rtol=0)
-    terms = model.loss_terms(seen, batch)
-    terms["color"].backward()
-    assert model.canonical.density.values.grad is not None
-    assert model.canonical.density.values.grad.any()
+    seen.color.sum().backward()
+    gradient = model.canonical.density.values.grad
+    assert gradient is not None and gradient.any()
 
 
 @pytest.mark.parametrize("space", [WORLD, NormalizedDevice(8, 6, (40.0, 40.0), near=2.0)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -16,8 +17,8 @@ from devrf.methods.devrf.motion_losses import (
     cycle,
     flow,
     induced_flow,
+    total_variation_weight,
 )
-from devrf.methods.devrf.smoothing import total_variation_weight
 from devrf.methods.devrf.volume_rendering import VoxelOutput
 from devrf.rendering.sampling import Samples
 from devrf.scenes.procedural import Material, ProceduralScene
@@ -45,7 +46,7 @@ def seen(
 
 
 @pytest.fixture
-def by_hand() -> MotionPrediction:
+def by_hand(ray_batch: Callable[..., RayBatch]) -> MotionPrediction:
     """Two rays of image 1, whose flow leads into image 0; three samples before them.
 
     Both cameras are at the origin and look along −z; image 0 has another lens. The motion: at t
@@ -60,11 +61,8 @@ def by_hand() -> MotionPrediction:
     )
     pixel = torch.tensor([[8.5, 6.5], [10.5, 4.5]])
     image = torch.tensor([1, 1])
-    batch = RayBatch(
-        rays=cameras.rays(image, pixel),
-        color=torch.zeros(2, 3),
-        alpha=None,
-        background=torch.zeros(3),
+    batch = ray_batch(
+        cameras.rays(image, pixel),
         time=torch.ones(2),
         frame=torch.ones(2, dtype=torch.long),
         image=image,

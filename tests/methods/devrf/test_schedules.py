@@ -81,11 +81,6 @@ def test_deformation_forward_facing_is_the_papers() -> None:
     assert schedule.growths(40) == [8000, 16000, 20000, 22000]
 
 
-def test_frames_start_from_the_one_before_at_the_coarsest_level_only() -> None:
-    for phase in deformation_phases(DeformationSchedule(), 6):
-        assert phase.init_from_previous == (phase.level == 0 and phase.frames[0] >= 2)
-
-
 def test_without_coarse_to_fine_every_share_goes_to_the_finest_grid() -> None:
     schedule = DeformationSchedule(coarse_to_fine=False)
     phases = deformation_phases(schedule, 50)

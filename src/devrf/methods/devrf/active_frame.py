@@ -1,13 +1,15 @@
-"""The frames that are being learned: copies of their displacements, and where their matter is."""
+"""The active frames: copies of their slices while they are trained (docs/method.md#warp)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from devrf.checkpoints.packing import pack_bits, unpack_bits
 from devrf.data.pool import PixelPool
 from devrf.geometry.box import Box
 from devrf.methods.devrf.deformation_field import DeformationField
@@ -17,48 +19,40 @@ from devrf.rendering.occupancy import Occupancy
 
 @dataclass
 class ActiveFrame:
-    """A frame that is learned; one frame after another in the same memory.
+    """Memory for a frame that is trained; one frame after another uses it.
 
-    The field itself may rest elsewhere, or in half precision. What has been learned is the
-    field's once it is written back (:meth:`write_back`).
+    The field itself may be kept on the host or in half precision; it knows what was learned once
+    that is written back.
 
     Attributes:
-        number: the frame; 0 before the first.
-        backward: (X, Y, Z, 3) its Δ_b, a leaf.
-        forward: (X, Y, Z, 3) its Δ_f, a leaf.
-        before: (X, Y, Z, 3) Δ_f of the frame before, frozen; zero for frame 0.
-        occupancy: where the frame's matter is.
+        backward: (X, Y, Z, 3) Δ_b of the frame, a leaf.
+        forward: (X, Y, Z, 3) Δ_f of the frame, a leaf.
+        before: (X, Y, Z, 3) Δ_f of the frame before, frozen.
+        occupancy: where something is at the frame's time.
         box: where all of them live.
+        number: the frame; 0 before the first.
         pools: the pixels to learn from; batches are drawn from each in turn.
+        losses: mean loss of each Lightning step since the frame was checked out.
     """
 
-    number: int
     backward: Tensor
     forward: Tensor
     before: Tensor
     occupancy: Occupancy
     box: Box
+    number: int = 0
     pools: list[PixelPool] = field(default_factory=list)
+    losses: list[float] = field(default_factory=list)
 
     @staticmethod
     def of(motion: DeformationField, occupancy: Occupancy) -> ActiveFrame:
-        """Memory for a frame of a field at its present resolution, on the field's device.
-
-        Args:
-            motion: the field.
-            occupancy: of the size that the frame's own will have.
-        """
-        here = motion.frames.here
-        backward, forward, before = (here.new_zeros(*motion.shape, 3) for _ in range(3))
-        mask = torch.zeros_like(occupancy.mask)
-        return ActiveFrame(
-            0,
-            backward.requires_grad_(),
-            forward.requires_grad_(),
-            before,
-            Occupancy(mask, motion.box),
-            motion.box,
+        """Memory at the field's resolution, on its device, with an occupancy like the given one."""
+        backward, forward, before = (
+            motion.frames.here.new_zeros(*motion.shape, 3) for _ in range(3)
         )
+        empty = Occupancy(torch.zeros_like(occupancy.mask), motion.box)
+        learned = backward.requires_grad_(), forward.requires_grad_()
+        return ActiveFrame(*learned, before, empty, motion.box)
 
     @property
     def slices(self) -> tuple[Tensor, Tensor]:
@@ -67,37 +61,58 @@ class ActiveFrame:
 
     @property
     def warp(self) -> GridWarp:
-        """Points of the frame → canonical space."""
+        """x → x + Δ_b(x, t)."""
         return GridWarp((self.backward,), self.box)
 
     @property
     def unwarp(self) -> GridWarp:
-        """Canonical points → the frame."""
+        """q → q + Δ_f(q, t)."""
         return GridWarp((self.forward,), self.box)
 
-    def unwarp_previous(self, *, looked_up: bool) -> GridWarp:
-        """Canonical points → the frame before.
+    def unwarp_previous(self, *, always_interpolate: bool) -> GridWarp:
+        """q → q + Δ_f(q, t − 1), the identity for frame 1.
 
         Args:
-            looked_up: move points by zero for frame 1, too, before which nothing has moved:
-                the same work for every frame.
+            always_interpolate: look displacements of zero up for frame 1, too, so that every
+                frame takes the same work.
         """
-        return GridWarp((self.before,) if looked_up or self.number > 1 else (), self.box)
+        return GridWarp((self.before,) if always_interpolate or self.number > 1 else (), self.box)
 
     def check_out(self, motion: DeformationField, number: int) -> None:
         """Copy a frame out of the field."""
-        self.number = number
+        self.number, self.losses = number, []
         motion.frames.read(number, self.slices)
         motion.frames.read_forward(number - 1, self.before)
 
-    def write_back(self, motion: DeformationField) -> None:
-        """Copy the frame back into the field; learning may go on."""
-        if self.number:
-            motion.frames.write(self.number, self.slices)
+    def state(self, images: Tensor, area: int, *, exact: bool) -> dict[str, Any]:
+        """Occupancy and pixels as plain data, for a progress file.
+
+        Args:
+            images: (K,) the images of the frame.
+            area: pixels of an image.
+            exact: add the displacements, which the field would round.
+        """
+        return {
+            "occupancy": pack_bits(self.occupancy.mask),
+            "shape": list(self.occupancy.mask.shape),
+            "pixels": [pack_bits(pool.mask(images, area)) for pool in self.pools],
+            "displacements": [tensor.detach().cpu() for tensor in self.slices if exact],
+        }
+
+    @torch.no_grad()
+    def load_state(self, state: dict[str, Any], images: Tensor, area: int) -> None:
+        """Restore what :meth:`state` gave; the frame has been checked out."""
+        for tensor, value in zip(self.slices, state["displacements"], strict=False):
+            tensor.copy_(value)
+        device, shape = self.backward.device, (len(images), area)
+        mask = unpack_bits(state["occupancy"], state["shape"], device)
+        self.occupancy.refill(Occupancy(mask, self.box))
+        masks = [unpack_bits(bits, shape, device) for bits in state["pixels"]]
+        self.pools = [PixelPool.of_mask(images, mask) for mask in masks]
 
 
 class ActiveFrames:
-    """The frames that are learned at the same time, and the field that they belong to."""
+    """The frames that are trained in parallel, and the field that they belong to."""
 
     def __init__(self, module: nn.Module) -> None:
         """No frame yet.
@@ -126,7 +141,7 @@ class ActiveFrames:
 
     def allocate(self, count: int, motion: DeformationField, occupancy: Occupancy) -> None:
         """Make memory for ``count`` frames at the field's present resolution."""
-        self._frames = []  # the memory of those before is free before more is taken
+        self._frames = []  # frees the memory of those before
         self._field = motion
         self._frames = [ActiveFrame.of(motion, occupancy) for _ in range(count)]
 
@@ -137,10 +152,11 @@ class ActiveFrames:
             frame.check_out(self._field, number)
 
     def write_back(self) -> None:
-        """Copy what was learned of the frames into the field."""
+        """Copy what was learned of the frames into the field; learning may go on."""
         if self._field is not None and self._frames:
             for frame in self._frames:
-                frame.write_back(self._field)
+                if frame.number:
+                    self._field.frames.write(frame.number, frame.slices)
             self._field.frames.synchronize()
 
     def close(self) -> None:

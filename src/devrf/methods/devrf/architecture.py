@@ -1,4 +1,4 @@
-"""The sizes of a canonical field, and the two fields that are built from them."""
+"""Sizes of the canonical field (docs/method.md#canonical-field)."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ from devrf.methods.devrf.color_decoder import ColorDecoder, SigmoidColor
 @dataclass(frozen=True)
 class Architecture:
     """Sizes of the canonical field; the defaults are the paper's, inward-facing.
-
-    See docs/method.md#canonical-field.
 
     Attributes:
         channels: features per voxel.

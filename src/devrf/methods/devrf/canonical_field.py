@@ -12,15 +12,23 @@ from devrf.geometry.box import Box
 from devrf.methods.devrf.color_decoder import ColorDecoder
 from devrf.methods.devrf.voxel_grid import VoxelGrid
 
+# What a checkpoint holds beside the tensors and the box.
+SIZES = ("voxels", "base_voxels", "alpha_init", "planes")
+
 
 class CanonicalField(nn.Module):
     """A voxel radiance field over a box (docs/method.md#canonical-field).
 
     Attributes:
-        density: raw densities (X, Y, Z, 1), before the softplus.
-        color: features (X, Y, Z, C) for the decoder.
+        density: raw densities v (X, Y, Z, 1), before the softplus.
+        color: features f (X, Y, Z, C) for the decoder.
         decoder: features and directions → RGB.
-        box: where the field lives, in world units or NDC.
+        box: B, where the field lives, in world units or NDC.
+        voxels: N, about how many voxels the grids have.
+        base_voxels: how many they have at full resolution.
+        alpha_init: opacity of one base voxel before anything is learned.
+        planes: P, in NDC the number of planes along the rays at every resolution; None for cubic
+            voxels.
     """
 
     def __init__(
@@ -38,41 +46,34 @@ class CanonicalField(nn.Module):
 
         Args:
             box: where the field lives.
-            decoder: maps (features, viewdirs, ray) to RGB.
-            channels: features per voxel.
+            decoder: maps (features, viewdirs, ray, precision) to RGB.
+            channels: C, features per voxel.
             voxels: about how many voxels to start with.
-            base_voxels: how many there are at full resolution; step lengths are measured in
-                voxels of that size. None: ``voxels``.
+            base_voxels: how many there are at full resolution; None: ``voxels``.
             alpha_init: opacity of one base voxel before anything is learned.
-            planes: in NDC, how many planes stand one behind another at every resolution;
-                then each plane starts with an equal share of every ray, the last one opaque.
-                None for cubic voxels.
+            planes: see docs/method.md#forward-facing; each starts with an equal share of every
+                ray, the last one opaque.
         """
         super().__init__()
         self.box = box
+        self.voxels = voxels
         self.base_voxels = base_voxels or voxels
         self.alpha_init = alpha_init
-        self.voxels = voxels
         self.planes = planes
         shape = self.grid_shape(voxels)
         self.density = VoxelGrid(shape, 1)
         self.color = VoxelGrid(shape, channels)
         self.decoder = decoder
         if planes is not None:
-            self._share_out(planes)
+            self._equal_shares(planes)
 
     @torch.no_grad()
-    def _share_out(self, planes: int) -> None:
+    def _equal_shares(self, planes: int) -> None:
         """Give each of P planes the weight 1/P of every ray: α_k = 1 / (P − k), the last ≈ 1."""
         alpha = 1 / torch.arange(planes, 0, -1, dtype=torch.float64)
         tau = -torch.log1p(-alpha.clamp(max=1 - 1e-6))
         raw = torch.log(torch.expm1(tau / self.step_in_base_voxels(1.0))) - self.shift
         self.density.values[..., 0] = raw.float()
-
-    @property
-    def has_network(self) -> bool:
-        """Whether colours come from a network: not in the coarse geometry search."""
-        return isinstance(self.decoder, ColorDecoder)
 
     def grid_shape(self, voxels: int) -> tuple[int, int, int]:
         """Grid points along (x, y, z) for about ``voxels`` voxels."""
@@ -85,31 +86,36 @@ class CanonicalField(nn.Module):
     def step_length(self, step: float) -> float:
         """Length of ``step`` voxels along a ray, in units of the ray's direction.
 
-        In NDC a direction leads from the first plane to the last, so that samples are evenly
-        spaced in NDC depth.
+        In NDC a direction leads from the first plane to the last: samples are evenly spaced in
+        depth.
         """
         if self.planes is None:
             return step * self.box.voxel_size(self.voxels)
         return step / (self.planes - 1)
+
+    def step_in_base_voxels(self, step: float) -> float:
+        """δ = step · s / s_base, in NDC step · 256 / P (docs/method.md#step-length)."""
+        if self.planes is None:
+            return step * self.box.voxel_size(self.voxels) / self.box.voxel_size(self.base_voxels)
+        return step * 256 / self.planes
 
     @property
     def shift(self) -> float:
         """b = log(1 / (1 − α_init) − 1): makes a raw density of 0 mean α_init."""
         return math.log(1 / (1 - self.alpha_init) - 1)
 
-    def step_in_base_voxels(self, step: float) -> float:
-        """δ of a step of ``step`` voxels: its length in voxels of the full resolution.
-
-        In NDC, where the planes stay as they are, in units of 1/256 of the depth.
-        """
-        if self.planes is None:
-            return step * self.box.voxel_size(self.voxels) / self.box.voxel_size(self.base_voxels)
-        return step * 256 / self.planes
+    def _tau(self, raw: Tensor, delta: float) -> Tensor:
+        """τ = σδ with σ = softplus(v + b) (docs/method.md#density)."""
+        return torch.nn.functional.softplus(raw + self.shift) * delta
 
     def optical_depth(self, points: Tensor, delta: float) -> Tensor:
-        """τ = softplus(v(x) + b)·δ (M,) at ``points`` (M, 3), for steps of δ base voxels."""
-        raw = self.density(points, self.box)[:, 0]
-        return torch.nn.functional.softplus(raw + self.shift) * delta
+        """τ (M,) at ``points`` (M, 3), for steps of δ base voxels."""
+        return self._tau(self.density(points, self.box)[:, 0], delta)
+
+    @torch.no_grad()
+    def voxel_alpha(self, step: float) -> Tensor:
+        """α (X, Y, Z) of a step of ``step`` voxels at each grid point."""
+        return -torch.expm1(-self._tau(self.density.values[..., 0], self.step_in_base_voxels(step)))
 
     def rgb(
         self,
@@ -125,12 +131,10 @@ class CanonicalField(nn.Module):
         color: Tensor = self.decoder(self.color(points, self.box), viewdirs, ray, precision)
         return color
 
-    @torch.no_grad()
-    def voxel_alpha(self, step: float) -> Tensor:
-        """Opacity (X, Y, Z) of a step of ``step`` voxels at each grid point."""
-        raw = self.density.values[..., 0]
-        tau = torch.nn.functional.softplus(raw + self.shift) * self.step_in_base_voxels(step)
-        return -torch.expm1(-tau)
+    @property
+    def has_network(self) -> bool:
+        """Whether colours come from a network: not in the coarse geometry search."""
+        return isinstance(self.decoder, ColorDecoder)
 
     def resize(self, voxels: int) -> None:
         """Resample both grids to about ``voxels`` voxels; new parameters result."""
@@ -141,34 +145,22 @@ class CanonicalField(nn.Module):
 
     @torch.no_grad()
     def clear(self, where: Tensor, alpha: float) -> None:
-        """Make grid points empty: density down to opacity ``alpha`` a base voxel or less.
+        """Lower the density to at most opacity ``alpha`` a base voxel ``where`` (X, Y, Z) bool.
 
-        Space that training never visited still holds the initial fog. A sample that the
-        deformation sends there must meet nothing.
-
-        Args:
-            where: (X, Y, Z) bool, the points to empty.
-            alpha: the opacity they may keep.
+        Space that training never visited still holds the initial fog. A sample that a
+        displacement sends there must meet nothing.
         """
         empty = math.log(math.expm1(-math.log1p(-alpha))) - self.shift
         raw = self.density.values[..., 0]
         raw[where] = raw[where].clamp(max=empty)
 
     def get_extra_state(self) -> dict[str, Any]:
-        """What the tensors alone do not tell, as plain numbers."""
-        return {
-            "low": list(self.box.low),
-            "high": list(self.box.high),
-            "voxels": self.voxels,
-            "base_voxels": self.base_voxels,
-            "alpha_init": self.alpha_init,
-            "planes": self.planes,
-        }
+        """Box and sizes, as plain numbers."""
+        corners = {"low": list(self.box.low), "high": list(self.box.high)}
+        return {**corners, **{name: getattr(self, name) for name in SIZES}}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_extra_state` gave."""
         self.box = Box.of(state["low"], state["high"])
-        self.voxels = state["voxels"]
-        self.base_voxels = state["base_voxels"]
-        self.alpha_init = state["alpha_init"]
-        self.planes = state["planes"]
+        for name in SIZES:
+            setattr(self, name, state[name])

@@ -18,36 +18,33 @@ class CanonicalPhase:
         start: first iteration.
         stop: one past the last iteration.
         voxels: about how many voxels the grids have.
+        frames: none: the scene is at rest.
     """
 
     kind: Literal["search", "fine"]
     start: int
     stop: int
     voxels: int
-
-    @property
-    def frames(self) -> tuple[int, ...]:
-        """None: the scene is at rest."""
-        return ()
+    frames: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
 class CanonicalSchedule:
-    """The canonical stage's course; the defaults are the paper's, inward-facing.
+    """The canonical stage's phases; the defaults are the paper's, inward-facing.
 
-    See docs/method.md#canonical-stage.
+    See docs/method.md#geometry-search and docs/method.md#radiance-field.
 
     Attributes:
         search_iterations: length of the coarse geometry search; 0 leaves it out.
-        search_side: side of the search grid: it has about side³ voxels.
-        carve: start from the visual hull of the static views where the images have mattes;
-            then the search sees little empty space and may be short, or left out.
-        iterations: length of the fine stage.
-        side: side of the final grid of about side³ voxels.
-        doublings: iterations of the fine stage at which the number of voxels doubles; it starts
-            at side³ / 2^len(doublings).
-        decay_iterations: every so many iterations the learning rates fall to a tenth.
-        rays: rays a batch.
+        search_side: the search grid has about search_side³ voxels.
+        carve: begin with the visual hull of the static views, if the images have mattes; then
+            the search may be short, or left out.
+        iterations: length of the radiance field's learning.
+        side: the final grid has about side³ voxels.
+        doublings: iterations, from the search's end, at which the number of voxels doubles; it
+            starts at side³ / 2^len(doublings).
+        decay_iterations: after as many iterations the learning rates have fallen to a tenth.
+        rays: of a batch.
     """
 
     search_iterations: int = 5000
@@ -61,15 +58,8 @@ class CanonicalSchedule:
     phases: tuple[CanonicalPhase, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        least = {
-            "search_iterations": 0,
-            "search_side": 2,
-            "iterations": 1,
-            "side": 2,
-            "decay_iterations": 1,
-            "rays": 1,
-        }
-        for name, bound in least.items():
+        least = {"search_side": 2, "iterations": 1, "side": 2, "decay_iterations": 1, "rays": 1}
+        for name, bound in {"search_iterations": 0, **least}.items():
             if getattr(self, name) < bound:
                 raise DevrfError(
                     f"schedule.canonical.{name}: expected at least {bound}, "
@@ -104,7 +94,6 @@ class CanonicalSchedule:
         return next((p for p in self.phases if iteration < p.stop), self.phases[-1])
 
     def learning_rate_factor(self, iteration: int) -> float:
-        """0.1^(n / decay_iterations), n counted from the start of the search or fine part."""
-        searching = iteration < self.search_iterations
-        since = iteration if searching else iteration - self.search_iterations
-        return float(0.1 ** (since / self.decay_iterations))
+        """0.1^(n / decay_iterations), n from the start of the search or of the radiance field."""
+        first = 0 if iteration < self.search_iterations else self.search_iterations
+        return float(0.1 ** ((iteration - first) / self.decay_iterations))

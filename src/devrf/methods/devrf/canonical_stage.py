@@ -1,30 +1,29 @@
-"""The canonical stage: static views → a voxel radiance field of the rest state."""
+"""The canonical stage: the static capture (docs/method.md#captures) → the scene at rest."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
-from devrf.data.batch import Pixels, background_color, gather_batch
+from devrf.checkpoints.packing import pack_bits, unpack_bits
+from devrf.data.batch import Pixels
 from devrf.data.pool import PixelPool
-from devrf.engine.ddp import rays_per_rank
 from devrf.engine.graphs import Graphs
 from devrf.engine.parallel_batch import ParallelBatch
 from devrf.engine.phase import Phase
 from devrf.errors import DevrfError
-from devrf.geometry.box import Box
-from devrf.geometry.cameras import Cameras
-from devrf.methods.devrf import phase_state
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.canonical_schedule import CanonicalPhase, CanonicalSchedule
 from devrf.methods.devrf.free_space import possible_matter, view_count_weight
 from devrf.methods.devrf.model import DeVRFModel
+from devrf.methods.devrf.motion_losses import total_variation_weight
 from devrf.methods.devrf.photometric_losses import PHOTOMETRIC_TERMS, Prediction, visibility
 from devrf.methods.devrf.pixel_selection import canonical_pool
 from devrf.methods.devrf.settings import (
@@ -35,7 +34,6 @@ from devrf.methods.devrf.settings import (
     RenderSettings,
     Sampling,
 )
-from devrf.methods.devrf.smoothing import total_variation_weight
 from devrf.methods.devrf.voxel_stage import VoxelStage
 from devrf.methods.weighted_loss import WeightedLoss
 from devrf.ops.adam import GridAdam
@@ -50,11 +48,12 @@ log = logging.getLogger(__name__)
 class CanonicalStage(VoxelStage):
     """Learns the canonical field from the static views (docs/method.md#canonical-stage).
 
-    First the coarse geometry is searched in the box of the scene's bounds; then the box is
-    tightened around it and enlarged so that motion has room, and the radiance field is learned
-    inside, on rays that meet the coarse geometry.
+    First the coarse geometry (docs/method.md#geometry-search) in the box of the scene's bounds;
+    then the radiance field (docs/method.md#radiance-field) in a box around it that leaves room for
+    motion, on rays that meet the coarse geometry.
     """
 
+    schedule: CanonicalSchedule
     name = "canonical"
     capture: CaptureName = "static"
     memory_keys = ("schedule.canonical.side", "schedule.canonical.rays")
@@ -79,9 +78,9 @@ class CanonicalStage(VoxelStage):
             architecture: sizes of the field.
             rates: learning rates.
             sampling: how rays are sampled.
-            search_loss: weights of the loss terms while the coarse geometry is searched;
-                ``tv`` is the total variation of both grids.
-            fine_loss: their weights afterwards.
+            search_loss: weights of the loss terms in the geometry search; ``tv`` is the total
+                variation of both grids.
+            fine_loss: their weights in the radiance field.
             iterations_per_step: optimiser iterations in one Lightning step.
             graphs: whether a GPU replays iterations from CUDA graphs: ``auto`` where it can.
             decoder_precision: what the colour network computes in; ``auto``: ``bfloat16`` on a
@@ -100,11 +99,9 @@ class CanonicalStage(VoxelStage):
         self.pool: PixelPool | None = None
         self._optimizer: GridAdam | None = None
 
-    # The schedule.
-
     @property
     def total_iterations(self) -> int:
-        """Iterations of search and fine stage together."""
+        """Iterations of search and radiance field together."""
         return self.schedule.total
 
     @property
@@ -126,8 +123,6 @@ class CanonicalStage(VoxelStage):
         """The schedule's exponential decay."""
         return self.schedule.learning_rate_factor(iteration)
 
-    # The field.
-
     def setup(self, stage: str) -> None:
         """Build the field of the first phase in the scene's box."""
         super().setup(stage)
@@ -147,17 +142,11 @@ class CanonicalStage(VoxelStage):
             self.render_settings(first),
             space=self.scene.space,
         )
-        groups = (
-            ("density", canonical.density, self.rates.density),
-            ("color", canonical.color, self.rates.color),
-            ("decoder", canonical.decoder, self.rates.decoder),
-        )
-        self._optimizer = GridAdam(
-            [
-                {"params": list(module.parameters()), "lr": rate, "base_lr": rate, "name": name}
-                for name, module, rate in groups
-            ]
-        )
+        groups: list[dict[str, Any]] = []
+        for name, rate in asdict(self.rates).items():
+            learned = list(canonical.get_submodule(name).parameters())
+            groups.append({"params": learned, "lr": rate, "base_lr": rate, "name": name})
+        self._optimizer = GridAdam(groups)
 
     def render_settings(self, phase: CanonicalPhase) -> RenderSettings:
         """How rays are sampled in a phase."""
@@ -183,17 +172,17 @@ class CanonicalStage(VoxelStage):
                 f"the field has become empty by iteration {self.iteration}: check data.background, "
                 "data.box and data.near, or lower schedule.rates.density"
             )
-        self.setup_optimizer(views.cameras)
+        self.setup_optimizer()
 
     def _begin_fine(self, phase: CanonicalPhase) -> None:
-        """Tighten the box around what the search found, enlarge it, start the radiance field."""
+        """Keep what the search found as the occupancy, and start the radiance field."""
         search, occupancy = self.scene_model.canonical, self.scene_model.occupancy
         found = search.voxel_alpha(self.sampling.step) > self.sampling.occupancy_threshold
         occupancy.replace(dilate(found & occupancy.mask, 1))
         self.scene_model.canonical = self._radiance_field(occupancy, phase).to(self.device)
 
     def _radiance_field(self, occupancy: Occupancy, phase: CanonicalPhase) -> CanonicalField:
-        """A new radiance field in the box around what is occupied, with room for motion."""
+        """A new radiance field in the tight box around what is occupied, enlarged for motion."""
         tight = bounding_box(occupancy.mask, occupancy.box)
         if tight is None:
             raise DevrfError(
@@ -201,21 +190,18 @@ class CanonicalStage(VoxelStage):
                 f"{occupancy.box.low} to {occupancy.box.high}: check data.box, data.near and "
                 "data.background, or give it more schedule.canonical.search_iterations"
             )
-        box = self._enlarged(tight)
+        bounds = self.scene.bounds
+        if bounds.motion is None:
+            box = tight.scaled(bounds.scale)
+        else:
+            box = tight.scaled(1.05).union(bounds.motion)
         share = 100 * occupancy.share
         log.info("%.1f%% of the searched box may be occupied; fields live in %s", share, box)
         return self.architecture.radiance_field(box, phase.voxels, round(self.schedule.side**3))
 
-    def _enlarged(self, box: Box) -> Box:
-        """The box with room for motion: the scene's motion box, or a multiple of the box."""
-        bounds = self.scene.bounds
-        if bounds.motion is None:
-            return box.scaled(bounds.scale)
-        return box.scaled(1.05).union(bounds.motion)
-
     @torch.no_grad()
     def update_occupancy(self) -> None:
-        """Find anew where something is, on the field's own grid, within what was occupied."""
+        """Find the occupancy at rest on the field's own grid, within the one before."""
         model, sampling = self.scene_model, self.sampling
         field = model.canonical
         found = dilate(field.voxel_alpha(sampling.step) > sampling.occupancy_threshold, 1)
@@ -223,12 +209,11 @@ class CanonicalStage(VoxelStage):
         before = model.occupancy.at(points.view(-1, 3)).view(found.shape)
         model.occupancy.replace(found & before, field.box)
 
-    def setup_optimizer(self, cameras: Cameras) -> None:
-        """Give the optimiser the present grids.
+    def setup_optimizer(self) -> None:
+        """Give the optimiser the present grids (docs/method.md#optimiser).
 
-        In the search each voxel learns at a rate of its own, by how many views see it; afterwards
-        a voxel without gradient keeps its moments. The total variation of both grids is smoothed
-        at the voxels that a batch has touched.
+        In the search the learning rate of each voxel depends on how many views see it; afterwards
+        a voxel without gradient keeps its moments.
         """
         assert self.phase is not None
         searching, field = self.phase.kind == "search", self.scene_model.canonical
@@ -239,7 +224,8 @@ class CanonicalStage(VoxelStage):
         if searching:
             points = field.box.grid_points(field.density.shape, field.density.values)
             points = self.scene.space.to_world(points)
-            per_voxel_lr = view_count_weight(cameras.to(self.device), points)[..., None]
+            cameras = self.scene.static.train.cameras.to(self.device)
+            per_voxel_lr = view_count_weight(cameras, points)[..., None]
         for group, grid in ((0, field.density), (1, field.color)):
             self.optimizer.replace(
                 group,
@@ -256,29 +242,18 @@ class CanonicalStage(VoxelStage):
         static_shape = triton_runs(field.density.values)
         self.bind(self.schedule.rays, [learned], static_shape=static_shape)
 
-    # An iteration.
-
     def draw(self, batch: ParallelBatch) -> Pixels:
         """Random pixels of all images."""
         assert self.pool is not None
-        with span("batch"):
-            image, flat = self.pool.draw(rays_per_rank(self.schedule.rays), self.generator)
-            background = background_color(self.scene.background, len(image), self.generator)
-            return Pixels(image, flat, background)
+        return self.draw_pixels(self.pool)
 
     def loss(
         self, batch: ParallelBatch, views: Views, pixels: Pixels
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Render a batch of pixels and compare it with the images."""
         assert self.phase is not None
-        with span("batch"):
-            rays = gather_batch(
-                views, pixels.image, pixels.flat, pixels.background, self.scene.space
-            )
-        output = self.render_rays(
-            rays.rays, self.scene_model.occupancy, rays.background, batch.capacity
-        )
-        prediction = Prediction(output, rays)
+        occupancy = self.scene_model.occupancy
+        prediction = Prediction(*self.render_pixels(views, pixels, occupancy, batch.capacity))
         with span("losses"):
             total, terms = self.losses[self.phase.kind](prediction)
             return total, {**terms, **visibility(prediction)}
@@ -291,8 +266,6 @@ class CanonicalStage(VoxelStage):
         self.update_occupancy()
         self.scene_model.canonical.clear(~self.scene_model.occupancy.mask, alpha=1e-6)
 
-    # What a checkpoint holds beside the tensors.
-
     def resize_to(self, state: dict[str, Tensor]) -> None:
         """Take a radiance field in place of the search's, if that is what was stored."""
         fine = any(key.startswith("scene_model.canonical.decoder.") for key in state)
@@ -302,11 +275,24 @@ class CanonicalStage(VoxelStage):
 
     def phase_state(self) -> dict[str, Any]:
         """The pixels that batches are drawn from."""
-        return phase_state.of_canonical(self)
+        assert self.pool is not None
+        images, area = self._images
+        return {"pixels": pack_bits(self.pool.mask(images, area))}
 
     def restore(self, phase: Phase, kept: dict[str, Any]) -> None:
         """Go on with ``phase``, the field being loaded."""
-        phase_state.restore_canonical(self, phase, kept)
+        assert isinstance(phase, CanonicalPhase)
+        images, area = self._images
+        mask = unpack_bits(kept["pixels"], (len(images), area), self.device)
+        self.pool = PixelPool.of_mask(images, mask)
+        self.scene_model.settings = self.render_settings(phase)
+        self.setup_optimizer()
+
+    @property
+    def _images(self) -> tuple[Tensor, int]:
+        """The numbers (N,) of the static training images, and the pixels of each."""
+        views = self.scene.static.train
+        return torch.arange(len(views), device=self.device), views.height * views.width
 
     def result(self) -> LoadedCheckpoint:
         """What the deformation stage builds on."""

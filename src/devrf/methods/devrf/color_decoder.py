@@ -1,4 +1,4 @@
-"""From interpolated features and a viewing direction to a colour."""
+"""Colour decoders: interpolated features and a viewing direction → RGB."""
 
 from __future__ import annotations
 
@@ -9,22 +9,15 @@ from torch import Tensor, nn
 class SigmoidColor(nn.Module):
     """Three channels are the colour itself, before a sigmoid: no network, no view dependence."""
 
-    def forward(
-        self,
-        features: Tensor,
-        viewdirs: Tensor,
-        ray: Tensor,
-        precision: torch.dtype = torch.float32,
-    ) -> Tensor:
-        """RGB (S, 3) in [0, 1] of ``features`` (S, 3), all else aside: there is no network."""
+    def forward(self, features: Tensor, *_: object) -> Tensor:
+        """RGB (S, 3) in [0, 1] of ``features`` (S, 3), whatever the direction."""
         return torch.sigmoid(features)
 
 
 class ColorDecoder(nn.Module):
-    """A shallow network: feature ⊕ d ⊕ sin(2^k d), cos(2^k d) → RGB (docs/method.md#colour).
+    """c = sigmoid(MLP(f, d, sin(2^k d), cos(2^k d))) (docs/method.md#colour).
 
-    The first layer is split: what depends on the direction alone is computed once a ray, not
-    once a sample.
+    The first layer is split: its direction part is computed once a ray, not once a sample.
     """
 
     octaves: Tensor
@@ -59,7 +52,7 @@ class ColorDecoder(nn.Module):
             viewdirs: (R, 3) unit directions of the rays, in world space.
             ray: (S,) int64, the ray of each sample.
             precision: what the hidden layers and their gradients are computed in. Weights,
-                sums, and the last layer stay in single precision: colours keep all their shades.
+                sums, and the last layer stay in single precision, so that colours do.
 
         Returns:
             RGB (S, 3) in [0, 1].

@@ -1,7 +1,7 @@
-"""The state of a finished scene as its checkpoint holds it: small, and as good to look at.
+"""The state of a finished scene as its checkpoint holds it.
 
-Grids are packed (devrf.checkpoints.packing): in half precision, in detail only near what is ever
-occupied. Files to go on learning from hold everything as it is.
+Grids are packed (:mod:`devrf.checkpoints.packing`): in half precision, in detail only near what is
+ever occupied. Progress files hold everything as it is.
 """
 
 from __future__ import annotations
@@ -29,14 +29,9 @@ def compact_state(
     deformation: DeformationField | None,
     occupancy_at: Callable[[float], Occupancy],
 ) -> dict[str, Any]:
-    """A model's state with its grids packed; what no half can hold stays as it is.
+    """The ``state`` of a finished scene with its grids packed.
 
-    Args:
-        state: of a finished scene: what was never occupied has been emptied.
-        occupancy: where something is at rest.
-        canonical: the canonical field.
-        deformation: how it moves, if it does.
-        occupancy_at: where something is at a time.
+    A grid with a value that half precision cannot hold stays as it is.
     """
     small, box = dict(state), canonical.box
     at_rest = _near(occupancy, canonical.density.shape, box)[None]
@@ -45,7 +40,7 @@ def compact_state(
     if deformation is not None:
         shape = deformation.shape
         moments = [_near(occupancy_at(time), shape, box) for time in deformation.clock.times]
-        # Between two frames what is seen is a mixture of both.
+        # Between two frames both are blended.
         moving = torch.stack(
             [torch.stack(moments[max(k - 1, 0) : k + 2]).any(dim=0) for k in range(len(moments))]
         )
@@ -82,9 +77,9 @@ def _unpacked(packed: dict[str, Any]) -> Tensor:
 
 
 def _near(occupancy: Occupancy, shape: Shape, box: Box) -> Tensor:
-    """The points of a grid (X, Y, Z) over ``box`` that a look-up near anything occupied reads."""
+    """The points of a grid over ``box`` that interpolation near anything occupied reads."""
     cells = zip(occupancy.mask.shape, shape, strict=True)
-    # So that a cell of the grid, which may be the larger one, is not between two looks.
+    # A cell of the grid may span several of the occupancy's cells.
     reach = max(1, *(-(-(theirs - 1) // max(ours - 1, 1)) for theirs, ours in cells))
     grown = Occupancy(dilate(occupancy.mask, reach), occupancy.box)
     points = box.grid_points(shape, torch.empty(0, device=occupancy.mask.device))

@@ -1,4 +1,4 @@
-"""The 4D deformation field: where each point of each frame lies in canonical space, and back."""
+"""The 4D deformation field V_motion (docs/method.md#deformation-field)."""
 
 from __future__ import annotations
 
@@ -16,10 +16,9 @@ from devrf.methods.devrf.grid_warp import GridWarp
 class DeformationField(nn.Module):
     """Displacements (T, X, Y, Z, 3) over a box, backward and forward (docs/method.md#warp).
 
-    A point x at time t is seen in canonical space at x + Δ_b(x, t); a canonical point q is at
-    q + Δ_f(q, t) at time t. Between frames both are blended linearly, which with the trilinear
-    interpolation in space makes the quadruple interpolation. Frame 0 is zero and is never
-    trained: at t = 0 the warp is the identity, exactly.
+    A point x at time t is seen in canonical space at q = x + Δ_b(x, t); a canonical point q is at
+    q + Δ_f(q, t) at time t. Frame 0 is zero and never trained: at t = 0 the warp is exactly the
+    identity.
 
     Attributes:
         frames: the displacements of all frames, in the box's units.
@@ -28,13 +27,7 @@ class DeformationField(nn.Module):
     """
 
     def __init__(self, box: Box, clock: FrameClock, *, voxels: int) -> None:
-        """A field at rest: no displacement anywhere.
-
-        Args:
-            box: where the field lives.
-            clock: the frames' times; frame 0 is the rest state.
-            voxels: about how many voxels each frame has.
-        """
+        """Zero displacements of the clock's T frames, each on about ``voxels`` voxels."""
         super().__init__()
         self.box = box
         self.clock = clock
@@ -57,20 +50,16 @@ class DeformationField(nn.Module):
         return x, y, z
 
     def warp(self, points: Tensor, time: float) -> Tensor:
-        """Canonical positions (M, 3) of ``points`` (M, 3) at ``time``; the identity at 0."""
+        """x + Δ_b(x, t) (M, 3) of ``points`` x (M, 3) at ``time`` t."""
         return self.warp_at(time)(points)
 
     def unwarp(self, points: Tensor, time: float) -> Tensor:
-        """Positions (M, 3) at ``time`` of canonical ``points`` (M, 3); the identity at 0."""
-        return self.unwarp_at(time)(points)
+        """q + Δ_f(q, t) (M, 3) of canonical ``points`` q (M, 3) at ``time`` t."""
+        return self._at(self.to_time, time)(points)
 
     def warp_at(self, time: float) -> GridWarp:
-        """The map of points at ``time`` into canonical space."""
+        """The map x → x + Δ_b(x, t) at ``time`` t."""
         return self._at(self.to_canonical, time)
-
-    def unwarp_at(self, time: float) -> GridWarp:
-        """The map of canonical points to where they are at ``time``."""
-        return self._at(self.to_time, time)
 
     def _at(self, frames: Tensor, time: float) -> GridWarp:
         moment = self.clock.at(time)
@@ -80,11 +69,10 @@ class DeformationField(nn.Module):
         return GridWarp(slices, self.box, moment.weight)
 
     def blended(self, time: float) -> Tensor:
-        """Δ_b at ``time`` as one grid (X, Y, Z, 3).
+        """Δ_b at ``time`` as one grid (X, Y, Z, 3): one look-up a point instead of two.
 
-        On a frame it is the frame's own memory, if that is where the field works, in single
-        precision. Looking a point up there takes one trilinear interpolation instead of two, and a
-        rounding of its own.
+        Rounded differently than :meth:`warp`. On a frame it shares the frame's memory, if the
+        frames are kept in single precision on the device.
         """
         moment, here = self.clock.at(time), self.frames.here
         before = self.to_canonical[moment.before].to(here)
@@ -99,11 +87,8 @@ class DeformationField(nn.Module):
 
     def get_extra_state(self) -> dict[str, Any]:
         """Box and clock, as plain numbers."""
-        return {
-            "low": list(self.box.low),
-            "high": list(self.box.high),
-            "times": list(self.clock.times),
-        }
+        low, high = list(self.box.low), list(self.box.high)
+        return {"low": low, "high": high, "times": list(self.clock.times)}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_extra_state` gave."""

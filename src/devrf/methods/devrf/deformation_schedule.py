@@ -12,7 +12,7 @@ from devrf.errors import DevrfError
 
 @dataclass(frozen=True)
 class DeformationPhase:
-    """A visit to one frame at one resolution, or to several side by side.
+    """A visit to one frame at one resolution, or to several in parallel.
 
     Attributes:
         level: 0 is the coarsest resolution.
@@ -43,30 +43,29 @@ class DeformationPhase:
 
 @dataclass(frozen=True)
 class DeformationSchedule:
-    """The deformation stage's course; the defaults are the paper's, inward-facing.
+    """The deformation stage's visits; the defaults are the paper's, inward-facing.
 
     See docs/method.md#coarse-to-fine.
 
-    Within a level the frames are visited one after another. A level has one share of
-    iterations for each of T frames; frame 0 is the identity and needs none, so frame 1 takes
-    its share beside its own: the level's length is share · T.
+    Within a level the frames t = 1, …, T − 1 are visited one after another, each for the level's
+    share of iterations. Frame 0 is the identity; frame 1 gets its share, so that a level takes
+    share · T iterations.
 
-    Where K frames may be learned at once the T frames are cut into contiguous stretches of
-    L = ⌈T / K⌉, but of two at least: neighbours are never learned at once. (The last stretch may be
-    shorter, and there may be fewer than K.) The j-th visit of the level, 0 ≤ j < L, is to the j-th
-    frame of each: frames j, j + L, j + 2L, … An iteration is one optimiser step on all of them,
-    each with a batch of its own, so the level's length is share · L. But for the first of a
-    stretch, the frame before has been learned at this level by then; the first of a stretch knows
-    what the level before has made of its neighbour. Frame 0 is left out. Where that leaves the
-    first visit empty, for there is one stretch, frame 1 has its share as said.
+    Where K frames may be learned in parallel, the T frames are cut into contiguous stretches of
+    L = max(2, ⌈T / K⌉) frames, so that neighbours are never learned together. Visit j of the level,
+    0 ≤ j < L, is to the j-th frame of every stretch: frames j, j + L, j + 2L, … without frame 0.
+    An iteration is one optimiser step on all of them, each with a batch of its own, so a level
+    takes share · L iterations. The first frame of a stretch is learned before the frame before it;
+    that one is known from the level before. With a single stretch visit 0 would be empty, and
+    frame 1 gets its share as above.
 
     Attributes:
-        sides: sides of the motion grids, coarse to fine.
+        sides: the motion grids have about side³ voxels at each level, coarse to fine.
         iterations_per_frame: share of a frame at each level.
         coarse_to_fine: False spends all shares at the finest resolution, at the base rate, each
-            frame starting from rest (the ``base`` row of the ablation tables).
+            frame starting from rest (``ablation=base``, docs/method.md#ablations).
         decay: factor of the learning rate from a level to the next.
-        rays: rays a batch.
+        rays: of a batch.
         parallel_frames: K of each level, 1 at the coarsest, where a frame starts from the one
             before it; None: 1 throughout.
     """
@@ -113,19 +112,16 @@ class DeformationSchedule:
             object.__setattr__(self, "parallel_frames", (at_once[-1],))
 
     def visits(self, level: int, frames: int) -> int:
-        """L: in how many visits a level goes through T = ``frames`` frames, the idle one counted.
-
-        Also how many frames lie between two that are visited together.
-        """
+        """L of T = ``frames`` frames: visits of a level, and the distance of parallel frames."""
         at_once = 1 if self.parallel_frames is None else self.parallel_frames[level]
         return max(2, -(-frames // at_once))
 
     def max_parallel_frames(self, level: int, frames: int) -> int:
-        """The most of T = ``frames`` frames that are visited together at a level."""
+        """The most of T = ``frames`` frames that a level learns in parallel."""
         return len(range(1, frames, self.visits(level, frames)))
 
     def total(self, frames: int) -> int:
-        """Iterations of the whole stage for T = ``frames`` frames, the rest frame counted."""
+        """Iterations of the whole stage for T = ``frames`` frames, frame 0 included."""
         return sum(self._lengths(frames))
 
     def growths(self, frames: int) -> list[int]:

@@ -1,4 +1,4 @@
-"""The deformation stage: dynamic views + the canonical field → how the scene moves."""
+"""The deformation stage: the dynamic capture and the canonical field → how the scene moves."""
 
 from __future__ import annotations
 
@@ -9,27 +9,29 @@ import torch
 from torch import Tensor
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
-from devrf.data.batch import Pixels, background_color, gather_batch
+from devrf.data.batch import Pixels
 from devrf.data.correspondence import previous_images
 from devrf.data.pool import all_pixels
-from devrf.engine.ddp import broadcast, rays_per_rank
+from devrf.engine.ddp import broadcast
 from devrf.engine.graphs import Graphs
 from devrf.engine.parallel_batch import ParallelBatch
 from devrf.engine.phase import Phase
-from devrf.methods.devrf import phase_state
+from devrf.methods.devrf import convergence
 from devrf.methods.devrf.active_frame import ActiveFrames
-from devrf.methods.devrf.convergence import ConvergenceMonitor
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule
 from devrf.methods.devrf.deformed_occupancy import deformed_occupancy
 from devrf.methods.devrf.flow_initialisation import follow, start_from_tracks
 from devrf.methods.devrf.frame_memory import rest_on_host
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.motion_losses import MOTION_TERMS, MotionPrediction
+from devrf.methods.devrf.motion_losses import (
+    MOTION_TERMS,
+    MotionPrediction,
+    total_variation_weight,
+)
 from devrf.methods.devrf.photometric_losses import visibility
 from devrf.methods.devrf.pixel_selection import frame_pools, images_of
 from devrf.methods.devrf.settings import DEFORMATION_LOSS, MotionSettings, Precision
-from devrf.methods.devrf.smoothing import total_variation_weight
 from devrf.methods.devrf.voxel_stage import VoxelStage
 from devrf.methods.weighted_loss import WeightedLoss
 from devrf.ops.adam import GridAdam
@@ -39,13 +41,14 @@ from devrf.system.profiling import span
 
 
 class DeformationStage(VoxelStage):
-    """Learns how a known canonical field deforms (docs/method.md#deformation-stage).
+    """Learns from the dynamic views how the scene deforms (docs/method.md#deformation-stage).
 
-    Frames are learned one after another, or several in parallel, coarse to fine. Only their two
-    slices are trained; the canonical field and all other frames are frozen. Frames that are
-    learned together learn as if each were alone: each has a batch of its own.
+    Coarse to fine (docs/method.md#coarse-to-fine), frames are learned one after another, or several
+    in parallel, each from batches of its own. Only their two slices are trained; the canonical
+    field and all other frames are frozen.
     """
 
+    schedule: DeformationSchedule
     name = "deformation"
     capture: CaptureName = "dynamic"
     rate_keys = "schedule.motion.learning_rate or the weights of loss.deformation"
@@ -89,10 +92,7 @@ class DeformationStage(VoxelStage):
             [{"params": [placeholder], "lr": self.motion.learning_rate, "name": "motion"}]
         )
         self.active = ActiveFrames(self)
-        self.convergence = ConvergenceMonitor(0, self.motion.min_rel_improvement)
         self._previous_images: Tensor | None = None
-
-    # The schedule.
 
     @property
     def field(self) -> DeformationField:
@@ -120,10 +120,8 @@ class DeformationStage(VoxelStage):
         return self.schedule.phase(iteration, len(self.field.clock))
 
     def learning_rate_factor(self, iteration: int) -> float:
-        """The decay of the level that ``iteration`` belongs to."""
+        """The decay of the iteration's level (docs/method.md#motion-learning-rate)."""
         return self.phase_at(iteration).learning_rate_factor
-
-    # The field and its frames.
 
     def setup(self, stage: str) -> None:
         """Build the field at rest, at the coarsest resolution, in the canonical field's box."""
@@ -168,11 +166,10 @@ class DeformationStage(VoxelStage):
         if len(self.active) != len(phase.frames):
             self._allocate(len(phase.frames))
         self.active.check_out(phase.frames)
-        self.convergence = ConvergenceMonitor(len(phase.frames), self.motion.min_rel_improvement)
 
     def _allocate(self, count: int) -> None:
         """Make memory for ``count`` active frames at the field's present resolution."""
-        # What belonged to the frames before is free before more is taken.
+        # The memory of the frames before is freed first.
         self.loop.release()
         self.active.allocate(0, self.field, self.scene_model.occupancy)
         self._optimizer.replace(0, [])
@@ -186,30 +183,24 @@ class DeformationStage(VoxelStage):
             self.bind(self.schedule.rays, slices, static_shape=static_shape)
 
     def _initialise(self, phase: DeformationPhase) -> None:
-        """Start the phase's frames from the frames before them, moved along the flow if known."""
-        if phase.init_from_previous:
-            for number in phase.frames:
+        """Start each frame from the one before it; along the observed flow, if asked to."""
+        for number in phase.frames:
+            if phase.init_from_previous:
                 self.field.frames.copy_previous(number)
-        if self._starts_along_flow(phase):
-            for number in phase.frames:
-                self._follow_flow(number)
+            if self._starts_along_flow(phase):
+                views, model, clock = self.views, self.scene_model, self.field.clock
+                pool, before = all_pixels(views, images_of(views, number)), clock.times[number - 1]
+                tracks = follow(model, views, pool, self.previous_images, before, self.generator)
+                start_from_tracks(self.field, number, tracks, views.cameras, model.space)
+                # Each process has followed pixels of its own.
+                broadcast([self.field.to_canonical[number], self.field.to_time[number]])
 
     def _starts_along_flow(self, phase: DeformationPhase) -> bool:
         asked = self.motion.start == "flow" and self.views.flow is not None
         return asked and phase.level == 0 and phase.has_previous
 
-    def _follow_flow(self, number: int) -> None:
-        """Move a frame's slices to where the flow says that the frame before has gone."""
-        views, model = self.views, self.scene_model
-        pool = all_pixels(views, images_of(views, number))
-        before = self.field.clock.times[number - 1]
-        tracks = follow(model, views, pool, self.previous_images, before, self.generator)
-        start_from_tracks(self.field, number, tracks, views.cameras, model.space)
-        # Each process has followed pixels of its own.
-        broadcast([self.field.to_canonical[number], self.field.to_time[number]])
-
     def _prefetch_after(self, phase: DeformationPhase) -> None:
-        """Begin to fetch the frames that come next, unless they are changed before they do."""
+        """Begin to fetch the next phase's frames, unless they change before it begins."""
         following = self.phase_at(phase.stop)
         changed = following.init_from_previous or self._starts_along_flow(following)
         if following.level == phase.level and following != phase and not changed:
@@ -240,15 +231,13 @@ class DeformationStage(VoxelStage):
         return self._previous_images
 
     def update_occupancy(self) -> None:
-        """Find where each active frame's matter is under its present displacements."""
+        """Find the occupancy of each active frame under its present displacements."""
         model = self.scene_model
         for frame in self.active:
             frame.occupancy.refill(deformed_occupancy(model.occupancy, model.canonical, frame.warp))
 
-    # An iteration.
-
     def prepare(self) -> None:
-        """Update the frames' occupancy, when it is time."""
+        """Update the frames' occupancy every ``occupancy_every`` iterations."""
         assert self.phase is not None
         since = self.iteration - self.phase.start
         if since and since % self.motion.occupancy_every == 0:
@@ -257,26 +246,21 @@ class DeformationStage(VoxelStage):
 
     def draw(self, batch: ParallelBatch) -> Pixels:
         """Random pixels of the batch's frame, of its views in turn or of all."""
-        with span("batch"):
-            pools = self.active[batch.number].pools
-            pool = pools[self.iteration % len(pools)]
-            image, flat = pool.draw(rays_per_rank(self.schedule.rays), self.generator)
-            background = background_color(self.scene.background, len(image), self.generator)
-            return Pixels(image, flat, background)
+        pools = self.active[batch.number].pools
+        return self.draw_pixels(pools[self.iteration % len(pools)])
 
     def loss(
         self, batch: ParallelBatch, views: Views, pixels: Pixels
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Render a batch of the frame through its warp; compare images and motion."""
-        frame, space = self.active[batch.number], self.scene_model.space
-        with span("batch"):
-            rays = gather_batch(views, pixels.image, pixels.flat, pixels.background, space)
-        output = self.render_rays(
-            rays.rays, frame.occupancy, rays.background, batch.capacity, frame.warp
-        )
-        before = frame.unwarp_previous(looked_up=batch.capacity is not None)
+        frame, capacity = self.active[batch.number], batch.capacity
         prediction = MotionPrediction(
-            output, rays, frame.unwarp, before, views.cameras, self.previous_images, space
+            *self.render_pixels(views, pixels, frame.occupancy, capacity, frame.warp),
+            frame.unwarp,
+            frame.unwarp_previous(always_interpolate=capacity is not None),
+            views.cameras,
+            self.previous_images,
+            self.scene_model.space,
         )
         with span("losses"):
             total, terms = self.losses(prediction)
@@ -284,14 +268,18 @@ class DeformationStage(VoxelStage):
 
     def converged(self, losses: Tensor) -> bool:
         """Whether each active frame's loss has stopped falling, if the schedule asks for that."""
-        if self.motion.min_rel_improvement is None:
+        least = self.motion.min_rel_improvement
+        if least is None:
             return False
-        return self.convergence.add(losses.tolist())
+        for frame, loss in zip(self.active, losses.tolist(), strict=True):
+            frame.losses.append(loss)
+        return all(convergence.converged(frame.losses, least) for frame in self.active)
 
     def rollback(self, iteration: int, lr_scale: float) -> None:
-        """Go on from an earlier iteration of the present frames; find anew where matter is."""
+        """Go on from an earlier iteration of the present frames, with an occupancy found anew."""
         super().rollback(iteration, lr_scale)
-        self.convergence = ConvergenceMonitor(len(self.active), self.motion.min_rel_improvement)
+        for frame in self.active:
+            frame.losses = []
         self.update_occupancy()
 
     @property
@@ -300,12 +288,23 @@ class DeformationStage(VoxelStage):
         keys = ("schedule.deformation.sides", "schedule.deformation.rays")
         return (*keys, "schedule.deformation.parallel_frames") if len(self.active) > 1 else keys
 
-    # What a checkpoint holds beside the tensors.
-
     def phase_state(self) -> dict[str, Any]:
-        """What the active frames have at hand, and how their losses fell."""
-        return phase_state.of_deformation(self)
+        """The state of each active frame, and its losses so far."""
+        area, exact = self.views.height * self.views.width, self.motion.store_half
+        return {
+            "frames": [
+                frame.state(images_of(self.views, frame.number), area, exact=exact)
+                for frame in self.active
+            ],
+            "losses": [list(frame.losses) for frame in self.active],
+        }
 
     def restore(self, phase: Phase, kept: dict[str, Any]) -> None:
         """Go on with the frames of ``phase``, the field being loaded."""
-        phase_state.restore_deformation(self, phase, kept)
+        assert isinstance(phase, DeformationPhase)
+        self.activate(phase)
+        views = self.views
+        states = zip(self.active, kept["frames"], kept["losses"], strict=True)
+        for frame, state, losses in states:
+            frame.load_state(state, images_of(views, frame.number), views.height * views.width)
+            frame.losses = list(losses)

@@ -1,4 +1,4 @@
-"""Where something is once it has moved."""
+"""Where something is at a time t (docs/method.md#occupancy)."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from devrf.rendering.occupancy import Occupancy, dilate
 def deformed_occupancy(
     occupancy: Occupancy, canonical: CanonicalField, warp: Callable[[Tensor], Tensor]
 ) -> Occupancy:
-    """Where something is at a time: the grid points that the time's warp sends to matter.
+    """The occupancy at a time: the grid points whose canonical position is occupied, grown by one.
 
     Args:
         occupancy: where something is at rest.
         canonical: gives the box.
-        warp: maps points (M, 3) at the time into canonical space.
+        warp: x → x + Δ_b(x, t), points (M, 3) at the time into canonical space.
     """
     points = occupancy_points(occupancy, canonical)
     moved = warp(points.view(-1, 3)).view(points.shape)
@@ -28,17 +28,16 @@ def deformed_occupancy(
 
 
 def occupancy_points(occupancy: Occupancy, canonical: CanonicalField) -> Tensor:
-    """The grid points (X, Y, Z, 3) at which a time's occupancy is looked up."""
+    """The grid points x (X, Y, Z, 3) at which a time's occupancy is looked up."""
     x, y, z = occupancy.mask.shape
     return canonical.box.grid_points((x, y, z), canonical.density.values)
 
 
 @torch.no_grad()
 def occupancy_through(occupancy: Occupancy, canonical: CanonicalField, moved: Tensor) -> Occupancy:
-    """The occupancy of a time whose grid points are seen at ``moved`` (X, Y, Z, 3).
+    """:func:`deformed_occupancy` of grid points with canonical positions ``moved`` (X, Y, Z, 3).
 
-    The canonical occupancy has a rim of one grid point, for what a stretching warp would step
-    over; so has the result, for what lies between its own grid points.
+    The rim of one grid point is for what lies between the points.
     """
     found = occupancy.at(moved.view(-1, 3)).view(moved.shape[:3])
     return Occupancy(dilate(found, 1), canonical.box)

@@ -1,11 +1,7 @@
-"""Where a frame starts from: the frame before it, moved along the observed optical flow.
+"""Starts a frame from the frame before it, moved along the observed optical flow.
 
-A part that moves further in one frame than it is thick does not overlap its old place: no ray
-that meets it now passes where it was, and no gradient of the rendering, nor of the flow loss
-(which weighs samples by what is rendered), can find it again. The flow itself says where it
-went. Each pixel of the frame whose flow leads onto the frame before sees the canonical point
-that was rendered there; several views of such pixels say where those points are now. The two
-coarse motion grids are fitted to that, in well under a second and without rendering anything.
+See docs/method.md#flow-initialisation: :func:`follow` is its step 1, :func:`start_from_tracks` are
+steps 2 and 3.
 """
 
 from __future__ import annotations
@@ -23,18 +19,19 @@ from devrf.geometry.space import WORLD, Space
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.volume_rendering import render
+from devrf.ops.compositing import sum_by_ray
 from devrf.ops.trilinear import interpolate
 from devrf.scenes.scene import Views
 
 
 @dataclass(frozen=True)
 class Tracks:
-    """N canonical points that were seen one frame earlier and are seen again.
+    """N canonical points that were seen one frame earlier, and where they are seen now.
 
     Attributes:
-        canonical: (N, 3) the points in canonical space.
+        canonical: (N, 3) the points q.
         camera: (N,) int64, the camera that sees each point now.
-        pixel: (N, 2) x, y where it sees it, in pixels.
+        pixel: (N, 2) x, y of the point in its image, in pixels.
     """
 
     canonical: Tensor
@@ -55,16 +52,16 @@ def follow(
     generator: torch.Generator,
     most: int = 4096,
 ) -> Tracks:
-    """Tracks from the frame before to the present one.
+    """Tracks Σ w_i q_i / Σ w_i from the frame before to the present one.
 
     Args:
         model: the scene, with the frame before learned.
         views: the dynamic training views; their flow must be known.
         pool: pixels of the present frame's images.
-        previous: (N,) for each image the one its flow leads to.
+        previous: (N,) int64, for each image the one that its flow leads to.
         time_before: the time of the frame before.
         generator: of the random choice, on the pool's device.
-        most: tracks at most; more pixels are thinned out at random.
+        most: tracks at most, chosen at random.
     """
     assert views.flow is not None
     area = views.height * views.width
@@ -83,10 +80,8 @@ def follow(
         torch.ones(3, device=image.device),
         model.warp(time_before),
     )
-    point = torch.zeros_like(rays.origins)
-    point.index_add_(0, seen.samples.ray, seen.weight[:, None] * seen.canonical)
-    mass = torch.zeros(len(rays), device=image.device)
-    mass.index_add_(0, seen.samples.ray, seen.weight)
+    point = sum_by_ray(seen.weight[:, None] * seen.canonical, seen.samples.ray, len(rays))
+    mass = sum_by_ray(seen.weight, seen.samples.ray, len(rays))
     met = (mass > 0.5).nonzero()[:, 0]
     return Tracks(point[met] / mass[met, None], image[met], now.pixel[met])
 
@@ -100,17 +95,17 @@ def start_from_tracks(
     smoothness: float = 0.01,
     steps: int = 60,
 ) -> None:
-    """Move a frame's two slices, carried from the frame before, along the tracks.
+    """Fit a frame's two slices, copied from the frame before, to the tracks.
 
-    First the forward slice is changed so that the tracked points fall on their pixels, then
-    the backward slice so that it leads back from there; both by the smoothest change that
-    does. Errors are counted in pixels, robustly (Huber), since flow is wrong at times.
+    First Δ_f, so that the tracked points project onto their pixels, then Δ_b, so that it leads
+    from there back to them; both by the smoothest change that does. Errors are in pixels and
+    robust (Huber), since observed flow has outliers.
 
     Args:
         field: the deformation field.
-        frame: the frame to start.
+        frame: the frame to start, from 1 on.
         tracks: where canonical points are seen at that frame.
-        cameras: the cameras that the tracks name.
+        cameras: all cameras.
         space: the space that the field lives in.
         smoothness: weight of differences between neighbouring voxels' changes.
         steps: optimiser steps of each fit.
@@ -140,7 +135,7 @@ def start_from_tracks(
 
 
 def _pixels_per_unit(tracks: Tracks, cameras: Cameras, space: Space, small: float) -> float:
-    """By how many pixels the tracked points move in their images for a unit of the space."""
+    """By how many pixels the tracked points move in their images for a unit of ``space``."""
     first, _ = cameras.project(tracks.camera, space.to_world(tracks.canonical))
     moves = []
     for axis in torch.eye(3).to(first):
@@ -154,13 +149,13 @@ def _pixels_per_unit(tracks: Tracks, cameras: Cameras, space: Space, small: floa
 def _fit(
     residual: Callable[[Tensor], Tensor], like: Tensor, scale: float, smoothness: float, steps: int
 ) -> Tensor:
-    """The change of a grid (X, Y, Z, 3) that makes ``residual(change)`` small and is smooth.
+    """The smooth change of a grid (X, Y, Z, 3) that makes ``residual(change)`` small.
 
     Args:
         residual: change → residuals (N, 2 or 3) in pixels.
         like: a grid of the shape and device wanted.
-        scale: pixels per world unit.
-        smoothness: weight of the differences between neighbours, in pixels.
+        scale: pixels per unit of the grid's values.
+        smoothness: weight of the squared differences between neighbours, in pixels.
         steps: Adam steps; the rate falls linearly from half a pixel a step.
     """
     change = torch.zeros_like(like).requires_grad_()

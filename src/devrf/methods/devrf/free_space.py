@@ -1,11 +1,10 @@
-"""What the static cameras say of space before anything is learned."""
+"""What the static cameras tell before anything is learned (docs/method.md#geometry-search)."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
 from devrf.scenes.scene import Scene
@@ -13,30 +12,24 @@ from devrf.scenes.visual_hull import visual_hull
 
 
 def possible_matter(scene: Scene, shape: tuple[int, int, int], *, carve: bool) -> Tensor:
-    """Where matter can be at rest, on a grid over the scene's box.
+    """Where matter can be at rest: (X, Y, Z) bool on the host, on a grid over the scene's box.
 
-    Not nearer to a camera than its near plane: a cloud before a lens would explain its picture
-    perfectly. And, to carve, inside the visual hull, where the images have mattes and all show
-    the rest state.
-
-    Returns:
-        (X, Y, Z) bool on the host.
+    Not nearer to a camera than its near plane: fog before a lens would explain its image
+    perfectly. ``carve`` leaves nothing outside the visual hull, if the images have mattes and all
+    show the rest state.
     """
     views, box = scene.static.train, scene.bounds.box
     possible = torch.ones(shape, dtype=torch.bool)
-    near_lenses = [p for p in views.cameras.positions if _distance(box, p) < scene.bounds.near]
-    if near_lenses:
+    positions, near = views.cameras.positions, scene.bounds.near
+    close = [one for one in positions if (box.nearest(one) - one).norm() < near]
+    if close:
         points = box.grid_points(shape, views.cameras.focal)
-        for position in near_lenses:
-            possible &= (points - position).norm(dim=-1) > scene.bounds.near
+        for position in close:
+            possible &= (points - position).norm(dim=-1) > near
     at_rest = float(views.times.max() - views.times.min()) <= FrameClock.TOLERANCE
     if carve and views.has_alpha and at_rest:
         possible &= visual_hull(views, box, shape)
     return possible
-
-
-def _distance(box: Box, point: Tensor) -> float:
-    return float((box.nearest(point) - point).norm())
 
 
 def view_count_weight(cameras: Cameras, points: Tensor) -> Tensor:

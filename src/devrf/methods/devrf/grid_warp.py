@@ -1,4 +1,4 @@
-"""A warp made of grids: points at one time to canonical space, or back."""
+"""The warp of points by displacement grids (docs/method.md#quadruple-interpolation)."""
 
 from __future__ import annotations
 
@@ -13,16 +13,13 @@ from devrf.ops.trilinear import interpolate, kept_gradient
 
 @dataclass(frozen=True)
 class GridWarp:
-    """x → x + Δ(x); Δ is trilinear in each of its grids, and linear between two of them.
-
-    Code that only moves points takes any function of points as a warp; the kernels that look up
-    displacement and density in one pass need the slices.
+    """x → x + Δ(x, t), Δ = (1 − λ) Δ_k + λ Δ_{k+1}, each Δ_k trilinear in space.
 
     Attributes:
-        slices: displacements (X, Y, Z, 3) in the box's units: one frame's, or those of the two
-            frames between which a time lies; none leaves every point where it is.
-        box: where the grids live; beyond it they go on as on its border.
-        weight: share of the second of two frames, in [0, 1].
+        slices: Δ_k (X, Y, Z, 3) in the box's units: one frame's, or those of the two frames
+            between which t lies; none is the identity.
+        box: where the grids live; outside it Δ is as on its border.
+        weight: λ in [0, 1].
     """
 
     slices: tuple[Tensor, ...]

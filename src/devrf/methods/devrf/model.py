@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from typing import Any, ClassVar
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from devrf.data.batch import RayBatch
 from devrf.geometry.box import Box
@@ -20,29 +20,27 @@ from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.compact_state import compact_state, expanded_state
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformed_occupancy import deformed_occupancy
-from devrf.methods.devrf.image_lists import ListRenderer
-from devrf.methods.devrf.photometric_losses import PHOTOMETRIC_TERMS, Prediction
 from devrf.methods.devrf.settings import RenderSettings
+from devrf.methods.devrf.static_shape.viewing import ListRenderer
 from devrf.methods.devrf.view import DeVRFView
-from devrf.methods.devrf.volume_rendering import VoxelOutput, Warp, joined, render
+from devrf.methods.devrf.volume_rendering import Warp, render
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.output import RenderOutput
 
 
 class DeVRFModel(DynamicModel):
-    """Everything that is needed to see a scene from any view at any time.
+    """A scene, to be rendered from any view at any time.
 
     Attributes:
         architecture: sizes of the canonical field.
         canonical: what the scene looks like at rest.
         occupancy: where something is at rest.
-        deformation: how it moves; None shows the rest state at every time.
+        deformation: V_motion; None shows the rest state at every time.
         settings: how rays are sampled.
         space: the space that the fields live in.
     """
 
     name: ClassVar[str] = "devrf"
-    losses: ClassVar[tuple[str, ...]] = tuple(PHOTOMETRIC_TERMS)
 
     def __init__(
         self,
@@ -98,39 +96,33 @@ class DeVRFModel(DynamicModel):
             space_from(config["space"]),
         )
 
-    def forward(self, batch: RayBatch) -> VoxelOutput:
+    def forward(self, batch: RayBatch) -> RenderOutput:
         """Render rays, those of each distinct time through that time's warp."""
-        outputs, places = [], []
+        rays = len(batch.rays)
+        background = batch.background.expand(rays, 3)
+        color = torch.zeros_like(batch.color)
+        depth, transmittance = color.new_zeros(rays), color.new_zeros(rays)
         for time in torch.unique(batch.time).tolist():
             place = (batch.time == time).nonzero()[:, 0]
-            background = batch.background
-            outputs.append(
-                render(
-                    batch.rays[place],
-                    self.canonical,
-                    self.occupancy_at(time),
-                    self.settings,
-                    background if background.dim() == 1 else background[place],
-                    self.warp(time),
-                )
+            seen = render(
+                batch.rays[place],
+                self.canonical,
+                self.occupancy_at(time),
+                self.settings,
+                background[place],
+                self.warp(time),
             )
-            places.append(place)
-        return joined(outputs, places)
-
-    def loss_terms(
-        self, output: RenderOutput, batch: RayBatch, names: Collection[str]
-    ) -> dict[str, Tensor]:
-        """The photometric terms; those of motion need the frame before (``motion_losses``)."""
-        assert isinstance(output, VoxelOutput)
-        prediction = Prediction(output, batch)
-        return {name: PHOTOMETRIC_TERMS[name](prediction) for name in names}
+            color = color.index_copy(0, place, seen.color)
+            depth = depth.index_copy(0, place, seen.depth)
+            transmittance = transmittance.index_copy(0, place, seen.transmittance)
+        return RenderOutput(color=color, depth=depth, transmittance=transmittance)
 
     def parts(self) -> dict[str, Iterable[nn.Parameter]]:
-        """The canonical field; the deformation is learned frame by frame, by its own stage."""
+        """The canonical field; frames of the deformation are learned by ``DeformationStage``."""
         return {"canonical": self.canonical.parameters()}
 
     def warp(self, time: float) -> Warp | None:
-        """The map from points (M, 3) at ``time`` into canonical space; None is the identity."""
+        """x → x + Δ_b(x, t), points (M, 3) at ``time`` → canonical space; None is the identity."""
         deformation = self.deformation
         if deformation is None or deformation.clock.at(time).after == 0:
             return None
@@ -145,13 +137,9 @@ class DeVRFModel(DynamicModel):
 
     def at(self, time: float, *, half: bool = False) -> DeVRFView:
         """The scene at ``time``: its occupancy and its displacements, ready."""
-        lists = self._lists.get(half)
-        if (
-            lists is None
-            or lists.field is not self.canonical
-            or lists.settings is not self.settings
-        ):
-            lists = self._lists[half] = ListRenderer(self.canonical, self.settings, half=half)
+        lists, present = self._lists.get(half), (self.canonical, self.settings)
+        if lists is None or (lists.field, lists.settings) != present:
+            lists = self._lists[half] = ListRenderer(*present, half=half)
         return DeVRFView(self.occupancy, self.deformation, lists, self.space, time)
 
     @property
@@ -172,7 +160,7 @@ class DeVRFModel(DynamicModel):
         return super().size + sum(tensor.numel() for tensor in frames)
 
     def stored_state(self) -> dict[str, Any]:
-        """The state with its grids in half precision, in detail only near matter."""
+        """The state with packed grids (``compact_state``)."""
         return compact_state(
             self.state_dict(), self.occupancy, self.canonical, self.deformation, self.occupancy_at
         )

@@ -1,4 +1,4 @@
-"""Terms that tie the deformation field together (docs/method.md#motion-losses)."""
+"""Terms that constrain the deformation field (docs/method.md#motion-losses)."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from devrf.methods.devrf.volume_rendering import Warp
 
 @dataclass(frozen=True)
 class MotionPrediction(Prediction):
-    """What was rendered through the warp of one frame, with what the motion terms need.
+    """A prediction through the warp of one frame t, with what the motion terms need.
 
     Attributes:
-        unwarp: canonical points (M, 3) → their positions at this frame, q + Δ_f(q, t).
-        unwarp_previous: the same for the frame before, frozen.
+        unwarp: canonical points q (M, 3) → q + Δ_f(q, t).
+        unwarp_previous: q → q + Δ_f(q, t − 1), frozen.
         cameras: the cameras of the images that the batch was drawn from.
         previous_image: (N,) int64, for each image the one that its flow leads to (the same view
             one frame earlier), or the image itself where there is none.
@@ -33,7 +33,7 @@ class MotionPrediction(Prediction):
 
 
 def cycle(prediction: MotionPrediction) -> Tensor:
-    """Mean over samples of ½ |x − (q + Δ_f(q, t))|²: there and back again."""
+    """L_cycle = mean_i ½ |x_i − (q_i + Δ_f(q_i, t))|² (docs/method.md#cycle)."""
     output = prediction.output
     returned = prediction.unwarp(output.canonical)
     missed = 0.5 * (output.samples.points - returned).square().sum(dim=1)
@@ -41,27 +41,24 @@ def cycle(prediction: MotionPrediction) -> Tensor:
 
 
 def flow(prediction: MotionPrediction) -> Tensor:
-    """L1 between the induced and the observed backward flow, weighted by w_i and the mask.
+    """L_flow = (1/M) Σ_i w_i m_i |φ_i − φ_i^observed|₁ in pixels (docs/method.md#flow).
 
-    Samples go back to canonical space, forward to the frame before, and onto that frame's
-    image; that pixel minus the sample's own is the induced flow. Pixels; the mean over the rays
-    whose flow is valid; zero without observed flow.
+    M is the number of rays whose flow is valid; 0 without observed flow.
     """
     batch, output = prediction.batch, prediction.output
     if batch.flow is None or batch.flow_valid is None:
         return output.canonical.new_zeros(())
-    seen = output.on_rays(batch.flow_valid)
+    ray, canonical, weight = output.on_rays(batch.flow_valid)
     induced = induced_flow(
-        seen.canonical,
+        canonical,
         prediction.unwarp_previous,
         prediction.cameras,
-        prediction.previous_image[batch.image[seen.ray]],
-        batch.pixel[seen.ray],
+        prediction.previous_image[batch.image[ray]],
+        batch.pixel[ray],
         prediction.space,
     )
-    observed = batch.flow[seen.ray]
-    error = (induced - observed).abs().sum(dim=1)
-    return (seen.weight * error).sum() / batch.flow_valid.sum().clamp(min=1)
+    error = (induced - batch.flow[ray]).abs().sum(dim=1)
+    return (weight * error).sum() / batch.flow_valid.sum().clamp(min=1)
 
 
 def induced_flow(
@@ -72,18 +69,31 @@ def induced_flow(
     pixel: Tensor,
     space: Space = WORLD,
 ) -> Tensor:
-    """The optical flow (M, 2) that the motion fields imply for canonical points.
+    """φ = π(q + Δ_f(q, t − 1)) − u (M, 2) in pixels, the flow that the motion implies.
 
     Args:
-        canonical: (M, 3) canonical positions of what is seen at ``pixel``.
-        unwarp_previous: canonical points → their positions one frame earlier.
+        canonical: (M, 3) canonical positions q.
+        unwarp_previous: q → q + Δ_f(q, t − 1).
         cameras: all cameras.
-        camera: (M,) the camera that took the earlier frame.
-        pixel: (M, 2) where the points are seen now, x, y in pixels.
-        space: the space that the points are in; they are projected from the world.
+        camera: (M,) int64, the camera π that took the earlier frame.
+        pixel: (M, 2) u, where the points are seen now: x, y in pixels.
+        space: the space that the points are in.
     """
     position, _ = cameras.project(camera, space.to_world(unwarp_previous(canonical)))
     return position - pixel
+
+
+def total_variation_weight(weight: float, side: int, rays: int) -> float:
+    """ω · (side / 128) / (6R): factor of Σ clamp(v − v', −1, 1) (docs/method.md#total-variation).
+
+    The optimiser adds this gradient, not autograd.
+
+    Args:
+        weight: ω, the term's weight.
+        side: max(N_x, N_y, N_z) of the grid.
+        rays: R, the rays of a batch.
+    """
+    return weight * (side / 128) / rays / 6
 
 
 MOTION_TERMS = {

@@ -13,24 +13,19 @@ from devrf.methods.devrf.volume_rendering import VoxelOutput
 
 @dataclass(frozen=True)
 class Prediction:
-    """What was rendered, beside what should have been.
-
-    Attributes:
-        output: what the rays see.
-        batch: the rays and the truth at their pixels.
-    """
+    """What the rays of a batch see, and the truth at their pixels."""
 
     output: VoxelOutput
     batch: RayBatch
 
 
 def color_error(prediction: Prediction) -> Tensor:
-    """Mean squared colour error over rays and channels."""
+    """Mean |Ĉ − C|² over rays and channels."""
     return torch.nn.functional.mse_loss(prediction.output.color, prediction.batch.color)
 
 
 def per_sample_color(prediction: Prediction) -> Tensor:
-    """Σ_i sg(w_i)·|c_i − C|² / R: each sample alone should have the pixel's colour."""
+    """(1/R) Σ_i sg(w_i) |c_i − C|²: each sample by itself should have the pixel's colour."""
     output = prediction.output
     truth = prediction.batch.color.index_select(0, output.samples.ray)
     error = (output.sample_color - truth).square().sum(dim=1)
@@ -38,16 +33,13 @@ def per_sample_color(prediction: Prediction) -> Tensor:
 
 
 def background_entropy(prediction: Prediction) -> Tensor:
-    """Mean of −(p log p + (1 − p) log(1 − p)), p = T_end: a ray hits something or nothing."""
+    """Mean −(p log p + (1 − p) log(1 − p)), p = T_end: a ray hits something or nothing."""
     p = prediction.output.transmittance.clamp(1e-6, 1 - 1e-6)
     return -(p * p.log() + (1 - p) * torch.log1p(-p)).mean()
 
 
 def matte(prediction: Prediction) -> Tensor:
-    """Mean of (T_end − (1 − alpha))²: what is left of a ray is what the matte lets through.
-
-    Zero where the images have no matte.
-    """
+    """Mean (T_end − (1 − A))², A the images' alpha channel; 0 without one."""
     alpha = prediction.batch.alpha
     if alpha is None:
         return prediction.output.transmittance.new_zeros(())
@@ -56,10 +48,7 @@ def matte(prediction: Prediction) -> Tensor:
 
 @torch.no_grad()
 def visibility(prediction: Prediction) -> dict[str, Tensor]:
-    """How much is seen, and how much should be: means over rays in [0, 1], no part of the loss.
-
-    ``opacity`` is 1 − T_end; ``coverage`` the matte, for images that have one.
-    """
+    """Means over rays, for the log: ``opacity`` 1 − T_end, and ``coverage`` A if there is one."""
     seen = {"opacity": 1 - prediction.output.transmittance.mean()}
     alpha = prediction.batch.alpha
     return seen if alpha is None else {**seen, "coverage": alpha.mean()}

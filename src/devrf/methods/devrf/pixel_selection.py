@@ -1,4 +1,4 @@
-"""Which pixels batches are drawn from: all, or those whose rays meet matter."""
+"""Which pixels batches are drawn from: all, or those whose rays hit something occupied."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ def rays_hit_occupied(
 ) -> Tensor:
     """Mask (H·W,): the pixels of an image whose rays pass near anything occupied.
 
-    One ray stands for a block of pixels, at a quarter of the cost: what is near it is told
-    generously enough (:meth:`~devrf.rendering.occupancy.Occupancy.near`) for its neighbours too.
+    One ray stands for a block of pixels, at a quarter of the cost:
+    :meth:`~devrf.rendering.occupancy.Occupancy.near` reaches far enough for its neighbours too.
 
     Args:
         cameras: all cameras, on the model's device.
@@ -46,13 +46,7 @@ def rays_hit_occupied(
 
 
 def canonical_pool(views: Views, model: DeVRFModel, *, everywhere: bool) -> PixelPool:
-    """The pixels of the static images to draw from; none where nothing is occupied.
-
-    Args:
-        views: the static training views, on the model's device.
-        model: the canonical field and its occupancy.
-        everywhere: all pixels; else those whose rays meet something that may be occupied.
-    """
+    """The static training images' pixels: ``everywhere``, or those that hit something occupied."""
     device = model.device
     images = torch.arange(len(views), device=device)
     if everywhere:
@@ -78,8 +72,8 @@ def frame_pools(
         views: the dynamic training views, on the model's device.
         frame: the frame.
         model: gives box, space, near and far.
-        occupancy: where the frame's matter is.
-        occupied_only: only pixels on the matte, or whose rays meet the frame's matter.
+        occupancy: where something is at the frame's time.
+        occupied_only: only pixels on the matte, or whose rays hit something occupied.
         join_views: one pool of all views; else one pool a view.
 
     Raises:
@@ -96,18 +90,18 @@ def frame_pools(
     ]
     if not join_views:
         return pools
-    parts = [torch.cat([getattr(pool, name) for pool in pools]) for name in ("image", "flat")]
-    return [PixelPool(*parts)]
+    image, flat = ([getattr(pool, name) for pool in pools] for name in ("image", "flat"))
+    return [PixelPool(torch.cat(image), torch.cat(flat))]
 
 
 def images_of(views: Views, frame: int) -> Tensor:
-    """The images (K,) int64 that show a frame, ascending."""
+    """The images (K,) int64 of a frame, ascending."""
     assert views.frames is not None
     return (views.frames == frame).nonzero()[:, 0]
 
 
 def _occupied(views: Views, image: Tensor, model: DeVRFModel, occupancy: Occupancy) -> PixelPool:
-    """Pixels on the matte, or whose rays meet matter; all if there are none."""
+    """Pixels on the matte, or whose rays hit something occupied; all if there are none."""
     wanted = rays_hit_occupied(views.cameras, int(image), model, occupancy)
     if views.has_alpha:
         wanted |= views.pixels[image, :, :, 3].flatten() > 0

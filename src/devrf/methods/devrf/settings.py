@@ -24,7 +24,7 @@ DEFORMATION_LOSS = {
 
 @dataclass(frozen=True)
 class CanonicalRates:
-    """Base learning rates of the canonical stage (docs/method.md#optimiser).
+    """Base learning rates of the canonical field's parts, by name (docs/method.md#optimiser).
 
     Attributes:
         density: of the density grid.
@@ -39,14 +39,15 @@ class CanonicalRates:
 
 @dataclass(frozen=True)
 class Sampling:
-    """How rays are sampled.
+    """How rays are sampled (docs/method.md#rays).
 
     Attributes:
         step: distance between samples in voxels.
-        alpha_threshold: opacity, and weight, under which a sample is not worth its colour.
-        search_alpha_threshold: the same during the coarse geometry search, which begins with
-            next to nothing everywhere.
-        occupancy_threshold: opacity of a step under which a cell counts as empty.
+        alpha_threshold: samples of a lower opacity, and then of a lower weight, are dropped
+            before their colour is computed.
+        search_alpha_threshold: the same in the geometry search, which begins almost transparent
+            everywhere.
+        occupancy_threshold: opacity of a step up to which a cell counts as empty.
     """
 
     step: float = 0.5
@@ -56,25 +57,45 @@ class Sampling:
 
 
 @dataclass(frozen=True)
+class RenderSettings:
+    """How rays are sampled at the present resolution.
+
+    Attributes:
+        step: distance between samples in voxels of the present resolution.
+        alpha_threshold: as in :class:`Sampling`.
+        near: distance before which nothing is sampled, in world units (or NDC).
+        far: distance behind which nothing is sampled, likewise.
+    """
+
+    step: float
+    alpha_threshold: float
+    near: float
+    far: float
+
+
+@dataclass(frozen=True)
 class MotionSettings:
     """How the deformation field is learned, beside its schedule.
 
+    What ``unit``, ``views``, ``pixels`` and ``start`` add to the paper: docs/method.md#departures.
+
     Attributes:
-        learning_rate: base rate, in ``unit`` per step: how far a voxel moves at most.
+        learning_rate: base rate, in ``unit`` per step: how far a voxel moves at most
+            (docs/method.md#motion-learning-rate).
         unit: ``world`` for world units; ``box`` for the longest edge of the fields' box, so
             that one value serves scenes of any scale.
         views: ``one`` draws a batch from one view of the frame, the views taking turns;
             ``all`` draws it from all of them.
-        pixels: ``all`` draws from whole images; ``occupied`` from the pixels of the
-            alpha mask and those whose rays hit what the present field has moved there.
-        occupancy_every: iterations after which the frame's occupancy is looked up anew.
+        pixels: ``all`` draws from whole images; ``occupied`` from the pixels of the alpha mask
+            and those whose rays hit what the present field has moved there.
+        occupancy_every: iterations between updates of the frame's occupancy.
         start: where a frame starts from at the coarsest level: ``previous`` is the result of
-            the frame before it; ``flow`` moves that along the observed optical flow, so that
-            parts that move far are not lost (without flow it is the same as ``previous``).
-        store: where the displacements of all frames rest while one is visited: ``device``,
-            ``host``, or ``auto``: on the device if they fit there beside all else. Of several
-            processes each keeps them on its device.
-        store_half: whether they rest in half precision; what is visited never does.
+            the frame before it; ``flow`` moves that along the observed optical flow, if there is
+            any (docs/method.md#flow-initialisation).
+        store: where the displacements of all frames are kept while one is learned: ``device``,
+            ``host``, or ``auto``: on the device if they fit there beside all else. Each of
+            several processes keeps them on its device.
+        store_half: whether they are kept in half precision; active frames never are.
         min_rel_improvement: a visit ends early when two Lightning steps have taken less than
             this share off its loss; None goes through the whole schedule.
     """
@@ -95,21 +116,3 @@ class MotionSettings:
                 "schedule.motion.min_rel_improvement: expected above 0, at most 1, or null, not "
                 f"{self.min_rel_improvement}"
             )
-
-
-@dataclass(frozen=True)
-class RenderSettings:
-    """How finely rays are sampled and what is too faint to matter.
-
-    Attributes:
-        step: distance between samples in voxels of the present resolution.
-        alpha_threshold: samples with a lower opacity are dropped, then samples with a lower
-            weight, before their colour is computed.
-        near: distance before which nothing is sampled, in world units (or NDC).
-        far: distance behind which nothing is sampled, likewise.
-    """
-
-    step: float
-    alpha_threshold: float
-    near: float
-    far: float

@@ -1,4 +1,4 @@
-"""A DeVRF scene at one time, ready to be looked at."""
+"""A DeVRF scene at one time, ready to be rendered."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from devrf.geometry.space import Space
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformed_occupancy import occupancy_points, occupancy_through
 from devrf.methods.devrf.grid_warp import GridWarp
-from devrf.methods.devrf.image_lists import ListRenderer
 from devrf.methods.devrf.motion_losses import induced_flow
+from devrf.methods.devrf.static_shape.viewing import ListRenderer
 from devrf.methods.devrf.volume_rendering import render
 from devrf.ops.compositing import sum_by_ray
 from devrf.ops.corners import shape_of
@@ -26,13 +26,12 @@ ON_CPU, ON_GPU, IN_LISTS = 8192, 2**15, 2**18
 
 
 class DeVRFView:
-    """The occupancy and the displacements of one time; it shares the fields' memory.
+    """The occupancy and the displacements of one time t; it shares the fields' memory.
 
     Attributes:
-        at_rest: whether nothing has moved at this time.
+        at_rest: whether the warp of this time is the identity.
         occupancy: where something is.
-        displacement: (X, Y, Z, 3) from here to canonical space, over the fields' box; None at
-            rest.
+        displacement: Δ_b(·, t) (X, Y, Z, 3) over the fields' box; None at rest.
     """
 
     @torch.no_grad()
@@ -44,11 +43,11 @@ class DeVRFView:
         space: Space,
         time: float,
     ) -> None:
-        """Find out what there is to know about a time.
+        """Blend the displacements of a time, and find its occupancy.
 
         Args:
             occupancy: where something is at rest.
-            deformation: how the scene moves; None: it rests at every time.
+            deformation: how the scene moves; None: it is at rest at every time.
             lists: renders the canonical field where Triton runs; has the field and its settings.
             space: the space that the fields live in.
             time: in [0, 1].
@@ -61,8 +60,8 @@ class DeVRFView:
         self._warp: GridWarp | None = None
         if deformation is not None and not self.at_rest:
             self.displacement = deformation.blended(time)
-            # At the points of a grid over the same box, looking up is resampling: several times
-            # faster.
+            # Interpolation at the points of a grid over the same box is resampling, which is
+            # several times faster.
             points = occupancy_points(occupancy, canonical)
             moved = points + resample(self.displacement, shape_of(points))
             self.occupancy = occupancy_through(occupancy, canonical, moved)
@@ -89,10 +88,9 @@ class DeVRFView:
     def induced_flow(
         self, rays: Rays, pixels: Tensor, cameras: Cameras, time: float
     ) -> tuple[Tensor, Tensor]:
-        """The mean induced flow (R, 2) of R rays, and the mass (R,) that it is a mean over.
+        """Σ w_i φ_i / Σ w_i (R, 2) of R rays back to ``time``, and Σ w_i (R,).
 
-        Each sample of a ray goes to canonical space, from there to where it was at ``time``, and
-        onto the image of that time.
+        See docs/method.md#flow for φ_i, with ``time`` in place of t − 1.
         """
         black = torch.zeros(3, device=rays.origins.device)
         seen = render(rays, self._canonical, self.occupancy, self._settings, black, self._warp)

@@ -1,8 +1,11 @@
-"""Volume rendering of a canonical field, seen through a warp or as it is."""
+"""Volume rendering of a canonical field, at rest or through a warp.
+
+The samples of each ray, docs/method.md#rays, composited: docs/method.md#compositing.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -19,34 +22,19 @@ from devrf.system.profiling import span
 
 Warp = Callable[[Tensor], Tensor]
 
-# A ray ends where less than this of it is left: what is behind cannot be seen.
+# A ray ends where its transmittance is less: what is behind cannot be seen.
 STOP = 1e-4
-
-
-@dataclass(frozen=True)
-class Segments:
-    """S samples of a render, those of some rays alone; what lies elsewhere has no weight.
-
-    Attributes:
-        ray: (S,) int64, the ray of each sample.
-        canonical: (S, 3) positions in canonical space.
-        weight: (S,) rendering weights.
-    """
-
-    ray: Tensor
-    canonical: Tensor
-    weight: Tensor
 
 
 @dataclass(frozen=True, kw_only=True)
 class VoxelOutput(RenderOutput):
-    """What R rays see, and the samples that they see it by.
+    """What R rays see, and the K samples whose colour was computed.
 
     Attributes:
-        samples: the K samples whose colour was computed, at their own positions.
-        canonical: (K, 3) positions of the samples in canonical space.
-        weight: (K,) their weights.
-        sample_color: (K, 3) their colours.
+        samples: at their positions x_i at the rays' time.
+        canonical: (K, 3) their canonical positions q_i.
+        weight: (K,) their weights w_i.
+        sample_color: (K, 3) their colours c_i.
     """
 
     samples: Samples
@@ -55,61 +43,24 @@ class VoxelOutput(RenderOutput):
     sample_color: Tensor
 
     def mean_over_samples(self, values: Tensor) -> Tensor:
-        """The mean () of values (K,) of samples; 0 without samples, differentiable all the same."""
+        """The mean () of values (K,) of samples, padding left out; 0 without samples."""
         present = self.samples.present
         if present is not None:
-            # A list of fixed length: padding counts for nothing.
             return torch.where(present, values, 0.0).sum() / present.sum().clamp(min=1)
         return values.mean() if len(values) else values.sum()
 
-    def on_rays(self, chosen: Tensor) -> Segments:
-        """The samples of the ``chosen`` rays, (R,) bool."""
-        ray, counts = self.samples.ray, chosen[self.samples.ray]
+    def on_rays(self, chosen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Ray (S,), canonical position (S, 3) and weight (S,) of the ``chosen`` (R,) rays' samples.
+
+        A list of fixed length keeps its length: other samples get weight 0 and a harmless position.
+        """
+        ray, kept = self.samples.ray, chosen[self.samples.ray]
         if self.samples.present is None:
-            kept = counts.nonzero()[:, 0]
-            return Segments(ray[kept], self.canonical[kept], self.weight[kept])
-        # A list of fixed length stays as long as it is: what does not count is made harmless,
-        # wherever it lies.
-        counts = counts & self.samples.present
-        canonical = torch.where(counts[:, None], self.canonical, 0.0)
-        return Segments(ray, canonical, torch.where(counts, self.weight, 0.0))
-
-
-def joined(outputs: Sequence[VoxelOutput], places: Sequence[Tensor]) -> VoxelOutput:
-    """What some renders see as that of one batch.
-
-    Args:
-        outputs: of the rays at ``places[k]``, in lists as long as need be.
-        places: (R_k,) int64, where in the batch the rays of each output stand; together all.
-    """
-    if len(outputs) == 1:
-        return outputs[0]
-    back = torch.cat(list(places)).argsort()
-    rays = len(back)
-    ray = torch.cat([place[one.samples.ray] for one, place in zip(outputs, places, strict=True)])
-    order = ray.argsort(stable=True)
-
-    def per_ray(name: str) -> Tensor:
-        return torch.cat([getattr(one, name) for one in outputs])[back]
-
-    def per_sample(values: Sequence[Tensor]) -> Tensor:
-        return torch.cat(list(values))[order]
-
-    samples = Samples(
-        ray[order],
-        per_sample([one.samples.distance for one in outputs]),
-        per_sample([one.samples.points for one in outputs]),
-        rays,
-    )
-    return VoxelOutput(
-        color=per_ray("color"),
-        depth=per_ray("depth"),
-        transmittance=per_ray("transmittance"),
-        samples=samples,
-        canonical=per_sample([one.canonical for one in outputs]),
-        weight=per_sample([one.weight for one in outputs]),
-        sample_color=per_sample([one.sample_color for one in outputs]),
-    )
+            index = kept.nonzero()[:, 0]
+            return ray[index], self.canonical[index], self.weight[index]
+        kept = kept & self.samples.present
+        canonical = torch.where(kept[:, None], self.canonical, 0.0)
+        return ray, canonical, torch.where(kept, self.weight, 0.0)
 
 
 def render(
@@ -121,9 +72,7 @@ def render(
     warp: Warp | None = None,
     precision: torch.dtype = torch.float32,
 ) -> VoxelOutput:
-    """Colours and depths of rays: C = Σ w_i c_i + T_end · background.
-
-    See docs/method.md#compositing.
+    """Colours Ĉ = Σ w_i c_i + T_end · C_background and depths Σ w_i z_i / Σ w_i of rays.
 
     Args:
         rays: R rays.
@@ -131,7 +80,7 @@ def render(
         occupancy: where something may be, in the space of the rays.
         settings: step length and thresholds.
         background: (3,) or (R, 3) RGB behind everything.
-        warp: maps the rays' points (M, 3) into canonical space; None leaves them.
+        warp: x → q = x + Δ_b(x, t), points (M, 3) to canonical space; None is the identity.
         precision: what the colour network works in.
 
     Returns:
@@ -147,8 +96,8 @@ def render(
             near=settings.near,
             far=settings.far,
         )
-    # Most samples turn out to be empty or hidden. That is found out without a graph, so that
-    # gradients are computed for the others only.
+    # Most samples are empty or hidden. They are left out before the graph is built, so that
+    # gradients are computed for the others alone.
     with torch.no_grad():
         samples, canonical, tau = _visible(samples, field, delta, settings.alpha_threshold, warp)
     if torch.is_grad_enabled():

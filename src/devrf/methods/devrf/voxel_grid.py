@@ -1,4 +1,4 @@
-"""A dense voxel grid of values over a box: the one thing that every field is made of."""
+"""A dense voxel grid over a box: v(x) and f(x) of docs/method.md#notation."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from devrf.ops.trilinear import interpolate, kept_gradient
 
 
 class VoxelGrid(nn.Module):
-    """Values (X, Y, Z, C) at the points of a grid whose corners sit on a box's corners.
+    """Values at the points of a grid whose outer points lie on a box.
 
     Attributes:
-        values: (X, Y, Z, C) learned values, channels last so that a corner is one row of memory.
+        values: (X, Y, Z, C), channels last so that a grid point is one row of memory.
     """
 
     values: nn.Parameter
@@ -33,7 +33,7 @@ class VoxelGrid(nn.Module):
         return x, y, z
 
     def forward(self, points: Tensor, box: Box) -> Tensor:
-        """Values (M, C) at ``points`` (M, 3) in the space of ``box``; outside, the border's."""
+        """Trilinear values (M, C) at ``points`` (M, 3) in ``box``; outside, the border's."""
         coords = to_grid(points, box, self.shape)
         return interpolate(self.values, coords, gradient=kept_gradient(self.values))
 

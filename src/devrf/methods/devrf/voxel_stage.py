@@ -1,21 +1,26 @@
-"""What both stages of DeVRF share: how a batch is rendered to learn from it."""
+"""What both stages share: how a batch is drawn and rendered."""
 
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
+from devrf.data.batch import Pixels, RayBatch, background_color, gather_batch
+from devrf.data.pool import PixelPool
+from devrf.engine.ddp import rays_per_rank
 from devrf.engine.graphs import Graphs
 from devrf.engine.stage import ScheduledStage
-from devrf.geometry.rays import Rays
+from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.grid_warp import GridWarp
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import Precision
-from devrf.methods.devrf.static_shape import render_static
+from devrf.methods.devrf.static_shape.training import render_static
 from devrf.methods.devrf.volume_rendering import VoxelOutput, render
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.sample_capacity import SampleCapacity
+from devrf.scenes.scene import Views
 from devrf.system.machine import multiplies_bfloat16
+from devrf.system.profiling import span
 
 
 class VoxelStage(ScheduledStage):
@@ -23,10 +28,12 @@ class VoxelStage(ScheduledStage):
 
     Attributes:
         scene_model: the canonical field, its occupancy, and how it deforms.
+        schedule: resolutions, iterations and rays.
         decoder_precision: what the colour network computes in while it learns.
     """
 
     scene_model: DeVRFModel
+    schedule: CanonicalSchedule | DeformationSchedule
 
     def __init__(
         self,
@@ -38,23 +45,32 @@ class VoxelStage(ScheduledStage):
         self.decoder_precision = decoder_precision
 
     def current_model(self) -> DeVRFModel:
-        """The model with all that has been learned so far in its place."""
+        """The model, everything that has been learned so far written back."""
         return self.scene_model
 
-    def render_rays(
+    def draw_pixels(self, pool: PixelPool) -> Pixels:
+        """A batch of random pixels of a pool."""
+        with span("batch"):
+            image, flat = pool.draw(rays_per_rank(self.schedule.rays), self.generator)
+            background = background_color(self.scene.background, len(image), self.generator)
+            return Pixels(image, flat, background)
+
+    def render_pixels(
         self,
-        rays: Rays,
+        views: Views,
+        pixels: Pixels,
         occupancy: Occupancy,
-        background: Tensor,
         capacity: SampleCapacity | None,
         warp: GridWarp | None = None,
-    ) -> VoxelOutput:
-        """Render rays to learn from them, in lists of fixed length if there is a ``capacity``."""
+    ) -> tuple[VoxelOutput, RayBatch]:
+        """Render pixels of ``views``, in lists of fixed length if there is a ``capacity``."""
         model, precision = self.scene_model, self._precision
-        fields = model.canonical, occupancy, model.settings, background, warp
+        with span("batch"):
+            batch = gather_batch(views, pixels.image, pixels.flat, pixels.background, model.space)
+        fields = model.canonical, occupancy, model.settings, batch.background, warp
         if capacity is None:
-            return render(rays, *fields, precision)
-        return render_static(rays, *fields, capacity, precision)
+            return render(batch.rays, *fields, precision), batch
+        return render_static(batch.rays, *fields, capacity, precision), batch
 
     @property
     def _precision(self) -> torch.dtype:

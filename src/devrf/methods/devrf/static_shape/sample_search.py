@@ -1,46 +1,46 @@
-"""The search for samples that can be seen, put to a canonical field and its settings."""
+"""Finds the samples that can be seen, for a canonical field under a warp."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-from torch import Tensor
-
 from devrf.geometry.rays import Rays
 from devrf.methods.devrf.canonical_field import CanonicalField
+from devrf.methods.devrf.grid_warp import GridWarp
 from devrf.methods.devrf.settings import RenderSettings
 from devrf.methods.devrf.volume_rendering import STOP
 from devrf.ops.search import PackedSamples, Thresholds, find_samples
 from devrf.rendering.occupancy import Occupancy
+from devrf.rendering.sampling import most_steps, steps_through
 
 
 def search(
     rays: Rays,
-    begins: tuple[Tensor, Tensor],
     field: CanonicalField,
     occupancy: Occupancy,
     settings: RenderSettings,
-    slices: Sequence[Tensor],
-    weight: float = 0.0,
+    warp: GridWarp,
     *,
-    longest: int,
     capacity: int,
+    wait: bool,
 ) -> PackedSamples:
     """What of R rays can be seen, as :func:`~devrf.ops.search.find_samples` gives it.
 
     Args:
         rays: R rays in the field's space.
-        begins: distance (R,) of each ray's first sample, and how many (R,) it has
-            (:func:`~devrf.rendering.sampling.steps_through`).
         field: the canonical field.
         occupancy: where something may be, in the space of the rays.
         settings: step length and thresholds.
-        slices: displacements over the field's box: none, one frame's, or two frames'.
-        weight: share of the second of two frames.
-        longest: no ray has more samples.
+        warp: the rays' points → canonical space, over the field's own box.
         capacity: the length of the lists.
+        wait: count the samples of the longest ray, which waits for the device; False uses an
+            upper bound.
     """
-    entry, count = begins
+    step = field.step_length(settings.step)
+    limits = {"step": step, "near": settings.near, "far": settings.far}
+    entry, count = steps_through(rays, field.box, **limits)
+    if wait:
+        longest = int(count.amax()) if len(rays) else 0
+    else:
+        longest = most_steps(field.box, **limits)
     threshold = settings.alpha_threshold
     return find_samples(
         rays.origins,
@@ -49,9 +49,9 @@ def search(
         count,
         occupancy.mask,
         field.density.values,
-        slices,
-        weight,
-        step=field.step_length(settings.step),
+        warp.slices,
+        warp.weight,
+        step=step,
         longest=longest,
         capacity=capacity,
         mask_box=occupancy.box,

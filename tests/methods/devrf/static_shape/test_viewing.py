@@ -10,11 +10,11 @@ import torch
 
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
-from devrf.methods.devrf import image_lists as module
 from devrf.methods.devrf.architecture import Architecture
-from devrf.methods.devrf.image_lists import ListRenderer
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import RenderSettings
+from devrf.methods.devrf.static_shape import viewing as module
+from devrf.methods.devrf.static_shape.viewing import ListRenderer
 from devrf.methods.devrf.volume_rendering import render
 from devrf.ops.dispatch import using
 from devrf.rendering.occupancy import Occupancy

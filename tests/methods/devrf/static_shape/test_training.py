@@ -12,7 +12,7 @@ from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.grid_warp import GridWarp
 from devrf.methods.devrf.settings import RenderSettings
-from devrf.methods.devrf.static_shape import render_static
+from devrf.methods.devrf.static_shape.training import render_static
 from devrf.methods.devrf.volume_rendering import VoxelOutput, render
 from devrf.ops.dispatch import Kind, using
 from devrf.rendering.occupancy import Occupancy

@@ -1,7 +1,7 @@
-"""Rendering for training in a few launches, on lists of fixed length: nothing waits for the device.
+"""Renders for training on lists of fixed length, so that nothing waits for the device.
 
-It sees what :func:`devrf.methods.devrf.volume_rendering.render` sees. Triton's kernels make it
-fast; with plain PyTorch it gives the same, more slowly.
+Gives what :func:`devrf.methods.devrf.volume_rendering.render` gives. CUDA graphs need it, and
+Triton's kernels make it fast; their plain PyTorch twins give the same, more slowly.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from torch import Tensor
 from devrf.geometry.rays import Rays
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.grid_warp import GridWarp
-from devrf.methods.devrf.sample_search import search
 from devrf.methods.devrf.settings import RenderSettings
+from devrf.methods.devrf.static_shape.sample_search import search
 from devrf.methods.devrf.volume_rendering import VoxelOutput
 from devrf.ops.compositing import composite_segments, sum_segments
 from devrf.ops.search import PackedSamples, SampleSubset, select
@@ -21,7 +21,7 @@ from devrf.ops.trilinear import kept_gradient
 from devrf.ops.warped_depth import warped_depth
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.sample_capacity import SampleCapacity
-from devrf.rendering.sampling import Samples, most_steps, steps_through
+from devrf.rendering.sampling import Samples
 from devrf.system.profiling import span
 
 
@@ -35,7 +35,7 @@ def render_static(
     capacity: SampleCapacity,
     precision: torch.dtype = torch.float32,
 ) -> VoxelOutput:
-    """What ``render`` gives, in lists of ``capacity.significant`` places.
+    """What ``render`` gives for the same arguments, in lists of ``capacity.significant`` places.
 
     Gradients of grids that have one already (``grad``) are added to it in place.
 
@@ -47,16 +47,18 @@ def render_static(
         background: (3,) or (R, 3) RGB behind everything.
         warp: maps the rays' points into canonical space, over the field's own box; None leaves
             them.
-        capacity: how long the lists are; it is told how long they would have to be.
+        capacity: how long the lists are; the lengths that were needed are noted in it.
         precision: what the colour network works in.
 
     Returns:
         What the rays see; ``samples.present`` tells samples from padding.
     """
     warp = warp or GridWarp((), field.box)
-    delta, density = field.step_in_base_voxels(settings.step), field.density.values
+    density = field.density.values
     with span("sampling"):
-        found = _search(rays, field, occupancy, settings, warp, capacity.visible)
+        found = search(
+            rays, field, occupancy, settings, warp, capacity=capacity.visible, wait=False
+        )
     with span("density"):
         canonical, tau = warped_depth(
             found.points,
@@ -65,7 +67,7 @@ def render_static(
             warp.weight,
             box=field.box,
             shift=field.shift,
-            delta=delta,
+            delta=field.step_in_base_voxels(settings.step),
             density_gradient=kept_gradient(density),
             slice_gradients=[kept_gradient(frame) for frame in warp.slices],
         )
@@ -79,11 +81,11 @@ def render_static(
         weight = torch.where(present, weight.index_select(0, chosen.index), 0.0)
     with span("decoder"):
         color = field.rgb(canonical, rays.viewdirs, samples.ray, precision)
-    with span("compositing"), torch.no_grad():
-        distance = torch.stack([samples.distance, torch.ones_like(samples.distance)], dim=1)
-        reached, mass = sum_segments(weight, distance, chosen.first).unbind(1)
     with span("compositing"):
         seen = sum_segments(weight, color, chosen.first)
+        with torch.no_grad():
+            distance = torch.stack([samples.distance, torch.ones_like(samples.distance)], dim=1)
+            reached, mass = sum_segments(weight, distance, chosen.first).unbind(1)
     return VoxelOutput(
         color=seen + transmittance[:, None] * background,
         depth=reached / mass.clamp(min=1e-6),
@@ -95,31 +97,8 @@ def render_static(
     )
 
 
-def _search(
-    rays: Rays,
-    field: CanonicalField,
-    occupancy: Occupancy,
-    settings: RenderSettings,
-    warp: GridWarp,
-    capacity: int,
-) -> PackedSamples:
-    """The samples that can be seen, in lists of ``capacity`` places."""
-    stretch = {"step": field.step_length(settings.step), "near": settings.near, "far": settings.far}
-    return search(
-        rays,
-        steps_through(rays, field.box, **stretch),
-        field,
-        occupancy,
-        settings,
-        warp.slices,
-        warp.weight,
-        longest=most_steps(field.box, **stretch),
-        capacity=capacity,
-    )
-
-
 def _listed(found: PackedSamples, chosen: SampleSubset, rays: int) -> tuple[Samples, Tensor]:
-    """The chosen samples, and which they are; the padding's rays are spread over all."""
+    """The chosen samples, and which places hold one; the padding's rays are spread over all."""
     place = torch.arange(len(chosen.index), device=chosen.index.device)
     present = place < chosen.first[-1]
     ray = torch.where(present, found.ray.index_select(0, chosen.index), place % max(rays, 1))

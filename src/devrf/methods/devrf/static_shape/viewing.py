@@ -1,6 +1,6 @@
-"""Rendering in a handful of launches, on lists of a fixed length: for devices that Triton runs on.
+"""Renders pictures in few kernel launches, on lists of fixed length, where Triton runs.
 
-It shows what :func:`devrf.methods.devrf.volume_rendering.render` shows, without gradients.
+Shows what :func:`devrf.methods.devrf.volume_rendering.render` shows, without gradients.
 """
 
 from __future__ import annotations
@@ -10,16 +10,16 @@ from torch import Tensor
 
 from devrf.geometry.rays import Rays
 from devrf.methods.devrf.canonical_field import CanonicalField
-from devrf.methods.devrf.sample_search import search
+from devrf.methods.devrf.grid_warp import GridWarp
 from devrf.methods.devrf.settings import RenderSettings
+from devrf.methods.devrf.static_shape.sample_search import search
 from devrf.ops.compositing import composite_segments, sum_segments
 from devrf.ops.search import PackedSamples, select
 from devrf.ops.warped_depth import warped_depth
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.rendered_image import RenderedImage
-from devrf.rendering.sampling import steps_through
 
-# Lists are this much longer than the last one had to be.
+# Lists are made this much longer than the present picture needs.
 SPARE = 1.25
 
 
@@ -53,21 +53,21 @@ class ListRenderer:
                 space; None at rest.
             background: (3,) or (R, 3) RGB.
         """
-        field, settings = self.field, self.settings
-        slices = () if displacement is None else (displacement,)
-        found, count = self._search(rays, occupancy, slices)
-        canonical, depth = warped_depth(
+        field = self.field
+        warp = GridWarp(() if displacement is None else (displacement,), field.box)
+        found, count = self._search(rays, occupancy, warp)
+        canonical, tau = warped_depth(
             found.points[:count],
             field.density.values,
-            slices,
+            warp.slices,
             box=field.box,
             shift=field.shift,
-            delta=field.step_in_base_voxels(settings.step),
+            delta=field.step_in_base_voxels(self.settings.step),
         )
-        weight, left = composite_segments(depth, found.first)
+        weight, left = composite_segments(tau, found.first)
         chosen = select(found.significant[:count], found.first, count)
         significant = chosen.index[: int(chosen.total)]
-        precision = torch.float16 if self.half and depth.is_cuda else torch.float32
+        precision = torch.float16 if self.half and tau.is_cuda else torch.float32
         color = field.rgb(canonical[significant], rays.viewdirs, found.ray[significant], precision)
         distance = found.distance[significant, None]
         seen = sum_segments(
@@ -82,28 +82,18 @@ class ListRenderer:
         )
 
     def _search(
-        self, rays: Rays, occupancy: Occupancy, slices: tuple[Tensor, ...]
+        self, rays: Rays, occupancy: Occupancy, warp: GridWarp
     ) -> tuple[PackedSamples, int]:
-        """The samples that can be seen, and how many they are, in lists that are long enough."""
-        field, settings = self.field, self.settings
-        begins = steps_through(
-            rays,
-            field.box,
-            step=field.step_length(settings.step),
-            near=settings.near,
-            far=settings.far,
-        )
-        longest = int(begins[1].amax()) if len(rays) else 0
+        """The samples that can be seen, in lists that are long enough, and how many they are."""
         while True:
             found = search(
                 rays,
-                begins,
-                field,
+                self.field,
                 occupancy,
-                settings,
-                slices,
-                longest=longest,
+                self.settings,
+                warp,
                 capacity=self._capacity,
+                wait=True,
             )
             total = int(found.total)
             if total <= self._capacity:
