@@ -1,4 +1,4 @@
-"""What training took: time, iterations, memory."""
+"""Records the time, iterations and memory of training."""
 
 from __future__ import annotations
 
@@ -13,10 +13,7 @@ from devrf.engine.stage import ScheduledStage
 
 
 class TrainingRecord(Callback):
-    """Measures a stage's training and leaves the figures in its ``record``.
-
-    What a run took before it was interrupted counts, up to the file that it goes on from.
-    """
+    """Measures a stage's training into its ``record``, over all resumed runs."""
 
     def __init__(self) -> None:
         self._started = 0.0
@@ -44,11 +41,7 @@ class TrainingRecord(Callback):
         self._peak_before = state_dict["peak_gpu_gb"]
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Write down seconds, iterations, iterations a second, peak GPU memory, back-offs.
-
-        Seconds are wall clock, without what previews took: they teach the fields nothing. Memory
-        is in GiB; None on a CPU.
-        """
+        """Fill the record: wall-clock seconds without previews, memory in GiB (None on a CPU)."""
         assert isinstance(pl_module, ScheduledStage)
         if pl_module.device.type == "cuda":
             torch.cuda.synchronize(pl_module.device)
