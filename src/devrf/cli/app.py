@@ -1,4 +1,4 @@
-"""The door: composes the config, checks it, and runs the asked stage."""
+"""The Hydra application: composes the config, checks it, and runs the stage."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ register_resolvers()
 
 
 def run(config: DictConfig) -> float | None:
-    """Run ``stage=…`` in the folder that Hydra made for it; return the objective, if measured."""
+    """Run ``stage=…`` in Hydra's output folder; return the objective, if measured."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     if job.in_sweep():
         return run_job(lambda: _job(config, folder), config, folder)
@@ -47,5 +47,5 @@ def _checked(config: DictConfig, folder: Path) -> float | None:
     return run_stage(config, folder)
 
 
-# Kept apart from `run`, which other processes find by its name.
+# A name of its own: other processes import `run` by its name.
 main = hydra.main(config_path=str(config_folder()), config_name="config", version_base="1.3")(run)
