@@ -47,7 +47,7 @@ class ResumableCSVLogger(CSVLogger):
         return self
 
     @rank_zero_only
-    def go_on(self, capture: str, iteration: int) -> None:
+    def drop_rows_beyond(self, capture: str, iteration: int) -> None:
         """Drop the rows of ``capture`` beyond ``iteration``: a resumed run writes them again."""
         kept = [
             row

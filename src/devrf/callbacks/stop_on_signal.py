@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from lightning import Callback, LightningModule, Trainer
 
 from devrf.callbacks.periodic_checkpoint import PeriodicCheckpoint
-from devrf.system.signals import Interrupted, answered_by
+from devrf.system.signals import Interrupted, handle_signals
 
 
 class StopOnSignal(Callback):
@@ -30,7 +30,7 @@ class StopOnSignal(Callback):
         self._take: Callable[[], None] | None = None
 
     def __enter__(self) -> StopOnSignal:
-        self._take = self._block.enter_context(answered_by(self._answer))
+        self._take = self._block.enter_context(handle_signals(self._answer))
         return self
 
     def __exit__(self, *_: object) -> None:

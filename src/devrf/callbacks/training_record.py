@@ -10,6 +10,7 @@ from lightning import Callback, LightningModule, Trainer
 
 from devrf.callbacks.previews import Previews
 from devrf.engine.stage import ScheduledStage
+from devrf.system.speed import wait
 
 
 class TrainingRecord(Callback):
@@ -43,8 +44,7 @@ class TrainingRecord(Callback):
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Fill the record: wall-clock seconds without previews, memory in GiB (None on a CPU)."""
         assert isinstance(pl_module, ScheduledStage)
-        if pl_module.device.type == "cuda":
-            torch.cuda.synchronize(pl_module.device)
+        wait(pl_module.device)
         seconds, done = self._seconds(), pl_module.iteration - pl_module.skipped
         pl_module.record = {
             "seconds": round(seconds, 2),

@@ -12,8 +12,8 @@ from devrf.cli import job
 from devrf.cli.config import config_folder, register_resolvers
 from devrf.cli.config_check import check_config
 from devrf.cli.messages import report_user_errors
-from devrf.cli.run_folder import nothing_left_of_mistakes
-from devrf.cli.run_lock import alone_in
+from devrf.cli.run_folder import removed_on_user_error
+from devrf.cli.run_lock import exclusive
 from devrf.cli.sweep import forget_failure, run_job
 
 register_resolvers()
@@ -26,8 +26,8 @@ def run(config: DictConfig) -> float | None:
         return run_job(lambda: _job(config, folder), config, folder)
     with (
         report_user_errors(),
-        alone_in(folder, config, "hydra.run.dir"),
-        nothing_left_of_mistakes(folder),
+        exclusive(folder, config, "hydra.run.dir"),
+        removed_on_user_error(folder),
     ):
         value = _checked(config, folder)
         forget_failure(folder)
@@ -35,7 +35,7 @@ def run(config: DictConfig) -> float | None:
 
 
 def _job(config: DictConfig, folder: Path) -> float | None:
-    with alone_in(folder, config, "hydra.sweep.dir"):
+    with exclusive(folder, config, "hydra.sweep.dir"):
         return _checked(config, folder)
 
 

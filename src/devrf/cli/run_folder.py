@@ -16,7 +16,7 @@ AT_FIRST = {".hydra", PLACE}
 
 
 @contextmanager
-def nothing_left_of_mistakes(folder: Path) -> Iterator[None]:
+def removed_on_user_error(folder: Path) -> Iterator[None]:
     """Remove ``folder`` if the run ends in a user error and the folder holds no results."""
     was_new = _holds_at_most(folder, AT_FIRST)
     try:

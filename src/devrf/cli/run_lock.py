@@ -45,7 +45,7 @@ class RunDirLock(Callback):
     """
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Lock the folder of a run; :func:`alone_in` releases it."""
+        """Lock the folder of a run; :func:`exclusive` releases it."""
         hydra = HydraConfig.instance()
         before = hydra.cfg
         try:
@@ -70,7 +70,7 @@ class RunDirLock(Callback):
 
 
 @contextmanager
-def alone_in(folder: Path, config: DictConfig, key: str) -> Iterator[None]:
+def exclusive(folder: Path, config: DictConfig, key: str) -> Iterator[None]:
     """While the block lasts, no other process works in a run's folder.
 
     Args:

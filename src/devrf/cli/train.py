@@ -70,7 +70,7 @@ def _fit(run: RunContext, stage: ScheduledStage, begin: ResumePoint) -> None:
         )
         trainer.strategy.checkpoint_io = ChecksummedCheckpointIO()
         if isinstance(run.logger, ResumableCSVLogger):
-            run.logger.go_on(stage.capture, begin.iteration)
+            run.logger.drop_rows_beyond(stage.capture, begin.iteration)
         path = begin.progress and str(begin.progress)
         trainer.fit(stage, datamodule=run.datamodule, ckpt_path=path)
         strategy = trainer.strategy

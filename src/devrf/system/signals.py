@@ -46,7 +46,7 @@ class _Handler:
 
 
 @contextmanager
-def answered_by(answer: Answer) -> Iterator[Callable[[], None]]:
+def handle_signals(answer: Answer) -> Iterator[Callable[[], None]]:
     """Handle signals by ``answer(number)`` within the block; earlier handlers return after it.
 
     A signal that is ignored or has another program's handler keeps it: launchers requeue their
