@@ -13,7 +13,7 @@ from lightning import Callback, Trainer
 from lightning.pytorch.loggers import CSVLogger, Logger
 from torch import Tensor
 
-from devrf.artifacts.tracking import Row, Tracker, trackers
+from devrf.artifacts.tracking import Row
 from devrf.callbacks import Meter, Previews, TrainingRecord
 from devrf.data.datamodule import SceneDataModule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
@@ -62,12 +62,6 @@ def learn(
         return stage
 
     return fit
-
-
-def test_only_a_logger_that_takes_pictures_is_a_tracker(tmp_path: Path) -> None:
-    album = Album()
-    assert isinstance(album, Tracker)
-    assert trackers([CSVLogger(tmp_path), album]) == [album]
 
 
 def test_previews_come_as_often_as_asked_for_and_look_right(
