@@ -9,7 +9,7 @@ from devrf.cli.app import main
 from devrf.cli.messages import report_user_errors
 from devrf.cli.sweep import failures_at_the_end
 from devrf.system.process import tune_for_cpu
-from devrf.system.signals import Interrupted, answered_by, end_at_once
+from devrf.system.signals import Interrupted, end_at_once, handle_signals
 
 
 def entry() -> None:
@@ -23,7 +23,7 @@ def entry() -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"
     tune_for_cpu()
     try:
-        with answered_by(end_at_once), report_user_errors(), failures_at_the_end():
+        with handle_signals(end_at_once), report_user_errors(), failures_at_the_end():
             main()
     except Interrupted as stop:
         print(f"devrf: {stop.said}", file=sys.stderr)

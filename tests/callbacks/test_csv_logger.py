@@ -52,11 +52,11 @@ def test_a_table_is_continued(path: Path) -> None:
 
 def test_rows_beyond_the_resume_point_are_dropped(path: Path) -> None:
     curves = again(path)
-    curves.go_on("dynamic", 10)
+    curves.drop_rows_beyond("dynamic", 10)
     assert [row["step"] for row in table(path)] == ["10", "20", "30", "10"]
-    curves.go_on("static", 0)
+    curves.drop_rows_beyond("static", 0)
     assert [row["dynamic/loss"] for row in table(path)] == ["2.0"]
-    curves.go_on("dynamic", 0)
+    curves.drop_rows_beyond("dynamic", 0)
     assert table(path) == []
 
 

@@ -1,4 +1,4 @@
-"""Learning that goes wrong is taken back once, then ended; learning that goes well is let alone."""
+"""Divergence is rolled back once, then ends the stage; a sound stage is not touched."""
 
 from __future__ import annotations
 
@@ -17,36 +17,52 @@ from lightning import Callback, Trainer
 from torch import Tensor
 
 from devrf.callbacks import DivergenceGuard, PeriodicCheckpoint, TrainingRecord
-from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, LoadedCheckpoint
+from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.checkpoints.checkpoint_file import read_checkpoint_file
 from devrf.data.datamodule import SceneDataModule
-from devrf.engine.stage import ScheduledStage
 from devrf.errors import DevrfError
-from devrf.methods.devrf.architecture import Architecture
-from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
-from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.settings import CanonicalRates
 from devrf.scenes.scene import Scene
 
-SMALL = Architecture(channels=4, width=8, frequencies=1)
-SCHEDULE = CanonicalSchedule(
-    search_iterations=0,
-    search_side=12,
-    carve=True,
-    iterations=24,
-    side=12,
-    doublings=(10,),
-    decay_iterations=100,
-    rays=64,
-)
 # Three frames. Level 0: frame 1 in 0–11, frame 2 in 12–17; level 1: 18–25 and 26–29.
 MOVING = DeformationSchedule(sides=(4, 6), iterations_per_frame=(6, 4), rays=64)
+# A phase of the canonical stage from 0 to 9, one from 10 to 23; and longer ones.
+SHORT: dict[str, Any] = {"iterations": 24, "doublings": (10,), "decay_iterations": 100}
+LONG: dict[str, Any] = {**SHORT, "iterations": 60, "doublings": (20,), "rays": 128}
+
+
+@pytest.fixture(autouse=True)
+def warnings_of_devrf(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.WARNING, logger="devrf")
+
+
+@pytest.fixture
+def moving(rest: LoadedCheckpoint) -> Callable[..., DeformationStage]:
+    """``moving(**schedule)``: a deformation stage of the tiny scene, by default ``MOVING``."""
+
+    def build(**schedule: Any) -> DeformationStage:
+        made = DeformationSchedule(**schedule, rays=64) if schedule else MOVING
+        return DeformationStage(copy.deepcopy(rest), made, iterations_per_step=1)
+
+    return build
+
+
+@pytest.fixture
+def without_masks(tiny_scene: Scene, datamodule: SceneDataModule) -> SceneDataModule:
+    """Serves the tiny scene without alpha masks."""
+
+    def bare(capture: Any) -> Any:
+        pixels = capture.train.pixels[..., :3].contiguous()
+        return replace(capture, train=replace(capture.train, pixels=pixels))
+
+    scene = replace(tiny_scene, static=bare(tiny_scene.static), dynamic=bare(tiny_scene.dynamic))
+    return type(datamodule)(scene)  # type: ignore[call-arg]
 
 
 class Spoil(Callback):
-    """Spoils something once at each of some iterations, as if the arithmetic had gone wrong."""
+    """Spoils a parameter or gradient once at each of some iterations."""
 
     def __init__(self, what: str, *iterations: int, group: int = 0) -> None:
         self.what = what
@@ -56,8 +72,7 @@ class Spoil(Callback):
         self.drawn: list[tuple[int, Tensor]] = []
 
     def on_before_optimizer_step(self, trainer: Trainer, pl_module: Any, optimizer: Any) -> None:
-        group = optimizer.param_groups[0]
-        self.rates.append((pl_module.iteration, group["lr"]))
+        self.rates.append((pl_module.iteration, optimizer.param_groups[0]["lr"]))
         if pl_module.iteration in self.iterations:
             self.iterations.remove(pl_module.iteration)
             value = optimizer.param_groups[self.group]["params"][0]
@@ -71,39 +86,24 @@ class Spoil(Callback):
         self.drawn.append((pl_module.iteration, pl_module.generator.get_state()))
 
 
-@pytest.fixture
-def fit(
-    datamodule: SceneDataModule, trainer: Callable[..., Trainer]
-) -> Callable[..., ScheduledStage]:
-    def learn(stage: ScheduledStage, *callbacks: Callback, **how: Any) -> ScheduledStage:
-        made = trainer(*callbacks, max_epochs=1, log_every_n_steps=1000)
-        made.strategy.checkpoint_io = ChecksummedCheckpointIO()
-        made.fit(stage, datamodule=how.pop("data", datamodule), **how)
-        return stage
-
-    return learn
-
-
-def canonical(**changes: Any) -> CanonicalStage:
-    return CanonicalStage(SCHEDULE, SMALL, iterations_per_step=1, **changes)
-
-
 def finite(state: dict[str, Any]) -> bool:
     values = [v for v in state.values() if isinstance(v, Tensor) and v.is_floating_point()]
     return all(bool(torch.isfinite(v).all()) for v in values)
 
 
+def finite_file(path: Path) -> bool:
+    return finite(read_checkpoint_file(path)["state_dict"])
+
+
 @pytest.mark.parametrize("what", ["gradient", "nan", "inf"])
-def test_once_is_taken_back(fit, caplog: pytest.LogCaptureFixture, what: str) -> None:
-    spoil = Spoil(what, 14)
-    with caplog.at_level(logging.WARNING, logger="devrf"):
-        stage = fit(canonical(), TrainingRecord(), spoil, DivergenceGuard(every_iterations=4))
+def test_the_first_time_is_rolled_back(fit, canonical, caplog, what: str) -> None:
+    spoil, guard = Spoil(what, 14), DivergenceGuard(every_iterations=4)
+    stage = fit(canonical(**SHORT), TrainingRecord(), spoil, guard)
     assert finite(stage.state_dict())
     assert (stage.iteration, stage.num_rollbacks, stage.lr_scale) == (24, 1, 0.5)
     assert stage.record["num_rollbacks"] == 1
     (said,) = caplog.messages
-    # Looked at after 18 iterations, or where the phase ended: the phase of iteration 10 is
-    # learned again.
+    # Checked after 18 iterations, or where the phase ended: the phase is learned again.
     assert said.startswith("canonical: ")
     assert " of 24 (13x8x13): back to iteration 10, learning rates at 0.5" in said
     rates = [rate for iteration, rate in spoil.rates if iteration == 10]
@@ -112,161 +112,124 @@ def test_once_is_taken_back(fit, caplog: pytest.LogCaptureFixture, what: str) ->
     assert not torch.equal(first, again)
 
 
-def test_the_iteration_that_went_wrong_is_told(fit, caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level(logging.WARNING, logger="devrf"):
-        fit(canonical(), Spoil("nan", 12, group=1), DivergenceGuard(every_iterations=100))
+def test_the_iteration_that_went_wrong_is_named(fit, canonical, caplog) -> None:
+    fit(canonical(**SHORT), Spoil("nan", 12, group=1), DivergenceGuard())
     # The colours, spoilt in iteration 12: in the loss of the next, the fourteenth.
     assert "the loss is nan by iteration 14 of 24 (13x8x13): back to iteration 10" in caplog.text
 
 
-def test_twice_ends_the_stage_as_it_last_was_well(fit, tmp_path: Path) -> None:
+def test_the_second_time_ends_the_stage_in_its_last_good_state(
+    fit, canonical, tmp_path: Path
+) -> None:
     saving = PeriodicCheckpoint(tmp_path, every_seconds=0, share=1.0)
-    stage = canonical()
+    spoil, guard = Spoil("nan", 3, 14, group=1), DivergenceGuard(every_iterations=4)
     with pytest.raises(DevrfError) as caught:
-        fit(stage, Spoil("nan", 3, 14, group=1), DivergenceGuard(every_iterations=4), saving)
+        fit(canonical(**SHORT), spoil, guard, saving)
     said = str(caught.value)
-    # Looked at before a file is written, after every iteration.
+    # Checked before a file is written, after every iteration.
     assert said.startswith("canonical stage: values of color are not finite by iteration 15 of 24")
-    assert "again after learning rates were cut to 0.5" in said
-    assert "what it was at iteration 10 is kept" in said
-    assert "lower schedule.rates or the weights of loss.fine" in said and "\n" not in said
-    # The newest file is what was well; nothing is half-written.
+    for part in (
+        "again after learning rates were cut to 0.5",
+        "what it was at iteration 10 is kept",
+        "lower schedule.rates or the weights of loss.fine",
+    ):
+        assert part in said
     newest = tmp_path / "canonical-progress-10.ckpt"
     assert newest in set(tmp_path.iterdir())
-    assert all(finite(read_checkpoint_file(path)["state_dict"]) for path in tmp_path.iterdir())
-    # It can be gone on from, and remembers.
-    again = canonical()
-    fit(again, DivergenceGuard(), ckpt_path=str(newest))
+    assert all(finite_file(path) for path in tmp_path.iterdir())
+    # A stage that goes on from there remembers.
+    again = fit(canonical(**SHORT), DivergenceGuard(), ckpt_path=newest)
     assert (again.iteration, again.num_rollbacks, again.lr_scale) == (24, 2, 0.25)
 
 
-def test_what_went_wrong_is_never_saved(fit, tmp_path: Path) -> None:
+def test_what_went_wrong_is_never_saved(fit, canonical, tmp_path: Path) -> None:
     saving = PeriodicCheckpoint(tmp_path, every_seconds=0, share=1.0)
-    stage = fit(canonical(), Spoil("nan", 17), DivergenceGuard(every_iterations=1000), saving)
+    guard = DivergenceGuard(every_iterations=1000)
+    stage = fit(canonical(**SHORT), Spoil("nan", 17), guard, saving)
     # Noticed before the file of iteration 18, not at the end of the phase.
     assert stage.num_rollbacks == 1 and finite(stage.state_dict())
-    assert all(finite(read_checkpoint_file(path)["state_dict"]) for path in tmp_path.iterdir())
+    assert all(finite_file(path) for path in tmp_path.iterdir())
 
 
-def test_the_last_iteration_is_looked_at(fit) -> None:
-    stage = fit(canonical(), Spoil("gradient", 23), DivergenceGuard())
+def test_the_last_iteration_is_looked_at(fit, canonical) -> None:
+    stage = fit(canonical(**SHORT), Spoil("gradient", 23), DivergenceGuard())
     assert stage.num_rollbacks == 1 and stage.iteration == 24 and finite(stage.state_dict())
 
 
-@pytest.mark.parametrize("iteration", [0, 7, 13, 18, 21, 29])
-def test_a_frame_is_visited_again(
-    fit, rest: LoadedCheckpoint, caplog: pytest.LogCaptureFixture, iteration: int
-) -> None:
-    stage = DeformationStage(copy.deepcopy(rest), MOVING, iterations_per_step=1)
-    with caplog.at_level(logging.WARNING, logger="devrf"):
-        fit(stage, Spoil("nan", iteration), DivergenceGuard())
-    entered, frame = next((p.start, p.frames[0]) for p in [MOVING.phase(iteration, 3)])
-    assert f"(frame {frame}, " in caplog.text and f"back to iteration {entered}," in caplog.text
+@pytest.mark.parametrize("iteration", [0, 13, 21, 29])
+def test_a_frame_is_visited_again(fit, moving, caplog, iteration: int) -> None:
+    stage = fit(moving(), Spoil("nan", iteration), DivergenceGuard())
+    phase = MOVING.phase(iteration, 3)
+    assert f"(frame {phase.frames[0]}, " in caplog.text
+    assert f"back to iteration {phase.start}," in caplog.text
     assert (stage.iteration, stage.num_rollbacks) == (30, 1) and finite(stage.state_dict())
 
 
-def test_frames_that_are_visited_together_are_visited_again_together(
-    fit, rest: LoadedCheckpoint, caplog: pytest.LogCaptureFixture, four_frames: SceneDataModule
+def test_parallel_frames_are_visited_again_together(
+    fit, moving, caplog, four_frames: SceneDataModule
 ) -> None:
-    schedule = DeformationSchedule(
-        sides=(4, 6), iterations_per_frame=(2, 5), rays=64, parallel_frames=(1, 2)
-    )
-    stage = DeformationStage(copy.deepcopy(rest), schedule, iterations_per_step=1)
-    with caplog.at_level(logging.WARNING, logger="devrf"):
-        fit(stage, Spoil("nan", 15), DivergenceGuard(), data=four_frames)
+    stage = moving(sides=(4, 6), iterations_per_frame=(2, 5), parallel_frames=(1, 2))
+    fit(stage, Spoil("nan", 15), DivergenceGuard(), data=four_frames)
     assert "of 18 (frames 1, 3, " in caplog.text and "back to iteration 13," in caplog.text
     assert (stage.iteration, stage.num_rollbacks) == (18, 1) and finite(stage.state_dict())
 
 
-def test_a_deformation_that_goes_wrong_twice_ends(fit, rest: LoadedCheckpoint) -> None:
-    stage = DeformationStage(copy.deepcopy(rest), MOVING, iterations_per_step=1)
+def test_a_deformation_that_goes_wrong_twice_ends(fit, moving) -> None:
+    stage = moving()
     with pytest.raises(DevrfError, match="deformation stage: .*frame 2.*motion.learning_rate"):
         fit(stage, Spoil("nan", 3, 15), DivergenceGuard())
     assert stage.iteration == 12 and finite(stage.state_dict())
 
 
-def test_a_field_that_empties_is_taken_back(fit, caplog: pytest.LogCaptureFixture) -> None:
-    longer = replace(SCHEDULE, iterations=60, doublings=(20,), rays=128)
-    stage = CanonicalStage(longer, SMALL, iterations_per_step=1)
-    with caplog.at_level(logging.WARNING, logger="devrf"):
-        fit(stage, Spoil("-100", 40), DivergenceGuard(every_iterations=20))
-    assert "everything has become empty by iteration" in caplog.text
+@pytest.mark.parametrize(
+    ("density", "words", "carve"), [("-100", "empty", True), ("100", "opaque", False)]
+)
+def test_a_field_that_empties_or_fills_is_rolled_back(
+    fit, canonical, caplog, density: str, words: str, carve: bool
+) -> None:
+    guard = DivergenceGuard(every_iterations=20)
+    stage = fit(canonical(**LONG, carve=carve), Spoil(density, 40), guard)
+    assert f"everything has become {words} by iteration" in caplog.text
     assert "data.background" in caplog.text and "data.box" in caplog.text
     assert stage.num_rollbacks == 1 and stage.iteration == 60
 
 
-def test_a_field_that_fills_is_taken_back(fit, caplog: pytest.LogCaptureFixture) -> None:
-    longer = replace(SCHEDULE, iterations=60, doublings=(20,), rays=128, carve=False)
-    stage = CanonicalStage(longer, SMALL, iterations_per_step=1)
-    with caplog.at_level(logging.WARNING, logger="devrf"):
-        fit(stage, Spoil("100", 40), DivergenceGuard(every_iterations=20))
-    assert "everything has become opaque by iteration" in caplog.text
-    assert stage.num_rollbacks == 1
-
-
-@pytest.mark.parametrize("mattes", [True, False])
+@pytest.mark.parametrize("masks", [True, False])
 def test_a_field_that_keeps_emptying_ends_the_stage(
-    fit, tiny_scene: Scene, datamodule: SceneDataModule, mattes: bool
+    fit, canonical, datamodule: SceneDataModule, without_masks: SceneDataModule, masks: bool
 ) -> None:
-    static, channels = tiny_scene.static, 4 if mattes else 3
-    train = replace(static.train, pixels=static.train.pixels[..., :channels].contiguous())
-    scene = replace(tiny_scene, static=replace(static, train=train))
-    longer = replace(SCHEDULE, iterations=60, doublings=(), rays=128)
-    stage = CanonicalStage(longer, replace(SMALL, alpha_init=0.1), iterations_per_step=1)
+    stage = canonical(**{**LONG, "doublings": ()}, alpha_init=0.1)
+    spoil, guard = Spoil("-100", 20, 40), DivergenceGuard(every_iterations=20)
     with pytest.raises(DevrfError) as caught:
-        fit(
-            stage,
-            Spoil("-100", 20, 40),
-            DivergenceGuard(every_iterations=20),
-            data=type(datamodule)(scene),  # type: ignore[call-arg]
-        )
+        fit(stage, spoil, guard, data=datamodule if masks else without_masks)
     said = str(caught.value)
     assert said.startswith("canonical stage: everything has become empty by iteration ")
     assert "data.background" in said and "begin afresh with resume=false" in said
     assert finite(stage.state_dict()) and stage.iteration == 0
 
 
-@pytest.mark.parametrize("doublings", [(), (10,)])
-def test_a_stage_that_never_saw_anything_tells(
-    fit, caplog: pytest.LogCaptureFixture, doublings: tuple[int, ...]
-) -> None:
-    clear, schedule = replace(SMALL, alpha_init=1e-7), replace(SCHEDULE, doublings=doublings)
-    stage = CanonicalStage(schedule, clear, rates=CanonicalRates(density=1e-9))
-    if doublings:  # nothing to draw pixels from
-        with pytest.raises(DevrfError, match="empty by iteration 10: check data.background"):
-            fit(stage, DivergenceGuard(every_iterations=20))
-        return
-    with caplog.at_level(logging.WARNING, logger="devrf"):
-        fit(stage, DivergenceGuard(every_iterations=20))
+def test_a_stage_that_never_saw_anything_warns(fit, canonical, caplog) -> None:
+    clear = {"alpha_init": 1e-7, "rates": CanonicalRates(density=1e-9)}
+    guard = DivergenceGuard(every_iterations=20)
+    stage = fit(canonical(**{**SHORT, "doublings": ()}, **clear), guard)
     assert "canonical: nothing is to be seen at the end (is data.background" in caplog.text
     assert (stage.iteration, stage.num_rollbacks) == (24, 0)
+    # With a second phase there is nothing to draw pixels from.
+    with pytest.raises(DevrfError, match="empty by iteration 10: check data.background"):
+        fit(canonical(**SHORT, **clear), guard)
 
 
-def test_moving_matter_that_leaves_the_picture_without_mattes_is_only_told(
-    fit,
-    rest: LoadedCheckpoint,
-    tiny_scene: Scene,
-    datamodule: SceneDataModule,
-    caplog: pytest.LogCaptureFixture,
+def test_motion_that_leaves_the_image_without_masks_only_warns(
+    fit, moving, without_masks: SceneDataModule, caplog
 ) -> None:
-    dynamic = tiny_scene.dynamic
-    bare = replace(dynamic.train, pixels=dynamic.train.pixels[..., :3].contiguous())
-    scene = replace(tiny_scene, dynamic=replace(dynamic, train=bare))
-    schedule = DeformationSchedule(sides=(4,), iterations_per_frame=(40,), rays=64)
-    stage = DeformationStage(copy.deepcopy(rest), schedule, iterations_per_step=1)
-    with caplog.at_level(logging.WARNING, logger="devrf"):
-        fit(
-            stage,
-            Spoil("100", 45),
-            DivergenceGuard(every_iterations=20),
-            data=type(datamodule)(scene),  # type: ignore[call-arg]
-        )
+    stage = moving(sides=(4,), iterations_per_frame=(40,))
+    fit(stage, Spoil("100", 45), DivergenceGuard(every_iterations=20), data=without_masks)
     assert caplog.text.count("everything has become empty by") == 1
     assert stage.num_rollbacks == 0
 
 
-def test_a_frame_whose_loss_stands_out_is_told(
-    fit, rest: LoadedCheckpoint, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+def test_a_frame_whose_loss_stands_out_is_named(
+    fit, moving, monkeypatch: pytest.MonkeyPatch, caplog
 ) -> None:
     usual = DeformationStage.loss
 
@@ -277,26 +240,20 @@ def test_a_frame_whose_loss_stands_out_is_told(
 
     monkeypatch.setattr(DeformationStage, "loss", dear)
     guard = DivergenceGuard()
-    schedule = DeformationSchedule(sides=(4,), iterations_per_frame=(20,), rays=64)
-    stage = DeformationStage(copy.deepcopy(rest), schedule, iterations_per_step=1)
     seen = {"kind": "level 0", "visited": [0.01, 0.011, 0.012, 0.01]}
     guard.load_state_dict({**guard.state_dict(), **seen})
-    monkeypatch.setattr(guard, "_forget", lambda: None)
-    with caplog.at_level(logging.WARNING, logger="devrf"):
-        fit(stage, guard)
+    monkeypatch.setattr(guard, "_reset", lambda: None)
+    fit(moving(sides=(4,), iterations_per_frame=(20,)), guard)
     assert "times that of the frames before" in caplog.text and "(frame 2, " in caplog.text
 
 
-def test_what_goes_well_is_let_alone(
-    fit, rest: LoadedCheckpoint, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_sound_stage_is_not_touched(fit, canonical, moving, caplog) -> None:
     def learned(*callbacks: Callback) -> list[dict[str, Any]]:
-        stages = [canonical(), DeformationStage(copy.deepcopy(rest), MOVING)]
+        stages = [canonical(**SHORT), moving()]
         torch.manual_seed(4)
         return [fit(stage, *callbacks).state_dict() for stage in stages]
 
-    with caplog.at_level(logging.WARNING, logger="devrf"):
-        watched, alone = learned(DivergenceGuard(every_iterations=3)), learned()
+    watched, alone = learned(DivergenceGuard(every_iterations=3)), learned()
     assert caplog.messages == []
     for one, other in zip(watched, alone, strict=True):
         for name, value in one.items():
@@ -304,7 +261,7 @@ def test_what_goes_well_is_let_alone(
                 assert torch.equal(value, other[name]), name
 
 
-def test_looking_costs_next_to_nothing(fit, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_checks_cost_next_to_nothing(fit, canonical, monkeypatch: pytest.MonkeyPatch) -> None:
     spent = [0.0]
     for name in ("on_train_batch_start", "on_train_batch_end"):
         usual = getattr(DivergenceGuard, name)
@@ -315,8 +272,7 @@ def test_looking_costs_next_to_nothing(fit, monkeypatch: pytest.MonkeyPatch) -> 
             spent[0] += time.process_time() - began
 
         monkeypatch.setattr(DivergenceGuard, name, timed)
-    schedule = replace(SCHEDULE, iterations=120, side=24, rays=512)
-    stage = CanonicalStage(schedule, SMALL)
+    stage = canonical(**{**SHORT, "iterations": 120, "side": 24, "rays": 512})
     began = time.process_time()
     fit(stage, DivergenceGuard())
     assert spent[0] < 0.02 * (time.process_time() - began)

@@ -15,26 +15,10 @@ from lightning import Callback, Trainer
 
 from devrf.callbacks import PeriodicCheckpoint, StopOnSignal, TrainingRecord
 from devrf.callbacks import periodic_checkpoint as module
-from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO
 from devrf.checkpoints.checkpoint_file import read_checkpoint_file
 from devrf.checkpoints.progress import progress_files
-from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
-from devrf.methods.devrf.architecture import Architecture
-from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
-
-SMALL = Architecture(channels=4, width=8, frequencies=1)
-SCHEDULE = CanonicalSchedule(
-    search_iterations=0,
-    search_side=12,
-    carve=True,
-    iterations=12,
-    side=12,
-    doublings=(5,),
-    decay_iterations=6,
-    rays=32,
-)
 
 
 class At(Callback):
@@ -50,19 +34,9 @@ class At(Callback):
 
 
 @pytest.fixture
-def fit(
-    datamodule: SceneDataModule, trainer: Callable[..., Trainer]
-) -> Callable[..., CanonicalStage]:
-    """Learn with callbacks; a step is an iteration, and no curve is due before the end."""
-
-    def learn(*callbacks: Callback, ckpt_path: Path | None = None) -> CanonicalStage:
-        stage = CanonicalStage(SCHEDULE, SMALL, iterations_per_step=1)
-        made = trainer(*callbacks, max_epochs=1, log_every_n_steps=100)
-        made.strategy.checkpoint_io = ChecksummedCheckpointIO()
-        made.fit(stage, datamodule=datamodule, ckpt_path=ckpt_path and str(ckpt_path))
-        return stage
-
-    return learn
+def learn(fit, canonical) -> Callable[..., CanonicalStage]:
+    """``learn(*callbacks)``: a stage of 12 iterations, each of them a step."""
+    return lambda *callbacks, **how: fit(canonical(), *callbacks, **how)
 
 
 def names(folder: Path) -> list[str]:
@@ -71,17 +45,17 @@ def names(folder: Path) -> list[str]:
 
 @pytest.mark.parametrize(("seconds", "left"), [(0, [10, 11]), (1000, [])])
 def test_the_last_two_are_kept_and_none_is_written_before_its_time(
-    fit, tmp_path: Path, seconds: float, left: list[int]
+    learn, tmp_path: Path, seconds: float, left: list[int]
 ) -> None:
     saving = PeriodicCheckpoint(tmp_path, seconds, share=1.0)
-    fit(saving)
+    learn(saving)
     # The stage's last iteration is its checkpoint's.
     assert names(tmp_path) == [f"canonical-progress-{n}.ckpt" for n in left]
     assert saving.saved == (left[-1] if left else None)
 
 
 def test_writing_takes_its_share_of_the_time(
-    fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    learn, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = [100.0]
     monkeypatch.setattr(module.time, "monotonic", lambda: clock[0])
@@ -98,25 +72,21 @@ def test_writing_takes_its_share_of_the_time(
         def on_train_batch_end(self, *_: Any) -> None:
             clock[0] += 1.0
 
-    fit(Tick(), PeriodicCheckpoint(tmp_path, every_seconds=0, share=0.4))
+    learn(Tick(), PeriodicCheckpoint(tmp_path, every_seconds=0, share=0.4))
     # Two seconds are 40% of five: three iterations to wait.
     assert written == [1, 4, 7, 10]
 
 
-def test_a_row_of_the_curves_that_is_due_is_waited_for(
-    datamodule: SceneDataModule, trainer: Callable[..., Trainer], tmp_path: Path
-) -> None:
+def test_a_row_of_the_curves_that_is_due_is_waited_for(learn, tmp_path: Path) -> None:
     seen: list[list[str]] = []
-    saving = PeriodicCheckpoint(tmp_path, every_seconds=0, share=1.0)
-    stage = CanonicalStage(SCHEDULE, SMALL, iterations_per_step=1)
     watch = At(6, lambda: seen.append(names(tmp_path)))
-    trainer(saving, watch, max_epochs=1, log_every_n_steps=3).fit(stage, datamodule=datamodule)
+    learn(PeriodicCheckpoint(tmp_path, every_seconds=0, share=1.0), watch, every=3)
     # Rows are written after iterations 3, 6, 9, once the callbacks are done.
     assert seen == [["canonical-progress-4.ckpt", "canonical-progress-5.ckpt"]]
 
 
 def test_a_full_disk_does_not_end_the_training(
-    fit, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    learn, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     usual = module.save_checkpoint
 
@@ -129,7 +99,7 @@ def test_a_full_disk_does_not_end_the_training(
     lost: list[list[str]] = []
     with caplog.at_level(logging.WARNING, logger="devrf"):
         watch = At(7, lambda: lost.append(names(tmp_path)))
-        stage = fit(PeriodicCheckpoint(tmp_path, every_seconds=0, share=1.0), watch)
+        stage = learn(PeriodicCheckpoint(tmp_path, every_seconds=0, share=1.0), watch)
     assert stage.iteration == 12
     assert lost == [["canonical-progress-2.ckpt", "canonical-progress-3.ckpt"]]
     (said,) = caplog.messages
@@ -138,10 +108,10 @@ def test_a_full_disk_does_not_end_the_training(
     assert names(tmp_path) == ["canonical-progress-10.ckpt", "canonical-progress-11.ckpt"]
 
 
-def test_half_written_files_of_a_killed_process_go(fit, tmp_path: Path) -> None:
+def test_half_written_files_of_a_killed_process_go(learn, tmp_path: Path) -> None:
     (tmp_path / ".partial-canonical-progress-3.ckpt").write_bytes(b"half")
     (tmp_path / ".partial-deformation.ckpt").write_bytes(b"not of this stage")
-    fit(PeriodicCheckpoint(tmp_path, every_seconds=1000))
+    learn(PeriodicCheckpoint(tmp_path, every_seconds=1000))
     assert names(tmp_path) == [".partial-deformation.ckpt"]
 
 
@@ -157,20 +127,20 @@ def test_senseless_times_are_refused(tmp_path: Path, seconds: float, share: floa
     ids=["on the way", "after the last iteration"],
 )
 def test_a_signal_stops_the_stage_saved(
-    fit, tmp_path: Path, iteration: int, left: list[str]
+    learn, tmp_path: Path, iteration: int, left: list[str]
 ) -> None:
     saving = PeriodicCheckpoint(tmp_path, every_seconds=1000)
     with StopOnSignal(saving) as stop:
-        stage = fit(At(iteration, lambda: os.kill(os.getpid(), signal.SIGTERM)), saving, stop)
+        stage = learn(At(iteration, lambda: os.kill(os.getpid(), signal.SIGTERM)), saving, stop)
     assert (stop.number, stage.iteration, names(tmp_path)) == (signal.SIGTERM, iteration, left)
 
 
-def test_seconds_add_up_over_interruptions(fit, tmp_path: Path) -> None:
+def test_seconds_add_up_over_interruptions(learn, tmp_path: Path) -> None:
     saving = PeriodicCheckpoint(tmp_path, every_seconds=1000)
     with StopOnSignal(saving) as stop:
         pause = At(3, lambda: time.sleep(0.3))
         ask = At(5, lambda: os.kill(os.getpid(), signal.SIGTERM))
-        first = fit(pause, ask, TrainingRecord(), saving, stop)
+        first = learn(pause, ask, TrainingRecord(), saving, stop)
     before = first.record["seconds"]
     assert before is not None and before >= 0.3
     (left,) = progress_files(tmp_path, "canonical")
@@ -180,6 +150,6 @@ def test_seconds_add_up_over_interruptions(fit, tmp_path: Path) -> None:
         if name.startswith("TrainingRecord")
     )
     assert 0.3 <= kept <= before + 0.01
-    second = fit(TrainingRecord(), ckpt_path=left)
+    second = learn(TrainingRecord(), ckpt_path=left)
     assert second.record["iterations"] == 12
     assert second.record["seconds"] > kept

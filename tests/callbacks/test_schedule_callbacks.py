@@ -11,28 +11,14 @@ import pytest
 from lightning import Callback, Trainer
 from torch.optim import Optimizer
 
-from devrf.callbacks import GridUpscaling, LearningRateDecay, Meter, Progress, TrainingRecord
+from devrf.callbacks import Meter, Progress, TrainingRecord
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
-from devrf.methods.devrf.architecture import Architecture
-from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
-from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.settings import MotionSettings
 
-SMALL = Architecture(channels=4, width=8, frequencies=1)
-CANONICAL = CanonicalSchedule(
-    search_iterations=0,
-    search_side=16,
-    carve=True,
-    iterations=12,
-    side=12,
-    doublings=(3, 7),
-    decay_iterations=6,
-    rays=64,
-)
 DEFORMATION = DeformationSchedule(sides=(4, 6), iterations_per_frame=(3, 2), rays=64)
 
 
@@ -49,25 +35,22 @@ class Watch(Callback):
         self.steps.append((pl_module.iteration, pl_module.phase, rates))
 
 
-def test_canonical_rates_and_phases_are_the_schedules_at_every_step(
-    datamodule: SceneDataModule, trainer: Callable[..., Trainer]
-) -> None:
+def test_canonical_rates_and_phases_are_the_schedules_at_every_step(fit, canonical) -> None:
     watch = Watch()
-    trainer(watch, max_epochs=1).fit(CanonicalStage(CANONICAL, SMALL), datamodule=datamodule)
+    stage = fit(canonical(iterations_per_step=10), watch)
     assert [step for step, _, _ in watch.steps] == list(range(12))
     for step, phase, rates in watch.steps:
-        assert phase == CANONICAL.phase(step)
+        assert phase == stage.schedule.phase(step)
         factor = 0.1 ** (step / 6)
         assert rates == pytest.approx([0.1 * factor, 0.1 * factor, 1e-3 * factor])
 
 
 @pytest.mark.parametrize("unit", ["world", "box"])
 def test_deformation_rates_and_phases_are_the_schedules_at_every_step(
-    rest: LoadedCheckpoint, datamodule: SceneDataModule, trainer: Callable[..., Trainer], unit: Any
+    fit, rest: LoadedCheckpoint, unit: Any
 ) -> None:
     watch, motion = Watch(), MotionSettings(learning_rate=2e-3, unit=unit)
-    stage = DeformationStage(rest, DEFORMATION, motion)
-    trainer(watch, max_epochs=1).fit(stage, datamodule=datamodule)
+    stage = fit(DeformationStage(rest, DEFORMATION, motion), watch)
     assert [step for step, _, _ in watch.steps] == list(range(15))
     # Three frames, shares of 3 and 2; frame 1 has two shares.
     visits = [(phase.level, *phase.frames) for _, phase, _ in watch.steps]
@@ -79,73 +62,58 @@ def test_deformation_rates_and_phases_are_the_schedules_at_every_step(
 
 
 def test_without_the_upscaling_callback_a_stage_says_what_is_missing(
-    datamodule: SceneDataModule,
+    canonical, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
 ) -> None:
-    bare = Trainer(
-        accelerator="cpu",
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        max_steps=1,
-        callbacks=[LearningRateDecay()],
-    )
+    bare = trainer(max_steps=1)
+    bare.callbacks.pop(0)  # type: ignore[attr-defined]
     with pytest.raises(DevrfError, match="CanonicalStage.*iteration 0.*GridUpscaling"):
-        bare.fit(CanonicalStage(CANONICAL, SMALL), datamodule=datamodule)
+        bare.fit(canonical(), datamodule=datamodule)
 
 
-def test_the_record_says_what_training_took(
-    datamodule: SceneDataModule, trainer: Callable[..., Trainer]
-) -> None:
-    stage = CanonicalStage(CANONICAL, SMALL)
-    trainer(TrainingRecord(), max_epochs=1).fit(stage, datamodule=datamodule)
+def test_the_record_says_what_training_took(fit, canonical) -> None:
+    stage = fit(canonical(), TrainingRecord())
     assert stage.record["iterations"] == 12
     assert stage.record["peak_gpu_gb"] is None
-    seconds = stage.record["seconds"]
-    assert seconds is not None and 0 < seconds < 60
-    speed = stage.record["iterations_per_second"]
-    assert speed is not None and 12 / speed == pytest.approx(seconds, abs=0.01)
+    seconds, speed = stage.record["seconds"], stage.record["iterations_per_second"]
+    assert 0 < seconds < 60 and 12 / speed == pytest.approx(seconds, abs=0.01)
     assert stage.metadata().records["canonical"] == stage.record
 
 
+@pytest.fixture
+def lines(caplog: pytest.LogCaptureFixture) -> Callable[[], list[str]]:
+    """The lines of progress that were logged."""
+    caplog.set_level(logging.INFO, logger="devrf")
+    return lambda: [line for line in caplog.messages if line.startswith("dynamic ")]
+
+
 def test_progress_writes_lines_where_there_is_no_terminal(
-    rest: LoadedCheckpoint,
-    datamodule: SceneDataModule,
-    trainer: Callable[..., Trainer],
-    caplog: pytest.LogCaptureFixture,
+    fit, rest: LoadedCheckpoint, lines: Callable[[], list[str]]
 ) -> None:
     stage = DeformationStage(rest, DEFORMATION, iterations_per_step=100)
-    with caplog.at_level(logging.INFO, logger="devrf"):
-        fit = trainer(Progress(line_every_seconds=0.0), max_epochs=1)
-        fit.fit(stage, datamodule=datamodule)
-    lines = [line for line in caplog.messages if line.startswith("dynamic ")]
+    fit(stage, Progress(line_every_seconds=0.0))
     # A line at the end of each phase: 6, 9, 13 and 15 iterations.
-    assert [line.split()[1] for line in lines] == ["6/15", "9/15", "13/15", "15/15"]
+    assert [line.split()[1] for line in lines()] == ["6/15", "9/15", "13/15", "15/15"]
     shape = "x".join(str(n) for n in stage.resolution)
-    assert "dB" in lines[-1] and "it/s" in lines[-1]
-    assert lines[-1].endswith(f"{shape}  frame 2")
+    assert "it/s" in lines()[-1] and lines()[-1].endswith(f"{shape}  frame 2")
 
 
 def test_progress_and_curves_name_the_frames_of_a_visit(
     rest: LoadedCheckpoint,
     four_frames: SceneDataModule,
     trainer: Callable[..., Trainer],
-    caplog: pytest.LogCaptureFixture,
+    lines: Callable[[], list[str]],
 ) -> None:
     schedule = replace(DEFORMATION, coarse_to_fine=False, parallel_frames=(1, 2))
     stage = DeformationStage(rest, schedule, iterations_per_step=100)
-    with caplog.at_level(logging.INFO, logger="devrf"):
-        fit = trainer(Progress(line_every_seconds=0.0), Meter(), max_epochs=1)
-        fit.fit(stage, datamodule=four_frames)
-    lines = [line for line in caplog.messages if line.startswith("dynamic ")]
-    assert [line.split("  ")[-1] for line in lines] == ["frame 2", "frames 1, 3"]
-    assert fit.callback_metrics["dynamic/frame"] == 1
+    fitted = trainer(Progress(line_every_seconds=0.0), Meter(), max_epochs=1)
+    fitted.fit(stage, datamodule=four_frames)
+    assert [line.split("  ")[-1] for line in lines()] == ["frame 2", "frames 1, 3"]
+    assert " dB" in lines()[-1]
+    assert fitted.callback_metrics["dynamic/frame"] == 1
 
 
-def test_phases_are_entered_once(
-    datamodule: SceneDataModule, trainer: Callable[..., Trainer], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stage = CanonicalStage(CANONICAL, SMALL, iterations_per_step=1)
+def test_phases_are_entered_once(fit, canonical, monkeypatch: pytest.MonkeyPatch) -> None:
+    stage = canonical()
     entered: list[Any] = []
     enter = stage.enter
 
@@ -154,7 +122,5 @@ def test_phases_are_entered_once(
         enter(phase)
 
     monkeypatch.setattr(stage, "enter", noted)
-    fit = trainer(max_epochs=1)
-    assert any(isinstance(c, GridUpscaling) for c in fit.callbacks)  # type: ignore[attr-defined]
-    fit.fit(stage, datamodule=datamodule)
-    assert entered == list(CANONICAL.phases)
+    fit(stage)
+    assert entered == list(stage.schedule.phases)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,23 +13,10 @@ from lightning import Callback, Trainer
 from lightning.pytorch.loggers import CSVLogger, Logger
 from torch import Tensor
 
-from devrf.artifacts.tracking import Row, Tracker, trackers
-from devrf.callbacks import GridUpscaling, LearningRateDecay, Meter, Previews, TrainingRecord
+from devrf.artifacts.tracking import Row
+from devrf.callbacks import Meter, Previews, TrainingRecord
 from devrf.data.datamodule import SceneDataModule
-from devrf.methods.devrf.architecture import Architecture
-from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
-
-SCHEDULE = CanonicalSchedule(
-    search_iterations=0,
-    search_side=16,
-    carve=True,
-    iterations=12,
-    side=12,
-    doublings=(3, 7),
-    decay_iterations=6,
-    rays=64,
-)
 
 
 class Album(Logger):
@@ -59,34 +47,28 @@ class Album(Logger):
     def close(self, *, failed: bool) -> None: ...
 
 
-def learn(datamodule: SceneDataModule, logger: Logger, *callbacks: Callback) -> CanonicalStage:
-    torch.manual_seed(3)
-    stage = CanonicalStage(
-        SCHEDULE, Architecture(channels=4, width=8, frequencies=1), iterations_per_step=1
-    )
-    Trainer(
-        accelerator="cpu",
-        devices=1,
-        logger=logger,
-        enable_checkpointing=False,
-        max_epochs=1,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        log_every_n_steps=4,
-        callbacks=[GridUpscaling(), LearningRateDecay(), *callbacks],
-    ).fit(stage, datamodule=datamodule)
-    return stage
+@pytest.fixture
+def learn(
+    canonical, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
+) -> Callable[..., CanonicalStage]:
+    """``learn(logger, *callbacks)``: a stage of 12 iterations, with a row of curves every 4."""
+
+    def fit(logger: Logger, *callbacks: Callback) -> CanonicalStage:
+        torch.manual_seed(3)
+        stage: CanonicalStage = canonical()
+        made = trainer(*callbacks, max_epochs=1, log_every_n_steps=4)
+        made.loggers = [logger]
+        made.fit(stage, datamodule=datamodule)
+        return stage
+
+    return fit
 
 
-def test_only_a_logger_that_takes_pictures_is_a_tracker(tmp_path: Path) -> None:
+def test_previews_come_as_often_as_asked_for_and_look_right(
+    learn, datamodule: SceneDataModule
+) -> None:
     album = Album()
-    assert isinstance(album, Tracker)
-    assert trackers([CSVLogger(tmp_path), album]) == [album]
-
-
-def test_previews_come_as_often_as_asked_for_and_look_right(datamodule: SceneDataModule) -> None:
-    album = Album()
-    learn(datamodule, album, Previews(times=3))
+    learn(album, Previews(times=3))
     shown = album.images["static/view"]
     assert [step for step, _ in shown] == [4, 8, 12]
     views = datamodule.scene.static.test
@@ -100,43 +82,35 @@ def test_previews_come_as_often_as_asked_for_and_look_right(datamodule: SceneDat
     torch.testing.assert_close(truth, expected)
 
 
-def test_watching_changes_nothing_of_what_is_learned(datamodule: SceneDataModule) -> None:
-    watched = learn(datamodule, Album(), Meter(), Previews(times=4)).scene_model
-    alone = learn(datamodule, Album()).scene_model
+def test_watching_changes_nothing_of_what_is_learned(learn) -> None:
+    watched = learn(Album(), Meter(), Previews(times=4)).scene_model
+    alone = learn(Album()).scene_model
     assert torch.equal(watched.canonical.density.values, alone.canonical.density.values)
     assert torch.equal(watched.canonical.color.values, alone.canonical.color.values)
 
 
-def test_what_previews_take_is_not_time_of_training(
-    datamodule: SceneDataModule, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    previews = Previews(times=2)
-    stage = learn(datamodule, Album(), previews, TrainingRecord())
-    seconds = stage.record["seconds"]
-    assert previews.seconds > 0 and seconds is not None
-
+def test_what_previews_take_is_not_time_of_training(learn) -> None:
     class Slow(Album):
         def show_image(self, name: str, image: Tensor, step: int | None = None) -> None:
-            import time
-
             time.sleep(0.5)
 
+    seconds = learn(Album(), TrainingRecord()).record["seconds"]
     slow = Previews(times=1)
-    again = learn(datamodule, Slow(), slow, TrainingRecord()).record["seconds"]
+    again = learn(Slow(), slow, TrainingRecord()).record["seconds"]
     assert slow.seconds > 1.0  # two pictures
-    assert again is not None and again < seconds + 0.5
+    assert again < seconds + 0.5
 
 
 def test_without_a_tracker_no_picture_is_made(
-    datamodule: SceneDataModule, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    learn, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("devrf.callbacks.previews.preview", lambda *_: pytest.fail("rendered"))
-    learn(datamodule, CSVLogger(tmp_path), Previews(times=3))
+    learn(CSVLogger(tmp_path), Previews(times=3))
 
 
-def test_curves_stand_in_the_rows_of_the_losses(datamodule: SceneDataModule) -> None:
+def test_curves_stand_in_the_rows_of_the_losses(learn) -> None:
     album = Album()
-    stage = learn(datamodule, album, Meter())
+    stage = learn(album, Meter())
     assert [row["step"] for row in album.rows] == [4, 8, 12]
     x, y, z = stage.resolution
     for row in album.rows:

@@ -12,6 +12,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -46,7 +47,7 @@ SHORT = (
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a command came to: its exit status and what it said."""
+    """A command's exit status and output."""
 
     status: int
     out: str
@@ -93,6 +94,14 @@ def short() -> tuple[str, ...]:
 
 
 @pytest.fixture(scope="session")
+def often() -> tuple[str, ...]:
+    """Overrides that write a progress file after every iteration."""
+    saving = ("callbacks.saving.every_seconds=0", "callbacks.saving.share=1.0")
+    steps = ("canonical.iterations_per_step=1", "deformation.iterations_per_step=1")
+    return (*saving, *steps, "trainer.log_every_n_steps=100")
+
+
+@pytest.fixture(scope="session")
 def devrf_in() -> Devrf:
     """``devrf_in(folder, *arguments)``: the command with that working folder."""
     return call
@@ -114,35 +123,49 @@ def trained(
     yield folder / "outputs" / "robot" / "default", outcome
 
 
+def environment(**more: str) -> dict[str, str]:
+    """This process's environment, with the package on Python's path."""
+    path = [str(Path(package.__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
+    own = {"PYTHONPATH": os.pathsep.join(path), "OMP_NUM_THREADS": "1", "HYDRA_FULL_ERROR": "0"}
+    return {**os.environ, **own, **more}
+
+
+@pytest.fixture(scope="session")
+def start() -> Callable[..., subprocess.Popen[str]]:
+    """``start(folder, *arguments, **variables)``: Python in a process of its own."""
+
+    def popen(folder: Path, *arguments: str, **more: str) -> subprocess.Popen[str]:
+        pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+        command = [sys.executable, *arguments]
+        return subprocess.Popen(command, cwd=folder, env=environment(**more), text=True, **pipes)
+
+    return popen
+
+
+@pytest.fixture(scope="session")
+def python(start: Callable[..., subprocess.Popen[str]]) -> Callable[..., Outcome]:
+    """``python(folder, *arguments, **variables)``: what that process came to."""
+
+    def run(*arguments: Any, **more: str) -> Outcome:
+        with start(*arguments, **more) as process:
+            out, err = process.communicate(timeout=300)
+        return Outcome(process.returncode, out, err)
+
+    return run
+
+
 class Warm:
     """Runs commands in processes of their own, without waiting for their imports."""
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self._process = process
 
-    def __call__(
-        self,
-        folder: Path,
-        *arguments: str,
-        after: tuple[str, int] | None = None,
-        delay: float = 0.0,
-        signals: tuple[int, ...] = (),
-        most_bytes: int = 0,
-        most_memory: int = 0,
-    ) -> Outcome:
-        """``devrf ARGUMENTS`` in ``folder``; ``warm_process.py`` says what the others do."""
+    def __call__(self, folder: Path, *arguments: str, **how: Any) -> Outcome:
+        """``devrf ARGUMENTS`` in ``folder``; ``warm_process.py`` describes ``how``."""
         assert self._process.stdin is not None and self._process.stdout is not None
         said = folder / "said.txt"
         before = said.stat().st_size if said.exists() else 0
-        asked = {
-            "folder": str(folder),
-            "arguments": arguments,
-            "after": after,
-            "delay": delay,
-            "signals": signals,
-            "most_bytes": most_bytes,
-            "most_memory": most_memory,
-        }
+        asked = {"folder": str(folder), "arguments": arguments, **how}
         self._process.stdin.write(json.dumps(asked) + "\n")
         self._process.stdin.flush()
         status = int(json.loads(self._process.stdout.readline()))
@@ -154,12 +177,9 @@ def warm() -> Iterator[Warm]:
     """Runs commands in processes of their own, at the cost of a fork each."""
     if not hasattr(os, "fork"):
         pytest.skip("needs fork")
-    source = str(Path(package.__file__).parents[1])
-    environment = {**os.environ, "PYTHONPATH": source, "OMP_NUM_THREADS": "1"}
-    environment.pop("HYDRA_FULL_ERROR", None)
     with subprocess.Popen(
         [sys.executable, str(Path(__file__).with_name("warm_process.py"))],
-        env=environment,
+        env=environment(),
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import pytest
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from devrf.cli.config_check import check_config
 from devrf.errors import DevrfError
@@ -28,31 +29,31 @@ def forwarding(**anything: object) -> None:
     """A part that takes any setting."""
 
 
-def config(**changes: object):
+BASE = f"""
+stage: pipeline
+seed: 0
+resume: true
+memory_check: true
+ckpt: null
+scene: robot
+method: devrf
+objective: dynamic.psnr
+kernels: auto
+graphs: auto
+decoder_precision: auto
+sizes: {{inner: {{_target_: {__name__}.Inner, size: 2}}}}
+loss: {{fine: {{color: 1.0}}}}
+outer:
+  _target_: {__name__}.Outer
+  root: there
+  inner: ${{sizes.inner}}
+  weights: ${{loss.fine}}
+"""
+
+
+def config(**changes: object) -> DictConfig:
     """A config whose ``outer`` takes ``inner`` and ``weights`` from elsewhere."""
-    here = f"{__name__}."
-    base = {
-        "stage": "pipeline",
-        "seed": 0,
-        "resume": True,
-        "memory_check": True,
-        "ckpt": None,
-        "scene": "robot",
-        "method": "devrf",
-        "objective": "dynamic.psnr",
-        "kernels": "auto",
-        "graphs": "auto",
-        "decoder_precision": "auto",
-        "sizes": {"inner": {"_target_": f"{here}Inner", "size": 2}},
-        "loss": {"fine": {"color": 1.0}},
-        "outer": {
-            "_target_": f"{here}Outer",
-            "root": "there",
-            "inner": "${sizes.inner}",
-            "weights": "${loss.fine}",
-        },
-    }
-    made = OmegaConf.create(base)
+    made = OmegaConf.create(BASE)
     for key, value in changes.items():
         OmegaConf.update(made, key.replace("__", "."), value, force_add=True)
     return made
@@ -61,8 +62,6 @@ def config(**changes: object):
 @pytest.fixture(autouse=True)
 def importable(monkeypatch, request):
     """Tests are no package; their module is put where Hydra looks for parts."""
-    import sys
-
     monkeypatch.setitem(sys.modules, __name__, request.module)
 
 

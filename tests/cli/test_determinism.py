@@ -27,6 +27,6 @@ def test_another_process_comes_to_the_same_scores(warm, tiny, trained, tmp_path,
     assert scores(tmp_path / "run") == pytest.approx(expected, abs=1e-6, rel=0)
 
 
-def test_another_seed_comes_to_others(warm, tiny, trained, tmp_path):
+def test_another_seed_comes_to_other_scores(warm, tiny, trained, tmp_path):
     assert warm(tmp_path, *tiny, "seed=1", "hydra.run.dir=run").status == 0
     assert scores(tmp_path / "run") != pytest.approx(scores(trained[0]), abs=1e-6, rel=0)

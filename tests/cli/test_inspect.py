@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import imageio.v3 as iio
-import pytest
 
 
 def test_a_scene_is_described_and_drawn(devrf, tmp_path, tiny):
@@ -33,26 +32,3 @@ def test_problems_are_advice(devrf, tiny):
     assert (outcome.status, outcome.err) == (0, "")
     assert "problems found: 1" in outcome.out
     assert "static training set: no view from a sector of" in outcome.out
-
-
-def test_a_finer_schedule_needs_more_memory(devrf, tiny):
-    def checkpoint(*more: str) -> str:
-        lines = devrf(*tiny, "stage=inspect", *more).out.splitlines()
-        return next(line for line in lines if line.strip().startswith("checkpoint"))
-
-    assert " kB" in checkpoint()
-    assert " MB" in checkpoint("schedule.deformation.sides=[4,64]")
-
-
-@pytest.mark.parametrize(
-    ("argument", "expected"),
-    [
-        ("ckpt=no.ckpt", "ckpt: stage=inspect starts from nothing"),
-        ("data.frames=1", "data.frames"),
-    ],
-)
-def test_a_scene_that_cannot_be_read_is_an_error(devrf, tmp_path, tiny, argument, expected):
-    outcome = devrf(*tiny, "stage=inspect", argument)
-    assert outcome.status == 2
-    assert outcome.err.startswith("devrf: ") and expected in outcome.err
-    assert not list(tmp_path.iterdir())

@@ -48,7 +48,7 @@ def test_where_nothing_moves_the_rest_state_is_judged() -> None:
         ("static.rest_pose_psnr", "objective: static has no 'rest_pose_psnr'"),
     ],
 )
-def test_anything_else_is_a_mistake(key: str, said: str) -> None:
+def test_anything_else_is_an_error(key: str, said: str) -> None:
     with pytest.raises(DevrfError) as caught:
         check_objective(key, ["lpips"])
     assert str(caught.value).startswith(said)

@@ -10,24 +10,10 @@ from pathlib import Path
 import imageio.v3 as iio
 import pytest
 
-FURTHER = {
-    "ms_ssim",
-    "lpips",
-    "psnr_masked",
-    "ssim_masked",
-    "lpips_masked",
-    "depth_error",
-    "flow_error",
-}
-CANONICAL_KEYS = {
-    "psnr",
-    "ssim",
-    "seconds",
-    "iterations",
-    "iterations_per_second",
-    "peak_gpu_gb",
-    "num_rollbacks",
-} | FURTHER
+MASKED = {"psnr_masked", "ssim_masked", "lpips_masked"}
+FURTHER = {"ms_ssim", "lpips", "depth_error", "flow_error"} | MASKED
+TRAINING = {"seconds", "iterations", "iterations_per_second", "peak_gpu_gb", "num_rollbacks"}
+CANONICAL_KEYS = {"psnr", "ssim"} | TRAINING | FURTHER
 DEFORMATION_KEYS = CANONICAL_KEYS | {"rest_pose_psnr", "checkpoint_mb"}
 
 
@@ -35,18 +21,13 @@ def metrics(folder: Path) -> dict:
     return json.loads((folder / "metrics.json").read_text())
 
 
-def test_the_whole_run_succeeds_and_says_nothing_on_stderr(trained):
-    _, outcome = trained
-    assert outcome.status == 0
-    assert outcome.err == ""
-
-
 def test_metrics_have_the_documented_keys(trained):
-    folder, _ = trained
+    folder, outcome = trained
+    assert (outcome.status, outcome.err) == (0, "")
     found = metrics(folder)
-    names = ["scene", "method", "protocol", "static", "dynamic", "canonical", "deformation", "run"]
-    assert list(found) == names
-    assert [found[name] for name in names[:3]] == ["robot", "devrf", "two_stage"]
+    sections = {"static", "canonical", "dynamic", "deformation"}
+    assert set(found) == {"scene", "method", "protocol", "run", *sections}
+    assert (found["scene"], found["method"], found["protocol"]) == ("robot", "devrf", "two_stage")
     # DeVRF's sections have the names of its stages, too.
     assert found["static"] == found["canonical"] and found["dynamic"] == found["deformation"]
     assert set(found["canonical"]) == CANONICAL_KEYS
@@ -111,23 +92,6 @@ def test_fewer_metrics_may_be_asked_for(devrf, tmp_path, tiny, trained):
     assert set(found) == CANONICAL_KEYS - FURTHER | {"psnr_masked"}
 
 
-@pytest.mark.parametrize(
-    ("argument", "expected"),
-    [
-        ("evaluation.metrics=[lpisp]", "evaluation.metrics: no metric 'lpisp'"),
-        ("evaluation.lpips_weights=no.pth", "evaluation.lpips_weights: no file no.pth"),
-        ("protocol=joint", "protocol: method=devrf does not learn by protocol=joint"),
-        ("stage=canonicl", "stage: expected one of pipeline, canonical, deformation, prepare"),
-        ("stage=benchmark", "stage=benchmark: moved; run python benchmarks/training.py instead"),
-    ],
-)
-def test_what_cannot_be_is_told_before_anything_is_made(devrf, tmp_path, tiny, argument, expected):
-    outcome = devrf(*tiny, argument)
-    assert outcome.status == 2
-    assert expected in outcome.err
-    assert not list(tmp_path.iterdir())
-
-
 def test_everything_lies_in_the_run_folder(trained):
     folder, _ = trained
     made = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
@@ -173,42 +137,19 @@ def test_stages_one_by_one_find_the_checkpoints_and_come_to_the_same(
 
 def test_the_canonical_stage_alone_can_be_scored(devrf, tmp_path, tiny):
     for stage in ("canonical", "evaluate"):
-        outcome = devrf(*tiny, f"stage={stage}", "hydra.run.dir=run")
+        outcome = devrf(*tiny, f"stage={stage}", "data.shape=flower", "ablation=c2f")
         assert (outcome.status, outcome.err) == (0, "")
-    found = metrics(tmp_path / "run")
+    found = metrics(tmp_path / "outputs" / "flower" / "default-c2f")
     assert list(found) == ["scene", "method", "protocol", "static", "canonical", "run"]
     assert found["run"]["wall_seconds"]["deformation"] is None
 
 
-def test_a_checkpoint_from_elsewhere_is_taken_as_given(devrf, tmp_path, tiny, trained):
+def test_a_checkpoint_from_elsewhere_is_scored(devrf, tmp_path, tiny, trained):
     checkpoint = trained[0] / "checkpoints" / "deformation.ckpt"
     outcome = devrf(*tiny, "stage=evaluate", f"ckpt={checkpoint}", "hydra.run.dir=scores")
     assert (outcome.status, outcome.err) == (0, "")
     scores, whole = metrics(tmp_path / "scores"), metrics(trained[0])
     assert {**scores, "run": None} == {**whole, "run": None}
-
-
-def test_the_deformation_stage_starts_from_a_checkpoint_elsewhere(devrf, tmp_path, tiny, trained):
-    checkpoint = trained[0] / "checkpoints" / "canonical.ckpt"
-    outcome = devrf(*tiny, "stage=deformation", f"ckpt={checkpoint}", "hydra.run.dir=moved")
-    assert (outcome.status, outcome.err) == (0, "")
-    assert (tmp_path / "moved" / "checkpoints" / "deformation.ckpt").is_file()
-
-
-def test_the_folder_tells_scene_experiment_and_ablation(devrf, tmp_path, tiny):
-    outcome = devrf(
-        *tiny, "stage=canonical", "data.shape=flower", "experiment=quickstart", "ablation=c2f"
-    )
-    assert (outcome.status, outcome.err) == (0, "")
-    assert (tmp_path / "outputs/flower/quickstart-c2f/checkpoints/canonical.ckpt").is_file()
-
-
-def test_a_sweep_runs_every_combination(devrf, tmp_path, tiny):
-    outcome = devrf(
-        "--multirun", *tiny, "stage=canonical", "ablation=base,full", "hydra.sweep.dir=sweep"
-    )
-    assert (outcome.status, outcome.err) == (0, "")
-    assert len(list((tmp_path / "sweep").glob("*/checkpoints/canonical.ckpt"))) == 2
 
 
 def test_a_deformation_of_another_canonical_field_is_not_passed_off_as_its_own(

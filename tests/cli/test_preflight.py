@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import re
 import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -15,6 +16,7 @@ from devrf.cli.preflight import Requirement, check
 from devrf.errors import DevrfError
 
 GIB = 2**30
+linux = pytest.mark.skipif(sys.platform != "linux", reason="memory as Linux limits and counts it")
 NEEDS = re.compile(
     r"needs about ([\d.]+) of [\d.]+ GiB of host memory, ([\d.]+) of [\d.]+ GiB of disk"
 )
@@ -23,8 +25,8 @@ NEEDS = re.compile(
 def need(what: str, needed: float, there: float, least: float | None = None) -> Requirement:
     """A requirement in GiB."""
     parts = {("data.frames", "data.width"): 3, ("data.rays",): 5, ("data.unused",): 0}
-    own = None if least is None else round(least * GIB)
-    return Requirement(what, round(needed * GIB), round(there * GIB), parts, own)
+    least = needed if least is None else least
+    return Requirement(what, *(round(n * GIB) for n in (needed, there)), parts, round(least * GIB))
 
 
 def test_needs_in_one_line() -> None:
@@ -82,7 +84,7 @@ def test_a_full_disk_is_noticed_before_it_begins(devrf, tiny, monkeypatch) -> No
     assert re.search(r" of 9.3e-07 GiB of disk; it would end for lack of disk", outcome.err)
 
 
-def test_little_memory_refuses_what_is_to_be_learned_and_touches_nothing(
+def test_little_memory_refuses_what_is_not_finished_and_changes_nothing(
     devrf, tiny, monkeypatch, tmp_path
 ) -> None:
     command = (*tiny, "stage=canonical", "hydra.run.dir=run")
@@ -98,9 +100,7 @@ def test_little_memory_refuses_what_is_to_be_learned_and_touches_nothing(
     assert not (tmp_path / "run" / "previous-1").exists()
 
 
-def test_a_lack_of_memory_that_nothing_helps_against_is_told_in_a_line(
-    devrf, tiny, monkeypatch
-) -> None:
+def test_running_out_of_memory_is_one_line(devrf, tiny, monkeypatch) -> None:
     def enter(stage: object, phase: object) -> None:
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 3.00 GiB.")
 
@@ -111,7 +111,13 @@ def test_a_lack_of_memory_that_nothing_helps_against_is_told_in_a_line(
     assert "lower schedule.canonical.side or schedule.canonical.rays" in outcome.err
 
 
-# Half of the fields and a small part of a batch fit into what is left of the program.
+def canonical_colors(folder: Path) -> torch.Tensor:
+    content = read_checkpoint_file(folder / "run" / "checkpoints" / "canonical.ckpt")
+    colors: torch.Tensor = content["state_dict"]["scene_model.canonical.color.values"]
+    return colors
+
+
+# Half of the fields and a small part of a batch fit into the memory left to the program.
 LARGE = (
     "schedule.canonical.rays=60000",
     "schedule.canonical.iterations=2",
@@ -121,25 +127,18 @@ LARGE = (
 )
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="limits as Linux knows them")
+@linux
 def test_a_stage_learns_in_parts_where_memory_is_short(warm, tiny, tmp_path) -> None:
-    command = (*tiny, *LARGE)
-    outcome = warm(tmp_path, *command, most_memory=300 * 2**20)
+    outcome = warm(tmp_path, *tiny, *LARGE, most_memory=300 * 2**20)
     assert outcome.status == 0, outcome.out
     assert re.search(r"out of memory \(.*: batches are taken in \d parts from now on", outcome.out)
-    limited = read_checkpoint_file(tmp_path / "run" / "checkpoints" / "canonical.ckpt")[
-        "state_dict"
-    ]
-    outcome = warm(tmp_path / "free", *command)
+    outcome = warm(tmp_path / "free", *tiny, *LARGE)
     assert outcome.status == 0 and "out of memory" not in outcome.out
-    free = read_checkpoint_file(tmp_path / "free" / "run" / "checkpoints" / "canonical.ckpt")[
-        "state_dict"
-    ]
-    name = "scene_model.canonical.color.values"
-    torch.testing.assert_close(limited[name], free[name], rtol=1e-3, atol=1e-4)
+    limited, free = canonical_colors(tmp_path), canonical_colors(tmp_path / "free")
+    torch.testing.assert_close(limited, free, rtol=1e-3, atol=1e-4)
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="limits as Linux knows them")
+@linux
 def test_a_stage_that_not_even_parts_fit_for_ends_saved(warm, tiny, tmp_path) -> None:
     command = (*tiny, *LARGE, "schedule.canonical.rays=400000")
     outcome = warm(tmp_path, *command, most_memory=200 * 2**20)
@@ -178,7 +177,7 @@ SIZES = {
 }
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="peaks as Linux counts them")
+@linux
 @pytest.mark.parametrize("size", SIZES)
 def test_the_estimate_is_near_what_is_taken(warm, tiny, tmp_path, size) -> None:
     command = (
@@ -199,7 +198,7 @@ def test_the_estimate_is_near_what_is_taken(warm, tiny, tmp_path, size) -> None:
         assert found is not None
         path = tmp_path / "run" / "logs" / stage / "metrics.csv"
         with path.open(newline="") as file:
-            rows = [row for row in csv.DictReader(file)]
+            rows = list(csv.DictReader(file))
         column = next(name for name in rows[0] if name.endswith("/peak_host_gb"))
         taken = max(float(row[column]) for row in rows)
         assert 0.7 < float(found.group(1)) / taken < 1.5, (stage, found.group(1), taken)

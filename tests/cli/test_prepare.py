@@ -27,11 +27,3 @@ def test_every_stage_runs_on_it(devrf, tmp_path, exported, short):
     found = json.loads((tmp_path / "outputs" / "robot" / "default" / "metrics.json").read_text())
     assert found["scene"] == "robot"
     assert found["deformation"]["iterations"] == 12
-
-
-def test_preparing_a_scene_needs_a_folder_to_write_to(devrf, tmp_path, tiny):
-    outcome = devrf(*tiny, "stage=prepare")
-    assert outcome.status == 2
-    expected = "data.export: stage=prepare needs a folder; give data.export=PATH"
-    assert outcome.err == f"devrf: {expected}\n"
-    assert not list(tmp_path.iterdir())

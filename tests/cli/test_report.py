@@ -40,13 +40,10 @@ def test_finished_runs_become_a_report_and_nothing_else_is_left(devrf, tmp_path,
     assert all(float(row["deformation.psnr"]) == psnr for row in rows)
 
 
-def test_it_needs_no_scene_from_disk(devrf, finished):
-    assert devrf("stage=report", "report.runs=mine", "data=lego", "data.root=nowhere").status == 0
-
-
-def test_outputs_are_what_is_reported_by_default(devrf, tmp_path, finished):
+def test_outputs_are_reported_by_default_and_no_scene_is_read(devrf, tmp_path, finished):
     finished.rename(tmp_path / "outputs")
-    assert devrf("stage=report").out.endswith("report written to outputs/report/report.md\n")
+    outcome = devrf("stage=report", "data=lego", "data.root=nowhere")
+    assert outcome.out.endswith("report written to outputs/report/report.md\n")
 
 
 def test_a_report_among_the_files_of_a_run_leaves_the_runs_record_alone(devrf, finished):

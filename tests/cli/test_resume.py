@@ -30,21 +30,18 @@ def again(devrf, tiny, run):
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in folder.rglob("*")
-        if path.is_file()
-    }
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
 def test_what_is_finished_is_not_learned_again(again, run):
-    before = {path.name: path.read_bytes() for path in (run / "checkpoints").glob("*.ckpt")}
+    before = contents(run / "checkpoints")
     scores = json.loads((run / "metrics.json").read_text())
     outcome = again()
     assert (outcome.status, outcome.err) == (0, "")
     for stage in ("canonical", "deformation"):
         assert f"{stage}: learned already ({run}/checkpoints/{stage}.ckpt)" in outcome.out
-        assert (run / "checkpoints" / f"{stage}.ckpt").read_bytes() == before[f"{stage}.ckpt"]
+    assert contents(run / "checkpoints") == before
     now = json.loads((run / "metrics.json").read_text())
     assert {**now, "run": None} == {**scores, "run": None}
 
@@ -178,19 +175,10 @@ def test_a_finished_checkpoint_that_is_damaged_is_refused(again, run):
     assert outcome.err.startswith(f"devrf: {path}: damaged: altered since it was written")
 
 
-OFTEN = (
-    "callbacks.saving.every_seconds=0",
-    "callbacks.saving.share=1.0",
-    "canonical.iterations_per_step=1",
-    "deformation.iterations_per_step=1",
-    "trainer.log_every_n_steps=100",
-)
-
-
 @pytest.fixture
-def cut_short(devrf, tiny, tmp_path):
+def cut_short(devrf, tiny, often, tmp_path):
     """A command, and the checkpoints of it, left after iteration 4 of the canonical stage."""
-    command = (*tiny, *OFTEN, "hydra.run.dir=run", "stage=canonical")
+    command = (*tiny, *often, "hydra.run.dir=run", "stage=canonical")
     checkpoints = tmp_path / "run" / "checkpoints"
     assert devrf(*command, "trainer.max_steps=4").status == 0
     left = {path.name for path in checkpoints.glob("*.ckpt")}

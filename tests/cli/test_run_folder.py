@@ -1,10 +1,10 @@
-"""The folder of a run that came to nothing is removed; any other stays."""
+"""The folder of a run that has made nothing is removed; any other stays."""
 
 from __future__ import annotations
 
 import pytest
 
-from devrf.cli.run_folder import nothing_left_of_mistakes
+from devrf.cli.run_folder import removed_on_user_error
 from devrf.errors import DevrfError
 
 
@@ -19,7 +19,7 @@ def folder(tmp_path, monkeypatch):
 
 
 def fail(folder, error, made=None):
-    with pytest.raises(type(error)), nothing_left_of_mistakes(folder):
+    with pytest.raises(type(error)), removed_on_user_error(folder):
         (folder / "run.log").write_text("reading the scene\n")
         if made:
             (folder / made).write_text("made")
@@ -51,17 +51,19 @@ def test_other_runs_stay(folder):
     assert [p.name for p in folder.parent.iterdir()] == ["paper"]
 
 
-def test_what_was_made_stays(folder):
-    fail(folder, DevrfError("loss: wrong"), made="metrics.json")
-    assert (folder / "metrics.json").is_file() and (folder / "run.log").is_file()
+@pytest.mark.parametrize(
+    ("error", "made"),
+    [
+        (DevrfError("loss: wrong"), "metrics.json"),  # a first result
+        (RuntimeError("ours"), None),  # the log of a fault of the program
+    ],
+)
+def test_results_and_faults_leave_the_folder(folder, error, made):
+    fail(folder, error, made)
+    assert (folder / "run.log").is_file() and (made is None or (folder / made).is_file())
 
 
 def test_an_earlier_run_stays(folder):
     (folder / "run.log").write_text("an earlier run\n")
     fail(folder, DevrfError("ckpt: wrong"))
-    assert (folder / "run.log").is_file()
-
-
-def test_a_fault_of_the_program_leaves_its_log(folder):
-    fail(folder, RuntimeError("ours"))
     assert (folder / "run.log").is_file()

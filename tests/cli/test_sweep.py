@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import os
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,9 +12,7 @@ import pytest
 import yaml
 from hydra.core.config_store import ConfigStore
 
-import devrf as package
 from devrf.cli.context import RunContext
-from devrf.cli.steps import STEPS
 
 LEARN = ("stage=canonical", "hydra.sweep.dir=sweep")
 SEARCH = ("hparams_search=loss_weights", "hydra.sweeper.n_trials=2")
@@ -36,7 +31,11 @@ def failure(folder: Path) -> dict[str, Any]:
 @pytest.fixture
 def steps(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[RunContext], None]], None]:
     """Replaces what stage=canonical does."""
-    return lambda step: monkeypatch.setitem(STEPS, "canonical", (step,))
+
+    def replace(step: Callable[[RunContext], None]) -> None:
+        monkeypatch.setattr("devrf.cli.steps.learn", lambda run, name: step(run))
+
+    return replace
 
 
 def test_a_mistake_in_one_job_is_recorded_and_the_others_go_on(devrf, tmp_path, tiny):
@@ -134,22 +133,12 @@ def test_a_slurm_job_has_a_gpu(devrf, tiny):
 
 
 @installed("hydra_joblib_launcher")
-def test_jobs_in_processes_of_their_own(tmp_path, tiny):
-    source = str(Path(package.__file__).parents[1])
-    path = os.pathsep.join(filter(None, [source, os.environ.get("PYTHONPATH")]))
+def test_jobs_in_processes_of_their_own(python, tmp_path, tiny):
     joblib = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "data.frames=3,1")
-    done = subprocess.run(
-        [sys.executable, "-m", "devrf", "-m", *tiny, *LEARN, *joblib],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        timeout=180,
-        check=False,
-    )
-    assert done.returncode == 3
-    assert "devrf: job 1_robot: data.frames: must be at least 2, not 1\n" in done.stderr
-    assert "1 of 2 jobs failed: 1_robot" in done.stderr and "Traceback" not in done.stderr
+    done = python(tmp_path, "-m", "devrf", "-m", *tiny, *LEARN, *joblib)
+    assert done.status == 3
+    assert "devrf: job 1_robot: data.frames: must be at least 2, not 1\n" in done.err
+    assert "1 of 2 jobs failed: 1_robot" in done.err and "Traceback" not in done.err
     assert (tmp_path / "sweep" / "0_robot" / "checkpoints" / "canonical.ckpt").is_file()
     assert failure(tmp_path / "sweep" / "1_robot")["mistake"] is True
 

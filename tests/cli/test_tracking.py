@@ -6,18 +6,13 @@ import csv
 import json
 import os
 import socket
-import subprocess
-import sys
 import threading
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
-
-import devrf as package
 
 BLOCK, HEADER = 32768, 7
 
@@ -91,8 +86,7 @@ def caller() -> Iterator[tuple[str, list[bytes]]]:
         yield f"http://127.0.0.1:{server.getsockname()[1]}", sent
 
 
-@dataclass(frozen=True)
-class Watched:
+class Watched(NamedTuple):
     """A run with logger=wandb, scored again by a later command."""
 
     folder: Path
@@ -102,33 +96,21 @@ class Watched:
 
 @pytest.fixture(scope="module")
 def watched(
-    tmp_path_factory: pytest.TempPathFactory, tiny: tuple[str, ...], caller: Any
+    python: Any, tmp_path_factory: pytest.TempPathFactory, tiny: tuple[str, ...], caller: Any
 ) -> Watched:
     pytest.importorskip("wandb")
     folder = tmp_path_factory.mktemp("watched")
     address, sent = caller
-    source = str(Path(package.__file__).parents[1])
     proxies = ("HTTP_PROXY", "HTTPS_PROXY", "http_proxy", "https_proxy")
-    environment = {k: v for k, v in os.environ.items() if not k.startswith("WANDB_")} | {
-        "PYTHONPATH": os.pathsep.join(filter(None, [source, os.environ.get("PYTHONPATH")])),
-        "OMP_NUM_THREADS": "1",
-        "WANDB_BASE_URL": address,
-        "NO_PROXY": "",
-        "no_proxy": "",
-        **dict.fromkeys(proxies, address),
-    }
+    variables = {"WANDB_BASE_URL": address, "NO_PROXY": "", "no_proxy": ""}
     options = ("logger=wandb", "hydra.run.dir=run", "callbacks.previews.times=3")
-    for stage in ("pipeline", "evaluate"):
-        done = subprocess.run(
-            [sys.executable, "-m", "devrf", *tiny, *options, f"stage={stage}"],
-            cwd=folder,
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=180,
-            check=False,
-        )
-        assert done.returncode == 0, done.stderr
+    with pytest.MonkeyPatch.context() as patch:
+        for name in [name for name in os.environ if name.startswith("WANDB_")]:
+            patch.delenv(name)
+        for stage in ("pipeline", "evaluate"):
+            command = ("-m", "devrf", *tiny, *options, f"stage={stage}")
+            done = python(folder, *command, **variables, **dict.fromkeys(proxies, address))
+            assert done.status == 0, done.err
     return Watched(folder / "run", offline_runs(folder / "run"), sent)
 
 
@@ -224,8 +206,7 @@ def test_tensorboard_holds_both_stages_and_the_scores(devrf, tmp_path, tiny):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     def read() -> EventAccumulator:
-        events = EventAccumulator(str(tmp_path / "run" / "tensorboard"))
-        return events.Reload()
+        return EventAccumulator(str(tmp_path / "run" / "tensorboard")).Reload()
 
     common = (*tiny, "logger=tensorboard", "hydra.run.dir=run", "callbacks.previews.times=2")
     assert devrf(*common).status == 0

@@ -6,16 +6,11 @@ import csv
 import json
 import multiprocessing
 import os
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
-import devrf as package
-
 TWO = ("trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2")
-# A scene and schedules that come to about 18 dB in seconds, with little noise.
+# A scene and schedules that reach about 18 dB in seconds, with little noise.
 MEANINGFUL = (
     "data.width=32",
     "data.height=32",
@@ -47,7 +42,7 @@ from devrf.errors import DevrfError
 
 
 class Witness(Callback):
-    """Writes down what a process has come to, and what it draws with."""
+    """Records fields, metrics and seed of a process."""
 
     def __init__(self, folder: str) -> None:
         self.folder = Path(folder)
@@ -94,10 +89,9 @@ def modules(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def pair(tmp_path_factory, modules):
+def pair(python, tmp_path_factory, modules):
     """The folder of a run in two processes, and the command's outcome."""
     folder = tmp_path_factory.mktemp("pair")
-    path = [str(modules), str(Path(package.__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
     arguments = (
         *MEANINGFUL,
         *TWO,
@@ -105,15 +99,9 @@ def pair(tmp_path_factory, modules):
         "+callbacks.witness._target_=witnesses.Witness",
         f"+callbacks.witness.folder={folder}",
     )
-    done = subprocess.run(
-        [sys.executable, "-m", "devrf", *arguments],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(path)},
-        timeout=300,
-        check=False,
-    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(modules), prepend=os.pathsep)
+        done = python(folder, "-m", "devrf", *arguments)
     return folder, done
 
 
@@ -126,8 +114,8 @@ def arguments(tiny, modules, monkeypatch):
 
 def test_it_ends_well_and_one_process_speaks(pair):
     _, done = pair
-    assert (done.returncode, done.stderr) == (0, "")
-    said = done.stdout.splitlines()
+    assert (done.status, done.err) == (0, "")
+    said = done.out.splitlines()
     assert len([line for line in said if line.startswith("canonical: seconds")]) == 1
     assert len(said) == len(set(said))
 
@@ -150,10 +138,8 @@ def test_both_processes_come_to_the_same_by_rays_of_their_own(pair, capture):
 def test_the_result_is_that_of_one_process_with_as_many_rays(pair, devrf, tmp_path):
     outcome = devrf(*MEANINGFUL, "trainer=cpu", "hydra.run.dir=one")
     assert outcome.status == 0
-    one, two = (
-        json.loads(path.read_text())
-        for path in (tmp_path / "one" / "metrics.json", pair[0] / "run" / "metrics.json")
-    )
+    folders = (tmp_path / "one", pair[0] / "run")
+    one, two = (json.loads((folder / "metrics.json").read_text()) for folder in folders)
     for stage in ("canonical", "deformation"):
         assert two[stage]["iterations"] == one[stage]["iterations"]
         assert two[stage]["psnr"] == pytest.approx(one[stage]["psnr"], abs=0.3)
@@ -181,16 +167,13 @@ def trip(rank: int, how: str) -> list[str]:
     [
         (0, "mistake", "data.root: gone"),
         (1, "mistake", "data.root: gone"),
-        (
-            1,
-            "killed",
-            "trainer.devices: the process of rank 1 was ended by signal 9; was memory short?",
-        ),
+        (1, "killed", "trainer.devices: the process of rank 1 was ended by signal 9; was"),
     ],
 )
 def test_a_failure_of_one_process_ends_both_with_its_line(devrf, arguments, rank, how, line):
     outcome = devrf(*arguments, *trip(rank, how))
-    assert (outcome.status, outcome.err) == (2, f"devrf: {line}\n")
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert outcome.err.startswith(f"devrf: {line}")
     assert not multiprocessing.active_children()
     assert not {"LOCAL_RANK", "MASTER_PORT"} & set(os.environ)
 
@@ -209,14 +192,8 @@ def test_fields_that_stray_are_not_passed_off_as_the_result(devrf, tmp_path, arg
     assert not (tmp_path / "run" / "checkpoints").exists()
 
 
-def test_both_processes_go_on_where_they_were_left(devrf, tmp_path, arguments):
-    command = (
-        *arguments,
-        "hydra.run.dir=run",
-        "canonical.iterations_per_step=2",
-        "callbacks.saving.every_seconds=0",
-        "callbacks.saving.share=1.0",
-    )
+def test_both_processes_go_on_where_they_were_left(devrf, often, tmp_path, arguments):
+    command = (*arguments, *often, "hydra.run.dir=run")
     checkpoints = tmp_path / "run" / "checkpoints"
     assert devrf(*command, "trainer.max_steps=4").status == 0
     assert (checkpoints / "canonical-progress-4.ckpt").is_file()

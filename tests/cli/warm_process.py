@@ -2,7 +2,7 @@
 
 A script, not a test: it loads the program once, without using it, and then forks for each
 command. It reads a JSON object a line and answers with the command's exit status, negative for
-the signal that ended it:
+the signal that ended it. The keys, all but the first two optional:
 
 * ``folder``, ``arguments``: where to run what. What the command says is added to ``said.txt``,
   and how many steps and file operations it took is in ``counts.json`` if it got to its end.
@@ -48,17 +48,17 @@ class Fuse:
     def tick(self, kind: str) -> bool:
         """Count; say whether this is the moment."""
         self.counts[kind] += 1
-        return [kind, self.counts[kind]] == self._asked["after"]
+        return [kind, self.counts[kind]] == self._asked.get("after")
 
     def burn(self) -> None:
         """Send the signals: now, or from another thread a little later."""
-        if self._asked["delay"]:
+        if self._asked.get("delay"):
             threading.Thread(target=self._send).start()
         else:
             self._send()
 
     def _send(self) -> None:
-        time.sleep(self._asked["delay"])
+        time.sleep(self._asked.get("delay", 0))
         for number in self._asked["signals"]:
             os.kill(os.getpid(), number)
 
@@ -93,9 +93,9 @@ def run(asked: dict[str, Any]) -> int:
     with open("said.txt", "a") as said:
         os.dup2(said.fileno(), 1)
         os.dup2(said.fileno(), 2)
-    if asked["most_bytes"]:
+    if "most_bytes" in asked:
         resource.setrlimit(resource.RLIMIT_FSIZE, (asked["most_bytes"],) * 2)
-    if asked["most_memory"]:
+    if "most_memory" in asked:
         taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (taken + asked["most_memory"],) * 2)
     fuse = Fuse(asked)

@@ -40,15 +40,7 @@ TINY = [
     "deformation.iterations_per_step=1",
     "trainer=cpu",
 ]
-OF_KIND = {
-    "inward": [],
-    "forward": [
-        "field=forward",
-        "loss=forward",
-        "field.planes=8",
-        "schedule.canonical.carve=false",
-    ],
-}
+FORWARD = ["field=forward", "loss=forward", "field.planes=8", "schedule.canonical.carve=false"]
 # The embedded scenes in sizes that take no time.
 EMBEDDED = {
     "procedural": ["data.static_views=8", "data.static_test_views=2"],
@@ -89,26 +81,15 @@ def write_nerfstudio(scene: Scene, root: Path) -> None:
                 "transform_matrix": [*pose, [0, 0, 0, 1]],
             }
         )
-    cameras = scene.static.train.cameras
-    (root / "transforms.json").write_text(
-        json.dumps(
-            {
-                "camera_model": "OPENCV",
-                "fl_x": float(cameras.focal[0, 0]),
-                "fl_y": float(cameras.focal[0, 1]),
-                "cx": float(cameras.center[0, 0]),
-                "cy": float(cameras.center[0, 1]),
-                "w": cameras.width,
-                "h": cameras.height,
-                "frames": frames,
-                "test_filenames": [
-                    f["file_path"]
-                    for f in frames
-                    if "rest" in f["file_path"] or "held" in f["file_path"]
-                ],
-            }
-        )
-    )
+    cameras, paths = scene.static.train.cameras, [frame["file_path"] for frame in frames]
+    (fl_x, fl_y), (cx, cy) = cameras.focal[0].tolist(), cameras.center[0].tolist()
+    content = {
+        "camera_model": "OPENCV",
+        **{"fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy},
+        **{"w": cameras.width, "h": cameras.height, "frames": frames},
+        "test_filenames": [path for path in paths if "rest" in path or "held" in path],
+    }
+    (root / "transforms.json").write_text(json.dumps(content))
 
 
 def write_nerfies(scene: Scene, root: Path) -> None:
@@ -121,29 +102,22 @@ def write_nerfies(scene: Scene, root: Path) -> None:
         iio.imwrite(root / f"rgb/4x/{name}.png", views.pixels[i].numpy())
         metadata[name] = {"warp_id": round(float(views.times[i]) * 2), "appearance_id": 0}
         pose, focal = views.cameras.camera_to_world[i], views.cameras.focal[i] * 4
-        (root / f"camera/{name}.json").write_text(
-            json.dumps(
-                {
-                    "orientation": (pose[:, :3] * torch.tensor([1.0, -1.0, -1.0])).T.tolist(),
-                    "position": pose[:, 3].tolist(),
-                    "focal_length": float(focal[0]),
-                    "principal_point": (views.cameras.center[i] * 4).tolist(),
-                    "image_size": [views.width * 4, views.height * 4],
-                    "skew": 0.0,
-                    "pixel_aspect_ratio": float(focal[1] / focal[0]),
-                    "radial_distortion": [0.0] * 3,
-                    "tangential_distortion": [0.0] * 2,
-                }
-            )
-        )
+        camera = {
+            "orientation": (pose[:, :3] * torch.tensor([1.0, -1.0, -1.0])).T.tolist(),
+            "position": pose[:, 3].tolist(),
+            "focal_length": float(focal[0]),
+            "principal_point": (views.cameras.center[i] * 4).tolist(),
+            "image_size": [views.width * 4, views.height * 4],
+            "skew": 0.0,
+            "pixel_aspect_ratio": float(focal[1] / focal[0]),
+            "radial_distortion": [0.0] * 3,
+            "tangential_distortion": [0.0] * 2,
+        }
+        (root / f"camera/{name}.json").write_text(json.dumps(camera))
     val = [name for name in ids if name.startswith(("rest", "held"))]
     train = [name for name in ids if name not in val]
-    world = {
-        "center": [0, 0, 0],
-        "scale": 1,
-        "near": scene.bounds.near,
-        "far": scene.bounds.far,
-    }
+    bounds = {"near": scene.bounds.near, "far": scene.bounds.far}
+    world = {"center": [0, 0, 0], "scale": 1, **bounds}
     for file, content in (
         ("dataset", {"count": len(ids), "ids": ids, "train_ids": train, "val_ids": val}),
         ("metadata", metadata),
@@ -168,7 +142,6 @@ def scene_config(
     """The whole config of ``data=<name>`` with a tiny scene and tiny fields."""
     choice = [f"data={name}"]
     target = composed(*choice).data["_target_"]
-    kind = "forward" if "Forward" in target else "inward"
     if name in EMBEDDED:
         choice += [
             *EMBEDDED[name],
@@ -181,7 +154,7 @@ def scene_config(
     else:
         write_scene(target, tmp_path / "scene", inward, forward)
         choice.append(f"data.root={tmp_path}/scene")
-    return composed(*choice, *OF_KIND[kind], *TINY)
+    return composed(*choice, *(FORWARD if "Forward" in target else ()), *TINY)
 
 
 @pytest.mark.parametrize("name", FILES)

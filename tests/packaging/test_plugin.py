@@ -69,14 +69,11 @@ def application(tmp_path: Path):
     return run
 
 
-def test_groups_and_resolvers_are_there(application):
+def test_groups_resolvers_and_choices_are_there(application):
     config = application()
     assert config["scene"]["_target_"] == "devrf.data.procedural.ProceduralDataModule"
     assert config["schedule"]["canonical"]["side"] == 160
     assert (config["run"], config["label"]) == ("theirs-base", "robot")
-
-
-def test_options_are_chosen_on_its_command_line(application):
     config = application("data@scene=inward", "scene.root=/scenes/suzanne", "schedule=quick")
     assert config["scene"]["_target_"] == "devrf.data.inward.InwardFacingDataModule"
     assert config["label"] == "suzanne"

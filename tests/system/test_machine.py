@@ -1,4 +1,4 @@
-"""What is left on a machine: told by the system, by control groups, by the disk."""
+"""Free memory by the system and its control groups, and free disk space."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Training curves as a CSV table that a run, however often interrupted, goes on with."""
+"""Training curves as a CSV table that a resumed run continues."""
 
 from __future__ import annotations
 
@@ -21,44 +21,34 @@ log = logging.getLogger(__name__)
 class ResumableCSVLogger(CSVLogger):
     """Writes a row of ``<save_dir>/<name>/<version>/metrics.csv`` for every step, at once.
 
-    A table that is there already is continued, where Lightning's logger would delete it:
-    :meth:`go_on` says from where. Where the disk is full the rows wait in memory, and are written
-    when there is room.
+    An existing table is continued, where Lightning's logger would delete it. On a full disk the
+    rows wait in memory until there is room.
 
     Attributes:
         path: the table.
     """
 
     def __init__(self, save_dir: str | Path, name: str = "logs", version: str = "run") -> None:
-        """Read the table that is there, if any; a last line that was cut off is no row.
-
-        Args:
-            save_dir: the run's folder.
-            name: a folder in it.
-            version: a folder in that.
-        """
+        """Read the table if there is one, without a last line that was cut off."""
         super().__init__(save_dir, name, version)
         self.path = Path(self.log_dir) / "metrics.csv"
         text = self.path.read_text() if self.path.is_file() else ""
         reader = csv.DictReader(io.StringIO(text[: text.rfind("\n") + 1]))
         self._columns = list(reader.fieldnames or [])
         self._rows = [{key: cell for key, cell in row.items() if cell} for row in reader]
-        # Rows of the file; None where they or the columns are not as they should be.
+        # Rows in the file; None: it has to be written anew.
         self._written: int | None = None
         self._failing = False
 
     @property
     @rank_zero_experiment
     def experiment(self) -> ResumableCSVLogger:
-        """The logger itself: there is nothing behind it."""
+        """The logger itself."""
         return self
 
     @rank_zero_only
-    def go_on(self, capture: str, iteration: int) -> None:
-        """Forget the rows of ``capture`` (``static``, ``dynamic``) beyond ``iteration``.
-
-        They were written after what the run goes on from, and will be written again.
-        """
+    def drop_rows_beyond(self, capture: str, iteration: int) -> None:
+        """Drop the rows of ``capture`` beyond ``iteration``: a resumed run writes them again."""
         kept = [
             row
             for row in self._rows
@@ -71,7 +61,7 @@ class ResumableCSVLogger(CSVLogger):
 
     @rank_zero_only
     def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None:  # type: ignore[override]
-        """Add a row: what was measured at ``step``."""
+        """Add the row of ``step``."""
         row = {key: repr(float(value)) for key, value in metrics.items()}
         if step is not None:
             row["step"] = str(step)
@@ -82,7 +72,7 @@ class ResumableCSVLogger(CSVLogger):
 
     @rank_zero_only
     def log_hyperparams(self, params: dict[str, Any] | Namespace | None = None) -> None:
-        """Nothing: the composed config lies in the run's folder."""
+        """Do nothing: Hydra has written the config."""
 
     @rank_zero_only
     def save(self) -> None:

@@ -1,4 +1,4 @@
-"""Whether learning goes well, and what to go back to when it does not."""
+"""What counts as divergence, and the state that a rollback returns to."""
 
 from __future__ import annotations
 
@@ -13,19 +13,18 @@ from torch import Tensor
 from devrf.engine.phase import Phase
 from devrf.engine.stage import ScheduledStage
 
-# Where less than this should be seen, nothing is said of what is.
+# An expected opacity (or transparency) below this is too small to judge by.
 FAINT = 0.02
-# As much of the matter that should be seen has been there before; as little is as good as none.
+# Shares of the expected opacity: seen before, and as good as gone.
 THERE, GONE = 0.1, 0.01
-# The same of the light that should pass. Much of it passes beside the field, whatever happens.
+# Shares of the expected transparency. Much light passes beside the field whatever happens.
 CLEAR, BLOCKED = 0.8, 0.5
-# Frames that a frame is compared with, and how many it takes.
+# Frames that a frame is compared with, and the fewest that allow a comparison.
 NEIGHBOURS, FEWEST = 10, 4
-# Deviations (of a normal distribution) that a frame may be off, and the least that counts as one:
-# losses of frames differ by a quarter for no reason.
+# Standard deviations of log loss that a frame may be off, and the least that counts as one: losses
+# of frames differ by a quarter without a cause.
 DEVIATIONS, SPREAD = 5.0, 0.25
-# Motion that grows from frame to frame raises the loss little by little; what is wrong with a
-# frame raises it at once, by this factor of the frame before.
+# Growing motion raises the loss gradually; a faulty frame raises it at once, by this factor.
 JUMP = 2.0
 
 
@@ -36,7 +35,7 @@ class Snapshot:
     Attributes:
         phase: the phase.
         iteration: the iteration.
-        values: copies of what the optimiser holds, in its order, on the same device.
+        values: copies of the optimiser's parameters, in its order, on the same device.
     """
 
     phase: Phase
@@ -47,31 +46,29 @@ class Snapshot:
     def of(stage: ScheduledStage) -> Snapshot:
         """The present state of a stage that has entered a phase."""
         assert stage.phase is not None
-        values = tuple(value.detach().clone() for value in trained(stage))
+        values = tuple(value.detach().clone() for value in _trained(stage))
         return Snapshot(stage.phase, stage.iteration, values)
 
     @torch.no_grad()
-    def put_back(self, stage: ScheduledStage, lr_scale: float) -> None:
-        """Let the stage go on from here, more cautiously."""
-        for value, kept in zip(trained(stage), self.values, strict=True):
+    def restore(self, stage: ScheduledStage, lr_scale: float) -> None:
+        """Roll the stage back to this state, with learning rates multiplied by ``lr_scale``."""
+        for value, kept in zip(_trained(stage), self.values, strict=True):
             value.copy_(kept)
         stage.rollback(self.iteration, lr_scale)
 
 
-def trained(stage: ScheduledStage) -> list[Tensor]:
-    """What the stage's optimiser holds."""
+def _trained(stage: ScheduledStage) -> list[Tensor]:
     return [value for group in stage.optimizer.param_groups for value in group["params"]]
 
 
 @torch.no_grad()
 def read(stage: ScheduledStage, steps: Sequence[Mapping[str, Tensor]]) -> list[dict[str, float]]:
-    """The values of steps, and behind them one row of what is trained, by name.
+    """The values of steps, then one row with the sum of each parameter group, by name.
 
-    The one place where the device is waited for. Of what is trained it is the sum that is
-    read: not finite if any value is not.
+    A sum is not finite if any value is not. This is the one place that waits for the device.
 
     Args:
-        stage: gives what is trained.
+        stage: gives the parameter groups.
         steps: means of each step by name, () each.
     """
     fields: dict[str, Tensor] = {}
@@ -90,22 +87,22 @@ def not_finite(values: Mapping[str, float]) -> str | None:
 
 
 def emptied(seen: float, most: float, expected: float) -> bool:
-    """Whether matter that should be seen was there and is gone; all are shares of the rays.
+    """Whether what should be seen was there and is gone.
 
     Args:
         seen: the mean opacity of rays.
-        most: the highest that it was before.
+        most: the highest mean opacity so far.
         expected: what it should be.
     """
     return expected > FAINT and most > THERE * expected and seen < GONE * expected
 
 
 def filled(seen: float, least: float, expected: float) -> bool:
-    """Whether light that should pass did so, and does no more; all are shares of the rays.
+    """Whether light that should pass did so, and no longer does.
 
     Args:
         seen: the mean opacity of rays.
-        least: the lowest that it was before.
+        least: the lowest mean opacity so far.
         expected: what it should be.
     """
     clear = 1 - expected
@@ -113,10 +110,10 @@ def filled(seen: float, least: float, expected: float) -> bool:
 
 
 def stands_out(loss: float, others: Sequence[float]) -> float | None:
-    """By what factor a frame's loss exceeds its neighbours', if that is beyond their range.
+    """By what factor a frame's loss exceeds its neighbours', if it is an outlier.
 
-    Their range is told by median and median absolute deviation of logarithms, which a few that
-    are off themselves do not move.
+    The range is the median and the median absolute deviation of log losses, which a few outliers
+    do not move.
 
     Args:
         loss: of the frame, above 0.

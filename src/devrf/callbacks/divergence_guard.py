@@ -1,8 +1,10 @@
-"""Notices when learning goes wrong, goes back once, then ends the stage."""
+"""Notices divergence, rolls back once, then ends the stage."""
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
+from statistics import mean
 from typing import Any
 
 from lightning import Callback, LightningModule, Trainer
@@ -24,31 +26,30 @@ from devrf.errors import DevrfError
 log = logging.getLogger(__name__)
 
 BACKGROUND = "is data.background that of the images, data.box around what they show?"
-# Iterations between copies of what is trained, in a phase without end.
-COPIED_EVERY = 1000
-# Fewer iterations than these say nothing of what is seen.
+# Iterations between snapshots in a long phase.
+SNAPSHOT_EVERY = 1000
+# The fewest iterations between checks that allow a judgement of opacity.
 TELLING = 20
 
 
 class DivergenceGuard(Callback):
-    """Looks every so often whether losses and fields are finite and anything is to be seen.
+    """Checks every so often that losses and fields are finite and that something can be seen.
 
-    Where they are not, what is trained is put back as it was when it was last well (at the
-    latest when the phase began: for the deformation, when the frame was), and the stage goes on
-    from there with lower learning rates and other pixels. If that happens again the stage
-    ends, as it last was well. Of a frame whose loss stands out from its neighbours' it only
-    tells. Frames that are visited together are looked at together, by their mean loss.
+    If not, the stage returns to its last good snapshot (at the latest of the phase's start; for
+    the deformation, of the frame's) and goes on with lower learning rates and other pixels. The
+    second time the stage ends in that state. A frame whose loss is an outlier is only logged.
+    Parallel frames are judged by their mean loss.
 
-    Between looks nothing is read from the device.
+    Nothing is read from the device between checks.
     """
 
     def __init__(self, every_iterations: int = 100, rate_factor: float = 0.5) -> None:
-        """Say how often to look, and how to go on.
+        """Say how often to check, and how to go on.
 
         Args:
-            every_iterations: between looks; one is also taken where a phase ends and before a
+            every_iterations: between checks; there is also one where a phase ends and before a
                 progress file is written.
-            rate_factor: what learning rates are multiplied by from a back-off on.
+            rate_factor: what learning rates are multiplied by after a rollback.
         """
         if every_iterations < 1 or not 0 < rate_factor <= 1:
             raise DevrfError(
@@ -57,9 +58,9 @@ class DivergenceGuard(Callback):
             )
         self.every_iterations = every_iterations
         self.rate_factor = rate_factor
-        self._forget()
+        self._reset()
 
-    def _forget(self) -> None:
+    def _reset(self) -> None:
         self._steps: list[tuple[int, dict[str, Tensor]]] = []
         self._good: Snapshot | None = None
         self._checked = 0
@@ -69,11 +70,11 @@ class DivergenceGuard(Callback):
         self._told = False
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Begin with another stage."""
-        self._forget()
+        """Forget the stage before."""
+        self._reset()
 
     def state_dict(self) -> dict[str, Any]:
-        """What was seen so far, to compare with."""
+        """What later checks compare with."""
         return {
             "kind": self._kind,
             "range": list(self._range),
@@ -94,13 +95,12 @@ class DivergenceGuard(Callback):
     def on_train_batch_start(
         self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int
     ) -> None:
-        """Keep what is trained where a phase begins."""
+        """Take a snapshot where a phase begins."""
         assert isinstance(pl_module, ScheduledStage)
         phase = pl_module.phase
         if phase is None or (self._good is not None and self._good.phase == phase):
             return
-        self._good = None  # gone before the next is made
-        self._good = Snapshot.of(pl_module)
+        self._snapshot(pl_module)
         if phase.kind != self._kind:
             self._kind = phase.kind
             if phase.frames:
@@ -111,20 +111,17 @@ class DivergenceGuard(Callback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Note what the step came to; look, when it is time."""
+        """Keep the step's losses; check, if it is due."""
         assert isinstance(pl_module, ScheduledStage) and pl_module.phase is not None
-        if outputs:
-            self._steps.append((pl_module.iteration, outputs))
         done = pl_module.iteration
+        if outputs:
+            self._steps.append((done, outputs))
         ends = done >= min(pl_module.phase.stop, pl_module.total_iterations)
         if ends or done - self._checked >= self.every_iterations:
             self.check(pl_module)
 
     def check(self, stage: ScheduledStage) -> None:
-        """See whether all is well; go back if not, or give up.
-
-        Nothing is done where nothing was learned since the last look.
-        """
+        """Roll the stage back, or end it, if it has diverged since the last check."""
         if not self._steps:
             return
         *steps, fields = read(stage, [means for _, means in self._steps])
@@ -132,95 +129,89 @@ class DivergenceGuard(Callback):
         since, self._checked = stage.iteration - self._checked, stage.iteration
         self._steps = []
         wrong = self._not_finite(stage, iterations, steps, fields)
-        if wrong is None:
-            wrong = self._collapsed(stage, steps, since)
+        wrong = wrong or self._collapsed(stage, steps, since)
         if wrong is not None:
             self._rollback(stage, wrong)
             return
         assert self._good is not None and stage.phase is not None
         if stage.iteration >= stage.phase.stop:
-            # What holds the motion together differs widely from frame to frame.
-            self._compare(stage, steps[-1].get("render", steps[-1]["loss"]))
-        elif stage.iteration - self._good.iteration >= COPIED_EVERY:
-            self._good = None
-            self._good = Snapshot.of(stage)
+            if stage.phase.frames:
+                # Regularisers differ widely from frame to frame; the rendering loss does not.
+                self._compare(stage, steps[-1].get("render", steps[-1]["loss"]))
+        elif stage.iteration - self._good.iteration >= SNAPSHOT_EVERY:
+            self._snapshot(stage)
+
+    def _snapshot(self, stage: ScheduledStage) -> None:
+        self._good = None  # its memory is free before the next takes as much
+        self._good = Snapshot.of(stage)
 
     def _not_finite(
         self,
         stage: ScheduledStage,
-        iterations: list[int],
-        steps: list[dict[str, float]],
+        iterations: Sequence[int],
+        steps: Sequence[dict[str, float]],
         fields: dict[str, float],
     ) -> str | None:
         """What is not finite, and where that was first seen, in words."""
         for iteration, means in zip(iterations, steps, strict=True):
-            name = not_finite(means)
-            if name is not None:
+            if name := not_finite(means):
                 kind = "the loss" if name == "loss" else f"the loss term {name}"
                 return f"{kind} is {means[name]} by {stage.describe(iteration)}"
-        name = not_finite(fields)
-        return (
-            None
-            if name is None
-            else (f"values of {name} are not finite by {stage.describe(stage.iteration)}")
-        )
-
-    def _collapsed(
-        self, stage: ScheduledStage, steps: list[dict[str, float]], since: int
-    ) -> str | None:
-        """In words, that nothing is seen any more where something should be, or matter alone."""
-        late = steps[len(steps) // 2 :]  # what went wrong since the last look is seen at this one
-        seen = sum(means["opacity"] for means in late) / len(late)
-        mattes = "coverage" in late[0]
-        covered = sum(means["coverage"] for means in late) / len(late) if mattes else None
-        least, most = self._range
-        where = stage.describe(stage.iteration)
-        if since >= TELLING:
-            self._range = [min(least, seen), max(most, seen)]
-            # Without mattes a scene may fill every picture, and what moves may leave it.
-            if covered is not None and filled(seen, least, covered):
-                return f"everything has become opaque by {where} ({BACKGROUND})"
-            if emptied(seen, most, most if covered is None else covered):
-                words = f"everything has become empty by {where} ({BACKGROUND})"
-                if covered is not None or stage.name == "canonical":
-                    return words
-                self._tell(stage, words)
-        if stage.iteration >= stage.total_iterations and seen < GONE * (covered or THERE):
-            self._tell(stage, f"nothing is to be seen at the end ({BACKGROUND})")
+        if name := not_finite(fields):
+            return f"values of {name} are not finite by {stage.describe(stage.iteration)}"
         return None
 
-    def _tell(self, stage: ScheduledStage, words: str) -> None:
-        """Say something once in a stage."""
+    def _collapsed(
+        self, stage: ScheduledStage, steps: Sequence[dict[str, float]], since: int
+    ) -> str | None:
+        """In words, that everything has become empty or opaque."""
+        late = steps[len(steps) // 2 :]
+        seen = mean(means["opacity"] for means in late)
+        # Only alpha masks say what should be seen.
+        covered = mean(means["coverage"] for means in late) if "coverage" in late[0] else None
+        least, most = self._range
+        where = f"{stage.describe(stage.iteration)} ({BACKGROUND})"
+        if since >= TELLING:
+            self._range = [min(least, seen), max(most, seen)]
+            if covered is not None and filled(seen, least, covered):
+                return f"everything has become opaque by {where}"
+            if emptied(seen, most, most if covered is None else covered):
+                words = f"everything has become empty by {where}"
+                if covered is not None or stage.name == "canonical":
+                    return words
+                self._warn_once(stage, words)  # what moves may have left the picture
+        if stage.iteration >= stage.total_iterations and seen < GONE * (covered or THERE):
+            self._warn_once(stage, f"nothing is to be seen at the end ({BACKGROUND})")
+        return None
+
+    def _warn_once(self, stage: ScheduledStage, words: str) -> None:
         if not self._told:
             log.warning("%s: %s", stage.name, words)
         self._told = True
 
     def _rollback(self, stage: ScheduledStage, wrong: str) -> None:
-        """Put back what was well; the second time, end there."""
+        """Restore the last good state; the second time, end there."""
         assert self._good is not None
-        again = stage.num_rollbacks > 0
-        cautious = stage.lr_scale
-        self._good.put_back(stage, self.rate_factor)
+        again, scale = stage.num_rollbacks > 0, stage.lr_scale
+        self._good.restore(stage, self.rate_factor)
         self._checked = stage.iteration
-        if not again:
-            log.warning(
-                "%s: %s: back to iteration %d, learning rates at %g of the schedule's",
-                stage.name,
-                wrong,
-                stage.iteration,
-                stage.lr_scale,
+        if again:
+            stage.abort(
+                f"{wrong}, again after learning rates were cut to {scale:g}; what it was at "
+                f"iteration {stage.iteration} is kept; lower {stage.rate_keys}, and begin afresh "
+                "with resume=false"
             )
             return
-        stage.abort(
-            f"{wrong}, again after learning rates were cut to {cautious:g}; what it was at "
-            f"iteration {stage.iteration} is kept; lower {stage.rate_keys}, and begin afresh "
-            "with resume=false"
+        log.warning(
+            "%s: %s: back to iteration %d, learning rates at %g of the schedule's",
+            stage.name,
+            wrong,
+            stage.iteration,
+            stage.lr_scale,
         )
 
     def _compare(self, stage: ScheduledStage, loss: float) -> None:
-        """Tell of a frame that ends with a loss out of its neighbours' range."""
-        if stage.phase is None or not stage.phase.frames:
-            return
+        """Log a frame that ends with an outlying loss."""
         factor = stands_out(loss, self._visited)
         if factor is not None:
             log.warning(

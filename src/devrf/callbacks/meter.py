@@ -1,4 +1,4 @@
-"""ResumableCSVLogger beside those of the losses: learning rates, speed, resolution, memory."""
+"""Curves beside those of the losses: learning rates, speed, resolution, memory."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from devrf.engine.stage import ScheduledStage
 
 
 class Meter(Callback):
-    """Adds what a stage is doing to the rows that its losses are logged in."""
+    """Logs learning rates, speed, resolution and memory in the rows of the losses."""
 
     def __init__(self) -> None:
         self._last = (0.0, 0)
@@ -27,7 +27,7 @@ class Meter(Callback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Log, in the steps that Lightning writes down; no number is read from the device."""
+        """Log in the steps in which Lightning logs; nothing is read from the device."""
         assert isinstance(pl_module, ScheduledStage)
         every: int = trainer.log_every_n_steps  # type: ignore[attr-defined]
         if not trainer.should_stop and (every == 0 or (batch_idx + 1) % every):

@@ -1,7 +1,7 @@
-"""Writes progress files while a stage learns: every so often, and when it is asked to stop.
+"""Writes progress files at intervals, and when the stage is asked to stop.
 
-Lightning's ModelCheckpoint with a time interval does less: it bounds no share of the time, ends the
-training where the disk is full, and may write what has diverged.
+Lightning's ModelCheckpoint does less: it bounds no share of the time, ends the training on a full
+disk, and may write what has diverged.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ log = logging.getLogger(__name__)
 
 
 class PeriodicCheckpoint(Callback):
-    """Keeps a stage's last progress files; stops the stage, saved, when it is asked to.
+    """Keeps a stage's last two progress files; stops the stage, saved, when it is asked to.
 
-    A file that cannot be written (a full disk) does not end the training: the ones before it
-    stay, a line says so, and the next one is tried when it is due.
+    A file that cannot be written (a full disk) does not end the training: the earlier ones stay,
+    a line says so, and the next one is tried when it is due.
 
     Attributes:
         saved: the iteration of the last file written or resumed from; None before the first.
@@ -40,10 +40,9 @@ class PeriodicCheckpoint(Callback):
         """Say where and how often.
 
         Args:
-            folder: gets ``<stage>-progress-<iteration>.ckpt``, the last two of them.
+            folder: gets ``<stage>-progress-<iteration>.ckpt``.
             every_seconds: between files.
-            share: the most of the time, 0 to 1, that writing may take: large files are written
-                less often.
+            share: the largest share of the time, 0 to 1, that writing may take.
         """
         if every_seconds < 0 or not 0 < share <= 1:
             raise DevrfError(
@@ -83,8 +82,8 @@ class PeriodicCheckpoint(Callback):
             asked, due = agreed(asked, all=False), agreed(due and trainer.is_global_zero, all=False)
         if pl_module.iteration >= pl_module.total_iterations:
             return  # the stage is done: its checkpoint is next
-        # This step's row of the curves, if it has one, is only written after this: a run that
-        # went on from a file written now would lack the row if it was killed in between.
+        # Lightning writes this step's row of the curves after this hook: a run that was killed in
+        # between and resumed from a file written now would lack the row.
         every: int = trainer.log_every_n_steps  # type: ignore[attr-defined]
         row_follows = every > 1 and (batch_idx + 1) % every == 0
         last = trainer.should_stop or 0 < trainer.max_steps <= trainer.global_step

@@ -1,4 +1,4 @@
-"""Pictures of a held-out view while a stage learns, for those who watch."""
+"""Pictures of a held-out view while a stage learns."""
 
 from __future__ import annotations
 
@@ -20,11 +20,7 @@ class Previews(Callback):
     """
 
     def __init__(self, times: int = 6) -> None:
-        """Say how often.
-
-        Args:
-            times: pictures of each stage, evenly spread over its iterations, the last at its end.
-        """
+        """``times``: pictures of each stage, evenly spread, the last at its end."""
         self.times = times
         self.seconds = 0.0
         self._shown = 0
@@ -37,7 +33,7 @@ class Previews(Callback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Show the view, when it is time."""
+        """Show the view, if a picture is due."""
         assert isinstance(pl_module, ScheduledStage)
         due = self._due(pl_module)
         if due == self._shown or not trainer.is_global_zero:

@@ -1,4 +1,4 @@
-"""A progress bar in the words of the field: iteration, PSNR, speed, resolution, frame."""
+"""A progress bar with iteration, PSNR, speed, resolution and frame."""
 
 from __future__ import annotations
 
@@ -9,33 +9,22 @@ from typing import Any
 
 from lightning import Callback, LightningModule, Trainer
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    TextColumn,
-    TimeRemainingColumn,
-)
-from rich.progress import (
-    Progress as Bar,
-)
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as Bar
 
 from devrf.engine.phase import in_words
 from devrf.engine.stage import ScheduledStage
 
 log = logging.getLogger(__name__)
 
+# Each update reads one number from the device.
+BAR_EVERY_SECONDS = 0.5
+
 
 class Progress(Callback):
-    """Shows how training goes: a bar on a terminal, else a line now and then."""
+    """Shows a bar on a terminal, else a line every ``line_every_seconds``."""
 
-    def __init__(self, every_seconds: float = 0.5, line_every_seconds: float = 15.0) -> None:
-        """Say how often to look.
-
-        Args:
-            every_seconds: between updates of the bar; each one reads one number from the device.
-            line_every_seconds: between lines where there is no terminal to draw on.
-        """
-        self.every_seconds = every_seconds
+    def __init__(self, line_every_seconds: float = 15.0) -> None:
         self.line_every_seconds = line_every_seconds
         self._bar: Bar | None = None
         self._shown = (0.0, 0)
@@ -67,11 +56,11 @@ class Progress(Callback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Update the bar, or write a line, when it is time."""
+        """Update the bar or write a line, if it is due."""
         assert isinstance(pl_module, ScheduledStage)
         now = time.perf_counter()
         since, done = now - self._shown[0], pl_module.iteration
-        if since < (self.line_every_seconds if self._bar is None else self.every_seconds):
+        if since < (self.line_every_seconds if self._bar is None else BAR_EVERY_SECONDS):
             return
         state = describe(trainer, pl_module, (done - self._shown[1]) / since)
         self._shown = (now, done)
@@ -87,7 +76,7 @@ class Progress(Callback):
     def on_exception(
         self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
     ) -> None:
-        """Close the bar, so that what is said next stands on a line of its own."""
+        """Close the bar, so that the message begins on a new line."""
         self._close()
 
     def _close(self) -> None:

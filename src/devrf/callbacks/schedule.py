@@ -1,4 +1,4 @@
-"""The callbacks through which a schedule acts on a stage."""
+"""The callbacks that apply a stage's schedule."""
 
 from __future__ import annotations
 
@@ -29,10 +29,7 @@ class LearningRateDecay(Callback):
     def on_before_optimizer_step(
         self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer
     ) -> None:
-        """Set ``lr`` to ``base_lr`` times the factor of the present iteration.
-
-        Lower still after the stage was taken back, by its ``lr_scale``.
-        """
+        """Set ``lr`` to ``base_lr`` times the iteration's factor and the stage's ``lr_scale``."""
         assert isinstance(pl_module, ScheduledStage)
         factor = pl_module.learning_rate_factor(pl_module.iteration) * pl_module.lr_scale
         for group in optimizer.param_groups:

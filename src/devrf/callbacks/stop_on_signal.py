@@ -1,4 +1,4 @@
-"""Ends a stage between two steps when a signal asks for it."""
+"""Ends a stage after the present step when a signal arrives."""
 
 from __future__ import annotations
 
@@ -9,16 +9,15 @@ from contextlib import ExitStack
 from lightning import Callback, LightningModule, Trainer
 
 from devrf.callbacks.periodic_checkpoint import PeriodicCheckpoint
-from devrf.system.signals import Interrupted, answered_by
+from devrf.system.signals import Interrupted, handle_signals
 
 
 class StopOnSignal(Callback):
-    """Lets the first signal stop the stage, saved; after it Ctrl-C ends the run at once.
+    """The first signal stops the stage, saved; a later Ctrl-C ends the run at once.
 
-    Other signals after the first change nothing: launchers may send theirs more than once.
-
-    As a context it answers signals within its block; as a callback it takes them back from
-    Lightning, whose own handler would end the run between two steps with nothing written.
+    Other later signals are ignored: launchers may repeat theirs. As a context manager it handles
+    signals within its block; as a callback it takes them back from Lightning, whose handler would
+    end the run with nothing written.
 
     Attributes:
         number: the first signal; None before it.
@@ -31,7 +30,7 @@ class StopOnSignal(Callback):
         self._take: Callable[[], None] | None = None
 
     def __enter__(self) -> StopOnSignal:
-        self._take = self._block.enter_context(answered_by(self._answer))
+        self._take = self._block.enter_context(handle_signals(self._answer))
         return self
 
     def __exit__(self, *_: object) -> None:

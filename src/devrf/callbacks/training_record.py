@@ -1,4 +1,4 @@
-"""What training took: time, iterations, memory."""
+"""Records the time, iterations and memory of training."""
 
 from __future__ import annotations
 
@@ -10,13 +10,11 @@ from lightning import Callback, LightningModule, Trainer
 
 from devrf.callbacks.previews import Previews
 from devrf.engine.stage import ScheduledStage
+from devrf.system.speed import wait
 
 
 class TrainingRecord(Callback):
-    """Measures a stage's training and leaves the figures in its ``record``.
-
-    What a run took before it was interrupted counts, up to the file that it goes on from.
-    """
+    """Measures a stage's training into its ``record``, over all resumed runs."""
 
     def __init__(self) -> None:
         self._started = 0.0
@@ -44,14 +42,9 @@ class TrainingRecord(Callback):
         self._peak_before = state_dict["peak_gpu_gb"]
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Write down seconds, iterations, iterations a second, peak GPU memory, back-offs.
-
-        Seconds are wall clock, without what previews took: they teach the fields nothing. Memory
-        is in GiB; None on a CPU.
-        """
+        """Fill the record: wall-clock seconds without previews, memory in GiB (None on a CPU)."""
         assert isinstance(pl_module, ScheduledStage)
-        if pl_module.device.type == "cuda":
-            torch.cuda.synchronize(pl_module.device)
+        wait(pl_module.device)
         seconds, done = self._seconds(), pl_module.iteration - pl_module.skipped
         pl_module.record = {
             "seconds": round(seconds, 2),

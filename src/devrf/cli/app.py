@@ -1,4 +1,4 @@
-"""The door: composes the config, checks it, and runs the asked stage."""
+"""The Hydra application: composes the config, checks it, and runs the stage."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from devrf.cli import job
 from devrf.cli.config import config_folder, register_resolvers
 from devrf.cli.config_check import check_config
 from devrf.cli.messages import report_user_errors
-from devrf.cli.run_folder import nothing_left_of_mistakes
-from devrf.cli.run_lock import alone_in
+from devrf.cli.run_folder import removed_on_user_error
+from devrf.cli.run_lock import exclusive
 from devrf.cli.sweep import forget_failure, run_job
 
 register_resolvers()
 
 
 def run(config: DictConfig) -> float | None:
-    """Run ``stage=…`` in the folder that Hydra made for it; return the objective, if measured."""
+    """Run ``stage=…`` in Hydra's output folder; return the objective, if measured."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     if job.in_sweep():
         return run_job(lambda: _job(config, folder), config, folder)
     with (
         report_user_errors(),
-        alone_in(folder, config, "hydra.run.dir"),
-        nothing_left_of_mistakes(folder),
+        exclusive(folder, config, "hydra.run.dir"),
+        removed_on_user_error(folder),
     ):
         value = _checked(config, folder)
         forget_failure(folder)
@@ -35,7 +35,7 @@ def run(config: DictConfig) -> float | None:
 
 
 def _job(config: DictConfig, folder: Path) -> float | None:
-    with alone_in(folder, config, "hydra.sweep.dir"):
+    with exclusive(folder, config, "hydra.sweep.dir"):
         return _checked(config, folder)
 
 
@@ -47,5 +47,5 @@ def _checked(config: DictConfig, folder: Path) -> float | None:
     return run_stage(config, folder)
 
 
-# Kept apart from `run`, which other processes find by its name.
+# A name of its own: other processes import `run` by its name.
 main = hydra.main(config_path=str(config_folder()), config_name="config", version_base="1.3")(run)

@@ -1,10 +1,12 @@
-"""Where the configuration lives, and the words it may use (OmegaConf resolvers)."""
+"""The configuration's folder and its OmegaConf resolvers."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
 from typing import Any
+
+from omegaconf import OmegaConf
 
 from devrf.reporting.settings import ReportSettings
 
@@ -16,12 +18,7 @@ def config_folder() -> Path:
 
 
 def scene_name(data: Any) -> str:
-    """The scene's short name, told from its data config alone: for folders and tables.
-
-    The name that was given, else the embedded scene's shape, else the folder's name.
-    """
-    from omegaconf import OmegaConf
-
+    """A scene's name for folders and tables: ``name``, else ``shape``, else the folder's name."""
     if OmegaConf.is_missing(data, "root"):
         return "scene"
     chosen = data.get("name") or data.get("shape") or Path(str(data.get("root"))).resolve().name
@@ -44,27 +41,27 @@ def run_name(
 
 
 def run_folder(stage: str, report: Any, scene: str, name: str) -> str:
-    """Where a run lives: told from scene and experiment; a report lives where it is written."""
+    """A run's folder: by scene and experiment; of a report, where it is written."""
     if stage != "report":
         return f"outputs/{scene}/{name}"
     settings = ReportSettings(report.runs, report.into)
-    # A folder that was misspelt is not made: the step says that there is none.
+    # A misspelt folder is not created: the step reports that there is none.
     there = Path(settings.runs).is_dir() or report.into is not None
     return str(settings.folder) if there else "outputs/report"
 
 
 def config_record(stage: str) -> str | None:
-    """The folder in a run's own for its composed config; a report may lie beside another's."""
+    """Where in its folder a run's composed config is; a report may lie beside another run's."""
     return None if stage == "report" else ".hydra"
 
 
 def tracked_name(scene: str, mode: Any, folder: str, overrides: str) -> str:
-    """What a tracker calls a run: the scene; a sweep's job by its folder and what was asked."""
+    """A tracker's name of a run: the scene; of a sweep's job, its folder and overrides."""
     return f"{Path(folder).name} {overrides}" if _of_sweep(mode) else scene
 
 
 def tracked_group(mode: Any, folder: str) -> str | None:
-    """The group that a tracker puts a run into: the sweep's folder's name, None outside one."""
+    """A tracker's group of a run: the name of the sweep's folder, None outside a sweep."""
     return Path(folder).name if _of_sweep(mode) else None
 
 
@@ -73,9 +70,6 @@ def _of_sweep(mode: Any) -> bool:
 
 
 def register_resolvers() -> None:
-    """Make ``${devrf.scene_name:…}`` and the other words known to OmegaConf."""
-    from omegaconf import OmegaConf
-
-    words = (scene_name, run_name, run_folder, config_record, tracked_name, tracked_group)
-    for word in words:
+    """Register ``${devrf.scene_name:…}`` and the other resolvers."""
+    for word in (scene_name, run_name, run_folder, config_record, tracked_name, tracked_group):
         OmegaConf.register_new_resolver(f"devrf.{word.__name__}", word, replace=True)

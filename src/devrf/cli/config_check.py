@@ -1,8 +1,4 @@
-"""Checks a composed config against the parts that it names, before anything is built.
-
-A config says of each part what it is (``_target_``) and what it is given. The part's own
-signature says which settings there are and of which type; nothing is written down twice.
-"""
+"""Checks a composed config against the signatures of its ``_target_``, before anything is built."""
 
 from __future__ import annotations
 
@@ -19,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from devrf.cli.value_types import described, fits
 from devrf.errors import DevrfError
 
-# What the run itself reads, beside the parts.
+# Keys outside the parts.
 ROOT: dict[str, Any] = {
     "stage": str,
     "method": str,
@@ -34,7 +30,7 @@ ROOT: dict[str, Any] = {
     "graphs": Literal["auto", "off"],
     "decoder_precision": Literal["auto", "float32", "bfloat16"],
 }
-# Keys of earlier versions, and what they are called now; then values, by key.
+# Keys of earlier versions and their new names; then values, by key.
 RENAMED = {
     "schedule.deformation.frames_at_once": "schedule.deformation.parallel_frames",
     "schedule.motion.least_gain": "schedule.motion.min_rel_improvement",
@@ -48,10 +44,7 @@ Node = Mapping[Any, Any]
 
 
 def check_config(config: DictConfig) -> None:
-    """Check that every value is set, belongs to a part, and is of the type its part expects.
-
-    Args:
-        config: a composed config, as ``conf/config.yaml`` describes it.
+    """Check that every value is set, belongs to a part, and has the type that the part expects.
 
     Raises:
         DevrfError: naming the key at fault and what was expected.
@@ -82,7 +75,7 @@ def _leaves(raw: Node, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _check_group(raw: Node, resolved: Node, path: str, read: set[str]) -> None:
-    """Check what is no part itself: parts below it, and values that parts refer to."""
+    """Check a node without ``_target_``: parts below it, and values that parts refer to."""
     for key, value in raw.items():
         where = f"{path}{key}"
         if isinstance(value, Mapping):
@@ -103,14 +96,14 @@ def _check_part(raw: Node, resolved: Node, path: str, read: set[str]) -> None:
             _check_part(given, value, f"{where}.", read)
         elif not (isinstance(value, Mapping) and "_target_" in value):
             hint, default = settings.get(key, (Any, None))
-            # The key to blame is the one where the value stands.
+            # The key to name is the one where the user sets the value.
             reference = REFERENCE.fullmatch(given) if isinstance(given, str) else None
             if value != default:
                 _check_value(reference.group(1) if reference else where, value, hint)
 
 
 def _settings(target: str, path: str) -> dict[str, tuple[Any, Any]]:
-    """Type and default of each setting of a part, by name; ``**`` when it takes any name."""
+    """Type and default of each parameter of a part, by name; ``**`` if it takes any name."""
     try:
         part = get_object(target)
         parameters = inspect.signature(part).parameters
@@ -119,7 +112,7 @@ def _settings(target: str, path: str) -> dict[str, tuple[Any, Any]]:
         raise DevrfError(f"{path}_target_: cannot load {target!r} ({why})") from None
     try:
         hints = get_type_hints(part.__init__ if inspect.isclass(part) else part)
-    except (NameError, TypeError):  # names that are only there for a type checker
+    except (NameError, TypeError):  # names imported only for a type checker
         hints = {}
     return {
         "**" if p.kind is p.VAR_KEYWORD else p.name: (hints.get(p.name, Any), p.default)
@@ -139,7 +132,7 @@ def _check_value(where: str, value: object, hint: Any) -> None:
 
 
 def unknown_key(where: str, known: Iterable[object]) -> DevrfError:
-    """The error for a key that does not exist, with the one that may have been meant."""
+    """The error for a key that does not exist, with the closest one that does."""
     if where in RENAMED:
         return DevrfError(f"{where}: renamed; write {RENAMED[where]}=VALUE")
     name = where.rpartition(".")[2]

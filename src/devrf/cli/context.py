@@ -1,4 +1,4 @@
-"""What the steps of a run share: its config and folder, and what is built from them once."""
+"""A run's config and folder, and the parts that its steps share."""
 
 from __future__ import annotations
 
@@ -28,24 +28,18 @@ from devrf.scenes.scene import Scene
 
 log = logging.getLogger(__name__)
 
-# What a stage was learned on, among the settings it was made with: the digest of the run's own
-# checkpoint of the stage before, or of one that was given.
+# Keys in a checkpoint's training config for the digest of the canonical checkpoint it builds on:
+# the run's own, or a given one.
 OWN_REST, GIVEN_REST = "checkpoints/canonical.ckpt", "ckpt"
-
-# What no checkpoint is of use to, beside stages that begin afresh.
-FROM_NOTHING = {"prepare", "inspect", "report"}
 
 
 class RunContext:
-    """A composed config, the run's folder, and the parts that more than one step needs.
-
-    A part is built when it is first asked for: a step that needs no scene reads none.
+    """A composed config, the run's folder, and parts that are built when first used.
 
     Attributes:
         config: a composed config (``conf/config.yaml``).
-        folder: where the run works: ``checkpoints/<stage>.ckpt``, ``metrics.json``,
-            ``frames.csv``, ``images/`` and ``videos/``, next to the composed config and the log
-            that Hydra writes.
+        folder: gets ``checkpoints/<stage>.ckpt``, ``metrics.json``, ``frames.csv``, ``images/`` and
+            ``videos/``, next to Hydra's config and log.
     """
 
     def __init__(self, config: DictConfig, folder: Path) -> None:
@@ -55,14 +49,14 @@ class RunContext:
         self._stepping = False
 
     def begin_step(self) -> None:
-        """Start the clock of a step; the first one's runs since the scene was read."""
+        """Start the clock of a step; that of the first has run since the run began."""
         if self._stepping:
             self._began = time.perf_counter()
         self._stepping = True
 
     @property
     def step_seconds(self) -> float:
-        """Wall clock since the present step began: reading, learning, scoring, writing."""
+        """Wall clock since the present step began."""
         return round(time.perf_counter() - self._began, 2)
 
     @cached_property
@@ -73,7 +67,7 @@ class RunContext:
 
     @property
     def scene(self) -> Scene:
-        """The scene, read when it is first needed."""
+        """The scene."""
         return self.datamodule.scene
 
     @cached_property
@@ -84,15 +78,15 @@ class RunContext:
 
     @property
     def learning_stages(self) -> tuple[str, ...]:
-        """The protocol's stages, in their order."""
+        """Names of the protocol's stages, in their order."""
         return tuple(step.name for step in self.protocol.steps)
 
     def stage_key(self, name: str) -> str:
-        """The key of the config that describes a stage: its own, or that of any ray stage."""
+        """The config key of a stage: its own name, or ``ray_stage``."""
         return name if name in self.config else "ray_stage"
 
     def stage_builder(self, name: str) -> Callable[..., ScheduledStage]:
-        """What builds a stage, given ``rest`` if it builds on another.
+        """A function that builds a stage, given ``rest`` if it builds on another.
 
         Raises:
             DevrfError: the method has no such stage.
@@ -112,9 +106,9 @@ class RunContext:
 
     @cached_property
     def logger(self) -> Any:
-        """What logs the whole run, one for all its steps; of several processes, rank 0's.
+        """The logger of all steps, False in other processes than rank 0.
 
-        A tracker is told the config, which begins its run: nothing should be wrong any more.
+        Giving a tracker the config begins its run: use it once the config has been checked.
         """
         if not self.leads:
             return False
@@ -127,7 +121,7 @@ class RunContext:
 
     @property
     def trackers(self) -> list[Tracker]:
-        """The logger, if it takes pictures, videos and tables."""
+        """The logger, if it takes images, videos and tables."""
         return trackers([self.logger])
 
     def close(self, *, failed: bool) -> None:
@@ -138,10 +132,10 @@ class RunContext:
 
     @cached_property
     def strategy(self) -> Strategy:
-        """How the configured trainer would work: on which device, in which process of how many.
+        """The configured trainer's strategy: its device, rank and number of processes.
 
         Raises:
-            DevrfError: in several processes, but not as the stages need it.
+            DevrfError: several processes without ``trainer=ddp``.
         """
         trainer: Trainer = instantiate(self.config.trainer, logger=False)
         if trainer.world_size > 1 and not isinstance(trainer.strategy, ManualDDP):
@@ -152,12 +146,12 @@ class RunContext:
 
     @property
     def leads(self) -> bool:
-        """Whether this process writes files and says what happens: rank 0, or the only one."""
+        """Whether this process writes files and logs: rank 0, or the only one."""
         return bool(self.strategy.is_global_zero)
 
     @property
     def device(self) -> torch.device:
-        """Where the configured trainer would work."""
+        """The trainer's device."""
         device: torch.device = self.strategy.root_device
         return device
 
@@ -168,14 +162,14 @@ class RunContext:
         return chosen
 
     def own_checkpoint(self, name: str) -> Path:
-        """Where this run keeps what the stage ``name`` learned."""
+        """The run's checkpoint of the stage ``name``, whether it exists or not."""
         return self.folder / "checkpoints" / f"{name}.ckpt"
 
     def checkpoint(self, name: str | None = None) -> Path:
-        """The checkpoint that was asked for, else the run's own.
+        """The checkpoint ``ckpt``, else the run's own.
 
         Args:
-            name: of a stage; None: the last stage of the protocol that has one.
+            name: a stage; None: the last stage that has a checkpoint.
 
         Raises:
             DevrfError: there is none.
@@ -194,10 +188,7 @@ class RunContext:
         return found[0]
 
     def load(self, name: str | None = None) -> LoadedCheckpoint:
-        """What a stage learned of this run's scene; ``name`` as for :meth:`checkpoint`.
-
-        What was learned on top of another checkpoint than the run's is passed over.
-        """
+        """Load :meth:`checkpoint`; one that builds on another than the run's is passed over."""
         path = self.checkpoint(name)
         loaded = load_checkpoint(path, self.scene)
         if self.config.ckpt is None and loaded.metadata.stage in self.learning_stages:

@@ -1,4 +1,4 @@
-"""The step that measures: ``stage=evaluate``."""
+"""``stage=evaluate``: scores on held-out views."""
 
 from __future__ import annotations
 
@@ -8,13 +8,7 @@ from statistics import mean
 from typing import Any
 
 from devrf.artifacts.contact_sheet import write_contact_sheet
-from devrf.artifacts.records import (
-    frame_rows,
-    in_words,
-    mean_scores,
-    provenance,
-    write_frames,
-)
+from devrf.artifacts.records import frame_rows, in_words, mean_scores, provenance, write_frames
 from devrf.cli import job
 from devrf.cli.context import RunContext
 from devrf.evaluation.held_out import HeldOutView, score
@@ -26,7 +20,7 @@ from devrf.system.files import write_json
 
 log = logging.getLogger(__name__)
 
-# What a checkpoint knows of its training that stands beside the scores.
+# Figures of the training, from the checkpoint, that stand beside the scores.
 TRAINING = ("seconds", "iterations", "iterations_per_second", "peak_gpu_gb", "num_rollbacks")
 
 
@@ -37,7 +31,7 @@ def evaluate(run: RunContext) -> None:
     suite = run.evaluation.suite(run.device)
     frames: dict[str, list[HeldOutView]] = {"static": _score(run, model, "static", suite)}
     last = loaded.metadata.stage
-    # What one stage learned at once is told of the dynamic section, where there is one.
+    # A single stage's training stands in the dynamic section, where there is one.
     rest = next((step.name for step in run.protocol.steps if step.capture == "static"), None)
     moved = model.moves and last != rest
     static = mean_scores(frames["static"])
@@ -72,7 +66,7 @@ def _track(
     scores: Mapping[str, Mapping[str, float | None]],
     frames: Mapping[str, Sequence[HeldOutView]],
 ) -> None:
-    """Show where the run is tracked what it has come to."""
+    """Give the trackers scores and tables."""
     for tracker in run.trackers:
         tracker.conclude(
             {
@@ -94,11 +88,7 @@ def _training(records: Records, stage: str) -> dict[str, float | None]:
 
 
 def _origin(run: RunContext, records: Records) -> dict[str, Any]:
-    """What was asked for, on how much data, and how long each step took from end to end.
-
-    The steps that learn may have run in other processes: their checkpoints tell (None if they
-    do not), measured up to the writing of the checkpoint.
-    """
+    """Choices, amount of data, and seconds of each step, of the stages as their checkpoints say."""
     scene = run.scene
     frames = scene.clock.frames_of(scene.dynamic.train.times)
     learned = {k: records.get(k, {}).get("wall_seconds") for k in run.learning_stages}

@@ -10,7 +10,6 @@ from rich.filesize import decimal
 from devrf.artifacts.inspection.report import inspect_scene
 from devrf.artifacts.inspection.text import as_text, inspection_text
 from devrf.cli.context import RunContext
-from devrf.cli.memory import budget_rows
 from devrf.cli.preflight import requirements
 from devrf.errors import DevrfError
 from devrf.scenes.export import export
@@ -28,11 +27,11 @@ def prepare(run: RunContext) -> None:
 
 
 def inspect(run: RunContext) -> None:
-    """Report and draw what the scene holds and what may be wrong with it; learn nothing."""
+    """Report and draw what the scene holds and what may be wrong with it."""
     # Only this step draws with matplotlib.
     from devrf.artifacts.inspection.picture import write_inspection_picture
 
-    needs = [(name, decimal(size)) for name, size in budget_rows(requirements(run))]
+    needs = [(name, decimal(size)) for name, size in requirements(run).rows()]
     report = inspection_text(inspect_scene(run.scene), needs)
     console = Console()
     if console.is_terminal:

@@ -1,4 +1,4 @@
-"""The present job as Hydra knows it: what was chosen, what was asked for, whether others follow."""
+"""The present Hydra job: its choices, overrides and mode."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from hydra.types import RunMode
 
 
 def choices() -> dict[str, str | None]:
-    """The chosen option of each of devrf's config groups, by group; empty outside Hydra."""
+    """The chosen option of each config group, without Hydra's own; empty outside Hydra."""
     if not HydraConfig.initialized():
         return {}
     chosen = HydraConfig.get().runtime.choices
@@ -15,7 +15,7 @@ def choices() -> dict[str, str | None]:
 
 
 def overrides() -> list[str]:
-    """What was given on the command line, Hydra's own keys left out; empty outside Hydra."""
+    """The overrides of the command line, without Hydra's own; empty outside Hydra."""
     return list(HydraConfig.get().overrides.task) if HydraConfig.initialized() else []
 
 
@@ -25,5 +25,5 @@ def in_sweep() -> bool:
 
 
 def in_search() -> bool:
-    """Whether the sweeper looks for the best, and so needs a number from each job."""
+    """Whether the sweeper optimises, and so needs the objective of each job."""
     return in_sweep() and "direction" in HydraConfig.get().sweeper

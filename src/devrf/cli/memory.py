@@ -1,7 +1,7 @@
-"""How much memory and disk a run needs, before it has cost any time.
+"""How much memory and disk a run needs, estimated before it begins.
 
-A method gives :class:`StageNeeds` for each of its stages. All of it is a sum over the tensors that
-will exist, except what a batch takes: :func:`batch_bytes` estimates that.
+Everything is a sum over the tensors that will exist, except what a batch takes: see
+:func:`batch_bytes`.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ class StageNeeds:
     Attributes:
         views: the training views, on the training device.
         held: what that device holds all the time besides.
-        batch: what the batches take that a GPU works on at the same time.
-        rays: the config key that says how large a batch is.
-        temporary: the most that other work takes while no batch is under way.
-        learned: what is learned, as it is worked with.
+        batch: the batches that a GPU works on at the same time.
+        rays: the config key of the batch size.
+        temporary: the most that other work takes between batches.
+        learned: the learned tensors in memory.
         checkpoint: the file of the finished stage.
-        progress: the file that an interrupted stage goes on from.
+        progress: a progress file.
         batches: how many batches ``batch`` counts; a CPU takes one after the other.
     """
 
@@ -66,12 +66,12 @@ class StageNeeds:
     batches: int = 1
 
     def peak(self, pieces: int = 1) -> int:
-        """Bytes on the device at the worst moment, each batch taken in so many pieces."""
+        """Peak bytes on the device, with each batch taken in ``pieces``."""
         return self.views + sum(self.held.values()) + max(self.batch // pieces, self.temporary)
 
     @property
     def on_host(self) -> int:
-        """Bytes beside the scene's where the host trains, and uses the views in place."""
+        """Peak bytes beside the scene's where the host trains; it uses the views in place."""
         return round(FRAGMENTATION * (self.peak(self.batches) - self.views))
 
 
@@ -86,9 +86,9 @@ class Budget:
         """Bytes on the host.
 
         Args:
-            alone: whether the host trains. Else what a GPU has learned comes there to be written,
-                and with its checkpoint to be scored.
-            processes: how many train together on this machine, each with a scene of its own.
+            alone: whether the host trains. Otherwise it holds what a GPU has learned, to write it,
+                and the checkpoint, to score it.
+            processes: how many train together on this machine, each with its copy of the scene.
         """
         own = [one.learned + one.checkpoint for one in self.stages.values()]
         if alone:
@@ -103,15 +103,14 @@ class Budget:
             worst, finished = max(worst, finished + written), finished + one.checkpoint
         return max(worst, finished + films)
 
-
-def budget_rows(budget: Budget) -> list[tuple[str, int]]:
-    """What a run needs, as rows of a name and bytes."""
-    return [
-        *((f"GPU, {name} stage", one.peak()) for name, one in budget.stages.items()),
-        ("host, beside a GPU", budget.host(alone=False)),
-        ("host, without a GPU", budget.host(alone=True)),
-        ("checkpoint", max(one.checkpoint for one in budget.stages.values())),
-    ]
+    def rows(self) -> list[tuple[str, int]]:
+        """A table of names and bytes."""
+        return [
+            *((f"GPU, {name} stage", one.peak()) for name, one in self.stages.items()),
+            ("host, beside a GPU", self.host(alone=False)),
+            ("host, without a GPU", self.host(alone=True)),
+            ("checkpoint", max(one.checkpoint for one in self.stages.values())),
+        ]
 
 
 def tensor_bytes(value: object) -> int:
@@ -130,9 +129,14 @@ def tensor_bytes(value: object) -> int:
 def module_needs(
     module: nn.Module, views: Views, *, keys: tuple[str, ...], batch: int, rays: str
 ) -> StageNeeds:
-    """What a stage needs that trains all of a module with Adam; ``keys`` change the module's size.
+    """What a stage needs that trains all of a module with Adam.
 
-    The module may be on torch's meta device. The other arguments as in :class:`StageNeeds`.
+    Args:
+        module: may be on torch's meta device.
+        views: the training views.
+        keys: the config keys of the module's size.
+        batch: as in :class:`StageNeeds`.
+        rays: as in :class:`StageNeeds`.
     """
     stored, parameters = tensor_bytes(module), tensor_bytes(module.parameters())
     pool = len(views) * views.height * views.width * POOLED
@@ -152,12 +156,12 @@ def module_needs(
 def batch_bytes(
     samples: float, decoded: float, channels: int, width: int, *, warped: bool = False
 ) -> int:
-    """About what a batch takes, the graph of its gradients included.
+    """About what a batch takes, with the graph of its gradients.
 
     Counted from the tensors that are alive at once: 230 bytes for each of ``samples`` (position,
-    ray, rows and weights of eight corners), 200 more where it is displaced first (``warped``). Each
-    of ``decoded``, whose colour is computed, takes six float32 for each unit of a hidden layer of
-    ``width``, 24 for each of its ``channels``, and 400 bytes besides.
+    ray, rows and weights of eight corners), 200 more where it is ``warped``. Each of ``decoded``,
+    whose colour is computed, takes 6 float32 for each hidden unit (``width``), 24 for each feature
+    channel, and 400 bytes besides.
     """
     color = 4 * (6 * width + 24 * channels) + 400
     return round((430 if warped else 230) * samples + color * decoded)
@@ -185,9 +189,9 @@ def estimate(
 ) -> Budget:
     """What DeVRF needs to learn ``scene``, with samples ``step`` voxels apart.
 
-    The fields' box is taken to be the scene's motion box, or its box where that is unknown. Grids
-    have about side³ voxels whatever the box, so a tighter one changes little. ``motion`` says where
-    displacements rest, and how; ``auto`` counts as on the device.
+    The fields' box is taken to be the scene's motion box, or its box where that is unknown: grids
+    have about side³ voxels in any box. A store of displacements that is ``auto`` counts as on the
+    device.
     """
     voxels, sizes = round(canonical.side**3), (architecture.channels, architecture.width)
     with torch.device("meta"):
@@ -195,8 +199,8 @@ def estimate(
         field = architecture.radiance_field(box, voxels, voxels)
     occupied = OCCUPIED if field.planes is None else 1.0
 
-    # The search looks everywhere; its three channels are the colour. The first fine phase begins
-    # as fog: the colour of every sample counts.
+    # The search samples the whole box; its three channels are the colour. The first fine phase
+    # begins as fog: the colour of every sample counts.
     first = next(phase for phase in canonical.phases if phase.kind == "fine")
     fog = canonical.rays * occupied * samples_per_ray(field, first.voxels, step)
     batch = batch_bytes(fog, fog, *sizes)
@@ -207,10 +211,10 @@ def estimate(
 
     met = deformation.rays * occupied * samples_per_ray(field, voxels, step)
     batch = batch_bytes(met, DECODED * met, *sizes, warped=True)
-    levels = range(len(deformation.sides))
+    motion = motion or MotionSettings()
     moving = [
-        _level_needs(scene, field, rest, deformation, level, motion or MotionSettings(), batch)
-        for level in levels
+        _level_needs(scene, field, rest, deformation, level, motion, batch)
+        for level in range(len(deformation.sides))
     ]
     everything = tensor_bytes((scene.static, scene.dynamic))
     return Budget(everything, {"canonical": rest, "deformation": max(moving, key=StageNeeds.peak)})
@@ -223,7 +227,7 @@ def _canonical_needs(scene: Scene, field: CanonicalField, batch: int) -> StageNe
     return replace(
         needs,
         held={**needs.held, GRIDS: needs.held[GRIDS] + 2 * points},  # with occupancy
-        temporary=max(needs.temporary, 80 * points),  # looking for what is occupied
+        temporary=max(needs.temporary, 80 * points),  # updating the occupancy
         learned=needs.learned + points,
         checkpoint=needs.checkpoint - grids // 2 + points,  # in half precision
         progress=needs.progress + 5 * points,  # with the number of views of each voxel
@@ -244,7 +248,7 @@ def _level_needs(
     shape, final = (field.box.grid_shape(schedule.sides[k] ** 3) for k in (level, -1))
     parallel, slices = schedule.max_parallel_frames(level, frames), resident_bytes(1, shape, False)
     pool = views.height * views.width * -(-len(views) // frames) * POOLED
-    if motion.store == "host":  # those that are next are on their way
+    if motion.store == "host":  # with the next frames, which are being copied
         resident, active = 0, active_bytes(shape) + slices
     else:
         resident, active = resident_bytes(frames, shape, motion.store_half), active_bytes(shape)
@@ -260,7 +264,7 @@ def _level_needs(
         },
         batch=parallel * batch,
         rays="schedule.deformation.rays",
-        # An optimiser step with a smoothed copy for each frame, or looking for what is occupied.
+        # An optimiser step with a smoothed copy of each frame, or updating the occupancy.
         temporary=max((1 + parallel) * slices, 200 * points),
         learned=rest.learned + learned,
         checkpoint=rest.checkpoint + learned // 2,

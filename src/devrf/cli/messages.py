@@ -20,13 +20,8 @@ FULL_ERRORS = os.environ.get("HYDRA_FULL_ERROR", "0") != "0"
 
 # Errors of a disk or its permissions. A missing file may be a fault of the program instead.
 REFUSED = {
-    errno.EACCES,
-    errno.EPERM,
-    errno.EROFS,
-    errno.ENOSPC,
-    errno.EDQUOT,
-    errno.ENOTDIR,
-    errno.EEXIST,
+    *(errno.EACCES, errno.EPERM, errno.EROFS),
+    *(errno.ENOSPC, errno.EDQUOT, errno.ENOTDIR, errno.EEXIST),
 }
 
 # Options that Hydra's plugins for sweeps add to its groups.
@@ -41,8 +36,8 @@ PLUGINS = {
 def report_user_errors() -> Iterator[None]:
     """Turn an error in config or input into one line on stderr and exit status 2.
 
-    With HYDRA_FULL_ERROR=1 in the environment it is raised with its traceback instead. Other
-    errors are faults of the program and pass through.
+    HYDRA_FULL_ERROR=1 in the environment raises it with its traceback instead. Other errors are
+    faults of the program and pass through.
     """
     try:
         yield
@@ -55,17 +50,17 @@ def report_user_errors() -> Iterator[None]:
 
 def is_user_error(error: Exception) -> bool:
     """Whether the user can correct it: input, config, or a disk that refuses."""
-    if own_error(error) is not None:
+    if _own_error(error) is not None:
         return True
     if isinstance(error, OSError) and not isinstance(error, HydraException):
         return error.errno in REFUSED
-    # An error of another kind from one of our own constructors is a fault of the program.
+    # Another error in a constructor of devrf is a fault of the program.
     ours = "Error in call to target 'devrf." in str(error)
     return isinstance(error, HydraException | OmegaConfBaseException) and not ours
 
 
-def own_error(error: BaseException) -> DevrfError | None:
-    """The project's own error in a chain of causes, if there is one."""
+def _own_error(error: BaseException) -> DevrfError | None:
+    """The first DevrfError in a chain of causes."""
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, DevrfError):
         cause = cause.__cause__
@@ -73,8 +68,8 @@ def own_error(error: BaseException) -> DevrfError | None:
 
 
 def one_line(error: BaseException) -> str:
-    """What an error says, on one line that begins with the key or file at fault."""
-    own = own_error(error)
+    """The error's message on one line that begins with the key or file at fault."""
+    own = _own_error(error)
     if own is not None:
         text = str(own)
     elif isinstance(error, MissingConfigException):
@@ -99,18 +94,13 @@ def _missing_option(error: MissingConfigException) -> str:
 
 def _of_hydra(error: BaseException) -> str:
     text = str(error)
-    unknown = re.match(r"Could not override '([^']+)'", text)
-    if unknown:
+    if unknown := re.match(r"Could not override '([^']+)'", text):
         # OmegaConf keeps the mapping that does not have the key.
         near = getattr(error.__cause__, "parent_node", None)
         return str(unknown_key(unknown.group(1), near or ()))
-    # OmegaConf adds lines on its types; of these only `full_key`, the key at fault, is shown.
-    key = re.search(r"^\s*full_key: (\S+)$", text, re.MULTILINE)
-    kept = [
-        line
-        for line in text.splitlines()
-        if not line.strip().startswith(("full_key:", "object_type=", "reference_type="))
-    ]
     if text.startswith("Error in call to target") and error.__cause__ is not None:
-        kept = [str(error.__cause__)]
-    return f"{key.group(1)}: {' '.join(kept)}" if key else " ".join(kept)
+        said = str(error.__cause__)
+    else:  # without the lines that OmegaConf adds on its types
+        said = re.sub(r"(?m)^\s*(full_key:|object_type=|reference_type=).*$", "", text)
+    key = re.search(r"^\s*full_key: (\S+)$", text, re.MULTILINE)
+    return f"{key.group(1)}: {said}" if key else said

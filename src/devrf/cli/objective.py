@@ -1,4 +1,4 @@
-"""The one number by which a run is compared with others: what a search maximises."""
+"""The number of metrics.json that a search maximises."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from devrf.errors import DevrfError
 
 OF_BOTH = ("psnr", "ssim", *TRAINING)
 OF_MOTION = ("rest_pose_psnr", "checkpoint_mb")
-# Names of the two sections of metrics.json; of DeVRF also those of its stages.
+# The two sections of metrics.json, and their names after DeVRF's stages.
 STATIC, DYNAMIC = ("static", "canonical"), ("dynamic", "deformation")
 
 
 def check_objective(key: str, metrics: Sequence[str]) -> None:
-    """See that metrics.json will have ``key``.
+    """Check that metrics.json will have ``key``.
 
     Args:
         key: ``SECTION.NAME``, such as ``dynamic.psnr``.
-        metrics: what is measured beside PSNR and SSIM (``evaluation.metrics``).
+        metrics: ``evaluation.metrics``.
 
     Raises:
         DevrfError: it will not.
@@ -35,7 +35,7 @@ def check_objective(key: str, metrics: Sequence[str]) -> None:
 def objective(key: str, found: Mapping[str, Any]) -> float | None:
     """The number ``key`` of metrics.json; None where it could not be measured.
 
-    Of the static section where nothing has learned to move.
+    The static section stands in for a missing dynamic one.
     """
     section, _, name = key.partition(".")
     section = "static" if section in STATIC else "dynamic"

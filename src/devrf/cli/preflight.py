@@ -1,4 +1,4 @@
-"""Whether memory and disk suffice for a run, before it has cost any time."""
+"""Whether memory and disk suffice for a run, checked before it begins."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from devrf.errors import DevrfError
 from devrf.system.machine import free_disk, free_host_memory, free_memory, own_memory
 from devrf.system.out_of_memory import gib, is_oom, numbers
 
-# What lowers the need, by the step that ran out of memory.
+# Keys that lower the need, by the stage that ran out of memory.
 LOWER = {
     "canonical": "schedule.canonical.side or schedule.canonical.rays",
     "deformation": "schedule.deformation.sides, schedule.deformation.rays or data.frames",
@@ -33,24 +33,19 @@ class Requirement:
     Attributes:
         what: in words: ``host memory``.
         needed: how much.
-        there: how much can be had.
+        there: how much is available.
         parts: what it is made of.
-        least: the least that the run can do with; None: all that is needed.
+        least: the least that the run can do with.
     """
 
     what: str
     needed: int
     there: int
     parts: Parts
-    least: int | None = None
+    least: int
 
     def __str__(self) -> str:
         return f"{gib(self.needed)} of {gib(self.there)} GiB of {self.what}"
-
-    @property
-    def possible(self) -> bool:
-        """Whether the run can do with what is there."""
-        return (self.needed if self.least is None else self.least) <= self.there
 
     @property
     def keys(self) -> list[str]:
@@ -60,7 +55,7 @@ class Requirement:
 
 
 def requirements(run: RunContext) -> Budget:
-    """What the configured run needs; each of several processes takes its share of a batch."""
+    """What the configured run needs; several processes share a batch."""
     budget = _of_devrf(run) if "canonical" in run.config else _of_rays(run)
     processes = getattr(run.strategy, "world_size", 1)
     stages = {k: replace(v, batch=v.batch // processes) for k, v in budget.stages.items()}
@@ -68,7 +63,7 @@ def requirements(run: RunContext) -> Budget:
 
 
 def _of_rays(run: RunContext) -> Budget:
-    """Of a method that is learned by ray stages: each trains the whole model."""
+    """The budget of a method of ray stages: each trains the whole model."""
     model = instantiate(run.config.ray_stage.model, _convert_="all")
     rays, scene = run.config.ray_stage.schedule.rays, run.scene
     stages = {
@@ -101,12 +96,11 @@ def preflight(run: RunContext, learns: Sequence[str], *, films: bool) -> str | N
 
     Args:
         run: the run; its scene is read.
-        learns: the stages that it will learn, by name. One whose checkpoint is there needs
-            nothing.
+        learns: names of the stages that it will learn, finished ones included.
         films: whether the run makes videos.
 
     Returns:
-        Both, in one line; None where nothing is needed.
+        Both, in one line; None where every stage is finished.
 
     Raises:
         DevrfError: memory or disk cannot suffice.
@@ -125,14 +119,15 @@ def preflight(run: RunContext, learns: Sequence[str], *, films: bool) -> str | N
         needs.append(Requirement("GPU memory", stage.peak(), there, parts, least))
     host = budget.host(alone=not on_gpu, processes=getattr(run.strategy, "num_processes", 1))
     on_host = Counter(stage.held if on_gpu else parts) + Counter({IMAGES: budget.scene})
-    needs.append(Requirement("host memory", host, free_host_memory() + own_memory(), on_host))
+    there = free_host_memory() + own_memory()
+    needs.append(Requirement("host memory", host, there, on_host, host))
     free, videos = free_disk(run.folder), 0
     if config.resume:  # these files will be replaced
         free += sum(file.stat().st_size for file in run.folder.glob("checkpoints/*.ckpt"))
     if films:
         videos = 2 * film_bytes(instantiate(config.video), run.scene.static.train.cameras)
     disk = budget.disk(kept=PeriodicCheckpoint.KEPT, films=videos)
-    needs.append(Requirement("disk", disk, free, stage.held))
+    needs.append(Requirement("disk", disk, free, stage.held, disk))
     return check(needs, lambda key: OmegaConf.select(config, key, default="") != "")
 
 
@@ -140,11 +135,11 @@ def check(needs: Sequence[Requirement], known: Callable[[str], bool]) -> str:
     """What is needed, in one line; ``known`` says whether the config has a key.
 
     Raises:
-        DevrfError: something cannot suffice.
+        DevrfError: something does not suffice.
     """
     said = f"needs about {', '.join(map(str, needs))}"
     for need in needs:
-        if not need.possible:
+        if need.least > need.there:
             keys = list(filter(known, need.keys))[:4]
             raise DevrfError(
                 f"{keys[0] if keys else 'data'}: the run {said}; it would end for lack of "
@@ -157,11 +152,7 @@ def check(needs: Sequence[Requirement], known: Callable[[str], bool]) -> str:
 
 @contextmanager
 def shortage_in_words(name: str, run: RunContext) -> Iterator[None]:
-    """Turn an error that says that memory ran out, in the step ``name``, into one line.
-
-    Raises:
-        DevrfError: memory has run out.
-    """
+    """Raise a DevrfError where memory runs out in the step ``name``."""
     try:
         yield
     except (RuntimeError, MemoryError) as error:

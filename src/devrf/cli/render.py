@@ -1,4 +1,4 @@
-"""The steps that show: ``stage=render`` and ``stage=still``."""
+"""``stage=render`` and ``stage=still``: videos and images."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def render(run: RunContext) -> None:
 
 
 def picture(run: RunContext) -> None:
-    """Picture the scene once, from one camera at one time."""
+    """Render the scene from one camera at one time."""
     settings: StillSettings = instantiate(run.config.still)
     stored, camera = run.load(), settings.camera(run.scene)
     renderer = Renderer(stored.model.to(run.device), half=settings.half)

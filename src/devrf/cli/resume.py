@@ -7,8 +7,7 @@ Each checkpoint holds the settings that decided what was learned:
 * either with other settings: the run is refused, naming the first that differs;
 * a deformation on top of another canonical field than the run's: it is learned anew.
 
-How the run is watched, tracked, scored and filmed, on which device, and where its data lies,
-decides nothing: such settings may differ.
+Settings of logging, scoring, rendering, the device and the place of the data may differ.
 """
 
 from __future__ import annotations
@@ -24,11 +23,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from devrf.checkpoints.checkpoint import CheckpointMetadata, metadata_in
-from devrf.checkpoints.checkpoint_file import (
-    OtherFormatError,
-    digest_of,
-    read_checkpoint_file,
-)
+from devrf.checkpoints.checkpoint_file import OtherFormatError, digest_of, read_checkpoint_file
 from devrf.checkpoints.progress import progress_files
 from devrf.cli.config_check import REFERENCE
 from devrf.cli.context import GIVEN_REST, OWN_REST, RunContext
@@ -48,8 +43,8 @@ class ResumePoint:
     Attributes:
         training_config: the present settings that decide what is learned.
         finished: there is nothing left to learn.
-        progress: the file to go on from; None begins at the beginning.
-        iteration: how far that file is.
+        progress: the file to go on from.
+        iteration: of that file.
     """
 
     training_config: dict[str, Any]
@@ -59,12 +54,7 @@ class ResumePoint:
 
 
 def deciding_settings(config: DictConfig, stage: str) -> dict[str, Any]:
-    """The settings that decide what a stage learns, by the key at which the user sets them.
-
-    Args:
-        config: a composed config.
-        stage: of the protocol.
-    """
+    """The settings that decide what a stage learns, by the key at which the user sets them."""
     own = (stage,) if stage in config else ("ray_stage", "protocol")
     parts = {key: OmegaConf.to_container(config[key], resolve=False) for key in ("data", *own)}
     found = dict(_values(config, parts, ""))
@@ -85,21 +75,17 @@ def _values(config: DictConfig, raw: Mapping[Any, Any], path: str) -> Iterator[t
             yield from _values(config, value, f"{where}.")
         elif key not in UNDECISIVE:
             plain = OmegaConf.select(config, where)
-            yield where, plain if isinstance(plain, str) else json.loads(_as_json(plain))
-
-
-def _as_json(value: object) -> str:
-    if OmegaConf.is_config(value):
-        value = OmegaConf.to_container(value, resolve=True)
-    return json.dumps(value)
+            if OmegaConf.is_config(plain):
+                plain = OmegaConf.to_container(plain, resolve=True)
+            yield where, json.loads(json.dumps(plain))  # as a checkpoint's JSON gives it back
 
 
 def beginning(run: RunContext, stage: str) -> ResumePoint:
     """Find where ``stage`` begins in the run's folder.
 
     Raises:
-        DevrfError: the folder holds what was learned with other settings or has another format,
-            or a finished checkpoint that is damaged.
+        DevrfError: a checkpoint there was learned with other settings, has another format, or is
+            finished and damaged.
     """
     training_config = deciding_settings(run.config, stage)
     below = run.protocol[stage].builds_on
@@ -132,10 +118,10 @@ def beginning(run: RunContext, stage: str) -> ResumePoint:
 
 
 def _agrees(path: Path, metadata: CheckpointMetadata, training_config: Mapping[str, Any]) -> bool:
-    """Whether a checkpoint has the present settings; False if it is of another canonical field.
+    """Whether a checkpoint has the present settings; False if only its canonical field differs.
 
     Raises:
-        DevrfError: it has other settings.
+        DevrfError: another setting differs.
     """
     old = metadata.training_config
     if old == training_config:
@@ -165,14 +151,13 @@ def remove_progress(folder: Path, stage: str) -> None:
 
 
 def archive_previous(folder: Path, *kept: Path) -> None:
-    """Move what earlier commands left in a run's folder into ``previous-<n>/`` within it.
+    """Move the results of earlier commands into ``previous-<n>/`` within the run's folder.
 
-    Moving it back undoes it. ``.hydra`` and the lock are the present command's and stay;
-    ``checkpoints/`` has the config that was learned with.
+    ``.hydra`` and the lock are the present command's and stay.
 
     Args:
         folder: the run's folder.
-        kept: files that the present command needs: they are found in both places.
+        kept: files that the present command needs: they are copied back.
     """
     names = {path.name for path in folder.iterdir()} - AT_FIRST
     old = [folder / name for name in names if not name.startswith("previous-")]
@@ -180,7 +165,7 @@ def archive_previous(folder: Path, *kept: Path) -> None:
         return
     for handler in logging.getLogger().handlers:
         if isinstance(handler, logging.FileHandler):
-            handler.close()  # it opens a new file when there is something to say
+            handler.close()  # it opens a new file for the next record
     taken = [int(p.name[9:]) for p in folder.glob("previous-*") if p.name[9:].isdigit()]
     previous = folder / f"previous-{max(taken, default=0) + 1}"
     previous.mkdir()

@@ -1,4 +1,4 @@
-"""Removes the folder of a run that ends in a mistake before it has made anything."""
+"""Removes the folder of a run that ends in a user error before it has made anything."""
 
 from __future__ import annotations
 
@@ -11,16 +11,13 @@ from pathlib import Path
 from devrf.cli.messages import is_user_error
 from devrf.cli.run_lock import PLACE
 
-# What is made in the folder before the program looks at its input.
+# Made in the folder before the config is checked.
 AT_FIRST = {".hydra", PLACE}
 
 
 @contextmanager
-def nothing_left_of_mistakes(folder: Path) -> Iterator[None]:
-    """Remove ``folder`` when the run ends in the user's mistake before it has made anything.
-
-    A folder that holds the results of an earlier run, or a first result of this one, stays.
-    """
+def removed_on_user_error(folder: Path) -> Iterator[None]:
+    """Remove ``folder`` if the run ends in a user error and the folder holds no results."""
     was_new = _holds_at_most(folder, AT_FIRST)
     try:
         yield
@@ -31,9 +28,9 @@ def nothing_left_of_mistakes(folder: Path) -> Iterator[None]:
 
 
 def remove_if_only(folder: Path, names: set[str]) -> None:
-    """Remove ``folder`` if it holds nothing but ``names``, and parents that are empty then.
+    """Remove ``folder`` if it holds nothing but ``names``, and then empty parents.
 
-    The working folder and all above it stay; of a folder elsewhere, its parents.
+    The working folder and all above it stay; so do the parents of a folder elsewhere.
     """
     if not _holds_at_most(folder, names):
         return
@@ -47,8 +44,9 @@ def remove_if_only(folder: Path, names: set[str]) -> None:
         else:
             path.unlink(missing_ok=True)
     here, folder = Path.cwd(), folder.resolve()
-    below_here = [path for path in folder.parents if here in path.parents]
-    for path in [] if here.is_relative_to(folder) else [folder, *below_here]:
+    if here.is_relative_to(folder):
+        return
+    for path in [folder, *(path for path in folder.parents if here in path.parents)]:
         if any(path.iterdir()):
             break
         path.rmdir()

@@ -1,7 +1,7 @@
 """One process at a time works in a run's folder.
 
-The lock is the system's on an open file, so it goes with its process, however that ends. A record
-beside it tells the others which process that is.
+The lock is the system's on an open file, so it ends with its process. A file beside it tells other
+processes which one that is.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import os
 import socket
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -34,25 +34,25 @@ LOCK, OWNER = "lock", "process.txt"
 # Environment variables in which torchrun and SLURM number the processes that they start.
 RANKS = ("RANK", "SLURM_PROCID")
 
-# Hydra writes before it calls the program, so its callback locks and the program finds it locked.
+# Hydra writes before it calls the program, so its callback locks, and the program uses that lock.
 _held: dict[Path, FileLock] = {}
 
 
 class RunDirLock(Callback):
-    """Hydra's callback that locks a run's or a sweep's folder before anything is written there.
+    """Hydra callback that locks the folder of a run or sweep before anything is written there.
 
-    Hydra ignores what a callback raises, except an exit: so errors are reported here.
+    Hydra ignores what a callback raises, except an exit: errors are reported here.
     """
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Lock the folder of a run; :func:`alone_in` releases it."""
+        """Lock the folder of a run; :func:`exclusive` releases it."""
         hydra = HydraConfig.instance()
         before = hydra.cfg
         try:
             hydra.set_config(config)  # Hydra does so later, and the folder may refer to it
             folder = Path(config.hydra.run.dir)
         except OmegaConfBaseException:
-            return  # Hydra will say what is wrong with the config
+            return  # Hydra will report what is wrong with the config
         finally:
             hydra.cfg = before
         if _locks(config):
@@ -70,13 +70,13 @@ class RunDirLock(Callback):
 
 
 @contextmanager
-def alone_in(folder: Path, config: DictConfig, key: str) -> Iterator[None]:
+def exclusive(folder: Path, config: DictConfig, key: str) -> Iterator[None]:
     """While the block lasts, no other process works in a run's folder.
 
     Args:
         folder: the run's folder.
         config: a composed config.
-        key: the setting by which another folder is chosen, for the message.
+        key: the setting that chooses another folder, for the message.
 
     Raises:
         DevrfError: another process works there.
@@ -109,10 +109,9 @@ def _lock(folder: Path, key: str) -> bool:
         with warnings.catch_warnings(action="ignore"):
             lock.acquire(timeout=0)
     except Timeout:
-        try:
+        which = ""
+        with suppress(OSError):  # the other process may not have written it yet
             which = f" ({owner.read_text()})"
-        except OSError:  # it has the lock, but has not written its record yet
-            which = ""
         raise DevrfError(
             f"{folder}: another devrf process{which} works in this folder; wait for it, or use "
             f"{key}=FOLDER"

@@ -1,4 +1,4 @@
-"""What each stage of a run does: which steps, in which order, after which checks."""
+"""The steps of ``stage=…``, in which order, after which checks."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lightning import seed_everything
 from omegaconf import DictConfig
 
 from devrf.cli import job
-from devrf.cli.context import FROM_NOTHING, RunContext
+from devrf.cli.context import RunContext
 from devrf.cli.evaluate import evaluate
 from devrf.cli.inspect_scene import inspect, prepare
 from devrf.cli.objective import check_objective, objective
@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 
 Step = Callable[[RunContext], None]
 
-# What learns nothing, by the name of its stage; the protocol's stages come beside these.
+# Stages that learn nothing; the protocol's stages come beside these.
 STEPS: dict[str, Step] = {
     "prepare": prepare,
     "inspect": inspect,
@@ -44,19 +44,15 @@ STEPS: dict[str, Step] = {
     "report": report,
 }
 PIPELINE = ("evaluate", "render")
+# Steps that use no checkpoint.
+FROM_NOTHING = {"prepare", "inspect", "report"}
 MOVED = {"benchmark": "run python benchmarks/training.py with the other overrides"}
 
-# What Lightning says of every run (accelerators it looked for, tips, how many workers a loader
-# might have) is of no use to someone who watches a scene being learned.
+# Lightning's messages on accelerators, tips and data loaders say nothing about this run.
 for _name in ("lightning.pytorch", "lightning.fabric"):
     logging.getLogger(_name).setLevel(logging.WARNING)
-for _words in (
-    "does not have many workers",
-    "LeafSpec",
-    "GPU available but not used",
-    "Experiment logs directory",
-):
-    warnings.filterwarnings("ignore", message=f".*{_words}.*")
+_IGNORED = "many workers|LeafSpec|GPU available but not used|Experiment logs directory"
+warnings.filterwarnings("ignore", message=f".*({_IGNORED})")
 
 
 @dataclass(frozen=True)
@@ -64,8 +60,8 @@ class Plan:
     """What ``stage=…`` asks for.
 
     Attributes:
-        learning: stages of the protocol, which several processes may learn together.
-        further: steps of one process after them, by name.
+        learning: stages of the protocol, learned by all processes.
+        further: steps after them, of rank 0 alone.
     """
 
     learning: tuple[str, ...]
@@ -73,7 +69,7 @@ class Plan:
 
 
 def plan(stage: str, protocol: Sequence[str]) -> Plan:
-    """What a stage asks for under a protocol of some stages.
+    """The steps of ``stage``; ``protocol`` names the stages that learn.
 
     Raises:
         DevrfError: there is no such stage.
@@ -95,13 +91,13 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
 
     Args:
         config: a composed config (``conf/config.yaml``).
-        folder: where to work.
+        folder: the run's folder.
 
     Returns:
-        What ``objective`` names; None where nothing was scored.
+        The objective; None where nothing was scored.
 
     Raises:
-        DevrfError: an unknown stage, or whatever is wrong with the input.
+        DevrfError: the input is wrong.
     """
     run = RunContext(config, folder)
     asked = plan(config.stage, run.learning_stages)
@@ -131,12 +127,7 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
 
 
 def learn_all(config: DictConfig, folder: Path) -> None:
-    """Learn what ``stage=…`` asks for, as one of several processes.
-
-    Args:
-        config: a composed config that has been checked.
-        folder: the run's folder; rank 0 writes into it.
-    """
+    """Learn the stages of ``stage=…`` in another process than rank 0; the config is checked."""
     run = RunContext(config, folder)
     with launch_workers(run, learn_all):
         _learn(run, plan(config.stage, run.learning_stages))
@@ -155,10 +146,7 @@ def _take(run: RunContext, name: str, step: Step) -> None:
 
 
 def _check(run: RunContext, asked: Plan) -> None:
-    """Find what can be found wrong before the first step has cost any time.
-
-    A mistake in the last stage's config would else show when the first is done.
-    """
+    """Find errors in the config of every step before the first begins."""
     config = run.config
     begins = asked.learning and run.protocol[asked.learning[0]].builds_on is None
     if config.ckpt is not None and (begins or not FROM_NOTHING.isdisjoint(asked.further)):

@@ -6,7 +6,7 @@ import gc
 import logging
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -34,16 +34,11 @@ NOTHING_FINISHED = "No trials are completed"
 
 
 def run_job(run: Callable[[], float | None], config: DictConfig, folder: Path) -> float | None:
-    """Run one job of a sweep; if it fails, record why, so that the next jobs still run.
-
-    Args:
-        run: does the job and returns its objective.
-        config: the job's config.
-        folder: the job's folder; a failure is recorded in its ``failure.json``.
+    """Run one job of a sweep; if it fails, write ``failure.json``, so that the next jobs still run.
 
     Returns:
-        The objective; None for a job that failed, which a search counts as failed. (A NaN would
-        end the search, an exception the basic sweeper.)
+        The objective; None for a failed job, which a search counts as failed. (A NaN would end the
+        search, an exception the basic sweeper.)
     """
     forget_peak_memory()
     try:
@@ -58,26 +53,27 @@ def run_job(run: Callable[[], float | None], config: DictConfig, folder: Path) -
 
 
 def forget_failure(folder: Path) -> None:
-    """Remove the record of an earlier failure from the folder of a run that succeeded."""
+    """Remove an earlier ``failure.json`` from the folder of a run that succeeded."""
     (folder / FAILURE).unlink(missing_ok=True)
 
 
 def _record(error: Exception, config: DictConfig, folder: Path) -> None:
-    """Say why a job failed: in its folder, and in one line on stderr."""
+    """Report why a job failed: in its folder, and in one line on stderr."""
     user_error = is_user_error(error)
     said = one_line(error) if user_error else f"{type(error).__name__}: {one_line(error)}"
-    write_json(
-        folder / FAILURE,
-        {
-            "scene": _scene(config),
-            "choices": job.choices(),
-            "overrides": job.overrides(),
-            "seed": config.get("seed"),
-            "error": said,
-            "mistake": user_error,
-            "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        },
-    )
+    scene = None
+    with suppress(OmegaConfBaseException):
+        scene = str(config.scene)
+    found = {
+        "scene": scene,
+        "choices": job.choices(),
+        "overrides": job.overrides(),
+        "seed": config.get("seed"),
+        "error": said,
+        "mistake": user_error,
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+    write_json(folder / FAILURE, found)
     where = ""
     if not user_error:
         _into_run_log(error)
@@ -85,15 +81,8 @@ def _record(error: Exception, config: DictConfig, folder: Path) -> None:
     print(f"devrf: job {folder.name}: {said}{where}", file=sys.stderr)
 
 
-def _scene(config: DictConfig) -> str | None:
-    try:
-        return str(config.scene)
-    except OmegaConfBaseException:
-        return None
-
-
 def _into_run_log(error: Exception) -> None:
-    """Write the traceback to the job's log only: the terminal has one line a job."""
+    """Write the traceback to the job's log, not to the terminal."""
     trace = (type(error), error, error.__traceback__)
     record = log.makeRecord(log.name, logging.ERROR, __file__, 0, "the job failed", (), trace)
     for handler in logging.getLogger().handlers:
@@ -102,29 +91,29 @@ def _into_run_log(error: Exception) -> None:
 
 
 class SweepMonitor(Callback):
-    """Hydra callback that tells :func:`failures_at_the_end` which jobs of a sweep failed."""
+    """Hydra callback that tells :func:`failures_at_the_end` which jobs failed."""
 
     started: SweepMonitor | None = None
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Record what the sweep's folder holds before the first job."""
+        """Note what the sweep's folder holds before the first job."""
         self.folder = Path(config.hydra.sweep.dir)
         self.was_there = self.folder.exists()
         self.failures, self.jobs = self._stamps(FAILURE), self._stamps(".hydra/config.yaml")
         SweepMonitor.started = self
 
     def failed(self) -> list[str]:
-        """The folders of this sweep's failed jobs, relative to the sweep's."""
+        """Folders of failed jobs, relative to the sweep's."""
         now = self._stamps(FAILURE)
         return [str(path.parent) for path in sorted(now) if now[path] != self.failures.get(path)]
 
     def count(self) -> int:
-        """The number of jobs that this sweep has started."""
+        """How many jobs have started."""
         now = self._stamps(".hydra/config.yaml")
         return sum(stamp != self.jobs.get(path) for path, stamp in now.items())
 
     def _stamps(self, name: str) -> dict[Path, int]:
-        """The time each file of that name below the sweep's folder was written, in nanoseconds."""
+        """When each file of that name was written, in nanoseconds."""
         found = self.folder.rglob(name)
         return {path.relative_to(self.folder): path.stat().st_mtime_ns for path in found}
 

@@ -1,4 +1,4 @@
-"""The report of a sweep's runs, written at the sweep's end."""
+"""The report of a sweep's runs."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from devrf.errors import DevrfError
 
 
 class SweepReport(Callback):
-    """Compares a sweep's runs once all jobs are done, in the process that started them."""
+    """Hydra callback that compares a sweep's runs once all jobs are done."""
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Write the report into the sweep's folder and print it; nothing if no job was scored."""
-        # Hydra loads this module with every command; pandas and matplotlib are needed only here.
+        # Hydra imports this module with every command; pandas and matplotlib are slow to import.
         from devrf.reporting.write import write_report
 
         try:

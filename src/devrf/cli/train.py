@@ -1,4 +1,4 @@
-"""The steps that learn: the stages of the run's protocol."""
+"""The stages that learn."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 
 def learn(run: RunContext, name: str) -> None:
-    """Learn a stage of the run's protocol, or what is left of it."""
+    """Learn a stage of the protocol, or the rest of it."""
     begin = _begin(run, name)
     if begin.finished:
         return
@@ -46,7 +46,7 @@ def learn(run: RunContext, name: str) -> None:
 
 
 def _begin(run: RunContext, stage: str) -> ResumePoint:
-    """Where the stage begins, as the leading process finds it: all must begin there."""
+    """Where the stage begins, as rank 0 finds it."""
     agreed = run.strategy.broadcast(beginning(run, stage) if run.leads else None)
     assert isinstance(agreed, ResumePoint)
     return agreed
@@ -54,11 +54,11 @@ def _begin(run: RunContext, stage: str) -> ResumePoint:
 
 def _fit(run: RunContext, stage: ScheduledStage, begin: ResumePoint) -> None:
     if run.leads:
-        _ = run.scene  # what is wrong with it is said before a logger writes files
+        _ = run.scene  # errors in it come before a logger writes files
     stage.training_config = begin.training_config
     callbacks = [*instantiate(run.config.callbacks).values(), TrainingRecord()]
     saving = next((one for one in callbacks if isinstance(one, PeriodicCheckpoint)), None)
-    if saving is None:  # nothing now and then, but still something when a signal asks
+    if saving is None:  # no periodic files, but still one at a signal
         saving = PeriodicCheckpoint(run.folder / "checkpoints", every_seconds=math.inf)
         callbacks.append(saving)
     with StopOnSignal(saving) as stop:
@@ -70,7 +70,7 @@ def _fit(run: RunContext, stage: ScheduledStage, begin: ResumePoint) -> None:
         )
         trainer.strategy.checkpoint_io = ChecksummedCheckpointIO()
         if isinstance(run.logger, ResumableCSVLogger):
-            run.logger.go_on(stage.capture, begin.iteration)
+            run.logger.drop_rows_beyond(stage.capture, begin.iteration)
         path = begin.progress and str(begin.progress)
         trainer.fit(stage, datamodule=run.datamodule, ckpt_path=path)
         strategy = trainer.strategy
@@ -78,14 +78,14 @@ def _fit(run: RunContext, stage: ScheduledStage, begin: ResumePoint) -> None:
         if run.leads and (not asked or stage.iteration >= stage.total_iterations):
             _keep(run, trainer, stage)
         strategy.barrier("the checkpoint is written")
-    if asked:  # of several processes the first is, and ends for all
+    if asked:
         raise Interrupted(stop.number or signal.SIGTERM, _where(stage, saving))
 
 
 def _keep(run: RunContext, trainer: Trainer, stage: ScheduledStage) -> None:
-    """Write what the stage has learned, and the config that it was learned with."""
+    """Write the stage's checkpoint, and the config that it was learned with."""
     path = run.own_checkpoint(stage.name)
-    # Scoring reads it from the checkpoint; hence without the time of writing that.
+    # Goes into the checkpoint, so without the time of writing it.
     stage.record["wall_seconds"] = run.step_seconds
     try:
         save_checkpoint(trainer, path)
@@ -104,7 +104,7 @@ def _keep(run: RunContext, trainer: Trainer, stage: ScheduledStage) -> None:
 
 
 def _where(stage: ScheduledStage, saving: PeriodicCheckpoint) -> str:
-    """Where a signal has ended the run, on one line."""
+    """Where a signal has ended the run, in one line."""
     done, total = stage.iteration, stage.total_iterations
     where = f"interrupted at iteration {done} of {total} of the {stage.name} stage"
     if done < total and saving.saved != done:

@@ -1,4 +1,4 @@
-"""Whether a value from a config is of the type that a signature states, and that type in words."""
+"""Whether a config value has the type that a signature states, and that type in words."""
 
 from __future__ import annotations
 
@@ -19,17 +19,16 @@ WORDS = {
 
 
 def fits(value: object, hint: Any) -> bool:
-    """Whether ``value`` can be given where ``hint`` is stated; True where no config value can be.
+    """Whether ``value`` fits a parameter annotated ``hint``; True for types no config value has.
 
-    Text counts as a path, a list as any sequence, a whole number as a number; nothing else is
-    converted.
+    Text counts as a path, a list as any sequence, a whole number as a number.
     """
     # Imported here: --help is answered before it has loaded.
     from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
 
     try:
         adapter = TypeAdapter(hint, config=ConfigDict(arbitrary_types_allowed=True))
-        # As JSON: given as Python's objects, strictly, text would be no path and a list no tuple.
+        # As JSON: of Python objects, strictly, text would be no path and a list no tuple.
         adapter.validate_json(json.dumps(value, default=str), strict=True)
     except PydanticUserError:  # a hint that pydantic does not know
         return True
@@ -39,7 +38,7 @@ def fits(value: object, hint: Any) -> bool:
 
 
 def described(hint: Any) -> str:
-    """The type in the words of someone who writes a config: ``a whole number or null``."""
+    """The type in words: ``a whole number or null``."""
     origin, inner = get_origin(hint), get_args(hint)
     if origin in (Union, types.UnionType):
         return " or ".join(dict.fromkeys(described(one) for one in inner))

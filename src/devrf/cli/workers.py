@@ -1,8 +1,8 @@
 """The processes that learn one scene together: started, watched, and ended with this one.
 
 Rank 0 is the process that the user started. It alone composes the config, writes files and logs;
-the others get the composed config, take part in the steps that learn, and end. Where a launcher
-such as torchrun has started all of them, none is started here.
+the others get the composed config and take part in the stages that learn. Where a launcher such as
+torchrun has started all of them, none is started here.
 
 Lightning's own launchers do not fit: one runs the command line again in each process, which would
 compose every job of a sweep anew; the other moves rank 0 to a process of its own, away from the
@@ -38,8 +38,8 @@ from devrf.errors import DevrfError
 from devrf.system.process import tune_for_cpu
 
 Work = Callable[[DictConfig, Path], None]
-# What other processes report, the first failure first: whether the user can correct it, and a line
-# on it or else the traceback.
+# Failures of other processes, the first one first: whether it is a user error, and its one line or
+# else the traceback.
 Reports = SimpleQueue[tuple[bool, str]]
 
 # Seconds that a process has to end, or to notice that another has ended.
@@ -48,19 +48,18 @@ GRACE = 10.0
 
 @contextmanager
 def launch_workers(run: RunContext, work: Work) -> Iterator[None]:
-    """While the block lasts, all processes that ``trainer`` asks for are there.
+    """While the block lasts, all processes that ``trainer`` asks for take part.
 
-    Rank 0 reads the scene first: errors in it are reported once, and optical flow that it
-    estimates and keeps is found by the others.
+    Rank 0 reads the scene first: errors in it are reported once, and the others find the optical
+    flow that it has estimated and stored.
 
     Args:
-        run: what this process works on.
-        work: what the others do with the composed config and the run's folder; it must be
-            importable by its name.
+        run: of this process.
+        work: what the others do with the composed config and the run's folder; importable by name.
 
     Raises:
         DevrfError: the processes cannot be started, or a user error ended one of them.
-        RuntimeError: another error of another process; the message has its traceback.
+        RuntimeError: another error of another process, with its traceback.
     """
     strategy = run.strategy
     if not isinstance(strategy, ManualDDP):
@@ -78,7 +77,7 @@ def launch_workers(run: RunContext, work: Work) -> Iterator[None]:
     if run.leads:
         _ = run.scene
     else:
-        silence_logs()
+        _silence_logs()
     others = nullcontext() if outside else _others(run, work, strategy.num_processes)
     with _restored(), others:
         strategy.setup_environment()
@@ -108,41 +107,37 @@ def _leave_group() -> None:
 
 @contextmanager
 def _others(run: RunContext, work: Work, count: int) -> Iterator[None]:
-    """Processes 1 to ``count`` - 1, which end with this block, if need be by force."""
+    """Processes 1 to ``count`` - 1, which end with this block, by force if necessary."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     os.environ.update(
         MASTER_ADDR="127.0.0.1", MASTER_PORT=str(port), NODE_RANK="0", WORLD_SIZE=str(count)
     )
-    config, spawn = (
-        OmegaConf.to_container(run.config, resolve=True),
-        multiprocessing.get_context("spawn"),
-    )
+    config = OmegaConf.to_container(run.config, resolve=True)
+    spawn = multiprocessing.get_context("spawn")
     reports: Reports = spawn.SimpleQueue()
+    arguments = (work, config, run.folder, reports)
     children: list[SpawnProcess] = []
     over = threading.Event()
     try:
         for rank in range(1, count):
             os.environ["LOCAL_RANK"] = str(rank)
-            child = spawn.Process(
-                target=_take_part, args=(work, config, run.folder, reports), daemon=True
-            )
-            with signals_blocked():
+            child = spawn.Process(target=_take_part, args=arguments, daemon=True)
+            with _signals_blocked():
                 child.start()
             children.append(child)
         os.environ["LOCAL_RANK"] = "0"
         for child in children:
-            threading.Thread(
-                target=_watch, args=(child, children, reports, over), daemon=True
-            ).start()
+            watched = (child, children, reports, over)
+            threading.Thread(target=_watch, args=watched, daemon=True).start()
         yield
         for child in children:
             child.join(GRACE)
     except Exception as error:
         if is_user_error(error):
             raise
-        # Where another process ends, what is noticed here is a connection that broke.
+        # If another process has ended, this one only notices a broken connection.
         wait([child.sentinel for child in children], timeout=1.0)
         raise _failure(children, reports) or error  # noqa: B904 - its cause is over there
     finally:
@@ -153,10 +148,10 @@ def _others(run: RunContext, work: Work, count: int) -> Iterator[None]:
 
 
 @contextmanager
-def signals_blocked() -> Iterator[None]:
+def _signals_blocked() -> Iterator[None]:
     """A process started now receives neither Ctrl-C nor SIGTERM.
 
-    They may go to all processes at once, but are for rank 0, which ends the others.
+    A terminal or launcher may send them to all processes, but rank 0 ends the others.
     """
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
@@ -170,10 +165,10 @@ def signals_blocked() -> Iterator[None]:
 
 
 def _failure(children: Sequence[SpawnProcess], reports: Reports) -> Exception | None:
-    """The first error that was reported, or what an exit status says; None if all is well."""
+    """The first error that was reported, else that of an exit status, if any."""
     if not reports.empty():
-        mistake, text = reports.get()
-        return DevrfError(text) if mistake else RuntimeError(text)
+        user_error, text = reports.get()
+        return DevrfError(text) if user_error else RuntimeError(text)
     for rank, child in enumerate(children, 1):
         if status := child.exitcode:
             how = f"was ended by signal {-status}" if status < 0 else f"ended with {status}"
@@ -186,9 +181,9 @@ def _failure(children: Sequence[SpawnProcess], reports: Reports) -> Exception | 
 def _watch(
     child: SpawnProcess, children: Sequence[SpawnProcess], reports: Reports, over: threading.Event
 ) -> None:
-    """End this process, and so the others, when one has failed and this one waits for it.
+    """End this process if ``child`` has failed and this one does not notice.
 
-    Between CPUs a connection breaks at once; a GPU may wait for the lost one for half an hour.
+    Between CPUs a connection breaks at once; a GPU may wait for the lost process for half an hour.
     """
     wait([child.sentinel])
     if child.exitcode == 0 or over.wait(GRACE):
@@ -201,13 +196,13 @@ def _watch(
 def _take_part(work: Work, config: Any, folder: Path, reports: Reports) -> None:
     """The whole life of another process."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    silence_logs()
+    _silence_logs()
     tune_for_cpu()
     try:
         work(OmegaConf.create(config), folder)
     except BaseException as error:
-        mistake = isinstance(error, Exception) and is_user_error(error)
-        reports.put((mistake, one_line(error) if mistake else traceback.format_exc()))
+        user_error = isinstance(error, Exception) and is_user_error(error)
+        reports.put((user_error, one_line(error) if user_error else traceback.format_exc()))
         sys.exit(1)
 
 
@@ -218,7 +213,7 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def silence_logs() -> None:
+def _silence_logs() -> None:
     """Log nothing in this process: rank 0 logs the same."""
     logging.disable(logging.CRITICAL)
     warnings.simplefilter("ignore")

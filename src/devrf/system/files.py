@@ -14,17 +14,14 @@ from typing import Any
 def atomic_write(path: Path) -> Iterator[Path]:
     """A path to write to that becomes ``path`` when the block ends well, and vanishes otherwise.
 
-    The content is on the disk before it has its name: after a kill or a power failure at any
-    moment the earlier file or the new one is there, whole.
-
-    Args:
-        path: the file; its folder is made.
+    The folder is made. After a kill or a power failure at any moment the earlier file or the new
+    one is there, whole.
 
     Raises:
         OSError: naming ``path``: it cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    # The suffix stays last: writers tell the format by it.
+    # The suffix stays last: writers choose the format by it.
     partial = path.with_name(f".partial-{path.name}")
     try:
         yield partial
@@ -41,7 +38,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Put a new name in ``folder`` on the disk, where the system can."""
+    """Write a new name in ``folder`` to the disk, where the system can."""
     with suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:

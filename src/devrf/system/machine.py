@@ -1,4 +1,4 @@
-"""What the machine has to give: memory, room on a disk, arithmetic."""
+"""What the machine offers: memory, disk space, arithmetic."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import psutil
 import torch
 
-# What a control group of version 1 says where it has no limit is larger than any machine.
+# A control group of version 1 without a limit states more than any machine has.
 UNLIMITED = 2**60
 
 
@@ -18,15 +18,15 @@ def free_memory(device: torch.device) -> int:
     if device.type != "cuda":
         return free_host_memory()
     free, _ = torch.cuda.mem_get_info(device)
-    # What torch keeps for itself but does not use is free, too.
+    # What torch has reserved but does not use is free, too.
     return free + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
 
 
 def free_host_memory(root: Path = Path("/")) -> int:
     """Bytes that this process could still take on the host.
 
-    What the system calls available, or what is left of the smallest limit of the control groups
-    that hold the process (containers, SLURM), whichever is less. ``root`` holds ``proc``, ``sys``.
+    The least of what the system calls available and what the process's control groups (containers,
+    SLURM) leave it. ``root`` holds ``proc`` and ``sys``.
     """
     available: int = psutil.virtual_memory().available
     return min([available, *_left_by_groups(root)])
@@ -44,10 +44,9 @@ def free_disk(folder: Path) -> int:
 
 
 def multiplies_bfloat16(device: torch.device) -> bool:
-    """Whether ``device`` is faster with products of bfloat16: NVIDIA's GPUs are from Ampere on.
+    """Whether ``device`` multiplies bfloat16 faster: NVIDIA's GPUs from Ampere on.
 
-    A CPU is not, even one with instructions for them: oneDNN compiles its products anew for each
-    number of samples, and no two batches have the same.
+    A CPU does not: oneDNN compiles its products anew for each number of samples.
     """
     return device.type == "cuda" and torch.cuda.get_device_capability(device) >= (8, 0)
 
@@ -76,7 +75,7 @@ def _left_by_groups(root: Path) -> Iterator[int]:
 
 
 def _left_by_group(folder: Path, limit: str, usage: str, cache: str) -> Iterator[int]:
-    """Bytes left of a group's limit, if it has one; files that are only cached give way."""
+    """Bytes left of a group's limit, if it has one; cached files count as free."""
     try:
         most, used = (int((folder / name).read_text()) for name in (limit, usage))
         stat = (folder / "memory.stat").read_text().split()

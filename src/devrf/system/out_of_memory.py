@@ -1,4 +1,4 @@
-"""When memory runs out: how errors say so, and how to free what is cached."""
+"""Recognises errors of memory, and frees what is cached."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from devrf.errors import DevrfError
 from devrf.system.machine import free_memory
 
-# What torch's allocators and its libraries say (oneDNN does not mention memory). On a GPU the error
+# Messages of torch's allocators and libraries (oneDNN's do not mention memory); on a GPU the error
 # has a class of its own.
 MESSAGES = (
     "out of memory",
@@ -46,7 +46,7 @@ def free_cache(device: torch.device) -> None:
 
 
 def numbers(said: str, device: torch.device) -> str:
-    """What was asked for, if the error ``said`` so, and what is free on ``device``, in words."""
+    """In words, what was asked for, if the message ``said`` so, and what is free on ``device``."""
     asked, free = ASKED.search(said), f"{gib(free_memory(device))} GiB free on {device}"
     if not asked or asked.group(2).lower() not in UNITS:
         return free

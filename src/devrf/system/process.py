@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 # glibc's malloc.h
@@ -14,11 +15,10 @@ M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD = -1, -2, -3
 def tune_for_cpu() -> None:
     """Keep threads from spinning long and freed memory from going back to the kernel.
 
-    Threads that wait for one another by spinning, as they do by default, are a hundred times
-    slower on a busy machine; threads that sleep at once gain nothing over one thread. A short spin
-    is fast on an idle machine and harmless on a busy one. And a training step allocates and frees
-    the same dozens of megabytes again and again: if they went back to the kernel each time, every
-    page would be mapped and zeroed anew, a tenth of the run.
+    Threads that wait by spinning, the default, are a hundred times slower on a busy machine;
+    threads that sleep at once gain nothing over one thread; a short spin suits both. A training
+    step frees and takes the same dozens of megabytes again and again: mapping and zeroing those
+    pages anew would be a tenth of the run.
 
     Of no effect once torch is loaded, on a GPU, or where the C library is not glibc.
     """
@@ -36,8 +36,6 @@ def tune_for_cpu() -> None:
 
 
 def forget_peak_memory() -> None:
-    """Restart the system's measurement of this process's peak memory, where it can (Linux)."""
-    try:
+    """Restart the system's measurement of this process's peak memory (Linux only)."""
+    with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
-    except OSError:
-        return

@@ -1,4 +1,4 @@
-"""Names for the parts of an iteration: seen by torch.profiler, free where nothing is profiled."""
+"""Names for the parts of an iteration, for torch.profiler; free where no profiler is active."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ _nothing = nullcontext()
 
 
 def measured() -> bool:
-    """Whether a profiler is active: parts then run one after another, not replayed as a whole."""
+    """Whether a profiler is active: no CUDA graph is replayed then."""
     return profiler._is_profiler_enabled
 
 
 def span(part: Part) -> AbstractContextManager[object]:
-    """Record what is done inside as ``part``, if a profiler is active; spans may be nested."""
+    """Record the block as ``part``, if a profiler is active; spans may be nested."""
     return profiler.record_function(part) if measured() else _nothing

@@ -1,4 +1,4 @@
-"""Signals that ask a run to end, and what answers them."""
+"""Handlers of the signals that ask a run to end."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import NoReturn
 
-# Ctrl-C, the system's request to end, and what SLURM sends some time before it does.
+# Ctrl-C, the system's request to end, and what SLURM sends some time before that.
 NAMES = ("SIGINT", "SIGTERM", "SIGUSR1", "SIGUSR2")
 STOP_SIGNALS = tuple(getattr(signal, name) for name in NAMES if hasattr(signal, name))
 
@@ -20,7 +20,7 @@ class Interrupted(SystemExit):
     """A signal has ended the run; the exit status is 128 plus its number, as in a shell.
 
     Attributes:
-        said: what to tell the user, on one line.
+        said: the line for the user.
     """
 
     def __init__(
@@ -31,16 +31,12 @@ class Interrupted(SystemExit):
 
 
 def end_at_once(number: int) -> NoReturn:
-    """Answer a signal by ending the run where it stands; half-written files are removed.
-
-    Raises:
-        Interrupted: always.
-    """
+    """End the run at once, by raising Interrupted; half-written files are removed."""
     raise Interrupted(number)
 
 
 class _Handler:
-    """A handler of ours, so that a block within another may take its signals."""
+    """A handler that an inner block recognises and may replace."""
 
     def __init__(self, answer: Answer) -> None:
         self.answer = answer
@@ -50,14 +46,14 @@ class _Handler:
 
 
 @contextmanager
-def answered_by(answer: Answer) -> Iterator[Callable[[], None]]:
-    """Answer signals by ``answer(number)`` within the block; the earlier handlers return after it.
+def handle_signals(answer: Answer) -> Iterator[Callable[[], None]]:
+    """Handle signals by ``answer(number)`` within the block; earlier handlers return after it.
 
-    A signal that is ignored or has another program's handler keeps it: a launcher that requeues
-    its job does so by a handler of its own. Of no effect outside the main thread.
+    A signal that is ignored or has another program's handler keeps it: launchers requeue their
+    jobs by handlers of their own. Of no effect outside the main thread.
 
     Yields:
-        A function that takes the block's signals back from a library that has taken them since.
+        A function that takes the signals back from a library that has replaced the handler.
     """
     handler = _Handler(answer)
     before = {number: signal.getsignal(number) for number in STOP_SIGNALS}

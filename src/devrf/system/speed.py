@@ -1,4 +1,4 @@
-"""Waiting for a device, whose work is queued: before a clock is read or memory is given away."""
+"""Waiting for a device, whose work is queued."""
 
 from __future__ import annotations
 
@@ -6,6 +6,6 @@ import torch
 
 
 def wait(device: torch.device) -> None:
-    """Return when the device has done all that it was told."""
+    """Return when the device has done all that is queued."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)

@@ -1,4 +1,4 @@
-"""Signals are answered by a block of ours, unless another program's handler does."""
+"""Signals are handled by the innermost block, unless another program handles them."""
 
 from __future__ import annotations
 
@@ -6,11 +6,10 @@ import os
 import signal
 import threading
 from collections.abc import Iterator
-from typing import Any
 
 import pytest
 
-from devrf.system.signals import STOP_SIGNALS, Interrupted, answered_by, end_at_once
+from devrf.system.signals import STOP_SIGNALS, Interrupted, end_at_once, handle_signals
 
 
 @pytest.fixture(autouse=True)
@@ -21,44 +20,44 @@ def as_before() -> Iterator[None]:
         signal.signal(number, handler)
 
 
-def send(number: int) -> None:
-    os.kill(os.getpid(), number)
+def send(*numbers: int) -> None:
+    for number in numbers:
+        os.kill(os.getpid(), number)
 
 
 @pytest.mark.parametrize("number", STOP_SIGNALS)
-def test_the_block_answers_and_gives_back(number: int) -> None:
-    before, heard = signal.getsignal(number), []
-    with answered_by(heard.append):
+def test_a_block_handles_signals_and_restores_the_handlers(number: int) -> None:
+    before = signal.getsignal(number)
+    heard: list[int] = []
+    with handle_signals(heard.append):
         send(number)
     assert heard == [number]
     assert signal.getsignal(number) == before
 
 
-def test_a_block_within_answers_first() -> None:
+def test_the_inner_block_comes_first() -> None:
     outer: list[int] = []
     inner: list[int] = []
-    with answered_by(outer.append):
-        with answered_by(inner.append):
+    with handle_signals(outer.append):
+        with handle_signals(inner.append):
             send(signal.SIGTERM)
         send(signal.SIGINT)
     assert (outer, inner) == ([signal.SIGINT], [signal.SIGTERM])
 
 
-def test_what_others_answer_or_ignore_stays_theirs() -> None:
+def test_other_programs_handlers_stay() -> None:
     theirs: list[int] = []
     ours: list[int] = []
     signal.signal(signal.SIGUSR2, lambda number, frame: theirs.append(number))
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    with answered_by(ours.append):
-        send(signal.SIGUSR2)
-        send(signal.SIGINT)
-        send(signal.SIGTERM)
+    with handle_signals(ours.append):
+        send(signal.SIGUSR2, signal.SIGINT, signal.SIGTERM)
     assert (theirs, ours) == ([signal.SIGUSR2], [signal.SIGTERM])
 
 
-def test_signals_are_taken_back_from_a_library_that_took_them() -> None:
+def test_signals_are_taken_back_from_a_library() -> None:
     heard: list[int] = []
-    with answered_by(heard.append) as take:
+    with handle_signals(heard.append) as take:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
         take()
         send(signal.SIGTERM)
@@ -66,10 +65,10 @@ def test_signals_are_taken_back_from_a_library_that_took_them() -> None:
 
 
 def test_outside_the_main_thread_nothing_is_taken() -> None:
-    found: list[Any] = []
+    found: list[object] = []
 
     def work() -> None:
-        with answered_by(end_at_once):
+        with handle_signals(end_at_once):
             found.append(signal.getsignal(signal.SIGTERM))
 
     thread = threading.Thread(target=work)
@@ -79,7 +78,7 @@ def test_outside_the_main_thread_nothing_is_taken() -> None:
 
 
 def test_ending_at_once_has_the_status_of_a_shell() -> None:
-    with pytest.raises(Interrupted) as caught, answered_by(end_at_once):
+    with pytest.raises(Interrupted) as caught, handle_signals(end_at_once):
         send(signal.SIGTERM)
     assert caught.value.code == 143
-    assert not isinstance(caught.value, Exception)  # so no handler of faults or mistakes catches it
+    assert not isinstance(caught.value, Exception)  # no handler of errors catches it
