@@ -7,8 +7,15 @@ from dataclasses import replace
 import pytest
 import torch
 
-from devrf.data.batch import background_color, concatenated, gather_batch, pixel_positions
-from devrf.data.pool import PixelPool, all_pixels, wanted_pixels
+from devrf.data.batch import (
+    PixelPool,
+    all_pixels,
+    background_color,
+    concatenated,
+    gather_batch,
+    pixel_positions,
+    wanted_pixels,
+)
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.scene import OpticalFlow, Views
 

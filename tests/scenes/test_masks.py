@@ -17,9 +17,9 @@ from PIL import Image
 from devrf.artifacts.inspection.image_advice import image_advice
 from devrf.artifacts.inspection.picture import shown
 from devrf.artifacts.inspection.report import inspect_scene
+from devrf.data.batch import all_pixels
 from devrf.data.flow_source import with_flow
 from devrf.data.nerfstudio import NerfstudioDataModule
-from devrf.data.pool import all_pixels
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.scenes.nerfstudio import NerfstudioReader

@@ -121,8 +121,11 @@ class Loop:
 
     def _accumulate(self, stage: ScheduledStage, views: Any) -> None:
         """Compute the gradients of all batches; add losses and terms to the metrics."""
-        pieces = [partial(self._gradients, batch, stage, views) for batch in self.batches]
-        found = self._streams(pieces, self._device)
+        if len(self.batches) == 1:
+            found = [self._gradients(self.batches[0], stage, views)]
+        else:
+            pieces = [partial(self._gradients, batch, stage, views) for batch in self.batches]
+            found = self._streams(pieces, self._device)
         groups = stage.optimizer.param_groups
         average_gradients(p for group in groups for p in group["params"])
         self.metrics.add(found)

@@ -10,8 +10,15 @@ import torch
 from torch import Tensor
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
-from devrf.data.batch import Pixels, RayBatch, background_color, concatenated, gather_batch
-from devrf.data.pool import PixelPool, all_pixels
+from devrf.data.batch import (
+    PixelPool,
+    Pixels,
+    RayBatch,
+    all_pixels,
+    background_color,
+    concatenated,
+    gather_batch,
+)
 from devrf.engine.ddp import rays_per_rank
 from devrf.engine.parallel_batch import ParallelBatch
 from devrf.engine.phase import Phase

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from devrf.checkpoints.packing import pack_bits, unpack_bits
-from devrf.data.pool import PixelPool
+from devrf.data.batch import PixelPool
 from devrf.geometry.box import Box
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.grid_warp import GridWarp

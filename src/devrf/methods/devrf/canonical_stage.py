@@ -12,8 +12,7 @@ from torch import Tensor
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.checkpoints.packing import pack_bits, unpack_bits
-from devrf.data.batch import Pixels
-from devrf.data.pool import PixelPool
+from devrf.data.batch import PixelPool, Pixels
 from devrf.engine.graphs import Graphs
 from devrf.engine.parallel_batch import ParallelBatch
 from devrf.engine.phase import Phase

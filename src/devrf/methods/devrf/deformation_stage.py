@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
-from devrf.data.batch import Pixels
+from devrf.data.batch import Pixels, all_pixels
 from devrf.data.correspondence import previous_images
-from devrf.data.pool import all_pixels
 from devrf.engine.ddp import broadcast
 from devrf.engine.graphs import Graphs
 from devrf.engine.parallel_batch import ParallelBatch

@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from devrf.data.batch import gather_batch
-from devrf.data.pool import PixelPool
+from devrf.data.batch import PixelPool, gather_batch
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.space import WORLD, Space
 from devrf.methods.devrf.deformation_field import DeformationField

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from devrf.data.pool import PixelPool, all_pixels, wanted_pixels
+from devrf.data.batch import PixelPool, all_pixels, wanted_pixels
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
 from devrf.methods.devrf.model import DeVRFModel

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from devrf.data.batch import Pixels, RayBatch, background_color, gather_batch
-from devrf.data.pool import PixelPool
+from devrf.data.batch import PixelPool, Pixels, RayBatch, background_color, gather_batch
 from devrf.engine.ddp import rays_per_rank
 from devrf.engine.graphs import Graphs
 from devrf.engine.stage import ScheduledStage
