@@ -212,7 +212,8 @@ def test_flow_initialises_only_frames_whose_predecessor_was_learned(
 ) -> None:
     followed: list[int] = []
     monkeypatch.setattr(
-        DeformationStage, "_follow_flow", lambda stage, number: followed.append(number)
+        "devrf.methods.devrf.deformation_stage.start_from_tracks",
+        lambda field, number, *rest: followed.append(number),
     )
     stage = DeformationStage(rest, TOGETHER, MotionSettings(start="flow"))
     trainer(max_epochs=1).fit(stage, datamodule=four_frames)

@@ -171,13 +171,16 @@ class Scene:
     space: Space = WORLD
 
     def __post_init__(self) -> None:
+        clock, numbered = self.clock, dict[int, Views]()
         for name in ("static", "dynamic"):
             capture: Capture = getattr(self, name)
-            numbered = (self._with_frames(views) for views in (capture.train, capture.test))
-            object.__setattr__(self, name, Capture(*numbered))
-
-    def _with_frames(self, views: Views) -> Views:
-        return replace(views, frames=self.clock.frames_of(views.times))
+            for views in (capture.train, capture.test):
+                # A moving camera's images may be both captures: they stay one.
+                if id(views) not in numbered:
+                    frames = clock.frames_of(views.times)
+                    numbered[id(views)] = replace(views, frames=frames)
+            pair = numbered[id(capture.train)], numbered[id(capture.test)]
+            object.__setattr__(self, name, Capture(*pair))
 
     def capture(self, name: CaptureName) -> Capture:
         """The capture called ``static`` or ``dynamic``."""
