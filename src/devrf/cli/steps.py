@@ -26,8 +26,7 @@ from devrf.cli.resume import archive_previous
 from devrf.cli.train import learn
 from devrf.cli.workers import launch_workers
 from devrf.errors import DevrfError
-from devrf.methods.devrf.motion_losses import MOTION_TERMS
-from devrf.methods.weighted_loss import WeightedLoss
+from devrf.methods.devrf.losses import MOTION_TERMS, WeightedLoss
 from devrf.ops.dispatch import using
 
 log = logging.getLogger(__name__)

@@ -12,7 +12,7 @@ from torch import Tensor
 from devrf.data.batch import RayBatch, gather_batch
 from devrf.data.correspondence import previous_images
 from devrf.geometry.cameras import Cameras
-from devrf.methods.devrf.motion_losses import (
+from devrf.methods.devrf.losses import (
     MotionPrediction,
     cycle,
     flow,

@@ -12,7 +12,7 @@ from devrf.data.batch import RayBatch
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.methods.devrf.grid_warp import GridWarp
-from devrf.methods.devrf.motion_losses import MOTION_TERMS, MotionPrediction
+from devrf.methods.devrf.losses import MOTION_TERMS, MotionPrediction
 from devrf.methods.devrf.volume_rendering import VoxelOutput
 from devrf.rendering.sampling import Samples
 

@@ -13,16 +13,16 @@ from torch import Tensor
 from devrf.data.batch import RayBatch
 from devrf.errors import DevrfError
 from devrf.geometry.rays import Rays
-from devrf.methods.devrf.photometric_losses import (
+from devrf.methods.devrf.losses import (
     PHOTOMETRIC_TERMS,
     Prediction,
+    WeightedLoss,
     background_entropy,
     color_error,
     matte,
     per_sample_color,
 )
 from devrf.methods.devrf.volume_rendering import VoxelOutput
-from devrf.methods.weighted_loss import WeightedLoss
 from devrf.rendering.sampling import Samples
 
 RAY = torch.tensor([0, 0, 2])

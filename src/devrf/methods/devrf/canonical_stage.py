@@ -21,9 +21,14 @@ from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.canonical_schedule import CanonicalPhase, CanonicalSchedule
 from devrf.methods.devrf.free_space import possible_matter, view_count_weight
+from devrf.methods.devrf.losses import (
+    PHOTOMETRIC_TERMS,
+    Prediction,
+    WeightedLoss,
+    total_variation_weight,
+    visibility,
+)
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.motion_losses import total_variation_weight
-from devrf.methods.devrf.photometric_losses import PHOTOMETRIC_TERMS, Prediction, visibility
 from devrf.methods.devrf.pixel_selection import canonical_pool
 from devrf.methods.devrf.settings import (
     FINE_LOSS,
@@ -34,7 +39,6 @@ from devrf.methods.devrf.settings import (
     Sampling,
 )
 from devrf.methods.devrf.voxel_stage import VoxelStage
-from devrf.methods.weighted_loss import WeightedLoss
 from devrf.ops.adam import GridAdam
 from devrf.ops.dispatch import triton_runs
 from devrf.rendering.occupancy import Occupancy, bounding_box, dilate

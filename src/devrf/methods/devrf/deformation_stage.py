@@ -22,17 +22,17 @@ from devrf.methods.devrf.deformation_schedule import DeformationPhase, Deformati
 from devrf.methods.devrf.deformed_occupancy import deformed_occupancy
 from devrf.methods.devrf.flow_initialisation import follow, start_from_tracks
 from devrf.methods.devrf.frame_memory import rest_on_host
-from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.motion_losses import (
+from devrf.methods.devrf.losses import (
     MOTION_TERMS,
     MotionPrediction,
+    WeightedLoss,
     total_variation_weight,
+    visibility,
 )
-from devrf.methods.devrf.photometric_losses import visibility
+from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.pixel_selection import frame_pools, images_of
 from devrf.methods.devrf.settings import DEFORMATION_LOSS, MotionSettings, Precision
 from devrf.methods.devrf.voxel_stage import VoxelStage
-from devrf.methods.weighted_loss import WeightedLoss
 from devrf.ops.adam import GridAdam
 from devrf.ops.dispatch import triton_runs
 from devrf.scenes.scene import CaptureName, Views

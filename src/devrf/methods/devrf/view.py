@@ -11,7 +11,7 @@ from devrf.geometry.space import Space
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformed_occupancy import occupancy_points, occupancy_through
 from devrf.methods.devrf.grid_warp import GridWarp
-from devrf.methods.devrf.motion_losses import induced_flow
+from devrf.methods.devrf.losses import induced_flow
 from devrf.methods.devrf.static_shape.viewing import ListRenderer
 from devrf.methods.devrf.volume_rendering import render
 from devrf.ops.compositing import sum_by_ray

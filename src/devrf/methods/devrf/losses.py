@@ -1,0 +1,192 @@
+"""The losses: terms that compare rays with images, terms that constrain the motion, their sum.
+
+See docs/method.md#photometric-losses and docs/method.md#motion-losses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import torch
+from torch import Tensor
+
+from devrf.data.batch import RayBatch
+from devrf.errors import DevrfError
+from devrf.geometry.cameras import Cameras
+from devrf.geometry.space import WORLD, Space
+from devrf.methods.devrf.volume_rendering import VoxelOutput, Warp
+
+Predicted = TypeVar("Predicted")
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What the rays of a batch see, and the truth at their pixels."""
+
+    output: VoxelOutput
+    batch: RayBatch
+
+
+def color_error(prediction: Prediction) -> Tensor:
+    """Mean |Ĉ − C|² over rays and channels."""
+    return torch.nn.functional.mse_loss(prediction.output.color, prediction.batch.color)
+
+
+def per_sample_color(prediction: Prediction) -> Tensor:
+    """(1/R) Σ_i sg(w_i) |c_i − C|²: each sample by itself should have the pixel's colour."""
+    output = prediction.output
+    truth = prediction.batch.color.index_select(0, output.samples.ray)
+    error = (output.sample_color - truth).square().sum(dim=1)
+    return (output.weight.detach() * error).sum() / len(prediction.batch.rays)
+
+
+def background_entropy(prediction: Prediction) -> Tensor:
+    """Mean −(p log p + (1 − p) log(1 − p)), p = T_end: a ray hits something or nothing."""
+    p = prediction.output.transmittance.clamp(1e-6, 1 - 1e-6)
+    return -(p * p.log() + (1 - p) * torch.log1p(-p)).mean()
+
+
+def matte(prediction: Prediction) -> Tensor:
+    """Mean (T_end − (1 − A))², A the images' alpha channel; 0 without one."""
+    alpha = prediction.batch.alpha
+    if alpha is None:
+        return prediction.output.transmittance.new_zeros(())
+    return (prediction.output.transmittance - (1 - alpha)).square().mean()
+
+
+@torch.no_grad()
+def visibility(prediction: Prediction) -> dict[str, Tensor]:
+    """Means over rays, for the log: ``opacity`` 1 − T_end, and ``coverage`` A if there is one."""
+    seen = {"opacity": 1 - prediction.output.transmittance.mean()}
+    alpha = prediction.batch.alpha
+    return seen if alpha is None else {**seen, "coverage": alpha.mean()}
+
+
+PHOTOMETRIC_TERMS = {
+    "color": color_error,
+    "per_sample_color": per_sample_color,
+    "entropy": background_entropy,
+    "matte": matte,
+}
+
+
+@dataclass(frozen=True)
+class MotionPrediction(Prediction):
+    """A prediction through the warp of one frame t, with what the motion terms need.
+
+    Attributes:
+        unwarp: canonical points q (M, 3) → q + Δ_f(q, t).
+        unwarp_previous: q → q + Δ_f(q, t − 1), frozen.
+        cameras: the cameras of the images that the batch was drawn from.
+        previous_image: (N,) int64, for each image the one that its flow leads to (the same view
+            one frame earlier), or the image itself where there is none.
+        space: the space that points are in.
+    """
+
+    unwarp: Warp
+    unwarp_previous: Warp
+    cameras: Cameras
+    previous_image: Tensor
+    space: Space = WORLD
+
+
+def cycle(prediction: MotionPrediction) -> Tensor:
+    """L_cycle = mean_i ½ |x_i − (q_i + Δ_f(q_i, t))|² (docs/method.md#cycle)."""
+    output = prediction.output
+    returned = prediction.unwarp(output.canonical)
+    missed = 0.5 * (output.samples.points - returned).square().sum(dim=1)
+    return output.mean_over_samples(missed)
+
+
+def flow(prediction: MotionPrediction) -> Tensor:
+    """L_flow = (1/M) Σ_i w_i m_i |φ_i − φ_i^observed|₁ in pixels (docs/method.md#flow).
+
+    M is the number of rays whose flow is valid; 0 without observed flow.
+    """
+    batch, output = prediction.batch, prediction.output
+    if batch.flow is None or batch.flow_valid is None:
+        return output.canonical.new_zeros(())
+    ray, canonical, weight = output.on_rays(batch.flow_valid)
+    induced = induced_flow(
+        canonical,
+        prediction.unwarp_previous,
+        prediction.cameras,
+        prediction.previous_image[batch.image[ray]],
+        batch.pixel[ray],
+        prediction.space,
+    )
+    error = (induced - batch.flow[ray]).abs().sum(dim=1)
+    return (weight * error).sum() / batch.flow_valid.sum().clamp(min=1)
+
+
+def induced_flow(
+    canonical: Tensor,
+    unwarp_previous: Warp,
+    cameras: Cameras,
+    camera: Tensor,
+    pixel: Tensor,
+    space: Space = WORLD,
+) -> Tensor:
+    """φ = π(q + Δ_f(q, t − 1)) − u (M, 2) in pixels, the flow that the motion implies.
+
+    Args:
+        canonical: (M, 3) canonical positions q.
+        unwarp_previous: q → q + Δ_f(q, t − 1).
+        cameras: all cameras.
+        camera: (M,) int64, the camera π that took the earlier frame.
+        pixel: (M, 2) u, where the points are seen now: x, y in pixels.
+        space: the space that the points are in.
+    """
+    position, _ = cameras.project(camera, space.to_world(unwarp_previous(canonical)))
+    return position - pixel
+
+
+def total_variation_weight(weight: float, side: int, rays: int) -> float:
+    """ω · (side / 128) / (6R): factor of Σ clamp(v − v', −1, 1) (docs/method.md#total-variation).
+
+    The optimiser adds this gradient, not autograd.
+
+    Args:
+        weight: ω, the term's weight.
+        side: max(N_x, N_y, N_z) of the grid.
+        rays: R, the rays of a batch.
+    """
+    return weight * (side / 128) / rays / 6
+
+
+MOTION_TERMS = {
+    **{("render" if name == "color" else name): term for name, term in PHOTOMETRIC_TERMS.items()},
+    "cycle": cycle,
+    "flow": flow,
+}
+
+
+@dataclass(frozen=True)
+class WeightedLoss(Generic[Predicted]):
+    """Σ weight · term over the terms whose weight is not zero; the others are not computed.
+
+    Attributes:
+        terms: what can be computed, by name: prediction → unweighted scalar.
+        weights: how much each counts.
+    """
+
+    terms: Mapping[str, Callable[[Predicted], Tensor]]
+    weights: Mapping[str, float]
+
+    def __post_init__(self) -> None:
+        unknown = sorted(set(self.weights) - set(self.terms))
+        if unknown:
+            known = ", ".join(sorted(self.terms))
+            raise DevrfError(f"loss: unknown term {unknown[0]!r}; the terms are {known}")
+
+    def __call__(self, prediction: Predicted) -> tuple[Tensor, dict[str, Tensor]]:
+        """The weighted sum, and each term's unweighted value by name, detached."""
+        values = {
+            name: self.terms[name](prediction) for name, weight in self.weights.items() if weight
+        }
+        total = sum((self.weights[name] * value for name, value in values.items()), start=0.0)
+        if not isinstance(total, Tensor):
+            raise DevrfError("loss: every weight is zero; at least one term must count")
+        return total, {name: value.detach() for name, value in values.items()}
