@@ -158,7 +158,8 @@ class DNeRF(DynamicModel):
         """
         samples = self._samples(rays, time, jitter=jitter)
         points, when = self._normalised(samples.points), time.index_select(0, samples.ray)
-        density, color = self._fields(points, when, rays, samples.ray)
+        canonical = points + self.deformation(points, when)
+        density, color = self.canonical(canonical, rays.viewdirs, samples.ray)
         seen = volume_render(self._scaled(samples), density, color, background)
         return RenderOutput(
             color=seen.color,
@@ -166,13 +167,6 @@ class DNeRF(DynamicModel):
             transmittance=seen.transmittance,
             extras={**seen.extras, "points": points, "time": when},
         )
-
-    def _fields(
-        self, points: Tensor, time: Tensor, rays: Rays, ray: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        canonical = points + self.deformation(points, time)
-        density, color = self.canonical(canonical, rays.viewdirs, ray)
-        return density, color
 
     def _samples(self, rays: Rays, time: Tensor, *, jitter: bool) -> RaySamples:
         if self.settings.sampling == "occupancy":
@@ -183,7 +177,7 @@ class DNeRF(DynamicModel):
         with torch.no_grad():
             coarse = flattened(rays, distance, far)
             points, when = self._normalised(coarse.points), time.index_select(0, coarse.ray)
-            density, _ = self._fields(points, when, rays, coarse.ray)
+            density = self.canonical.sigma(points + self.deformation(points, when))
             depth = density * self._scaled(coarse).length
             weight, _ = composite(depth, coarse.ray, len(rays))
             drawn = importance(distance, weight.view_as(distance), near, far, s.fine, jitter=jitter)

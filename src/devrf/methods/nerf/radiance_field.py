@@ -50,7 +50,15 @@ class RadianceField(nn.Module):
             σ (S,) ≥ 0 per unit of normalised space, and RGB (S, 3) in [0, 1].
         """
         x = self.trunk(self.encode_position(points))
-        density = nn.functional.softplus(self.density(x)[:, 0]) * self.density_scale
+        density = self._density(x)
         direction = self.encode_direction(viewdirs).index_select(0, ray)
         x = torch.relu(self.branch(torch.cat([self.feature(x), direction], dim=-1)))
         return density, torch.sigmoid(self.color(x))
+
+    def sigma(self, points: Tensor) -> Tensor:
+        """σ (S,) alone, for samples whose colour does not count; ``points`` as above."""
+        return self._density(self.trunk(self.encode_position(points)))
+
+    def _density(self, features: Tensor) -> Tensor:
+        raw: Tensor = self.density(features)[:, 0]
+        return nn.functional.softplus(raw) * self.density_scale
