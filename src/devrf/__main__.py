@@ -7,6 +7,7 @@ import sys
 
 from devrf.cli.app import main
 from devrf.cli.messages import report_user_errors
+from devrf.cli.paper_scene import with_paper_experiment
 from devrf.cli.sweep import failures_at_the_end
 from devrf.system.process import tune_for_cpu
 from devrf.system.signals import Interrupted, end_at_once, handle_signals
@@ -24,6 +25,7 @@ def entry() -> None:
     tune_for_cpu()
     try:
         with handle_signals(end_at_once), report_user_errors(), failures_at_the_end():
+            sys.argv[1:] = with_paper_experiment(sys.argv[1:])
             main()
     except Interrupted as stop:
         print(f"devrf: {stop.said}", file=sys.stderr)

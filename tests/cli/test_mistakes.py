@@ -26,7 +26,20 @@ MISTAKES = {
         "schedule.motion.pixels: useful was renamed; write schedule.motion.pixels=occupied",
     ),
     "unknown option": (["data=legoo"], "data=legoo: no such option; choose one of"),
-    "unknown experiment": (["experiment=paper"], "experiment=paper: no such option"),
+    "unknown experiment": (["experiment=papers"], "experiment=papers: no such option"),
+    "paper without a scene": (["experiment=paper"], "kuka, lego, pig_toy, plant, rabbit; no data="),
+    "unpublished scene": (
+        ["experiment=paper", "data=procedural"],
+        "experiment=paper: has published settings for data=daisy, floating_robot",
+    ),
+    "published settings of another scene": (
+        ["experiment=paper_lego", "data=inward", "data.root=."],
+        "experiment=paper_lego: holds the published settings of data=lego, not of data=inward",
+    ),
+    "forward-facing field of an inward-facing scene": (
+        ["field=forward_small", "stage=canonical"],
+        "field.planes: 48 planes are of forward-facing scenes, and this scene is not",
+    ),
     "unreadable override": (["data.box=[[1"], "data.box=[[1: not understood"),
     "missing root": (["data=inward"], "data.root: required; give data.root=PATH"),
     "missing folder": (["data=inward", "data.root=nowhere"], "nowhere: no such folder"),

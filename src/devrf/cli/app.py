@@ -12,6 +12,7 @@ from devrf.cli import job
 from devrf.cli.config import config_folder, register_resolvers
 from devrf.cli.config_check import check_config
 from devrf.cli.messages import report_user_errors
+from devrf.cli.paper_scene import check_paper_scene
 from devrf.cli.run_folder import removed_on_user_error
 from devrf.cli.run_lock import exclusive
 from devrf.cli.sweep import forget_failure, run_job
@@ -40,6 +41,7 @@ def _job(config: DictConfig, folder: Path) -> float | None:
 
 
 def _checked(config: DictConfig, folder: Path) -> float | None:
+    check_paper_scene(job.choices())
     check_config(config)
     # Imported here: --help and a misspelt key are answered before torch has loaded.
     from devrf.cli.steps import run_stage

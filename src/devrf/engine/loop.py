@@ -83,6 +83,10 @@ class Loop:
         """Drop batches, metrics and the captured graph with its memory."""
         self.batches, self.metrics, self._graphed = [], MetricAccumulator(), None
 
+    def recapture(self) -> None:
+        """Capture the next iteration anew: a setting that the graph contains has changed."""
+        self._graphed = None
+
     def step(self, stage: ScheduledStage, views: Any, optimizer: LightningOptimizer) -> None:
         """Run one iteration.
 
@@ -112,7 +116,7 @@ class Loop:
     def poll(self) -> None:
         """Adapt the capacities to the sample counts that have reached the host."""
         if any([capacity.poll() for capacity in self.capacities]):  # a list: poll all of them
-            self._graphed = None  # it was captured with the former lengths
+            self.recapture()  # it has the former lengths
 
     def _make_capacities(self) -> None:
         rays = -(-rays_per_rank(self._rays) // self.micro_batching.count)

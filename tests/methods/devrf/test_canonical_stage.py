@@ -18,7 +18,7 @@ from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.color_decoder import ColorDecoder, SigmoidColor
-from devrf.methods.devrf.free_space import view_count_weight
+from devrf.methods.devrf.free_space import possible_matter, view_count, view_count_weight
 from devrf.methods.devrf.settings import Precision
 from devrf.scenes.scene import Scene
 
@@ -166,10 +166,43 @@ def test_no_matter_is_possible_before_a_lens(
 ) -> None:
     bounds = replace(tiny_scene.bounds, box=Box((-3.0, -3.0, -3.0), (3.0, 3.0, 3.0)), near=3.0)
     datamodule._scene = replace(tiny_scene, bounds=bounds)
-    stage = CanonicalStage(CanonicalSchedule(2, 16, False, 2, 8, (), rays=16), SMALL)
+    schedule = CanonicalSchedule(2, 16, False, 2, 8, (), rays=16, least_views=1)
+    stage = CanonicalStage(schedule, SMALL)
     trainer(max_steps=1).fit(stage, datamodule=datamodule)
     occupancy = stage.scene_model.occupancy
     points = bounds.box.grid_points((16, 16, 16), torch.zeros(())).reshape(-1, 3)
     nearest = torch.cdist(points, tiny_scene.static.train.cameras.positions).amin(dim=1)
     assert torch.equal(occupancy.mask.flatten(), nearest > 3.0)
     assert 0 < occupancy.share < 1
+
+
+def test_no_matter_is_possible_where_too_few_cameras_look(tiny_scene: Scene) -> None:
+    bounds = replace(tiny_scene.bounds, box=Box((-3.0, -3.0, -3.0), (3.0, 3.0, 3.0)))
+    scene = replace(tiny_scene, bounds=bounds)
+    points = bounds.box.grid_points((12, 12, 12), torch.zeros(()))
+    seen = view_count(scene.static.train.cameras, points)
+    assert 0 < (seen < 3).float().mean() < 1
+    apart = {n: possible_matter(scene, (12, 12, 12), carve=False, least_views=n) for n in (1, 3)}
+    assert torch.equal(apart[3], apart[1] & (seen >= 3))
+    # A capture of fewer views than that is kept whole.
+    everywhere = possible_matter(scene, (12, 12, 12), carve=False, least_views=1000)
+    assert torch.equal(everywhere, apart[1])
+
+
+def test_the_total_variation_reaches_all_voxels_until_the_schedule_says_so(
+    datamodule: SceneDataModule, trainer: Callable[..., Trainer]
+) -> None:
+    schedule = CanonicalSchedule(0, 8, True, 40, 8, (), rays=16, dense_tv_iterations=20)
+    stage = CanonicalStage(schedule, SMALL, fine_loss={"color": 1.0, "tv": 1e-3})
+    touched: list[bool] = []
+
+    class Recorder(Callback):
+        def on_train_batch_end(self, *_: Any) -> None:
+            groups = stage.optimizer.param_groups
+            touched.append(groups[0]["touched_only"])
+            assert groups[1]["touched_only"] == touched[-1]
+
+    watched = trainer(max_epochs=1)
+    watched.callbacks.append(Recorder())  # type: ignore[attr-defined]
+    watched.fit(stage, datamodule=datamodule)
+    assert touched == [False, False, True, True]

@@ -98,6 +98,12 @@ def test_flow_by_hand(by_hand: MotionPrediction) -> None:
     assert flow(by_hand).item() == pytest.approx(0.5 * 0.5 + 0.25 * 1.0, abs=1e-5)
 
 
+def test_flow_as_a_mean_over_both_components_of_the_samples(by_hand: MotionPrediction) -> None:
+    """Two of the three samples are on the ray whose flow is valid."""
+    value = (0.5 * 0.5 + 0.25 * 1.0) / (2 * 2)
+    assert flow(by_hand, mean="samples").item() == pytest.approx(value, abs=1e-6)
+
+
 def test_flow_counts_valid_rays_even_those_that_see_nothing(by_hand: MotionPrediction) -> None:
     both = replace(by_hand.batch, flow_valid=torch.tensor([True, True]))
     # Ray 1: −10·0.2/2 = −1 along x, against (9, 9): 10 + 9, weight 1; now two rays.

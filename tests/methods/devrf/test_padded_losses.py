@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -12,7 +13,7 @@ from devrf.data.batch import RayBatch
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.methods.devrf.grid_warp import GridWarp
-from devrf.methods.devrf.losses import MOTION_TERMS, MotionPrediction
+from devrf.methods.devrf.losses import MOTION_TERMS, MotionPrediction, flow
 from devrf.methods.devrf.volume_rendering import VoxelOutput
 from devrf.rendering.sampling import Samples
 
@@ -92,9 +93,12 @@ class Case:
         )
 
 
-@pytest.mark.parametrize("name", list(MOTION_TERMS))
+TERMS = {**MOTION_TERMS, "flow over samples": partial(flow, mean="samples")}
+
+
+@pytest.mark.parametrize("name", list(TERMS))
 def test_padding_changes_no_term_and_no_gradient(name: str) -> None:
-    case, term = Case(torch.tensor([0, 0, 1, 3, 3, 3, 4, 5]), 5), MOTION_TERMS[name]
+    case, term = Case(torch.tensor([0, 0, 1, 3, 3, 3, 4, 5]), 5), TERMS[name]
     exact, listed = term(case.prediction(padded=False)), term(case.prediction(padded=True))
     torch.testing.assert_close(listed, exact, atol=1e-14, rtol=1e-12)
     if not exact.requires_grad:

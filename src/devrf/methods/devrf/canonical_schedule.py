@@ -45,6 +45,10 @@ class CanonicalSchedule:
             starts at side³ / 2^len(doublings).
         decay_iterations: after as many iterations the learning rates have fallen to a tenth.
         rays: of a batch.
+        least_views: cells that fewer training views have in the picture are empty from the
+            start; 1 keeps those that no camera sees as well.
+        dense_tv_iterations: so long, from the search's end, the total variation smooths all
+            voxels; afterwards those that a batch has touched.
     """
 
     search_iterations: int = 5000
@@ -55,11 +59,14 @@ class CanonicalSchedule:
     doublings: Sequence[int] = (1000, 2000, 3000, 4000)
     decay_iterations: int = 20000
     rays: int = 8192
+    least_views: int = 3
+    dense_tv_iterations: int = 0
     phases: tuple[CanonicalPhase, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        least = {"search_side": 2, "iterations": 1, "side": 2, "decay_iterations": 1, "rays": 1}
-        for name, bound in {"search_iterations": 0, **least}.items():
+        least = {"search_side": 2, "side": 2}
+        least |= dict.fromkeys(("least_views", "iterations", "decay_iterations", "rays"), 1)
+        for name, bound in {"search_iterations": 0, "dense_tv_iterations": 0, **least}.items():
             if getattr(self, name) < bound:
                 raise DevrfError(
                     f"schedule.canonical.{name}: expected at least {bound}, "
@@ -92,6 +99,10 @@ class CanonicalSchedule:
     def phase(self, iteration: int) -> CanonicalPhase:
         """The phase that ``iteration`` belongs to; the last one from the end on."""
         return next((p for p in self.phases if iteration < p.stop), self.phases[-1])
+
+    def smooths_all(self, iteration: int) -> bool:
+        """Whether the total variation of ``iteration`` reaches untouched voxels too."""
+        return 0 <= iteration - self.search_iterations < self.dense_tv_iterations
 
     def learning_rate_factor(self, iteration: int) -> float:
         """0.1^(n / decay_iterations), n from the start of the search or of the radiance field."""

@@ -17,6 +17,7 @@ from devrf.engine.graphs import Graphs
 from devrf.engine.parallel_batch import ParallelBatch
 from devrf.engine.phase import Phase
 from devrf.errors import DevrfError
+from devrf.geometry.ndc import NormalizedDevice
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.canonical_schedule import CanonicalPhase, CanonicalSchedule
@@ -131,9 +132,13 @@ class CanonicalStage(VoxelStage):
         super().setup(stage)
         if hasattr(self, "scene_model"):
             return
+        self._check_space()
         box, first = self.scene.bounds.box, self.schedule.phase(0)
-        shape = box.grid_shape(self.schedule.search_side**3)
-        occupancy = Occupancy(possible_matter(self.scene, shape, carve=self.schedule.carve), box)
+        schedule, shape = self.schedule, box.grid_shape(self.schedule.search_side**3)
+        possible = possible_matter(
+            self.scene, shape, carve=schedule.carve, least_views=schedule.least_views
+        )
+        occupancy = Occupancy(possible, box)
         if first.kind == "search":
             canonical = self.architecture.search_field(box, first.voxels)
         else:
@@ -150,6 +155,21 @@ class CanonicalStage(VoxelStage):
             learned = list(canonical.get_submodule(name).parameters())
             groups.append({"params": learned, "lr": rate, "base_lr": rate, "name": name})
         self._optimizer = GridAdam(groups)
+
+    def _check_space(self) -> None:
+        """Check that the grid has planes exactly where the scene is in NDC."""
+        planes = self.architecture.planes
+        forward = isinstance(self.scene.space, NormalizedDevice)
+        if forward and planes is None:
+            raise DevrfError(
+                "field.planes: expected a number of planes for a forward-facing scene, not null; "
+                "field=forward and field=forward_small have one"
+            )
+        if planes is not None and not forward:
+            raise DevrfError(
+                f"field.planes: {planes} planes are of forward-facing scenes, and this scene is "
+                "not: give field=inward or field=small"
+            )
 
     def render_settings(self, phase: CanonicalPhase) -> RenderSettings:
         """How rays are sampled in a phase."""
@@ -215,8 +235,8 @@ class CanonicalStage(VoxelStage):
     def setup_optimizer(self) -> None:
         """Give the optimiser the present grids (docs/method.md#optimiser).
 
-        In the search the learning rate of each voxel depends on how many views see it; afterwards
-        a voxel without gradient keeps its moments.
+        In the search the learning rate of a voxel's density depends on how many views see it;
+        afterwards a voxel without gradient keeps its moments.
         """
         assert self.phase is not None
         searching, field = self.phase.kind == "search", self.scene_model.canonical
@@ -233,10 +253,10 @@ class CanonicalStage(VoxelStage):
             self.optimizer.replace(
                 group,
                 list(grid.parameters()),
-                per_voxel_lr=per_voxel_lr,
+                per_voxel_lr=per_voxel_lr if grid is field.density else None,
                 skip_zero=not searching,
                 smoothing=smoothing,
-                touched_only=True,
+                touched_only=not self.schedule.smooths_all(self.iteration),
             )
         decoder = list(field.decoder.parameters())
         if [id(p) for p in decoder] != [id(p) for p in self.optimizer.param_groups[2]["params"]]:
@@ -244,6 +264,14 @@ class CanonicalStage(VoxelStage):
         learned = [p for group in self.optimizer.param_groups for p in group["params"]]
         static_shape = triton_runs(field.density.values)
         self.bind(self.schedule.rays, [learned], static_shape=static_shape)
+
+    def prepare(self) -> None:
+        """From the schedule's iteration on, smooth only what batches touch."""
+        touched_only = not self.schedule.smooths_all(self.iteration)
+        if touched_only != self.optimizer.param_groups[0]["touched_only"]:
+            for group in self.optimizer.param_groups[:2]:
+                group["touched_only"] = touched_only
+            self.loop.recapture()
 
     def draw(self, batch: ParallelBatch) -> Pixels:
         """Random pixels of all images."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import torch
@@ -24,8 +25,10 @@ from devrf.methods.devrf.flow_initialisation import follow, start_from_tracks
 from devrf.methods.devrf.frame_memory import rest_on_host
 from devrf.methods.devrf.losses import (
     MOTION_TERMS,
+    FlowMean,
     MotionPrediction,
     WeightedLoss,
+    flow,
     total_variation_weight,
     visibility,
 )
@@ -58,6 +61,7 @@ class DeformationStage(VoxelStage):
         schedule: DeformationSchedule | None = None,
         motion: MotionSettings | None = None,
         loss: Mapping[str, float] = DEFORMATION_LOSS,
+        flow_mean: FlowMean = "rays",
         iterations_per_step: int = 10,
         graphs: Graphs = "auto",
         decoder_precision: Precision = "auto",
@@ -70,6 +74,7 @@ class DeformationStage(VoxelStage):
             schedule: resolutions, iterations and frames.
             motion: learning rate and how batches are drawn.
             loss: weights of the loss terms; ``tv`` is the total variation of both fields.
+            flow_mean: what the flow loss is a mean over (docs/method.md#flow).
             iterations_per_step: optimiser iterations in one Lightning step.
             graphs: whether a GPU replays iterations from CUDA graphs: ``auto`` where it can.
             decoder_precision: what the colour network computes in; ``auto``: ``bfloat16`` on a
@@ -80,7 +85,7 @@ class DeformationStage(VoxelStage):
         self.motion = motion or MotionSettings()
         weights = dict(loss)
         self.tv = weights.pop("tv", 0.0)
-        self.losses = WeightedLoss(MOTION_TERMS, weights)
+        self.losses = WeightedLoss(MOTION_TERMS | {"flow": partial(flow, mean=flow_mean)}, weights)
         still = rest.model
         self.scene_model = DeVRFModel(
             still.architecture, still.canonical, still.occupancy, still.settings, space=still.space

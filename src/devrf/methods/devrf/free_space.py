@@ -11,25 +11,40 @@ from devrf.scenes.scene import Scene
 from devrf.scenes.visual_hull import visual_hull
 
 
-def possible_matter(scene: Scene, shape: tuple[int, int, int], *, carve: bool) -> Tensor:
+def possible_matter(
+    scene: Scene, shape: tuple[int, int, int], *, carve: bool, least_views: int = 1
+) -> Tensor:
     """Where matter can be at rest: (X, Y, Z) bool on the host, on a grid over the scene's box.
 
     Not nearer to a camera than its near plane: fog before a lens would explain its image
-    perfectly. ``carve`` leaves nothing outside the visual hull, if the images have mattes and all
-    show the rest state.
+    perfectly. Not where fewer than ``least_views`` cameras look, if there are so many: fog would
+    explain two images as well. ``carve`` leaves nothing outside the visual hull, if the images
+    have mattes and all show the rest state.
     """
     views, box = scene.static.train, scene.bounds.box
     possible = torch.ones(shape, dtype=torch.bool)
+    points = box.grid_points(shape, views.cameras.focal)
     positions, near = views.cameras.positions, scene.bounds.near
-    close = [one for one in positions if (box.nearest(one) - one).norm() < near]
-    if close:
-        points = box.grid_points(shape, views.cameras.focal)
-        for position in close:
+    for position in positions:
+        if (box.nearest(position) - position).norm() < near:
             possible &= (points - position).norm(dim=-1) > near
+    if 1 < least_views <= len(positions):
+        possible &= view_count(views.cameras, scene.space.to_world(points)) >= least_views
     at_rest = float(views.times.max() - views.times.min()) <= FrameClock.TOLERANCE
     if carve and views.has_alpha and at_rest:
         possible &= visual_hull(views, box, shape)
     return possible
+
+
+def view_count(cameras: Cameras, points: Tensor) -> Tensor:
+    """How many cameras have each point (X, Y, Z, 3), in world units, in the picture: (X, Y, Z)."""
+    flat = points.view(-1, 3)
+    seen = torch.zeros(len(flat), device=flat.device)
+    for k in range(len(cameras)):
+        pixel, depth = cameras.project_into(k, flat)
+        x, y = pixel.unbind(-1)
+        seen += (depth > 0) & (x >= 0) & (x <= cameras.width) & (y >= 0) & (y <= cameras.height)
+    return seen.view(points.shape[:-1])
 
 
 def view_count_weight(cameras: Cameras, points: Tensor) -> Tensor:
@@ -37,10 +52,5 @@ def view_count_weight(cameras: Cameras, points: Tensor) -> Tensor:
 
     Relative to the best-seen point; a point that no camera sees gets the share of one camera.
     """
-    flat = points.view(-1, 3)
-    seen = torch.zeros(len(flat), device=flat.device)
-    for k in range(len(cameras)):
-        pixel, depth = cameras.project_into(k, flat)
-        x, y = pixel.unbind(-1)
-        seen += (depth > 0) & (x >= 0) & (x <= cameras.width) & (y >= 0) & (y <= cameras.height)
-    return (seen.clamp(min=1) / seen.max().clamp(min=1)).view(points.shape[:-1])
+    seen = view_count(cameras, points)
+    return seen.clamp(min=1) / seen.max().clamp(min=1)

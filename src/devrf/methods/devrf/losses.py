@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Generic, Literal, TypeVar
 
 import torch
 from torch import Tensor
@@ -19,6 +19,9 @@ from devrf.geometry.space import WORLD, Space
 from devrf.methods.devrf.volume_rendering import VoxelOutput, Warp
 
 Predicted = TypeVar("Predicted")
+
+# What the flow loss is a mean over.
+FlowMean = Literal["rays", "samples"]
 
 
 @dataclass(frozen=True)
@@ -100,10 +103,11 @@ def cycle(prediction: MotionPrediction) -> Tensor:
     return output.mean_over_samples(missed)
 
 
-def flow(prediction: MotionPrediction) -> Tensor:
+def flow(prediction: MotionPrediction, mean: FlowMean = "rays") -> Tensor:
     """L_flow = (1/M) Σ_i w_i m_i |φ_i − φ_i^observed|₁ in pixels (docs/method.md#flow).
 
-    M is the number of rays whose flow is valid; 0 without observed flow.
+    M is the number of ``rays`` whose flow is valid, or twice the number of their ``samples``;
+    the loss is 0 without observed flow.
     """
     batch, output = prediction.batch, prediction.output
     if batch.flow is None or batch.flow_valid is None:
@@ -118,7 +122,10 @@ def flow(prediction: MotionPrediction) -> Tensor:
         prediction.space,
     )
     error = (induced - batch.flow[ray]).abs().sum(dim=1)
-    return (weight * error).sum() / batch.flow_valid.sum().clamp(min=1)
+    total = (weight * error).sum()
+    if mean == "rays":
+        return total / batch.flow_valid.sum().clamp(min=1)
+    return total / (2 * output.count_on(batch.flow_valid)).clamp(min=1)
 
 
 def induced_flow(
@@ -156,7 +163,7 @@ def total_variation_weight(weight: float, side: int, rays: int) -> float:
     return weight * (side / 128) / rays / 6
 
 
-MOTION_TERMS = {
+MOTION_TERMS: dict[str, Callable[[MotionPrediction], Tensor]] = {
     **{("render" if name == "color" else name): term for name, term in PHOTOMETRIC_TERMS.items()},
     "cycle": cycle,
     "flow": flow,

@@ -49,6 +49,11 @@ class VoxelOutput(RenderOutput):
             return torch.where(present, values, 0.0).sum() / present.sum().clamp(min=1)
         return values.mean() if len(values) else values.sum()
 
+    def count_on(self, chosen: Tensor) -> Tensor:
+        """The number () of samples on the ``chosen`` (R,) rays, padding left out."""
+        kept, present = chosen[self.samples.ray], self.samples.present
+        return kept.sum() if present is None else (kept & present).sum()
+
     def on_rays(self, chosen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Ray (S,), canonical position (S, 3) and weight (S,) of the ``chosen`` (R,) rays' samples.
 

@@ -1,10 +1,14 @@
-"""``experiment=paper_inward`` is the paper's schedule (supplementary, section A), to the number."""
+"""``experiment=paper…`` is the published schedule of each scene, to the number.
+
+Sources: the supplementary material, section A; per scene the authors' configuration.
+"""
 
 from __future__ import annotations
 
 import pytest
 from hydra.utils import instantiate
 
+from devrf.cli.paper_scene import with_paper_experiment
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.settings import (
@@ -35,6 +39,7 @@ def test_canonical_schedule(paper):
         doublings=[1000, 2000, 3000, 4000],
         rays=8192,
         carve=False,
+        least_views=3,
     )
     search, *fine = schedule.phases
     assert (search.kind, search.start, search.stop, search.voxels) == ("search", 0, 5000, 100**3)
@@ -109,3 +114,57 @@ def test_the_rows_of_the_ablation_tables(composed, ablation, off, coarse_to_fine
     config = composed("experiment=paper_inward", ROOT, f"ablation={ablation}")
     assert {name for name, weight in config.loss.deformation.items() if not weight} == off
     assert config.schedule.deformation.coarse_to_fine is coarse_to_fine
+
+
+INWARD = ("lego", "floating_robot", "daisy", "glove", "kuka", "flower_360")
+
+
+@pytest.mark.parametrize("scene", INWARD)
+def test_the_inward_scenes_have_the_papers_schedule_and_the_authors_bound_scale(composed, scene):
+    config, general = (
+        composed(f"experiment=paper_{scene}", ROOT),
+        composed("experiment=paper_inward", ROOT),
+    )
+    assert (config.data.name, config.data.bound_scale) == (scene, 1.2)
+    for part in ("field", "schedule", "sampling", "loss"):
+        assert config[part] == general[part]
+    assert config.loss.flow_mean == "samples"
+
+
+@pytest.mark.parametrize(
+    ("scene", "frames", "sides", "growths", "total"),
+    [
+        ("pig_toy", 50, [10, 20, 40, 80, 160], [10_000, 15_000, 20_000, 22_500], 25_000),
+        ("rabbit", 40, [40, 80, 160], [8000, 12_000], 13_000),
+        ("plant", 40, [8, 16, 32, 64, 128], [8000, 16_000, 20_000, 22_000], 24_000),
+    ],
+)
+def test_each_forward_scene_has_its_published_schedule(
+    composed, scene, frames, sides, growths, total
+):
+    config = composed(f"experiment=paper_{scene}", ROOT)
+    schedule = instantiate(config.schedule.deformation, _convert_="all")
+    assert (config.data.name, schedule.sides) == (scene, sides)
+    assert (schedule.growths(frames), schedule.total(frames)) == (growths, total)
+    assert config.schedule.canonical.dense_tv_iterations == 10_000
+    assert config.loss.flow_mean == "samples"
+    assert (config.field.planes, config.field.channels, config.field.width) == (128, 9, 64)
+
+
+@pytest.mark.parametrize(
+    ("typed", "meant"),
+    [
+        (["experiment=paper", "data=lego"], ["experiment=paper_lego", "data=lego"]),
+        (
+            ["data=inward", "experiment=paper", "seed=1"],
+            ["data=inward", "experiment=paper_inward", "seed=1"],
+        ),
+        (
+            ["-m", "experiment=paper", "data=lego,plant"],
+            ["-m", "experiment=paper_lego,paper_plant"],
+        ),
+        (["experiment=quickstart", "data=lego"], ["experiment=quickstart", "data=lego"]),
+    ],
+)
+def test_the_experiment_paper_is_that_of_its_data(typed, meant):
+    assert with_paper_experiment(typed) == meant
