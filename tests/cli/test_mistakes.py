@@ -38,7 +38,7 @@ MISTAKES = {
     ),
     "forward-facing field of an inward-facing scene": (
         ["field=forward_small", "stage=canonical"],
-        "field.planes: 48 planes are of forward-facing scenes, and this scene is not",
+        "field.planes=48: planes are of forward-facing scenes, and this scene is not",
     ),
     "unreadable override": (["data.box=[[1"], "data.box=[[1: not understood"),
     "missing root": (["data=inward"], "data.root: required; give data.root=PATH"),

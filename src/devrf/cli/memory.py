@@ -16,6 +16,7 @@ from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
+from devrf.methods.devrf.forward_resolution import fitted_to
 from devrf.methods.devrf.frame_memory import active_bytes, resident_bytes
 from devrf.methods.devrf.settings import MotionSettings
 from devrf.scenes.scene import Scene, Views
@@ -193,6 +194,7 @@ def estimate(
     have about side³ voxels in any box. A store of displacements that is ``auto`` counts as on the
     device.
     """
+    canonical, architecture = fitted_to(scene, canonical, architecture)
     voxels, sizes = round(canonical.side**3), (architecture.channels, architecture.width)
     with torch.device("meta"):
         box = scene.bounds.motion or scene.bounds.box

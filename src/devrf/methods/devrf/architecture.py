@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from devrf.geometry.box import Box
 from devrf.methods.devrf.canonical_field import CanonicalField
@@ -20,7 +21,10 @@ class Architecture:
             direction alone.
         alpha_init: opacity of a voxel of the radiance field before anything is learned.
         search_alpha_init: the same in the coarse geometry search.
-        planes: planes of an NDC grid, one behind another; None for cubic voxels.
+        planes: planes of an NDC grid, one behind another; None for cubic voxels; ``auto`` until
+            the scene's views have told (:mod:`devrf.methods.devrf.forward_resolution`).
+        aspect: in NDC, grid points across a unit of x to those across a unit of y: the width of
+            the images to their height makes voxels as square as pixels. The paper's is 1.
     """
 
     channels: int = 12
@@ -28,7 +32,8 @@ class Architecture:
     frequencies: int = 4
     alpha_init: float = 1e-2
     search_alpha_init: float = 1e-6
-    planes: int | None = None
+    planes: int | Literal["auto"] | None = None
+    aspect: float = 1.0
 
     def search_field(self, box: Box, voxels: int) -> CanonicalField:
         """The field of the coarse geometry search: colours straight from three channels."""
@@ -38,6 +43,7 @@ class Architecture:
 
     def radiance_field(self, box: Box, voxels: int, base_voxels: int) -> CanonicalField:
         """The radiance field: features and a shallow decoder."""
+        assert self.planes != "auto", "the scene has not told how many planes there are"
         return CanonicalField(
             box,
             ColorDecoder(self.channels, self.width, self.frequencies),
@@ -46,4 +52,5 @@ class Architecture:
             base_voxels=base_voxels,
             alpha_init=self.alpha_init,
             planes=self.planes,
+            aspect=self.aspect,
         )

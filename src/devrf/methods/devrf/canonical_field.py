@@ -13,7 +13,7 @@ from devrf.methods.devrf.color_decoder import ColorDecoder
 from devrf.methods.devrf.voxel_grid import VoxelGrid
 
 # What a checkpoint holds beside the tensors and the box.
-SIZES = ("voxels", "base_voxels", "alpha_init", "planes")
+SIZES = ("voxels", "base_voxels", "alpha_init", "planes", "aspect")
 
 
 class CanonicalField(nn.Module):
@@ -29,6 +29,7 @@ class CanonicalField(nn.Module):
         alpha_init: opacity of one base voxel before anything is learned.
         planes: P, in NDC the number of planes along the rays at every resolution; None for cubic
             voxels.
+        aspect: in NDC, grid points across a unit of x to those across a unit of y.
     """
 
     def __init__(
@@ -41,6 +42,7 @@ class CanonicalField(nn.Module):
         base_voxels: int | None = None,
         alpha_init: float,
         planes: int | None = None,
+        aspect: float = 1.0,
     ) -> None:
         """Build an empty field.
 
@@ -53,6 +55,7 @@ class CanonicalField(nn.Module):
             alpha_init: opacity of one base voxel before anything is learned.
             planes: see docs/method.md#forward-facing; each starts with an equal share of every
                 ray, the last one opaque.
+            aspect: as the attribute.
         """
         super().__init__()
         self.box = box
@@ -60,6 +63,7 @@ class CanonicalField(nn.Module):
         self.base_voxels = base_voxels or voxels
         self.alpha_init = alpha_init
         self.planes = planes
+        self.aspect = aspect
         shape = self.grid_shape(voxels)
         self.density = VoxelGrid(shape, 1)
         self.color = VoxelGrid(shape, channels)
@@ -80,8 +84,9 @@ class CanonicalField(nn.Module):
         if self.planes is None:
             return self.box.grid_shape(voxels)
         width, height, _ = self.box.size
-        edge = (width * height * self.planes / voxels) ** 0.5
-        return max(2, int(width / edge + 1e-6)), max(2, int(height / edge + 1e-6)), self.planes
+        edge, wider = (width * height * self.planes / voxels) ** 0.5, self.aspect**0.5
+        across, down = int(width * wider / edge + 1e-6), int(height / wider / edge + 1e-6)
+        return max(2, across), max(2, down), self.planes
 
     def step_length(self, step: float) -> float:
         """Length of ``step`` voxels along a ray, in units of the ray's direction.
@@ -162,5 +167,6 @@ class CanonicalField(nn.Module):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_extra_state` gave."""
         self.box = Box.of(state["low"], state["high"])
+        # Files of the first revisions of format 3 have no aspect.
         for name in SIZES:
-            setattr(self, name, state[name])
+            setattr(self, name, state.get(name, getattr(self, name)))

@@ -49,6 +49,8 @@ class CanonicalSchedule:
             start; 1 keeps those that no camera sees as well.
         dense_tv_iterations: so long, from the search's end, the total variation smooths all
             voxels; afterwards those that a batch has touched.
+        voxels_per_pixel: in forward-facing scenes, grid points for each pixel of a row or column;
+            decides ``side``. None: ``side`` is as it says.
     """
 
     search_iterations: int = 5000
@@ -61,6 +63,7 @@ class CanonicalSchedule:
     rays: int = 8192
     least_views: int = 3
     dense_tv_iterations: int = 0
+    voxels_per_pixel: float | None = None
     phases: tuple[CanonicalPhase, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -72,6 +75,11 @@ class CanonicalSchedule:
                     f"schedule.canonical.{name}: expected at least {bound}, "
                     f"not {getattr(self, name)}"
                 )
+        if self.voxels_per_pixel is not None and not 0 < self.voxels_per_pixel <= 4:
+            raise DevrfError(
+                "schedule.canonical.voxels_per_pixel: expected above 0, at most 4, or null, not "
+                f"{self.voxels_per_pixel}"
+            )
         if self.side**3 < 8 * 2 ** len(self.doublings):
             raise DevrfError(
                 f"schedule.canonical.doublings: {len(self.doublings)} of them are too many for "

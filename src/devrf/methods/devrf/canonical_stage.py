@@ -21,6 +21,7 @@ from devrf.geometry.ndc import NormalizedDevice
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.canonical_schedule import CanonicalPhase, CanonicalSchedule
+from devrf.methods.devrf.forward_resolution import fitted_to
 from devrf.methods.devrf.free_space import possible_matter, view_count_weight
 from devrf.methods.devrf.losses import (
     PHOTOMETRIC_TERMS,
@@ -133,6 +134,7 @@ class CanonicalStage(VoxelStage):
         if hasattr(self, "scene_model"):
             return
         self._check_space()
+        self.schedule, self.architecture = fitted_to(self.scene, self.schedule, self.architecture)
         box, first = self.scene.bounds.box, self.schedule.phase(0)
         schedule, shape = self.schedule, box.grid_shape(self.schedule.search_side**3)
         possible = possible_matter(
@@ -167,7 +169,7 @@ class CanonicalStage(VoxelStage):
             )
         if planes is not None and not forward:
             raise DevrfError(
-                f"field.planes: {planes} planes are of forward-facing scenes, and this scene is "
+                f"field.planes={planes}: planes are of forward-facing scenes, and this scene is "
                 "not: give field=inward or field=small"
             )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -21,6 +22,9 @@ _ROUNDING = 0.04
 # Parts: the wall is 0, the floor 1; the shape's own come after the pedestal.
 _PEDESTAL, _FIRST = 2, 3
 
+Vector = tuple[float, float, float]
+Wave = tuple[Vector, float, Vector]
+
 # Waves of the paint: direction (x, y, z) times angular frequency in radians per world unit, a
 # phase, and how much of it goes into red, green and blue. No two wavelengths have a common
 # multiple within the picture, so that no place looks like another.
@@ -31,6 +35,15 @@ _WAVES = (
     ((1.3, 4.7, 3.3), 0.7, (0.5, 0.6, 0.3)),
     ((-5.3, -3.9, 4.1), 2.9, (0.6, 0.6, 0.6)),
     ((6.7, 4.1, -2.9), 4.2, (0.5, 0.4, 0.5)),
+)
+# A weave over the clouds, of wavelengths from 0.11 to 0.27 world units: on the wall five to
+# twelve pixels of an image that is 240 pixels wide.
+_WEAVE = (
+    ((23.0, 9.1, 5.3), 0.9, (0.9, 0.5, 0.3)),
+    ((-13.7, 29.3, 17.9), 2.2, (0.4, 0.9, 0.6)),
+    ((41.3, -7.7, 21.1), 3.7, (0.8, 0.7, 0.8)),
+    ((11.9, 37.1, -43.7), 5.1, (0.6, 0.8, 0.9)),
+    ((-33.1, -43.3, 31.7), 1.6, (0.7, 0.6, 0.5)),
 )
 # Paler than what stands before it.
 _DARKEST, _LIGHTEST = (0.42, 0.45, 0.52), (0.86, 0.88, 0.90)
@@ -44,9 +57,11 @@ class OnStage:
 
     Attributes:
         shape: what stands on the pedestal, and moves.
+        weave: whether the paint is fine, for images of about 240 pixels or more; else soft.
     """
 
     shape: Shape
+    weave: bool = False
 
     def distance(self, points: Tensor, time: float) -> Tensor:
         """The smaller of the shape's distance bound and the stage's distance (M,)."""
@@ -69,7 +84,7 @@ class OnStage:
 
     def color(self, material: Material) -> Tensor:
         """The shape's paint, or the stage's."""
-        painted = _mural(material.rest)
+        painted = _mural(material.rest, (*_WAVES, *_WEAVE) if self.weave else _WAVES)
         # The pedestal stands out from the floor.
         painted = torch.where((material.part == _PEDESTAL)[:, None], 0.5 * painted, painted)
         own = self.shape.color(_of_shape(material))
@@ -88,10 +103,10 @@ def _still(points: Tensor) -> Tensor:
     return torch.stack([z - WALL, y - FLOOR, rounded_box(x - a, y - b, z - c, _HALF, _ROUNDING)])
 
 
-def _mural(points: Tensor) -> Tensor:
-    """Clouds of colour (M, 3), painted in space."""
-    wave = points.new_tensor([w for w, _, _ in _WAVES])
-    phase = points.new_tensor([p for _, p, _ in _WAVES])
-    mixed = (points @ wave.T + phase).cos() @ points.new_tensor([c for _, _, c in _WAVES])
+def _mural(points: Tensor, waves: Sequence[Wave]) -> Tensor:
+    """Clouds of colour (M, 3), painted in space: the sum of ``waves``, then bounded."""
+    wave = points.new_tensor([w for w, _, _ in waves])
+    phase = points.new_tensor([p for _, p, _ in waves])
+    mixed = (points @ wave.T + phase).cos() @ points.new_tensor([c for _, _, c in waves])
     dark, light = points.new_tensor(_DARKEST), points.new_tensor(_LIGHTEST)
     return torch.lerp(dark, light, torch.sigmoid(1.5 * mixed))

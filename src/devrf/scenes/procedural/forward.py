@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import torch
 
@@ -35,9 +36,12 @@ class ProceduralForwardScene(Recipe):
 
     Attributes:
         name: the scene's name.
+        texture: how wall and floor are painted: ``soft``, or ``fine`` for images of about 240
+            pixels or more, in which it has waves of five to twelve pixels.
     """
 
     name: str = "plush"
+    texture: Literal["soft", "fine"] = field(default="soft", kw_only=True)
     height: int = field(default=72, kw_only=True)
     static_views: int = field(default=20, kw_only=True)
     frames: int = field(default=12, kw_only=True)
@@ -61,4 +65,4 @@ class ProceduralForwardScene(Recipe):
 
     def model(self) -> Shape:
         """The toy and its stage themselves, for exact answers at any point and time."""
-        return OnStage(Plush(float(self.speed)))
+        return OnStage(Plush(float(self.speed)), weave=self.texture == "fine")

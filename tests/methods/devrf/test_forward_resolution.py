@@ -1,0 +1,64 @@
+"""How fine a forward-facing grid is, by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from devrf.geometry.ndc import NormalizedDevice
+from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
+from devrf.methods.devrf.forward_resolution import fitted_to, resolved_planes
+from devrf.scenes.procedural import ProceduralForwardScene
+from devrf.scenes.scene import Scene
+
+SPACE = NormalizedDevice(200, 100, (150.0, 120.0), near=1.0)
+
+
+@pytest.mark.parametrize(
+    ("apart", "near", "planes"),
+    [
+        (0.8, 1.0, 61),  # 150 · 0.8 / 1 = 120 pixels, 2 to each of 60 steps
+        (0.8, 0.5, 121),
+        (0.01, 1.0, 32),  # hardly any parallax
+        (50.0, 1.0, 256),
+    ],
+)
+def test_planes_are_two_pixels_of_parallax_apart(apart: float, near: float, planes: int) -> None:
+    # The distance along the line of sight does not count.
+    positions = torch.tensor([[0.0, 0, 0], [0.6 * apart, 0.8 * apart, 9.0], [0.1 * apart, 0, 0]])
+    assert resolved_planes(positions, replace(SPACE, near=near)) == planes
+
+
+@pytest.fixture(scope="module")
+def forward_scene() -> Scene:
+    size = {"width": 24, "height": 18, "static_views": 6, "train_views": 1}
+    return ProceduralForwardScene(**size, frames=2, supersample=1).render()
+
+
+def test_the_grid_has_so_many_points_to_a_pixel(forward_scene: Scene) -> None:
+    schedule = CanonicalSchedule(side=30, doublings=(), voxels_per_pixel=0.5)
+    fitted, sizes = fitted_to(forward_scene, schedule, Architecture(planes=40))
+    box = forward_scene.bounds.box
+    field = sizes.radiance_field(box, round(fitted.side**3), round(fitted.side**3))
+    width, height, planes = field.density.shape
+    # The box is wider than the reference image, which spans 2 units of NDC.
+    assert width == pytest.approx(0.5 * 24 * box.size[0] / 2, abs=1)
+    assert height == pytest.approx(0.5 * 18 * box.size[1] / 2, abs=1)
+    assert planes == 40
+    assert fitted.phases[-1].voxels == round(fitted.side**3)
+
+
+def test_planes_are_told_by_the_scene_only_where_asked(forward_scene: Scene) -> None:
+    schedule = CanonicalSchedule(side=30, doublings=())
+    asked = fitted_to(forward_scene, schedule, Architecture(planes="auto"))
+    assert asked == (schedule, Architecture(planes=32))
+    given = Architecture(planes=7)
+    assert fitted_to(forward_scene, schedule, given) == (schedule, given)
+
+
+def test_a_scene_seen_from_all_around_keeps_its_numbers(tiny_scene: Scene) -> None:
+    schedule = CanonicalSchedule(voxels_per_pixel=0.5)
+    assert fitted_to(tiny_scene, schedule, Architecture()) == (schedule, Architecture())
