@@ -20,7 +20,8 @@ METRICS = ["psnr", "ssim", "rest_pose_psnr", "depth_error", "flow_error"]
 
 def view(name: str, time: float, psnr: float, **further: float | None) -> HeldOutView:
     image = torch.zeros(2, 2, 3)
-    return HeldOutView(name, time, image, image, psnr, 0.5, 9.0, further, compared=image)
+    planes = {"depth": image[..., 0], "opacity": image[..., 0]}
+    return HeldOutView(name, time, image, image, psnr, 0.5, 9.0, further, compared=image, **planes)
 
 
 def test_means_are_over_what_is_known() -> None:
