@@ -45,7 +45,7 @@ def time_left(seconds: float) -> str:
     if seconds < 60:
         return f"about {max(round(seconds), 1)} s left"
     minutes = round(seconds / 60)
-    if minutes < 60:
+    if minutes <= 60:
         return f"about {minutes} min left"
     hours, minutes = divmod(minutes, 60)
     if hours >= 10 or not minutes:
