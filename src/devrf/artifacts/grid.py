@@ -24,6 +24,7 @@ def image_grid(
     rows: Sequence[Sequence[Tensor]],
     headings: Sequence[str] = (),
     labels: Sequence[Sequence[str]] = (),
+    text: int | None = None,
 ) -> Tensor:
     """A picture of all images, with text that is fitted to its place, never cut off.
 
@@ -31,12 +32,13 @@ def image_grid(
         rows: images (H, W, 3) in [0, 1], all of one size, as many in each row.
         headings: text above each column; none: no line of them.
         labels: lines of text left of each row; none: no room for them.
+        text: its height in pixels; None: a twentieth of that of the images, within limits.
 
     Returns:
         (H', W', 3) in [0, 1].
     """
     height, width = rows[0][0].shape[:2]
-    size = min(max(round(TEXT * height), SMALLEST_TEXT), LARGEST_TEXT)
+    size = text or min(max(round(TEXT * height), SMALLEST_TEXT), LARGEST_TEXT)
     gap = size // 3 + 1
     widths = (_font(size).getlength(line) for label in labels for line in label)
     left = round(max(widths, default=-3 * gap)) + 3 * gap
