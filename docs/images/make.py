@@ -1,8 +1,10 @@
 """Makes this folder's pictures from finished runs of embedded scenes.
 
-python -m devrf experiment=quickstart
-python -m devrf experiment=quickstart data.shape=flower
-python docs/images/make.py outputs/robot/quickstart outputs/flower/quickstart
+Learn the scenes, then give the folders of their runs::
+
+    python -m devrf experiment=quickstart
+    python -m devrf experiment=quickstart data.shape=flower
+    python docs/images/make.py outputs/robot/quickstart outputs/flower/quickstart
 """
 
 from __future__ import annotations

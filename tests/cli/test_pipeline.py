@@ -104,6 +104,8 @@ def test_everything_lies_in_the_run_folder(trained):
         "checkpoints/deformation.ckpt",
         "images/static.png",
         "images/dynamic.png",
+        "images/training_canonical.png",
+        "images/training_deformation.png",
         "videos/held_out.mp4",
         "videos/orbit.mp4",
     } <= made
