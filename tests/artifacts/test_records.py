@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import devrf
-from devrf.artifacts.records import git_revision, mean_scores, provenance, write_frames
+from devrf.artifacts.records import git_revision, in_words, mean_scores, provenance, write_frames
 from devrf.evaluation.held_out import HeldOutView
 
 METRICS = ["psnr", "ssim", "rest_pose_psnr", "depth_error", "flow_error"]
@@ -20,7 +20,8 @@ METRICS = ["psnr", "ssim", "rest_pose_psnr", "depth_error", "flow_error"]
 
 def view(name: str, time: float, psnr: float, **further: float | None) -> HeldOutView:
     image = torch.zeros(2, 2, 3)
-    return HeldOutView(name, time, image, image, psnr, 0.5, 9.0, further, compared=image)
+    planes = {"depth": image[..., 0], "opacity": image[..., 0]}
+    return HeldOutView(name, time, image, image, psnr, 0.5, 9.0, further, compared=image, **planes)
 
 
 def test_means_are_over_what_is_known() -> None:
@@ -35,6 +36,21 @@ def test_means_are_over_what_is_known() -> None:
         "flow_error": 3.0,
         "lpips": None,
     }
+
+
+def test_numbers_are_rounded_for_people() -> None:
+    values = {
+        "psnr": 33.42981,
+        "ssim": 0.99137,
+        "lpips": None,
+        "iterations": 123456,
+        "seconds": 12345.678,
+        "error": 0.000123456,
+        "missing": float("nan"),
+    }
+    assert in_words(values) == (
+        "psnr 33.43, ssim 0.9914, iterations 123456, seconds 12346, error 0.0001235, missing nan"
+    )
 
 
 def test_frames_read_back(tmp_path: Path) -> None:

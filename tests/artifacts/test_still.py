@@ -20,7 +20,8 @@ from devrf.scenes.scene import Scene
 def test_the_camera_that_is_meant(tiny_scene: Scene) -> None:
     held_out = StillSettings().camera(tiny_scene)
     assert torch.equal(held_out.positions, tiny_scene.dynamic.test.cameras.positions[:1])
-    assert (held_out.width, held_out.height) == (24, 18)
+    # The images are 24 x 18: pictures of them are rendered 400 pixels high.
+    assert (held_out.width, held_out.height) == (533, 400)
     fifth = StillSettings(view=5, height=36).camera(tiny_scene)
     assert torch.equal(fifth.positions, tiny_scene.static.train.cameras.positions[5:6])
     assert (fifth.width, fifth.height) == (48, 36)
@@ -32,6 +33,7 @@ def test_the_camera_that_is_meant(tiny_scene: Scene) -> None:
         (StillSettings, {"view": -1}, "still.view: expected held_out or 0 to 7, not -1"),
         (StillSettings, {"height": 0}, "still.height: expected at least 1, not 0"),
         (FilmSettings, {"height": 15}, "video.height: expected at least 16, not 15"),
+        (FilmSettings, {"max_seconds": 0}, "video.max_seconds: expected more than 0, not 0"),
     ],
 )
 def test_what_cannot_be_shown(

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import imageio.v3 as iio
 import pytest
 import torch
 from lightning import Callback, Trainer
@@ -14,7 +17,7 @@ from lightning.pytorch.loggers import CSVLogger, Logger
 from torch import Tensor
 
 from devrf.artifacts.tracking import Row
-from devrf.callbacks import Meter, Previews, TrainingRecord
+from devrf.callbacks import Meter, Previews, TrainingCurve, TrainingRecord
 from devrf.data.datamodule import SceneDataModule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 
@@ -80,6 +83,53 @@ def test_previews_come_as_often_as_asked_for_and_look_right(
     pixels = views.pixels[len(views) // 2].float() / 255
     expected = 1 + pixels[..., 3:] * (pixels[..., :3] - 1)  # on white
     torch.testing.assert_close(truth, expected)
+    # The PSNR of the same pictures stands among the curves.
+    errors = [
+        (float(step), float((image[:, : views.width] - expected).square().mean()))
+        for step, image in album.images["static/view"]
+    ]
+    found = [(row["step"], row["static/held_out_psnr"]) for row in album.rows if "held" in str(row)]
+    assert [step for step, _ in found] == [4, 8, 12]
+    for (_, psnr), (_, error) in zip(found, errors, strict=True):
+        assert psnr == pytest.approx(-10 * math.log10(error), abs=1e-3)
+
+
+def test_the_curve_of_a_stage_has_every_step(
+    learn, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[Any] = []
+    module = "devrf.artifacts.training_curve"
+    original = importlib.import_module(module).training_curve
+    monkeypatch.setattr(f"{module}.training_curve", lambda *a: drawn.append(a) or original(*a))
+    album = Album()
+    learn(album, Meter(), Previews(times=3), TrainingCurve(tmp_path / "images"))
+    ((stage, batches, previews, grids),) = drawn
+    assert stage == "canonical" and [iteration for iteration, _ in batches] == list(range(1, 13))
+    logged = {row["step"]: row["static/psnr"] for row in album.rows if "static/psnr" in row}
+    assert {k: psnr for k, psnr in batches if k in logged} == pytest.approx(logged)
+    assert [iteration for iteration, _ in previews] == [4, 8, 12]
+    assert [iteration for iteration, _ in grids] == [1, 4, 8]  # the schedule's doublings: 3, 7
+    height, width, _ = iio.imread(tmp_path / "images" / "training_canonical.png").shape
+    assert height > 400 and width > 800
+
+
+def test_a_curve_goes_on_after_a_break_and_a_rollback(learn, tmp_path: Path) -> None:
+    class Keeping(TrainingCurve):
+        def on_train_end(self, trainer: Trainer, pl_module: Any) -> None: ...
+
+    first = Keeping(tmp_path)
+    stage = learn(Album(), first)
+    second = TrainingCurve(tmp_path)
+    second.load_state_dict(first.state_dict())
+    assert second.state_dict() == first.state_dict() and len(first.state_dict()["points"]) == 12
+    # Iteration 12 once more, after it was rolled back to 10.
+    for iteration in (11, 12):
+        stage.iteration = iteration
+        error = {"render": torch.tensor(10.0**-iteration)}
+        second.on_train_batch_end(stage.trainer, stage, error, None, 0)
+    points = second.state_dict()["points"]
+    assert [iteration for iteration, _ in points] == list(range(1, 13))
+    assert points[-2:] == [(11, pytest.approx(110)), (12, pytest.approx(120))]
 
 
 def test_watching_changes_nothing_of_what_is_learned(learn) -> None:
@@ -114,6 +164,7 @@ def test_curves_stand_in_the_rows_of_the_losses(learn) -> None:
     assert [row["step"] for row in album.rows] == [4, 8, 12]
     x, y, z = stage.resolution
     for row in album.rows:
+        assert row["static/psnr"] == pytest.approx(-10 * math.log10(row["static/color"]), abs=1e-4)
         assert row["static/loss"] > 0 and row["static/iterations_per_second"] > 0
         factor = 0.1 ** ((row["step"] - 1) / 6)
         rates = [row[f"static/lr/{name}"] for name in ("density", "color", "decoder")]

@@ -41,6 +41,7 @@ SHORT = (
     "schedule.deformation.iterations_per_frame=[2,2]",
     "schedule.deformation.rays=64",
     "video.frames=4",
+    "video.height=40",
     "trainer=cpu",
 )
 

@@ -104,6 +104,8 @@ def test_everything_lies_in_the_run_folder(trained):
         "checkpoints/deformation.ckpt",
         "images/static.png",
         "images/dynamic.png",
+        "images/training_canonical.png",
+        "images/training_deformation.png",
         "videos/held_out.mp4",
         "videos/orbit.mp4",
     } <= made
@@ -116,8 +118,8 @@ def test_pictures_and_videos_can_be_read(trained):
     assert sheet.ndim == 3 and sheet.shape[2] == 3
     video = iio.imread(folder / "videos" / "held_out.mp4")
     assert len(video) == 4
-    # Colour beside depth, 24 x 20 px each, enlarged alike.
-    assert video.shape[2] / video.shape[1] == pytest.approx(2 * 24 / 20, rel=0.02)
+    # Truth, rendering and depth, 48 x 40 px each, side by side below a line of text.
+    assert video.shape[1:] == (18 + 40, 3 * 48 + 2 * 4, 3)
 
 
 def test_stages_one_by_one_find_the_checkpoints_and_come_to_the_same(

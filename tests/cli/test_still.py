@@ -24,13 +24,14 @@ def test_a_still_in_any_size(devrf, tmp_path, tiny, trained):
         assert iio.imread(tmp_path / "run" / "images" / f"{name}.png").shape == (70, 84, 3)
 
 
-def test_videos_in_any_size_are_not_enlarged(devrf, tmp_path, tiny, trained):
+def test_videos_in_any_size(devrf, tmp_path, tiny, trained):
     shutil.copytree(trained[0] / "checkpoints", tmp_path / "run" / "checkpoints")
     outcome = devrf(*tiny, "stage=render", "video.height=30", "hydra.run.dir=run")
     assert (outcome.status, outcome.err) == (0, "")
-    for name in ("held_out", "orbit"):
+    # Two and three images of 30 x 36 pixels with a gap of 4, below a line of text.
+    for name, width in (("held_out", 3 * 36 + 8), ("orbit", 2 * 36 + 4)):
         video = iio.imread(tmp_path / "run" / "videos" / f"{name}.mp4")
-        assert video.shape == (4, 30, 72, 3)
+        assert video.shape == (4, 18 + 30, width, 3)
 
 
 @pytest.mark.parametrize(

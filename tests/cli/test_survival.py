@@ -173,8 +173,10 @@ def test_a_full_disk_is_said_and_the_run_goes_on_when_there_is_room(warm, comman
     finished = (whole / "run" / "checkpoints" / "canonical.ckpt").stat().st_size
     outcome = warm(tmp_path, *command, most_bytes=min(len(before), finished) // 2)
     assert outcome.status == 2
-    *_, warned, last = (line for line in outcome.out.splitlines() if "File too large" in line)
+    told = [line for line in outcome.out.splitlines() if "File too large" in line]
+    warned, drawn, last = told[-3:]
     assert "training goes on, the last good progress file stays (iteration 6)" in warned
+    assert "training_canonical.png" in drawn and drawn.endswith("the curve is not drawn")
     assert outcome.out.count("training goes on") == 1
     assert last.startswith("devrf: ") and "canonical.ckpt: File too large" in last
     assert "the last good progress file stays (canonical-progress-6.ckpt)" in last

@@ -12,6 +12,7 @@ from devrf.artifacts.film import FilmSettings
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.rendering.renderer import Renderer
+from devrf.scenes.scene import Views
 
 
 def orbit(cameras: Cameras, box: Box, settings: FilmSettings) -> Cameras:
@@ -47,6 +48,27 @@ def spiral(cameras: Cameras, focus: float, settings: FilmSettings) -> Cameras:
     offsets = (cameras.positions - middle) @ axes.T
     radii = 0.9 * offsets.abs().quantile(0.8, dim=0)
     return _ring(cameras, middle, radii[:, None] * axes, middle - focus * back, up, settings)
+
+
+def held_out_images(views: Views, frames: int) -> list[int]:
+    """The held-out image for each of ``frames`` times, evenly spread over [0, 1].
+
+    Of a capture with fixed cameras these are images of the first one. Images at rest follow one
+    another.
+
+    Args:
+        views: held-out views, at least one.
+        frames: number of times.
+    """
+    first = (views.view == views.view[0]).nonzero()[:, 0]
+    own = first if len(first) > 1 else torch.arange(len(views))
+    times = views.times[own]
+    if bool((times == times[0]).all()):
+        times = torch.linspace(0, 1, len(own))
+    wanted = torch.linspace(0, 1, frames)
+    nearest = (times[None] - wanted[:, None]).abs().argmin(dim=1)
+    found: list[int] = own[nearest].tolist()
+    return found
 
 
 def _ring(

@@ -2,31 +2,31 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import imageio
 import numpy as np
-import torch
 from torch import Tensor
 
 from devrf.artifacts.colors import to_bytes
-from devrf.artifacts.images import enlarged
-from devrf.artifacts.still import still
+from devrf.artifacts.grid import image_grid, scaled
+from devrf.artifacts.still import sized, still
 from devrf.errors import DevrfError
+from devrf.evaluation.held_out import background_value, truth_image
 from devrf.geometry.cameras import Cameras
 from devrf.rendering.renderer import Renderer
+from devrf.scenes.scene import Background, Views
 from devrf.system.files import atomic_write
 
-# Smaller images are enlarged to this height: a video of 100 pixels is too small to watch.
-WATCHABLE = 240
-# Upper bound of the bytes of a pixel in a video: measured on images of 200 pixels and less.
+# Upper bound of the bytes of a pixel in a video: measured on images of 400 pixels and less.
 PIXEL = 0.2
 # H.264 has blocks of so many pixels.
 SMALLEST = 16
+# Fewer frames are no video.
+FEWEST = 8
 
 
 @dataclass(frozen=True)
@@ -39,38 +39,82 @@ class FilmSettings:
         fps: images a second.
         orbit_turns: how often the orbit goes round while time runs once.
         orbit_elevation: degrees above the horizon.
-        height: of the images in pixels; None for the captured images' height, with small
-            images enlarged.
+        height: of the rendered images in pixels; None for the captured images' height, but at
+            least 400.
+        max_seconds: what rendering a video may take; where it would take longer, fewer frames
+            are rendered, over the same duration. None: no limit.
         half: whether the colour network works in half precision, on a CUDA device only.
     """
 
     frames: int = 60
-    fps: int = 20
+    fps: float = 20
     orbit_turns: float = 1.0
     orbit_elevation: float = 25.0
     height: int | None = None
+    max_seconds: float | None = None
     half: bool = False
 
     def __post_init__(self) -> None:
         if self.height is not None and self.height < SMALLEST:
             raise DevrfError(f"video.height: expected at least {SMALLEST}, not {self.height}")
+        if self.max_seconds is not None and not self.max_seconds > 0:
+            raise DevrfError(f"video.max_seconds: expected more than 0, not {self.max_seconds}")
 
     def sized(self, cameras: Cameras) -> Cameras:
         """Captured cameras with images of the video's size."""
-        return cameras if self.height is None else cameras.of_height(self.height)
+        return sized(cameras, self.height)
+
+    def within_limit(self, seconds: float) -> FilmSettings:
+        """The settings for images that take ``seconds`` each: fewer frames if need be."""
+        most = self.frames if self.max_seconds is None else int(self.max_seconds / seconds)
+        frames = min(self.frames, max(most, FEWEST))
+        return replace(self, frames=frames, fps=self.fps * frames / self.frames)
 
 
-def pictures(renderer: Renderer, cameras: Cameras, background: float) -> Iterator[Tensor]:
-    """Colour beside depth (H, 2W, 3) from each of N cameras, while time runs from 0 to 1."""
+def orbit_pictures(renderer: Renderer, cameras: Cameras, background: float) -> Iterator[Tensor]:
+    """Colour beside depth (H', W', 3) from each of N cameras, while time runs from 0 to 1."""
     for index in range(len(cameras)):
         time = index / max(len(cameras) - 1, 1)
-        yield torch.cat(still(renderer, cameras, time, background, index), dim=1)
+        color, depth = still(renderer, cameras, time, background, index)
+        yield image_grid([[color, depth]], [f"time {time:.2f}", "depth: near is bright"])
 
 
-def write_video(path: Path, images: Iterator[Tensor], fps: int, *, least: int = WATCHABLE) -> None:
+def held_out_pictures(
+    renderer: Renderer,
+    views: Views,
+    images: Sequence[int],
+    film: FilmSettings,
+    background: Background,
+) -> Iterator[Tensor]:
+    """Truth, rendering and depth (H', W', 3) side by side, while time runs from 0 to 1.
+
+    Args:
+        renderer: of the learned scene.
+        views: the held-out views, on the host.
+        images: for each frame the held-out image to show, whose camera is used
+            (:func:`~devrf.artifacts.camera_paths.held_out_images`).
+        film: the images' height.
+        background: what is behind the alpha mask.
+    """
+    cameras, behind = film.sized(views.cameras), background_value(background)
+    larger = ", enlarged" if cameras.height > views.height else ""
+    for frame, image in enumerate(images):
+        time = frame / max(len(images) - 1, 1)
+        color, depth = still(renderer, cameras, time, behind, image)
+        # Resized from its own size, not rendered: it shows what there is to compare with.
+        truth = scaled(truth_image(views, image, background), cameras.height, cameras.width)
+        headings = [
+            f"truth at {float(views.times[image]):.2f} ({views.width}x{views.height}{larger})",
+            f"rendered at time {time:.2f}",
+            "depth: near is bright",
+        ]
+        yield image_grid([[truth, color, depth]], headings)
+
+
+def write_video(path: Path, images: Iterator[Tensor], fps: float) -> None:
     """Write images (H, W, 3) in [0, 1] of one size as an mp4 (H.264), ``fps`` a second.
 
-    Images less than ``least`` pixels high are enlarged by a whole factor.
+    A last row or column is repeated where that makes the side even, as H.264 needs it.
     """
     with atomic_write(path) as partial:
         writer = imageio.get_writer(
@@ -79,13 +123,15 @@ def write_video(path: Path, images: Iterator[Tensor], fps: int, *, least: int = 
         # As a context manager of its own it would leave ffmpeg running, and writing, on an error.
         with closing(writer):
             for image in images:
-                shown = to_bytes(enlarged(image, height=least)).numpy()
-                odd = [(0, side % 2) for side in shown.shape[:2]]  # H.264 needs even sides
+                shown = to_bytes(image).numpy()
+                odd = [(0, side % 2) for side in shown.shape[:2]]
                 writer.append_data(np.pad(shown, [*odd, (0, 0)], mode="edge"))
 
 
 def film_bytes(film: FilmSettings, cameras: Cameras) -> int:
-    """Upper estimate of a video's size in bytes, colour beside depth, for the captured cameras."""
-    sized = film.sized(cameras)
-    enlarged = max(1, math.ceil(WATCHABLE / sized.height)) if film.height is None else 1
-    return round(film.frames * 2 * sized.height * sized.width * enlarged**2 * PIXEL)
+    """Upper estimate of the size in bytes of both videos, for the captured cameras.
+
+    Two images a frame in one, three in the other, and labels above them.
+    """
+    shown = film.sized(cameras)
+    return round(film.frames * 5 * (1.1 * shown.height) * shown.width * PIXEL)

@@ -1,8 +1,7 @@
-"""Images as files, side by side, enlarged; and their names as labels."""
+"""Images as files and side by side; and their names as labels."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -29,12 +28,6 @@ def side_by_side(images: Sequence[Tensor]) -> Tensor:
     """Images (H, W, 3) of one height in a row, with ``GAP`` white pixels between them."""
     padded = [torch.nn.functional.pad(image, (0, 0, 0, GAP), value=1.0) for image in images]
     return torch.cat(padded, dim=1)[:, :-GAP]
-
-
-def enlarged(image: Tensor, *, height: int = 1, width: int = 1) -> Tensor:
-    """An image (H, W, 3) with each pixel repeated, so that it is at least so high and so wide."""
-    factor = max(math.ceil(height / image.shape[0]), math.ceil(width / image.shape[1]))
-    return image.repeat_interleave(factor, dim=0).repeat_interleave(factor, dim=1)
 
 
 def short_name(name: str) -> str:

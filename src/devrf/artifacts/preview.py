@@ -2,21 +2,35 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from torch import Tensor
 
 from devrf.artifacts.colors import error_colors
 from devrf.artifacts.images import side_by_side
 from devrf.artifacts.still import still
 from devrf.evaluation.held_out import background_value, compare, truth_image
+from devrf.metrics.image import psnr
 from devrf.rendering.renderer import Renderer
 from devrf.rendering.view import Viewable
 from devrf.scenes.scene import Background, Views
 
 
-def preview(model: Viewable, views: Views, index: int, background: Background) -> dict[str, Tensor]:
-    """Images (H, W', 3) in [0, 1] by name.
+class Preview(NamedTuple):
+    """A held-out view as rendered so far.
 
-    ``view`` is the rendered image beside the truth and the error, ``depth`` its depth.
+    Attributes:
+        images: (H, W', 3) in [0, 1] by name: ``view`` is the rendered image beside the truth and
+            the error, ``depth`` its depth.
+        psnr: dB, of the whole image, pixels that are not valid taken as right.
+    """
+
+    images: dict[str, Tensor]
+    psnr: float
+
+
+def preview(model: Viewable, views: Views, index: int, background: Background) -> Preview:
+    """Render a held-out view and compare it with the truth.
 
     Args:
         model: what has been learned so far.
@@ -27,5 +41,6 @@ def preview(model: Viewable, views: Views, index: int, background: Background) -
     time, behind = float(views.times[index]), background_value(background)
     prediction, depth = still(Renderer(model, times=1), views.cameras, time, behind, index)
     truth = truth_image(views, index, background).cpu()
-    error = error_colors(compare(prediction, truth, views.valid_mask_of(index)), truth)
-    return {"view": side_by_side([prediction, truth, error]), "depth": depth}
+    compared = compare(prediction, truth, views.valid_mask_of(index))
+    shown = side_by_side([prediction, truth, error_colors(compared, truth)])
+    return Preview({"view": shown, "depth": depth}, psnr(compared, truth))

@@ -118,5 +118,14 @@ def peak_host_memory() -> float | None:
 
 
 def in_words(values: Mapping[str, Any]) -> str:
-    """``name value, name value, …`` on one line, without unknown values."""
-    return ", ".join(f"{key} {value}" for key, value in values.items() if value is not None)
+    """``name value, name value, …`` on one line, rounded, without unknown values."""
+    return ", ".join(
+        f"{key} {rounded(value)}" for key, value in values.items() if value is not None
+    )
+
+
+def rounded(value: Any) -> str:
+    """A number with four digits, whole numbers with all of theirs, for people; others as text."""
+    if not isinstance(value, float):
+        return str(value)
+    return f"{value:.0f}" if 1000 <= abs(value) < 1e15 else f"{value:.4g}"

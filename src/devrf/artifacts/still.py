@@ -13,6 +13,9 @@ from devrf.geometry.cameras import Cameras
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene
 
+# Pictures of small images are rendered at this height, in pixels, unless another is asked for.
+READABLE = 400
+
 
 @dataclass(frozen=True)
 class StillSettings:
@@ -22,7 +25,7 @@ class StillSettings:
         view: ``held_out`` for the first held-out camera of the moving scene, or the number of an
             image of the static training set for that image's camera.
         time: in [0, 1]; 0 is the rest state.
-        height: pixels; None for the captured images' height.
+        height: pixels; None for the captured images' height, but at least 400.
         half: whether the colour network works in half precision, on a CUDA device only.
     """
 
@@ -49,8 +52,12 @@ class StillSettings:
         if not 0 <= index < len(captured):
             some = f"expected held_out or 0 to {len(scene.static.train) - 1}, not {self.view}"
             raise DevrfError(f"still.view: {some}")
-        camera = captured.cameras[[index]]
-        return camera if self.height is None else camera.of_height(self.height)
+        return sized(captured.cameras[[index]], self.height)
+
+
+def sized(cameras: Cameras, height: int | None) -> Cameras:
+    """The cameras with images ``height`` pixels high; None: as high as they are, at least 400."""
+    return cameras.of_height(max(cameras.height, READABLE) if height is None else height)
 
 
 def still(

@@ -7,6 +7,7 @@ from devrf.callbacks.previews import Previews
 from devrf.callbacks.progress import Progress
 from devrf.callbacks.schedule import GridUpscaling, LearningRateDecay
 from devrf.callbacks.stop_on_signal import StopOnSignal
+from devrf.callbacks.training_curve import TrainingCurve
 from devrf.callbacks.training_record import TrainingRecord
 
 __all__ = [
@@ -18,5 +19,6 @@ __all__ = [
     "Progress",
     "PeriodicCheckpoint",
     "StopOnSignal",
+    "TrainingCurve",
     "TrainingRecord",
 ]

@@ -1,4 +1,4 @@
-"""Curves beside those of the losses: learning rates, speed, resolution, memory."""
+"""Curves beside those of the losses: PSNR, learning rates, speed, resolution, memory."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 
 from devrf.artifacts.records import peak_host_memory
+from devrf.callbacks.training_curve import batch_psnr
 from devrf.engine.stage import ScheduledStage
 
 
 class Meter(Callback):
-    """Logs learning rates, speed, resolution and memory in the rows of the losses."""
+    """Logs the batches' PSNR, learning rates, speed, resolution and memory beside the losses."""
 
     def __init__(self) -> None:
         self._last = (0.0, 0)
@@ -47,6 +48,9 @@ class Meter(Callback):
             values["frame"] = pl_module.phase.frames[0]  # a column has one number
         if pl_module.device.type == "cuda":
             values["peak_gpu_gb"] = torch.cuda.max_memory_allocated(pl_module.device) / 2**30
+        psnr = batch_psnr(outputs or {})
+        if psnr is not None:
+            pl_module.log(f"{pl_module.capture}/psnr", psnr)
         pl_module.log_dict(
             {f"{pl_module.capture}/{k}": float(v) for k, v in values.items() if v is not None}
         )

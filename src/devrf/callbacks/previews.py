@@ -17,13 +17,27 @@ class Previews(Callback):
 
     Attributes:
         seconds: what the pictures of the present stage have taken.
+        psnr: (iteration, dB) of the pictures of the present stage.
     """
 
     def __init__(self, times: int = 6) -> None:
         """``times``: pictures of each stage, evenly spread, the last at its end."""
         self.times = times
         self.seconds = 0.0
+        self.psnr: list[tuple[int, float]] = []
         self._shown = 0
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Forget the stage before."""
+        self.psnr = []
+
+    def state_dict(self) -> dict[str, Any]:
+        """The PSNR of the pictures so far."""
+        return {"psnr": list(self.psnr)}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on with what :meth:`state_dict` gave."""
+        self.psnr = [(int(k), float(value)) for k, value in state_dict["psnr"]]
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Begin to count."""
@@ -45,9 +59,13 @@ class Previews(Callback):
             seen = preview(
                 pl_module.current_model(), views, len(views) // 2, pl_module.scene.background
             )
+            done, capture = pl_module.iteration, pl_module.capture
+            self.psnr = [point for point in self.psnr if point[0] < done] + [(done, seen.psnr)]
             for tracker in found:
-                for name, image in seen.items():
-                    tracker.show_image(f"{pl_module.capture}/{name}", image, pl_module.iteration)
+                for name, image in seen.images.items():
+                    tracker.show_image(f"{capture}/{name}", image, done)
+            for logger in trainer.loggers:
+                logger.log_metrics({f"{capture}/held_out_psnr": seen.psnr}, done)
         self.seconds += time.perf_counter() - started
 
     def _due(self, stage: ScheduledStage) -> int:

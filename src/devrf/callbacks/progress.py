@@ -1,19 +1,22 @@
-"""A progress bar with iteration, PSNR, speed, resolution and frame."""
+"""A progress bar with iteration, PSNR, speed, resolution, frame and the time left."""
 
 from __future__ import annotations
 
 import logging
-import math
 import time
+from collections.abc import Mapping
 from typing import Any
 
 from lightning import Callback, LightningModule, Trainer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
+from torch import Tensor
 
+from devrf.callbacks.training_curve import batch_psnr
 from devrf.engine.phase import in_words
 from devrf.engine.stage import ScheduledStage
+from devrf.system.progress import time_left
 
 log = logging.getLogger(__name__)
 
@@ -62,10 +65,12 @@ class Progress(Callback):
         since, done = now - self._shown[0], pl_module.iteration
         if since < (self.line_every_seconds if self._bar is None else BAR_EVERY_SECONDS):
             return
-        state = describe(trainer, pl_module, (done - self._shown[1]) / since)
+        speed, total = (done - self._shown[1]) / since, pl_module.total_iterations
+        state = describe(outputs or {}, pl_module, speed)
         self._shown = (now, done)
         if self._bar is None:
-            log.info("%s %d/%d  %s", pl_module.capture, done, pl_module.total_iterations, state)
+            left = f"  {time_left((total - done) / speed)}" if 0 < speed and done < total else ""
+            log.info("%s %d/%d  %s%s", pl_module.capture, done, total, state, left)
         else:
             self._bar.update(self._bar.task_ids[0], completed=done, state=state)
 
@@ -86,12 +91,11 @@ class Progress(Callback):
             self._bar = None
 
 
-def describe(trainer: Trainer, stage: ScheduledStage, speed: float) -> str:
+def describe(means: Mapping[str, Tensor], stage: ScheduledStage, speed: float) -> str:
     """PSNR of the last batches, iterations a second, resolution, and the frames if any."""
-    means = trainer.callback_metrics
-    error = means.get(f"{stage.capture}/color", means.get(f"{stage.capture}/render"))
-    parts = [] if error is None else [f"{-10 * math.log10(max(float(error), 1e-12)):.1f} dB"]
-    parts.append(f"{speed:.0f} it/s")
+    psnr = batch_psnr(means)
+    parts = [] if psnr is None else [f"{float(psnr):.1f} dB"]
+    parts.append(f"{speed:.0f} it/s" if speed >= 10 else f"{speed:.2g} it/s")
     if stage.resolution:
         parts.append("x".join(str(n) for n in stage.resolution))
     if stage.phase is not None and stage.phase.frames:

@@ -125,7 +125,7 @@ def preflight(run: RunContext, learns: Sequence[str], *, films: bool) -> str | N
     if config.resume:  # these files will be replaced
         free += sum(file.stat().st_size for file in run.folder.glob("checkpoints/*.ckpt"))
     if films:
-        videos = 2 * film_bytes(instantiate(config.video), run.scene.static.train.cameras)
+        videos = film_bytes(instantiate(config.video), run.scene.static.train.cameras)
     disk = budget.disk(kept=PeriodicCheckpoint.KEPT, films=videos)
     needs.append(Requirement("disk", disk, free, stage.held, disk))
     return check(needs, lambda key: OmegaConf.select(config, key, default="") != "")

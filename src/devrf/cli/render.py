@@ -3,39 +3,70 @@
 from __future__ import annotations
 
 import logging
+import time
+from collections.abc import Iterator
 
 from hydra.utils import instantiate
+from torch import Tensor
 
-from devrf.artifacts.camera_paths import focus_distance, orbit, spiral
-from devrf.artifacts.film import SMALLEST, WATCHABLE, FilmSettings, pictures, write_video
+from devrf.artifacts.camera_paths import focus_distance, held_out_images, orbit, spiral
+from devrf.artifacts.film import FilmSettings, held_out_pictures, orbit_pictures, write_video
 from devrf.artifacts.images import write_image
 from devrf.artifacts.still import StillSettings, still
 from devrf.cli.context import RunContext
 from devrf.evaluation.held_out import background_value
 from devrf.rendering.renderer import Renderer
+from devrf.system.progress import followed
 
 log = logging.getLogger(__name__)
 
 
 def render(run: RunContext) -> None:
-    """Film the held-out view over time, and an orbit (or a spiral) while time runs."""
+    """Film the held-out views over time, and an orbit (or a spiral) while time runs."""
     stored, scene = run.load(), run.scene
     film: FilmSettings = instantiate(run.config.video)
     renderer = Renderer(stored.model.to(run.device), half=film.half)
-    held_out = film.sized(scene.dynamic.test.cameras[[0] * film.frames])
-    captured = film.sized(scene.static.train.cameras)
-    paths = {"held_out": held_out}
-    if scene.kind == "forward":
-        paths["spiral"] = spiral(captured, focus_distance(renderer, captured), film)
+    film = _within_limit(run, film, renderer)
+    views, captured = scene.dynamic.test, film.sized(scene.static.train.cameras)
+    images = held_out_images(views, film.frames)
+    _write(
+        run, film, "held_out", held_out_pictures(renderer, views, images, film, scene.background)
+    )
+    forward = scene.kind == "forward"
+    if forward:
+        path = spiral(captured, focus_distance(renderer, scene.static.train.cameras), film)
     else:
-        paths["orbit"] = orbit(captured, renderer.model.box, film)
-    for name, cameras in paths.items():
-        path = run.folder / "videos" / f"{name}.mp4"
-        shown = pictures(renderer, cameras, background_value(scene.background))
-        write_video(path, shown, film.fps, least=WATCHABLE if film.height is None else SMALLEST)
-        log.info("video written to %s", path)
-        for tracker in run.trackers:
-            tracker.show_video(f"videos/{name}", path)
+        path = orbit(captured, renderer.model.box, film)
+    shown = orbit_pictures(renderer, path, background_value(scene.background))
+    _write(run, film, "spiral" if forward else "orbit", shown)
+
+
+def _within_limit(run: RunContext, film: FilmSettings, renderer: Renderer) -> FilmSettings:
+    """The settings, with fewer frames where ``video.max_seconds`` would not suffice."""
+    if film.max_seconds is None:
+        return film
+    cameras = film.sized(run.scene.dynamic.test.cameras[[0]])
+    began = time.perf_counter()
+    still(renderer, cameras, 0.5, 1.0)
+    seconds = time.perf_counter() - began
+    fewer = film.within_limit(seconds)
+    if fewer.frames < film.frames:
+        log.warning(
+            "videos have %d frames, not %d: rendering one takes %.1f s; video.max_seconds=null "
+            "renders all, a lower video.height is faster",
+            fewer.frames,
+            film.frames,
+            seconds,
+        )
+    return fewer
+
+
+def _write(run: RunContext, film: FilmSettings, name: str, images: Iterator[Tensor]) -> None:
+    path = run.folder / "videos" / f"{name}.mp4"
+    write_video(path, followed(images, film.frames, f"{name}.mp4"), film.fps)
+    log.info("video written to %s", path)
+    for tracker in run.trackers:
+        tracker.show_video(f"videos/{name}", path)
 
 
 def picture(run: RunContext) -> None:

@@ -30,6 +30,8 @@ class HeldOutView:
         rest_pose_psnr: PSNR in dB of the scene at rest, in place of the prediction.
         further: other metrics by name; None where there is nothing to compare with.
         compared: (H, W, 3) RGB in [0, 1], the prediction at valid pixels, else the truth.
+        depth: (H, W) mean distance of what is seen, in the space of the fields.
+        opacity: (H, W) in [0, 1], how much is seen there.
     """
 
     name: str
@@ -41,6 +43,8 @@ class HeldOutView:
     rest_pose_psnr: float
     further: dict[str, float | None] = field(default_factory=dict)
     compared: Tensor = field(kw_only=True)
+    depth: Tensor = field(kw_only=True)
+    opacity: Tensor = field(kw_only=True)
 
     @property
     def scores(self) -> dict[str, float | None]:
@@ -83,8 +87,9 @@ def score(
     valid_mask = views.valid_mask_of(index)
     compared, rest = (compare(image, truth, valid_mask) for image in (prediction, rest))
     further: dict[str, float | None] = {}
+    shape = (views.height, views.width)
+    opacity = seen.opacity.cpu().view(shape)
     if suite is not None and suite.metrics:
-        shape = (views.height, views.width)
         distance = _world_distance(renderer.model, views, index, seen)
         further = suite.scores(
             MetricInput(
@@ -94,7 +99,7 @@ def score(
                 compared,
                 truth,
                 distance.view(shape),
-                seen.opacity.cpu().view(shape),
+                opacity,
                 suite.lpips,
             )
         )
@@ -108,6 +113,8 @@ def score(
         rest_pose_psnr=_psnr(rest, truth, valid_mask),
         further=further,
         compared=compared,
+        depth=seen.depth.cpu().view(shape),
+        opacity=opacity,
     )
 
 

@@ -27,6 +27,11 @@ class Box:
         if not all(a < b for a, b in zip(self.low, self.high, strict=True)):
             raise ValueError(f"a box needs low < high on every axis, not {self.low}, {self.high}")
 
+    def __str__(self) -> str:
+        """Both corners with three digits, for people."""
+        low, high = (" ".join(f"{v:.3g}" for v in corner) for corner in (self.low, self.high))
+        return f"[{low}] to [{high}]"
+
     @property
     def size(self) -> tuple[float, float, float]:
         """Edge lengths (x, y, z)."""

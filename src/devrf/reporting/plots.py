@@ -15,9 +15,17 @@ from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
 from devrf.reporting.runs import metric_over_time
 from devrf.reporting.table import LPIPS, PSNR, SSIM, TIME, Block, Table
 
-# The palette of Okabe and Ito, distinguishable with colour-blindness; then dashes.
-COLORS = "#0072B2 #D55E00 #009E73 #CC79A7 #E69F00 #56B4E9 #000000 #8C6D31".split()
-DASHES = ("-", "--", ":", "-.")
+# The palette of Okabe and Ito, distinguishable with colour-blindness; then each time the colour
+# furthest in CIELAB from those before, from white and from grey. Other dashes every eight colours.
+COLORS = (
+    "#0072B2 #D55E00 #009E73 #CC79A7 #E69F00 #56B4E9 #000000 #8C6D31 "
+    "#4B0096 #96D21E #FF0069 #69001E #D200A5 #A587FF #0F3C00 #4B1E5A "
+    "#00E178 #FFB496 #B4C369 #1E870F #D25A5A #006969 #5AD2D2 #D2001E"
+).split()
+DASHES, ALIKE = ("-", "--", ":", "-."), 8
+POINTS = "osD^"
+# Inches of a line of the legend: the figure grows by it, so that curves keep their room.
+LEGEND_LINE, MOST_COLUMNS = 0.19, 8
 PUBLISHED, GREY = ", published", "#9a9a9a"
 STYLE: dict[Any, Any] = {
     "figure.dpi": 160,
@@ -31,6 +39,7 @@ STYLE: dict[Any, Any] = {
     "axes.axisbelow": True,
     "legend.frameon": False,
     "legend.fontsize": 8,
+    "legend.handlelength": 2.6,  # of two dashes
     "lines.linewidth": 1.6,
     "lines.markersize": 4,
 }
@@ -147,7 +156,9 @@ def against_views(table: Table) -> Figure | None:
 def _points(axes: Axes, table: Table, block: Block) -> None:
     """One scene's panel."""
     for label, seconds, psnr in _seconds_and_psnr(block.measured):
-        axes.plot(seconds, psnr, "o", color=_look(table, label)[0], markersize=6, label=label)
+        color, dashes = _look(table, label)
+        mark = POINTS[DASHES.index(dashes)]
+        axes.plot(seconds, psnr, mark, color=color, markersize=6, label=label)
     for label, seconds, psnr in _seconds_and_psnr(block.published):
         method = re.sub(VARIANT, "", label)
         look: dict[str, Any] = {"color": GREY, "markerfacecolor": "none"}
@@ -180,16 +191,27 @@ def _look(table: Table, label: str) -> tuple[str, str]:
 
 
 def _style(k: int) -> tuple[str, str]:
-    return COLORS[k % len(COLORS)], DASHES[k // len(COLORS) % len(DASHES)]
+    return COLORS[k % len(COLORS)], DASHES[k // ALIKE % len(DASHES)]
 
 
 def _legend(figure: Figure) -> None:
-    """One legend below the figure for all its panels: each label once, ours first."""
+    """One legend below the figure for all its panels: each label once, ours first.
+
+    The figure grows, so that the legend takes no room from the panels and is nowhere cut off.
+    """
     handles: dict[str, Artist] = {}
     for axes in figure.axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
     handles = dict(sorted(handles.items(), key=lambda entry: entry[0].endswith(PUBLISHED)))
-    longest = max(map(len, handles))
-    columns = max(1, min(len(handles), int(figure.get_figwidth() * 16 / (longest + 6))))
-    figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=columns)
+    for columns in range(min(len(handles), MOST_COLUMNS), 0, -1):
+        legend = figure.legend(
+            list(handles.values()), list(handles), loc="outside lower center", ncols=columns
+        )
+        needed = legend.get_window_extent().width / figure.dpi
+        if needed <= figure.get_figwidth() or columns == 1:
+            figure.set_figwidth(max(needed, figure.get_figwidth()))
+            lines = -(-len(handles) // columns)
+            figure.set_figheight(figure.get_figheight() + (lines - 1) * LEGEND_LINE)
+            return
+        legend.remove()

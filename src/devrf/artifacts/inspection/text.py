@@ -11,7 +11,6 @@ from rich.table import Table
 from rich.text import Text
 
 from devrf.artifacts.inspection.report import FlowFacts, Inspection, ViewsFacts
-from devrf.geometry.box import Box
 
 HEADING = "set,images,views x times,size,alpha masks,masks,focal length,distance".split(",")
 
@@ -55,23 +54,18 @@ def _facts(found: Inspection) -> list[tuple[str, str]]:
     scene, bounds, times = found.scene, found.scene.bounds, found.times
     spacing = "evenly spaced" if found.even else "unevenly spaced"
     unit = "NDC" if scene.kind == "forward" else "world units"
-    motion = "" if bounds.motion is None else f"{_box(bounds.motion)}, "
+    motion = "" if bounds.motion is None else f"{bounds.motion}, "
     rows = [
         ("scene", f"{scene.name}, {scene.kind}-facing, {scene.background} background"),
         ("times", f"{len(times)} from {times[0]:g} to {times[-1]:g}, {spacing}"),
         ("near, far", f"{bounds.near:.4g}, {bounds.far:.4g} ({unit})"),
-        ("box", _box(bounds.box)),
+        ("box", str(bounds.box)),
         ("room for motion", f"{motion}{bounds.source}"),
         ("optical flow", _flow(found.flow)),
     ]
     if found.gap is not None:
         rows.insert(2, ("static views", f"widest sector without one: {found.gap:.0f} degrees"))
     return rows
-
-
-def _box(box: Box) -> str:
-    low, high = (" ".join(f"{v:.3g}" for v in corner) for corner in (box.low, box.high))
-    return f"[{low}] to [{high}]"
 
 
 def _flow(flow: FlowFacts | None) -> str:
