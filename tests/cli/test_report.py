@@ -20,6 +20,11 @@ def finished(trained, tmp_path):
         (tmp_path / "mine" / name).mkdir(parents=True)
         for file in ("metrics.json", "frames.csv"):
             shutil.copy(trained[0] / file, tmp_path / "mine" / name / file)
+    # Another run, although its numbers are the same.
+    path = tmp_path / "mine" / "two" / "metrics.json"
+    found = json.loads(path.read_text())
+    found["run"]["checkpoint"] = "another"
+    path.write_text(json.dumps(found))
     return tmp_path / "mine"
 
 
@@ -102,3 +107,18 @@ def test_a_sweep_without_scores_ends_without_a_report(devrf, tmp_path, tiny):
     outcome = devrf("-m", *tiny, "stage=canonical", "seed=0", "hydra.sweep.dir=sweep")
     assert (outcome.status, outcome.err) == (0, "")
     assert "report" not in outcome.out and not (tmp_path / "sweep" / "report").exists()
+
+
+def test_equal_runs_are_one_row_and_others_say_what_differs(devrf, tmp_path, tiny):
+    brief = (*tiny, "video.frames=2", "evaluation.metrics=[]")
+    assert devrf(*brief, "hydra.run.dir=outputs/one").status == 0
+    # The defaults typed out, another seed, and an archived run of the first.
+    afresh = ("experiment=quickstart", "sampling=quick", "seed=1", "resume=false")
+    assert devrf("hydra.run.dir=outputs/one", *afresh).status == 0
+    assert devrf("hydra.run.dir=outputs/two", *brief, "data.height=18").status == 0
+    checkpoint = "ckpt=outputs/one/checkpoints/deformation.ckpt"
+    assert devrf("stage=evaluate", checkpoint, "hydra.run.dir=outputs/scored").status == 0
+    outcome = devrf("stage=report")
+    assert (outcome.status, outcome.err) == (0, "")
+    assert "data.height=20 (n = 2)" in outcome.out and "data.height=18  " in outcome.out
+    assert "Counted once, as last scored elsewhere with the same checkpoint: one." in outcome.out
