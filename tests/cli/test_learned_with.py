@@ -142,6 +142,7 @@ def test_a_group_that_is_typed_begins_from_its_own_values(run, monkeypatch):
     there = [f"hydra.run.dir={run}", "stage=inspect"]
     kept = ["seed=1", "field.width=8", "hydra.mode=RUN"]
     assert completed([*there, "data=forward"]) == [*kept, *there, "data=forward"]
+    assert completed([*there, "data=inward"])[:2] == ["data.downscale=2", "seed=1"]
     # Another method has other settings.
     kept = ["data=inward", "data.downscale=2", "seed=1", "hydra.mode=RUN"]
     assert completed([*there, "method=dnerf"]) == [*kept, *there, "method=dnerf"]

@@ -217,16 +217,19 @@ def _composed_folder(typed: _Typed) -> Path | None:
 def _begin(typed: _Typed, command: Sequence[str], source: str) -> list[str]:
     """The recorded overrides that stay beside what is typed.
 
-    A group that is typed begins from its own values. Another method takes over data and seed only.
+    Another option of a group begins from its own values. Another method takes over data and seed.
     """
     parsed = OverridesParser.create().parse_overrides(list(command))
+    before = _Typed(tuple(parsed), multirun=False)
     keys = [one.key_or_group for one in typed.overrides if not one.is_add()]
+    changed = [key for key in keys if typed.values(key) != before.values(key)]
     method = typed.value("method")
-    other = method not in (None, value_in(command, "method") or "devrf")
+    other = method not in (None, before.value("method") or "devrf")
     stay = []
     for one in parsed:
         key = one.key_or_group
-        replaced = any(key.startswith(f"{k}.") or (key == k and not one.is_add()) for k in keys)
+        replaced = any(key.startswith(f"{k}.") for k in changed)
+        replaced |= key in keys and not one.is_add()
         if not replaced and (not other or re.split("[./]", key)[0] in ("data", "seed")):
             stay.append(str(one.input_line))
     if stay:
