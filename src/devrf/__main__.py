@@ -6,6 +6,7 @@ import os
 import sys
 
 from devrf.cli.app import main
+from devrf.cli.learned_with import completed
 from devrf.cli.messages import report_user_errors
 from devrf.cli.paper_scene import with_paper_experiment
 from devrf.cli.sweep import failures_at_the_end
@@ -26,6 +27,7 @@ def entry() -> None:
     try:
         with handle_signals(end_at_once), report_user_errors(), failures_at_the_end():
             sys.argv[1:] = with_paper_experiment(sys.argv[1:])
+            sys.argv[1:] = completed(sys.argv[1:])
             main()
     except Interrupted as stop:
         print(f"devrf: {stop.said}", file=sys.stderr)

@@ -11,6 +11,7 @@ from lightning import Trainer
 
 from devrf.artifacts.film import FilmSettings
 from devrf.artifacts.still import StillSettings, still
+from devrf.checkpoints.viewpoints import Viewpoints
 from devrf.errors import DevrfError
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.rendering.renderer import Renderer
@@ -18,11 +19,11 @@ from devrf.scenes.scene import Scene
 
 
 def test_the_camera_that_is_meant(tiny_scene: Scene) -> None:
-    held_out = StillSettings().camera(tiny_scene)
+    held_out = StillSettings().camera(Viewpoints.of(tiny_scene))
     assert torch.equal(held_out.positions, tiny_scene.dynamic.test.cameras.positions[:1])
     # The images are 24 x 18: pictures of them are rendered 400 pixels high.
     assert (held_out.width, held_out.height) == (533, 400)
-    fifth = StillSettings(view=5, height=36).camera(tiny_scene)
+    fifth = StillSettings(view=5, height=36).camera(Viewpoints.of(tiny_scene))
     assert torch.equal(fifth.positions, tiny_scene.static.train.cameras.positions[5:6])
     assert (fifth.width, fifth.height) == (48, 36)
 
@@ -40,14 +41,17 @@ def test_what_cannot_be_shown(
     tiny_scene: Scene, settings: type[Any], given: dict[str, int], expected: str
 ) -> None:
     with pytest.raises(DevrfError) as caught:
-        settings(**given).camera(tiny_scene)
+        settings(**given).camera(Viewpoints.of(tiny_scene))
     assert str(caught.value) == expected
 
 
 def test_colour_and_depth_of_any_size(
     learned: tuple[CanonicalStage, Trainer], tiny_scene: Scene, reference: Callable[..., Any]
 ) -> None:
-    model, camera = learned[0].scene_model, StillSettings(view=2, height=31).camera(tiny_scene)
+    model, camera = (
+        learned[0].scene_model,
+        StillSettings(view=2, height=31).camera(Viewpoints.of(tiny_scene)),
+    )
     color, depth = still(Renderer(model), camera, 0.0, 0.0)
     assert color.shape == depth.shape == (31, 41, 3)
     seen = reference(model, camera.image_rays(0), 0.0, torch.zeros(3))

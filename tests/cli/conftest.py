@@ -121,7 +121,7 @@ def trained(
     """The folder of a whole tiny run and what the command said; to be read only."""
     folder = tmp_path_factory.mktemp("trained")
     outcome = call(folder, *tiny)
-    yield folder / "outputs" / "robot" / "default", outcome
+    yield folder / "outputs" / "robot" / "quickstart", outcome
 
 
 def environment(**more: str) -> dict[str, str]:

@@ -141,7 +141,7 @@ def test_the_canonical_stage_alone_can_be_scored(devrf, tmp_path, tiny):
     for stage in ("canonical", "evaluate"):
         outcome = devrf(*tiny, f"stage={stage}", "data.shape=flower", "ablation=c2f")
         assert (outcome.status, outcome.err) == (0, "")
-    found = metrics(tmp_path / "outputs" / "flower" / "default-c2f")
+    found = metrics(tmp_path / "outputs" / "flower" / "quickstart-c2f")
     assert list(found) == ["scene", "method", "protocol", "static", "canonical", "run"]
     assert found["run"]["wall_seconds"]["deformation"] is None
 

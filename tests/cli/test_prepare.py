@@ -24,6 +24,6 @@ def test_every_stage_runs_on_it(devrf, tmp_path, exported, short):
     outcome = devrf(*short, "data=inward", f"data.root={exported}", "data.bound_scale=1.2")
     assert (outcome.status, outcome.err) == (0, "")
     # The folder is told from the scene's: outputs/SCENE/EXPERIMENT.
-    found = json.loads((tmp_path / "outputs" / "robot" / "default" / "metrics.json").read_text())
+    found = json.loads((tmp_path / "outputs" / "robot" / "quickstart" / "metrics.json").read_text())
     assert found["scene"] == "robot"
     assert found["deformation"]["iterations"] == 12

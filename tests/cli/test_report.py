@@ -20,6 +20,11 @@ def finished(trained, tmp_path):
         (tmp_path / "mine" / name).mkdir(parents=True)
         for file in ("metrics.json", "frames.csv"):
             shutil.copy(trained[0] / file, tmp_path / "mine" / name / file)
+    # Another run, although its numbers are the same.
+    path = tmp_path / "mine" / "two" / "metrics.json"
+    found = json.loads(path.read_text())
+    found["run"]["checkpoint"] = "another"
+    path.write_text(json.dumps(found))
     return tmp_path / "mine"
 
 
@@ -102,3 +107,18 @@ def test_a_sweep_without_scores_ends_without_a_report(devrf, tmp_path, tiny):
     outcome = devrf("-m", *tiny, "stage=canonical", "seed=0", "hydra.sweep.dir=sweep")
     assert (outcome.status, outcome.err) == (0, "")
     assert "report" not in outcome.out and not (tmp_path / "sweep" / "report").exists()
+
+
+def test_equal_runs_are_one_row_whatever_was_typed(devrf, tmp_path, trained):
+    shutil.copytree(trained[0], tmp_path / "outputs" / "one")
+    # The defaults typed out, another seed, and an archived run of the first.
+    typed = ("experiment=quickstart", "sampling=quick", "seed=1", "video.frames=2")
+    afresh = (*typed, "evaluation.metrics=[]", "resume=false")
+    assert devrf("hydra.run.dir=outputs/one", *afresh).status == 0
+    checkpoint = "ckpt=outputs/one/checkpoints/deformation.ckpt"
+    scored = ("hydra.run.dir=outputs/scored", "evaluation.metrics=[]")
+    assert devrf("stage=evaluate", checkpoint, *scored).status == 0
+    outcome = devrf("stage=report")
+    assert (outcome.status, outcome.err) == (0, "")
+    assert "(n = 2)" in outcome.out and outcome.out.count("Ours w/ c2f") == 1
+    assert "Counted once, as last scored elsewhere with the same checkpoint: one." in outcome.out

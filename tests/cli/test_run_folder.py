@@ -12,7 +12,7 @@ from devrf.errors import DevrfError
 def folder(tmp_path, monkeypatch):
     """A run folder as Hydra leaves it to the program."""
     monkeypatch.chdir(tmp_path)
-    made = tmp_path / "outputs" / "robot" / "default"
+    made = tmp_path / "outputs" / "robot" / "quickstart"
     (made / ".hydra").mkdir(parents=True)
     (made / ".hydra" / "config.yaml").write_text("seed: 0\n")
     return made

@@ -19,7 +19,7 @@ def test_a_still_in_any_size(devrf, tmp_path, tiny, trained):
         "hydra.run.dir=run",
     )
     assert (outcome.status, outcome.err) == (0, "")
-    for name in ("still", "still_depth"):
+    for name in ("still_held_out_t0.3_h70", "still_held_out_t0.3_h70_depth"):
         assert f"{name}.png" in outcome.out
         assert iio.imread(tmp_path / "run" / "images" / f"{name}.png").shape == (70, 84, 3)
 
@@ -44,7 +44,32 @@ def test_videos_in_any_size(devrf, tmp_path, tiny, trained):
 )
 def test_no_such_still(devrf, tmp_path, tiny, trained, arguments, expected):
     checkpoint = trained[0] / "checkpoints" / "deformation.ckpt"
-    outcome = devrf(*tiny, "stage=still", f"ckpt={checkpoint}", *arguments)
+    here = ("stage=still", f"ckpt={checkpoint}", "hydra.run.dir=run")
+    outcome = devrf(*tiny, *here, *arguments)
     assert outcome.status == 2
     assert outcome.err.count("\n") == 1 and expected in outcome.err
     assert not list(tmp_path.iterdir())
+
+
+def test_earlier_stills_stay(devrf, tmp_path, trained):
+    shutil.copytree(trained[0] / "checkpoints", tmp_path / "run" / "checkpoints")
+    for typed in ((), (), ("still.view=1",)):
+        assert devrf("stage=still", "hydra.run.dir=run", *typed).status == 0
+    names = ("held_out_t0.5", "held_out_t0.5_2", "1_t0.5")
+    made = {path.stem for path in (tmp_path / "run" / "images").iterdir()}
+    assert made == {f"still_{name}{kind}" for name in names for kind in ("", "_depth")}
+
+
+def test_a_still_reads_no_scene(devrf, tmp_path, tiny, trained, monkeypatch):
+    command = ("stage=still", f"ckpt={trained[0] / 'checkpoints' / 'deformation.ckpt'}")
+
+    def unread(self):
+        raise AssertionError("the scene was read")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("devrf.data.rendered.RenderedDataModule.load", unread)
+        assert devrf(*command, "hydra.run.dir=run").status == 0
+    # Data that is not that of the checkpoint is read, and refused.
+    outcome = devrf(*command, "hydra.run.dir=other", "data.frames=4")
+    assert outcome.status == 2
+    assert "belongs to another scene" in outcome.err

@@ -128,3 +128,55 @@ def test_a_row_knows_its_views_and_its_label_without_them(ran, runs):
         ran(str(views), train_views=views, overrides=[f"data.train_views={views}"])
     found = labelled(collect(runs).runs)
     assert list(found["views"]) == [1, 3] and set(found["line"]) == {FULL}
+
+
+SETTINGS = {"data.frames": 14, "data.width": 96, "data.near": None, "seed": 0}
+
+
+@pytest.fixture
+def learned(ran):
+    """``learned(name, settings, …)``: leaves a run that records its settings."""
+
+    def write(name, settings=(), seed=0, **how):
+        own = {**SETTINGS, **dict(settings), "seed": seed}
+        ran(name, method="devrf", protocol="two_stage", seed=seed, settings=own, **how)
+
+    return write
+
+
+def test_equal_runs_share_a_row_whatever_was_typed(rows, learned):
+    learned("a")
+    learned("b", seed=1, choices={"experiment": "quickstart"}, overrides=["data.width=96"])
+    learned("b/previous-1", overrides=["resume=false", "ckpt=x"], choices={"field": "small"})
+    learned("c", ablation="base", overrides=["seed=3", "data.frames=14"], seed=3)
+    assert rows() == [("robot", "Ours (base)", ["a", "b", "b/previous-1", "c"])]
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "endings"),
+    [
+        ({"data.width": 48}, {}, ["; data.width=48", "; data.width=96"]),
+        ({"data.frames": 8, "data.width": 48}, {}, ["; data.frames=14", "; data.frames=8"]),
+        ({"data.near": 0.5}, {}, ["; data.near=0.5", "; data.near=null"]),
+        ({"data.sides": [4, 8]}, {}, ["", "; data.sides=[4, 8]"]),
+    ],
+)
+def test_unequal_runs_say_what_differs(labels, learned, one, other, endings):
+    # Not what was typed, and not the name of an experiment that has the defaults.
+    learned("a", one, choices={"experiment": "quickstart"})
+    learned("b", other, choices={"experiment": None}, seed=1)
+    assert labels() == [FULL + ending for ending in endings]
+
+
+def test_a_name_for_the_settings_is_said_where_all_equal_runs_have_it(labels, learned):
+    for k, schedule in enumerate(("quick", "paper")):
+        for seed in (0, 1):
+            width = {"schedule.side": k, "data.width": 96 + k}
+            learned(f"{k}{seed}", width, seed=seed, choices={"schedule": schedule})
+    assert labels() == [f"{FULL}; schedule=paper", f"{FULL}; schedule=quick"]
+
+
+def test_captures_of_one_name_are_not_taken_for_one(labels, learned):
+    for k in "ab":
+        learned(k, fingerprint=f"{k}bcdefgh")
+    assert labels() == [f"{FULL}; capture abcdef", f"{FULL}; capture bbcdef"]

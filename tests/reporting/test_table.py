@@ -161,3 +161,12 @@ def test_runs_scored_at_rest_only_are_named_and_not_tabulated(table, ran):
     found = table()
     assert len(found.rows) == 1
     assert "Scored at rest only, and therefore not in the tables: b, c." in found.notes
+
+
+def test_a_checkpoint_that_was_scored_twice_counts_once(table, ran):
+    for k, psnr in enumerate((20.0, 21.0, 30.0)):
+        date = f"2026-01-0{k + 1}T00:00:00+00:00"
+        ran(str(k), scores={"psnr": psnr}, checkpoint="ab"[k == 2], date=date)
+    found = table()
+    assert list(found.rows["count"]) == [2] and list(found.rows["PSNR"]) == [25.5]
+    assert any("same checkpoint: 0." in note for note in found.notes)

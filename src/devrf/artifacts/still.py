@@ -8,10 +8,10 @@ from typing import Literal
 from torch import Tensor
 
 from devrf.artifacts.colors import depth_colors
+from devrf.checkpoints.viewpoints import Viewpoints
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
 from devrf.rendering.renderer import Renderer
-from devrf.scenes.scene import Scene
 
 # Pictures of small images are rendered at this height, in pixels, unless another is asked for.
 READABLE = 400
@@ -40,19 +40,25 @@ class StillSettings:
         if self.height is not None and self.height < 1:
             raise DevrfError(f"still.height: expected at least 1, not {self.height}")
 
-    def camera(self, scene: Scene) -> Cameras:
+    @property
+    def name(self) -> str:
+        """What the image's file is called, without its suffix: ``still_held_out_t0.5_h800``."""
+        size = "" if self.height is None else f"_h{self.height}"
+        return f"still_{self.view}_t{self.time:g}{size}"
+
+    def camera(self, viewpoints: Viewpoints) -> Cameras:
         """The chosen camera, with images of the chosen height.
 
         Raises:
             DevrfError: the scene has no such camera.
         """
-        captured, index = scene.dynamic.test, 0
+        captured, index = viewpoints.held_out, 0
         if isinstance(self.view, int):
-            captured, index = scene.static.train, self.view
+            captured, index = viewpoints.static, self.view
         if not 0 <= index < len(captured):
-            some = f"expected held_out or 0 to {len(scene.static.train) - 1}, not {self.view}"
+            some = f"expected held_out or 0 to {len(viewpoints.static) - 1}, not {self.view}"
             raise DevrfError(f"still.view: {some}")
-        return sized(captured.cameras[[index]], self.height)
+        return sized(captured[[index]], self.height)
 
 
 def sized(cameras: Cameras, height: int | None) -> Cameras:

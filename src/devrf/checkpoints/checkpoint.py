@@ -14,7 +14,12 @@ from lightning import Trainer
 from lightning.fabric.plugins import CheckpointIO
 from torch import nn
 
-from devrf.checkpoints.checkpoint_file import read_checkpoint_file, write_checkpoint_file
+from devrf.checkpoints.checkpoint_file import (
+    read_checkpoint_file,
+    read_description,
+    write_checkpoint_file,
+)
+from devrf.checkpoints.viewpoints import Viewpoints, viewpoints_in
 from devrf.errors import DevrfError
 from devrf.scenes.scene import Scene
 
@@ -44,6 +49,9 @@ class CheckpointMetadata:
         records: what training took, by stage.
         training_config: the settings that decided what was learned, by config key; empty for a
             stage that was not trained from a config.
+        earlier_configs: the same of the stages that this one builds on, by name.
+        command: the overrides of the command that learned it, without those that say only what to
+            do; None where none did.
         complete: whether the stage has gone through its whole schedule.
     """
 
@@ -54,6 +62,8 @@ class CheckpointMetadata:
     protocol: str | None = None
     records: dict[str, dict[str, float | None]] = field(default_factory=dict)
     training_config: dict[str, Any] = field(default_factory=dict)
+    earlier_configs: dict[str, dict[str, Any]] = field(default_factory=dict)
+    command: list[str] | None = None
     complete: bool = True
 
     def as_data(self) -> dict[str, Any]:
@@ -68,10 +78,12 @@ class LoadedCheckpoint:
     Attributes:
         metadata: which scene, and how it was learned.
         model: the scene, ready to render: a :class:`~devrf.methods.base.DynamicModel`.
+        viewpoints: where the scene was seen from; None where the file does not say.
     """
 
     metadata: CheckpointMetadata
     model: Any
+    viewpoints: Viewpoints | None = None
 
 
 class ChecksummedCheckpointIO(CheckpointIO):
@@ -131,9 +143,8 @@ def load_checkpoint(path: Path, scene: Scene | None = None) -> LoadedCheckpoint:
     if scene is not None:
         check_scene(path, metadata, scene)
     state = data.get("state_dict")
-    return LoadedCheckpoint(
-        metadata, _model(path, metadata, state if isinstance(state, dict) else {})
-    )
+    model = _model(path, metadata, state if isinstance(state, dict) else {})
+    return LoadedCheckpoint(metadata, model, viewpoints_in(path, data))
 
 
 def check_scene(path: Path, metadata: CheckpointMetadata, scene: Scene) -> None:
@@ -147,6 +158,15 @@ def check_scene(path: Path, metadata: CheckpointMetadata, scene: Scene) -> None:
             f"{path}: belongs to another scene ({metadata.scene}: other cameras, times or image "
             f"sizes than {scene.name}); train this scene, or set ckpt to its own checkpoint"
         )
+
+
+def metadata_of(path: Path) -> CheckpointMetadata:
+    """The metadata of a checkpoint, read without its tensors and without its checksum.
+
+    Raises:
+        DevrfError: the file is not devrf's, or has no metadata.
+    """
+    return metadata_in(path, read_description(path))
 
 
 def metadata_in(path: Path, data: dict[str, Any]) -> CheckpointMetadata:

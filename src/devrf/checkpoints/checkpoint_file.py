@@ -14,6 +14,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+from collections import defaultdict
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -113,6 +114,30 @@ def read_checkpoint_file(path: Path) -> dict[str, Any]:
         raise DevrfError(
             f"{path}: whole, but its content is not devrf's; set ckpt to a file that devrf wrote"
         )
+    return content
+
+
+def read_description(path: Path) -> dict[str, Any]:
+    """The content of a checkpoint file with None for each tensor; only its header is read.
+
+    Altered bytes are not noticed: what is used further is read by :func:`read_checkpoint_file`.
+
+    Raises:
+        DevrfError: the file does not begin as devrf's of this format.
+    """
+    with path.open("rb") as file:
+        seal = _seal(file)
+        file.seek(0)
+        header = file.read(int.from_bytes(file.read(8), "little")) if seal else b""
+    if seal is not None and seal.version != FORMAT:
+        raise OtherFormatError(path, seal.version)
+    try:
+        nested = json.loads(json.loads(header)["__metadata__"]["nested"])
+        content = unflatten(nested, defaultdict(lambda: None))
+    except (LookupError, RecursionError, TypeError, ValueError):
+        content = None
+    if not isinstance(content, dict):
+        raise DevrfError(f"{path}: not a devrf checkpoint, or a damaged one")
     return content
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from torch import Tensor
@@ -35,7 +36,7 @@ def flatten(value: Any, tensors: dict[str, Tensor], name: str = "") -> Any:
     raise TypeError(f"{name}: a checkpoint cannot hold a {type(value).__name__}")
 
 
-def unflatten(node: Any, tensors: dict[str, Tensor]) -> Any:
+def unflatten(node: Any, tensors: Mapping[str, Any]) -> Any:
     """The nested data that :func:`flatten` made ``node`` and ``tensors`` of.
 
     Raises:

@@ -8,7 +8,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from devrf.cli import job
+from devrf.cli import job, learned_with
 from devrf.cli.config import config_folder, register_resolvers
 from devrf.cli.config_check import check_config
 from devrf.cli.messages import report_user_errors
@@ -23,6 +23,7 @@ register_resolvers()
 def run(config: DictConfig) -> float | None:
     """Run ``stage=…`` in Hydra's output folder; return the objective, if measured."""
     folder = Path(HydraConfig.get().runtime.output_dir)
+    learned_with.log_source()
     if job.in_sweep():
         return run_job(lambda: _job(config, folder), config, folder)
     with (

@@ -22,7 +22,12 @@ def scene_name(data: Any) -> str:
     if OmegaConf.is_missing(data, "root"):
         return "scene"
     chosen = data.get("name") or data.get("shape") or Path(str(data.get("root"))).resolve().name
-    return re.sub(r"[^\w.-]+", "_", str(chosen)) or "scene"
+    return scene_folder_name(str(chosen))
+
+
+def scene_folder_name(scene: str) -> str:
+    """A scene's name as a folder may be called."""
+    return re.sub(r"[^\w.-]+", "_", scene) or "scene"
 
 
 def run_name(
@@ -31,8 +36,11 @@ def run_name(
     method: str = "devrf",
     protocol: str = "two_stage",
 ) -> str:
-    """The run's folder name: the experiment, and what else was chosen beside the usual."""
-    parts = [experiment or "default"]
+    """The run's folder name: the experiment, and what else was chosen beside the usual.
+
+    Without an experiment the config is that of ``experiment=quickstart``: they are one run.
+    """
+    parts = [experiment or "quickstart"]
     if ablation not in (None, "full"):
         parts.append(str(ablation))
     if (method, protocol) != ("devrf", "two_stage"):

@@ -187,15 +187,20 @@ class RunContext:
             )
         return found[0]
 
-    def load(self, name: str | None = None) -> LoadedCheckpoint:
-        """Load :meth:`checkpoint`; one that builds on another than the run's is passed over."""
-        path = self.checkpoint(name)
-        loaded = load_checkpoint(path, self.scene)
+    def load(self, name: str | None = None, *, unread: bool = False) -> LoadedCheckpoint:
+        """Load :meth:`checkpoint`; one that builds on another than the run's is passed over.
+
+        Args:
+            name: as of :meth:`checkpoint`.
+            unread: whether any scene's checkpoint is taken, so that the scene is not read.
+        """
+        path, scene = self.checkpoint(name), None if unread else self.scene
+        loaded = load_checkpoint(path, scene)
         if self.config.ckpt is None and loaded.metadata.stage in self.learning_stages:
             below = self.protocol[loaded.metadata.stage].builds_on
             rest = loaded.metadata.training_config.get(OWN_REST)
             own = None if below is None else self.own_checkpoint(below)
             if rest and own is not None and own.is_file() and digest_of(own) != rest:
                 log.info("%s: left out, it belongs to another %s.ckpt than the run's", path, below)
-                return load_checkpoint(own, self.scene)
+                return load_checkpoint(own, scene)
         return loaded

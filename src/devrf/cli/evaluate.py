@@ -9,8 +9,10 @@ from typing import Any
 
 from devrf.artifacts.contact_sheet import write_contact_sheet
 from devrf.artifacts.records import frame_rows, in_words, mean_scores, provenance, write_frames
+from devrf.checkpoints.checkpoint import CheckpointMetadata
+from devrf.checkpoints.checkpoint_file import digest_of
 from devrf.cli import job
-from devrf.cli.context import RunContext
+from devrf.cli.context import GIVEN_REST, OWN_REST, RunContext
 from devrf.evaluation.held_out import HeldOutView, score
 from devrf.evaluation.suite import MetricSuite
 from devrf.methods.base import DynamicModel
@@ -49,7 +51,7 @@ def evaluate(run: RunContext) -> None:
         if rest is not None:
             sections[last] = dynamic
     write_frames(run.folder / "frames.csv", frames)
-    ran = {**provenance(model.size, run.device), **_origin(run, records)}
+    ran = {**provenance(model.size, run.device), **_origin(run, loaded.metadata)}
     head = {
         "scene": run.scene.name,
         "method": model.name,
@@ -87,15 +89,24 @@ def _training(records: Records, stage: str) -> dict[str, float | None]:
     return {name: records.get(stage, {}).get(name) for name in TRAINING}
 
 
-def _origin(run: RunContext, records: Records) -> dict[str, Any]:
-    """Choices, amount of data, and seconds of each step, of the stages as their checkpoints say."""
-    scene = run.scene
+def _origin(run: RunContext, described: CheckpointMetadata) -> dict[str, Any]:
+    """Choices, amount of data, and seconds of each step, of the stages as their checkpoints say.
+
+    ``settings`` are those that decided what was learned, by config key, in all stages.
+    """
+    scene, records = run.scene, described.records
+    settings: dict[str, Any] = {}
+    for of_stage in (*described.earlier_configs.values(), described.training_config):
+        settings |= of_stage
     frames = scene.clock.frames_of(scene.dynamic.train.times)
     learned = {k: records.get(k, {}).get("wall_seconds") for k in run.learning_stages}
     return {
         "choices": job.choices(),
         "overrides": job.overrides(),
-        "seed": run.config.seed,
+        "seed": settings.get("seed", run.config.seed),
+        "settings": {k: settings[k] for k in sorted(settings) if k not in (OWN_REST, GIVEN_REST)},
+        "fingerprint": described.fingerprint,
+        "checkpoint": digest_of(run.checkpoint(described.stage)),
         # A camera that moves is one view, however many images it took.
         "train_views": int(frames.bincount().max()),
         "test_frames": len(scene.dynamic.test),

@@ -1,4 +1,4 @@
-"""``stage=render`` and ``stage=still``: videos and images."""
+"""``stage=render``: videos."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from torch import Tensor
 
 from devrf.artifacts.camera_paths import focus_distance, held_out_images, orbit, spiral
 from devrf.artifacts.film import FilmSettings, held_out_pictures, orbit_pictures, write_video
-from devrf.artifacts.images import write_image
-from devrf.artifacts.still import StillSettings, still
+from devrf.artifacts.still import still
 from devrf.cli.context import RunContext
 from devrf.evaluation.held_out import background_value
 from devrf.rendering.renderer import Renderer
@@ -67,15 +66,3 @@ def _write(run: RunContext, film: FilmSettings, name: str, images: Iterator[Tens
     log.info("video written to %s", path)
     for tracker in run.trackers:
         tracker.show_video(f"videos/{name}", path)
-
-
-def picture(run: RunContext) -> None:
-    """Render the scene from one camera at one time."""
-    settings: StillSettings = instantiate(run.config.still)
-    stored, camera = run.load(), settings.camera(run.scene)
-    renderer = Renderer(stored.model.to(run.device), half=settings.half)
-    color, depth = still(renderer, camera, settings.time, background_value(run.scene.background))
-    for name, image in (("still", color), ("still_depth", depth)):
-        path = run.folder / "images" / f"{name}.png"
-        write_image(path, image)
-        log.info("picture written to %s", path)

@@ -16,15 +16,18 @@ from omegaconf import DictConfig
 
 from devrf.cli import job
 from devrf.cli.context import RunContext
+from devrf.cli.done import done, noting, say_done
 from devrf.cli.evaluate import evaluate
 from devrf.cli.inspect_scene import inspect, prepare
 from devrf.cli.objective import check_objective, objective
 from devrf.cli.preflight import preflight, shortage_in_words
-from devrf.cli.render import picture, render
+from devrf.cli.render import render
 from devrf.cli.report import report
-from devrf.cli.resume import archive_previous
+from devrf.cli.resume import archive_previous, beginning
+from devrf.cli.still import picture
 from devrf.cli.train import learn
 from devrf.cli.workers import launch_workers
+from devrf.engine.ddp import ManualDDP
 from devrf.errors import DevrfError
 from devrf.methods.devrf.losses import MOTION_TERMS, WeightedLoss
 from devrf.ops.dispatch import using
@@ -101,6 +104,8 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
     run = RunContext(config, folder)
     asked = plan(config.stage, run.learning_stages)
     _check(run, asked)
+    if _all_done(run, asked):
+        return _objective(run)
     needs = None
     if asked.learning and config.memory_check and run.leads:
         needs = preflight(run, asked.learning, films="render" in asked.further)
@@ -116,13 +121,38 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
                 _learn(run, asked)
         if not asked.learning or run.leads:
             for name in asked.further:
-                _take(run, name, STEPS[name])
+                if asked.learning and (files := done(run, name)):
+                    say_done(name, files)
+                else:
+                    _take(run, name, STEPS[name])
         ended = True
     finally:
         run.close(failed=not ended)
     if "evaluate" not in asked.further or not run.leads:
         return None
-    return objective(config.objective, json.loads((folder / "metrics.json").read_text()))
+    return _objective(run)
+
+
+def _all_done(run: RunContext, asked: Plan) -> bool:
+    """Whether nothing of a pipeline is left to do, so that its scene need not be read; says so."""
+    config = run.config
+    if asked.further != PIPELINE or not config.resume or isinstance(run.strategy, ManualDDP):
+        return False
+    made = {name: done(run, name) for name in asked.further}
+    learned = all(run.own_checkpoint(name).is_file() for name in asked.learning)
+    if not (learned and all(made.values())):
+        return False
+    # Refuses other settings than those that it was learned with.
+    if not all(beginning(run, name).finished for name in asked.learning):
+        return False
+    for name, files in made.items():
+        say_done(name, files)
+    return True
+
+
+def _objective(run: RunContext) -> float | None:
+    found = json.loads((run.folder / "metrics.json").read_text())
+    return objective(run.config.objective, found)
 
 
 def learn_all(config: DictConfig, folder: Path) -> None:
@@ -140,7 +170,7 @@ def _learn(run: RunContext, asked: Plan) -> None:
 def _take(run: RunContext, name: str, step: Step) -> None:
     seed_everything(run.config.seed, verbose=False)
     run.begin_step()
-    with using(run.config.kernels), shortage_in_words(name, run):
+    with using(run.config.kernels), shortage_in_words(name, run), noting(run, name):
         step(run)
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from devrf.checkpoints.checkpoint import MODEL, CheckpointMetadata, check_scene, metadata_in
 from devrf.checkpoints.progress import rng_state
+from devrf.checkpoints.viewpoints import Viewpoints
 from devrf.errors import DevrfError
 from devrf.rendering.view import Viewable
 
@@ -41,6 +42,8 @@ def metadata(stage: ScheduledStage) -> CheckpointMetadata:
         protocol=stage.protocol,
         records={**stage.earlier_records, stage.name: stage.record},
         training_config=stage.training_config,
+        earlier_configs=stage.earlier_configs,
+        command=stage.command,
         complete=stage.iteration >= stage.total_iterations,
     )
 
@@ -48,6 +51,7 @@ def metadata(stage: ScheduledStage) -> CheckpointMetadata:
 def save(stage: ScheduledStage, checkpoint: dict[str, Any]) -> None:
     """Add the state that is not in tensors to a checkpoint of Lightning's."""
     checkpoint["devrf"] = metadata(stage).as_data()
+    checkpoint["viewpoints"] = Viewpoints.of(stage.scene).as_data()
     # Without the optimiser's state a checkpoint is for rendering, not for resuming.
     if "optimizer_states" not in checkpoint:
         if stage.iteration >= stage.total_iterations:

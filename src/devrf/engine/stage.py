@@ -58,6 +58,9 @@ class ScheduledStage(LightningModule, ABC):
         seed: of the generator.
         training_config: the settings that decide what is learned, by config key; empty for a
             stage that was not built from a config.
+        earlier_configs: the same of the stages that this one builds on, by name.
+        command: the overrides of the command that learns, for its checkpoints; None where none
+            does.
         protocol: the name of the protocol that the stage is a part of, if any.
         num_rollbacks: how often training diverged and was rolled back.
         lr_scale: factor of the scheduled learning rates; below 1 after a rollback.
@@ -85,6 +88,8 @@ class ScheduledStage(LightningModule, ABC):
         self.generator = torch.Generator()
         self.seed = 0
         self.training_config: dict[str, Any] = {}
+        self.earlier_configs: dict[str, dict[str, Any]] = {}
+        self.command: list[str] | None = None
         self.protocol: str | None = None
         self.num_rollbacks = 0
         self.lr_scale = 1.0

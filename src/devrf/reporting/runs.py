@@ -18,7 +18,7 @@ from devrf.errors import DevrfError
 COLUMNS = (
     *("folder", "status", "scene", "method", "protocol", "error", "mistake"),
     *("train_seconds", "peak_gpu_gb", "dynamic.psnr", "dynamic.ssim", "dynamic.lpips"),
-    *("run.device", "run.overrides", "run.seed", "path"),
+    *("run.device", "run.overrides", "run.seed", "run.checkpoint", "run.date", "path"),
 )
 # Earlier versions knew one method and one protocol, and named sections after its stages.
 DEFAULT_METHOD, DEFAULT_PROTOCOL = "devrf", "two_stage"

@@ -114,7 +114,8 @@ def tabulate(found: Collection, published_scenes: PublishedScenes = "matching") 
             none.
     """
     scored = found.runs[PSNR.key].map(number).notna()
-    runs = labelled(found.runs[scored])
+    again = _scored_again(found.runs[scored])
+    runs = labelled(found.runs[scored].drop(index=again.index))
     for column in COLUMNS:
         runs[column.title] = runs[column.key].map(number).astype(float)
     groups = runs.groupby(["scene", "label"], sort=False)
@@ -138,7 +139,7 @@ def tabulate(found: Collection, published_scenes: PublishedScenes = "matching") 
         title = f"average over {len(ours)} scenes"
         average = Block(title, _average(runs, rows, ours), _published(ours, theirs))
         blocks += [average] if len(average.measured) else []
-    notes = _notes(runs, found.runs.loc[~scored, "folder"])
+    notes = _notes(runs, found.runs.loc[~scored, "folder"], again)
     return Table(found, runs, rows, tuple(blocks), tuple(notes))
 
 
@@ -216,7 +217,16 @@ def _over_scenes(values: pd.DataFrame, scenes: list[str]) -> pd.DataFrame:
     return groups.mean().where(groups.count() == len(scenes))
 
 
-def _notes(runs: pd.DataFrame, at_rest: pd.Series) -> list[str]:
+def _scored_again(runs: pd.DataFrame) -> pd.Series:
+    """Folders of runs whose checkpoint was scored again later, in another folder."""
+    known = runs[runs["run.checkpoint"].notna()].sort_values(
+        "run.date", kind="stable", na_position="first"
+    )
+    again = known.loc[known.duplicated("run.checkpoint", keep="last"), "folder"]
+    return again.sort_index()
+
+
+def _notes(runs: pd.DataFrame, at_rest: pd.Series, again: pd.Series) -> list[str]:
     notes = [
         f"No run has {column.title}: {column.why_missing}."
         for column in COLUMNS
@@ -227,4 +237,7 @@ def _notes(runs: pd.DataFrame, at_rest: pd.Series) -> list[str]:
     if len(at_rest):
         names = ", ".join(at_rest)
         notes.append(f"Scored at rest only, and therefore not in the tables: {names}.")
+    if len(again):
+        names = ", ".join(again)
+        notes.append(f"Counted once, as last scored elsewhere with the same checkpoint: {names}.")
     return notes

@@ -53,7 +53,7 @@ def csv(table: Table) -> str:
     ``train_seconds`` and ``peak_gpu_gb`` are the tables' Time and GPU; further columns are those
     of ``metrics.json``, by dotted name. Unknown values are empty.
     """
-    runs = table.found.runs.drop(columns="path")
+    runs = table.found.runs.drop(columns="path").copy()  # in one piece
     runs.insert(3, "row", table.runs["label"])
     failures = table.found.failures.drop(columns="path")
     rows = pd.concat([runs, failures], ignore_index=True)
