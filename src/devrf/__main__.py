@@ -5,7 +5,10 @@ from __future__ import annotations
 import os
 import sys
 
+import devrf
 from devrf.cli.app import main
+from devrf.cli.arguments import with_quoted_paths
+from devrf.cli.completion import answer_completion
 from devrf.cli.messages import report_user_errors
 from devrf.cli.sweep import failures_at_the_end
 from devrf.system.process import tune_for_cpu
@@ -21,6 +24,12 @@ def entry() -> None:
     """
     # Hydra would print a traceback of its own and exit with 1 if it were not told to raise.
     os.environ["HYDRA_FULL_ERROR"] = "1"
+    if "--version" in sys.argv[1:]:  # else Hydra's own
+        print(f"devrf {devrf.__version__}")
+        return
+    if answer_completion(sys.argv[1:]):
+        return
+    sys.argv[1:] = with_quoted_paths(sys.argv[1:])
     tune_for_cpu()
     try:
         with handle_signals(end_at_once), report_user_errors(), failures_at_the_end():
