@@ -15,6 +15,7 @@ from lightning import seed_everything
 from omegaconf import DictConfig
 
 from devrf.cli import job
+from devrf.cli.closing import say_what_next
 from devrf.cli.context import RunContext
 from devrf.cli.evaluate import evaluate
 from devrf.cli.fetch import fetch
@@ -125,6 +126,8 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
         run.close(failed=not ended)
     if "evaluate" not in asked.further or not run.leads:
         return None
+    if asked.further == PIPELINE and not job.in_sweep():
+        say_what_next(folder)
     return objective(config.objective, json.loads((folder / "metrics.json").read_text()))
 
 
