@@ -11,7 +11,6 @@ from rich.console import Console
 from rich.filesize import decimal
 from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColumn
 
-from devrf.cli.arguments import in_quotes
 from devrf.cli.context import RunContext
 from devrf.scenes.fetch.catalogue import PublishedScene, published_scene
 from devrf.scenes.fetch.fetch import RECORD, Fetched, download_size, fetch_scene, fetched_before
@@ -56,9 +55,7 @@ def _conclude(scene: PublishedScene, done: Fetched) -> None:
             done.sha256,
             done.path / RECORD,
         )
-    root = str(done.path)
-    value = root if root.replace("/", "").replace("_", "").isalnum() else in_quotes(root)
-    given = f"data={scene.collection.data} data.root={value}"
+    given = [f"data={scene.collection.data}", f"data.root={done.path}"]
     log.info("next:")
-    for words in (f"stage=inspect {given}", f"{scene.collection.learn} {given}"):
-        log.info("  python -m devrf %s", " ".join(map(shlex.quote, words.split(" "))))
+    for first in (["stage=inspect"], scene.collection.learn.split()):
+        log.info("  %s", shlex.join(["python", "-m", "devrf", *first, *given]))

@@ -92,13 +92,13 @@ def fetch_scene(
         DevrfError: it cannot be fetched, is not what was expected, or does not fit on the disk.
         OSError: the disk refuses.
     """
-    expected = sha256 or scene.sha256
+    expected = sha256.lower() if sha256 else scene.sha256
     with _working_folder(into / f".{scene.name}.fetch") as work:
         _check_disk(scene, work, size)
         files = _download_all(scene, work / "files", progress)
         digest = _digest(files)
         if expected is not None and digest != expected:
-            shutil.rmtree(work / "files")
+            shutil.rmtree(work, ignore_errors=True)
             raise DevrfError(
                 f"scene={scene.name}: what came has the SHA-256 {digest}, expected {expected}; it "
                 "was removed: try again, and if it comes again, ask who published it"
