@@ -21,9 +21,9 @@ PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --duratio
 quickstart: $(VENV)/.installed
 	$(BIN)/python -m devrf experiment=quickstart
 	@echo
-	@echo "Results: outputs/robot/quickstart (videos/orbit.mp4, images/, metrics.json)."
-	@echo "Next: source $(BIN)/activate, then"
-	@echo "  python -m devrf experiment=quickstart data.shape=flower"
+	@echo "For these commands: source $(BIN)/activate (or make shell). Then, too:"
+	@echo "  python -m devrf experiment=quickstart data.shape=flower    # another scene"
+	@echo "  python -m devrf stage=fetch scene=fox                      # real photographs"
 	@echo "  python -m devrf stage=inspect data=inward data.root=PATH   # a scene of your own"
 
 test: $(VENV)/.installed-dev

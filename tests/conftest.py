@@ -5,9 +5,11 @@ from __future__ import annotations
 import copy
 import logging
 import os
+import threading
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 # Before torch, which loads Triton: Triton decides then whether its interpreter runs kernels.
@@ -207,3 +209,69 @@ def same() -> Callable[[RenderedImage, RenderedImage], None]:
             )
 
     return compare
+
+
+@dataclass
+class Web:
+    """A server on this machine.
+
+    Attributes:
+        address: of the server, without a slash at the end.
+        files: what it serves, by path; a change gives a file another version.
+        cuts: after how many bytes the connection breaks, for each request in turn, by path.
+        asked: (method, path, Range) of each request.
+        remembers: whether it knows versions of its files, and gives parts of them.
+    """
+
+    address: str = ""
+    files: dict[str, bytes] = field(default_factory=dict)
+    cuts: dict[str, list[int]] = field(default_factory=dict)
+    asked: list[tuple[str, str, str | None]] = field(default_factory=list)
+    remembers: bool = True
+
+
+def handler_of(web: Web) -> type[BaseHTTPRequestHandler]:
+    """Answers requests for the files of ``web``."""
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_HEAD(self) -> None:  # noqa: N802
+            self.answer()
+
+        def do_GET(self) -> None:  # noqa: N802
+            content = self.answer()
+            cuts = web.cuts.get(self.path, [])
+            self.wfile.write(content[: cuts.pop(0)] if cuts else content)
+
+        def answer(self) -> bytes:
+            asked = self.headers.get("Range")
+            web.asked.append((self.command, self.path, asked))
+            if self.path not in web.files:
+                self.send_error(404)
+                return b""
+            content = web.files[self.path]
+            version = f'"{hash(content)}"'
+            partial = web.remembers and asked and self.headers.get("If-Range") == version
+            if partial:
+                content = content[int(asked.removeprefix("bytes=").removesuffix("-")) :]
+            self.send_response(206 if partial else 200)
+            self.send_header("Content-Length", str(len(content)))
+            if web.remembers:
+                self.send_header("ETag", version)
+            self.end_headers()
+            return content
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    return Handler
+
+
+@pytest.fixture
+def web() -> Iterator[Web]:
+    """A server of a test's own files."""
+    served = Web()
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler_of(served)) as server:
+        served.address = f"http://127.0.0.1:{server.server_port}"
+        threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
+        yield served
+        server.shutdown()

@@ -5,7 +5,10 @@ from __future__ import annotations
 import os
 import sys
 
+import devrf
 from devrf.cli.app import main
+from devrf.cli.arguments import with_quoted_paths
+from devrf.cli.completion import answer_completion
 from devrf.cli.learned_with import completed
 from devrf.cli.messages import report_user_errors
 from devrf.cli.paper_scene import with_paper_experiment
@@ -23,11 +26,16 @@ def entry() -> None:
     """
     # Hydra would print a traceback of its own and exit with 1 if it were not told to raise.
     os.environ["HYDRA_FULL_ERROR"] = "1"
+    if "--version" in sys.argv[1:]:  # else Hydra's own
+        print(f"devrf {devrf.__version__}")
+        return
+    if answer_completion(sys.argv[1:]):
+        return
     tune_for_cpu()
     try:
         with handle_signals(end_at_once), report_user_errors(), failures_at_the_end():
-            sys.argv[1:] = with_paper_experiment(sys.argv[1:])
-            sys.argv[1:] = completed(sys.argv[1:])
+            typed = with_paper_experiment(with_quoted_paths(sys.argv[1:]))
+            sys.argv[1:] = completed(typed)
             main()
     except Interrupted as stop:
         print(f"devrf: {stop.said}", file=sys.stderr)

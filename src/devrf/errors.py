@@ -1,5 +1,10 @@
 """The project's own error type: what a user can put right, said in one line."""
 
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
 
 class DevrfError(Exception):
     """A mistake in the input (a file, a key, a checkpoint) that the user can put right.
@@ -7,3 +12,15 @@ class DevrfError(Exception):
     The message is one line: it names the file or key, what was expected, and what to do.
     The command line prints it and exits with status 2; nothing has been half-written.
     """
+
+
+def did_you_mean(word: object, known: Iterable[object], before: str = "") -> str:
+    """The end of a message that names the closest of the known words, empty where none is close.
+
+    Args:
+        word: what was given.
+        known: what there is.
+        before: what is written before the word: ``data=``.
+    """
+    close = difflib.get_close_matches(str(word), [str(one) for one in known], n=1)
+    return f"; did you mean {before}{close[0]}?" if close else ""

@@ -19,6 +19,7 @@ from devrf.errors import DevrfError
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
+from devrf.scenes.fetch.catalogue import catalogue
 
 GROUPS = sorted({path.name for path in config_folder().iterdir() if path.is_dir()} - {"hydra"})
 NAMES = {g: sorted(p.stem for p in (config_folder() / g).glob("*.yaml")) for g in GROUPS}
@@ -71,6 +72,13 @@ def test_a_method_learns_by_the_protocols_that_it_has_stages_for(
             continue
         if step.builds_on is None:
             assert isinstance(run.stage_builder(step.name)(), ScheduledStage)
+
+
+@pytest.mark.parametrize("page", sorted({scene.collection.page for scene in catalogue()}))
+def test_what_to_try_with_a_public_scene_composes(composed, page):
+    collection = next(s.collection for s in catalogue() if s.collection.page == page)
+    given = (f"data={collection.data}", "data.root=scene")
+    check_config(composed(*collection.learn.split(), *given))
 
 
 @pytest.mark.parametrize("choice", FILES)

@@ -113,6 +113,9 @@ def test_counts_that_do_not_match(llff_folder, message_of):
 def test_missing_folders(llff_folder, tmp_path, message_of):
     root = llff_folder.root
     assert "nowhere: no such folder" in message_of(tmp_path / "nowhere")
+    (llff_folder.dynamic / "view1").rename(llff_folder.dynamic / "view0")
+    assert f"{llff_folder.dynamic}/view0: views are numbered view1, view2" in message_of(root)
+    (llff_folder.dynamic / "view0").rename(llff_folder.dynamic / "view1")
     (llff_folder.dynamic / "view2").rename(llff_folder.dynamic / "other")
     assert f"{llff_folder.dynamic}: no folder view2 although there is view3" in message_of(root)
     for view in ("view1", "view3"):
@@ -202,7 +205,8 @@ def test_a_fixed_camera_that_looks_elsewhere(llff_folder, camera, message_of):
         ({"train_views": 0}, "data.train_views"),
         ({"train_views": 3}, "there are 2 views to learn from"),
         ({"test_view": 0}, "data.test_view"),
-        ({"test_view": 4}, "none of the 3 views"),
+        ({"test_view": 4}, "none of the 3 views in"),
+        ({"test_view": 4}, "view1 … view3; give 1 … 3"),
         ({"test_view": -4}, "none of the 3 views"),
         ({"test_view": 1.0}, "data.test_view"),
         ({"near": 0}, "data.near"),

@@ -11,6 +11,7 @@ from omegaconf import DictConfig
 from devrf.cli import job, learned_with
 from devrf.cli.config import config_folder, register_resolvers
 from devrf.cli.config_check import check_config
+from devrf.cli.extras import check_extras
 from devrf.cli.messages import report_user_errors
 from devrf.cli.paper_scene import check_paper_scene
 from devrf.cli.run_folder import removed_on_user_error
@@ -44,6 +45,7 @@ def _job(config: DictConfig, folder: Path) -> float | None:
 def _checked(config: DictConfig, folder: Path) -> float | None:
     check_paper_scene(job.choices())
     check_config(config)
+    check_extras(config)
     # Imported here: --help and a misspelt key are answered before torch has loaded.
     from devrf.cli.steps import run_stage
 

@@ -50,6 +50,8 @@ def run_name(
 
 def run_folder(stage: str, report: Any, scene: str, name: str) -> str:
     """A run's folder: by scene and experiment; of a report, where it is written."""
+    if stage == "fetch":
+        return "outputs/fetch"
     if stage != "report":
         return f"outputs/{scene}/{name}"
     settings = ReportSettings(report.runs, report.into)
@@ -59,8 +61,11 @@ def run_folder(stage: str, report: Any, scene: str, name: str) -> str:
 
 
 def config_record(stage: str) -> str | None:
-    """Where in its folder a run's composed config is; a report may lie beside another run's."""
-    return None if stage == "report" else ".hydra"
+    """Where in its folder a run's composed config is; a report may lie beside another run's.
+
+    stage=fetch is no run.
+    """
+    return None if stage in ("report", "fetch") else ".hydra"
 
 
 def tracked_name(scene: str, mode: Any, folder: str, overrides: str) -> str:

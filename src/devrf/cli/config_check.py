@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import inspect
 import re
 from collections.abc import Iterable, Iterator, Mapping
@@ -12,8 +11,8 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 
-from devrf.cli.value_types import described, fits
-from devrf.errors import DevrfError
+from devrf.cli.value_types import choices, described, fits
+from devrf.errors import DevrfError, did_you_mean
 
 # Keys outside the parts.
 ROOT: dict[str, Any] = {
@@ -128,7 +127,8 @@ def _check_value(where: str, value: object, hint: Any) -> None:
         now = RENAMED_VALUES.get(where, {}).get(str(value))
         if now:
             raise DevrfError(f"{where}: {value} was renamed; write {where}={now}")
-        raise DevrfError(f"{where}: expected {described(hint)}, not {value!r}")
+        meant = did_you_mean(value, choices(hint), f"{where}=")
+        raise DevrfError(f"{where}: expected {described(hint)}, not {value!r}{meant}")
 
 
 def unknown_key(where: str, known: Iterable[object]) -> DevrfError:
@@ -136,7 +136,5 @@ def unknown_key(where: str, known: Iterable[object]) -> DevrfError:
     if where in RENAMED:
         return DevrfError(f"{where}: renamed; write {RENAMED[where]}=VALUE")
     name = where.rpartition(".")[2]
-    close = difflib.get_close_matches(name, [str(k) for k in known if k != "**"], n=1)
-    meant = where[: -len(name)] + close[0] if close else ""
-    hint = f"did you mean {meant}?" if close else "--cfg job shows every key there is"
-    return DevrfError(f"{where}: no such key; {hint}")
+    meant = did_you_mean(name, (k for k in known if k != "**"), where[: -len(name)])
+    return DevrfError(f"{where}: no such key{meant or '; --cfg job shows every key there is'}")

@@ -5,15 +5,20 @@ from __future__ import annotations
 import errno
 import os
 import re
+import shlex
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf.errors import OmegaConfBaseException
 
+from devrf.cli.arguments import in_quotes
+from devrf.cli.config import config_folder
 from devrf.cli.config_check import unknown_key
-from devrf.errors import DevrfError
+from devrf.cli.stages import meant_stage
+from devrf.errors import DevrfError, did_you_mean
 
 # Read at import: the entry point sets the variable, so that Hydra raises its errors.
 FULL_ERRORS = os.environ.get("HYDRA_FULL_ERROR", "0") != "0"
@@ -75,7 +80,7 @@ def one_line(error: BaseException) -> str:
     elif isinstance(error, MissingConfigException):
         text = _missing_option(error)
     elif isinstance(error, OverrideParseException):
-        text = f"{error.override}: not understood; write KEY=VALUE, in quotes where needed"
+        text = _not_understood(str(error.override))
     elif isinstance(error, OSError) and not isinstance(error, HydraException):
         text = f"{error.filename or 'output'}: {error.strerror}"
     else:
@@ -83,17 +88,43 @@ def one_line(error: BaseException) -> str:
     return " ".join(text.split())
 
 
+def _not_understood(argument: str) -> str:
+    """What to type instead of an argument that Hydra cannot read."""
+    key, is_set, value = argument.partition("=")
+    if is_set:
+        as_text = shlex.quote(f"{key}={in_quotes(value)}")
+        return f"{argument}: not understood; as text write {as_text}, else see that brackets close"
+    groups = sorted(path for path in config_folder().iterdir() if path.is_dir())
+    options = [
+        f"{group.name}={argument}" for group in groups if (group / f"{argument}.yaml").is_file()
+    ]
+    if options:
+        return f"{argument}: not understood; did you mean {' or '.join(options)}?"
+    if Path(argument).is_dir():
+        return f"{argument}: not understood; did you mean data.root={shlex.quote(argument)}?"
+    meant = meant_stage(argument) or "; write KEY=VALUE, or --help for what there is"
+    return f"{argument}: not understood{meant}"
+
+
 def _missing_option(error: MissingConfigException) -> str:
     group, _, option = str(error.missing_cfg_file).rpartition("/")
     if option in PLUGINS.get(group, ()):
         return f'{group}={option}: not installed; pip install "devrf[sweeps]"'
     if error.options:
-        return f"{group}={option}: no such option; choose one of {', '.join(error.options)}"
+        meant = did_you_mean(option, error.options, f"{group}=")
+        known = ", ".join(error.options)
+        return f"{group}={option}: no such option; choose one of {known}{meant}"
     return _of_hydra(error)
 
 
 def _of_hydra(error: BaseException) -> str:
     text = str(error)
+    if several := re.search(r"Ambiguous value for argument '([^']+)'", text):
+        key, _, value = several[1].partition("=")
+        return (
+            f"{several[1]}: several values need -m; as a list write {key}=[{value}], as text "
+            f"{shlex.quote(f'{key}={in_quotes(value)}')}"
+        )
     if unknown := re.match(r"Could not override '([^']+)'", text):
         # OmegaConf keeps the mapping that does not have the key.
         near = getattr(error.__cause__, "parent_node", None)

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from devrf.cli.evaluate import TRAINING
-from devrf.errors import DevrfError
+from devrf.errors import DevrfError, did_you_mean
 
 OF_BOTH = ("psnr", "ssim", *TRAINING)
 OF_MOTION = ("rest_pose_psnr", "checkpoint_mb")
@@ -29,7 +29,10 @@ def check_objective(key: str, metrics: Sequence[str]) -> None:
         raise DevrfError(f"objective: expected static.NAME or dynamic.NAME, not {key!r}")
     known = [*OF_BOTH, *metrics, *(OF_MOTION if section in DYNAMIC else ())]
     if name not in known:
-        raise DevrfError(f"objective: {section} has no {name!r}; choose from {', '.join(known)}")
+        raise DevrfError(
+            f"objective: {section} has no {name!r}; choose from {', '.join(known)}"
+            f"{did_you_mean(name, known, f'objective={section}.')}"
+        )
 
 
 def objective(key: str, found: Mapping[str, Any]) -> float | None:

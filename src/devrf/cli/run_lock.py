@@ -92,9 +92,14 @@ def exclusive(folder: Path, config: DictConfig, key: str) -> Iterator[None]:
 
 
 def _locks(config: DictConfig) -> bool:
-    """Whether a process needs the lock: a report only reads, and rank 0 locks for its workers."""
+    """Whether a process needs the lock: rank 0 locks for its workers.
+
+    A report only reads, and stage=fetch locks where it writes.
+    """
+    if config.stage in ("report", "fetch"):
+        return False
     worker = any(os.environ.get(name, "0") != "0" for name in RANKS)
-    return config.stage != "report" and not (worker and config.trainer.get("strategy") is not None)
+    return not (worker and config.trainer.get("strategy") is not None)
 
 
 def _lock(folder: Path, key: str) -> bool:

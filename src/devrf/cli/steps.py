@@ -15,15 +15,18 @@ from lightning import seed_everything
 from omegaconf import DictConfig
 
 from devrf.cli import job
+from devrf.cli.closing import say_what_next
 from devrf.cli.context import RunContext
 from devrf.cli.done import done, noting, say_done
 from devrf.cli.evaluate import evaluate
+from devrf.cli.fetch import fetch
 from devrf.cli.inspect_scene import inspect, prepare
 from devrf.cli.objective import check_objective, objective
 from devrf.cli.preflight import preflight, shortage_in_words
 from devrf.cli.render import render
 from devrf.cli.report import report
 from devrf.cli.resume import archive_previous, beginning
+from devrf.cli.stages import meant_stage
 from devrf.cli.still import picture
 from devrf.cli.train import learn
 from devrf.cli.workers import launch_workers
@@ -36,7 +39,7 @@ log = logging.getLogger(__name__)
 
 Step = Callable[[RunContext], None]
 
-# Stages that learn nothing; the protocol's stages come beside these.
+# What devrf.cli.stages.STEPS names.
 STEPS: dict[str, Step] = {
     "prepare": prepare,
     "inspect": inspect,
@@ -44,10 +47,11 @@ STEPS: dict[str, Step] = {
     "render": render,
     "still": picture,
     "report": report,
+    "fetch": fetch,
 }
 PIPELINE = ("evaluate", "render")
 # Steps that use no checkpoint.
-FROM_NOTHING = {"prepare", "inspect", "report"}
+FROM_NOTHING = {"prepare", "inspect", "report", "fetch"}
 MOVED = {"benchmark": "run python benchmarks/training.py with the other overrides"}
 
 # Lightning's messages on accelerators, tips and data loaders say nothing about this run.
@@ -85,7 +89,7 @@ def plan(stage: str, protocol: Sequence[str]) -> Plan:
     if stage in MOVED:
         raise DevrfError(f"stage={stage}: moved; {MOVED[stage]}")
     known = ", ".join(["pipeline", *protocol, *STEPS])
-    raise DevrfError(f"stage: expected one of {known}, not {stage!r}")
+    raise DevrfError(f"stage: expected one of {known}, not {stage!r}{meant_stage(stage)}")
 
 
 def run_stage(config: DictConfig, folder: Path) -> float | None:
@@ -130,6 +134,8 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
         run.close(failed=not ended)
     if "evaluate" not in asked.further or not run.leads:
         return None
+    if asked.further == PIPELINE and not job.in_sweep():
+        say_what_next(folder)
     return _objective(run)
 
 
@@ -183,7 +189,7 @@ def _check(run: RunContext, asked: Plan) -> None:
             f"ckpt: stage={config.stage} starts from nothing; with ckpt=PATH give a stage that "
             "builds on another, stage=evaluate, stage=render or stage=still"
         )
-    if "report" in asked.further:
+    if not asked.learning and not {"report", "fetch"}.isdisjoint(asked.further):
         return
     _ = run.datamodule
     for name in run.learning_stages:

@@ -37,6 +37,16 @@ def fits(value: object, hint: Any) -> bool:
     return True
 
 
+def choices(hint: Any) -> tuple[object, ...]:
+    """The values that a hint enumerates; none where it does not."""
+    inner = get_args(hint)
+    if get_origin(hint) is Literal:
+        return inner
+    if get_origin(hint) in (Union, types.UnionType):
+        return tuple(value for one in inner for value in choices(one))
+    return ()
+
+
 def described(hint: Any) -> str:
     """The type in words: ``a whole number or null``."""
     origin, inner = get_origin(hint), get_args(hint)

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from devrf.errors import DevrfError
+from devrf.errors import DevrfError, did_you_mean
 from devrf.evaluation.held_out_flow import flow_error
 from devrf.metrics.geometric import depth_error
 from devrf.metrics.image import ms_ssim
@@ -123,6 +123,7 @@ class Evaluation:
             if name not in MEASURES:
                 raise DevrfError(
                     f"evaluation.metrics: no metric {name!r}; choose from {', '.join(MEASURES)}"
+                    f"{did_you_mean(name, MEASURES)}"
                 )
         if self.lpips_weights is not None and not Path(self.lpips_weights).is_file():
             raise DevrfError(

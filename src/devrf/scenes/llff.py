@@ -133,7 +133,7 @@ def _chosen_views(
     if test_view == 0 or not -count <= test_view <= count:
         raise scene_error(
             "data.test_view",
-            f"{test_view} is none of the {count} views in {folder}; give 1 … "
+            f"{test_view} is none of the {count} views in {folder}, view1 … view{count}; give 1 … "
             f"{count}, or -1 for the last one",
         )
     test = test_view - 1 if test_view > 0 else count + test_view

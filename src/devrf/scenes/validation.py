@@ -8,7 +8,7 @@ from collections.abc import Iterable
 
 from pydantic import ValidationError
 
-from devrf.errors import DevrfError
+from devrf.errors import DevrfError, did_you_mean
 from devrf.geometry.box import Box
 
 # A hostile header can promise any size; no camera in the field makes images beyond this.
@@ -104,7 +104,8 @@ def check_choice(key: str, value: object, choices: Iterable[str]) -> None:
     """DevrfError unless ``value`` is one of ``choices``."""
     allowed = tuple(choices)
     if value not in allowed:
-        raise scene_error(key, f"expected one of {', '.join(allowed)}, not {value!r}")
+        meant = did_you_mean(value, allowed, f"{key}=")
+        raise scene_error(key, f"expected one of {', '.join(allowed)}, not {value!r}{meant}")
 
 
 def checked_box(value: object) -> Box:

@@ -16,6 +16,7 @@ from devrf.scenes.validation import scene_error
 log = logging.getLogger(__name__)
 
 _VIEW = re.compile(r"view([1-9]\d{0,5})")
+_FROM_ZERO = re.compile(r"view0\d*")
 _DIGITS = re.compile(r"\d+")
 _SUFFIX = "_bwd.npz"
 
@@ -39,12 +40,18 @@ def view_folders(folder: Path, downscale: int) -> list[ViewFolder]:
     """The folders of V fixed cameras, in order of their numbers.
 
     Raises:
-        DevrfError: there are none, a number is left out, or they hold different numbers of
-            images or fewer than two.
+        DevrfError: there are none, a number is left out or written with a zero in front, or
+            they hold different numbers of images or fewer than two.
     """
     numbered = {}
     for path in entries(folder):
         match = _VIEW.fullmatch(path.name)
+        if _FROM_ZERO.fullmatch(path.name) and os.path.isdir(path):
+            raise scene_error(
+                path,
+                "views are numbered view1, view2, … from 1 on, without zeros in front; rename the "
+                "fixed cameras' folders, in the order of their rows in poses.npy",
+            )
         if match and os.path.isdir(path):
             numbered[int(match[1])] = path
     if not numbered:

@@ -1,0 +1,150 @@
+"""stage=fetch puts a published scene in its place, whole and checked, or says why not."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import zipfile
+
+import pytest
+
+PICTURE = b"not really a picture" * 500
+
+FILES = """
+[[collection]]
+page = "https://example.org/fox"
+licence = "anyone's"
+data = "nerfstudio"
+learn = "experiment=cpu_small"
+url = "{address}/fox/{{file}}"
+files = ["transforms.json", "images/0001.jpg"]
+scenes.fox = "a fox"
+"""
+ARCHIVE = """
+[[collection]]
+page = "https://example.org/blender"
+licence = "anyone's"
+data = "inward"
+learn = "experiment=cpu_small"
+url = "{address}/{{scene}}.zip"
+scenes.lego = "a digger"
+[collection.sha256]
+lego = "{sha256}"
+"""
+
+
+@pytest.fixture
+def published(web, tmp_path):
+    """Two scenes on a server, and a catalogue of them; the arguments that name it."""
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        archive.writestr("lego/transforms_train.json", "{}")
+        archive.writestr("lego/train/r_0.png", PICTURE)
+    web.files["/lego.zip"] = packed.getvalue()
+    web.files["/fox/transforms.json"] = b"{}"
+    web.files["/fox/images/0001.jpg"] = PICTURE
+    digest = hashlib.sha256(packed.getvalue()).hexdigest()
+    text = FILES.format(address=web.address) + ARCHIVE.format(address=web.address, sha256=digest)
+    (tmp_path / "mine.toml").write_text(text)
+    return ("stage=fetch", "fetch.catalogue=mine.toml")
+
+
+def record(folder):
+    return json.loads((folder / "fetched.json").read_text())
+
+
+def test_single_files_are_fetched_and_their_checksum_is_kept(devrf, tmp_path, published):
+    outcome = devrf(*published, "scene=fox")
+    assert (outcome.status, outcome.err) == (0, "")
+    fox = tmp_path / "scenes" / "fox"
+    assert (fox / "images" / "0001.jpg").read_bytes() == PICTURE
+    # What `sha256sum images/0001.jpg transforms.json | sha256sum` prints.
+    lines = f"{hashlib.sha256(PICTURE).hexdigest()}  images/0001.jpg\n"
+    lines += f"{hashlib.sha256(b'{}').hexdigest()}  transforms.json\n"
+    digest = hashlib.sha256(lines.encode()).hexdigest()
+    assert record(fox)["sha256"] == digest and record(fox)["compared"] is False
+    assert f"SHA-256 {digest}: none was known to compare it with" in outcome.out
+    assert "python -m devrf stage=inspect data=nerfstudio data.root=scenes/fox" in outcome.out
+    assert {path.name for path in (tmp_path / "scenes").iterdir()} == {"fox"}
+    assert devrf(*published, "scene=fox", "fetch.into=b", f"fetch.sha256={digest}").status == 0
+    assert record(tmp_path / "b" / "fox")["compared"] is True
+
+
+def test_an_archive_is_compared_with_the_catalogue_and_unpacked(devrf, tmp_path, published):
+    outcome = devrf(*published, "scene=lego", "fetch.into=my scenes (1)")
+    assert (outcome.status, outcome.err) == (0, "")
+    lego = tmp_path / "my scenes (1)" / "lego"
+    files = {path.relative_to(lego).as_posix() for path in lego.rglob("*") if path.is_file()}
+    assert files == {"transforms_train.json", "train/r_0.png", "fetched.json"}
+    assert record(lego)["compared"] is True and "as expected" in outcome.out
+
+
+def test_fetched_before_is_said_and_nothing_is_asked_for(devrf, web, published):
+    assert devrf(*published, "scene=fox").status == 0
+    web.asked.clear()
+    outcome = devrf(*published, "scene=fox")
+    assert outcome.status == 0 and "is in scenes/fox already" in outcome.out
+    assert not web.asked
+
+
+def test_a_wrong_checksum_leaves_no_scene(devrf, web, tmp_path, published):
+    web.files["/lego.zip"] = web.files["/lego.zip"] + b"changed"
+    outcome = devrf(*published, "scene=lego")
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert "what came has the SHA-256" in outcome.err and "expected" in outcome.err
+    assert not (tmp_path / "scenes" / "lego").exists()
+    assert not list(tmp_path.rglob("archive"))
+
+
+def test_an_interruption_is_gone_on_with(devrf, web, tmp_path, published):
+    web.cuts["/fox/images/0001.jpg"] = [4000, 0]
+    outcome = devrf(*published, "scene=fox")
+    assert outcome.status == 2 and "the same command goes on where it stopped" in outcome.err
+    assert not (tmp_path / "scenes" / "fox").exists()
+    web.asked.clear()
+    assert devrf(*published, "scene=fox").status == 0
+    fetched = [asked for asked in web.asked if asked[0] == "GET"]
+    assert fetched == [("GET", "/fox/images/0001.jpg", "bytes=4000-")]
+    assert (tmp_path / "scenes" / "fox" / "images" / "0001.jpg").read_bytes() == PICTURE
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["scene=fxo"], "scene: stage=fetch knows no 'fxo'; choose one of fox, lego"),
+        ([], "knows no 'robot'; choose one of fox, lego"),
+        (["scene=fox", "ckpt=x"], "ckpt: stage=fetch starts from nothing"),
+        (["scene=fox", "fetch.catalogue=none.toml"], "fetch.catalogue: none.toml cannot be read"),
+        (["scene=fox", "fetch.sha256=0"], "fetch.sha256: expected text or null, not 0"),
+    ],
+)
+def test_one_line_for_a_mistake(devrf, tmp_path, published, arguments, expected):
+    outcome = devrf(*published, *arguments)
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert expected in outcome.err
+    assert not (tmp_path / "outputs").exists()
+
+
+def test_another_folder_in_its_place_is_left_alone(devrf, web, tmp_path, published):
+    (tmp_path / "scenes" / "fox").mkdir(parents=True)
+    outcome = devrf(*published, "scene=fox")
+    assert outcome.status == 2
+    assert "scenes/fox: there is something else, without fetched.json" in outcome.err
+    assert not web.asked
+
+
+def test_a_full_disk_is_found_before_the_download(devrf, web, published, monkeypatch):
+    monkeypatch.setattr("devrf.scenes.fetch.fetch.free_disk", lambda folder: 1)
+    outcome = devrf(*published, "scene=lego")
+    assert outcome.status == 2 and "fetch.into: scene=lego needs" in outcome.err
+    assert all(method == "HEAD" for method, _, _ in web.asked)
+
+
+def test_no_network_is_one_line(devrf, web, tmp_path, published):
+    text = (tmp_path / "mine.toml").read_text()
+    (tmp_path / "mine.toml").write_text(text.replace(web.address, "http://127.0.0.1:9"))
+    outcome = devrf(*published, "scene=fox")
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert "cannot be fetched" in outcome.err
+    assert not (tmp_path / "scenes").exists()

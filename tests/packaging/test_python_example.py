@@ -1,0 +1,38 @@
+"""The example of README and docs/python.md runs as it is printed, at a smaller size."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+REPOSITORY = Path(__file__).parents[2]
+# Sizes that take seconds: what is printed, and what stands for it here.
+SMALLER = {
+    "width=64, height=64, frames=8": "width=20, height=20, frames=3",
+    "search_side=48": "search_side=12",
+    "iterations=400": "iterations=6",
+    "side=56": "side=14",
+    "doublings=[80, 160, 240]": "doublings=[2]",
+    "rays=1024": "rays=64",
+    "sides=[12, 20, 32], iterations_per_frame=[36, 18, 18]": "sides=[4], iterations_per_frame=[2]",
+}
+
+
+def example(page: str) -> str:
+    found = re.search(r"```python\n(.*?)```", (REPOSITORY / page).read_text(), re.DOTALL)
+    assert found
+    return found[1]
+
+
+def test_both_pages_print_the_same():
+    assert example("README.md") == example("docs/python.md")
+
+
+def test_it_runs(capsys):
+    code = example("README.md")
+    for printed, smaller in SMALLER.items():
+        assert printed in code
+        code = code.replace(printed, smaller)
+    names: dict[str, object] = {"__name__": "__main__"}
+    exec(compile(code, "README.md", "exec"), names)
+    assert "psnr" in capsys.readouterr().out.lower()
