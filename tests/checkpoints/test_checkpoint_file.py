@@ -23,6 +23,7 @@ from devrf.checkpoints.checkpoint_file import (
     LONGEST_HEADER,
     digest_of,
     read_checkpoint_file,
+    read_description,
     write_checkpoint_file,
 )
 from devrf.errors import DevrfError
@@ -117,6 +118,17 @@ def test_the_digest_tells_contents_apart(path: Path) -> None:
     assert digest_of(path) == digest_of(other)
     other.write_bytes(b"something else")
     assert digest_of(other) == ""
+
+
+def test_a_description_is_read_without_tensors(path: Path) -> None:
+    write_checkpoint_file(path, {"a": [1, torch.ones(3)], "b": {"c": "d"}})
+    assert read_description(path) == {"a": [1, None], "b": {"c": "d"}}
+    path.write_bytes(path.read_bytes()[:-4])  # which only a whole reading notices
+    assert read_description(path)["a"][0] == 1
+    for damaged in (path.read_bytes()[:200], b"", b"\0" * 300):
+        path.write_bytes(damaged)
+        with pytest.raises(DevrfError, match=f"{path}: not a devrf checkpoint"):
+            read_description(path)
 
 
 def test_every_altered_bit_is_noticed(path: Path) -> None:

@@ -10,7 +10,8 @@ import pytest
 from omegaconf import OmegaConf
 
 from devrf.checkpoints.checkpoint_file import read_checkpoint_file, write_checkpoint_file
-from devrf.cli.learned_with import completed, recorded
+from devrf.cli.learned_with import completed
+from devrf.cli.overrides import recorded
 
 
 @pytest.fixture
@@ -50,7 +51,7 @@ def test_a_run_that_was_interrupted_goes_on_by_its_folder(devrf, tiny, often, tm
     command = (*tiny, *often, "hydra.run.dir=run", "stage=canonical")
     assert devrf(*command, "trainer.max_steps=4").status == 0
     (tmp_path / "run" / "checkpoints" / "canonical.ckpt").unlink()
-    outcome = devrf("hydra.run.dir=run", "stage=canonical", "trainer.max_steps=-1")
+    outcome = devrf("hydra.run.dir=run", "stage=canonical")
     assert (outcome.status, outcome.err) == (0, "")
     assert "canonical: goes on at iteration 4" in outcome.out
 
@@ -128,12 +129,46 @@ def test_a_job_of_an_experiment_that_sweeps_does_not_start_its_sweep(devrf, run)
 
 def test_a_command_is_recorded_without_what_is_of_that_command_alone(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    typed = ["stage=render", "data.root='a b'", "+x=1", "~y", "still.time=1", "ckpt=c", "seed=2"]
+    typed = [
+        "stage=render",
+        "trainer=cpu",
+        "data.root='a b'",
+        "+x=1",
+        "~y",
+        "still.time=1",
+        "ckpt=c",
+        "seed=2",
+    ]
     root = f"data.root='{tmp_path}/a b'"
     assert recorded([*typed, "hydra/launcher=joblib"]) == [root, "+x=1", "~y", "seed=2"]
 
 
-def test_a_group_that_is_typed_begins_from_its_own_values(run, monkeypatch):
+def test_a_checkpoint_does_not_choose_which_code_is_run(devrf, run):
+    path = run / "checkpoints" / "deformation.ckpt"
+    content = read_checkpoint_file(path)
+    hostile = ["data._target_=os.getcwd", "+hydra.callbacks.x={_target_:os.getcwd}", "seed=1"]
+    content["devrf"]["command"] = hostile
+    write_checkpoint_file(path, content)
+    typed = [f"hydra.run.dir={run}", "stage=still"]
+    assert completed(typed) == ["seed=1", "hydra.mode=RUN", *typed]
+    content["devrf"]["command"] = ["not an override"]
+    write_checkpoint_file(path, content)
+    assert completed(typed) == typed
+
+
+def test_checkpoints_of_a_sweep_share_what_they_have_in_common(run):
+    path = run / "checkpoints" / "deformation.ckpt"
+    content = read_checkpoint_file(path)
+    content["devrf"]["command"] = ["data.frames=5", "seed=4"]
+    write_checkpoint_file(other := path.with_name("other.ckpt"), content)
+    content["devrf"]["command"] = ["data.frames=5", "seed=5"]
+    write_checkpoint_file(path, content)
+    typed = ["-m", "stage=still", f"ckpt={path},{other}"]
+    shared = ["data.frames=5", "hydra.sweeper.params=null"]
+    assert completed(typed) == ["-m", *shared, *typed[1:]]
+
+
+def test_another_option_of_a_group_begins_from_its_own_values(run):
     path = run / "checkpoints" / "deformation.ckpt"
     content = read_checkpoint_file(path)
     content["devrf"]["command"] = ["data=inward", "data.downscale=2", "seed=1", "field.width=8"]

@@ -16,6 +16,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 import devrf
+from devrf.callbacks.csv_logger import ResumableCSVLogger
 from devrf.checkpoints.checkpoint_file import digest_of
 from devrf.cli.context import RunContext
 from devrf.cli.run_lock import PLACE
@@ -35,8 +36,12 @@ PLACES = {"flow_cache", "export"}
 
 def done(run: RunContext, step: str) -> list[str]:
     """The files of a step that need not be done again; none where it must be."""
-    noted = _notes(run.folder).get(step)
-    if noted is None or noted["with"] != _done_with(run, step):
+    noted, present = _notes(run.folder).get(step), _done_with(run, step)
+    if noted is None or present is None:
+        return []
+    if present["tracker"] is None:  # what was tracked need not be tracked again
+        noted["with"]["tracker"] = None
+    if noted["with"] != present:
         return []
     files: list[str] = noted["files"]
     return files if all((run.folder / name).is_file() for name in files) else []
@@ -75,8 +80,9 @@ def _done_with(run: RunContext, step: str) -> dict[str, Any] | None:
         del data[place]
     if data.get("root") is not None:
         data["root"] = str(Path(data["root"]).resolve())
-    tracker = OmegaConf.select(run.config, "logger._target_")
-    found = {"checkpoint": checkpoint, "version": devrf.__version__, "logger": tracker, **parts}
+    logger = OmegaConf.select(run.config, "logger._target_")
+    tracker = None if str(logger).endswith(ResumableCSVLogger.__name__) else logger
+    found = {"checkpoint": checkpoint, "version": devrf.__version__, "tracker": tracker, **parts}
     plain: dict[str, Any] = json.loads(json.dumps(found))
     return plain
 

@@ -13,7 +13,7 @@ from devrf.artifacts.still import StillSettings, still
 from devrf.checkpoints.checkpoint import CheckpointMetadata
 from devrf.checkpoints.viewpoints import Viewpoints
 from devrf.cli.context import RunContext
-from devrf.cli.learned_with import value_in
+from devrf.cli.overrides import Overrides
 from devrf.cli.resume import deciding_settings
 from devrf.evaluation.held_out import background_value
 from devrf.rendering.renderer import Renderer
@@ -44,7 +44,7 @@ def _is_its_data(run: RunContext, metadata: CheckpointMetadata) -> bool:
     present = deciding_settings(run.config, metadata.stage)
     if metadata.command is None or data != {k: present[k] for k in present if k in data}:
         return False
-    root, before = run.config.data.get("root"), value_in(metadata.command, "data.root")
+    root, before = run.config.data.get("root"), Overrides.of(metadata.command).value("data.root")
     return root is None or (before is not None and Path(root).resolve() == Path(before).resolve())
 
 

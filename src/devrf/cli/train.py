@@ -17,7 +17,7 @@ from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, save_checkpoin
 from devrf.checkpoints.progress import progress_files
 from devrf.cli import job
 from devrf.cli.context import RunContext
-from devrf.cli.learned_with import recorded
+from devrf.cli.overrides import recorded
 from devrf.cli.resume import ResumePoint, beginning, remove_progress
 from devrf.engine.stage import ScheduledStage
 from devrf.errors import DevrfError
