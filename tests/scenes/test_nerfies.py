@@ -205,7 +205,6 @@ CAMERA = "camera/000004.json"
         ("dataset.json", lambda c: c.clear(), "lists 0 images"),
         ("metadata.json", lambda c: c.pop(IDS[5]), "says nothing of image '000005'"),
         ("metadata.json", lambda c: c[IDS[5]].pop("warp_id"), "image '000005' has no warp_id"),
-        ("metadata.json", lambda c: [e.update(warp_id=1) for e in c.values()], "two times"),
         ("scene.json", lambda c: c.update(scale=0), "scale: should be greater than 0, not 0"),
         ("scene.json", lambda c: c.pop("near"), "near: is missing"),
         ("scene.json", lambda c: c.update(far=float("nan")), "far: should be a finite number"),
@@ -255,3 +254,10 @@ def test_files_that_are_missing_or_cut_short(folder, file, message_of):
 def test_ids_stay_inside_the_scene(folder, escape, message_of):
     folder.write("dataset.json", {"train_ids": [*IDS[:3], escape], "val_ids": IDS[3:]})
     assert "dataset.json" in message_of(folder.root)
+
+
+def test_one_time_is_a_scene_at_rest(folder):
+    folder.edit("metadata.json", lambda c: [e.update(warp_id=1) for e in c.values()])
+    scene = NerfiesReader(folder.root, downscale=1).read()
+    assert not scene.moves and scene.dynamic.train is scene.static.train
+    assert scene.static.train.times.tolist() == [0.0] * len(scene.static.train)

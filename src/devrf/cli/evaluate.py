@@ -11,6 +11,7 @@ from devrf.artifacts.contact_sheet import write_contact_sheet
 from devrf.artifacts.records import frame_rows, in_words, mean_scores, provenance, write_frames
 from devrf.cli import job
 from devrf.cli.context import RunContext
+from devrf.cli.scene_stages import stages_with_images
 from devrf.evaluation.held_out import HeldOutView, score
 from devrf.evaluation.suite import MetricSuite
 from devrf.methods.base import DynamicModel
@@ -50,11 +51,13 @@ def evaluate(run: RunContext) -> None:
             sections[last] = dynamic
     write_frames(run.folder / "frames.csv", frames)
     ran = {**provenance(model.size, run.device), **_origin(run, records)}
-    head = {
+    head: dict[str, Any] = {
         "scene": run.scene.name,
         "method": model.name,
         "protocol": loaded.metadata.protocol or run.protocol.name,
     }
+    if not run.scene.moves:
+        head["at_rest"] = True
     write_json(run.folder / "metrics.json", {**head, **sections, "run": ran})
     for name in frames:
         log.info("%s: %s", name, in_words(sections[name]))
@@ -91,13 +94,13 @@ def _origin(run: RunContext, records: Records) -> dict[str, Any]:
     """Choices, amount of data, and seconds of each step, of the stages as their checkpoints say."""
     scene = run.scene
     frames = scene.clock.frames_of(scene.dynamic.train.times)
-    learned = {k: records.get(k, {}).get("wall_seconds") for k in run.learning_stages}
+    learned = {k: records.get(k, {}).get("wall_seconds") for k in stages_with_images(run)}
     return {
         "choices": job.choices(),
         "overrides": job.overrides(),
         "seed": run.config.seed,
         # A camera that moves is one view, however many images it took.
-        "train_views": int(frames.bincount().max()),
+        "train_views": int(frames.bincount().max()) if scene.moves else None,
         "test_frames": len(scene.dynamic.test),
         "wall_seconds": {**learned, "evaluate": run.step_seconds},
     }

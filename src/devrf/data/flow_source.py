@@ -24,8 +24,8 @@ def with_flow(scene: Scene, source: FlowSource, cache: Path | None) -> Scene:
     Args:
         scene: as its reader gave it, with flow from files or without.
         source: ``dis`` and ``raft`` estimate; ``auto`` keeps what was read from files, else
-            estimates with DIS unless the cameras jump from frame to frame; the others change
-            nothing.
+            estimates with DIS unless the cameras jump from frame to frame, or the scene is at rest;
+            the others change nothing.
         cache: an ``.npz`` that keeps the estimate, or None.
 
     Raises:
@@ -33,6 +33,8 @@ def with_flow(scene: Scene, source: FlowSource, cache: Path | None) -> Scene:
     """
     train = scene.dynamic.train
     method = source
+    if not scene.moves and method == "auto":
+        return scene
     if method == "auto" and train.flow is None:
         method, how = "dis", "estimated with DIS"
         if camera_turn(train) > JUMP_DEGREES:

@@ -12,12 +12,14 @@ from devrf.scenes.masks import Masks
 from devrf.scenes.scene import Capture, Views
 from devrf.scenes.splits import (
     Split,
+    at_one_moment,
     at_times,
     distinct_times,
     evenly_spread,
     first_views,
     load_views,
 )
+from devrf.scenes.transforms import Transforms
 from devrf.scenes.validation import scene_error
 
 log = logging.getLogger(__name__)
@@ -30,7 +32,7 @@ class Layout:
     Attributes:
         static_train: images of the scene at rest.
         static_test: held-out images of the scene at rest.
-        dynamic_train: images of the scene in motion.
+        dynamic_train: images of the scene in motion; of a scene at rest ``static_train`` itself.
         dynamic_test: held-out images of the scene in motion.
     """
 
@@ -38,6 +40,24 @@ class Layout:
     static_test: Split
     dynamic_train: Split
     dynamic_test: Split
+
+    @property
+    def moves(self) -> bool:
+        """Whether there are images of the scene in motion."""
+        return self.dynamic_train is not self.static_train
+
+
+def static_alone(train: Transforms, test: Transforms, why: str) -> Layout:
+    """The layout of a scene at rest, whose images all show one moment.
+
+    Args:
+        train: the images to learn from.
+        test: the held-out images.
+        why: what says so, for the log.
+    """
+    log.info("%s: %s: all images show one moment, the scene is at rest", train.file, why)
+    train_set, test_set = at_one_moment(train), at_one_moment(test)
+    return Layout(train_set, test_set, train_set, test_set)
 
 
 def without_static_set(train: Split, test: Split, static_until: float) -> Layout:
@@ -82,8 +102,12 @@ def fewer(layout: Layout, train_views: int | None, frames: int | None) -> tuple[
         frames: keep so many times, evenly spread, first and last included; None: all.
 
     Raises:
-        DevrfError: the dynamic images have one time only, or fewer views.
+        DevrfError: the dynamic images have one time only, or fewer views; or there are none.
     """
+    if not layout.moves:
+        for key, asked in (("train_views", train_views), ("frames", frames)):
+            refuse_at_rest(layout.static_train.transforms.file, f"data.{key}", asked)
+        return layout, False
     train, test = first_views(layout.dynamic_train, train_views), layout.dynamic_test
     if len(distinct_times(train.used_times)) < 2:
         raise scene_error(
@@ -97,6 +121,14 @@ def fewer(layout: Layout, train_views: int | None, frames: int | None) -> tuple[
         # Held-out times of their own (D-NeRF) need not meet the kept ones: then all stay.
         test = same if len(same.index) else test
     return replace(layout, dynamic_train=train, dynamic_test=test), kept is not None
+
+
+def refuse_at_rest(file: Path, key: str, asked: object) -> None:
+    """DevrfError where an option on motion is set (not None) for the scene at rest in ``file``."""
+    if asked is not None:
+        raise scene_error(
+            key, f"{asked} was asked for, but all images of {file} show one moment; leave it null"
+        )
 
 
 def load_layout(

@@ -22,13 +22,13 @@ from devrf.scenes.bounds import box_of_frusta
 from devrf.scenes.holdout import every_nth
 from devrf.scenes.image_folders import image_folder
 from devrf.scenes.json_files import Name, Number, Positive, Vector3, read_json
-from devrf.scenes.layout import fewer, load_layout, without_static_set
+from devrf.scenes.layout import Layout, fewer, load_layout, static_alone, without_static_set
 from devrf.scenes.nerfies_camera import read_camera
 from devrf.scenes.paths import scene_folder
 from devrf.scenes.poses import FARTHEST
 from devrf.scenes.reader import Count, EstimatedFlow, Holdout, InwardReader, Time
 from devrf.scenes.scene import Scene
-from devrf.scenes.splits import in_motion
+from devrf.scenes.splits import in_motion, one_moment
 from devrf.scenes.transforms import Transforms, listed_image
 from devrf.scenes.validation import abbreviated, first_error, scene_error
 
@@ -88,7 +88,8 @@ class NerfiesReader(InwardReader):
     World units are those of ``scene.json``: (position − center) · scale; it gives near and far,
     too. The time of an image is its ``time_id`` (HyperNeRF), else its ``warp_id``, brought to
     [0, 1]. Images come from ``rgb/<downscale>x``, or from a larger folder and are made smaller;
-    they are undistorted. Without alpha masks the box is all that the cameras see
+    they are undistorted. With one time for all of them the scene is at rest.
+    Without alpha masks the box is all that the cameras see
     between near and far.
 
     Attributes:
@@ -111,9 +112,7 @@ class NerfiesReader(InwardReader):
         items, train, test = _items(folder / DATASET, self.holdout)
         images = image_folder(folder / "rgb", self.downscale, full="1x", reduced="{}x")
         transforms = _transforms(folder, items, images.path, world)
-        layout = without_static_set(
-            in_motion(transforms[train]), in_motion(transforms[test]), self.static_until
-        )
+        layout = _layout(transforms, train, test, self.static_until)
         layout, _ = fewer(layout, None, self.frames)
         static, dynamic = load_layout(layout, folder, images.downscale)
         near = world.near if self.near is None else self.near
@@ -124,6 +123,14 @@ class NerfiesReader(InwardReader):
             seen = box_of_frusta(static.train.cameras, near, far)
             box = [seen.low, seen.high]
         return replace(self, near=near, far=far, box=box).scene(folder, static, dynamic)
+
+
+def _layout(transforms: Transforms, train: list[int], test: list[int], until: float) -> Layout:
+    if not one_moment(transforms):
+        both = in_motion(transforms[train]), in_motion(transforms[test])
+        return without_static_set(*both, until)
+    why = f"all images have one time in {METADATA}"
+    return static_alone(transforms[train], transforms[test], why)
 
 
 def _items(file: Path, holdout: int) -> tuple[list[str], list[int], list[int]]:
@@ -175,7 +182,11 @@ def _transforms(folder: Path, items: list[str], images: Path, world: _World) -> 
 
 def _times(file: Path, items: list[str]) -> tuple[float, ...]:
     """When each image was taken, from 0 (the first of all) to 1 (the last)."""
-    content = read_json(file, _ENTRIES, "it says when each image was taken; add it")
+    content = read_json(
+        file,
+        _ENTRIES,
+        "it says when each image was taken; add it, with one time_id for all of a scene at rest",
+    )
     moments = []
     for item in items:
         if item not in content:
@@ -192,6 +203,4 @@ def _times(file: Path, items: list[str]) -> tuple[float, ...]:
             raise scene_error(file, f"image {abbreviated(item)} has no {key}; add it")
         ids.append(value)
     first, last = min(ids), max(ids)
-    if first == last:
-        raise scene_error(file, f"all images have the {key} {first:g}, expected at least two times")
-    return tuple((value - first) / (last - first) for value in ids)
+    return tuple((value - first) / ((last - first) or 1.0) for value in ids)

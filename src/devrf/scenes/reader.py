@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import ConfigDict, Field, PlainValidator, ValidationError, model_validator
 from pydantic.dataclasses import dataclass
 
+from devrf.geometry.clock import FrameClock
 from devrf.scenes.bounds import inward_bounds
 from devrf.scenes.json_files import Number
 from devrf.scenes.scene import Background, Capture, Scene
@@ -126,7 +127,7 @@ class InwardReader(SceneReader):
         """
         bounds = inward_bounds(
             static.train,
-            dynamic.train,
+            dynamic.train if len(FrameClock.from_times(dynamic.train.times)) > 1 else None,
             [static.train, static.test, dynamic.train, dynamic.test],
             bound_scale=self.bound_scale,
             near=self.near,
