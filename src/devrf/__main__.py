@@ -6,6 +6,7 @@ import os
 import sys
 
 from devrf.cli.app import main
+from devrf.cli.data_choice import with_data_choice
 from devrf.cli.messages import report_user_errors
 from devrf.cli.sweep import failures_at_the_end
 from devrf.system.process import tune_for_cpu
@@ -21,6 +22,7 @@ def entry() -> None:
     """
     # Hydra would print a traceback of its own and exit with 1 if it were not told to raise.
     os.environ["HYDRA_FULL_ERROR"] = "1"
+    sys.argv = [sys.argv[0], *with_data_choice(sys.argv[1:])]
     tune_for_cpu()
     try:
         with handle_signals(end_at_once), report_user_errors(), failures_at_the_end():

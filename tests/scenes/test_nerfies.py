@@ -261,3 +261,18 @@ def test_one_time_is_a_scene_at_rest(folder):
     scene = NerfiesReader(folder.root, downscale=1).read()
     assert not scene.moves and scene.dynamic.train is scene.static.train
     assert scene.static.train.times.tolist() == [0.0] * len(scene.static.train)
+
+
+def test_absent_images_are_counted_or_left_out(folder, message_of, caplog):
+    before = NerfiesReader(folder.root, downscale=1).read().dynamic.train
+    gone = before.names[2]
+    (folder.root / gone).unlink()
+    assert f"1 of the {COUNT} images in dataset.json are absent" in message_of(folder.root)
+    after = NerfiesReader(folder.root, downscale=1, missing="skip").read().dynamic.train
+    kept = [k for k, name in enumerate(before.names) if name != gone]
+    assert after.names == tuple(before.names[k] for k in kept)
+    assert torch.equal(after.cameras.camera_to_world, before.cameras.camera_to_world[kept])
+    assert sum("absent" in record.getMessage() for record in caplog.records) == 1
+    for item in (IDS[3], IDS[8]):
+        (folder.root / f"rgb/1x/{item}.png").unlink()
+    assert "all that are held out, are absent" in message_of(folder.root, missing="skip")

@@ -11,6 +11,7 @@ from omegaconf import DictConfig
 from devrf.cli import job
 from devrf.cli.config import config_folder, register_resolvers
 from devrf.cli.config_check import check_config
+from devrf.cli.data_choice import with_recognised_data
 from devrf.cli.messages import report_user_errors
 from devrf.cli.run_folder import removed_on_user_error
 from devrf.cli.run_lock import exclusive
@@ -40,6 +41,7 @@ def _job(config: DictConfig, folder: Path) -> float | None:
 
 
 def _checked(config: DictConfig, folder: Path) -> float | None:
+    config = with_recognised_data(config)
     check_config(config)
     # Imported here: --help and a misspelt key are answered before torch has loaded.
     from devrf.cli.steps import run_stage

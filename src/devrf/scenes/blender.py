@@ -9,6 +9,7 @@ from pathlib import Path
 
 from pydantic.dataclasses import dataclass
 
+from devrf.scenes.absent_images import Missing
 from devrf.scenes.capture_folders import chosen_dynamic, dynamic_folders
 from devrf.scenes.flow_files import read_flow
 from devrf.scenes.image_files import image_size
@@ -46,20 +47,24 @@ class BlenderReader(InwardReader):
     def read(self) -> Scene:
         """See :meth:`devrf.scenes.reader.SceneReader.read`."""
         folder = scene_folder(self.root)
-        layout, flow_folder = _layout(folder, self.dynamic, self.static_until)
+        layout, flow_folder = _layout(folder, self.dynamic, self.static_until, self.missing)
         layout, thinned = fewer(layout, self.train_views, self.frames)
         static, dynamic = load_layout(layout, folder, self.downscale)
         if not layout.moves:
             return self.scene(folder, static, dynamic)
         if self.wants_flow_files and thinned:
             log.info("flow files dropped: data.frames=%s leaves out neighbours", self.frames)
+        elif self.wants_flow_files and layout.dynamic_train.transforms.skipped:
+            log.info("flow files dropped: they are numbered by images of which some are absent")
         elif self.wants_flow_files:
             train = _with_flow(dynamic.train, layout.dynamic_train, flow_folder)
             dynamic = replace(dynamic, train=train)
         return self.scene(folder, static, dynamic)
 
 
-def _layout(root: Path, dynamic: str | None, static_until: float) -> tuple[Layout, Path]:
+def _layout(
+    root: Path, dynamic: str | None, static_until: float, missing: Missing
+) -> tuple[Layout, Path]:
     """The splits, and the folder where flow files would lie."""
     static = root / "static"
     if not os.path.isdir(static) and not dynamic_folders(root):
@@ -69,7 +74,7 @@ def _layout(root: Path, dynamic: str | None, static_until: float) -> tuple[Layou
                 "expected static/ and dynamic_<V>views/, or transforms_train.json; "
                 "set data.root to the scene's folder",
             )
-        train, test = _train_and_test(root, root)
+        train, test = _train_and_test(root, root, missing)
         if one_moment(train, test):
             return static_alone(train, test, one_moment_in_words(train)), root
         layout = without_static_set(in_motion(train), in_motion(test), static_until)
@@ -77,17 +82,21 @@ def _layout(root: Path, dynamic: str | None, static_until: float) -> tuple[Layou
     existing_folder(static)
     if dynamic is None and not dynamic_folders(root):
         why = "there is no folder dynamic_<V>views"
-        return static_alone(*_train_and_test(static, root), why), root
+        return static_alone(*_train_and_test(static, root, missing), why), root
     moving = chosen_dynamic(root, dynamic)
-    rest_sets, moving_sets = _train_and_test(static, root), _train_and_test(moving, root)
+    rest_sets, moving_sets = (
+        _train_and_test(static, root, missing),
+        _train_and_test(moving, root, missing),
+    )
     return Layout(*map(at_rest, rest_sets), *map(in_motion, moving_sets)), moving / "train_flow"
 
 
-def _train_and_test(folder: Path, root: Path) -> tuple[Transforms, Transforms]:
+def _train_and_test(folder: Path, root: Path, missing: Missing) -> tuple[Transforms, Transforms]:
     """The images of a capture to learn from, and those held out."""
     test, val = folder / "transforms_test.json", folder / "transforms_val.json"
     held_out = val if os.path.isfile(val) and not os.path.isfile(test) else test
-    return read_transforms(folder / "transforms_train.json", root), read_transforms(held_out, root)
+    train = read_transforms(folder / "transforms_train.json", root, missing)
+    return train, read_transforms(held_out, root, missing)
 
 
 def _with_flow(views: Views, split: Split, folder: Path) -> Views:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
 
+from devrf.scenes.downscale import whole_factor
+from devrf.scenes.image_files import image_size
 from devrf.scenes.masks import Masks
 from devrf.scenes.scene import Capture, Views
 from devrf.scenes.splits import (
@@ -132,22 +135,36 @@ def refuse_at_rest(file: Path, key: str, asked: object) -> None:
 
 
 def load_layout(
-    layout: Layout, root: Path, downscale: int, masks: Masks = "none"
+    layout: Layout, root: Path, downscale: int | str, masks: Masks = "none"
 ) -> tuple[Capture, Capture]:
-    """The static and the dynamic capture, images read; ``masks`` as for load_views.
+    """The static and the dynamic capture, images read.
+
+    Args:
+        layout: which images.
+        root: the scene's folder.
+        downscale: as :class:`devrf.scenes.reader.SceneReader` has it.
+        masks: as for :func:`devrf.scenes.splits.load_views`.
 
     Raises:
         DevrfError: what :func:`devrf.scenes.splits.load_views` raises.
     """
+    factor = whole_factor(downscale, partial(_shorter_side, layout.static_train))
     splits = (layout.static_train, layout.static_test, layout.dynamic_train, layout.dynamic_test)
     loaded: list[tuple[Split, Views]] = []
     for split in splits:
         # Without a static set the captures share files: read them once.
         twin = next((v for s, v in loaded if _same_images(s, split)), None)
-        views = load_views(split, root, downscale, masks) if twin is None else twin
+        views = load_views(split, root, factor, masks) if twin is None else twin
         loaded.append((split, views))
     a, b, c, d = (views for _, views in loaded)
     return Capture(a, b), Capture(c, d)
+
+
+def _shorter_side(split: Split, factor: int) -> int:
+    """The shorter side in pixels of a split's images made smaller by ``factor``."""
+    first = int(split.index[0])
+    size = image_size(split.transforms.images[first], split.transforms.intrinsics[first].size)
+    return min(size) // factor
 
 
 def _same_images(a: Split, b: Split) -> bool:

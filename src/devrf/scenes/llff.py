@@ -14,6 +14,7 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from devrf.scenes.capture_folders import chosen_dynamic, dynamic_folders
+from devrf.scenes.downscale import Downscale, folder_factor
 from devrf.scenes.flow_files import stacked_flow
 from devrf.scenes.forward_bounds import forward_bounds, reference_space
 from devrf.scenes.image_files import Size, image_size
@@ -57,7 +58,7 @@ class LlffReader(SceneReader):
 
     _: KW_ONLY
     dynamic: str | None = None
-    downscale: Count = 4
+    downscale: Downscale = "up_to_4"
     test_view: Annotated[int, Field(strict=True)] = -1
     holdout: Holdout = 8
     near: Positive = 1.0
@@ -92,7 +93,8 @@ class LlffReader(SceneReader):
         video = self.monocular
         if video is None:
             video = not moving and os.path.isfile(posed / VIDEO)
-        images = _posed_images(posed, folder, self.downscale)
+        factor = folder_factor(posed, self.downscale)
+        images = _posed_images(posed, folder, factor)
         if video:
             if self.train_views is not None:
                 raise scene_error(
@@ -101,7 +103,7 @@ class LlffReader(SceneReader):
             return video_captures(images, posed, self.holdout, self.frames, self.static_until)
         static = _held_out(images, self.holdout)
         if moving:
-            return static, _dynamic(self, chosen_dynamic(folder, self.dynamic), folder)
+            return static, _dynamic(self, chosen_dynamic(folder, self.dynamic), folder, factor)
         log.info("%s: no times: all images show one moment, the scene is at rest", posed)
         for key in ("train_views", "frames"):
             refuse_at_rest(posed, f"data.{key}", getattr(self, key))
@@ -157,8 +159,8 @@ def _numbered(views: Views) -> Views:
     return replace(views, view=torch.arange(len(views)))
 
 
-def _dynamic(options: LlffReader, folder: Path, root: Path) -> Capture:
-    views = view_folders(folder, options.downscale)
+def _dynamic(options: LlffReader, folder: Path, root: Path, downscale: int) -> Capture:
+    views = view_folders(folder, downscale)
     posed = read_dynamic_poses(folder)
     if len(posed) < len(views):
         raise scene_error(

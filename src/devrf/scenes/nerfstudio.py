@@ -12,9 +12,10 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from devrf.scenes.holdout import every_nth
+from devrf.scenes.image_files import find_image, image_at
 from devrf.scenes.layout import Layout, fewer, load_layout, static_alone, without_static_set
 from devrf.scenes.masks import Masks
-from devrf.scenes.paths import scene_folder
+from devrf.scenes.paths import inside, scene_folder
 from devrf.scenes.reader import Count, EstimatedFlow, Holdout, InwardReader, Time
 from devrf.scenes.scene import Scene
 from devrf.scenes.splits import (
@@ -24,7 +25,7 @@ from devrf.scenes.splits import (
     one_moment,
     one_moment_in_words,
 )
-from devrf.scenes.transforms import Transforms, listed_image, posed_images, read_listing
+from devrf.scenes.transforms import Transforms, posed_images, read_listing
 from devrf.scenes.validation import abbreviated, scene_error
 
 log = logging.getLogger(__name__)
@@ -69,17 +70,17 @@ class NerfstudioReader(InwardReader):
     def read(self) -> Scene:
         """See :meth:`devrf.scenes.reader.SceneReader.read`."""
         folder = scene_folder(self.root)
-        layout = _layout(folder, self.holdout, self.static_until, self.masks != "none")
+        layout = _layout(folder, self)
         layout, _ = fewer(layout, self.train_views, self.frames)
         return self.scene(folder, *load_layout(layout, folder, self.downscale, self.masks))
 
 
-def _layout(root: Path, holdout: int, static_until: float | None, masked: bool) -> Layout:
+def _layout(root: Path, options: NerfstudioReader) -> Layout:
     if os.path.isfile(root / FILE):
-        train, test = _train_and_test(root / FILE, root, holdout, masked)
+        train, test = _train_and_test(root / FILE, root, options)
         if one_moment(train, test):
             return static_alone(train, test, one_moment_in_words(train))
-        return _one_file(train, test, static_until)
+        return _one_file(train, test, options.static_until)
     still, moving = root / "static" / FILE, root / "dynamic" / FILE
     if not os.path.isfile(still) and not os.path.isfile(moving):
         raise scene_error(
@@ -87,10 +88,10 @@ def _layout(root: Path, holdout: int, static_until: float | None, masked: bool) 
             f"expected {FILE}, or static/{FILE} (and dynamic/{FILE}); set data.root to the "
             "scene's folder",
         )
-    rest = _train_and_test(still, root, holdout, masked)
+    rest = _train_and_test(still, root, options)
     if not os.path.isfile(moving):
         return static_alone(*rest, f"there is no dynamic/{FILE}")
-    motion = _train_and_test(moving, root, holdout, masked)
+    motion = _train_and_test(moving, root, options)
     if motion[0].times is None:
         raise scene_error(
             moving,
@@ -101,10 +102,12 @@ def _layout(root: Path, holdout: int, static_until: float | None, masked: bool) 
 
 
 def _train_and_test(
-    file: Path, root: Path, holdout: int, masked: bool
+    file: Path, root: Path, options: NerfstudioReader
 ) -> tuple[Transforms, Transforms]:
     listing = read_listing(file)
-    transforms = posed_images(listing, file, root, masked=masked)
+    transforms = posed_images(
+        listing, file, root, masked=options.masks != "none", missing=options.missing
+    )
     count = len(transforms.images)
     listed = {
         split: _listed(getattr(listing, f"{split}_filenames"), split, transforms, root)
@@ -116,7 +119,7 @@ def _train_and_test(
     if listed["train"] and not test:
         test = sorted(set(range(count)) - set(train))
     elif not test and count > 1:
-        train, test = every_nth(count, holdout)
+        train, test = every_nth(count, options.holdout)
     if not train or not test or set(train) & set(test):
         raise scene_error(
             file,
@@ -132,7 +135,10 @@ def _listed(names: list[str] | None, split: str, transforms: Transforms, root: P
     position = {image: i for i, image in enumerate(transforms.images)}
     found = []
     for name in names or []:
-        image = listed_image(name, transforms.file, root)
+        place = inside(root, transforms.file.parent, name, transforms.file)
+        if transforms.skipped and image_at(place) is None:
+            continue
+        image = find_image(place)
         if image not in position:
             raise scene_error(
                 transforms.file,
