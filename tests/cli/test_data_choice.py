@@ -79,7 +79,10 @@ def test_an_experiment_and_a_sweep_take_what_is_found(devrf, tmp_path, moving, s
         "0_walker",
         "1_still",
     }
-    assert "32 x 24" in done.out and "images are made smaller by 1, not 4" in done.out
+    assert (
+        "32 x 24" in done.out
+        and "images keep their size, although data.downscale=up_to_4" in done.out
+    )
     assert "(data=inward)" in done.out and "(data=nerfstudio)" in done.out
 
 

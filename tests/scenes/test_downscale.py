@@ -39,7 +39,10 @@ def test_the_folder_that_is_there_is_taken(llff_folder, caplog):
         scene = LlffReader(llff_folder.root).read()
     # 96 x 64 pixels: made smaller at all they would have fewer than 64.
     assert (scene.static.train.width, scene.dynamic.train.width) == (96, 96)
-    assert "images are made smaller by 1, not 4: their shorter side has 64 px" in caplog.text
+    assert (
+        "images keep their size, although data.downscale=up_to_4: their shorter side has 64"
+        in caplog.text
+    )
 
 
 def test_an_image_that_is_too_small_stays_as_it_is(scene_folder, refusal):

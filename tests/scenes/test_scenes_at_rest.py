@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -113,6 +114,15 @@ def test_nerfstudio_without_times(tmp_path, balls, time):
     assert_at_rest(NerfstudioReader(tmp_path / "one").read(), 8, 1)
     balls.write(tmp_path / "two/static", None)
     assert_at_rest(NerfstudioReader(tmp_path / "two").read(), 8, 1)
+
+
+def test_frames_that_skip_one_another_need_no_flow(tiny_scene):
+    """Each of two cameras has every other frame: nothing to estimate, and no error."""
+    train = tiny_scene.dynamic.train
+    kept = (train.frames % 2 == train.view).nonzero()[:, 0]
+    moving = replace(tiny_scene.dynamic, train=replace(train, flow=None)[kept])
+    scene = replace(tiny_scene, dynamic=moving)
+    assert with_flow(scene, "auto", None).dynamic.train.flow is None
 
 
 def test_a_bound_scale_that_was_given_stays(scene_folder):

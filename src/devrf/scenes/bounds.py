@@ -16,6 +16,7 @@ from devrf.scenes.validation import scene_error
 FALLBACK_BOUND_SCALE = 1.5
 # At rest: as much as is left around the rest state where the room for motion is known.
 REST_BOUND_SCALE = 1.05
+STILL = "no motion: the scene is at rest"
 # Mean square sine of the angle between the axes and their common direction: about 2 degrees.
 NEARLY_PARALLEL = 1e-3
 # A near plane inside the box's sphere would be 0 or less: stay this share of the way out.
@@ -146,9 +147,9 @@ def inward_bounds(
     scale = FALLBACK_BOUND_SCALE if bound_scale == "auto" else float(bound_scale)
     box = box or box_from_cameras(static.cameras)
     motion, source = None, f"canonical box x bound scale {scale:g}"
-    if bound_scale == "auto" and dynamic is None:
-        scale, source = REST_BOUND_SCALE, "no motion: the scene is at rest"
-    elif bound_scale == "auto" and dynamic is not None:
+    if dynamic is None and bound_scale == "auto":
+        scale, source = REST_BOUND_SCALE, STILL
+    elif dynamic is not None and bound_scale == "auto":
         motion = motion_box(dynamic, box)
         if motion is None:
             source += " (no alpha masks from two cameras at every time)"

@@ -53,10 +53,10 @@ def whole_factor(downscale: int | str, side_at: Callable[[int], int | None]) -> 
     factor = enough[0] if enough else max(known, key=lambda one: (known[one], -one))
     if factor < most:
         log.info(
-            "images are made smaller by %d, not %d: their shorter side has %d px, and is not to "
+            "images %s, although data.downscale=%s: their shorter side has %d px, and is not to "
             "fall below %d (data.downscale=%d all the same)",
-            factor,
-            most,
+            f"are made smaller by {factor}" if factor > 1 else "keep their size",
+            downscale,
             known[factor],
             LEAST_SIDE,
             most,

@@ -13,6 +13,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
+from devrf.scenes.bounds import STILL
 from devrf.scenes.capture_folders import chosen_dynamic, dynamic_folders
 from devrf.scenes.downscale import Downscale, folder_factor
 from devrf.scenes.flow_files import stacked_flow
@@ -31,6 +32,9 @@ from devrf.scenes.validation import scene_error
 from devrf.scenes.view_folders import ViewFolder, flow_files, view_folders
 
 log = logging.getLogger(__name__)
+
+# Where the room for motion comes from.
+SEEN = "all that the cameras see (forward-facing)"
 
 
 @dataclass(frozen=True)
@@ -76,7 +80,8 @@ class LlffReader(SceneReader):
             list({id(v): v for v in both}.values())
             for both in ((static.train, dynamic.train), (static.test, dynamic.test))
         )
-        bounds = forward_bounds(learned, space, "all that the cameras see (forward-facing)")
+        moves = dynamic.train is not static.train or len(set(dynamic.train.times.tolist())) > 1
+        bounds = forward_bounds(learned, space, SEEN if moves else STILL)
         # The held-out cameras need not see inside the box, but they have to look the same way.
         forward_bounds(held_out, space, "")
         _warn_of_cameras_beyond(self.near, learned + held_out)
