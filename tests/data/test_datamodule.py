@@ -114,5 +114,5 @@ def test_a_datamodule_has_the_options_of_its_reader_with_their_types():
     assert (parameters["downscale"].default, parameters["holdout"].default) == ("up_to_4", 8)
     assert "train_views" not in parameters and "export" not in parameters
     hints = get_type_hints(NerfiesDataModule.__init__)
-    assert hints["downscale"] is int and hints["frames"] == int | None
+    assert hints["downscale"] == int | str and hints["frames"] == int | None
     assert inspect.signature(ProceduralDataModule).parameters["export"].default is None
