@@ -7,11 +7,9 @@ import sys
 
 import devrf
 from devrf.cli.app import main
-from devrf.cli.arguments import with_quoted_paths
+from devrf.cli.command_line import as_hydra_takes_it
 from devrf.cli.completion import answer_completion
-from devrf.cli.learned_with import completed
 from devrf.cli.messages import report_user_errors
-from devrf.cli.paper_scene import with_paper_experiment
 from devrf.cli.sweep import failures_at_the_end
 from devrf.system.process import tune_for_cpu
 from devrf.system.signals import Interrupted, end_at_once, handle_signals
@@ -34,8 +32,7 @@ def entry() -> None:
     tune_for_cpu()
     try:
         with handle_signals(end_at_once), report_user_errors(), failures_at_the_end():
-            typed = with_paper_experiment(with_quoted_paths(sys.argv[1:]))
-            sys.argv[1:] = completed(typed)
+            sys.argv[1:] = as_hydra_takes_it(sys.argv[1:])
             main()
     except Interrupted as stop:
         print(f"devrf: {stop.said}", file=sys.stderr)

@@ -152,7 +152,7 @@ def test_results_of_an_earlier_run_survive_a_mistake(devrf, tmp_path, tiny):
 def test_help_names_stages_groups_and_examples(devrf):
     outcome = devrf("--help")
     assert outcome.status == 0
-    for words in ("stage=deformation", "data=inward data.root=PATH", "experiment: ", "ablation: "):
+    for words in ("stage=deformation", "data.root=PATH", "experiment: ", "ablation: "):
         assert words in outcome.out
 
 

@@ -111,8 +111,8 @@ def test_options_are_checked_before_anything_is_read(module, sources):
 def test_a_datamodule_has_the_options_of_its_reader_with_their_types():
     parameters = inspect.signature(NerfiesDataModule).parameters
     assert parameters["root"].default is inspect.Parameter.empty
-    assert (parameters["downscale"].default, parameters["holdout"].default) == (4, 8)
+    assert (parameters["downscale"].default, parameters["holdout"].default) == ("up_to_4", 8)
     assert "train_views" not in parameters and "export" not in parameters
     hints = get_type_hints(NerfiesDataModule.__init__)
-    assert hints["downscale"] is int and hints["frames"] == int | None
+    assert hints["downscale"] == int | str and hints["frames"] == int | None
     assert inspect.signature(ProceduralDataModule).parameters["export"].default is None

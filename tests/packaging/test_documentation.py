@@ -10,6 +10,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from devrf.cli.config_check import check_config
+from devrf.cli.data_choice import with_data_choice
 
 REPOSITORY = Path(__file__).parents[2]
 PAGES = [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md"]
@@ -78,7 +79,7 @@ def test_commands_compose(command, composed):
     # Of the values of a sweep, the first.
     words = [word if "[" in word else word.split(",")[0] for word in command.split()]
     words = [re.sub(r"=(PATH|FOLDER|…)$", "=scene", word) for word in words if word != "-m"]
-    check_config(composed(*words))
+    check_config(composed(*with_data_choice(words)))
 
 
 def test_keys_exist(composed):

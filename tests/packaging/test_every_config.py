@@ -30,19 +30,22 @@ NEEDS = {
 }
 
 
-def rooted(composed, *overrides):
+def rooted(composed, folder, *overrides):
     """The composed config, with a folder for a scene from disk where one is asked for."""
     config = composed(*overrides)
-    missing = OmegaConf.is_missing(config.data, "root")
-    return composed(*overrides, "data.root=scene") if missing else config
+    if not OmegaConf.is_missing(config.data, "root"):
+        return config
+    (folder / "scene").mkdir()
+    (folder / "scene" / "transforms.json").touch()  # so that a layout is recognised
+    return composed(*overrides, f"data.root={folder}/scene")
 
 
 @pytest.mark.parametrize("choice", [name for name in FILES if not name.startswith("method=")])
-def test_it_composes_and_builds(composed, choice):
+def test_it_composes_and_builds(composed, tmp_path, choice):
     needed = NEEDS.get(choice)
     if needed and importlib.util.find_spec(needed) is None:
         pytest.skip(f"{needed} is not installed")
-    config = rooted(composed, choice)
+    config = rooted(composed, tmp_path, choice)
     check_config(config)
     assert isinstance(instantiate(config.data), SceneDataModule)
     assert isinstance(instantiate(config.canonical, _convert_="all"), CanonicalStage)

@@ -101,7 +101,8 @@ def test_missing_folders(scene_folder, tmp_path, message_of):
     (tmp_path / "empty").mkdir()
     assert "expected static/ and dynamic_<V>views/" in message_of(tmp_path / "empty")
     shutil.rmtree(scene_folder.dynamic)
-    assert "no folder dynamic_<V>views" in message_of(scene_folder.root)
+    message = message_of(scene_folder.root, dynamic="dynamic_2views")
+    assert "no folder 'dynamic_2views' (found: none)" in message
 
 
 def test_a_dynamic_capture_without_a_static_one(scene_folder, message_of):

@@ -113,7 +113,7 @@ def test_full_size_images_are_made_smaller_where_the_factor_is_missing(llff_fold
         count = len(list((folder / "images_4").iterdir()))
         shutil.rmtree(folder / "images_4")
         llff_folder.images(folder / "images", count, times=4)
-    scene = LlffReader(llff_folder.root).read()
+    scene = LlffReader(llff_folder.root, downscale=4).read()
     assert scene.static.train.pixels.shape == (7, 16, 24, 3)
     assert scene.static.train.cameras.focal[0].tolist() == [20, 20]
     assert scene.dynamic.train.cameras.focal[0].tolist() == [20, 20]

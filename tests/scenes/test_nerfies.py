@@ -205,7 +205,6 @@ CAMERA = "camera/000004.json"
         ("dataset.json", lambda c: c.clear(), "lists 0 images"),
         ("metadata.json", lambda c: c.pop(IDS[5]), "says nothing of image '000005'"),
         ("metadata.json", lambda c: c[IDS[5]].pop("warp_id"), "image '000005' has no warp_id"),
-        ("metadata.json", lambda c: [e.update(warp_id=1) for e in c.values()], "two times"),
         ("scene.json", lambda c: c.update(scale=0), "scale: should be greater than 0, not 0"),
         ("scene.json", lambda c: c.pop("near"), "near: is missing"),
         ("scene.json", lambda c: c.update(far=float("nan")), "far: should be a finite number"),
@@ -255,3 +254,25 @@ def test_files_that_are_missing_or_cut_short(folder, file, message_of):
 def test_ids_stay_inside_the_scene(folder, escape, message_of):
     folder.write("dataset.json", {"train_ids": [*IDS[:3], escape], "val_ids": IDS[3:]})
     assert "dataset.json" in message_of(folder.root)
+
+
+def test_one_time_is_a_scene_at_rest(folder):
+    folder.edit("metadata.json", lambda c: [e.update(warp_id=1) for e in c.values()])
+    scene = NerfiesReader(folder.root, downscale=1).read()
+    assert not scene.moves and scene.dynamic.train is scene.static.train
+    assert scene.static.train.times.tolist() == [0.0] * len(scene.static.train)
+
+
+def test_absent_images_are_counted_or_left_out(folder, message_of, caplog):
+    before = NerfiesReader(folder.root, downscale=1).read().dynamic.train
+    gone = before.names[2]
+    (folder.root / gone).unlink()
+    assert f"1 of the {COUNT} images in dataset.json are absent" in message_of(folder.root)
+    after = NerfiesReader(folder.root, downscale=1, missing="skip").read().dynamic.train
+    kept = [k for k, name in enumerate(before.names) if name != gone]
+    assert after.names == tuple(before.names[k] for k in kept)
+    assert torch.equal(after.cameras.camera_to_world, before.cameras.camera_to_world[kept])
+    assert sum("absent" in record.getMessage() for record in caplog.records) == 1
+    for item in (IDS[3], IDS[8]):
+        (folder.root / f"rgb/1x/{item}.png").unlink()
+    assert "all that are held out, are absent" in message_of(folder.root, missing="skip")

@@ -178,7 +178,6 @@ def test_two_folders(tmp_path, balls_are_where_they_project, balls):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda c: [f.pop("time") for f in c["frames"]], 'no "time", which a capture of a moving'),
         (lambda c: c.update(camera_model="OPENCV_FISHEYE"), "'OPENCV_FISHEYE' is not supported"),
         (lambda c: c.update(camera_model=[1]), "camera_model: [1] is not supported"),
         (lambda c: c.update(is_fisheye=True), "is_fisheye: a fisheye is not supported"),
@@ -197,7 +196,6 @@ def test_two_folders(tmp_path, balls_are_where_they_project, balls):
             "2 images to learn from, 1 held out, 1 of them both",
         ),
         (lambda c: c.update(frames=c["frames"][:1]), "1 images to learn from, 0 held out"),
-        (lambda c: [f.update(time=0.0) for f in c["frames"]], "at a time above 0"),
     ],
 )
 def test_wrong_values(moving, change, said, message_of, balls):

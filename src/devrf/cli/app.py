@@ -11,6 +11,7 @@ from omegaconf import DictConfig
 from devrf.cli import job, learned_with
 from devrf.cli.config import config_folder, register_resolvers
 from devrf.cli.config_check import check_config
+from devrf.cli.data_choice import with_recognised_data
 from devrf.cli.extras import check_extras
 from devrf.cli.messages import report_user_errors
 from devrf.cli.paper_scene import check_paper_scene
@@ -44,6 +45,7 @@ def _job(config: DictConfig, folder: Path) -> float | None:
 
 def _checked(config: DictConfig, folder: Path) -> float | None:
     check_paper_scene(job.choices())
+    config = with_recognised_data(config)
     check_config(config)
     check_extras(config)
     # Imported here: --help and a misspelt key are answered before torch has loaded.

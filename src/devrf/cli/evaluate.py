@@ -13,6 +13,7 @@ from devrf.checkpoints.checkpoint import CheckpointMetadata
 from devrf.checkpoints.checkpoint_file import digest_of
 from devrf.cli import job
 from devrf.cli.context import GIVEN_REST, OWN_REST, RunContext
+from devrf.cli.scene_stages import stages_with_images
 from devrf.evaluation.held_out import HeldOutView, score
 from devrf.evaluation.suite import MetricSuite
 from devrf.methods.base import DynamicModel
@@ -52,11 +53,13 @@ def evaluate(run: RunContext) -> None:
             sections[last] = dynamic
     write_frames(run.folder / "frames.csv", frames)
     ran = {**provenance(model.size, run.device), **_origin(run, loaded.metadata)}
-    head = {
+    head: dict[str, Any] = {
         "scene": run.scene.name,
         "method": model.name,
         "protocol": loaded.metadata.protocol or run.protocol.name,
     }
+    if not run.scene.moves:
+        head["at_rest"] = True
     write_json(run.folder / "metrics.json", {**head, **sections, "run": ran})
     for name in frames:
         log.info("%s: %s", name, in_words(sections[name]))
@@ -99,7 +102,7 @@ def _origin(run: RunContext, described: CheckpointMetadata) -> dict[str, Any]:
     for of_stage in (*described.earlier_configs.values(), described.training_config):
         settings |= of_stage
     frames = scene.clock.frames_of(scene.dynamic.train.times)
-    learned = {k: records.get(k, {}).get("wall_seconds") for k in run.learning_stages}
+    learned = {k: records.get(k, {}).get("wall_seconds") for k in stages_with_images(run)}
     return {
         "choices": job.choices(),
         "overrides": job.overrides(),
@@ -108,7 +111,7 @@ def _origin(run: RunContext, described: CheckpointMetadata) -> dict[str, Any]:
         "fingerprint": described.fingerprint,
         "checkpoint": digest_of(run.checkpoint(described.stage)),
         # A camera that moves is one view, however many images it took.
-        "train_views": int(frames.bincount().max()),
+        "train_views": int(frames.bincount().max()) if scene.moves else None,
         "test_frames": len(scene.dynamic.test),
         "wall_seconds": {**learned, "evaluate": run.step_seconds},
     }

@@ -19,7 +19,12 @@ log = logging.getLogger(__name__)
 
 def prepare(run: RunContext) -> None:
     """Write the scene to ``data.export`` in the published layout."""
-    folder = getattr(run.datamodule, "export", None)
+    if not hasattr(run.datamodule, "export"):
+        raise DevrfError(
+            "stage=prepare: writes an embedded scene; choose data=procedural or "
+            "data=procedural_forward, and give data.export=PATH"
+        )
+    folder = run.datamodule.export
     if folder is None:
         raise DevrfError("data.export: stage=prepare needs a folder; give data.export=PATH")
     export(run.scene, folder)

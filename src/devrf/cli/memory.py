@@ -218,7 +218,7 @@ def estimate(
         _level_needs(scene, field, rest, deformation, level, motion, batch)
         for level in range(len(deformation.sides))
     ]
-    everything = tensor_bytes((scene.static, scene.dynamic))
+    everything = tensor_bytes(scene.captures.values())
     return Budget(everything, {"canonical": rest, "deformation": max(moving, key=StageNeeds.peak)})
 
 

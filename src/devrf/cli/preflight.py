@@ -14,6 +14,7 @@ from devrf.artifacts.film import film_bytes
 from devrf.callbacks import PeriodicCheckpoint
 from devrf.cli.context import RunContext
 from devrf.cli.memory import IMAGES, Budget, Parts, estimate, module_needs, tensor_bytes
+from devrf.cli.scene_stages import stages_with_images
 from devrf.engine.micro_batching import MicroBatching
 from devrf.errors import DevrfError
 from devrf.system.machine import free_disk, free_host_memory, free_memory, own_memory
@@ -58,7 +59,9 @@ def requirements(run: RunContext) -> Budget:
     """What the configured run needs; several processes share a batch."""
     budget = _of_devrf(run) if "canonical" in run.config else _of_rays(run)
     processes = getattr(run.strategy, "world_size", 1)
-    stages = {k: replace(v, batch=v.batch // processes) for k, v in budget.stages.items()}
+    # A scene at rest that the protocol has no stage for can be looked at all the same.
+    kept = stages_with_images(run) or run.learning_stages
+    stages = {k: replace(budget.stages[k], batch=budget.stages[k].batch // processes) for k in kept}
     return replace(budget, stages=stages)
 
 
@@ -76,7 +79,7 @@ def _of_rays(run: RunContext) -> Budget:
         )
         for step in run.protocol.steps
     }
-    return Budget(tensor_bytes((scene.static, scene.dynamic)), stages)
+    return Budget(tensor_bytes(scene.captures.values()), stages)
 
 
 def _of_devrf(run: RunContext) -> Budget:

@@ -15,6 +15,7 @@ from devrf.artifacts.still import still
 from devrf.cli.context import RunContext
 from devrf.evaluation.held_out import background_value
 from devrf.rendering.renderer import Renderer
+from devrf.scenes.scene import Views
 from devrf.system.progress import followed
 
 log = logging.getLogger(__name__)
@@ -25,8 +26,8 @@ def render(run: RunContext) -> None:
     stored, scene = run.load(), run.scene
     film: FilmSettings = instantiate(run.config.video)
     renderer = Renderer(stored.model.to(run.device), half=film.half)
-    film = _within_limit(run, film, renderer)
-    views, captured = scene.dynamic.test, film.sized(scene.static.train.cameras)
+    views = (scene.dynamic if scene.moves else scene.static).test
+    film, captured = _within_limit(film, renderer, views), film.sized(scene.static.train.cameras)
     images = held_out_images(views, film.frames)
     _write(
         run, film, "held_out", held_out_pictures(renderer, views, images, film, scene.background)
@@ -40,11 +41,11 @@ def render(run: RunContext) -> None:
     _write(run, film, "spiral" if forward else "orbit", shown)
 
 
-def _within_limit(run: RunContext, film: FilmSettings, renderer: Renderer) -> FilmSettings:
+def _within_limit(film: FilmSettings, renderer: Renderer, views: Views) -> FilmSettings:
     """The settings, with fewer frames where ``video.max_seconds`` would not suffice."""
     if film.max_seconds is None:
         return film
-    cameras = film.sized(run.scene.dynamic.test.cameras[[0]])
+    cameras = film.sized(views.cameras[[0]])
     began = time.perf_counter()
     still(renderer, cameras, 0.5, 1.0)
     seconds = time.perf_counter() - began

@@ -6,7 +6,7 @@ import json
 import logging
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -26,6 +26,7 @@ from devrf.cli.preflight import preflight, shortage_in_words
 from devrf.cli.render import render
 from devrf.cli.report import report
 from devrf.cli.resume import archive_previous, beginning
+from devrf.cli.scene_stages import learnable
 from devrf.cli.stages import meant_stage
 from devrf.cli.still import picture
 from devrf.cli.train import learn
@@ -110,6 +111,8 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
     _check(run, asked)
     if _all_done(run, asked):
         return _objective(run)
+    if asked.learning and run.leads:
+        asked = _for_the_scene(run, asked)
     needs = None
     if asked.learning and config.memory_check and run.leads:
         needs = preflight(run, asked.learning, films="render" in asked.further)
@@ -168,8 +171,17 @@ def learn_all(config: DictConfig, folder: Path) -> None:
         _learn(run, plan(config.stage, run.learning_stages))
 
 
+def _for_the_scene(run: RunContext, asked: Plan) -> Plan:
+    """The plan without stages that learn motion, for a scene at rest."""
+    left = replace(asked, learning=learnable(run, asked.learning))
+    if left != asked:
+        steps = ", ".join(left.learning + left.further)
+        log.info("%s is at rest: %s; no motion is learned", run.scene.name, steps)
+    return left
+
+
 def _learn(run: RunContext, asked: Plan) -> None:
-    for name in asked.learning:
+    for name in learnable(run, asked.learning):
         _take(run, name, partial(learn, name=name))
 
 

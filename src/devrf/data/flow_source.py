@@ -6,7 +6,7 @@ import logging
 from dataclasses import replace
 from pathlib import Path
 
-from devrf.scenes.optical_flow import camera_turn, estimate_flow
+from devrf.scenes.optical_flow import camera_turn, estimate_flow, frame_pairs
 from devrf.scenes.reader import FlowSource
 from devrf.scenes.scene import Scene
 
@@ -24,8 +24,8 @@ def with_flow(scene: Scene, source: FlowSource, cache: Path | None) -> Scene:
     Args:
         scene: as its reader gave it, with flow from files or without.
         source: ``dis`` and ``raft`` estimate; ``auto`` keeps what was read from files, else
-            estimates with DIS unless the cameras jump from frame to frame; the others change
-            nothing.
+            estimates with DIS unless the cameras jump from frame to frame, no view has two frames
+            in a row, or the scene is at rest; the others change nothing.
         cache: an ``.npz`` that keeps the estimate, or None.
 
     Raises:
@@ -33,9 +33,13 @@ def with_flow(scene: Scene, source: FlowSource, cache: Path | None) -> Scene:
     """
     train = scene.dynamic.train
     method = source
+    if not scene.moves and method == "auto":
+        return scene
     if method == "auto" and train.flow is None:
         method, how = "dis", "estimated with DIS"
-        if camera_turn(train) > JUMP_DEGREES:
+        if not frame_pairs(train):
+            method, how = "none", "left out (no view has two frames in a row)"
+        elif camera_turn(train) > JUMP_DEGREES:
             method, how = "none", "left out (the cameras jump from frame to frame)"
         log.info("%s: no optical flow files; flow is %s", scene.name, how)
     if method not in ("dis", "raft"):

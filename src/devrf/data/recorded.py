@@ -24,7 +24,7 @@ class RecordedDataModule(SceneDataModule):
     def load(self) -> Scene:
         """Read the scene, and estimate its optical flow if that is asked for."""
         scene = self.reader.read()
-        if scene.kind == "inward":
+        if scene.kind == "inward" and scene.moves:
             log.info("%s: box for motion from %s", scene.name, scene.bounds.source)
         cache = self.reader.flow_cache
         return with_flow(scene, self.reader.flow, None if cache is None else Path(cache))

@@ -16,7 +16,7 @@ from devrf.errors import DevrfError
 
 # What every run has; further columns are what its file holds, by dotted name.
 COLUMNS = (
-    *("folder", "status", "scene", "method", "protocol", "error", "mistake"),
+    *("folder", "status", "scene", "method", "protocol", "at_rest", "error", "mistake"),
     *("train_seconds", "peak_gpu_gb", "dynamic.psnr", "dynamic.ssim", "dynamic.lpips"),
     *("run.device", "run.overrides", "run.seed", "run.checkpoint", "run.date", "path"),
 )
@@ -43,6 +43,7 @@ class _Metrics(BaseModel):
     scene: str
     method: str = DEFAULT_METHOD
     protocol: str = DEFAULT_PROTOCOL
+    at_rest: bool = False
     run: _Setup = _Setup()
     static: Section = {}
     dynamic: Section = {}
@@ -148,9 +149,11 @@ def _finished(content: bytes) -> dict[str, Any]:
     for name, earlier in EARLIER_SECTIONS.items():
         values[name] = {**values.get(earlier, {}), **values.get(name, {})}
     values |= {"method": metrics.method, "protocol": metrics.protocol}
+    values |= {"at_rest": metrics.at_rest}
     # Other protocols may have no stage of their own for the static capture.
-    stages = [values["dynamic"]]
-    if metrics.protocol == DEFAULT_PROTOCOL or values["static"].get("seconds") is not None:
+    stages = [] if metrics.at_rest else [values["dynamic"]]
+    of_static = metrics.at_rest or values["static"].get("seconds") is not None
+    if of_static or metrics.protocol == DEFAULT_PROTOCOL:
         stages.append(values["static"])
     frame = pd.DataFrame(stages, columns=["seconds", "peak_gpu_gb"], dtype=object).map(number)
     values["train_seconds"] = frame["seconds"].sum(skipna=False)

@@ -86,7 +86,8 @@ class Table:
 
     Attributes:
         found: the runs and failures that it is about.
-        runs: the runs whose dynamic capture was scored, labelled.
+        runs: the runs whose dynamic capture was scored, or of a scene at rest the static one;
+            labelled.
         rows: means over runs, indexed by scene and label: ``name``, ``protocol``, ``line``,
             ``views``, ``count`` and every title; NaN unless all runs of the row have the value.
         blocks: one for each scene, then the average if there is more than one.
@@ -113,11 +114,11 @@ def tabulate(found: Collection, published_scenes: PublishedScenes = "matching") 
         published_scenes: which of the paper's rows to show: of the scenes that were run, all, or
             none.
     """
-    scored = found.runs[PSNR.key].map(number).notna()
+    scored = _values(found.runs, PSNR).notna()
     again = _scored_again(found.runs[scored])
     runs = labelled(found.runs[scored].drop(index=again.index))
     for column in COLUMNS:
-        runs[column.title] = runs[column.key].map(number).astype(float)
+        runs[column.title] = _values(runs, column)
     groups = runs.groupby(["scene", "label"], sort=False)
     heads = groups[["name", "protocol", "line", "views"]].first().assign(count=groups.size())
     complete = groups[TITLES].count().eq(heads["count"], axis=0)
@@ -141,6 +142,16 @@ def tabulate(found: Collection, published_scenes: PublishedScenes = "matching") 
         blocks += [average] if len(average.measured) else []
     notes = _notes(runs, found.runs.loc[~scored, "folder"], again)
     return Table(found, runs, rows, tuple(blocks), tuple(notes))
+
+
+def _values(runs: pd.DataFrame, column: Column) -> pd.Series:
+    """The values of a column, NaN where unknown; those of scenes at rest are of the static set."""
+    values = runs[column.key].map(number).astype(float)
+    section, _, name = column.key.partition(".")
+    at_rest, key = runs["at_rest"].eq(True), f"static.{name}"
+    if section == "dynamic" and key in runs:
+        values = values.where(~at_rest, runs[key].map(number).astype(float))
+    return values
 
 
 def shown(value: float, column: Column, spread: float = math.nan) -> str:
@@ -234,6 +245,9 @@ def _notes(runs: pd.DataFrame, at_rest: pd.Series, again: pd.Series) -> list[str
     ]
     if runs["run.device"].nunique(dropna=False) > 1:
         notes.append("Memory and time are marked only among rows of one device.")
+    still = runs.loc[runs["at_rest"].eq(True), "scene"].unique()
+    if len(still):
+        notes.append(f"At rest, scored on held-out images of the static set: {', '.join(still)}.")
     if len(at_rest):
         names = ", ".join(at_rest)
         notes.append(f"Scored at rest only, and therefore not in the tables: {names}.")

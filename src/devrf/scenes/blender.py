@@ -1,4 +1,4 @@
-"""Inward-facing scenes on disk: DeVRF's static + dynamic folders, and D-NeRF's single folder."""
+"""Inward-facing scenes on disk: DeVRF's folders, and D-NeRF's or NeRF-synthetic's single folder."""
 
 from __future__ import annotations
 
@@ -9,15 +9,16 @@ from pathlib import Path
 
 from pydantic.dataclasses import dataclass
 
+from devrf.scenes.absent_images import Missing
 from devrf.scenes.capture_folders import chosen_dynamic, dynamic_folders
 from devrf.scenes.flow_files import read_flow
 from devrf.scenes.image_files import image_size
-from devrf.scenes.layout import Layout, fewer, load_layout, without_static_set
+from devrf.scenes.layout import Layout, fewer, load_layout, static_alone, without_static_set
 from devrf.scenes.paths import existing_folder, scene_folder
 from devrf.scenes.reader import Count, InwardReader, Time
 from devrf.scenes.scene import Scene, Views
-from devrf.scenes.splits import Split, at_rest, in_motion
-from devrf.scenes.transforms import read_transforms
+from devrf.scenes.splits import Split, at_rest, in_motion, one_moment, one_moment_in_words
+from devrf.scenes.transforms import Transforms, read_transforms
 from devrf.scenes.validation import scene_error
 
 log = logging.getLogger(__name__)
@@ -27,8 +28,10 @@ log = logging.getLogger(__name__)
 class BlenderReader(InwardReader):
     """Reads ``transforms_{train,test}.json`` and images.
 
-    Two layouts: ``static/`` next to ``dynamic_<V>views/``, or (D-NeRF) the JSON files in
-    ``root`` itself, where the static capture is taken from the training images.
+    Two layouts: ``static/``, next to ``dynamic_<V>views/`` unless the scene is at rest; or the
+    JSON files in ``root`` itself: with times (D-NeRF) the static capture is taken from the training
+    images, without them (NeRF-synthetic) the scene is at rest. Without ``transforms_test.json``
+    ``transforms_val.json`` is held out.
 
     Attributes:
         dynamic: which ``dynamic_*views`` folder, where there are several.
@@ -44,18 +47,24 @@ class BlenderReader(InwardReader):
     def read(self) -> Scene:
         """See :meth:`devrf.scenes.reader.SceneReader.read`."""
         folder = scene_folder(self.root)
-        layout, flow_folder = _layout(folder, self.dynamic, self.static_until)
+        layout, flow_folder = _layout(folder, self.dynamic, self.static_until, self.missing)
         layout, thinned = fewer(layout, self.train_views, self.frames)
         static, dynamic = load_layout(layout, folder, self.downscale)
+        if not layout.moves:
+            return self.scene(folder, static, dynamic)
         if self.wants_flow_files and thinned:
             log.info("flow files dropped: data.frames=%s leaves out neighbours", self.frames)
+        elif self.wants_flow_files and layout.dynamic_train.transforms.skipped:
+            log.info("flow files dropped: they are numbered by images of which some are absent")
         elif self.wants_flow_files:
             train = _with_flow(dynamic.train, layout.dynamic_train, flow_folder)
             dynamic = replace(dynamic, train=train)
         return self.scene(folder, static, dynamic)
 
 
-def _layout(root: Path, dynamic: str | None, static_until: float) -> tuple[Layout, Path]:
+def _layout(
+    root: Path, dynamic: str | None, static_until: float, missing: Missing
+) -> tuple[Layout, Path]:
     """The splits, and the folder where flow files would lie."""
     static = root / "static"
     if not os.path.isdir(static) and not dynamic_folders(root):
@@ -65,23 +74,29 @@ def _layout(root: Path, dynamic: str | None, static_until: float) -> tuple[Layou
                 "expected static/ and dynamic_<V>views/, or transforms_train.json; "
                 "set data.root to the scene's folder",
             )
-        train = in_motion(read_transforms(root / "transforms_train.json", root))
-        test = in_motion(read_transforms(root / "transforms_test.json", root))
-        return without_static_set(train, test, static_until), root / "train_flow"
+        train, test = _train_and_test(root, root, missing)
+        if one_moment(train, test):
+            return static_alone(train, test, one_moment_in_words(train)), root
+        layout = without_static_set(in_motion(train), in_motion(test), static_until)
+        return layout, root / "train_flow"
     existing_folder(static)
+    if dynamic is None and not dynamic_folders(root):
+        why = "there is no folder dynamic_<V>views"
+        return static_alone(*_train_and_test(static, root, missing), why), root
     moving = chosen_dynamic(root, dynamic)
-    at_rest_train, at_rest_test, moving_train, moving_test = (
-        read_transforms(capture / f"transforms_{split}.json", root)
-        for capture in (static, moving)
-        for split in ("train", "test")
+    rest_sets, moving_sets = (
+        _train_and_test(static, root, missing),
+        _train_and_test(moving, root, missing),
     )
-    layout = Layout(
-        at_rest(at_rest_train),
-        at_rest(at_rest_test),
-        in_motion(moving_train),
-        in_motion(moving_test),
-    )
-    return layout, moving / "train_flow"
+    return Layout(*map(at_rest, rest_sets), *map(in_motion, moving_sets)), moving / "train_flow"
+
+
+def _train_and_test(folder: Path, root: Path, missing: Missing) -> tuple[Transforms, Transforms]:
+    """The images of a capture to learn from, and those held out."""
+    test, val = folder / "transforms_test.json", folder / "transforms_val.json"
+    held_out = val if os.path.isfile(val) and not os.path.isfile(test) else test
+    train = read_transforms(folder / "transforms_train.json", root, missing)
+    return train, read_transforms(held_out, root, missing)
 
 
 def _with_flow(views: Views, split: Split, folder: Path) -> Views:

@@ -14,6 +14,9 @@ from devrf.scenes.validation import scene_error
 
 # Room for motion where nothing else is known: the published scenes use 1.05 to 2.
 FALLBACK_BOUND_SCALE = 1.5
+# At rest: as much as is left around the rest state where the room for motion is known.
+REST_BOUND_SCALE = 1.05
+STILL = "no motion: the scene is at rest"
 # Mean square sine of the angle between the axes and their common direction: about 2 degrees.
 NEARLY_PARALLEL = 1e-3
 # A near plane inside the box's sphere would be 0 or less: stay this share of the way out.
@@ -119,7 +122,7 @@ def depth_range(cameras: Cameras, box: Box) -> tuple[float, float]:
 
 def inward_bounds(
     static: Views,
-    dynamic: Views,
+    dynamic: Views | None,
     everyone: list[Views],
     *,
     bound_scale: float | str = "auto",
@@ -131,7 +134,7 @@ def inward_bounds(
 
     Args:
         static: training views at rest, whose cameras give the box.
-        dynamic: training views in motion, whose alpha masks give the motion box.
+        dynamic: training views in motion, whose alpha masks give the motion box; None at rest.
         everyone: all views, test included; near and far hold for all their cameras.
         bound_scale: "auto" (silhouettes where there are alpha masks) or a number ≥ 1.
         near: distance in world units, or None for the cameras to say.
@@ -144,7 +147,9 @@ def inward_bounds(
     scale = FALLBACK_BOUND_SCALE if bound_scale == "auto" else float(bound_scale)
     box = box or box_from_cameras(static.cameras)
     motion, source = None, f"canonical box x bound scale {scale:g}"
-    if bound_scale == "auto":
+    if dynamic is None and bound_scale == "auto":
+        scale, source = REST_BOUND_SCALE, STILL
+    elif dynamic is not None and bound_scale == "auto":
         motion = motion_box(dynamic, box)
         if motion is None:
             source += " (no alpha masks from two cameras at every time)"

@@ -62,17 +62,26 @@ class Header:
     ambiguous_orientation: bool = False
 
 
-def find_image(path: Path) -> Path:
-    """The file at ``path``, or at ``path`` with an image suffix appended; else DevrfError."""
+def image_at(path: Path) -> Path | None:
+    """The file at ``path``, or at ``path`` with an image suffix appended; None: there is none."""
     candidates = [path.with_name(path.name + suffix) for suffix in SUFFIXES]
     if path.suffix.lower() in SUFFIXES:
         candidates.insert(0, path)
     for candidate in candidates:
         if os.path.isfile(candidate):  # Path.is_file raises on names that are too long
             return candidate
-    raise scene_error(
-        path, f"no such image (looked for {', '.join(SUFFIXES)}); correct file_path or add the file"
-    )
+    return None
+
+
+def find_image(path: Path) -> Path:
+    """As :func:`image_at`; DevrfError where there is none."""
+    found = image_at(path)
+    if found is None:
+        raise scene_error(
+            path,
+            f"no such image (looked for {', '.join(SUFFIXES)}); correct file_path or add the file",
+        )
+    return found
 
 
 def _open(path: Path) -> Image.Image:

@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
 
+from devrf.scenes.downscale import whole_factor
+from devrf.scenes.image_files import image_size
 from devrf.scenes.masks import Masks
 from devrf.scenes.scene import Capture, Views
 from devrf.scenes.splits import (
     Split,
+    at_one_moment,
     at_times,
     distinct_times,
     evenly_spread,
     first_views,
     load_views,
 )
+from devrf.scenes.transforms import Transforms
 from devrf.scenes.validation import scene_error
 
 log = logging.getLogger(__name__)
@@ -30,7 +35,7 @@ class Layout:
     Attributes:
         static_train: images of the scene at rest.
         static_test: held-out images of the scene at rest.
-        dynamic_train: images of the scene in motion.
+        dynamic_train: images of the scene in motion; of a scene at rest ``static_train`` itself.
         dynamic_test: held-out images of the scene in motion.
     """
 
@@ -38,6 +43,24 @@ class Layout:
     static_test: Split
     dynamic_train: Split
     dynamic_test: Split
+
+    @property
+    def moves(self) -> bool:
+        """Whether there are images of the scene in motion."""
+        return self.dynamic_train is not self.static_train
+
+
+def static_alone(train: Transforms, test: Transforms, why: str) -> Layout:
+    """The layout of a scene at rest, whose images all show one moment.
+
+    Args:
+        train: the images to learn from.
+        test: the held-out images.
+        why: what says so, for the log.
+    """
+    log.info("%s: %s: all images show one moment, the scene is at rest", train.file, why)
+    train_set, test_set = at_one_moment(train), at_one_moment(test)
+    return Layout(train_set, test_set, train_set, test_set)
 
 
 def without_static_set(train: Split, test: Split, static_until: float) -> Layout:
@@ -82,8 +105,12 @@ def fewer(layout: Layout, train_views: int | None, frames: int | None) -> tuple[
         frames: keep so many times, evenly spread, first and last included; None: all.
 
     Raises:
-        DevrfError: the dynamic images have one time only, or fewer views.
+        DevrfError: the dynamic images have one time only, or fewer views; or there are none.
     """
+    if not layout.moves:
+        for key, asked in (("train_views", train_views), ("frames", frames)):
+            refuse_at_rest(layout.static_train.transforms.file, f"data.{key}", asked)
+        return layout, False
     train, test = first_views(layout.dynamic_train, train_views), layout.dynamic_test
     if len(distinct_times(train.used_times)) < 2:
         raise scene_error(
@@ -99,23 +126,45 @@ def fewer(layout: Layout, train_views: int | None, frames: int | None) -> tuple[
     return replace(layout, dynamic_train=train, dynamic_test=test), kept is not None
 
 
+def refuse_at_rest(file: Path, key: str, asked: object) -> None:
+    """DevrfError where an option on motion is set (not None) for the scene at rest in ``file``."""
+    if asked is not None:
+        raise scene_error(
+            key, f"{asked} was asked for, but all images of {file} show one moment; leave it null"
+        )
+
+
 def load_layout(
-    layout: Layout, root: Path, downscale: int, masks: Masks = "none"
+    layout: Layout, root: Path, downscale: int | str, masks: Masks = "none"
 ) -> tuple[Capture, Capture]:
-    """The static and the dynamic capture, images read; ``masks`` as for load_views.
+    """The static and the dynamic capture, images read.
+
+    Args:
+        layout: which images.
+        root: the scene's folder.
+        downscale: as :class:`devrf.scenes.reader.SceneReader` has it.
+        masks: as for :func:`devrf.scenes.splits.load_views`.
 
     Raises:
         DevrfError: what :func:`devrf.scenes.splits.load_views` raises.
     """
+    factor = whole_factor(downscale, partial(_shorter_side, layout.static_train))
     splits = (layout.static_train, layout.static_test, layout.dynamic_train, layout.dynamic_test)
     loaded: list[tuple[Split, Views]] = []
     for split in splits:
         # Without a static set the captures share files: read them once.
         twin = next((v for s, v in loaded if _same_images(s, split)), None)
-        views = load_views(split, root, downscale, masks) if twin is None else twin
+        views = load_views(split, root, factor, masks) if twin is None else twin
         loaded.append((split, views))
     a, b, c, d = (views for _, views in loaded)
     return Capture(a, b), Capture(c, d)
+
+
+def _shorter_side(split: Split, factor: int) -> int:
+    """The shorter side in pixels of a split's images made smaller by ``factor``."""
+    first = int(split.index[0])
+    size = image_size(split.transforms.images[first], split.transforms.intrinsics[first].size)
+    return min(size) // factor
 
 
 def _same_images(a: Split, b: Split) -> bool:

@@ -1,8 +1,9 @@
-"""Forward-facing scenes on disk: LLFF's static folder and DeVRF's folder of fixed views."""
+"""Forward-facing scenes on disk: LLFF's folder alone, and DeVRF's with folders of fixed views."""
 
 from __future__ import annotations
 
 import logging
+import os
 from dataclasses import KW_ONLY, replace
 from pathlib import Path
 from typing import Annotated
@@ -12,26 +13,37 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
-from devrf.scenes.capture_folders import chosen_dynamic
+from devrf.scenes.bounds import STILL
+from devrf.scenes.capture_folders import chosen_dynamic, dynamic_folders
+from devrf.scenes.downscale import Downscale, folder_factor
 from devrf.scenes.flow_files import stacked_flow
 from devrf.scenes.forward_bounds import forward_bounds, reference_space
 from devrf.scenes.image_files import Size, image_size
 from devrf.scenes.image_folders import image_folder, listed_images
 from devrf.scenes.images import load_images
 from devrf.scenes.json_files import Positive
-from devrf.scenes.llff_poses import PosedSet, read_dynamic_poses, read_static_poses
+from devrf.scenes.layout import refuse_at_rest
+from devrf.scenes.llff_poses import POSES, PosedSet, read_dynamic_poses, read_static_poses
+from devrf.scenes.llff_video import VIDEO, video_captures
 from devrf.scenes.paths import existing_folder, scene_folder
-from devrf.scenes.reader import Count, Holdout, SceneReader
+from devrf.scenes.reader import Count, Holdout, SceneReader, Time
 from devrf.scenes.scene import Capture, Scene, Views
 from devrf.scenes.validation import scene_error
 from devrf.scenes.view_folders import ViewFolder, flow_files, view_folders
 
 log = logging.getLogger(__name__)
 
+# Where the room for motion comes from.
+SEEN = "all that the cameras see (forward-facing)"
+
 
 @dataclass(frozen=True)
 class LlffReader(SceneReader):
-    """Reads a scene that cameras face from one side: ``static/`` and ``dynamic_<V>views/``.
+    """Reads a scene that cameras face from one side.
+
+    Three layouts: ``static/`` and ``dynamic_<V>views/``; LLFF's ``poses_bounds.npy`` and images in
+    ``root`` itself, or in ``static/`` alone: a scene at rest; or the same as a video by one camera
+    (NR-NeRF), each image a time of its own, in the order of their names.
 
     The world's unit is 0.75 of the least depth of the static cameras, their average pose its
     origin and axes (x right, y up, −z forward). The scene's space is NDC of that camera. Images
@@ -44,32 +56,79 @@ class LlffReader(SceneReader):
         near: distance of the near plane from the average camera, in the world's unit; the
             nearest point of the static scene is at 1/0.75.
         train_views: train on the first so many of the views that are not held out; None: all.
+        monocular: whether LLFF's images are a video; None: where NR-NeRF's ``precomputed.json`` is.
+        static_until: of a video, the latest time of an image that counts as static.
     """
 
     _: KW_ONLY
     dynamic: str | None = None
-    downscale: Count = 4
+    downscale: Downscale = "up_to_4"
     test_view: Annotated[int, Field(strict=True)] = -1
     holdout: Holdout = 8
     near: Positive = 1.0
     train_views: Count | None = None
+    monocular: bool | None = None
+    static_until: Time = 1.0
 
     def read(self) -> Scene:
         """See :meth:`devrf.scenes.reader.SceneReader.read`."""
         folder = scene_folder(self.root)
-        static = _static(existing_folder(folder / "static"), folder, self.downscale, self.holdout)
-        dynamic = _dynamic(self, chosen_dynamic(folder, self.dynamic), folder)
+        static, dynamic = self._captures(folder)
         space = reference_space(static.train.cameras, self.near)
-        learned, held_out = [static.train, dynamic.train], [static.test, dynamic.test]
-        bounds = forward_bounds(learned, space, "all that the cameras see (forward-facing)")
+        # The captures of a scene at rest, and of a video, share images.
+        learned, held_out = (
+            list({id(v): v for v in both}.values())
+            for both in ((static.train, dynamic.train), (static.test, dynamic.test))
+        )
+        moves = dynamic.train is not static.train or len(set(dynamic.train.times.tolist())) > 1
+        bounds = forward_bounds(learned, space, SEEN if moves else STILL)
         # The held-out cameras need not see inside the box, but they have to look the same way.
         forward_bounds(held_out, space, "")
         _warn_of_cameras_beyond(self.near, learned + held_out)
         name = self.name_of(folder)
         return Scene(name, "forward", static, dynamic, bounds, self.background, space)
 
+    def _captures(self, folder: Path) -> tuple[Capture, Capture]:
+        """The static and the dynamic capture; of a scene at rest the same twice."""
+        posed, moving = static_folder(folder), bool(dynamic_folders(folder)) or self.dynamic
+        if moving and self.monocular:
+            raise scene_error(
+                "data.monocular", f"{folder} has fixed views, so it is no video; leave it null"
+            )
+        video = self.monocular
+        if video is None:
+            video = not moving and os.path.isfile(posed / VIDEO)
+        factor = folder_factor(posed, self.downscale)
+        images = _posed_images(posed, folder, factor)
+        if video:
+            if self.train_views is not None:
+                raise scene_error(
+                    posed, "data.train_views needs fixed cameras, and this one moves; leave it null"
+                )
+            return video_captures(images, posed, self.holdout, self.frames, self.static_until)
+        static = _held_out(images, self.holdout)
+        if moving:
+            return static, _dynamic(self, chosen_dynamic(folder, self.dynamic), folder, factor)
+        log.info("%s: no times: all images show one moment, the scene is at rest", posed)
+        for key in ("train_views", "frames"):
+            refuse_at_rest(posed, f"data.{key}", getattr(self, key))
+        return static, static
 
-def _static(folder: Path, root: Path, downscale: int, holdout: int) -> Capture:
+
+def static_folder(root: Path) -> Path:
+    """Where a scene's static cameras and images are: ``static/``, or ``root`` itself.
+
+    Raises:
+        DevrfError: neither is there.
+    """
+    static = root / "static"
+    if not os.path.isdir(static) and os.path.isfile(root / POSES) and not dynamic_folders(root):
+        return root
+    return existing_folder(static)
+
+
+def _posed_images(folder: Path, root: Path, downscale: int) -> Views:
+    """All images of a folder, with the cameras of its ``poses_bounds.npy``, at time 0."""
     posed = read_static_poses(folder).normalised()
     source = image_folder(folder, downscale)
     images = listed_images(source.path)
@@ -83,7 +142,7 @@ def _static(folder: Path, root: Path, downscale: int, holdout: int) -> Capture:
         raise scene_error(source.path, "holds one image, expected at least one more to hold out")
     loaded = load_images(images, source.downscale, posed.sizes)
     count, height, width = loaded.pixels.shape[:3]
-    views = Views(
+    return Views(
         loaded.pixels,
         posed.cameras(width, height),
         torch.zeros(count),
@@ -91,7 +150,11 @@ def _static(folder: Path, root: Path, downscale: int, holdout: int) -> Capture:
         _names(images, root),
         ambiguous_orientation=loaded.ambiguous_orientation,
     )
-    order = torch.arange(count)
+
+
+def _held_out(views: Views, holdout: int) -> Capture:
+    """A static capture of which one image in ``holdout`` is held out, the first included."""
+    order = torch.arange(len(views))
     train, test = views[order[order % holdout != 0]], views[order[order % holdout == 0]]
     return Capture(_numbered(train), _numbered(test))
 
@@ -101,8 +164,8 @@ def _numbered(views: Views) -> Views:
     return replace(views, view=torch.arange(len(views)))
 
 
-def _dynamic(options: LlffReader, folder: Path, root: Path) -> Capture:
-    views = view_folders(folder, options.downscale)
+def _dynamic(options: LlffReader, folder: Path, root: Path, downscale: int) -> Capture:
+    views = view_folders(folder, downscale)
     posed = read_dynamic_poses(folder)
     if len(posed) < len(views):
         raise scene_error(

@@ -20,6 +20,8 @@ from devrf.scenes.lens import LEAST_FOCAL, MOST_FOCAL, MOST_OFFSET
 from devrf.scenes.poses import FARTHEST, in_reach, is_rotation
 from devrf.scenes.validation import scene_error
 
+# The file of LLFF's cameras.
+POSES = "poses_bounds.npy"
 # Images made smaller lose a fraction of a pixel; images of another shape belong to other poses.
 ASPECT_TOLERANCE = 0.05
 # The nearest point of the scene comes to rest at 1/0.75 of the near plane, as the field does it.
@@ -122,7 +124,7 @@ def read_static_poses(folder: Path) -> PosedSet:
     Raises:
         DevrfError: a file is missing or damaged, or holds something else.
     """
-    file, inner = folder / "poses_bounds.npy", folder / "hwf_cxcy.npy"
+    file, inner = folder / POSES, folder / "hwf_cxcy.npy"
     rows = read_numbers(file, "the static cameras, (N, 17) or (N, 14)")
     if rows.ndim != 2 or rows.shape[1] not in (14, 17) or len(rows) == 0:
         raise scene_error(

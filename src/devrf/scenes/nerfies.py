@@ -18,18 +18,20 @@ from pydantic import (
 )
 from pydantic.dataclasses import dataclass
 
+from devrf.scenes.absent_images import present_images
 from devrf.scenes.bounds import box_of_frusta
+from devrf.scenes.downscale import Downscale, folder_factor
 from devrf.scenes.holdout import every_nth
 from devrf.scenes.image_folders import image_folder
 from devrf.scenes.json_files import Name, Number, Positive, Vector3, read_json
-from devrf.scenes.layout import fewer, load_layout, without_static_set
+from devrf.scenes.layout import Layout, fewer, load_layout, static_alone, without_static_set
 from devrf.scenes.nerfies_camera import read_camera
 from devrf.scenes.paths import scene_folder
 from devrf.scenes.poses import FARTHEST
-from devrf.scenes.reader import Count, EstimatedFlow, Holdout, InwardReader, Time
+from devrf.scenes.reader import EstimatedFlow, Holdout, InwardReader, Time
 from devrf.scenes.scene import Scene
-from devrf.scenes.splits import in_motion
-from devrf.scenes.transforms import Transforms, listed_image
+from devrf.scenes.splits import in_motion, one_moment
+from devrf.scenes.transforms import Transforms
 from devrf.scenes.validation import abbreviated, first_error, scene_error
 
 log = logging.getLogger(__name__)
@@ -88,7 +90,8 @@ class NerfiesReader(InwardReader):
     World units are those of ``scene.json``: (position − center) · scale; it gives near and far,
     too. The time of an image is its ``time_id`` (HyperNeRF), else its ``warp_id``, brought to
     [0, 1]. Images come from ``rgb/<downscale>x``, or from a larger folder and are made smaller;
-    they are undistorted. Without alpha masks the box is all that the cameras see
+    they are undistorted. With one time for all of them the scene is at rest.
+    Without alpha masks the box is all that the cameras see
     between near and far.
 
     Attributes:
@@ -97,7 +100,7 @@ class NerfiesReader(InwardReader):
     """
 
     _: KW_ONLY
-    downscale: Count = 4
+    downscale: Downscale = "up_to_4"
     flow: EstimatedFlow = "auto"
     holdout: Holdout = 8
     static_until: Time = 1.0
@@ -109,11 +112,14 @@ class NerfiesReader(InwardReader):
             folder / SCENE, _WORLD, "it says where the scene is; set data.root to its folder"
         )
         items, train, test = _items(folder / DATASET, self.holdout)
-        images = image_folder(folder / "rgb", self.downscale, full="1x", reduced="{}x")
-        transforms = _transforms(folder, items, images.path, world)
-        layout = without_static_set(
-            in_motion(transforms[train]), in_motion(transforms[test]), self.static_until
-        )
+        names = {"full": "1x", "reduced": "{}x"}
+        factor = folder_factor(folder / "rgb", self.downscale, **names)
+        images = image_folder(folder / "rgb", factor, **names)
+        listed = [f"rgb/{images.path.name}/{item}" for item in items]
+        present = present_images(listed, folder / DATASET, folder, self.missing)
+        transforms = _transforms(folder, items, present, world)
+        train, test = (_present(part, present, folder / DATASET) for part in (train, test))
+        layout = _layout(transforms, train, test, self.static_until)
         layout, _ = fewer(layout, None, self.frames)
         static, dynamic = load_layout(layout, folder, images.downscale)
         near = world.near if self.near is None else self.near
@@ -124,6 +130,14 @@ class NerfiesReader(InwardReader):
             seen = box_of_frusta(static.train.cameras, near, far)
             box = [seen.low, seen.high]
         return replace(self, near=near, far=far, box=box).scene(folder, static, dynamic)
+
+
+def _layout(transforms: Transforms, train: list[int], test: list[int], until: float) -> Layout:
+    if not one_moment(transforms):
+        both = in_motion(transforms[train]), in_motion(transforms[test])
+        return without_static_set(*both, until)
+    why = f"all images have one time in {METADATA}"
+    return static_alone(transforms[train], transforms[test], why)
 
 
 def _items(file: Path, holdout: int) -> tuple[list[str], list[int], list[int]]:
@@ -161,21 +175,39 @@ def _items(file: Path, holdout: int) -> tuple[list[str], list[int], list[int]]:
     return items, learned, [position[item] for item in val]
 
 
-def _transforms(folder: Path, items: list[str], images: Path, world: _World) -> Transforms:
-    file = folder / DATASET
-    cameras = [read_camera(folder, item, world.center, world.scale) for item in items]
+def _present(wanted: list[int], present: dict[int, Path], file: Path) -> list[int]:
+    """Positions among the images that are present."""
+    place = {position: k for k, position in enumerate(present)}
+    kept = [place[position] for position in wanted if position in place]
+    if not kept:
+        raise scene_error(
+            file, "all images to learn from, or all that are held out, are absent; add them"
+        )
+    return kept
+
+
+def _transforms(
+    folder: Path, items: list[str], images: dict[int, Path], world: _World
+) -> Transforms:
+    """The images, by their positions among the items, with cameras and times."""
+    names = [items[position] for position in images]
+    cameras = [read_camera(folder, name, world.center, world.scale) for name in names]
     return Transforms(
-        file,
+        folder / DATASET,
         tuple(intrinsics for _, intrinsics in cameras),
-        tuple(listed_image(f"rgb/{images.name}/{item}", file, folder) for item in items),
+        tuple(images.values()),
         torch.stack([pose for pose, _ in cameras]),
-        _times(folder / METADATA, items),
+        _times(folder / METADATA, names),
     )
 
 
 def _times(file: Path, items: list[str]) -> tuple[float, ...]:
     """When each image was taken, from 0 (the first of all) to 1 (the last)."""
-    content = read_json(file, _ENTRIES, "it says when each image was taken; add it")
+    content = read_json(
+        file,
+        _ENTRIES,
+        "it says when each image was taken; add it, with one time_id for all of a scene at rest",
+    )
     moments = []
     for item in items:
         if item not in content:
@@ -192,6 +224,4 @@ def _times(file: Path, items: list[str]) -> tuple[float, ...]:
             raise scene_error(file, f"image {abbreviated(item)} has no {key}; add it")
         ids.append(value)
     first, last = min(ids), max(ids)
-    if first == last:
-        raise scene_error(file, f"all images have the {key} {first:g}, expected at least two times")
-    return tuple((value - first) / (last - first) for value in ids)
+    return tuple((value - first) / ((last - first) or 1.0) for value in ids)

@@ -1,4 +1,4 @@
-"""Scenes in nerfstudio's layout: one ``transforms.json`` for all images, with a time on each."""
+"""Scenes in nerfstudio's and instant-ngp's layout: one ``transforms.json`` for all images."""
 
 from __future__ import annotations
 
@@ -12,13 +12,20 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from devrf.scenes.holdout import every_nth
-from devrf.scenes.layout import Layout, fewer, load_layout, without_static_set
+from devrf.scenes.image_files import find_image, image_at
+from devrf.scenes.layout import Layout, fewer, load_layout, static_alone, without_static_set
 from devrf.scenes.masks import Masks
-from devrf.scenes.paths import scene_folder
+from devrf.scenes.paths import inside, scene_folder
 from devrf.scenes.reader import Count, EstimatedFlow, Holdout, InwardReader, Time
 from devrf.scenes.scene import Scene
-from devrf.scenes.splits import at_rest, distinct_poses, in_motion
-from devrf.scenes.transforms import Transforms, listed_image, posed_images, read_listing
+from devrf.scenes.splits import (
+    at_rest,
+    distinct_poses,
+    in_motion,
+    one_moment,
+    one_moment_in_words,
+)
+from devrf.scenes.transforms import Transforms, posed_images, read_listing
 from devrf.scenes.validation import abbreviated, scene_error
 
 log = logging.getLogger(__name__)
@@ -34,7 +41,8 @@ class NerfstudioReader(InwardReader):
     """Reads ``transforms.json`` and images.
 
     The file may lie in ``root``, with a ``time`` in [0, 1] on every frame, or in
-    ``root/static`` and, with times, in ``root/dynamic``. Cameras may stand still or move.
+    ``root/static`` and, with times, in ``root/dynamic``. Without times, or without
+    ``root/dynamic``, the scene is at rest. Cameras may stand still or move.
     Held-out images are those in ``test_filenames`` (else ``val_filenames``), else every
     ``holdout``-th. Images are undistorted; the world is that of the file's poses.
 
@@ -62,42 +70,44 @@ class NerfstudioReader(InwardReader):
     def read(self) -> Scene:
         """See :meth:`devrf.scenes.reader.SceneReader.read`."""
         folder = scene_folder(self.root)
-        layout = _layout(folder, self.holdout, self.static_until, self.masks != "none")
+        layout = _layout(folder, self)
         layout, _ = fewer(layout, self.train_views, self.frames)
         return self.scene(folder, *load_layout(layout, folder, self.downscale, self.masks))
 
 
-def _layout(root: Path, holdout: int, static_until: float | None, masked: bool) -> Layout:
+def _layout(root: Path, options: NerfstudioReader) -> Layout:
     if os.path.isfile(root / FILE):
-        both = _train_and_test(root / FILE, root, holdout, masked)
-        return _one_file(*_with_times(*both), static_until)
+        train, test = _train_and_test(root / FILE, root, options)
+        if one_moment(train, test):
+            return static_alone(train, test, one_moment_in_words(train))
+        return _one_file(train, test, options.static_until)
     still, moving = root / "static" / FILE, root / "dynamic" / FILE
     if not os.path.isfile(still) and not os.path.isfile(moving):
         raise scene_error(
             root,
-            f"expected {FILE}, or static/{FILE} and dynamic/{FILE}; set data.root to the "
+            f"expected {FILE}, or static/{FILE} (and dynamic/{FILE}); set data.root to the "
             "scene's folder",
         )
-    rest = _train_and_test(still, root, holdout, masked)
-    motion = _with_times(*_train_and_test(moving, root, holdout, masked))
-    return Layout(at_rest(rest[0]), at_rest(rest[1]), in_motion(motion[0]), in_motion(motion[1]))
-
-
-def _with_times(train: Transforms, test: Transforms) -> tuple[Transforms, Transforms]:
-    if train.times is None:
+    rest = _train_and_test(still, root, options)
+    if not os.path.isfile(moving):
+        return static_alone(*rest, f"there is no dynamic/{FILE}")
+    motion = _train_and_test(moving, root, options)
+    if motion[0].times is None:
         raise scene_error(
-            train.file,
+            moving,
             'its frames have no "time", which a capture of a moving scene needs; '
             "give every frame its time in [0, 1]",
         )
-    return train, test
+    return Layout(at_rest(rest[0]), at_rest(rest[1]), in_motion(motion[0]), in_motion(motion[1]))
 
 
 def _train_and_test(
-    file: Path, root: Path, holdout: int, masked: bool
+    file: Path, root: Path, options: NerfstudioReader
 ) -> tuple[Transforms, Transforms]:
     listing = read_listing(file)
-    transforms = posed_images(listing, file, root, masked=masked)
+    transforms = posed_images(
+        listing, file, root, masked=options.masks != "none", missing=options.missing
+    )
     count = len(transforms.images)
     listed = {
         split: _listed(getattr(listing, f"{split}_filenames"), split, transforms, root)
@@ -109,7 +119,7 @@ def _train_and_test(
     if listed["train"] and not test:
         test = sorted(set(range(count)) - set(train))
     elif not test and count > 1:
-        train, test = every_nth(count, holdout)
+        train, test = every_nth(count, options.holdout)
     if not train or not test or set(train) & set(test):
         raise scene_error(
             file,
@@ -125,7 +135,10 @@ def _listed(names: list[str] | None, split: str, transforms: Transforms, root: P
     position = {image: i for i, image in enumerate(transforms.images)}
     found = []
     for name in names or []:
-        image = listed_image(name, transforms.file, root)
+        place = inside(root, transforms.file.parent, name, transforms.file)
+        if transforms.skipped and image_at(place) is None:
+            continue
+        image = find_image(place)
         if image not in position:
             raise scene_error(
                 transforms.file,
@@ -181,5 +194,5 @@ def _seen_moving(transforms: Transforms) -> list[int]:
 
 
 def _times(transforms: Transforms) -> Tensor:
-    assert transforms.times is not None  # _with_times asks for them
+    assert transforms.times is not None  # else the scene is at rest
     return torch.tensor(transforms.times)

@@ -11,7 +11,10 @@ from typing import Annotated, Any, Literal
 from pydantic import ConfigDict, Field, PlainValidator, ValidationError, model_validator
 from pydantic.dataclasses import dataclass
 
+from devrf.geometry.clock import FrameClock
+from devrf.scenes.absent_images import Missing
 from devrf.scenes.bounds import inward_bounds
+from devrf.scenes.downscale import Downscale
 from devrf.scenes.json_files import Number
 from devrf.scenes.scene import Background, Capture, Scene
 from devrf.scenes.validation import LARGEST, checked_box, first_error
@@ -53,7 +56,8 @@ class SceneReader(ABC):
     Attributes:
         root: the scene's folder.
         name: short name; None takes the folder's.
-        downscale: integer factor ≥ 1 by which images and flow are made smaller.
+        downscale: integer factor ≥ 1 by which images and flow are made smaller; ``up_to_<factor>``:
+            no further than to 64 pixels of the shorter side.
         background: what is behind the alpha masks of RGBA images; RGB images are used as they are.
         flow: ``files`` reads the scene's backward flow where there is any, ``dis`` and ``raft``
             estimate it, ``none`` does without; ``auto`` reads the files, else estimates with
@@ -68,7 +72,7 @@ class SceneReader(ABC):
     root: str | Path
     _: KW_ONLY
     name: str | None = None
-    downscale: Count = 1
+    downscale: Downscale = 1
     background: Background = "white"
     flow: FlowSource = "auto"
     flow_cache: str | Path | None = None
@@ -110,6 +114,7 @@ class InwardReader(SceneReader):
         near: distance in world units before which nothing is; None: from the cameras.
         far: distance in world units behind which nothing is; None: from the cameras.
         box: [[x, y, z], [x, y, z]] in world units; None: from the cameras.
+        missing: whether listed images that are absent are an ``error``, or left out (``skip``).
     """
 
     _: KW_ONLY
@@ -117,6 +122,7 @@ class InwardReader(SceneReader):
     near: Number | None = None
     far: Number | None = None
     box: Corners = None
+    missing: Missing = "error"
 
     def scene(self, folder: Path, static: Capture, dynamic: Capture) -> Scene:
         """The scene of two captures that were read from ``folder``, its bounds found.
@@ -126,7 +132,7 @@ class InwardReader(SceneReader):
         """
         bounds = inward_bounds(
             static.train,
-            dynamic.train,
+            dynamic.train if len(FrameClock.from_times(dynamic.train.times)) > 1 else None,
             [static.train, static.test, dynamic.train, dynamic.test],
             bound_scale=self.bound_scale,
             near=self.near,

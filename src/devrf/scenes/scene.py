@@ -150,13 +150,14 @@ class Bounds:
 
 @dataclass(frozen=True)
 class Scene:
-    """A static → dynamic capture.
+    """A static → dynamic capture, or a static one alone.
 
     Attributes:
         name: short name for folders and tables.
         kind: ``inward`` (cameras around the scene) or ``forward`` (cameras before it, NDC).
         static: many views of the scene at rest (t = 0).
-        dynamic: a few fixed views of the scene as it deforms.
+        dynamic: a few fixed views of the scene as it deforms; of a scene that is always at rest the
+            static capture itself.
         bounds: where the scene is.
         background: what is behind the matte.
         space: the space that the fields live in, and in which ``bounds`` are given.
@@ -187,9 +188,20 @@ class Scene:
         return self.static if name == "static" else self.dynamic
 
     @property
+    def captures(self) -> dict[CaptureName, Capture]:
+        """The captures by name; of a scene at rest the static one alone."""
+        static: dict[CaptureName, Capture] = {"static": self.static}
+        return {**static, "dynamic": self.dynamic} if self.moves else static
+
+    @property
     def clock(self) -> FrameClock:
         """The clock of the dynamic training views' times."""
         return FrameClock.from_times(self.dynamic.train.times)
+
+    @property
+    def moves(self) -> bool:
+        """Whether it was seen at more than one time."""
+        return len(self.clock) > 1
 
     @property
     def fingerprint(self) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from bisect import bisect_left, bisect_right, insort
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -86,6 +86,22 @@ def at_rest(transforms: Transforms) -> Split:
     count = len(transforms.images)
     times = torch.zeros(count) if transforms.times is None else torch.tensor(transforms.times)
     return Split(transforms, times, torch.arange(count), False, torch.arange(count))
+
+
+def at_one_moment(transforms: Transforms) -> Split:
+    """A split of a scene that never moves: as :func:`at_rest`, whatever one time the file gives."""
+    return replace(at_rest(transforms), times=torch.zeros(len(transforms.images)))
+
+
+def one_moment(*sets: Transforms) -> bool:
+    """Whether some sets of images have no times, or one time altogether."""
+    times = [time for transforms in sets for time in transforms.times or ()]
+    return len(distinct_times(torch.tensor(times))) < 2
+
+
+def one_moment_in_words(transforms: Transforms) -> str:
+    """What says that :func:`one_moment` holds."""
+    return "its frames have no time" if transforms.times is None else "its frames have one time"
 
 
 def in_motion(transforms: Transforms) -> Split:

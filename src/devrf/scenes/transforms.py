@@ -16,7 +16,7 @@ import torch
 from pydantic import AfterValidator, Field, TypeAdapter
 from torch import Tensor
 
-from devrf.scenes.image_files import find_image
+from devrf.scenes.absent_images import Missing, present_images
 from devrf.scenes.intrinsics import CameraKeys, Intrinsics, frame_intrinsics, intrinsics_of
 from devrf.scenes.json_files import Name, Number, Vector4, read_json
 from devrf.scenes.paths import inside
@@ -82,6 +82,7 @@ class Transforms:
         times: N times in [0, 1], or None when the file gives none.
         masks: N existing files inside the scene's folder, or None of an image without one; None
             where they were not asked for.
+        skipped: how many images of the file are absent, and left out.
     """
 
     file: Path
@@ -90,6 +91,7 @@ class Transforms:
     poses: Tensor
     times: tuple[float, ...] | None
     masks: tuple[Path | None, ...] | None = None
+    skipped: int = 0
 
     def __getitem__(self, index: Sequence[int]) -> Transforms:
         """The images at the positions ``index``, at least one, in that order."""
@@ -100,6 +102,7 @@ class Transforms:
             self.poses[list(index)],
             None if self.times is None else tuple(self.times[i] for i in index),
             None if self.masks is None else tuple(self.masks[i] for i in index),
+            self.skipped,
         )
 
 
@@ -113,13 +116,18 @@ def read_listing(file: Path) -> TransformsFile:
     return read_json(file, _FILE, "every capture needs its posed images")
 
 
-def read_transforms(file: Path, root: Path) -> Transforms:
+def read_transforms(file: Path, root: Path, missing: Missing = "error") -> Transforms:
     """One split, or one file of all images; see :func:`read_listing` and :func:`posed_images`."""
-    return posed_images(read_listing(file), file, root)
+    return posed_images(read_listing(file), file, root, missing=missing)
 
 
 def posed_images(
-    listing: TransformsFile, file: Path, root: Path, *, masked: bool = False
+    listing: TransformsFile,
+    file: Path,
+    root: Path,
+    *,
+    masked: bool = False,
+    missing: Missing = "error",
 ) -> Transforms:
     """The posed images that a transforms file lists.
 
@@ -128,13 +136,15 @@ def posed_images(
         file: where it is; its image paths are relative to its folder.
         root: the scene's folder, which no image path may leave.
         masked: whether ``mask_path`` is followed, too.
+        missing: as for :func:`devrf.scenes.absent_images.present_images`.
 
     Raises:
         DevrfError: an image is missing, a pose is no rigid transform, or only some frames have
             a time.
     """
-    frames = listing.frames
-    where = [f"{file}: frames[{index}]" for index in range(len(frames))]
+    images = present_images([one.file_path for one in listing.frames], file, root, missing)
+    frames = [listing.frames[index] for index in images]
+    where = [f"{file}: frames[{index}]" for index in images]
     times = [frame.time for frame in frames]
     known = [t for t in times if t is not None]
     if known and len(known) < len(times):
@@ -144,21 +154,19 @@ def posed_images(
         )
     return Transforms(
         file,
-        _intrinsics(listing, where, file),
-        tuple(listed_image(frame.file_path, file, root) for frame in frames),
+        _intrinsics(listing, frames, where, file),
+        tuple(images.values()),
         _poses(frames, where).float(),
         tuple(known) or None,
         tuple(_mask(frame, file, root) for frame in frames) if masked else None,
+        skipped=len(listing.frames) - len(frames),
     )
 
 
-def listed_image(name: str, file: Path, root: Path) -> Path:
-    """The existing image inside ``root`` that ``file`` calls ``name``; else DevrfError."""
-    return find_image(inside(root, file.parent, name, file))
-
-
-def _intrinsics(listing: TransformsFile, where: list[str], file: Path) -> tuple[Intrinsics, ...]:
-    own = [frame_intrinsics(listing, f, at) for f, at in zip(listing.frames, where, strict=True)]
+def _intrinsics(
+    listing: TransformsFile, frames: list[Frame], where: list[str], file: Path
+) -> tuple[Intrinsics, ...]:
+    own = [frame_intrinsics(listing, f, at) for f, at in zip(frames, where, strict=True)]
     if None not in own:
         return tuple(lens for lens in own if lens is not None)
     shared = intrinsics_of(listing, file)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
+from devrf.errors import DevrfError
 from devrf.evaluation.held_out import score
 from devrf.methods.devrf.compact_state import expanded_state
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
@@ -40,6 +41,24 @@ def test_two_steps_move_the_first_frame_only(
         assert not frames[0].any() and not frames[2].any()
     for name, value in stage.scene_model.canonical.named_parameters():
         assert torch.equal(value, before[name])
+
+
+def test_a_scene_at_rest_has_no_motion_to_learn(
+    rest: LoadedCheckpoint, tiny_scene: Scene, trainer: Callable[..., Trainer]
+) -> None:
+    module = Static()
+    module.given = replace(tiny_scene, dynamic=tiny_scene.static)
+    with pytest.raises(DevrfError, match="is at rest, so there is no motion to learn"):
+        trainer(max_steps=1).fit(DeformationStage(rest, SHORT), datamodule=module)
+
+
+class Static(SceneDataModule):
+    """Serves a scene at rest."""
+
+    given: Scene
+
+    def load(self) -> Scene:
+        return self.given
 
 
 def test_a_whole_schedule_sees_the_motion_better_than_the_rest_pose(

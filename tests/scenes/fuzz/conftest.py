@@ -209,7 +209,7 @@ def check_scene(scene: Scene) -> None:
     bounds = scene.bounds
     corners = torch.tensor([bounds.box.low, bounds.box.high])
     assert bool(corners.isfinite().all()) and 0 <= bounds.near < bounds.far < 1e10
-    assert len(scene.clock) >= 2 and scene.fingerprint
+    assert scene.fingerprint and (scene.moves or scene.dynamic.train is scene.static.train)
 
 
 class Verdicts:

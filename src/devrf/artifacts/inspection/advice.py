@@ -27,14 +27,13 @@ class Advice:
 
 
 def image_sets(scene: Scene) -> dict[str, Views]:
-    """The four sets of images by the names that a report gives them; empty ones are left out."""
-    sets = {
-        "static training set": scene.static.train,
-        "static test set": scene.static.test,
-        "dynamic training set": scene.dynamic.train,
-        "dynamic test set": scene.dynamic.test,
+    """The sets of images by the names that a report gives them; empty ones are left out."""
+    return {
+        f"{name} {kind} set": views
+        for name, capture in scene.captures.items()
+        for kind, views in (("training", capture.train), ("test", capture.test))
+        if len(views)
     }
-    return {name: views for name, views in sets.items() if len(views)}
 
 
 def images_where(scene: Scene, test: Callable[[Views, int], bool]) -> list[str]:

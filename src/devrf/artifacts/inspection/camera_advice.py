@@ -27,7 +27,7 @@ def camera_advice(scene: Scene) -> list[Advice]:
 
 
 def _held_out(scene: Scene) -> Iterator[Advice]:
-    for name, capture in (("static", scene.static), ("dynamic", scene.dynamic)):
+    for name, capture in scene.captures.items():
         if len(capture.test) == 0:
             yield Advice(
                 f"{name} test set",

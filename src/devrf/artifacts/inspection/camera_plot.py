@@ -76,12 +76,16 @@ def scene_lines(scene: Scene) -> list[Lines]:
     lines = [Lines("box" + endless * " (endless, cut off)", box_edges(scene, bounds.box), "0.2", 2)]
     if bounds.motion is not None:
         lines.append(Lines("room for motion", box_edges(scene, bounds.motion), "#1f9e6b", 2))
-    for label, views, color, width in (
+    sets = [
         ("static views", scene.static.train, "#4f7fd0", 1.0),
         ("held-out static", scene.static.test, "#7cc4ea", 1.0),
-        ("dynamic views", scene.dynamic.train, TRAIN_COLOR, 2.0),
-        ("held-out dynamic", scene.dynamic.test, TEST_COLOR, 2.0),
-    ):
+    ]
+    if scene.moves:
+        sets += [
+            ("dynamic views", scene.dynamic.train, TRAIN_COLOR, 2.0),
+            ("held-out dynamic", scene.dynamic.test, TEST_COLOR, 2.0),
+        ]
+    for label, views, color, width in sets:
         images = list(first_images(views).values())
         ends = frusta(views.cameras[images], size)
         lines.append(Lines(f"{label} ({len(images)})", ends, color, width))

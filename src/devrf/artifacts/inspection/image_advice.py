@@ -118,6 +118,8 @@ def _masks(scene: Scene) -> Iterator[Advice]:
 
 
 def _times(scene: Scene) -> Iterator[Advice]:
+    if not scene.moves:
+        return
     views, clock = scene.dynamic.train, scene.clock
     first = float(views.times.min())
     if first > FrameClock.TOLERANCE:

@@ -58,7 +58,8 @@ def inspection_figure(scene: Scene) -> Figure:
     views = scene.static.train
     tiles = [(shown(views, k), short_name(views.names[k])) for k in evenly(len(views), COLUMNS)]
     static = f"Static training set: {len(views)} images", [tiles]
-    sections: list[Section] = [static, *_dynamic_sections(scene.dynamic.train)]
+    moving = _dynamic_sections(scene.dynamic.train) if scene.moves else []
+    sections: list[Section] = [static, *moving]
     tile = min(TALLEST, WIDTH / COLUMNS * views.height / views.width)
     heights = [CAMERAS, *(HEADING + len(rows) * (tile + CAPTION) for _, rows in sections)]
     with matplotlib.rc_context(STYLE):

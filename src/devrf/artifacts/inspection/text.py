@@ -53,11 +53,12 @@ def _titled_table(
 def _facts(found: Inspection) -> list[tuple[str, str]]:
     scene, bounds, times = found.scene, found.scene.bounds, found.times
     spacing = "evenly spaced" if found.even else "unevenly spaced"
+    span = f"{len(times)} from {times[0]:g} to {times[-1]:g}, {spacing}"
     unit = "NDC" if scene.kind == "forward" else "world units"
     motion = "" if bounds.motion is None else f"{bounds.motion}, "
     rows = [
         ("scene", f"{scene.name}, {scene.kind}-facing, {scene.background} background"),
-        ("times", f"{len(times)} from {times[0]:g} to {times[-1]:g}, {spacing}"),
+        ("times", span if scene.moves else "one moment: the scene is at rest"),
         ("near, far", f"{bounds.near:.4g}, {bounds.far:.4g} ({unit})"),
         ("box", str(bounds.box)),
         ("room for motion", f"{motion}{bounds.source}"),

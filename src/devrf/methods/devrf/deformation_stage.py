@@ -16,6 +16,7 @@ from devrf.engine.ddp import broadcast
 from devrf.engine.graphs import Graphs
 from devrf.engine.parallel_batch import ParallelBatch
 from devrf.engine.phase import Phase
+from devrf.errors import DevrfError
 from devrf.methods.devrf import convergence
 from devrf.methods.devrf.active_frame import ActiveFrames
 from devrf.methods.devrf.deformation_field import DeformationField
@@ -128,8 +129,17 @@ class DeformationStage(VoxelStage):
         return self.phase_at(iteration).learning_rate_factor
 
     def setup(self, stage: str) -> None:
-        """Build the field at rest, at the coarsest resolution, in the canonical field's box."""
+        """Build the field at rest, at the coarsest resolution, in the canonical field's box.
+
+        Raises:
+            DevrfError: the scene is at rest.
+        """
         super().setup(stage)
+        if not self.scene.moves:
+            raise DevrfError(
+                f"{self.scene.name}: is at rest, so there is no motion to learn; the canonical "
+                "stage is all that it takes"
+            )
         model, motion = self.scene_model, self.motion
         if model.deformation is None:
             voxels = self.schedule.sides[0] ** 3

@@ -222,7 +222,7 @@ class DNeRF(DynamicModel):
         terms = super().loss_terms(output, batch, names) if "color" in names else {}
         if "temporal" in names:
             points, time = output.extras["points"].detach(), output.extras["time"]
-            between = 1 / (len(self.clock) - 1)
+            between = 1 / max(len(self.clock) - 1, 1)
             other = (time + between * (2 * torch.rand_like(time) - 1)).clamp(0, 1)
             change = self.deformation(points, time) - self.deformation(points, other)
             terms["temporal"] = change.square().sum()
