@@ -11,7 +11,7 @@ def test_the_last_lines_are_commands_that_work(devrf, tmp_path, trained):
     lines = outcome.out.splitlines()
     at = next(k for k, line in enumerate(lines) if line.startswith("results:"))
     found = "(metrics.json, images, videos/orbit.mp4, checkpoints)"
-    assert lines[at].endswith(f"{folder.parent.name}/{folder.name} {found}")
+    assert lines[at] == f"results: outputs/{folder.parent.name}/{folder.name} {found}"
     commands = [shlex.split(line) for line in lines[at + 2 :]]
     assert [words[:3] for words in commands] == [["python", "-m", "devrf"]] * 3
     copy = tmp_path / "outputs" / folder.parent.name / folder.name

@@ -61,7 +61,7 @@ def test_the_options_of_the_reader_reach_it(devrf, tmp_path, moving, short):
     options = ("data.downscale=2", "data.train_views=1", "data.frames=2", "data.name=w")
     done = devrf(f"data.root={moving}", *options, *short, "stage=canonical")
     assert (done.status, done.err) == (0, "")
-    stored = OmegaConf.load(tmp_path / "outputs/w/default/checkpoints/config.yaml").data
+    stored = OmegaConf.load(tmp_path / "outputs/w/quickstart/checkpoints/config.yaml").data
     assert stored._target_ == "devrf.data.inward.InwardFacingDataModule"
     assert (stored.downscale, stored.train_views, stored.frames) == (2, 1, 2)
     assert (stored.background, stored.bound_scale) == ("white", "auto")

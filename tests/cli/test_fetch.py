@@ -65,7 +65,7 @@ def test_single_files_are_fetched_and_their_checksum_is_kept(devrf, tmp_path, pu
     digest = hashlib.sha256(lines.encode()).hexdigest()
     assert record(fox)["sha256"] == digest and record(fox)["compared"] is False
     assert f"SHA-256 {digest}: none was known to compare it with" in outcome.out
-    assert "python -m devrf stage=inspect data=nerfstudio data.root=scenes/fox" in outcome.out
+    assert "python -m devrf stage=inspect data.root=scenes/fox" in outcome.out
     assert {path.name for path in (tmp_path / "scenes").iterdir()} == {"fox"}
     assert devrf(*published, "scene=fox", "fetch.into=b", f"fetch.sha256={digest}").status == 0
     assert record(tmp_path / "b" / "fox")["compared"] is True

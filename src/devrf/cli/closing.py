@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import logging
+import os
 import shlex
 from pathlib import Path
-
-from devrf.cli import job
 
 log = logging.getLogger(__name__)
 
@@ -22,10 +21,9 @@ NEXT = (
 def say_what_next(folder: Path) -> None:
     """Log where the results are, and commands that go on from them."""
     found = ", ".join(name for name in RESULTS if (folder / name).exists())
-    log.info("results: %s (%s)", folder, found)
+    place = Path(os.path.relpath(folder)) if folder.is_relative_to(Path.cwd()) else folder
+    log.info("results: %s (%s)", place, found)
     log.info("next:")
-    given = [word for word in job.overrides() if not word.startswith("stage=")]
-    given += [word for word in job.hydra_overrides() if word.startswith("hydra.run.dir=")]
     for words in NEXT:
-        chosen = [] if words == "stage=report" else given
+        chosen = [] if words == "stage=report" else [f"hydra.run.dir={place}"]
         log.info("  %s", shlex.join(["python", "-m", "devrf", *chosen, *words.split()]))

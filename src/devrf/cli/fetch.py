@@ -55,7 +55,7 @@ def _conclude(scene: PublishedScene, done: Fetched) -> None:
             done.sha256,
             done.path / RECORD,
         )
-    given = [f"data={scene.collection.data}", f"data.root={done.path}"]
+    given = [f"data.root={done.path}"]
     log.info("next:")
     for first in (["stage=inspect"], scene.collection.learn.split()):
         log.info("  %s", shlex.join(["python", "-m", "devrf", *first, *given]))

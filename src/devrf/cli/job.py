@@ -19,11 +19,6 @@ def overrides() -> list[str]:
     return list(HydraConfig.get().overrides.task) if HydraConfig.initialized() else []
 
 
-def hydra_overrides() -> list[str]:
-    """The overrides of Hydra's own keys on the command line; empty outside Hydra."""
-    return list(HydraConfig.get().overrides.hydra) if HydraConfig.initialized() else []
-
-
 def in_sweep() -> bool:
     """Whether the job is one of a multirun."""
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN

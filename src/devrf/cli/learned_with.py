@@ -28,7 +28,7 @@ from devrf.errors import DevrfError
 log = logging.getLogger(__name__)
 
 # Stages that a checkpoint is not looked for: they learn from nothing, or only read a scene.
-FROM_NOTHING = {"pipeline", "inspect", "prepare", "report"}
+FROM_NOTHING = {"pipeline", "fetch", "inspect", "prepare", "report"}
 # Stages that show or score a checkpoint, beside what it is the checkpoint of.
 OF_A_CHECKPOINT = {"evaluate", "render", "still"}
 

@@ -110,7 +110,7 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
     asked = plan(config.stage, run.learning_stages)
     _check(run, asked)
     if _all_done(run, asked):
-        return _objective(run)
+        return _ended(run, asked)
     if asked.learning and run.leads:
         asked = _for_the_scene(run, asked)
     needs = None
@@ -137,9 +137,7 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
         run.close(failed=not ended)
     if "evaluate" not in asked.further or not run.leads:
         return None
-    if asked.further == PIPELINE and not job.in_sweep():
-        say_what_next(folder)
-    return _objective(run)
+    return _ended(run, asked)
 
 
 def _all_done(run: RunContext, asked: Plan) -> bool:
@@ -159,7 +157,10 @@ def _all_done(run: RunContext, asked: Plan) -> bool:
     return True
 
 
-def _objective(run: RunContext) -> float | None:
+def _ended(run: RunContext, asked: Plan) -> float | None:
+    """The objective; a pipeline ends with what to try next."""
+    if asked.further == PIPELINE and not job.in_sweep():
+        say_what_next(run.folder)
     found = json.loads((run.folder / "metrics.json").read_text())
     return objective(run.config.objective, found)
 

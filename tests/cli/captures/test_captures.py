@@ -49,7 +49,7 @@ def learned(
 def metrics_of(place: Path, name: str) -> dict[str, Any]:
     """The scores of a capture's run."""
     content: dict[str, Any] = json.loads(
-        (place / "outputs" / name / "default" / "metrics.json").read_text()
+        (place / "outputs" / name / "quickstart" / "metrics.json").read_text()
     )
     return content
 
@@ -67,7 +67,7 @@ def test_a_capture_needs_no_flag_beside_its_folder(
     metrics = metrics_of(place, name)
     assert metrics["scene"] == name and metrics["run"]["choices"]["data"] == reader
     assert ("dynamic" in metrics) is moves and metrics["static"]["psnr"] > 0
-    assert (place / "outputs" / name / "default/videos/held_out.mp4").stat().st_size > 0
+    assert (place / "outputs" / name / "quickstart/videos/held_out.mp4").stat().st_size > 0
 
 
 def test_they_are_in_one_report(

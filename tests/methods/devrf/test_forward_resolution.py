@@ -51,9 +51,9 @@ def test_the_grid_has_so_many_points_to_a_pixel(forward_scene: Scene) -> None:
     assert fitted.phases[-1].voxels == round(fitted.side**3)
 
 
-def test_planes_are_told_by_the_scene_only_where_asked(forward_scene: Scene) -> None:
+def test_planes_are_told_by_the_scene_where_none_are_given(forward_scene: Scene) -> None:
     schedule = CanonicalSchedule(side=30, doublings=())
-    asked = fitted_to(forward_scene, schedule, Architecture(planes="auto"))
+    asked = fitted_to(forward_scene, schedule, Architecture())
     assert asked == (schedule, Architecture(planes=32))
     given = Architecture(planes=7)
     assert fitted_to(forward_scene, schedule, given) == (schedule, given)

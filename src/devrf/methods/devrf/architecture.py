@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 from devrf.geometry.box import Box
 from devrf.methods.devrf.canonical_field import CanonicalField
@@ -21,8 +20,8 @@ class Architecture:
             direction alone.
         alpha_init: opacity of a voxel of the radiance field before anything is learned.
         search_alpha_init: the same in the coarse geometry search.
-        planes: planes of an NDC grid, one behind another; None for cubic voxels; ``auto`` until
-            the scene's views have told (:mod:`devrf.methods.devrf.forward_resolution`).
+        planes: planes of an NDC grid, one behind another; None: in NDC as many as the scene's
+            views tell apart (:mod:`devrf.methods.devrf.forward_resolution`), elsewhere cubic voxels.
         aspect: in NDC, grid points across a unit of x to those across a unit of y: the width of
             the images to their height makes voxels as square as pixels. The paper's is 1.
     """
@@ -32,7 +31,7 @@ class Architecture:
     frequencies: int = 4
     alpha_init: float = 1e-2
     search_alpha_init: float = 1e-6
-    planes: int | Literal["auto"] | None = None
+    planes: int | None = None
     aspect: float = 1.0
 
     def search_field(self, box: Box, voxels: int) -> CanonicalField:
@@ -43,7 +42,6 @@ class Architecture:
 
     def radiance_field(self, box: Box, voxels: int, base_voxels: int) -> CanonicalField:
         """The radiance field: features and a shallow decoder."""
-        assert self.planes != "auto", "the scene has not told how many planes there are"
         return CanonicalField(
             box,
             ColorDecoder(self.channels, self.width, self.frequencies),

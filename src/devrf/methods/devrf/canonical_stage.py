@@ -159,15 +159,9 @@ class CanonicalStage(VoxelStage):
         self._optimizer = GridAdam(groups)
 
     def _check_space(self) -> None:
-        """Check that the grid has planes exactly where the scene is in NDC."""
+        """Check that only a scene in NDC has planes."""
         planes = self.architecture.planes
-        forward = isinstance(self.scene.space, NormalizedDevice)
-        if forward and planes is None:
-            raise DevrfError(
-                "field.planes: expected a number of planes for a forward-facing scene, not null; "
-                "field=forward and field=forward_small have one"
-            )
-        if planes is not None and not forward:
+        if planes is not None and not isinstance(self.scene.space, NormalizedDevice):
             raise DevrfError(
                 f"field.planes={planes}: planes are of forward-facing scenes, and this scene is "
                 "not: give field=inward or field=small"

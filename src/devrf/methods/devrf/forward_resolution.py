@@ -23,18 +23,17 @@ def fitted_to(
 ) -> tuple[CanonicalSchedule, Architecture]:
     """Schedule and architecture with the numbers that ``scene`` decides filled in.
 
-    ``planes="auto"`` becomes the number of planes that the static views resolve;
-    ``voxels_per_pixel`` becomes the ``side`` of a grid so fine (docs/method.md#forward-facing).
-    Neither means anything but in NDC.
+    In NDC, where no number of planes is given it becomes the one that the static views resolve,
+    and ``voxels_per_pixel`` becomes the ``side`` of a grid so fine (docs/method.md#forward-facing).
     """
     space = scene.space
     if not isinstance(space, NormalizedDevice):
         return schedule, architecture
     planes = architecture.planes
-    if planes == "auto":
+    if planes is None:
         planes = resolved_planes(scene.static.train.cameras.positions, space)
         architecture = replace(architecture, planes=planes)
-    if schedule.voxels_per_pixel is not None and planes is not None:
+    if schedule.voxels_per_pixel is not None:
         width, height, _ = scene.bounds.box.size
         # The reference image spans 2 × 2 units of NDC.
         across = width / 2 * space.width * schedule.voxels_per_pixel
