@@ -193,9 +193,10 @@ def estimate(
     have about side³ voxels in any box. A store of displacements that is ``auto`` counts as on the
     device.
     """
+    canonical = canonical.in_space(scene.space)
     voxels, sizes = round(canonical.side**3), (architecture.channels, architecture.width)
     with torch.device("meta"):
-        box = scene.bounds.motion or scene.bounds.box
+        box = (scene.space.straight and scene.bounds.motion) or scene.bounds.box
         field = architecture.radiance_field(box, voxels, voxels)
     occupied = OCCUPIED if field.planes is None else 1.0
 

@@ -16,18 +16,19 @@ def possible_matter(scene: Scene, shape: tuple[int, int, int], *, carve: bool) -
 
     Not nearer to a camera than its near plane: fog before a lens would explain its image
     perfectly. ``carve`` leaves nothing outside the visual hull, if the images have mattes and all
-    show the rest state.
+    show the rest state, and the box is not endless.
     """
-    views, box = scene.static.train, scene.bounds.box
+    views, box, space = scene.static.train, scene.bounds.box, scene.space
     possible = torch.ones(shape, dtype=torch.bool)
     positions, near = views.cameras.positions, scene.bounds.near
-    close = [one for one in positions if (box.nearest(one) - one).norm() < near]
+    places = space.from_world(positions)
+    close = [one for one in positions[(box.nearest(places) - places).norm(dim=1) < near]]
     if close:
-        points = box.grid_points(shape, views.cameras.focal)
+        points = space.to_world(box.grid_points(shape, views.cameras.focal))
         for position in close:
             possible &= (points - position).norm(dim=-1) > near
     at_rest = float(views.times.max() - views.times.min()) <= FrameClock.TOLERANCE
-    if carve and views.has_alpha and at_rest:
+    if carve and space.straight and views.has_alpha and at_rest:
         possible &= visual_hull(views, box, shape)
     return possible
 
