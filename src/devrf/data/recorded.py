@@ -25,6 +25,10 @@ class RecordedDataModule(SceneDataModule):
         """Read the scene, and estimate its optical flow if that is asked for."""
         scene = self.reader.read()
         if scene.kind == "inward":
-            log.info("%s: box for motion from %s", scene.name, scene.bounds.source)
+            bounds, kind = scene.bounds, "world" if scene.space.straight else "contracted"
+            log.info(
+                "%s: %s space (%s), box from %s", scene.name, kind, bounds.reason, bounds.box_source
+            )
+            log.info("%s: box for motion from %s", scene.name, bounds.source)
         cache = self.reader.flow_cache
         return with_flow(scene, self.reader.flow, None if cache is None else Path(cache))
