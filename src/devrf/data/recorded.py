@@ -29,6 +29,6 @@ class RecordedDataModule(SceneDataModule):
             log.info(
                 "%s: %s space (%s), box from %s", scene.name, kind, bounds.reason, bounds.box_source
             )
-            log.info("%s: box for motion from %s", scene.name, bounds.source)
+            log.info("%s: room for motion: %s", scene.name, bounds.source)
         cache = self.reader.flow_cache
         return with_flow(scene, self.reader.flow, None if cache is None else Path(cache))
