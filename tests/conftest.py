@@ -92,6 +92,18 @@ def tiny_scene(tiny_recipe: ProceduralScene) -> Scene:
     return tiny_recipe()
 
 
+@pytest.fixture(scope="session")
+def tiny_room_recipe(tiny_recipe: ProceduralScene) -> ProceduralScene:
+    """How the tiny room is made."""
+    return replace(tiny_recipe, surroundings="room")
+
+
+@pytest.fixture(scope="session")
+def tiny_room(tiny_room_recipe: ProceduralScene) -> Scene:
+    """The tiny scene in a room: images without mattes, a scene without end."""
+    return tiny_room_recipe()
+
+
 class GivenScene(SceneDataModule):
     """Serves a scene that is there already."""
 

@@ -32,3 +32,12 @@ def test_problems_are_advice(devrf, tiny):
     assert (outcome.status, outcome.err) == (0, "")
     assert "problems found: 1" in outcome.out
     assert "static training set: no view from a sector of" in outcome.out
+
+
+def test_the_space_and_the_box_are_said_with_their_reasons(devrf, tiny):
+    outcome = devrf(*tiny, "stage=inspect", "data.surroundings=room", "data.static_views=16")
+    assert (outcome.status, outcome.err) == (0, "")
+    lines = {line.strip()[:5]: line for line in outcome.out.splitlines()}
+    assert "contracted" in lines["space"]
+    assert "(the images have no mattes, data.box is not given)" in lines["space"]
+    assert "(what the static cameras all see)" in lines["box  "]

@@ -153,7 +153,9 @@ def test_without_mattes_the_box_holds_the_backdrop(folder):
     for item in IDS:
         image = iio.imread(folder.root / f"rgb/1x/{item}.png")
         iio.imwrite(folder.root / f"rgb/1x/{item}.png", image[..., :3])
-    scene = NerfiesReader(folder.root, downscale=1).read()
+    endless = NerfiesReader(folder.root, downscale=1).read()
+    assert not endless.space.straight and endless.bounds.reason.startswith("the images have no")
+    scene = NerfiesReader(folder.root, downscale=1, space="world").read()
     cameras, box = scene.static.train.cameras, scene.bounds.box
     for camera in range(len(cameras)):
         rays = cameras.image_rays(camera)

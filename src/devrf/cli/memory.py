@@ -16,8 +16,8 @@ from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
-from devrf.methods.devrf.forward_resolution import fitted_to
 from devrf.methods.devrf.frame_memory import active_bytes, resident_bytes
+from devrf.methods.devrf.grid_resolution import fitted_to
 from devrf.methods.devrf.settings import MotionSettings
 from devrf.scenes.scene import Scene, Views
 
@@ -197,7 +197,7 @@ def estimate(
     canonical, architecture = fitted_to(scene, canonical, architecture)
     voxels, sizes = round(canonical.side**3), (architecture.channels, architecture.width)
     with torch.device("meta"):
-        box = scene.bounds.motion or scene.bounds.box
+        box = (scene.space.straight and scene.bounds.motion) or scene.bounds.box
         field = architecture.radiance_field(box, voxels, voxels)
     occupied = OCCUPIED if field.planes is None else 1.0
 

@@ -215,12 +215,7 @@ def concatenated(batches: Sequence[RayBatch]) -> RayBatch:
             [torch.ones_like(b.time) if b.alpha is None else b.alpha for b in batches]
         )
     return RayBatch(
-        rays=Rays(
-            *(
-                torch.cat([getattr(one.rays, name) for one in batches])
-                for name in ("origins", "directions", "viewdirs")
-            )
-        ),
+        rays=Rays.joined([one.rays for one in batches]),
         color=torch.cat([one.color for one in batches]),
         alpha=alpha,
         background=torch.cat([one.background.expand(len(one.rays), 3) for one in batches]),

@@ -24,7 +24,12 @@ class RecordedDataModule(SceneDataModule):
     def load(self) -> Scene:
         """Read the scene, and estimate its optical flow if that is asked for."""
         scene = self.reader.read()
-        if scene.kind == "inward" and scene.moves:
-            log.info("%s: box for motion from %s", scene.name, scene.bounds.source)
+        if scene.kind == "inward":
+            bounds, kind = scene.bounds, "world" if scene.space.straight else "contracted"
+            log.info(
+                "%s: %s space (%s), box from %s", scene.name, kind, bounds.reason, bounds.box_source
+            )
+            if scene.moves:
+                log.info("%s: room for motion: %s", scene.name, bounds.source)
         cache = self.reader.flow_cache
         return with_flow(scene, self.reader.flow, None if cache is None else Path(cache))

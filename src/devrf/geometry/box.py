@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -117,18 +118,15 @@ class Box:
         ]
         return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
 
-    def crossing(self, rays: Rays) -> tuple[Tensor, Tensor]:
-        """Distances (M,), (M,) at which rays enter and leave the box (slab method).
+    def crossing(
+        self, rays: Rays, near: float = -math.inf, far: float = math.inf
+    ) -> tuple[Tensor, Tensor]:
+        """Distances (M,), (M,) at which rays enter and leave the box, within [near, far].
 
-        A ray that misses has entry > exit; entry is negative for a ray that starts inside.
+        A ray that misses has entry > exit; entry is negative for a ray that starts inside, if
+        ``near`` is.
         """
-        low, high = self.corners(rays.origins)
-        d = rays.directions
-        d = torch.where(d.abs() < 1e-9, torch.full_like(d, 1e-9), d)
-        to_low, to_high = (low - rays.origins) / d, (high - rays.origins) / d
-        entry = torch.minimum(to_low, to_high).amax(dim=-1)
-        leave = torch.maximum(to_low, to_high).amin(dim=-1)
-        return entry, leave
+        return rays.crossing(*self.corners(rays.origins), near, far)
 
     @staticmethod
     def of(low: Tensor | list[float], high: Tensor | list[float]) -> Box:

@@ -7,16 +7,14 @@ near plane to z' = −1, infinity to z' = 1 (NeRF, appendix C).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
-from devrf.geometry.space import WORLD, Space
 
 
 @dataclass(frozen=True)
@@ -34,6 +32,13 @@ class NormalizedDevice:
     height: int
     focal: tuple[float, float]
     near: float = 1.0
+
+    straight: ClassVar[bool] = True
+    side_factor: ClassVar[float] = 1.0
+
+    def inner(self, box: Box) -> Box:
+        """All of the box."""
+        return box
 
     @property
     def _slopes(self) -> tuple[float, float]:
@@ -71,13 +76,3 @@ class NormalizedDevice:
     ) -> tuple[float, float]:
         """The limits themselves: every ray goes from the near plane to infinity."""
         return limits
-
-
-def space_config(space: Space) -> dict[str, Any]:
-    """A space as plain data; the world is empty."""
-    return asdict(space) if isinstance(space, NormalizedDevice) else {}
-
-
-def space_from(config: Mapping[str, Any]) -> Space:
-    """The space that :func:`space_config` described."""
-    return NormalizedDevice(**config) if config else WORLD

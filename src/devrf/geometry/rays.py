@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -25,9 +27,9 @@ class Rays:
     def __len__(self) -> int:
         return self.origins.shape[0]
 
-    def __getitem__(self, index: Tensor | slice) -> Rays:
+    def __getitem__(self, index: Tensor | slice) -> Self:
         """The rays at ``index``: a slice, a mask (M,) or positions (K,)."""
-        return Rays(self.origins[index], self.directions[index], self.viewdirs[index])
+        return self._mapped(lambda of_rays: of_rays[index])
 
     def at(self, ray: Tensor, distance: Tensor) -> Tensor:
         """Points (S, 3) at ``distance`` (S,) along the rays numbered ``ray`` (S,).
@@ -39,6 +41,48 @@ class Rays:
         directions = self.directions.t().contiguous().index_select(1, ray)
         return origins.addcmul_(directions, distance).t()
 
-    def to(self, device: torch.device | str) -> Rays:
+    def to(self, device: torch.device | str) -> Self:
         """The same rays on ``device``."""
-        return Rays(self.origins.to(device), self.directions.to(device), self.viewdirs.to(device))
+        return self._mapped(lambda of_rays: of_rays.to(device))
+
+    def crossing(self, low: Tensor, high: Tensor, near: float, far: float) -> tuple[Tensor, Tensor]:
+        """Distances (M,), (M,) at which rays enter and leave a box, within [near, far].
+
+        The slab method. A ray that misses the box has entry > exit.
+
+        Args:
+            low: (3,) the box's corner with the smallest coordinates, in the rays' space.
+            high: (3,) the one with the largest.
+            near: the least distance; entry is negative for a ray that starts inside, if it is.
+            far: the largest distance.
+        """
+        d = self.directions
+        d = torch.where(d.abs() < 1e-9, torch.full_like(d, 1e-9), d)
+        to_low, to_high = (low - self.origins) / d, (high - self.origins) / d
+        entry = torch.minimum(to_low, to_high).amax(dim=-1)
+        leave = torch.maximum(to_low, to_high).amin(dim=-1)
+        return entry.clamp(min=near), leave.clamp(max=far)
+
+    @property
+    def pace(self) -> float:
+        """The most units of the fields' space that a unit of distance is, 0 without rays."""
+        return float(self.directions.norm(dim=1).amax()) if len(self) else 0.0
+
+    def ends(self) -> Tensor | None:
+        """Where rays meet infinity, (M, 3) in the fields' space; None where that is not in it."""
+        return None
+
+    @staticmethod
+    def joined(parts: Sequence[Rays]) -> Rays:
+        """The rays of several parts of one space, one part after another."""
+        names = parts[0]._tensors()
+        tensors = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
+        return replace(parts[0], **tensors)
+
+    def _mapped(self, change: Callable[[Tensor], Tensor]) -> Self:
+        return replace(self, **{name: change(value) for name, value in self._tensors().items()})
+
+    def _tensors(self) -> dict[str, Tensor]:
+        """What there is for each ray, by the attribute's name."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value for name, value in values.items() if isinstance(value, Tensor)}

@@ -1,10 +1,10 @@
-"""The space that fields live in: the world itself, or a frustum made into a box."""
+"""The space that fields live in: the world itself, or an endless part of it made into a box."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 from torch import Tensor
 
@@ -16,8 +16,23 @@ class Space(Protocol):
     """A mapping between world space and the space of the fields.
 
     :class:`WorldSpace` for inward-facing scenes,
-    :class:`~devrf.geometry.ndc.NormalizedDevice` for forward-facing ones.
+    :class:`~devrf.geometry.ndc.NormalizedDevice` for forward-facing ones,
+    :class:`~devrf.geometry.contraction.ContractedSpace` for what has no end on any side.
     """
+
+    @property
+    def straight(self) -> bool:
+        """Whether world rays are straight lines in it, walked evenly."""
+        ...
+
+    @property
+    def side_factor(self) -> float:
+        """How many times longer a grid's side must be here than over :meth:`inner`."""
+        ...
+
+    def inner(self, box: Box) -> Box:
+        """The part of the fields' ``box`` where things may move: what the cameras look at."""
+        ...
 
     def from_world(self, points: Tensor) -> Tensor:
         """Points (..., 3) of the world in the fields' space."""
@@ -47,6 +62,13 @@ class Space(Protocol):
 @dataclass(frozen=True)
 class WorldSpace:
     """Fields that live in world space: nothing is mapped."""
+
+    straight: ClassVar[bool] = True
+    side_factor: ClassVar[float] = 1.0
+
+    def inner(self, box: Box) -> Box:
+        """All of the box."""
+        return box
 
     def from_world(self, points: Tensor) -> Tensor:
         """The points themselves."""

@@ -52,8 +52,7 @@ def steps_through(
 
     Arguments as for :func:`march`.
     """
-    entry, leave = box.crossing(rays)
-    entry, leave = entry.clamp(min=near), leave.clamp(max=far)
+    entry, leave = box.crossing(rays, near, far)
     # Including a sample exactly at the exit: in NDC it is the last plane, behind the whole scene.
     count = torch.where(leave >= entry, ((leave - entry) / step + 1e-3).floor() + 1, 0.0)
     return entry, count.long()
@@ -109,9 +108,8 @@ def march(
 
 
 def _reach(rays: Rays, occupancy: Occupancy) -> float:
-    """The vicinity's reach in units of the rays' directions, whose length in NDC is not 1."""
-    lengths = rays.directions.norm(dim=1)
-    return occupancy.reach / max(float(lengths.amax()), 1e-9) if len(rays) else occupancy.reach
+    """The vicinity's reach in units of the rays' distance, which in NDC are not the space's."""
+    return occupancy.reach / max(rays.pace, 1e-9) if len(rays) else occupancy.reach
 
 
 @torch.no_grad()
@@ -128,8 +126,7 @@ def hits(
 
 
 def _hits(rays: Rays, box: Box, occupancy: Occupancy, near: float, far: float) -> Tensor:
-    entry, leave = box.crossing(rays)
-    entry, leave = entry.clamp(min=near), leave.clamp(max=far)
+    entry, leave = box.crossing(rays, near, far)
     stride = _reach(rays, occupancy)
     strides = ((leave - entry) / stride).clamp(min=0).ceil().long()
     ray = torch.repeat_interleave(strides)

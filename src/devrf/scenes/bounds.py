@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.poses import FARTHEST
@@ -51,6 +52,15 @@ def axes_meet(cameras: Cameras) -> Tensor:
             "the scene; set data.box=[[x,y,z],[x,y,z]], data.near and data.far",
         )
     return point.float()
+
+
+def axes_do_meet(cameras: Cameras) -> bool:
+    """Whether :func:`axes_meet` finds a point."""
+    try:
+        axes_meet(cameras)
+    except DevrfError:
+        return False
+    return True
 
 
 def seen_radius(cameras: Cameras, center: Tensor) -> float:
@@ -136,7 +146,8 @@ def inward_bounds(
         static: training views at rest, whose cameras give the box.
         dynamic: training views in motion, whose alpha masks give the motion box; None at rest.
         everyone: all views, test included; near and far hold for all their cameras.
-        bound_scale: "auto" (silhouettes where there are alpha masks) or a number ≥ 1.
+        bound_scale: "auto" (silhouettes where there are alpha masks, else the given box or a
+            fixed scale) or a number ≥ 1.
         near: distance in world units, or None for the cameras to say.
         far: distance in world units, or None.
         box: the scene's box, or None.
@@ -144,6 +155,7 @@ def inward_bounds(
     Raises:
         DevrfError: the cameras do not say where the scene is, or near ≥ far.
     """
+    given = box is not None
     scale = FALLBACK_BOUND_SCALE if bound_scale == "auto" else float(bound_scale)
     box = box or box_from_cameras(static.cameras)
     motion, source = None, f"canonical box x bound scale {scale:g}"
@@ -156,6 +168,9 @@ def inward_bounds(
         else:
             views, frames = len(set(dynamic.view.tolist())), len(set(dynamic.times.tolist()))
             source = f"silhouettes of {views} views x {frames} frames"
+    limited = given and motion is None and bound_scale == "auto"
+    if limited:
+        source = "data.box (no alpha masks from two cameras at every time)"
     reach = box if motion is None else box.union(motion)
     ranges = [depth_range(views.cameras, reach) for views in everyone]
     near = min(r[0] for r in ranges) if near is None else float(near)
@@ -166,4 +181,4 @@ def inward_bounds(
             f"expected 0 <= near < far, not {near:g} and {far:g}; "
             "set both, in world units, or leave them null",
         )
-    return Bounds(box, near, far, motion, scale, source)
+    return Bounds(box, near, far, motion, scale, source, limited)

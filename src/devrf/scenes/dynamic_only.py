@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from devrf.geometry.ndc import NormalizedDevice
-from devrf.scenes.bounds import inward_bounds
 from devrf.scenes.forward_bounds import forward_bounds
+from devrf.scenes.inward_space import SpaceChoice, inward_space
 from devrf.scenes.scene import Capture, Scene
 
 
@@ -22,6 +22,7 @@ def dynamic_only(scene: Scene) -> Scene:
     at_rest = [v[(v.times == v.times.min()).nonzero()[:, 0]] for v in (views, held_out)]
     if isinstance(scene.space, NormalizedDevice):
         bounds = forward_bounds([views], scene.space, "all that the dynamic cameras see")
-    else:
-        bounds = inward_bounds(views, views, [views, held_out])
-    return replace(scene, static=Capture(*at_rest), bounds=bounds)
+        return replace(scene, static=Capture(*at_rest), bounds=bounds)
+    choice: SpaceChoice = "world" if scene.space.straight else "contracted"
+    space, bounds = inward_space(choice, views, views, [views, held_out])
+    return replace(scene, static=Capture(*at_rest), bounds=bounds, space=space)

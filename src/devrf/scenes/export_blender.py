@@ -8,9 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import imageio.v3 as iio
-import numpy as np
 import torch
-from torch import Tensor
 
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.flow_files import write_flow
@@ -25,9 +23,9 @@ _VALIDATION_VIEWS = 4
 def export_blender(scene: Scene, folder: Path) -> None:
     """Write ``scene`` as ``folder/static`` and ``folder/dynamic_<V>views``.
 
-    Each holds ``transforms_{train,val,test}.json`` and RGBA images; dynamic images are ordered
-    time-major, and their flow, where there is one, goes to ``train_flow/<index>_bwd.npz``.
-    Poses, times and images read back exactly.
+    Each holds ``transforms_{train,val,test}.json`` and images, RGBA where they have mattes; dynamic
+    images are ordered time-major, and their flow, where there is one, goes to
+    ``train_flow/<index>_bwd.npz``. Poses, times and images read back exactly.
 
     Args:
         scene: an inward-facing scene.
@@ -64,7 +62,7 @@ def _write_split(views: Views, split: str, folder: Path) -> None:
         zip(views.pixels, views.cameras.camera_to_world, views.times.tolist(), strict=True)
     ):
         name = f"r_{k:03d}"
-        iio.imwrite(folder / split / f"{name}.png", _rgba(pixels))
+        iio.imwrite(folder / split / f"{name}.png", pixels.cpu().numpy())
         frames.append(
             {
                 "file_path": f"./{split}/{name}",
@@ -76,14 +74,6 @@ def _write_split(views: Views, split: str, folder: Path) -> None:
     content = {"camera_angle_x": _field_of_view(views.cameras), "frames": frames}
     text = json.dumps(content, indent=1)
     (folder / f"transforms_{split}.json").write_text(text + "\n", encoding="utf-8")
-
-
-def _rgba(pixels: Tensor) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    """(H, W, 4) uint8; an image without an alpha mask is opaque."""
-    if pixels.shape[-1] == 3:
-        pixels = torch.cat([pixels, torch.full_like(pixels[..., :1], 255)], dim=-1)
-    array: np.ndarray[Any, np.dtype[np.uint8]] = pixels.cpu().numpy()
-    return array
 
 
 def _field_of_view(cameras: Cameras) -> float:

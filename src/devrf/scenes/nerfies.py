@@ -19,7 +19,7 @@ from pydantic import (
 from pydantic.dataclasses import dataclass
 
 from devrf.scenes.absent_images import present_images
-from devrf.scenes.bounds import box_of_frusta
+from devrf.scenes.bounds import FALLBACK_BOUND_SCALE, axes_do_meet, box_of_frusta
 from devrf.scenes.downscale import Downscale, folder_factor
 from devrf.scenes.holdout import every_nth
 from devrf.scenes.image_folders import image_folder
@@ -91,8 +91,8 @@ class NerfiesReader(InwardReader):
     too. The time of an image is its ``time_id`` (HyperNeRF), else its ``warp_id``, brought to
     [0, 1]. Images come from ``rgb/<downscale>x``, or from a larger folder and are made smaller;
     they are undistorted. With one time for all of them the scene is at rest.
-    Without alpha masks the box is all that the cameras see
-    between near and far.
+    Without alpha masks the scene has no end, or, where the cameras look in
+    nearly one direction, the box is all that they see between near and far.
 
     Attributes:
         holdout: without ``val_ids``, one of so many images is held out.
@@ -124,12 +124,19 @@ class NerfiesReader(InwardReader):
         static, dynamic = load_layout(layout, folder, images.downscale)
         near = world.near if self.near is None else self.near
         far = world.far if self.far is None else self.far
-        box = self.box
-        if box is None and not static.train.has_alpha and 0 <= near < far:
-            # Without alpha masks the backdrop is to be learned too.
-            seen = box_of_frusta(static.train.cameras, near, far)
-            box = [seen.low, seen.high]
-        return replace(self, near=near, far=far, box=box).scene(folder, static, dynamic)
+        reader, cameras = replace(self, near=near, far=far), static.train.cameras
+        wide = self.box is None and not static.train.cut_out and 0 <= near < far
+        if not wide or (self.space != "world" and axes_do_meet(cameras)):
+            return reader.scene(folder, static, dynamic)
+        # Without mattes the backdrop is to be learned too.
+        seen = box_of_frusta(cameras, near, far)
+        scale = FALLBACK_BOUND_SCALE if self.bound_scale == "auto" else self.bound_scale
+        box = [seen.low, seen.high]
+        reader = replace(reader, box=box, space="world", bound_scale=scale)
+        scene = reader.scene(folder, static, dynamic)
+        why = "data.space=world" if self.space == "world" else "the cameras look in one direction"
+        bounds = replace(scene.bounds, reason=why, box_source="all that the cameras see up to far")
+        return replace(scene, bounds=bounds)
 
 
 def _layout(transforms: Transforms, train: list[int], test: list[int], until: float) -> Layout:

@@ -13,8 +13,8 @@ from pydantic.dataclasses import dataclass
 
 from devrf.geometry.clock import FrameClock
 from devrf.scenes.absent_images import Missing
-from devrf.scenes.bounds import inward_bounds
 from devrf.scenes.downscale import Downscale
+from devrf.scenes.inward_space import SpaceChoice, inward_space
 from devrf.scenes.json_files import Number
 from devrf.scenes.scene import Background, Capture, Scene
 from devrf.scenes.validation import LARGEST, checked_box, first_error
@@ -113,7 +113,11 @@ class InwardReader(SceneReader):
             tightened canonical box is enlarged.
         near: distance in world units before which nothing is; None: from the cameras.
         far: distance in world units behind which nothing is; None: from the cameras.
-        box: [[x, y, z], [x, y, z]] in world units; None: from the cameras.
+        box: [[x, y, z], [x, y, z]] in world units, enlarged only for silhouettes that move
+            beyond it, or by a ``bound_scale``; None: from the cameras.
+        space: ``world``: the scene is in the box, and nothing is around it; ``contracted``: it has
+            no end, and the box is what is looked at; ``auto``: contracted if the images have no
+            mattes and no box is given.
         missing: whether listed images that are absent are an ``error``, or left out (``skip``).
     """
 
@@ -123,14 +127,16 @@ class InwardReader(SceneReader):
     far: Number | None = None
     box: Corners = None
     missing: Missing = "error"
+    space: SpaceChoice = "auto"
 
     def scene(self, folder: Path, static: Capture, dynamic: Capture) -> Scene:
         """The scene of two captures that were read from ``folder``, its bounds found.
 
         Raises:
-            DevrfError: what :func:`devrf.scenes.bounds.inward_bounds` raises.
+            DevrfError: what :func:`devrf.scenes.inward_space.inward_space` raises.
         """
-        bounds = inward_bounds(
+        space, bounds = inward_space(
+            self.space,
             static.train,
             dynamic.train if len(FrameClock.from_times(dynamic.train.times)) > 1 else None,
             [static.train, static.test, dynamic.train, dynamic.test],
@@ -139,4 +145,5 @@ class InwardReader(SceneReader):
             far=self.far,
             box=None if self.box is None else checked_box(self.box),
         )
-        return Scene(self.name_of(folder), "inward", static, dynamic, bounds, self.background)
+        name = self.name_of(folder)
+        return Scene(name, "inward", static, dynamic, bounds, self.background, space)

@@ -84,6 +84,11 @@ class Views:
         """Whether the images carry a matte."""
         return self.pixels.shape[3] == 4
 
+    @property
+    def cut_out(self) -> bool:
+        """Whether something is left out by the mattes: an opaque one says nothing."""
+        return self.has_alpha and bool((self.pixels[..., 3] < 255).any())
+
     def __getitem__(self, index: Tensor) -> Views:
         """The views at positions ``index`` (K,) int64."""
         return replace(
@@ -138,6 +143,9 @@ class Bounds:
         scale: how much larger than the tightened canonical box the fields' box is made, about
             its centre, so that motion has room; not used when ``motion`` is known.
         source: where the motion box came from, in words, for the log.
+        limited: whether motion has no more room than the box: it was given, and nothing is known.
+        reason: why the scene is learned in its space, in words.
+        box_source: where the box came from, in words.
     """
 
     box: Box
@@ -146,6 +154,9 @@ class Bounds:
     motion: Box | None
     scale: float
     source: str
+    limited: bool = False
+    reason: str = ""
+    box_source: str = ""
 
 
 @dataclass(frozen=True)

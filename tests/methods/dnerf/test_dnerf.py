@@ -17,6 +17,7 @@ from devrf.checkpoints.checkpoint import (
     save_checkpoint,
 )
 from devrf.data.datamodule import SceneDataModule
+from devrf.data.rendered import RenderedDataModule
 from devrf.errors import DevrfError
 from devrf.methods.dnerf.model import DNeRF, DNeRFSettings
 from devrf.methods.protocol import ProtocolStage
@@ -201,3 +202,18 @@ def test_an_unknown_term_and_an_unknown_part_are_named(
         stage(loss={"elastic": 1.0})
     with pytest.raises(DevrfError, match=r"dnerf has no part 'codes'"):
         fit(stage(ProtocolStage("joint", "both", frozen=("codes",))), trainer, datamodule)
+
+
+@pytest.mark.parametrize("sampling", ["occupancy", "hierarchical"])
+def test_a_scene_without_end_is_learned_and_comes_back(
+    trainer: Trainers, tiny_room: Scene, tmp_path: Path, sampling: Any
+) -> None:
+    one = stage()
+    one.scene_model = DNeRF(replace(TINY, sampling=sampling, coarse=8, fine=8))
+    fitted = fit(one, trainer, RenderedDataModule(lambda: tiny_room, None))
+    save_checkpoint(fitted, tmp_path / "room.ckpt")
+    model = load_checkpoint(tmp_path / "room.ckpt").model
+    assert model.space == tiny_room.space and model.box == tiny_room.bounds.box
+    seen = Renderer(model).view(tiny_room.static.test.cameras, 0, 0.5, 1.0)
+    # The last sample stands for all that is behind it: no background shows.
+    torch.testing.assert_close(seen.opacity, torch.ones_like(seen.opacity))

@@ -25,13 +25,14 @@ def box_points(scene: Scene, box: Box, shape: tuple[int, int, int]) -> Tensor:
     """A grid (X, Y, Z, 3) over a box of the scene, in world units.
 
     Args:
-        scene: its space maps the box into the world; an NDC box is cut off before infinity.
+        scene: its space maps the box into the world; an NDC box is cut off before infinity, and of
+            contracted space the inner box is taken.
         box: a box in the fields' space.
         shape: grid points along x, y, z; the outer ones lie on the box's faces.
     """
     if scene.kind == "forward":
         box = Box.of(list(box.low), [*box.high[:2], min(box.high[2], NDC_CUT)])
-    points = box.grid_points(shape, scene.static.train.cameras.focal)
+    points = scene.space.inner(box).grid_points(shape, scene.static.train.cameras.focal)
     return scene.space.to_world(points)
 
 

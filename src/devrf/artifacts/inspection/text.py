@@ -11,6 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from devrf.artifacts.inspection.report import FlowFacts, Inspection, ViewsFacts
+from devrf.scenes.scene import Scene
 
 HEADING = "set,images,views x times,size,alpha masks,masks,focal length,distance".split(",")
 
@@ -59,14 +60,27 @@ def _facts(found: Inspection) -> list[tuple[str, str]]:
     rows = [
         ("scene", f"{scene.name}, {scene.kind}-facing, {scene.background} background"),
         ("times", span if scene.moves else "one moment: the scene is at rest"),
+        ("space", _space(scene)),
         ("near, far", f"{bounds.near:.4g}, {bounds.far:.4g} ({unit})"),
-        ("box", str(bounds.box)),
+        ("box", f"{scene.space.inner(bounds.box)}{_why(bounds.box_source)}"),
         ("room for motion", f"{motion}{bounds.source}"),
         ("optical flow", _flow(found.flow)),
     ]
     if found.gap is not None:
         rows.insert(2, ("static views", f"widest sector without one: {found.gap:.0f} degrees"))
     return rows
+
+
+def _space(scene: Scene) -> str:
+    """The space that fields live in, and why."""
+    name = "normalised device coordinates" if scene.kind == "forward" else "the world"
+    if not scene.space.straight:
+        name = "contracted: beyond the box everything to infinity is squeezed into a shell"
+    return name + _why(scene.bounds.reason)
+
+
+def _why(reason: str) -> str:
+    return f" ({reason})" if reason else ""
 
 
 def _flow(flow: FlowFacts | None) -> str:

@@ -29,7 +29,8 @@ class ActiveFrame:
         forward: (X, Y, Z, 3) Δ_f of the frame, a leaf.
         before: (X, Y, Z, 3) Δ_f of the frame before, frozen.
         occupancy: where something is at the frame's time.
-        box: where all of them live.
+        box: where the displacements live.
+        still_outside: whether nothing moves outside the box.
         number: the frame; 0 before the first.
         pools: the pixels to learn from; batches are drawn from each in turn.
         losses: mean loss of each Lightning step since the frame was checked out.
@@ -40,6 +41,7 @@ class ActiveFrame:
     before: Tensor
     occupancy: Occupancy
     box: Box
+    still_outside: bool
     number: int = 0
     pools: list[PixelPool] = field(default_factory=list)
     losses: list[float] = field(default_factory=list)
@@ -50,9 +52,9 @@ class ActiveFrame:
         backward, forward, before = (
             motion.frames.here.new_zeros(*motion.shape, 3) for _ in range(3)
         )
-        empty = Occupancy(torch.zeros_like(occupancy.mask), motion.box)
+        empty = Occupancy(torch.zeros_like(occupancy.mask), occupancy.box)
         learned = backward.requires_grad_(), forward.requires_grad_()
-        return ActiveFrame(*learned, before, empty, motion.box)
+        return ActiveFrame(*learned, before, empty, motion.box, motion.still_outside)
 
     @property
     def slices(self) -> tuple[Tensor, Tensor]:
@@ -62,12 +64,12 @@ class ActiveFrame:
     @property
     def warp(self) -> GridWarp:
         """x → x + Δ_b(x, t)."""
-        return GridWarp((self.backward,), self.box)
+        return self._by(self.backward)
 
     @property
     def unwarp(self) -> GridWarp:
         """q → q + Δ_f(q, t)."""
-        return GridWarp((self.forward,), self.box)
+        return self._by(self.forward)
 
     def unwarp_previous(self, *, always_interpolate: bool) -> GridWarp:
         """q → q + Δ_f(q, t − 1), the identity for frame 1.
@@ -76,7 +78,10 @@ class ActiveFrame:
             always_interpolate: look displacements of zero up for frame 1, too, so that every
                 frame takes the same work.
         """
-        return GridWarp((self.before,) if always_interpolate or self.number > 1 else (), self.box)
+        return self._by(*[self.before] if always_interpolate or self.number > 1 else [])
+
+    def _by(self, *slices: Tensor) -> GridWarp:
+        return GridWarp(slices, self.box, still_outside=self.still_outside)
 
     def check_out(self, motion: DeformationField, number: int) -> None:
         """Copy a frame out of the field."""
@@ -106,7 +111,7 @@ class ActiveFrame:
             tensor.copy_(value)
         device, shape = self.backward.device, (len(images), area)
         mask = unpack_bits(state["occupancy"], state["shape"], device)
-        self.occupancy.refill(Occupancy(mask, self.box))
+        self.occupancy.refill(Occupancy(mask, self.occupancy.box))
         masks = [unpack_bits(bits, shape, device) for bits in state["pixels"]]
         self.pools = [PixelPool.of_mask(images, mask) for mask in masks]
 

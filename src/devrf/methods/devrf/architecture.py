@@ -21,7 +21,7 @@ class Architecture:
         alpha_init: opacity of a voxel of the radiance field before anything is learned.
         search_alpha_init: the same in the coarse geometry search.
         planes: planes of an NDC grid, one behind another; None: in NDC as many as the scene's
-            views tell apart (:mod:`devrf.methods.devrf.forward_resolution`), elsewhere cubic voxels.
+            views tell apart (:mod:`devrf.methods.devrf.grid_resolution`), elsewhere cubic voxels.
         aspect: in NDC, grid points across a unit of x to those across a unit of y: the width of
             the images to their height makes voxels as square as pixels. The paper's is 1.
     """

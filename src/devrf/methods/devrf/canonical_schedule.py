@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from devrf.errors import DevrfError
+from devrf.geometry.space import Space
 
 
 @dataclass(frozen=True)
@@ -111,6 +112,18 @@ class CanonicalSchedule:
     def smooths_all(self, iteration: int) -> bool:
         """Whether the total variation of ``iteration`` reaches untouched voxels too."""
         return 0 <= iteration - self.search_iterations < self.dense_tv_iterations
+
+    def in_space(self, space: Space) -> CanonicalSchedule:
+        """The same schedule with sides longer by the space's factor.
+
+        So voxels have the size that they would have over the inner box alone
+        (docs/method.md#scene-contraction).
+        """
+        factor = space.side_factor
+        if factor == 1:
+            return self
+        search = round(self.search_side * factor)
+        return replace(self, side=self.side * factor, search_side=search)
 
     def learning_rate_factor(self, iteration: int) -> float:
         """0.1^(n / decay_iterations), n from the start of the search or of the radiance field."""

@@ -21,8 +21,8 @@ from devrf.geometry.ndc import NormalizedDevice
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.canonical_schedule import CanonicalPhase, CanonicalSchedule
-from devrf.methods.devrf.forward_resolution import fitted_to
 from devrf.methods.devrf.free_space import possible_matter, view_count_weight
+from devrf.methods.devrf.grid_resolution import fitted_to
 from devrf.methods.devrf.losses import (
     PHOTOMETRIC_TERMS,
     Prediction,
@@ -42,7 +42,6 @@ from devrf.methods.devrf.settings import (
 )
 from devrf.methods.devrf.voxel_stage import VoxelStage
 from devrf.ops.adam import GridAdam
-from devrf.ops.dispatch import triton_runs
 from devrf.rendering.occupancy import Occupancy, bounding_box, dilate
 from devrf.scenes.scene import CaptureName, Views
 from devrf.system.profiling import span
@@ -134,7 +133,10 @@ class CanonicalStage(VoxelStage):
         if hasattr(self, "scene_model"):
             return
         self._check_space()
-        self.schedule, self.architecture = fitted_to(self.scene, self.schedule, self.architecture)
+        asked = self.schedule
+        self.schedule, self.architecture = fitted_to(self.scene, asked, self.architecture)
+        if self.schedule.side != asked.side:
+            log.info("schedule.canonical.side: %g is %.4g here", asked.side, self.schedule.side)
         box, first = self.scene.bounds.box, self.schedule.phase(0)
         schedule, shape = self.schedule, box.grid_shape(self.schedule.search_side**3)
         possible = possible_matter(
@@ -201,7 +203,10 @@ class CanonicalStage(VoxelStage):
         self.scene_model.canonical = self._radiance_field(occupancy, phase).to(self.device)
 
     def _radiance_field(self, occupancy: Occupancy, phase: CanonicalPhase) -> CanonicalField:
-        """A new radiance field in the tight box around what is occupied, enlarged for motion."""
+        """A new radiance field in the tight box around what is occupied, enlarged for motion.
+
+        Contracted space is not made tighter: it has no end.
+        """
         tight = bounding_box(occupancy.mask, occupancy.box)
         if tight is None:
             raise DevrfError(
@@ -210,10 +215,14 @@ class CanonicalStage(VoxelStage):
                 "data.background, or give it more schedule.canonical.search_iterations"
             )
         bounds = self.scene.bounds
-        if bounds.motion is None:
+        if not self.scene.space.straight:
+            box = occupancy.box
+        elif bounds.motion is None:
             box = tight.scaled(bounds.scale)
         else:
             box = tight.scaled(1.05).union(bounds.motion)
+        if bounds.limited:
+            box = box.clipped(bounds.box)
         share = 100 * occupancy.share
         log.info("%.1f%% of the searched box may be occupied; fields live in %s", share, box)
         return self.architecture.radiance_field(box, phase.voxels, round(self.schedule.side**3))
@@ -258,7 +267,7 @@ class CanonicalStage(VoxelStage):
         if [id(p) for p in decoder] != [id(p) for p in self.optimizer.param_groups[2]["params"]]:
             self.optimizer.replace(2, decoder)
         learned = [p for group in self.optimizer.param_groups for p in group["params"]]
-        static_shape = triton_runs(field.density.values)
+        static_shape = self.static_shape(field.density.values)
         self.bind(self.schedule.rays, [learned], static_shape=static_shape)
 
     def prepare(self) -> None:

@@ -28,17 +28,31 @@ def compact_state(
     canonical: CanonicalField,
     deformation: DeformationField | None,
     occupancy_at: Callable[[float], Occupancy],
+    *,
+    endless: bool,
 ) -> dict[str, Any]:
     """The ``state`` of a finished scene with its grids packed.
 
     A grid with a value that half precision cannot hold stays as it is.
+
+    Args:
+        state: the model's.
+        occupancy: where something is at rest.
+        canonical: the canonical field.
+        deformation: how it deforms, or None.
+        occupancy_at: where something is at a time.
+        endless: whether rays end in the field: its outer faces are then kept.
     """
-    small, box = dict(state), canonical.box
-    at_rest = _near(occupancy, canonical.density.shape, box)[None]
+    small = dict(state)
+    at_rest = _near(occupancy, canonical.density.shape, canonical.box)[None]
+    if endless:
+        rim = torch.ones_like(at_rest)
+        rim[:, 1:-1, 1:-1, 1:-1] = False
+        at_rest |= rim
     for name in ("canonical.density.values", "canonical.color.values"):
         small[name] = _packed(small[name][None], at_rest, smooth=False, many=False)
     if deformation is not None:
-        shape = deformation.shape
+        shape, box = deformation.shape, deformation.box
         moments = [_near(occupancy_at(time), shape, box) for time in deformation.clock.times]
         # Between two frames both are blended.
         moving = torch.stack(

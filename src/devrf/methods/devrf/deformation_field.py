@@ -24,11 +24,16 @@ class DeformationField(nn.Module):
         frames: the displacements of all frames, in the box's units.
         box: where the field lives.
         clock: the times of the T frames.
+        still_outside: whether nothing moves outside the box, which is then smaller than the
+            canonical field's; else displacements are as on the border there.
     """
 
-    def __init__(self, box: Box, clock: FrameClock, *, voxels: int) -> None:
+    def __init__(
+        self, box: Box, clock: FrameClock, *, voxels: int, still_outside: bool = False
+    ) -> None:
         """Zero displacements of the clock's T frames, each on about ``voxels`` voxels."""
         super().__init__()
+        self.still_outside = still_outside
         self.box = box
         self.clock = clock
         self.frames = FrameStore(len(clock), box.grid_shape(voxels))
@@ -66,7 +71,7 @@ class DeformationField(nn.Module):
         chosen = (moment.before,) if moment.weight == 0.0 else (moment.before, moment.after)
         here = self.frames.here
         slices = tuple(frames[k].to(here) for k in chosen if len(chosen) > 1 or k)
-        return GridWarp(slices, self.box, moment.weight)
+        return GridWarp(slices, self.box, moment.weight, self.still_outside)
 
     def blended(self, time: float) -> Tensor:
         """Δ_b at ``time`` as one grid (X, Y, Z, 3): one look-up a point instead of two.
@@ -88,9 +93,11 @@ class DeformationField(nn.Module):
     def get_extra_state(self) -> dict[str, Any]:
         """Box and clock, as plain numbers."""
         low, high = list(self.box.low), list(self.box.high)
-        return {"low": low, "high": high, "times": list(self.clock.times)}
+        outside = {"still_outside": True} if self.still_outside else {}
+        return {"low": low, "high": high, "times": list(self.clock.times), **outside}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_extra_state` gave."""
         self.box = Box.of(state["low"], state["high"])
         self.clock = FrameClock(tuple(state["times"]))
+        self.still_outside = bool(state.get("still_outside"))

@@ -38,7 +38,6 @@ from devrf.methods.devrf.pixel_selection import frame_pools, images_of
 from devrf.methods.devrf.settings import DEFORMATION_LOSS, MotionSettings, Precision
 from devrf.methods.devrf.voxel_stage import VoxelStage
 from devrf.ops.adam import GridAdam
-from devrf.ops.dispatch import triton_runs
 from devrf.scenes.scene import CaptureName, Views
 from devrf.system.profiling import span
 
@@ -129,7 +128,10 @@ class DeformationStage(VoxelStage):
         return self.phase_at(iteration).learning_rate_factor
 
     def setup(self, stage: str) -> None:
-        """Build the field at rest, at the coarsest resolution, in the canonical field's box.
+        """Build the field at rest, at the coarsest resolution.
+
+        It lives in the canonical field's box; in contracted space in the inner box, and what is
+        outside stays where it is.
 
         Raises:
             DevrfError: the scene is at rest.
@@ -143,12 +145,15 @@ class DeformationStage(VoxelStage):
         model, motion = self.scene_model, self.motion
         if model.deformation is None:
             voxels = self.schedule.sides[0] ** 3
-            model.deformation = DeformationField(model.box, self.scene.clock, voxels=voxels)
+            box = model.space.inner(model.box)
+            model.deformation = DeformationField(
+                box, self.scene.clock, voxels=voxels, still_outside=box != model.box
+            )
             self.field.frames.offload(
                 on_host=rest_on_host(self.trainer, model, self.schedule, motion),
                 half=motion.store_half,
             )
-        scale = model.box.longest if motion.unit == "box" else 1.0
+        scale = self.field.box.longest if motion.unit == "box" else 1.0
         self._optimizer.param_groups[0]["base_lr"] = motion.learning_rate * scale
 
     def enter(self, phase: Phase) -> None:
@@ -193,7 +198,7 @@ class DeformationStage(VoxelStage):
         learned = [tensor for pair in slices for tensor in pair]
         self._optimizer.replace(0, learned, smoothing=smoothing)
         if slices:
-            static_shape = triton_runs(self.scene_model.canonical.density.values)
+            static_shape = self.static_shape(self.scene_model.canonical.density.values)
             self.bind(self.schedule.rays, slices, static_shape=static_shape)
 
     def _initialise(self, phase: DeformationPhase) -> None:

@@ -40,6 +40,10 @@ class Tracks:
     def __len__(self) -> int:
         return self.canonical.shape[0]
 
+    def __getitem__(self, mask: Tensor) -> Tracks:
+        """The tracks where ``mask`` (N,) is True."""
+        return Tracks(self.canonical[mask], self.camera[mask], self.pixel[mask])
+
 
 @torch.no_grad()
 def follow(
@@ -109,6 +113,8 @@ def start_from_tracks(
         smoothness: weight of differences between neighbouring voxels' changes.
         steps: optimiser steps of each fit.
     """
+    if field.still_outside:
+        tracks = tracks[field.box.contains(tracks.canonical)]
     if len(tracks) == 0:
         return
     scale = _pixels_per_unit(tracks, cameras, space, 1e-3 * field.box.longest)

@@ -56,7 +56,8 @@ def rest_on_host(
         return False
     assert model.deformation is not None
     free, _ = torch.cuda.mem_get_info(device)
-    frames, shape = len(model.deformation.clock), model.box.grid_shape(schedule.sides[-1] ** 3)
+    motion_box, frames = model.deformation.box, len(model.deformation.clock)
+    shape = motion_box.grid_shape(schedule.sides[-1] ** 3)
     parallel = schedule.max_parallel_frames(-1, frames)
     fits = fits_on_device(free, frames, shape, half=motion.store_half, parallel=parallel)
     if not fits:

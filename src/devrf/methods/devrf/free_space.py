@@ -19,19 +19,19 @@ def possible_matter(
     Not nearer to a camera than its near plane: fog before a lens would explain its image
     perfectly. Not where fewer than ``least_views`` cameras look, if there are so many: fog would
     explain two images as well. ``carve`` leaves nothing outside the visual hull, if the images
-    have mattes and all show the rest state.
+    have mattes and all show the rest state, and the box is not endless.
     """
-    views, box = scene.static.train, scene.bounds.box
+    views, box, space = scene.static.train, scene.bounds.box, scene.space
     possible = torch.ones(shape, dtype=torch.bool)
-    points = box.grid_points(shape, views.cameras.focal)
+    points = space.to_world(box.grid_points(shape, views.cameras.focal))
     positions, near = views.cameras.positions, scene.bounds.near
-    for position in positions:
-        if (box.nearest(position) - position).norm() < near:
-            possible &= (points - position).norm(dim=-1) > near
+    places = space.from_world(positions)
+    for position in positions[(box.nearest(places) - places).norm(dim=1) < near]:
+        possible &= (points - position).norm(dim=-1) > near
     if 1 < least_views <= len(positions):
-        possible &= view_count(views.cameras, scene.space.to_world(points)) >= least_views
+        possible &= view_count(views.cameras, points) >= least_views
     at_rest = float(views.times.max() - views.times.min()) <= FrameClock.TOLERANCE
-    if carve and views.has_alpha and at_rest:
+    if carve and space.straight and views.has_alpha and at_rest:
         possible &= visual_hull(views, box, shape)
     return possible
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from devrf.geometry.box import Box
@@ -18,13 +19,15 @@ class GridWarp:
     Attributes:
         slices: Δ_k (X, Y, Z, 3) in the box's units: one frame's, or those of the two frames
             between which t lies; none is the identity.
-        box: where the grids live; outside it Δ is as on its border.
+        box: where the grids live.
         weight: λ in [0, 1].
+        still_outside: whether Δ is 0 outside the box; else it is as on the border.
     """
 
     slices: tuple[Tensor, ...]
     box: Box
     weight: float = 0.0
+    still_outside: bool = False
 
     def __call__(self, points: Tensor) -> Tensor:
         """The points (M, 3) moved, (M, 3); differentiable in the slices and the points."""
@@ -32,4 +35,7 @@ class GridWarp:
             return points
         coords = to_grid(points, self.box, shape_of(self.slices[0]))
         moves = [interpolate(frame, coords, gradient=kept_gradient(frame)) for frame in self.slices]
-        return points + (moves[0] if len(moves) == 1 else moves[0].lerp(moves[1], self.weight))
+        move = moves[0] if len(moves) == 1 else moves[0].lerp(moves[1], self.weight)
+        if self.still_outside:
+            move = torch.where(self.box.contains(points)[:, None], move, 0.0)
+        return points + move

@@ -12,8 +12,8 @@ from torch import nn
 from devrf.data.batch import RayBatch
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
-from devrf.geometry.ndc import space_config, space_from
 from devrf.geometry.space import WORLD, Space
+from devrf.geometry.space_config import space_config, space_from
 from devrf.methods.base import DynamicModel
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField
@@ -161,9 +161,8 @@ class DeVRFModel(DynamicModel):
 
     def stored_state(self) -> dict[str, Any]:
         """The state with packed grids (``compact_state``)."""
-        return compact_state(
-            self.state_dict(), self.occupancy, self.canonical, self.deformation, self.occupancy_at
-        )
+        fields = self.occupancy, self.canonical, self.deformation, self.occupancy_at
+        return compact_state(self.state_dict(), *fields, endless=not self.space.straight)
 
     def load_stored_state(self, state: Mapping[str, Any]) -> None:
         """Take a compact or a full state."""

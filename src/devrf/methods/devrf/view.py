@@ -31,7 +31,7 @@ class DeVRFView:
     Attributes:
         at_rest: whether the warp of this time is the identity.
         occupancy: where something is.
-        displacement: Δ_b(·, t) (X, Y, Z, 3) over the fields' box; None at rest.
+        displacement: Δ_b(·, t) (X, Y, Z, 3) over the deformation field's box; None at rest.
     """
 
     @torch.no_grad()
@@ -60,25 +60,36 @@ class DeVRFView:
         self._warp: GridWarp | None = None
         if deformation is not None and not self.at_rest:
             self.displacement = deformation.blended(time)
-            # Interpolation at the points of a grid over the same box is resampling, which is
-            # several times faster.
+            still_outside = deformation.still_outside
+            self._warp = GridWarp(
+                (self.displacement,), deformation.box, still_outside=still_outside
+            )
             points = occupancy_points(occupancy, canonical)
-            moved = points + resample(self.displacement, shape_of(points))
+            if still_outside:
+                moved = self._warp(points.view(-1, 3)).view(points.shape)
+            else:
+                # Interpolation at the points of a grid over the same box is resampling, which is
+                # several times faster.
+                moved = points + resample(self.displacement, shape_of(points))
             self.occupancy = occupancy_through(occupancy, canonical, moved)
-            self._warp = GridWarp((self.displacement,), deformation.box)
+
+    @property
+    def _in_lists(self) -> bool:
+        """Whether lists of fixed length are rendered: their kernels take straight rays."""
+        return self._space.straight and triton_runs(self._canonical.density.values)
 
     @property
     def chunk(self) -> int:
         """Rays that are best rendered at once."""
         density = self._canonical.density.values
-        if triton_runs(density):
+        if self._in_lists:
             return IN_LISTS
         return ON_GPU if density.is_cuda else ON_CPU
 
     @torch.no_grad()
     def render(self, rays: Rays, background: Tensor) -> RenderedImage:
         """What R rays in the fields' space see."""
-        if triton_runs(self._canonical.density.values):
+        if self._in_lists:
             return self._lists.picture(rays, self.occupancy, self.displacement, background)
         return RenderedImage.of(
             render(rays, self._canonical, self.occupancy, self._settings, background, self._warp)

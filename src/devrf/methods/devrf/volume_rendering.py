@@ -79,12 +79,14 @@ def render(
 ) -> VoxelOutput:
     """Colours Ĉ = Σ w_i c_i + T_end · C_background and depths Σ w_i z_i / Σ w_i of rays.
 
+    Where the fields' space holds infinity, the field's colour there is what rays end in.
+
     Args:
         rays: R rays.
         field: the canonical field.
         occupancy: where something may be, in the space of the rays.
         settings: step length and thresholds.
-        background: (3,) or (R, 3) RGB behind everything.
+        background: (3,) or (R, 3) RGB behind everything, if the space does not hold infinity.
         warp: x → q = x + Δ_b(x, t), points (M, 3) to canonical space; None is the identity.
         precision: what the colour network works in.
 
@@ -117,6 +119,10 @@ def render(
         weight = weight.index_select(0, significant)
     with span("decoder"):
         color = field.rgb(canonical, rays.viewdirs, samples.ray, precision)
+        ends = rays.ends()
+        if ends is not None:
+            every = torch.arange(len(rays), device=ends.device)
+            background = field.rgb(ends, rays.viewdirs, every, precision)
     with span("compositing"):
         seen = sum_by_ray(weight[:, None] * color, samples.ray, len(rays))
         with torch.no_grad():

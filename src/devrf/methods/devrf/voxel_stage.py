@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 from devrf.data.batch import PixelPool, Pixels, RayBatch, background_color, gather_batch
 from devrf.engine.ddp import rays_per_rank
@@ -15,6 +16,7 @@ from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import Precision
 from devrf.methods.devrf.static_shape.training import render_static
 from devrf.methods.devrf.volume_rendering import VoxelOutput, render
+from devrf.ops.dispatch import triton_runs
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.sample_capacity import SampleCapacity
 from devrf.scenes.scene import Views
@@ -70,6 +72,13 @@ class VoxelStage(ScheduledStage):
         if capacity is None:
             return render(batch.rays, *fields, precision), batch
         return render_static(batch.rays, *fields, capacity, precision), batch
+
+    def static_shape(self, density: Tensor) -> bool:
+        """Whether batches are rendered in lists of fixed length: where Triton runs.
+
+        Its kernels take straight rays, which contracted space does not have.
+        """
+        return self.scene_model.space.straight and triton_runs(density)
 
     @property
     def _precision(self) -> torch.dtype:

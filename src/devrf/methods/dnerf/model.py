@@ -13,9 +13,9 @@ from devrf.data.batch import RayBatch
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
-from devrf.geometry.ndc import space_config, space_from
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import WORLD, Space
+from devrf.geometry.space_config import space_config, space_from
 from devrf.methods.base import DynamicModel
 from devrf.methods.dnerf.deformation import TranslationField
 from devrf.methods.nerf.hierarchical import flattened, importance, limits, stratified
@@ -110,7 +110,7 @@ class DNeRF(DynamicModel):
         if s.sampling == "occupancy":
             shape = box.grid_shape(s.occupancy_side**3)
             self.occupancy = OccupancyFrames(len(scene.clock), shape).to(self.device)
-            if scene.kind == "inward":
+            if scene.kind == "inward" and scene.space.straight:
                 self.occupancy.carve(scene, box)
 
     def config(self) -> dict[str, Any]:
@@ -157,6 +157,8 @@ class DNeRF(DynamicModel):
             jitter: sample at random places, to learn from them.
         """
         samples = self._samples(rays, time, jitter=jitter)
+        if not self.space.straight:
+            samples = samples.endless()
         points, when = self._normalised(samples.points), time.index_select(0, samples.ray)
         canonical = points + self.deformation(points, when)
         density, color = self.canonical(canonical, rays.viewdirs, samples.ray)

@@ -15,9 +15,9 @@ def limits(rays: Rays, box: Box, depths: tuple[float, float]) -> tuple[Tensor, T
 
     A ray that misses the box is sampled in a stretch of no length.
     """
-    entry, leave = box.crossing(rays)
-    near = entry.clamp(min=depths[0], max=depths[1])
-    return near, torch.maximum(leave.clamp(max=depths[1]), near)
+    entry, leave = box.crossing(rays, *depths)
+    near = entry.clamp(max=depths[1])
+    return near, torch.maximum(leave, near)
 
 
 def stratified(near: Tensor, far: Tensor, count: int, *, jitter: bool) -> Tensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -10,6 +10,9 @@ from torch import Tensor
 from devrf.geometry.rays import Rays
 from devrf.ops.compositing import composite, sum_by_ray
 from devrf.rendering.output import RenderOutput
+
+# Opaque at any density that a softplus gives.
+ENDLESS = 1e10
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,12 @@ class RaySamples:
         """
         unit = rays.directions.norm(dim=1).index_select(0, ray)
         return RaySamples(ray, distance, unit * stretch, rays.at(ray, distance), len(rays))
+
+    def endless(self) -> RaySamples:
+        """The same samples, the last of each ray standing for all that is behind it."""
+        following = torch.cat([self.ray[1:], self.ray.new_full((1,), -1)])[: len(self.ray)]
+        length = torch.where(self.ray != following, ENDLESS, self.length)
+        return replace(self, length=length)
 
 
 def volume_render(

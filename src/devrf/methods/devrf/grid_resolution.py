@@ -1,4 +1,4 @@
-"""How fine the grid of a forward-facing scene is: as its images, and as its views resolve depth."""
+"""How fine a grid a scene asks for: by its space, its images, and the depth its views resolve."""
 
 from __future__ import annotations
 
@@ -25,10 +25,11 @@ def fitted_to(
 
     In NDC, where no number of planes is given it becomes the one that the static views resolve,
     and ``voxels_per_pixel`` becomes the ``side`` of a grid so fine (docs/method.md#forward-facing).
+    In contracted space sides are longer (docs/method.md#scene-contraction).
     """
     space = scene.space
     if not isinstance(space, NormalizedDevice):
-        return schedule, architecture
+        return schedule.in_space(space), architecture
     planes = architecture.planes
     if planes is None:
         planes = resolved_planes(scene.static.train.cameras.positions, space)

@@ -10,7 +10,7 @@ import torch
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
-from devrf.methods.devrf.forward_resolution import fitted_to, resolved_planes
+from devrf.methods.devrf.grid_resolution import fitted_to, resolved_planes
 from devrf.scenes.procedural import ProceduralForwardScene
 from devrf.scenes.scene import Scene
 

@@ -1,0 +1,134 @@
+"""Scene contraction by hand."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from devrf.geometry.box import Box
+from devrf.geometry.contraction import ContractedSpace
+from devrf.geometry.ndc import NormalizedDevice
+from devrf.geometry.rays import Rays
+from devrf.geometry.space import WORLD, Space
+from devrf.geometry.space_config import space_config, space_from
+
+# Inner half edges 1, 2, 4 about (1, 0, 0): not a cube, so that a swap of axes shows.
+SPACE = ContractedSpace((0.0, -2.0, -4.0), (2.0, 2.0, 4.0), shell=1.0)
+CUBE = ContractedSpace((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), shell=0.5)
+
+
+@pytest.mark.parametrize(
+    ("world", "contracted"),
+    [
+        ((1.5, -2.0, 3.0), (1.5, -2.0, 3.0)),  # inside, on a face: as it is
+        ((3.0, 0.0, 0.0), (2.5, 0.0, 0.0)),  # u = 2: 2 − 1/2 half edges of 1 from 1
+        ((1.0, 8.0, 8.0), (1.0, 3.5, 3.5)),  # u = (0, 4, 2): 1.75 of (0, 2, 2)
+        ((1.0, 0.0, -(2.0**19)), (1.0, 0.0, -8 + 2.0**-15)),  # far away: the outer face
+    ],
+)
+def test_points_by_hand(
+    world: tuple[float, float, float], contracted: tuple[float, float, float]
+) -> None:
+    torch.testing.assert_close(SPACE.from_world(torch.tensor([world])), torch.tensor([contracted]))
+    torch.testing.assert_close(SPACE.to_world(torch.tensor([contracted])), torch.tensor([world]))
+
+
+def test_a_thin_shell_by_hand() -> None:
+    assert CUBE.box == Box((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5))
+    assert CUBE.inner() == Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+    contracted = CUBE.from_world(torch.tensor([[0.0, -5.0, 2.5]]))
+    torch.testing.assert_close(contracted, torch.tensor([[0.0, -1.4, 0.7]]))
+
+
+def test_there_and_back(rng: torch.Generator) -> None:
+    points = 20 * torch.randn(1000, 3, generator=rng, dtype=torch.float64)
+    for space in (SPACE, CUBE):
+        contracted = space.from_world(points)
+        assert bool(space.box.contains(contracted).all())
+        torch.testing.assert_close(space.to_world(contracted), points)
+
+
+def test_infinity_stays_finite() -> None:
+    corner = torch.tensor([[1.5, 1.5, -1.5]])
+    assert bool(CUBE.to_world(corner).isfinite().all())
+    assert float(CUBE.to_world(corner).amax()) > 1e5
+
+
+def _rays(rng: torch.Generator, count: int, scale: float) -> Rays:
+    directions = torch.randn(count, 3, generator=rng)
+    directions = torch.nn.functional.normalize(directions, dim=1)
+    return Rays(scale * torch.randn(count, 3, generator=rng), directions, directions)
+
+
+def test_rays_in_the_inner_box_are_those_of_the_world(rng: torch.Generator) -> None:
+    world = _rays(rng, 400, 0.2)
+    every, distance = torch.arange(400), 0.4 * torch.rand(400, generator=rng)
+    straight = world.at(every, distance)
+    inside = CUBE.inner().contains(straight)
+    assert int(inside.sum()) > 300
+    assert torch.equal(CUBE.rays(world).at(every, distance)[inside], straight[inside])
+
+
+def test_samples_are_evenly_spaced_in_disparity_along_a_ray() -> None:
+    x = torch.tensor([[1.0, 0.0, 0.0]])
+    rays = CUBE.rays(Rays(0 * x, x, x))
+    entry, leave = CUBE.box.crossing(rays, 0.25, math.inf)
+    assert (float(entry), float(leave)) == (0.25, 1.5)
+    distance = torch.tensor([0.5, 1.0, 1.1, 1.2, 1.3, 1.4])
+    ray = torch.zeros(6, dtype=torch.int64)
+    # 1/t falls by 0.2 from one to the next beyond the inner box.
+    expected = torch.tensor([0.5, 1.0, 1 / 0.8, 1 / 0.6, 1 / 0.4, 1 / 0.2])
+    torch.testing.assert_close(rays.world_distance(ray, distance), expected)
+    torch.testing.assert_close(rays.at(ray, distance)[:, 0], distance)
+    torch.testing.assert_close(rays.ends(), 1.5 * x)
+
+
+def test_a_ray_from_outside_is_contracted_on_its_way_in_too() -> None:
+    x = torch.tensor([[1.0, 0.0, 0.0]])
+    rays = CUBE.rays(Rays(-5 * x, x, x))
+    entry, leave = CUBE.box.crossing(rays, 0.0, math.inf)
+    # It starts at −1.4 of −1.5; in the inner box its distance is the world's, from 4 to 6.
+    torch.testing.assert_close(entry, torch.tensor([3.6]))
+    torch.testing.assert_close(leave, torch.tensor([6.5]))
+    ray = torch.zeros(3, dtype=torch.int64)
+    points = rays.at(ray, torch.tensor([3.6, 4.5, 6.25]))
+    torch.testing.assert_close(points[:, 0], torch.tensor([-1.4, -0.5, 1.25]))
+
+
+@pytest.mark.parametrize("scale", [0.3, 2.0, 6.0])
+def test_a_step_is_never_much_longer_in_contracted_space(
+    rng: torch.Generator, scale: float
+) -> None:
+    rays = CUBE.rays(_rays(rng, 300, scale))
+    entry, leave = CUBE.box.crossing(rays, 0.0, math.inf)
+    assert bool((leave > entry).all())
+    step, count = 1e-3, 200
+    for share in (0.0, 0.2, 0.5, 0.8, 0.99):
+        here = entry + share * (leave - entry - step)
+        ray = torch.arange(len(rays))
+        moved = rays.at(ray, here + step) - rays.at(ray, here)
+        assert float(moved.abs().max()) < rays.pace * step * 1.05
+    every = torch.linspace(0, 1, count)[:, None] * (leave - entry) + entry
+    points = rays.at(torch.arange(len(rays)).repeat(count), every.reshape(-1))
+    assert bool(CUBE.box.contains(points).all())
+
+
+def test_parts_of_rays_stay_contracted(rng: torch.Generator) -> None:
+    rays = CUBE.rays(_rays(rng, 10, 2.0))
+    again = Rays.joined([rays[:4], rays[torch.arange(4, 10)]])
+    ray, distance = torch.arange(10), torch.full((10,), 2.0)
+    assert torch.equal(again.at(ray, distance), rays.at(ray, distance))
+
+
+@pytest.mark.parametrize(
+    "space", [WORLD, CUBE, NormalizedDevice(16, 12, (8.0, 9.0), 0.5)], ids=["world", "cube", "ndc"]
+)
+def test_spaces_come_back_from_plain_data(space: Space) -> None:
+    assert space_from(space_config(space)) == space
+
+
+def test_files_without_a_kind_hold_ndc() -> None:
+    old = {"width": 16, "height": 12, "focal": (8.0, 9.0), "near": 0.5}
+    assert space_from(old) == NormalizedDevice(16, 12, (8.0, 9.0), 0.5)

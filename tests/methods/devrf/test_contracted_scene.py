@@ -1,0 +1,158 @@
+"""DeVRF in contracted space: rays end in the field, and nothing moves outside the inner box."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from lightning import Trainer
+
+from devrf.data.rendered import RenderedDataModule
+from devrf.geometry.box import Box
+from devrf.geometry.clock import FrameClock
+from devrf.geometry.contraction import ContractedSpace
+from devrf.geometry.rays import Rays
+from devrf.methods.devrf.active_frame import ActiveFrame
+from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
+from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.devrf.deformation_field import DeformationField
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule
+from devrf.methods.devrf.deformation_stage import DeformationStage
+from devrf.methods.devrf.flow_initialisation import Tracks, start_from_tracks
+from devrf.methods.devrf.grid_warp import GridWarp
+from devrf.methods.devrf.model import DeVRFModel
+from devrf.methods.devrf.settings import MotionSettings, RenderSettings
+from devrf.rendering.occupancy import Occupancy
+from devrf.rendering.renderer import Renderer
+from devrf.scenes.scene import Scene
+
+SPACE = ContractedSpace((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), shell=0.5)
+BUILD = Architecture(channels=4, width=8, frequencies=1)
+
+
+def box_of_moves() -> tuple[torch.Tensor, Box]:
+    return torch.full((3, 3, 3, 3), 0.25), SPACE.inner()
+
+
+def test_displacements_are_zero_outside_where_they_are_asked_to_be() -> None:
+    points = torch.tensor([[0.5, 0.0, 0.0], [1.0, 1.0, 1.0], [1.001, 0.0, 0.0], [0.0, 1.4, 0.0]])
+    grid, box = box_of_moves()
+    assert torch.equal(GridWarp((grid,), box)(points), points + 0.25)
+    still = GridWarp((grid,), box, still_outside=True)
+    moved = still(points)
+    torch.testing.assert_close(moved[:2], points[:2] + 0.25)
+    assert torch.equal(moved[2:], points[2:])
+
+
+def test_a_field_and_its_active_frame_agree_on_what_stays() -> None:
+    clock = FrameClock((0.0, 1.0))
+    field = DeformationField(SPACE.inner(), clock, voxels=27, still_outside=True)
+    field.to_canonical[1:] = 0.25
+    outside = torch.tensor([[1.3, 0.0, 0.0]])
+    assert torch.equal(field.warp(outside, 1.0), outside)
+    frame = ActiveFrame.of(field, Occupancy.full((4, 4, 4), SPACE.box))
+    frame.check_out(field, 1)
+    assert torch.equal(frame.warp(outside), outside) and frame.occupancy.box == SPACE.box
+    again = DeformationField(Box((0.0,) * 3, (1.0,) * 3), clock, voxels=8)
+    again.set_extra_state(field.get_extra_state())
+    assert again.still_outside and again.box == SPACE.inner()
+
+
+def test_points_outside_leave_no_tracks() -> None:
+    field = DeformationField(SPACE.inner(), FrameClock((0.0, 1.0)), voxels=27, still_outside=True)
+    none = Tracks(torch.tensor([[1.2, 0.0, 0.0]]), torch.zeros(1).long(), torch.zeros(1, 2))
+    start_from_tracks(field, 1, none, None)  # type: ignore[arg-type]  # cameras are not asked
+    assert not bool(field.to_time.any())
+
+
+@pytest.fixture
+def model() -> DeVRFModel:
+    """Random colours around a ball that moves along x; far away the field is empty."""
+    torch.manual_seed(0)
+    canonical = BUILD.radiance_field(SPACE.box, 18**3, 18**3)
+    points = SPACE.box.grid_points(canonical.density.shape, torch.empty(0))
+    solid = points.norm(dim=-1) < 0.5
+    with torch.no_grad():
+        canonical.density.values.fill_(-9.0)
+        canonical.density.values[solid] = 12.0
+        canonical.color.values.copy_(torch.randn(*canonical.color.shape, 4))
+    motion = DeformationField(
+        SPACE.inner(), FrameClock((0.0, 0.5, 1.0)), voxels=8**3, still_outside=True
+    )
+    motion.to_canonical[1, ..., 0], motion.to_canonical[2, ..., 0] = -0.1, -0.2
+    settings = RenderSettings(step=0.5, alpha_threshold=1e-3, near=0.2, far=math.inf)
+    return DeVRFModel(BUILD, canonical, Occupancy(solid, SPACE.box), settings, motion, SPACE)
+
+
+def _views(count: int = 60) -> Rays:
+    directions = torch.randn(count, 3, generator=torch.Generator().manual_seed(3))
+    directions = torch.nn.functional.normalize(directions, dim=1)
+    return Rays(torch.tensor([[-2.0, 0.0, 0.0]]).expand(count, 3), directions, directions)
+
+
+def test_rays_that_meet_nothing_end_in_the_fields_colour_at_infinity(model: DeVRFModel) -> None:
+    rays = _views()
+    seen = Renderer(model).picture(rays, 0.0, 1.0)
+    missed = seen.opacity < 1e-6
+    assert 10 < int(missed.sum()) < 60
+    ends = SPACE.rays(rays).ends()
+    with torch.no_grad():
+        expected = model.canonical.rgb(ends, rays.viewdirs, torch.arange(len(rays)))
+    torch.testing.assert_close(seen.color[missed], expected[missed])
+    # The given background shows nowhere.
+    torch.testing.assert_close(Renderer(model).picture(rays, 0.0, 0.0).color, seen.color)
+
+
+def test_a_checkpoint_shows_the_same(model: DeVRFModel) -> None:
+    other = DeVRFModel.from_config(model.config())
+    other.load_stored_state(model.stored_state())
+    assert other.space == SPACE and other.deformation is not None
+    for time in (0.0, 0.25, 1.0):
+        ours, theirs = (Renderer(one).picture(_views(), time, 1.0) for one in (model, other))
+        # Grids are stored in half precision.
+        torch.testing.assert_close(ours.color, theirs.color, atol=5e-3, rtol=0)
+    at_rest, moved = (Renderer(model).picture(_views(), time, 1.0) for time in (0.0, 1.0))
+    assert not torch.equal(at_rest.opacity, moved.opacity)
+
+
+def test_grids_are_longer_by_the_shell() -> None:
+    schedule = CanonicalSchedule(side=64, search_side=48)
+    longer = schedule.in_space(SPACE)
+    assert (longer.side, longer.search_side) == (96, 72)
+    assert schedule.in_space(replace(SPACE, shell=1.0)).phases[-1].voxels == 128**3
+
+
+def test_a_room_is_learned_and_moves_inside_the_inner_box(
+    tiny_room: Scene, trainer: Callable[..., Trainer]
+) -> None:
+    room, data = tiny_room, RenderedDataModule(lambda: tiny_room, None)
+    schedule = CanonicalSchedule(
+        search_iterations=0,
+        search_side=16,
+        carve=True,
+        iterations=60,
+        side=20,
+        doublings=(20, 40),
+        rays=256,
+    )
+    stage = CanonicalStage(schedule, BUILD)
+    fitted = trainer(max_epochs=1)
+    fitted.fit(stage, datamodule=data)
+    assert stage.scene_model.box == room.bounds.box and stage.schedule.side == 30
+    mean = room.static.train.pixels.float().div(255).mean(dim=(0, 1, 2))
+    blank = float((room.static.train.pixels.float() / 255 - mean).square().mean())
+    assert float(fitted.callback_metrics["static/color"]) < 0.8 * blank
+    moving = DeformationStage(
+        stage.result(),
+        DeformationSchedule(sides=(6,), iterations_per_frame=(10,), rays=256),
+        MotionSettings(unit="box", views="all", start="flow"),
+    )
+    trainer(max_epochs=1).fit(moving, datamodule=data)
+    assert moving.field.box == room.space.inner(room.bounds.box) and moving.field.still_outside
+    far = torch.tensor([[room.bounds.box.high[0], 0.0, 0.0]])
+    assert torch.equal(moving.scene_model.deformation.warp(far, 1.0), far)
+    assert bool(moving.field.to_canonical[1].any())
