@@ -12,6 +12,7 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 import torch
 from torch import Tensor, nn
 
+from devrf.methods.devrf.appearance import AppearanceSettings
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
@@ -26,6 +27,7 @@ Parts = Mapping[tuple[str, ...], int]
 IMAGES = ("data.downscale", "data.width", "data.frames")
 GRIDS = ("schedule.canonical.side",)
 FRAMES = ("schedule.deformation.sides", "data.frames")
+APPEARANCE = ("schedule.appearance.side", "data.frames")
 PARALLEL = ("schedule.deformation.parallel_frames", "schedule.deformation.sides")
 
 # Python and its libraries on the host, without what the driver of a GPU adds.
@@ -186,12 +188,13 @@ def estimate(
     architecture: Architecture,
     step: float = 0.5,
     motion: MotionSettings | None = None,
+    appearance: AppearanceSettings | None = None,
 ) -> Budget:
     """What DeVRF needs to learn ``scene``, with samples ``step`` voxels apart.
 
     The fields' box is taken to be the scene's motion box, or its box where that is unknown: grids
     have about side³ voxels in any box. A store of displacements that is ``auto`` counts as on the
-    device.
+    device, an appearance that is ``auto`` as learned.
     """
     voxels, sizes = round(canonical.side**3), (architecture.channels, architecture.width)
     with torch.device("meta"):
@@ -216,6 +219,8 @@ def estimate(
         _level_needs(scene, field, rest, deformation, level, motion, batch)
         for level in range(len(deformation.sides))
     ]
+    if appearance is not None and appearance.learn != "never":
+        moving = [_with_appearance(one, scene, field, appearance.side) for one in moving]
     everything = tensor_bytes((scene.static, scene.dynamic))
     return Budget(everything, {"canonical": rest, "deformation": max(moving, key=StageNeeds.peak)})
 
@@ -231,6 +236,23 @@ def _canonical_needs(scene: Scene, field: CanonicalField, batch: int) -> StageNe
         learned=needs.learned + points,
         checkpoint=needs.checkpoint - grids // 2 + points,  # in half precision
         progress=needs.progress + 5 * points,  # with the number of views of each voxel
+    )
+
+
+def _with_appearance(
+    needs: StageNeeds, scene: Scene, field: CanonicalField, side: int
+) -> StageNeeds:
+    """What a level needs with residuals of colours, on grids of about side³ voxels."""
+    x, y, z = field.box.grid_shape(side**3)
+    frame = x * y * z * 12
+    learned, active = len(scene.clock) * frame, needs.batches * frame
+    return replace(
+        needs,
+        # An active frame's values, gradients, two moments, and the copy for a rollback.
+        held={**needs.held, APPEARANCE: learned + 5 * active},
+        learned=needs.learned + learned,
+        checkpoint=needs.checkpoint + learned // 2,
+        progress=needs.progress + learned + 2 * active,
     )
 
 

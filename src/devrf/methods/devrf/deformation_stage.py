@@ -17,6 +17,7 @@ from devrf.engine.parallel_batch import ParallelBatch
 from devrf.engine.phase import Phase
 from devrf.methods.devrf import convergence
 from devrf.methods.devrf.active_frame import ActiveFrames
+from devrf.methods.devrf.appearance import AppearanceField, AppearanceSettings
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule
 from devrf.methods.devrf.deformed_occupancy import deformed_occupancy
@@ -24,6 +25,7 @@ from devrf.methods.devrf.flow_initialisation import follow, start_from_tracks
 from devrf.methods.devrf.frame_memory import rest_on_host
 from devrf.methods.devrf.losses import (
     MOTION_TERMS,
+    TOTAL_VARIATIONS,
     MotionPrediction,
     WeightedLoss,
     total_variation_weight,
@@ -61,6 +63,7 @@ class DeformationStage(VoxelStage):
         iterations_per_step: int = 10,
         graphs: Graphs = "auto",
         decoder_precision: Precision = "auto",
+        appearance: AppearanceSettings | None = None,
     ) -> None:
         """Build the stage; the defaults are the paper's for inward-facing scenes.
 
@@ -69,17 +72,22 @@ class DeformationStage(VoxelStage):
                 ``load_checkpoint``); its fields are frozen.
             schedule: resolutions, iterations and frames.
             motion: learning rate and how batches are drawn.
-            loss: weights of the loss terms; ``tv`` is the total variation of both fields.
+            loss: weights of the loss terms; ``tv`` is the total variation of the displacements,
+                ``appearance_tv`` that of the residuals.
             iterations_per_step: optimiser iterations in one Lightning step.
             graphs: whether a GPU replays iterations from CUDA graphs: ``auto`` where it can.
             decoder_precision: what the colour network computes in; ``auto``: ``bfloat16`` on a
                 GPU that multiplies it.
+            appearance: whether and how the change of colours is learned.
         """
         super().__init__(iterations_per_step, graphs, decoder_precision)
         self.schedule = schedule or DeformationSchedule()
         self.motion = motion or MotionSettings()
+        self.appearance_settings = appearance or AppearanceSettings()
         weights = dict(loss)
-        self.tv = weights.pop("tv", 0.0)
+        self.tv, self.appearance_tv = (weights.pop(name, 0.0) for name in TOTAL_VARIATIONS)
+        if self.appearance_settings.learn == "never":
+            weights.pop("appearance", None)
         self.losses = WeightedLoss(MOTION_TERMS, weights)
         still = rest.model
         self.scene_model = DeVRFModel(
@@ -133,8 +141,27 @@ class DeformationStage(VoxelStage):
                 on_host=rest_on_host(self.trainer, model, self.schedule, motion),
                 half=motion.store_half,
             )
+            self._setup_appearance()
         scale = model.box.longest if motion.unit == "box" else 1.0
         self._optimizer.param_groups[0]["base_lr"] = motion.learning_rate * scale
+
+    def _setup_appearance(self) -> None:
+        """Build the residuals, zero, and their parameter group, if they are learned."""
+        chosen, model = self.appearance_settings, self.scene_model
+        if chosen.learn == "never":
+            return
+        model.appearance = AppearanceField(model.box, self.field.clock, voxels=chosen.side**3)
+        rate, placeholder = chosen.learning_rate, torch.zeros(2, 2, 2, 3, requires_grad=True)
+        self._optimizer.add_param_group(
+            {"params": [placeholder], "lr": rate, "base_lr": rate, "name": "appearance"}
+        )
+
+    @property
+    def learned_appearance(self) -> AppearanceField | None:
+        """The appearance, if the present level learns it."""
+        first = min(self.appearance_settings.first_level, len(self.schedule.sides) - 1)
+        assert isinstance(self.phase, DeformationPhase)
+        return self.scene_model.appearance if self.phase.level >= first else None
 
     def enter(self, phase: Phase) -> None:
         """Go to the phase's frames: grow the grids if a level begins, fresh Adam."""
@@ -146,7 +173,8 @@ class DeformationStage(VoxelStage):
             self.field.resize(phase.side**3)
         self._initialise(phase)
         if len(self.active) == len(phase.frames):
-            self._optimizer.forget(0)
+            for group in range(len(self._optimizer.param_groups)):
+                self._optimizer.forget(group)
         self.activate(phase)
         self._prefetch_after(phase)
         self.update_occupancy()
@@ -170,22 +198,30 @@ class DeformationStage(VoxelStage):
         """Make memory for ``count`` active frames at the field's present resolution."""
         # The memory of the frames before is freed first.
         self.loop.release()
-        self.active.allocate(0, self.field, self.scene_model.occupancy)
-        self._optimizer.replace(0, [])
-        self.active.allocate(count, self.field, self.scene_model.occupancy)
-        slices = [frame.slices for frame in self.active]
+        fields = self.field, self.scene_model.occupancy, self.learned_appearance
+        self.active.allocate(0, *fields)
+        for group in range(len(self._optimizer.param_groups)):
+            self._optimizer.replace(group, [])
+        self.active.allocate(count, *fields)
         smoothing = total_variation_weight(self.tv, max(self.field.shape), self.schedule.rays)
-        learned = [tensor for pair in slices for tensor in pair]
+        learned = [tensor for frame in self.active for tensor in frame.slices]
         self._optimizer.replace(0, learned, smoothing=smoothing)
-        if slices:
+        residuals = [frame.residual for frame in self.active if frame.residual is not None]
+        if residuals:
+            longest = max(residuals[0].shape)
+            smoothing = total_variation_weight(self.appearance_tv, longest, self.schedule.rays)
+            self._optimizer.replace(1, residuals, smoothing=smoothing)
+        if len(self.active):
             static_shape = triton_runs(self.scene_model.canonical.density.values)
-            self.bind(self.schedule.rays, slices, static_shape=static_shape)
+            parameters = [frame.learned for frame in self.active]
+            self.bind(self.schedule.rays, parameters, static_shape=static_shape)
 
     def _initialise(self, phase: DeformationPhase) -> None:
         """Start each frame from the one before it; along the observed flow, if asked to."""
         for number in phase.frames:
             if phase.init_from_previous:
                 self.field.frames.copy_previous(number)
+            self._carry_appearance(phase, number)
             if self._starts_along_flow(phase):
                 views, model, clock = self.views, self.scene_model, self.field.clock
                 pool, before = all_pixels(views, images_of(views, number)), clock.times[number - 1]
@@ -193,6 +229,12 @@ class DeformationStage(VoxelStage):
                 start_from_tracks(self.field, number, tracks, views.cameras, model.space)
                 # Each process has followed pixels of its own.
                 broadcast([self.field.to_canonical[number], self.field.to_time[number]])
+
+    def _carry_appearance(self, phase: DeformationPhase, number: int) -> None:
+        """At the first level that learns it, start a frame's from that of the frame before it."""
+        first = min(self.appearance_settings.first_level, len(self.schedule.sides) - 1)
+        if self.scene_model.appearance is not None and phase.level == first:
+            self.scene_model.appearance.copy_previous([number])
 
     def _starts_along_flow(self, phase: DeformationPhase) -> bool:
         asked = self.motion.start == "flow" and self.views.flow is not None
@@ -254,7 +296,9 @@ class DeformationStage(VoxelStage):
         """Render a batch of the frame through its warp; compare images and motion."""
         frame, capacity = self.active[batch.number], batch.capacity
         prediction = MotionPrediction(
-            *self.render_pixels(views, pixels, frame.occupancy, capacity, frame.warp),
+            *self.render_pixels(
+                views, pixels, frame.occupancy, capacity, frame.warp, frame.appearance
+            ),
             frame.unwarp,
             frame.unwarp_previous(always_interpolate=capacity is not None),
             views.cameras,
