@@ -31,6 +31,7 @@ from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
+from devrf.methods.devrf.refinement import RefinementSettings
 from devrf.methods.devrf.settings import MotionSettings
 from devrf.scenes.scene import Scene
 
@@ -200,6 +201,23 @@ def test_colours_that_change_go_on_exactly(
     whole = learn(build, data=four_frames)
     assert_same(learn(build, 3, 9, 15, 16, 18, 22, 25, data=four_frames), whole)
     assert len(whole["optimizer"]["param_groups"][1]["params"]) == 2
+
+
+def test_the_refinement_goes_on_exactly(learn, rest: LoadedCheckpoint) -> None:
+    def build() -> ScheduledStage:
+        return DeformationStage(
+            copy.deepcopy(rest),
+            MOVING,
+            ALONG_FLOW,
+            iterations_per_step=1,
+            appearance=AppearanceSettings(learn="always", side=5),
+            refinement=RefinementSettings(iterations=6),
+        )
+
+    # At its beginning, within, before its end.
+    whole = learn(build)
+    assert_same(learn(build, 30, 31, 33, 35), whole)
+    assert whole["iteration"] == 36
 
 
 def test_a_step_of_many_iterations_goes_on_exactly(learn, rest: LoadedCheckpoint) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from typing import Any
 
@@ -33,7 +34,8 @@ from devrf.methods.devrf.losses import (
 )
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.pixel_selection import frame_pools, images_of
-from devrf.methods.devrf.settings import DEFORMATION_LOSS, MotionSettings, Precision
+from devrf.methods.devrf.refinement import Refinement, RefinementPhase, RefinementSettings
+from devrf.methods.devrf.settings import DEFORMATION_LOSS, FINE_LOSS, MotionSettings, Precision
 from devrf.methods.devrf.voxel_stage import VoxelStage
 from devrf.ops.adam import GridAdam
 from devrf.ops.dispatch import triton_runs
@@ -45,8 +47,9 @@ class DeformationStage(VoxelStage):
     """Learns from the dynamic views how the scene deforms (docs/method.md#deformation-stage).
 
     Coarse to fine (docs/method.md#coarse-to-fine), frames are learned one after another, or several
-    in parallel, each from batches of its own. Only their two slices are trained; the canonical
-    field and all other frames are frozen.
+    in parallel, each from batches of its own. Only their two slices are trained, and how their
+    colours change if that is asked for; the canonical field and all other frames are frozen. A last
+    phase may refine the canonical field (docs/method.md#refinement).
     """
 
     schedule: DeformationSchedule
@@ -64,6 +67,8 @@ class DeformationStage(VoxelStage):
         graphs: Graphs = "auto",
         decoder_precision: Precision = "auto",
         appearance: AppearanceSettings | None = None,
+        refinement: RefinementSettings | None = None,
+        refinement_loss: Mapping[str, float] = FINE_LOSS,
     ) -> None:
         """Build the stage; the defaults are the paper's for inward-facing scenes.
 
@@ -79,6 +84,8 @@ class DeformationStage(VoxelStage):
             decoder_precision: what the colour network computes in; ``auto``: ``bfloat16`` on a
                 GPU that multiplies it.
             appearance: whether and how the change of colours is learned.
+            refinement: how the canonical field learns on at the end.
+            refinement_loss: weights of the photometric terms that it learns from.
         """
         super().__init__(iterations_per_step, graphs, decoder_precision)
         self.schedule = schedule or DeformationSchedule()
@@ -90,8 +97,12 @@ class DeformationStage(VoxelStage):
             weights.pop("appearance", None)
         self.losses = WeightedLoss(MOTION_TERMS, weights)
         still = rest.model
+        fields = still.canonical, still.occupancy
+        self.refinement = Refinement(self, refinement or RefinementSettings(), refinement_loss)
+        if self.refinement.settings.iterations:
+            fields = copy.deepcopy(fields)  # what rest holds stays as it is
         self.scene_model = DeVRFModel(
-            still.architecture, still.canonical, still.occupancy, still.settings, space=still.space
+            still.architecture, *fields, still.settings, space=still.space
         ).requires_grad_(False)
         self.earlier_records = rest.metadata.records
         placeholder = torch.zeros(2, 2, 2, 3, requires_grad=True)
@@ -109,8 +120,8 @@ class DeformationStage(VoxelStage):
 
     @property
     def total_iterations(self) -> int:
-        """Iterations of all levels and frames."""
-        return self.schedule.total(len(self.field.clock))
+        """Iterations of all levels and frames, and of the refinement."""
+        return self.schedule.total(len(self.field.clock)) + self.refinement.settings.iterations
 
     @property
     def resolution(self) -> tuple[int, ...]:
@@ -122,13 +133,20 @@ class DeformationStage(VoxelStage):
         """Adam over the two slices of each active frame."""
         return self._optimizer
 
-    def phase_at(self, iteration: int) -> DeformationPhase:
-        """The schedule's phase."""
-        return self.schedule.phase(iteration, len(self.field.clock))
+    def phase_at(self, iteration: int) -> DeformationPhase | RefinementPhase:
+        """The schedule's phase, or the refinement after the last."""
+        frames = len(self.field.clock)
+        last = self.schedule.total(frames)
+        if iteration >= last and self.refinement.settings.iterations:
+            return self.refinement.phase(last)
+        return self.schedule.phase(iteration, frames)
 
     def learning_rate_factor(self, iteration: int) -> float:
         """The decay of the iteration's level (docs/method.md#motion-learning-rate)."""
-        return self.phase_at(iteration).learning_rate_factor
+        phase = self.phase_at(iteration)
+        if isinstance(phase, RefinementPhase):
+            return phase.learning_rate_factor(iteration)
+        return phase.learning_rate_factor
 
     def setup(self, stage: str) -> None:
         """Build the field at rest, at the coarsest resolution, in the canonical field's box."""
@@ -142,6 +160,8 @@ class DeformationStage(VoxelStage):
                 half=motion.store_half,
             )
             self._setup_appearance()
+            if self.refinement.settings.iterations:
+                self.refinement.add_groups()
         scale = model.box.longest if motion.unit == "box" else 1.0
         self._optimizer.param_groups[0]["base_lr"] = motion.learning_rate * scale
 
@@ -165,9 +185,13 @@ class DeformationStage(VoxelStage):
 
     def enter(self, phase: Phase) -> None:
         """Go to the phase's frames: grow the grids if a level begins, fresh Adam."""
-        assert isinstance(phase, DeformationPhase)
+        assert isinstance(phase, DeformationPhase | RefinementPhase)
         previous, self.phase = self.phase, phase
         self.active.write_back()
+        if isinstance(phase, RefinementPhase):
+            self.refinement.grow()
+            self._begin_refinement()
+            return
         if isinstance(previous, DeformationPhase) and previous.level != phase.level:
             self._allocate(0)
             self.field.resize(phase.side**3)
@@ -187,6 +211,11 @@ class DeformationStage(VoxelStage):
                 occupied_only=self.motion.pixels == "occupied",
                 join_views=self.motion.views == "all",
             )
+
+    def _begin_refinement(self) -> None:
+        """Free what the frames were learned with, and refine the canonical field."""
+        self.active.close()
+        self.refinement.begin(self.views, occupied_only=self.motion.pixels == "occupied")
 
     def activate(self, phase: DeformationPhase) -> None:
         """Check out the phase's frames, with memory for them."""
@@ -243,6 +272,8 @@ class DeformationStage(VoxelStage):
     def _prefetch_after(self, phase: DeformationPhase) -> None:
         """Begin to fetch the next phase's frames, unless they change before it begins."""
         following = self.phase_at(phase.stop)
+        if isinstance(following, RefinementPhase):
+            return
         changed = following.init_from_previous or self._starts_along_flow(following)
         if following.level == phase.level and following != phase and not changed:
             self.field.frames.prefetch(following.frames)
@@ -255,6 +286,7 @@ class DeformationStage(VoxelStage):
     def on_train_end(self) -> None:
         """Write the last frames back."""
         self.active.close()
+        self.refinement.end()
 
     @property
     def views(self) -> Views:
@@ -287,6 +319,8 @@ class DeformationStage(VoxelStage):
 
     def draw(self, batch: ParallelBatch) -> Pixels:
         """Random pixels of the batch's frame, of its views in turn or of all."""
+        if isinstance(self.phase, RefinementPhase):
+            return self.refinement.draw()
         pools = self.active[batch.number].pools
         return self.draw_pixels(pools[self.iteration % len(pools)])
 
@@ -294,6 +328,8 @@ class DeformationStage(VoxelStage):
         self, batch: ParallelBatch, views: Views, pixels: Pixels
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Render a batch of the frame through its warp; compare images and motion."""
+        if isinstance(self.phase, RefinementPhase):
+            return self.refinement.loss(views, pixels)
         frame, capacity = self.active[batch.number], batch.capacity
         prediction = MotionPrediction(
             *self.render_pixels(
@@ -312,7 +348,7 @@ class DeformationStage(VoxelStage):
     def converged(self, losses: Tensor) -> bool:
         """Whether each active frame's loss has stopped falling, if the schedule asks for that."""
         least = self.motion.min_rel_improvement
-        if least is None:
+        if least is None or isinstance(self.phase, RefinementPhase):
             return False
         for frame, loss in zip(self.active, losses.tolist(), strict=True):
             frame.losses.append(loss)
@@ -344,6 +380,9 @@ class DeformationStage(VoxelStage):
 
     def restore(self, phase: Phase, kept: dict[str, Any]) -> None:
         """Go on with the frames of ``phase``, the field being loaded."""
+        if isinstance(phase, RefinementPhase):
+            self._begin_refinement()
+            return
         assert isinstance(phase, DeformationPhase)
         self.activate(phase)
         views = self.views
