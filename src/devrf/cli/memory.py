@@ -18,6 +18,7 @@ from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.frame_memory import active_bytes, resident_bytes
+from devrf.methods.devrf.refinement import RefinementSettings
 from devrf.methods.devrf.settings import MotionSettings
 from devrf.scenes.scene import Scene, Views
 
@@ -189,6 +190,7 @@ def estimate(
     step: float = 0.5,
     motion: MotionSettings | None = None,
     appearance: AppearanceSettings | None = None,
+    refinement: RefinementSettings | None = None,
 ) -> Budget:
     """What DeVRF needs to learn ``scene``, with samples ``step`` voxels apart.
 
@@ -221,6 +223,8 @@ def estimate(
     ]
     if appearance is not None and appearance.learn != "never":
         moving = [_with_appearance(one, scene, field, appearance.side) for one in moving]
+    if refinement is not None and refinement.iterations:
+        moving.append(_refinement_needs(moving[-1], scene, field))
     everything = tensor_bytes((scene.static, scene.dynamic))
     return Budget(everything, {"canonical": rest, "deformation": max(moving, key=StageNeeds.peak)})
 
@@ -254,6 +258,18 @@ def _with_appearance(
         checkpoint=needs.checkpoint + learned // 2,
         progress=needs.progress + learned + 2 * active,
     )
+
+
+def _refinement_needs(last: StageNeeds, scene: Scene, field: CanonicalField) -> StageNeeds:
+    """What refining the canonical field needs, after the ``last`` level, with all of that."""
+    views, points = scene.dynamic.train, field.density.values.numel()
+    parameters = tensor_bytes(field.parameters())
+    pools = len(views) * views.height * views.width * POOLED
+    occupancies = 2 * len(scene.clock) * points
+    # Gradients, two moments, and the copy that a rollback returns to.
+    held = {**last.held, IMAGES: last.held[IMAGES] + pools}
+    held[GRIDS] += 4 * parameters + occupancies
+    return replace(last, held=held, progress=last.progress + 2 * parameters)
 
 
 def _level_needs(

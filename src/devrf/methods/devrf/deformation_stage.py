@@ -18,7 +18,8 @@ from devrf.engine.parallel_batch import ParallelBatch
 from devrf.engine.phase import Phase
 from devrf.methods.devrf import convergence
 from devrf.methods.devrf.active_frame import ActiveFrames
-from devrf.methods.devrf.appearance import AppearanceField, AppearanceSettings
+from devrf.methods.devrf.appearance import AppearanceSettings
+from devrf.methods.devrf.appearance_learning import AppearanceLearning
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule
 from devrf.methods.devrf.deformed_occupancy import deformed_occupancy
@@ -90,10 +91,11 @@ class DeformationStage(VoxelStage):
         super().__init__(iterations_per_step, graphs, decoder_precision)
         self.schedule = schedule or DeformationSchedule()
         self.motion = motion or MotionSettings()
-        self.appearance_settings = appearance or AppearanceSettings()
         weights = dict(loss)
-        self.tv, self.appearance_tv = (weights.pop(name, 0.0) for name in TOTAL_VARIATIONS)
-        if self.appearance_settings.learn == "never":
+        self.tv, smoothing = (weights.pop(name, 0.0) for name in TOTAL_VARIATIONS)
+        chosen = appearance or AppearanceSettings()
+        self.appearance = AppearanceLearning(chosen, self.schedule, smoothing)
+        if chosen.learn == "never":
             weights.pop("appearance", None)
         self.losses = WeightedLoss(MOTION_TERMS, weights)
         still = rest.model
@@ -159,29 +161,11 @@ class DeformationStage(VoxelStage):
                 on_host=rest_on_host(self.trainer, model, self.schedule, motion),
                 half=motion.store_half,
             )
-            self._setup_appearance()
+            self.appearance.setup(model, self.field.clock, self._optimizer)
             if self.refinement.settings.iterations:
                 self.refinement.add_groups()
         scale = model.box.longest if motion.unit == "box" else 1.0
         self._optimizer.param_groups[0]["base_lr"] = motion.learning_rate * scale
-
-    def _setup_appearance(self) -> None:
-        """Build the residuals, zero, and their parameter group, if they are learned."""
-        chosen, model = self.appearance_settings, self.scene_model
-        if chosen.learn == "never":
-            return
-        model.appearance = AppearanceField(model.box, self.field.clock, voxels=chosen.side**3)
-        rate, placeholder = chosen.learning_rate, torch.zeros(2, 2, 2, 3, requires_grad=True)
-        self._optimizer.add_param_group(
-            {"params": [placeholder], "lr": rate, "base_lr": rate, "name": "appearance"}
-        )
-
-    @property
-    def learned_appearance(self) -> AppearanceField | None:
-        """The appearance, if the present level learns it."""
-        first = min(self.appearance_settings.first_level, len(self.schedule.sides) - 1)
-        assert isinstance(self.phase, DeformationPhase)
-        return self.scene_model.appearance if self.phase.level >= first else None
 
     def enter(self, phase: Phase) -> None:
         """Go to the phase's frames: grow the grids if a level begins, fresh Adam."""
@@ -227,7 +211,9 @@ class DeformationStage(VoxelStage):
         """Make memory for ``count`` active frames at the field's present resolution."""
         # The memory of the frames before is freed first.
         self.loop.release()
-        fields = self.field, self.scene_model.occupancy, self.learned_appearance
+        assert isinstance(self.phase, DeformationPhase)
+        appearance = self.appearance.at_level(self.scene_model, self.phase.level)
+        fields = self.field, self.scene_model.occupancy, appearance
         self.active.allocate(0, *fields)
         for group in range(len(self._optimizer.param_groups)):
             self._optimizer.replace(group, [])
@@ -236,10 +222,7 @@ class DeformationStage(VoxelStage):
         learned = [tensor for frame in self.active for tensor in frame.slices]
         self._optimizer.replace(0, learned, smoothing=smoothing)
         residuals = [frame.residual for frame in self.active if frame.residual is not None]
-        if residuals:
-            longest = max(residuals[0].shape)
-            smoothing = total_variation_weight(self.appearance_tv, longest, self.schedule.rays)
-            self._optimizer.replace(1, residuals, smoothing=smoothing)
+        self.appearance.give_parameters(self._optimizer, residuals)
         if len(self.active):
             static_shape = triton_runs(self.scene_model.canonical.density.values)
             parameters = [frame.learned for frame in self.active]
@@ -247,10 +230,10 @@ class DeformationStage(VoxelStage):
 
     def _initialise(self, phase: DeformationPhase) -> None:
         """Start each frame from the one before it; along the observed flow, if asked to."""
+        self.appearance.initialise(self.scene_model, phase)
         for number in phase.frames:
             if phase.init_from_previous:
                 self.field.frames.copy_previous(number)
-            self._carry_appearance(phase, number)
             if self._starts_along_flow(phase):
                 views, model, clock = self.views, self.scene_model, self.field.clock
                 pool, before = all_pixels(views, images_of(views, number)), clock.times[number - 1]
@@ -258,12 +241,6 @@ class DeformationStage(VoxelStage):
                 start_from_tracks(self.field, number, tracks, views.cameras, model.space)
                 # Each process has followed pixels of its own.
                 broadcast([self.field.to_canonical[number], self.field.to_time[number]])
-
-    def _carry_appearance(self, phase: DeformationPhase, number: int) -> None:
-        """At the first level that learns it, start a frame's from that of the frame before it."""
-        first = min(self.appearance_settings.first_level, len(self.schedule.sides) - 1)
-        if self.scene_model.appearance is not None and phase.level == first:
-            self.scene_model.appearance.copy_previous([number])
 
     def _starts_along_flow(self, phase: DeformationPhase) -> bool:
         asked = self.motion.start == "flow" and self.views.flow is not None
