@@ -178,7 +178,7 @@ def test_the_papers_sizes(cubic: Scene) -> None:
 
 
 def test_colours_that_change_by_hand(cubic: Scene) -> None:
-    plain, settings = deformation_needs(cubic), AppearanceSettings(learn="auto", side=6)
+    plain, settings = deformation_needs(cubic), AppearanceSettings(learn="always", side=6)
     needs = estimate(cubic, CANONICAL, DEFORMATION, SMALL, appearance=settings).stages[
         "deformation"
     ]

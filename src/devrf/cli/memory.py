@@ -196,7 +196,7 @@ def estimate(
 
     The fields' box is taken to be the scene's motion box, or its box where that is unknown: grids
     have about side³ voxels in any box. A store of displacements that is ``auto`` counts as on the
-    device, an appearance that is ``auto`` as learned.
+    device.
     """
     voxels, sizes = round(canonical.side**3), (architecture.channels, architecture.width)
     with torch.device("meta"):

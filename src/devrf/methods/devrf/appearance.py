@@ -21,15 +21,14 @@ class AppearanceSettings:
     """Whether and how the appearance is learned, beside the displacements.
 
     Attributes:
-        learn: ``never``, ``always``, or ``auto``: where the optical flow shows that colours do not
-            stay what they are along the motion.
+        learn: ``never`` or ``always``.
         side: the grid of a frame has about side³ voxels.
         learning_rate: logits a step: how far a value moves at most.
         first_level: the first level that learns it, from 0; the last one where there are fewer.
             The levels before find the motion alone.
     """
 
-    learn: Literal["never", "always", "auto"] = "never"
+    learn: Literal["never", "always"] = "never"
     side: int = 40
     learning_rate: float = 0.05
     first_level: int = 1
