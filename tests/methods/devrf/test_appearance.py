@@ -16,6 +16,7 @@ from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.methods.devrf.appearance import AppearanceField, AppearanceSettings, ColorResidual
+from devrf.methods.devrf.appearance_learning import check_weights
 from devrf.methods.devrf.color_decoder import ColorDecoder, SigmoidColor
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
@@ -155,3 +156,8 @@ def test_a_checkpoint_keeps_the_colours(
 def test_wrong_settings_are_told(wrong: dict[str, float], told: str) -> None:
     with pytest.raises(DevrfError, match=told):
         AppearanceSettings(**wrong)  # type: ignore[arg-type]
+
+
+def test_an_unknown_weight_is_told() -> None:
+    with pytest.raises(DevrfError, match="loss.appearance: unknown term 'tvs'; the terms are"):
+        check_weights({"tvs": 1.0})

@@ -23,7 +23,7 @@ from devrf.scenes.scene import Scene
 SHORT = DeformationSchedule(sides=(4, 6), iterations_per_frame=(8, 4), rays=256)
 FAST = MotionSettings(learning_rate=5e-3, views="all", pixels="occupied")
 # Three frames: 24 + 12 iterations, then these.
-REFINED = RefinementSettings(iterations=30, rates=CanonicalRates(0.05, 0.05, 5e-4))
+REFINED = RefinementSettings(iterations=30, rates=CanonicalRates(0.05, 0.05, 5e-4), grow=1)
 
 
 def test_the_rates_fall_over_the_phase() -> None:

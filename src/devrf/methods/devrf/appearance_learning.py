@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from torch import Tensor
 
+from devrf.errors import DevrfError
 from devrf.geometry.clock import FrameClock
 from devrf.methods.devrf.appearance import AppearanceField, AppearanceSettings
 from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule
@@ -16,6 +17,19 @@ from devrf.ops.adam import GridAdam
 GROUP = "appearance"
 
 
+def check_weights(loss: Mapping[str, float]) -> None:
+    """Check the names of the weights in ``loss.appearance``.
+
+    Raises:
+        DevrfError: there is no such term.
+    """
+    unknown = sorted(map(str, set(loss) - {"residual", "tv"}))
+    if unknown:
+        raise DevrfError(
+            f"loss.appearance: unknown term {unknown[0]!r}; the terms are residual, tv"
+        )
+
+
 class AppearanceLearning:
     """Gives the deformation stage residuals to learn, level by level.
 
@@ -24,20 +38,30 @@ class AppearanceLearning:
     """
 
     def __init__(
-        self, settings: AppearanceSettings, schedule: DeformationSchedule, smoothing: float
+        self,
+        settings: AppearanceSettings,
+        schedule: DeformationSchedule,
+        loss: Mapping[str, float],
     ) -> None:
         """Say how to learn.
 
         Args:
             settings: whether, and on which grids.
             schedule: the stage's levels, and its rays.
-            smoothing: weight of the residuals' total variation.
+            loss: weights of the loss term ``residual``, and of the total variation ``tv``.
         """
+        check_weights(loss)
         self.settings = settings
         self._schedule = schedule
-        self._smoothing = smoothing
+        self._smoothing = loss.get("tv", 0.0)
+        self._residual = loss.get("residual", 0.0)
         # The ablation without levels has one.
         self._first = min(settings.first_level, len(schedule.sides) - 1)
+
+    @property
+    def weights(self) -> dict[str, float]:
+        """The weights of further loss terms of the stage; none where nothing is learned."""
+        return {} if self.settings.learn == "never" else {"residual": self._residual}
 
     def setup(self, model: DeVRFModel, clock: FrameClock, optimizer: GridAdam) -> None:
         """Build the residuals, zero, and their parameter group, empty as yet."""

@@ -27,7 +27,6 @@ from devrf.methods.devrf.flow_initialisation import follow, start_from_tracks
 from devrf.methods.devrf.frame_memory import rest_on_host
 from devrf.methods.devrf.losses import (
     MOTION_TERMS,
-    TOTAL_VARIATIONS,
     MotionPrediction,
     WeightedLoss,
     total_variation_weight,
@@ -36,7 +35,13 @@ from devrf.methods.devrf.losses import (
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.pixel_selection import frame_pools, images_of
 from devrf.methods.devrf.refinement import Refinement, RefinementPhase, RefinementSettings
-from devrf.methods.devrf.settings import DEFORMATION_LOSS, FINE_LOSS, MotionSettings, Precision
+from devrf.methods.devrf.settings import (
+    APPEARANCE_LOSS,
+    DEFORMATION_LOSS,
+    FINE_LOSS,
+    MotionSettings,
+    Precision,
+)
 from devrf.methods.devrf.voxel_stage import VoxelStage
 from devrf.ops.adam import GridAdam
 from devrf.ops.dispatch import triton_runs
@@ -68,6 +73,7 @@ class DeformationStage(VoxelStage):
         graphs: Graphs = "auto",
         decoder_precision: Precision = "auto",
         appearance: AppearanceSettings | None = None,
+        appearance_loss: Mapping[str, float] = APPEARANCE_LOSS,
         refinement: RefinementSettings | None = None,
         refinement_loss: Mapping[str, float] = FINE_LOSS,
     ) -> None:
@@ -78,13 +84,14 @@ class DeformationStage(VoxelStage):
                 ``load_checkpoint``); its fields are frozen.
             schedule: resolutions, iterations and frames.
             motion: learning rate and how batches are drawn.
-            loss: weights of the loss terms; ``tv`` is the total variation of the displacements,
-                ``appearance_tv`` that of the residuals.
+            loss: weights of the loss terms; ``tv`` is the total variation of both fields.
             iterations_per_step: optimiser iterations in one Lightning step.
             graphs: whether a GPU replays iterations from CUDA graphs: ``auto`` where it can.
             decoder_precision: what the colour network computes in; ``auto``: ``bfloat16`` on a
                 GPU that multiplies it.
             appearance: whether and how the change of colours is learned.
+            appearance_loss: weights of the squared residuals, ``residual``, and of their total
+                variation, ``tv``.
             refinement: how the canonical field learns on at the end.
             refinement_loss: weights of the photometric terms that it learns from.
         """
@@ -92,11 +99,10 @@ class DeformationStage(VoxelStage):
         self.schedule = schedule or DeformationSchedule()
         self.motion = motion or MotionSettings()
         weights = dict(loss)
-        self.tv, smoothing = (weights.pop(name, 0.0) for name in TOTAL_VARIATIONS)
+        self.tv = weights.pop("tv", 0.0)
         chosen = appearance or AppearanceSettings()
-        self.appearance = AppearanceLearning(chosen, self.schedule, smoothing)
-        if chosen.learn == "never":
-            weights.pop("appearance", None)
+        self.appearance = AppearanceLearning(chosen, self.schedule, appearance_loss)
+        weights.update(self.appearance.weights)
         self.losses = WeightedLoss(MOTION_TERMS, weights)
         still = rest.model
         fields = still.canonical, still.occupancy

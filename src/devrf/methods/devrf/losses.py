@@ -156,7 +156,7 @@ def total_variation_weight(weight: float, side: int, rays: int) -> float:
     return weight * (side / 128) / rays / 6
 
 
-def appearance(prediction: MotionPrediction) -> Tensor:
+def residual(prediction: MotionPrediction) -> Tensor:
     """(1/R) Σ_i w_i |A_t(q_i)|²: colours stay what they are at rest; 0 without residuals."""
     output = prediction.output
     if output.residual is None:
@@ -169,11 +169,8 @@ MOTION_TERMS = {
     **{("render" if name == "color" else name): term for name, term in PHOTOMETRIC_TERMS.items()},
     "cycle": cycle,
     "flow": flow,
-    "appearance": appearance,
+    "residual": residual,
 }
-
-# Weights in a config that are not of terms: the optimiser adds the gradient.
-TOTAL_VARIATIONS = ("tv", "appearance_tv")
 
 
 @dataclass(frozen=True)

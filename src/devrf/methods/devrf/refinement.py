@@ -29,17 +29,17 @@ class RefinementSettings:
         rates: learning rates at the first iteration.
         decay: factor of the rates from the first iteration to the last, exponential in between.
         static_share: share of a batch's rays that show the scene at rest.
-        grow: by how many voxels the occupancy at rest grows: there may be matter that no static
-            view shows.
+        grow: by how many voxels the occupancy at rest grows first, where there may be matter
+            that no static view shows.
     """
 
     iterations: int = 0
     rates: CanonicalRates = field(
-        default_factory=lambda: CanonicalRates(density=0.02, color=0.02, decoder=2e-4)
+        default_factory=lambda: CanonicalRates(density=0.1, color=0.05, decoder=2e-4)
     )
     decay: float = 0.1
     static_share: float = 0.5
-    grow: int = 1
+    grow: int = 0
 
     def __post_init__(self) -> None:
         for name in ("iterations", "grow"):

@@ -19,9 +19,8 @@ DEFORMATION_LOSS = {
     "tv": 1.0,
     "per_sample_color": 0.1,
     "entropy": 0.01,
-    "appearance": 1e-3,
-    "appearance_tv": 0.1,
 }
+APPEARANCE_LOSS = {"residual": 1e-3, "tv": 0.01}
 
 
 @dataclass(frozen=True)
