@@ -29,8 +29,8 @@ class AppearanceSettings:
     """
 
     learn: Literal["never", "always"] = "never"
-    side: int = 40
-    learning_rate: float = 0.05
+    side: int = 64
+    learning_rate: float = 0.1
     first_level: int = 1
 
     def __post_init__(self) -> None:

@@ -35,10 +35,10 @@ class RefinementSettings:
 
     iterations: int = 0
     rates: CanonicalRates = field(
-        default_factory=lambda: CanonicalRates(density=0.1, color=0.05, decoder=2e-4)
+        default_factory=lambda: CanonicalRates(density=0.01, color=5e-3, decoder=5e-5)
     )
     decay: float = 0.1
-    static_share: float = 0.5
+    static_share: float = 0.75
     grow: int = 0
 
     def __post_init__(self) -> None:
