@@ -27,6 +27,7 @@ from devrf.data.datamodule import SceneDataModule
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.geometry.rays import Rays
+from devrf.methods.devrf.appearance import AppearanceField
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
@@ -185,13 +186,19 @@ def rest(learned: tuple[CanonicalStage, Trainer]) -> LoadedCheckpoint:
 
 @pytest.fixture
 def moving(learned: tuple[CanonicalStage, Trainer], rng: torch.Generator) -> DeVRFModel:
-    """The tiny scene; at the times 0.4 and 1 every point has moved by up to 5 % of its box."""
+    """The tiny scene; at the times 0.4 and 1 every point has moved by up to 5 % of its box.
+
+    Its colours have changed, too.
+    """
     model = copy.deepcopy(learned[0].scene_model)
     box = model.canonical.box
     motion = DeformationField(box, FrameClock((0.0, 0.4, 1.0)), voxels=5**3)
     shape = motion.to_canonical[1:].shape
     motion.to_canonical[1:] = 0.1 * box.longest * (torch.rand(shape, generator=rng) - 0.5)
     model.deformation = motion
+    model.appearance = AppearanceField(box, motion.clock, voxels=4**3)
+    shape = model.appearance.values[1:].shape
+    model.appearance.values[1:] = 2 * torch.rand(shape, generator=rng) - 1
     return model
 
 
@@ -201,7 +208,8 @@ def plain_picture(
     """What rays in the fields' space see of a model at ``time``, by the plain renderer."""
     scene = model.canonical, model.occupancy_at(time), model.settings
     with torch.no_grad():
-        return RenderedImage.of(render(rays, *scene, background, model.warp(time)))
+        warp, colors = model.warp(time), model.residual(time)
+        return RenderedImage.of(render(rays, *scene, background, warp, appearance=colors))
 
 
 @pytest.fixture

@@ -25,11 +25,13 @@ from devrf.checkpoints.progress import progress_files
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.stage import ScheduledStage
 from devrf.errors import DevrfError
+from devrf.methods.devrf.appearance import AppearanceSettings
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
+from devrf.methods.devrf.refinement import RefinementSettings
 from devrf.methods.devrf.settings import MotionSettings
 from devrf.scenes.scene import Scene
 
@@ -182,6 +184,40 @@ def test_frames_that_are_visited_together_go_on_exactly(
     whole = learn(build, data=four_frames)
     assert_same(learn(build, *leaves, data=four_frames), whole)
     assert len(whole["optimizer"]["param_groups"][0]["params"]) == 4
+
+
+@pytest.mark.parametrize("first_level", [0, 1])
+def test_colours_that_change_go_on_exactly(
+    learn, rest: LoadedCheckpoint, four_frames: SceneDataModule, first_level: int
+) -> None:
+    appearance = AppearanceSettings(learn="always", side=5, first_level=first_level)
+
+    def build() -> ScheduledStage:
+        return DeformationStage(
+            copy.deepcopy(rest), TOGETHER, ROUNDED, iterations_per_step=1, appearance=appearance
+        )
+
+    # Mid-visit at both levels, around a frame's end, around the level's.
+    whole = learn(build, data=four_frames)
+    assert_same(learn(build, 3, 9, 15, 16, 18, 22, 25, data=four_frames), whole)
+    assert len(whole["optimizer"]["param_groups"][1]["params"]) == 2
+
+
+def test_the_refinement_goes_on_exactly(learn, rest: LoadedCheckpoint) -> None:
+    def build() -> ScheduledStage:
+        return DeformationStage(
+            copy.deepcopy(rest),
+            MOVING,
+            ALONG_FLOW,
+            iterations_per_step=1,
+            appearance=AppearanceSettings(learn="always", side=5),
+            refinement=RefinementSettings(iterations=6),
+        )
+
+    # At its beginning, within, before its end.
+    whole = learn(build)
+    assert_same(learn(build, 30, 31, 33, 35), whole)
+    assert whole["iteration"] == 36
 
 
 def test_a_step_of_many_iterations_goes_on_exactly(learn, rest: LoadedCheckpoint) -> None:

@@ -10,6 +10,7 @@ import torch
 from torch import nn
 
 from devrf.cli.memory import (
+    APPEARANCE,
     FRAMES,
     GRIDS,
     IMAGES,
@@ -23,9 +24,11 @@ from devrf.cli.memory import (
     tensor_bytes,
 )
 from devrf.geometry.box import Box
+from devrf.methods.devrf.appearance import AppearanceSettings
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
+from devrf.methods.devrf.refinement import RefinementSettings
 from devrf.methods.devrf.settings import MotionSettings
 from devrf.scenes.scene import Scene
 
@@ -172,3 +175,32 @@ def test_the_papers_sizes(cubic: Scene) -> None:
     for needs in budget.stages.values():
         assert 1e9 < needs.peak() < 12e9
     assert budget.stages["deformation"].learned > 2 * 2.4576e9
+
+
+def test_colours_that_change_by_hand(cubic: Scene) -> None:
+    plain, settings = deformation_needs(cubic), AppearanceSettings(learn="always", side=6)
+    needs = estimate(cubic, CANONICAL, DEFORMATION, SMALL, appearance=settings).stages[
+        "deformation"
+    ]
+    frame = 6**3 * 12
+    # Four frames; the active one's values, gradients, two moments, a copy.
+    assert needs.held == {**plain.held, APPEARANCE: 9 * frame}
+    assert needs.learned - plain.learned == 4 * frame
+    assert needs.checkpoint - plain.checkpoint == 2 * frame
+    assert needs.progress - plain.progress == 6 * frame
+    never = replace(settings, learn="never")
+    assert (
+        estimate(cubic, CANONICAL, DEFORMATION, SMALL, appearance=never).stages["deformation"]
+        == plain
+    )
+
+
+def test_the_refinement_by_hand(cubic: Scene) -> None:
+    plain, settings = deformation_needs(cubic), RefinementSettings(iterations=1)
+    needs = estimate(cubic, CANONICAL, DEFORMATION, SMALL, refinement=settings).stages[
+        "deformation"
+    ]
+    # Gradients, two moments, a copy; masks and vicinities of four frames.
+    assert needs.held[GRIDS] - plain.held[GRIDS] == 4 * (GRID_BYTES + DECODER) + 8 * POINTS
+    # The pixels of all images at once.
+    assert needs.held[IMAGES] - plain.held[IMAGES] == 8 * 24 * 18 * 8

@@ -91,6 +91,8 @@ def _of_devrf(run: RunContext) -> Budget:
         canonical.architecture,
         canonical.sampling.step,
         instantiate(run.config.deformation.motion, _convert_="all"),
+        instantiate(run.config.deformation.appearance, _convert_="all"),
+        instantiate(run.config.deformation.refinement, _convert_="all"),
     )
 
 

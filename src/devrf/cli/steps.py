@@ -33,7 +33,8 @@ from devrf.cli.train import learn
 from devrf.cli.workers import launch_workers
 from devrf.engine.ddp import ManualDDP
 from devrf.errors import DevrfError
-from devrf.methods.devrf.losses import MOTION_TERMS, WeightedLoss
+from devrf.methods.devrf.appearance_learning import check_weights
+from devrf.methods.devrf.losses import MOTION_TERMS, PHOTOMETRIC_TERMS, WeightedLoss
 from devrf.ops.dispatch import using
 
 log = logging.getLogger(__name__)
@@ -210,6 +211,8 @@ def _check(run: RunContext, asked: Plan) -> None:
     if "deformation" in config:
         weights = {k: v for k, v in config.deformation.loss.items() if k != "tv"}
         WeightedLoss(MOTION_TERMS, weights)
+        WeightedLoss(PHOTOMETRIC_TERMS, dict(config.deformation.refinement_loss))
+        check_weights(config.deformation.appearance_loss)
     run.evaluation.check()
     check_objective(config.objective, run.evaluation.metrics)
     if job.in_search() and "evaluate" not in asked.further:

@@ -66,6 +66,9 @@ def _facts(found: Inspection) -> list[tuple[str, str]]:
         ("room for motion", f"{motion}{bounds.source}"),
         ("optical flow", _flow(found.flow)),
     ]
+    if found.color_change is not None:
+        change = f"differ by {100 * found.color_change:.1f} % over a few frames"
+        rows.append(("colours along the flow", change))
     if found.gap is not None:
         rows.insert(2, ("static views", f"widest sector without one: {found.gap:.0f} degrees"))
     return rows

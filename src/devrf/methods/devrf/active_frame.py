@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from devrf.checkpoints.packing import pack_bits, unpack_bits
 from devrf.data.batch import PixelPool
 from devrf.geometry.box import Box
+from devrf.methods.devrf.appearance import AppearanceField, ColorResidual
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.grid_warp import GridWarp
 from devrf.rendering.occupancy import Occupancy
@@ -31,6 +32,7 @@ class ActiveFrame:
         occupancy: where something is at the frame's time.
         box: where the displacements live.
         still_outside: whether nothing moves outside the box.
+        appearance: q → A_t(q) of the frame, its grid a leaf; None where it is not learned.
         number: the frame; 0 before the first.
         pools: the pixels to learn from; batches are drawn from each in turn.
         losses: mean loss of each Lightning step since the frame was checked out.
@@ -42,24 +44,41 @@ class ActiveFrame:
     occupancy: Occupancy
     box: Box
     still_outside: bool
+    appearance: ColorResidual | None = None
     number: int = 0
     pools: list[PixelPool] = field(default_factory=list)
     losses: list[float] = field(default_factory=list)
 
     @staticmethod
-    def of(motion: DeformationField, occupancy: Occupancy) -> ActiveFrame:
-        """Memory at the field's resolution, on its device, with an occupancy like the given one."""
+    def of(
+        motion: DeformationField, occupancy: Occupancy, appearance: AppearanceField | None = None
+    ) -> ActiveFrame:
+        """Memory at the fields' resolutions, on their device, with an occupancy like the given."""
         backward, forward, before = (
             motion.frames.here.new_zeros(*motion.shape, 3) for _ in range(3)
         )
         empty = Occupancy(torch.zeros_like(occupancy.mask), occupancy.box)
         learned = backward.requires_grad_(), forward.requires_grad_()
-        return ActiveFrame(*learned, before, empty, motion.box, motion.still_outside)
+        residual = None
+        if appearance is not None:
+            grid = torch.zeros_like(appearance.values[0]).requires_grad_()
+            residual = ColorResidual(grid, appearance.box)
+        return ActiveFrame(*learned, before, empty, motion.box, motion.still_outside, residual)
 
     @property
     def slices(self) -> tuple[Tensor, Tensor]:
         """Both directions of the frame."""
         return self.backward, self.forward
+
+    @property
+    def learned(self) -> list[Tensor]:
+        """Everything that is learned of the frame."""
+        return [*self.slices, *([] if self.residual is None else [self.residual])]
+
+    @property
+    def residual(self) -> Tensor | None:
+        """(X', Y', Z', 3) A_t of the frame, if it is learned."""
+        return None if self.appearance is None else self.appearance.grid
 
     @property
     def warp(self) -> GridWarp:
@@ -83,11 +102,16 @@ class ActiveFrame:
     def _by(self, *slices: Tensor) -> GridWarp:
         return GridWarp(slices, self.box, still_outside=self.still_outside)
 
-    def check_out(self, motion: DeformationField, number: int) -> None:
-        """Copy a frame out of the field."""
+    @torch.no_grad()
+    def check_out(
+        self, motion: DeformationField, number: int, appearance: AppearanceField | None = None
+    ) -> None:
+        """Copy a frame out of the fields."""
         self.number, self.losses = number, []
         motion.frames.read(number, self.slices)
         motion.frames.read_forward(number - 1, self.before)
+        if self.residual is not None and appearance is not None:
+            self.residual.copy_(appearance.values[number])
 
     def state(self, images: Tensor, area: int, *, exact: bool) -> dict[str, Any]:
         """Occupancy and pixels as plain data, for a progress file.
@@ -128,6 +152,7 @@ class ActiveFrames:
         """
         self._frames: list[ActiveFrame] = []
         self._field: DeformationField | None = None
+        self._appearance: AppearanceField | None = None
         module.register_state_dict_pre_hook(  # type: ignore[no-untyped-call]
             lambda *_: self.write_back()
         )
@@ -144,24 +169,40 @@ class ActiveFrames:
     def __getitem__(self, number: int) -> ActiveFrame:
         return self._frames[number]
 
-    def allocate(self, count: int, motion: DeformationField, occupancy: Occupancy) -> None:
-        """Make memory for ``count`` frames at the field's present resolution."""
+    def allocate(
+        self,
+        count: int,
+        motion: DeformationField,
+        occupancy: Occupancy,
+        appearance: AppearanceField | None = None,
+    ) -> None:
+        """Make memory for ``count`` frames at the fields' present resolutions.
+
+        Args:
+            count: how many frames are trained in parallel.
+            motion: their displacements.
+            occupancy: at rest.
+            appearance: their residuals; None where they are not learned.
+        """
         self._frames = []  # frees the memory of those before
-        self._field = motion
-        self._frames = [ActiveFrame.of(motion, occupancy) for _ in range(count)]
+        self._field, self._appearance = motion, appearance
+        self._frames = [ActiveFrame.of(motion, occupancy, appearance) for _ in range(count)]
 
     def check_out(self, numbers: Sequence[int]) -> None:
         """Copy as many frames as there is memory for out of the field."""
         assert self._field is not None
         for frame, number in zip(self._frames, numbers, strict=True):
-            frame.check_out(self._field, number)
+            frame.check_out(self._field, number, self._appearance)
 
+    @torch.no_grad()
     def write_back(self) -> None:
-        """Copy what was learned of the frames into the field; learning may go on."""
+        """Copy what was learned of the frames into the fields; learning may go on."""
         if self._field is not None and self._frames:
             for frame in self._frames:
                 if frame.number:
                     self._field.frames.write(frame.number, frame.slices)
+                    if frame.residual is not None and self._appearance is not None:
+                        self._appearance.values[frame.number].copy_(frame.residual)
             self._field.frames.synchronize()
 
     def close(self) -> None:
@@ -172,4 +213,4 @@ class ActiveFrames:
     def _check_out_again(self) -> None:
         for frame in self._frames:
             if frame.number and self._field is not None:
-                frame.check_out(self._field, frame.number)
+                frame.check_out(self._field, frame.number, self._appearance)

@@ -128,12 +128,15 @@ class CanonicalField(nn.Module):
         viewdirs: Tensor,
         ray: Tensor,
         precision: torch.dtype = torch.float32,
+        residual: Tensor | None = None,
     ) -> Tensor:
         """RGB (S, 3) at ``points`` (S, 3) on rays ``ray`` (S,) with ``viewdirs`` (R, 3).
 
-        The decoder works in ``precision``; the result is in single precision.
+        The decoder works in ``precision``; the result is in single precision. ``residual`` (S, 3)
+        is added before the sigmoid.
         """
-        color: Tensor = self.decoder(self.color(points, self.box), viewdirs, ray, precision)
+        features = self.color(points, self.box)
+        color: Tensor = self.decoder(features, viewdirs, ray, precision, residual)
         return color
 
     @property

@@ -9,9 +9,16 @@ from torch import Tensor, nn
 class SigmoidColor(nn.Module):
     """Three channels are the colour itself, before a sigmoid: no network, no view dependence."""
 
-    def forward(self, features: Tensor, *_: object) -> Tensor:
+    def forward(
+        self,
+        features: Tensor,
+        viewdirs: Tensor,
+        ray: Tensor,
+        precision: torch.dtype = torch.float32,
+        residual: Tensor | None = None,
+    ) -> Tensor:
         """RGB (S, 3) in [0, 1] of ``features`` (S, 3), whatever the direction."""
-        return torch.sigmoid(features)
+        return torch.sigmoid(features if residual is None else features + residual)
 
 
 class ColorDecoder(nn.Module):
@@ -44,6 +51,7 @@ class ColorDecoder(nn.Module):
         viewdirs: Tensor,
         ray: Tensor,
         precision: torch.dtype = torch.float32,
+        residual: Tensor | None = None,
     ) -> Tensor:
         """Colours of samples.
 
@@ -53,6 +61,7 @@ class ColorDecoder(nn.Module):
             ray: (S,) int64, the ray of each sample.
             precision: what the hidden layers and their gradients are computed in. Weights,
                 sums, and the last layer stay in single precision, so that colours do.
+            residual: (S, 3) what is added before the sigmoid; None: nothing.
 
         Returns:
             RGB (S, 3) in [0, 1].
@@ -62,7 +71,8 @@ class ColorDecoder(nn.Module):
             by_ray = self.from_direction(self._encode(viewdirs))
             x = torch.relu(self.from_feature(features) + by_ray.index_select(0, ray))
             x = torch.relu(self.hidden(x))
-        return torch.sigmoid(self.output(x.to(self.output.weight.dtype)))
+        logits = self.output(x.to(self.output.weight.dtype))
+        return torch.sigmoid(logits if residual is None else logits + residual)
 
     def _encode(self, viewdirs: Tensor) -> Tensor:
         angles = (viewdirs[:, None, :] * self.octaves[:, None]).flatten(1)

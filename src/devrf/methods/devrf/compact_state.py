@@ -14,6 +14,7 @@ from torch import Tensor
 
 from devrf.checkpoints.packing import pack, unpack
 from devrf.geometry.box import Box
+from devrf.methods.devrf.appearance import AppearanceField
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.rendering.occupancy import Occupancy, dilate
@@ -28,6 +29,7 @@ def compact_state(
     canonical: CanonicalField,
     deformation: DeformationField | None,
     occupancy_at: Callable[[float], Occupancy],
+    appearance: AppearanceField | None = None,
     *,
     endless: bool,
 ) -> dict[str, Any]:
@@ -41,6 +43,7 @@ def compact_state(
         canonical: the canonical field.
         deformation: how it deforms, or None.
         occupancy_at: where something is at a time.
+        appearance: how its colours change, or None.
         endless: whether rays end in the field: its outer faces are then kept.
     """
     small = dict(state)
@@ -62,6 +65,9 @@ def compact_state(
         small[f"{frames}to_canonical"] = _packed(deformation.to_canonical, moving, smooth=True)
         at_rest = _near(occupancy, shape, box)[None]
         small[f"{frames}to_time"] = _packed(deformation.to_time, at_rest, smooth=True)
+    if appearance is not None:
+        at_rest = _near(occupancy, appearance.shape, appearance.box)[None]
+        small["appearance.values"] = _packed(appearance.values, at_rest, smooth=False)
     return small
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from functools import partial
 from typing import Any
@@ -19,6 +20,8 @@ from devrf.engine.phase import Phase
 from devrf.errors import DevrfError
 from devrf.methods.devrf import convergence
 from devrf.methods.devrf.active_frame import ActiveFrames
+from devrf.methods.devrf.appearance import AppearanceSettings
+from devrf.methods.devrf.appearance_learning import AppearanceLearning
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule
 from devrf.methods.devrf.deformed_occupancy import deformed_occupancy
@@ -35,7 +38,14 @@ from devrf.methods.devrf.losses import (
 )
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.pixel_selection import frame_pools, images_of
-from devrf.methods.devrf.settings import DEFORMATION_LOSS, MotionSettings, Precision
+from devrf.methods.devrf.refinement import Refinement, RefinementPhase, RefinementSettings
+from devrf.methods.devrf.settings import (
+    APPEARANCE_LOSS,
+    DEFORMATION_LOSS,
+    FINE_LOSS,
+    MotionSettings,
+    Precision,
+)
 from devrf.methods.devrf.voxel_stage import VoxelStage
 from devrf.ops.adam import GridAdam
 from devrf.scenes.scene import CaptureName, Views
@@ -46,8 +56,9 @@ class DeformationStage(VoxelStage):
     """Learns from the dynamic views how the scene deforms (docs/method.md#deformation-stage).
 
     Coarse to fine (docs/method.md#coarse-to-fine), frames are learned one after another, or several
-    in parallel, each from batches of its own. Only their two slices are trained; the canonical
-    field and all other frames are frozen.
+    in parallel, each from batches of its own. Only their two slices are trained, and how their
+    colours change if that is asked for; the canonical field and all other frames are frozen. A last
+    phase may refine the canonical field (docs/method.md#refinement).
     """
 
     schedule: DeformationSchedule
@@ -65,6 +76,10 @@ class DeformationStage(VoxelStage):
         iterations_per_step: int = 10,
         graphs: Graphs = "auto",
         decoder_precision: Precision = "auto",
+        appearance: AppearanceSettings | None = None,
+        appearance_loss: Mapping[str, float] = APPEARANCE_LOSS,
+        refinement: RefinementSettings | None = None,
+        refinement_loss: Mapping[str, float] = FINE_LOSS,
     ) -> None:
         """Build the stage; the defaults are the paper's for inward-facing scenes.
 
@@ -79,16 +94,28 @@ class DeformationStage(VoxelStage):
             graphs: whether a GPU replays iterations from CUDA graphs: ``auto`` where it can.
             decoder_precision: what the colour network computes in; ``auto``: ``bfloat16`` on a
                 GPU that multiplies it.
+            appearance: whether and how the change of colours is learned.
+            appearance_loss: weights of the squared residuals, ``residual``, and of their total
+                variation, ``tv``.
+            refinement: how the canonical field learns on at the end.
+            refinement_loss: weights of the photometric terms that it learns from.
         """
         super().__init__(iterations_per_step, graphs, decoder_precision)
         self.schedule = schedule or DeformationSchedule()
         self.motion = motion or MotionSettings()
         weights = dict(loss)
         self.tv = weights.pop("tv", 0.0)
+        chosen = appearance or AppearanceSettings()
+        self.appearance = AppearanceLearning(chosen, self.schedule, appearance_loss)
+        weights.update(self.appearance.weights)
         self.losses = WeightedLoss(MOTION_TERMS | {"flow": partial(flow, mean=flow_mean)}, weights)
         still = rest.model
+        fields = still.canonical, still.occupancy
+        self.refinement = Refinement(self, refinement or RefinementSettings(), refinement_loss)
+        if self.refinement.settings.iterations:
+            fields = copy.deepcopy(fields)  # what rest holds stays as it is
         self.scene_model = DeVRFModel(
-            still.architecture, still.canonical, still.occupancy, still.settings, space=still.space
+            still.architecture, *fields, still.settings, space=still.space
         ).requires_grad_(False)
         self.earlier_records = rest.metadata.records
         placeholder = torch.zeros(2, 2, 2, 3, requires_grad=True)
@@ -106,8 +133,8 @@ class DeformationStage(VoxelStage):
 
     @property
     def total_iterations(self) -> int:
-        """Iterations of all levels and frames."""
-        return self.schedule.total(len(self.field.clock))
+        """Iterations of all levels and frames, and of the refinement."""
+        return self.schedule.total(len(self.field.clock)) + self.refinement.settings.iterations
 
     @property
     def resolution(self) -> tuple[int, ...]:
@@ -119,13 +146,20 @@ class DeformationStage(VoxelStage):
         """Adam over the two slices of each active frame."""
         return self._optimizer
 
-    def phase_at(self, iteration: int) -> DeformationPhase:
-        """The schedule's phase."""
-        return self.schedule.phase(iteration, len(self.field.clock))
+    def phase_at(self, iteration: int) -> DeformationPhase | RefinementPhase:
+        """The schedule's phase, or the refinement after the last."""
+        frames = len(self.field.clock)
+        last = self.schedule.total(frames)
+        if iteration >= last and self.refinement.settings.iterations:
+            return self.refinement.phase(last)
+        return self.schedule.phase(iteration, frames)
 
     def learning_rate_factor(self, iteration: int) -> float:
         """The decay of the iteration's level (docs/method.md#motion-learning-rate)."""
-        return self.phase_at(iteration).learning_rate_factor
+        phase = self.phase_at(iteration)
+        if isinstance(phase, RefinementPhase):
+            return phase.learning_rate_factor(iteration)
+        return phase.learning_rate_factor
 
     def setup(self, stage: str) -> None:
         """Build the field at rest, at the coarsest resolution.
@@ -153,20 +187,28 @@ class DeformationStage(VoxelStage):
                 on_host=rest_on_host(self.trainer, model, self.schedule, motion),
                 half=motion.store_half,
             )
+            self.appearance.setup(model, self.field.clock, self._optimizer)
+            if self.refinement.settings.iterations:
+                self.refinement.add_groups()
         scale = self.field.box.longest if motion.unit == "box" else 1.0
         self._optimizer.param_groups[0]["base_lr"] = motion.learning_rate * scale
 
     def enter(self, phase: Phase) -> None:
         """Go to the phase's frames: grow the grids if a level begins, fresh Adam."""
-        assert isinstance(phase, DeformationPhase)
+        assert isinstance(phase, DeformationPhase | RefinementPhase)
         previous, self.phase = self.phase, phase
         self.active.write_back()
+        if isinstance(phase, RefinementPhase):
+            self.refinement.grow()
+            self._begin_refinement()
+            return
         if isinstance(previous, DeformationPhase) and previous.level != phase.level:
             self._allocate(0)
             self.field.resize(phase.side**3)
         self._initialise(phase)
         if len(self.active) == len(phase.frames):
-            self._optimizer.forget(0)
+            for group in range(len(self._optimizer.param_groups)):
+                self._optimizer.forget(group)
         self.activate(phase)
         self._prefetch_after(phase)
         self.update_occupancy()
@@ -180,6 +222,11 @@ class DeformationStage(VoxelStage):
                 join_views=self.motion.views == "all",
             )
 
+    def _begin_refinement(self) -> None:
+        """Free what the frames were learned with, and refine the canonical field."""
+        self.active.close()
+        self.refinement.begin(self.views, occupied_only=self.motion.pixels == "occupied")
+
     def activate(self, phase: DeformationPhase) -> None:
         """Check out the phase's frames, with memory for them."""
         if len(self.active) != len(phase.frames):
@@ -190,19 +237,26 @@ class DeformationStage(VoxelStage):
         """Make memory for ``count`` active frames at the field's present resolution."""
         # The memory of the frames before is freed first.
         self.loop.release()
-        self.active.allocate(0, self.field, self.scene_model.occupancy)
-        self._optimizer.replace(0, [])
-        self.active.allocate(count, self.field, self.scene_model.occupancy)
-        slices = [frame.slices for frame in self.active]
+        assert isinstance(self.phase, DeformationPhase)
+        appearance = self.appearance.at_level(self.scene_model, self.phase.level)
+        fields = self.field, self.scene_model.occupancy, appearance
+        self.active.allocate(0, *fields)
+        for group in range(len(self._optimizer.param_groups)):
+            self._optimizer.replace(group, [])
+        self.active.allocate(count, *fields)
         smoothing = total_variation_weight(self.tv, max(self.field.shape), self.schedule.rays)
-        learned = [tensor for pair in slices for tensor in pair]
+        learned = [tensor for frame in self.active for tensor in frame.slices]
         self._optimizer.replace(0, learned, smoothing=smoothing)
-        if slices:
+        residuals = [frame.residual for frame in self.active if frame.residual is not None]
+        self.appearance.give_parameters(self._optimizer, residuals)
+        if len(self.active):
             static_shape = self.static_shape(self.scene_model.canonical.density.values)
-            self.bind(self.schedule.rays, slices, static_shape=static_shape)
+            parameters = [frame.learned for frame in self.active]
+            self.bind(self.schedule.rays, parameters, static_shape=static_shape)
 
     def _initialise(self, phase: DeformationPhase) -> None:
         """Start each frame from the one before it; along the observed flow, if asked to."""
+        self.appearance.initialise(self.scene_model, phase)
         for number in phase.frames:
             if phase.init_from_previous:
                 self.field.frames.copy_previous(number)
@@ -221,6 +275,8 @@ class DeformationStage(VoxelStage):
     def _prefetch_after(self, phase: DeformationPhase) -> None:
         """Begin to fetch the next phase's frames, unless they change before it begins."""
         following = self.phase_at(phase.stop)
+        if isinstance(following, RefinementPhase):
+            return
         changed = following.init_from_previous or self._starts_along_flow(following)
         if following.level == phase.level and following != phase and not changed:
             self.field.frames.prefetch(following.frames)
@@ -233,6 +289,7 @@ class DeformationStage(VoxelStage):
     def on_train_end(self) -> None:
         """Write the last frames back."""
         self.active.close()
+        self.refinement.end()
 
     @property
     def views(self) -> Views:
@@ -265,6 +322,8 @@ class DeformationStage(VoxelStage):
 
     def draw(self, batch: ParallelBatch) -> Pixels:
         """Random pixels of the batch's frame, of its views in turn or of all."""
+        if isinstance(self.phase, RefinementPhase):
+            return self.refinement.draw()
         pools = self.active[batch.number].pools
         return self.draw_pixels(pools[self.iteration % len(pools)])
 
@@ -272,9 +331,13 @@ class DeformationStage(VoxelStage):
         self, batch: ParallelBatch, views: Views, pixels: Pixels
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Render a batch of the frame through its warp; compare images and motion."""
+        if isinstance(self.phase, RefinementPhase):
+            return self.refinement.loss(views, pixels)
         frame, capacity = self.active[batch.number], batch.capacity
         prediction = MotionPrediction(
-            *self.render_pixels(views, pixels, frame.occupancy, capacity, frame.warp),
+            *self.render_pixels(
+                views, pixels, frame.occupancy, capacity, frame.warp, frame.appearance
+            ),
             frame.unwarp,
             frame.unwarp_previous(always_interpolate=capacity is not None),
             views.cameras,
@@ -288,7 +351,7 @@ class DeformationStage(VoxelStage):
     def converged(self, losses: Tensor) -> bool:
         """Whether each active frame's loss has stopped falling, if the schedule asks for that."""
         least = self.motion.min_rel_improvement
-        if least is None:
+        if least is None or isinstance(self.phase, RefinementPhase):
             return False
         for frame, loss in zip(self.active, losses.tolist(), strict=True):
             frame.losses.append(loss)
@@ -320,6 +383,9 @@ class DeformationStage(VoxelStage):
 
     def restore(self, phase: Phase, kept: dict[str, Any]) -> None:
         """Go on with the frames of ``phase``, the field being loaded."""
+        if isinstance(phase, RefinementPhase):
+            self._begin_refinement()
+            return
         assert isinstance(phase, DeformationPhase)
         self.activate(phase)
         views = self.views

@@ -163,10 +163,20 @@ def total_variation_weight(weight: float, side: int, rays: int) -> float:
     return weight * (side / 128) / rays / 6
 
 
+def residual(prediction: MotionPrediction) -> Tensor:
+    """(1/R) Σ_i w_i |A_t(q_i)|²: colours stay what they are at rest; 0 without residuals."""
+    output = prediction.output
+    if output.residual is None:
+        return output.color.new_zeros(())
+    large = (output.weight.detach() * output.residual.square().sum(dim=1)).sum()
+    return large / len(prediction.batch.rays)
+
+
 MOTION_TERMS: dict[str, Callable[[MotionPrediction], Tensor]] = {
     **{("render" if name == "color" else name): term for name, term in PHOTOMETRIC_TERMS.items()},
     "cycle": cycle,
     "flow": flow,
+    "residual": residual,
 }
 
 

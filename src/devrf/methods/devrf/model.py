@@ -15,6 +15,7 @@ from devrf.geometry.clock import FrameClock
 from devrf.geometry.space import WORLD, Space
 from devrf.geometry.space_config import space_config, space_from
 from devrf.methods.base import DynamicModel
+from devrf.methods.devrf.appearance import AppearanceField, ColorResidual
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.compact_state import compact_state, expanded_state
@@ -38,6 +39,7 @@ class DeVRFModel(DynamicModel):
         deformation: V_motion; None shows the rest state at every time.
         settings: how rays are sampled.
         space: the space that the fields live in.
+        appearance: how colours change over time; None: they do not.
     """
 
     name: ClassVar[str] = "devrf"
@@ -50,6 +52,7 @@ class DeVRFModel(DynamicModel):
         settings: RenderSettings,
         deformation: DeformationField | None = None,
         space: Space = WORLD,
+        appearance: AppearanceField | None = None,
     ) -> None:
         super().__init__()
         self.architecture = architecture
@@ -57,6 +60,7 @@ class DeVRFModel(DynamicModel):
         self.occupancy = occupancy
         self.settings = settings
         self.deformation = deformation
+        self.appearance = appearance
         self.space = space
         self._lists: dict[bool, ListRenderer] = {}
 
@@ -78,6 +82,7 @@ class DeVRFModel(DynamicModel):
             "space": space_config(self.space),
             "radiance": self.canonical.has_network,
             "deforms": self.moves,
+            "changes_color": self.appearance is not None,
         }
 
     @classmethod
@@ -86,14 +91,15 @@ class DeVRFModel(DynamicModel):
         box = Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
         build = Architecture(**config["architecture"])
         # A stage that was stopped in its search has no colour network yet.
-        radiance = config["radiance"]
+        radiance, clock = config["radiance"], FrameClock((0.0, 1.0))
         return cls(
             build,
             build.radiance_field(box, 8, 8) if radiance else build.search_field(box, 8),
             Occupancy.full((2, 2, 2), box),
             RenderSettings(**config["settings"]),
-            DeformationField(box, FrameClock((0.0, 1.0)), voxels=8) if config["deforms"] else None,
+            DeformationField(box, clock, voxels=8) if config["deforms"] else None,
             space_from(config["space"]),
+            AppearanceField(box, clock, voxels=8) if config.get("changes_color") else None,
         )
 
     def forward(self, batch: RayBatch) -> RenderOutput:
@@ -111,6 +117,7 @@ class DeVRFModel(DynamicModel):
                 self.settings,
                 background[place],
                 self.warp(time),
+                appearance=self.residual(time),
             )
             color = color.index_copy(0, place, seen.color)
             depth = depth.index_copy(0, place, seen.depth)
@@ -128,6 +135,10 @@ class DeVRFModel(DynamicModel):
             return None
         return deformation.warp_at(time)
 
+    def residual(self, time: float) -> ColorResidual | None:
+        """q → A_t(q) at ``time``; None where colours are those of the canonical field."""
+        return None if self.appearance is None else self.appearance.at(time)
+
     def occupancy_at(self, time: float) -> Occupancy:
         """Where something is at ``time`` in [0, 1]."""
         warp = self.warp(time)
@@ -140,7 +151,7 @@ class DeVRFModel(DynamicModel):
         lists, present = self._lists.get(half), (self.canonical, self.settings)
         if lists is None or (lists.field, lists.settings) != present:
             lists = self._lists[half] = ListRenderer(*present, half=half)
-        return DeVRFView(self.occupancy, self.deformation, lists, self.space, time)
+        return DeVRFView(self.occupancy, self.deformation, lists, self.space, time, self.appearance)
 
     @property
     def device(self) -> torch.device:
@@ -154,15 +165,17 @@ class DeVRFModel(DynamicModel):
 
     @property
     def size(self) -> int:
-        """Values of both fields."""
-        motion = self.deformation
+        """Values of all fields."""
+        motion, appearance = self.deformation, self.appearance
         frames = [] if motion is None else [motion.to_canonical, motion.to_time]
+        frames += [] if appearance is None else [appearance.values]
         return super().size + sum(tensor.numel() for tensor in frames)
 
     def stored_state(self) -> dict[str, Any]:
         """The state with packed grids (``compact_state``)."""
         fields = self.occupancy, self.canonical, self.deformation, self.occupancy_at
-        return compact_state(self.state_dict(), *fields, endless=not self.space.straight)
+        endless = not self.space.straight
+        return compact_state(self.state_dict(), *fields, self.appearance, endless=endless)
 
     def load_stored_state(self, state: Mapping[str, Any]) -> None:
         """Take a compact or a full state."""

@@ -20,6 +20,7 @@ DEFORMATION_LOSS = {
     "per_sample_color": 0.1,
     "entropy": 0.01,
 }
+APPEARANCE_LOSS = {"residual": 1e-3, "tv": 0.002}
 
 
 @dataclass(frozen=True)

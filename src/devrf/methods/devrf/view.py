@@ -8,6 +8,7 @@ from torch import Tensor
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import Space
+from devrf.methods.devrf.appearance import AppearanceField
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformed_occupancy import occupancy_points, occupancy_through
 from devrf.methods.devrf.grid_warp import GridWarp
@@ -42,8 +43,9 @@ class DeVRFView:
         lists: ListRenderer,
         space: Space,
         time: float,
+        appearance: AppearanceField | None = None,
     ) -> None:
-        """Blend the displacements of a time, and find its occupancy.
+        """Blend the displacements and residuals of a time, and find its occupancy.
 
         Args:
             occupancy: where something is at rest.
@@ -51,10 +53,12 @@ class DeVRFView:
             lists: renders the canonical field where Triton runs; has the field and its settings.
             space: the space that the fields live in.
             time: in [0, 1].
+            appearance: how colours change; None: they do not.
         """
         canonical = self._canonical = lists.field
         self._lists, self._settings, self._space = lists, lists.settings, space
         self._motion = deformation
+        self._residual = None if appearance is None else appearance.at(time)
         self.occupancy, self.displacement = occupancy, None
         self.at_rest = deformation is None or deformation.clock.at(time).after == 0
         self._warp: GridWarp | None = None
@@ -90,9 +94,19 @@ class DeVRFView:
     def render(self, rays: Rays, background: Tensor) -> RenderedImage:
         """What R rays in the fields' space see."""
         if self._in_lists:
-            return self._lists.picture(rays, self.occupancy, self.displacement, background)
+            return self._lists.picture(
+                rays, self.occupancy, self.displacement, background, self._residual
+            )
         return RenderedImage.of(
-            render(rays, self._canonical, self.occupancy, self._settings, background, self._warp)
+            render(
+                rays,
+                self._canonical,
+                self.occupancy,
+                self._settings,
+                background,
+                self._warp,
+                appearance=self._residual,
+            )
         )
 
     @torch.no_grad()

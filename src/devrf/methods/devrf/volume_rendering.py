@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from devrf.geometry.rays import Rays
+from devrf.methods.devrf.appearance import ColorResidual
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.settings import RenderSettings
 from devrf.ops.compositing import composite, sum_by_ray, transmittances
@@ -35,12 +36,14 @@ class VoxelOutput(RenderOutput):
         canonical: (K, 3) their canonical positions q_i.
         weight: (K,) their weights w_i.
         sample_color: (K, 3) their colours c_i.
+        residual: (K, 3) A_t(q_i) in logits; None without one.
     """
 
     samples: Samples
     canonical: Tensor
     weight: Tensor
     sample_color: Tensor
+    residual: Tensor | None = None
 
     def mean_over_samples(self, values: Tensor) -> Tensor:
         """The mean () of values (K,) of samples, padding left out; 0 without samples."""
@@ -76,6 +79,7 @@ def render(
     background: Tensor,
     warp: Warp | None = None,
     precision: torch.dtype = torch.float32,
+    appearance: ColorResidual | None = None,
 ) -> VoxelOutput:
     """Colours Ĉ = Σ w_i c_i + T_end · C_background and depths Σ w_i z_i / Σ w_i of rays.
 
@@ -89,9 +93,10 @@ def render(
         background: (3,) or (R, 3) RGB behind everything, if the space does not hold infinity.
         warp: x → q = x + Δ_b(x, t), points (M, 3) to canonical space; None is the identity.
         precision: what the colour network works in.
+        appearance: q → A_t(q), added to the colours' logits; None: nothing is.
 
     Returns:
-        What the rays see; differentiable in the field's and the warp's parameters.
+        What the rays see; differentiable in the parameters of field, warp and appearance.
     """
     delta = field.step_in_base_voxels(settings.step)
     with span("sampling"):
@@ -118,7 +123,8 @@ def render(
         samples, canonical = samples[significant], canonical.index_select(0, significant)
         weight = weight.index_select(0, significant)
     with span("decoder"):
-        color = field.rgb(canonical, rays.viewdirs, samples.ray, precision)
+        residual = None if appearance is None else appearance(canonical)
+        color = field.rgb(canonical, rays.viewdirs, samples.ray, precision, residual)
         ends = rays.ends()
         if ends is not None:
             every = torch.arange(len(rays), device=ends.device)
@@ -136,6 +142,7 @@ def render(
         canonical=canonical,
         weight=weight,
         sample_color=color,
+        residual=residual,
     )
 
 

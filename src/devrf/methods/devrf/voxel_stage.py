@@ -9,6 +9,7 @@ from devrf.data.batch import PixelPool, Pixels, RayBatch, background_color, gath
 from devrf.engine.ddp import rays_per_rank
 from devrf.engine.graphs import Graphs
 from devrf.engine.stage import ScheduledStage
+from devrf.methods.devrf.appearance import ColorResidual
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.grid_warp import GridWarp
@@ -63,6 +64,7 @@ class VoxelStage(ScheduledStage):
         occupancy: Occupancy,
         capacity: SampleCapacity | None,
         warp: GridWarp | None = None,
+        appearance: ColorResidual | None = None,
     ) -> tuple[VoxelOutput, RayBatch]:
         """Render pixels of ``views``, in lists of fixed length if there is a ``capacity``."""
         model, precision = self.scene_model, self._precision
@@ -70,8 +72,8 @@ class VoxelStage(ScheduledStage):
             batch = gather_batch(views, pixels.image, pixels.flat, pixels.background, model.space)
         fields = model.canonical, occupancy, model.settings, batch.background, warp
         if capacity is None:
-            return render(batch.rays, *fields, precision), batch
-        return render_static(batch.rays, *fields, capacity, precision), batch
+            return render(batch.rays, *fields, precision, appearance), batch
+        return render_static(batch.rays, *fields, capacity, precision, appearance), batch
 
     def static_shape(self, density: Tensor) -> bool:
         """Whether batches are rendered in lists of fixed length: where Triton runs.

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
+from devrf.methods.devrf.appearance import ColorResidual
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.grid_warp import GridWarp
@@ -46,6 +47,9 @@ class World:
             (0.1 * draw(4, 3, 5, 3)).to(dtype).requires_grad_() for _ in range(frames)
         )
         self.warp = GridWarp(self.slices, box, 0.3 if frames == 2 else 0.0)
+        # Colours change while something moves.
+        self.residual = (draw(3, 4, 3, 3)).to(dtype).requires_grad_() if frames else None
+        self.appearance = None if self.residual is None else ColorResidual(self.residual, box)
         origins = torch.tensor([[-3.0, 0.0, 0.0]]) + 0.3 * draw(RAYS, 3)
         directions = torch.nn.functional.normalize(
             torch.tensor([[1.0, 0.0, 0.0]]) + 0.25 * draw(RAYS, 3), dim=1
@@ -55,10 +59,19 @@ class World:
 
     @property
     def leaves(self) -> list[Tensor]:
-        return [*self.field.parameters(), *self.slices]
+        residuals = [] if self.residual is None else [self.residual]
+        return [*self.field.parameters(), *self.slices, *residuals]
 
     def exactly(self) -> VoxelOutput:
-        return render(self.rays, self.field, self.occupancy, SETTINGS, self.behind, self.warp)
+        return render(
+            self.rays,
+            self.field,
+            self.occupancy,
+            SETTINGS,
+            self.behind,
+            self.warp,
+            appearance=self.appearance,
+        )
 
     def listed(self, capacity: SampleCapacity) -> VoxelOutput:
         return render_static(
@@ -69,6 +82,7 @@ class World:
             self.behind,
             self.warp if self.slices else None,
             capacity,
+            appearance=self.appearance,
         )
 
 

@@ -47,7 +47,8 @@ def test_what_the_renderer_shows(
 ) -> None:
     rays, view = tiny_scene.dynamic.test.cameras.image_rays(0), moving.at(time)
     renderer = ListRenderer(moving.canonical, moving.settings, half=True)  # not on a CPU
-    seen = renderer.picture(rays, view.occupancy, view.displacement, WHITE)
+    colors = moving.residual(time)
+    seen = renderer.picture(rays, view.occupancy, view.displacement, WHITE, colors)
     same(seen, reference(moving, rays, time, WHITE))
     assert int((seen.opacity > 0.5).sum()) > 20
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from devrf.geometry.rays import Rays
+from devrf.methods.devrf.appearance import ColorResidual
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.grid_warp import GridWarp
 from devrf.methods.devrf.settings import RenderSettings
@@ -34,6 +35,7 @@ def render_static(
     warp: GridWarp | None,
     capacity: SampleCapacity,
     precision: torch.dtype = torch.float32,
+    appearance: ColorResidual | None = None,
 ) -> VoxelOutput:
     """What ``render`` gives for the same arguments, in lists of ``capacity.significant`` places.
 
@@ -49,6 +51,7 @@ def render_static(
             them.
         capacity: how long the lists are; the lengths that were needed are noted in it.
         precision: what the colour network works in.
+        appearance: q → A_t(q), added to the colours' logits; None: nothing is.
 
     Returns:
         What the rays see; ``samples.present`` tells samples from padding.
@@ -80,7 +83,8 @@ def render_static(
         canonical = canonical.index_select(0, chosen.index)
         weight = torch.where(present, weight.index_select(0, chosen.index), 0.0)
     with span("decoder"):
-        color = field.rgb(canonical, rays.viewdirs, samples.ray, precision)
+        residual = None if appearance is None else appearance(canonical)
+        color = field.rgb(canonical, rays.viewdirs, samples.ray, precision, residual)
     with span("compositing"):
         seen = sum_segments(weight, color, chosen.first)
         with torch.no_grad():
@@ -94,6 +98,7 @@ def render_static(
         canonical=canonical,
         weight=weight,
         sample_color=color,
+        residual=residual,
     )
 
 

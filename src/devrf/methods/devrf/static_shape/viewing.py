@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from devrf.geometry.rays import Rays
+from devrf.methods.devrf.appearance import ColorResidual
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.grid_warp import GridWarp
 from devrf.methods.devrf.settings import RenderSettings
@@ -42,7 +43,12 @@ class ListRenderer:
 
     @torch.no_grad()
     def picture(
-        self, rays: Rays, occupancy: Occupancy, displacement: Tensor | None, background: Tensor
+        self,
+        rays: Rays,
+        occupancy: Occupancy,
+        displacement: Tensor | None,
+        background: Tensor,
+        appearance: ColorResidual | None = None,
     ) -> RenderedImage:
         """What rays see.
 
@@ -52,6 +58,7 @@ class ListRenderer:
             displacement: (X, Y, Z, 3) over the field's box, their time's points → canonical
                 space; None at rest.
             background: (3,) or (R, 3) RGB.
+            appearance: q → A_t(q), added to the colours' logits; None: nothing is.
         """
         field = self.field
         warp = GridWarp(() if displacement is None else (displacement,), field.box)
@@ -68,7 +75,9 @@ class ListRenderer:
         chosen = select(found.significant[:count], found.first, count)
         significant = chosen.index[: int(chosen.total)]
         precision = torch.float16 if self.half and tau.is_cuda else torch.float32
-        color = field.rgb(canonical[significant], rays.viewdirs, found.ray[significant], precision)
+        points, ray = canonical[significant], found.ray[significant]
+        residual = None if appearance is None else appearance(points)
+        color = field.rgb(points, rays.viewdirs, ray, precision, residual)
         distance = found.distance[significant, None]
         seen = sum_segments(
             weight[significant],

@@ -1,0 +1,107 @@
+"""How much colours change along the observed motion, without training."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn.functional import conv2d, grid_sample, max_pool2d, pad
+
+from devrf.data.correspondence import previous_images
+from devrf.scenes.scene import Views
+
+# Images of which colours are followed, evenly spread, and frames that they are followed back.
+IMAGES, STEPS = 64, 4
+# Colours are smoothed before they are compared: what is finer than the pixels flickers as it moves.
+SIGMA = 1.5
+# Pixels nearer than this to the matte's edge, or to an occlusion, are left out.
+MARGIN = 4
+
+
+@torch.no_grad()
+def color_change(views: Views) -> float | None:
+    """Mean |C(u) − C'(u + flow)| in [0, 1] over pixels u whose flow can be followed.
+
+    C' is the image of the same view ``STEPS`` frames earlier (fewer, where the recording is
+    shorter), and the flow is followed back through the images between; both are smoothed. Without
+    mattes only pixels that move by more than half a pixel count: a backdrop says nothing.
+
+    Args:
+        views: the dynamic training views.
+
+    Returns:
+        The mean over images, channels and pixels; None where no flow can be followed.
+    """
+    if views.flow is None:
+        return None
+    previous = previous_images(views).tolist()
+    chains = [_chain(image, previous) for image in range(len(views))]
+    longest = max(len(chain) for chain in chains)
+    followed = [chain for chain in chains if len(chain) == longest > 1]
+    spread = followed[:: -(-len(followed) // IMAGES) or 1]
+    changes = [change for chain in spread if (change := _change(views, chain)) is not None]
+    return sum(changes) / len(changes) if changes else None
+
+
+def _chain(image: int, previous: list[int]) -> list[int]:
+    """An image and those before it in its view, ``STEPS`` at most."""
+    chain = [image]
+    while len(chain) <= STEPS and previous[chain[-1]] != chain[-1]:
+        chain.append(previous[chain[-1]])
+    return chain
+
+
+def _change(views: Views, chain: list[int]) -> float | None:
+    """The mean change from a chain's last image to its first; None where too little is left."""
+    assert views.flow is not None
+    height, width = views.height, views.width
+    x, y = torch.arange(width) + 0.5, torch.arange(height) + 0.5
+    start = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
+    place, kept = start, _inside(views, chain[0])
+    for image, earlier in zip(chain, chain[1:], strict=False):
+        valid = views.flow.valid[image]
+        vectors = torch.where(valid[..., None], views.flow.vectors[image], 0.0)
+        kept = kept & (_look_up(valid[None].float(), place)[0] > 0.999)
+        place = place + _look_up(vectors.permute(2, 0, 1), place).permute(1, 2, 0)
+        kept = kept & (_look_up(_inside(views, earlier)[None].float(), place)[0] > 0.999)
+    if not views.has_alpha:
+        kept = kept & ((place - start).norm(dim=-1) > 0.5)
+    if int(kept.sum()) < MARGIN**2:
+        return None
+    now, before = _smooth(views, chain[0]), _smooth(views, chain[-1])
+    return float((_look_up(before, place) - now).abs()[:, kept].mean())
+
+
+def _inside(views: Views, image: int) -> Tensor:
+    """(H, W) bool: pixels that are valid and well within the matte, where there is one."""
+    outside = torch.zeros(views.height, views.width, dtype=torch.bool)
+    if views.has_alpha:
+        outside |= views.pixels[image, ..., 3] < 253
+    if (valid := views.valid_mask_of(image)) is not None:
+        outside |= ~valid
+    grown = max_pool2d(outside[None, None].float(), 2 * MARGIN + 1, stride=1, padding=MARGIN)
+    return grown[0, 0] < 0.5
+
+
+def _smooth(views: Views, image: int) -> Tensor:
+    """(3, H, W) the colours of an image in [0, 1], smoothed within the matte."""
+    color = views.pixels[image, ..., :3].permute(2, 0, 1).float() / 255
+    weight = torch.ones_like(color[:1])
+    if views.has_alpha:
+        weight = views.pixels[image, ..., 3][None].float() / 255
+    return _gaussian(color * weight) / _gaussian(weight).clamp(min=1e-3)
+
+
+def _gaussian(image: Tensor) -> Tensor:
+    """(C, H, W) smoothed, the border repeated."""
+    reach = round(3 * SIGMA)
+    kernel = torch.exp(-(torch.arange(-reach, reach + 1.0) ** 2) / (2 * SIGMA**2))
+    kernel = kernel / kernel.sum()
+    along = conv2d(pad(image[:, None], (reach, reach, 0, 0), "replicate"), kernel.view(1, 1, 1, -1))
+    return conv2d(pad(along, (0, 0, reach, reach), "replicate"), kernel.view(1, 1, -1, 1))[:, 0]
+
+
+def _look_up(image: Tensor, place: Tensor) -> Tensor:
+    """An image (C, H, W) at ``place`` (H', W', 2) in pixels, x then y: bilinear, (C, H', W')."""
+    _, height, width = image.shape
+    scaled = 2 * place / torch.tensor([width, height]) - 1
+    return grid_sample(image[None], scaled[None], padding_mode="border", align_corners=False)[0]

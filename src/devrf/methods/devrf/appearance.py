@@ -1,0 +1,127 @@
+"""How colours change over time: a residual in canonical space (docs/method.md#appearance)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+
+from devrf.errors import DevrfError
+from devrf.geometry.box import Box
+from devrf.geometry.clock import FrameClock
+from devrf.ops.corners import shape_of, to_grid
+from devrf.ops.trilinear import interpolate, kept_gradient
+
+
+@dataclass(frozen=True)
+class AppearanceSettings:
+    """Whether and how the appearance is learned, beside the displacements.
+
+    Attributes:
+        learn: ``never`` or ``always``.
+        side: the grid of a frame has about side³ voxels.
+        learning_rate: logits a step: how far a value moves at most.
+        first_level: the first level that learns it, from 0; the last one where there are fewer.
+            The levels before find the motion alone.
+    """
+
+    learn: Literal["never", "always"] = "never"
+    side: int = 64
+    learning_rate: float = 0.1
+    first_level: int = 1
+
+    def __post_init__(self) -> None:
+        for name, least in (("side", 2), ("first_level", 0)):
+            if getattr(self, name) < least:
+                raise DevrfError(
+                    f"schedule.appearance.{name}: expected at least {least}, "
+                    f"not {getattr(self, name)}"
+                )
+        if not self.learning_rate > 0:
+            raise DevrfError(
+                f"schedule.appearance.learning_rate: expected more than 0, not {self.learning_rate}"
+            )
+
+
+@dataclass(frozen=True)
+class ColorResidual:
+    """q → A(q), trilinear in space.
+
+    Attributes:
+        grid: (X, Y, Z, 3) logits.
+        box: where the grid lives, in canonical space; outside it A is as on its border.
+    """
+
+    grid: Tensor
+    box: Box
+
+    def __call__(self, points: Tensor) -> Tensor:
+        """A (M, 3) at canonical ``points`` (M, 3); differentiable in the grid and the points."""
+        coords = to_grid(points, self.box, shape_of(self.grid))
+        return interpolate(self.grid, coords, gradient=kept_gradient(self.grid))
+
+
+class AppearanceField(nn.Module):
+    """Residuals A_t (T, X, Y, Z, 3) over a box: c = sigmoid(decoder(f(q), d) + A_t(q)).
+
+    Frame 0 is zero and never trained: the scene at rest looks as the canonical field says.
+    Between two frames both are blended, as displacements are.
+
+    Attributes:
+        values: (T, X, Y, Z, 3) logits.
+        box: where the field lives, in canonical space.
+        clock: the times of the T frames.
+    """
+
+    values: Tensor
+
+    def __init__(self, box: Box, clock: FrameClock, *, voxels: int) -> None:
+        """Residuals of zero for the clock's T frames, each on about ``voxels`` voxels."""
+        super().__init__()
+        self.box = box
+        self.clock = clock
+        self.register_buffer("values", torch.zeros(len(clock), *box.grid_shape(voxels), 3))
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Grid points along x, y, z."""
+        _, x, y, z, _ = self.values.shape
+        return x, y, z
+
+    def at(self, time: float) -> ColorResidual | None:
+        """q → A(q) at ``time`` in [0, 1]; None where it is zero everywhere."""
+        moment = self.clock.at(time)
+        if moment.after == 0:
+            return None
+        grid = self.values[moment.before]
+        if moment.weight:
+            grid = grid.lerp(self.values[moment.after], moment.weight)
+        return ColorResidual(grid, self.box)
+
+    @torch.no_grad()
+    def copy_previous(self, frames: Sequence[int]) -> None:
+        """Initialise ``frames``, from 1 on, from the frames before them."""
+        for frame in frames:
+            self.values[frame] = self.values[frame - 1]
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Box and clock, as plain numbers."""
+        low, high = list(self.box.low), list(self.box.high)
+        return {"low": low, "high": high, "times": list(self.clock.times)}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`get_extra_state` gave."""
+        self.box = Box.of(state["low"], state["high"])
+        self.clock = FrameClock(tuple(state["times"]))
+
+    def _load_from_state_dict(
+        self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
+    ) -> None:
+        """Take the shape of the stored grids."""
+        stored = state_dict.get(prefix + "values")
+        if stored is not None and stored.shape != self.values.shape:
+            self.values = self.values.new_empty(stored.shape)
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)

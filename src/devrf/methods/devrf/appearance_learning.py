@@ -1,0 +1,90 @@
+"""When and with what the deformation stage learns the appearance (docs/method.md#appearance)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from torch import Tensor
+
+from devrf.errors import DevrfError
+from devrf.geometry.clock import FrameClock
+from devrf.methods.devrf.appearance import AppearanceField, AppearanceSettings
+from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule
+from devrf.methods.devrf.losses import total_variation_weight
+from devrf.methods.devrf.model import DeVRFModel
+from devrf.ops.adam import GridAdam
+
+GROUP = "appearance"
+
+
+def check_weights(loss: Mapping[str, float]) -> None:
+    """Check the names of the weights in ``loss.appearance``.
+
+    Raises:
+        DevrfError: there is no such term.
+    """
+    unknown = sorted(map(str, set(loss) - {"residual", "tv"}))
+    if unknown:
+        raise DevrfError(
+            f"loss.appearance: unknown term {unknown[0]!r}; the terms are residual, tv"
+        )
+
+
+class AppearanceLearning:
+    """Gives the deformation stage residuals to learn, level by level.
+
+    Attributes:
+        settings: whether and how they are learned.
+    """
+
+    def __init__(
+        self,
+        settings: AppearanceSettings,
+        schedule: DeformationSchedule,
+        loss: Mapping[str, float],
+    ) -> None:
+        """Say how to learn.
+
+        Args:
+            settings: whether, and on which grids.
+            schedule: the stage's levels, and its rays.
+            loss: weights of the loss term ``residual``, and of the total variation ``tv``.
+        """
+        check_weights(loss)
+        self.settings = settings
+        self._schedule = schedule
+        self._smoothing = loss.get("tv", 0.0)
+        self._residual = loss.get("residual", 0.0)
+        # The ablation without levels has one.
+        self._first = min(settings.first_level, len(schedule.sides) - 1)
+
+    @property
+    def weights(self) -> dict[str, float]:
+        """The weights of further loss terms of the stage; none where nothing is learned."""
+        return {} if self.settings.learn == "never" else {"residual": self._residual}
+
+    def setup(self, model: DeVRFModel, clock: FrameClock, optimizer: GridAdam) -> None:
+        """Build the residuals, zero, and their parameter group, empty as yet."""
+        if self.settings.learn == "never":
+            return
+        voxels, rate = self.settings.side**3, self.settings.learning_rate
+        model.appearance = AppearanceField(model.box, clock, voxels=voxels)
+        group = {"params": [], "lr": rate, "base_lr": rate, "name": GROUP}
+        optimizer.add_param_group(group)
+
+    def at_level(self, model: DeVRFModel, level: int) -> AppearanceField | None:
+        """The residuals, if ``level`` learns them."""
+        return model.appearance if level >= self._first else None
+
+    def initialise(self, model: DeVRFModel, phase: DeformationPhase) -> None:
+        """At the first level that learns it, start a frame's from that of the frame before it."""
+        if model.appearance is not None and phase.level == self._first:
+            model.appearance.copy_previous(phase.frames)
+
+    def give_parameters(self, optimizer: GridAdam, residuals: Sequence[Tensor]) -> None:
+        """Let the optimiser learn the active frames' ``residuals``, (X, Y, Z, 3) each."""
+        for number, group in enumerate(optimizer.param_groups):
+            if group["name"] == GROUP:
+                longest = max([2, *(max(one.shape) for one in residuals)])
+                weight = total_variation_weight(self._smoothing, longest, self._schedule.rays)
+                optimizer.replace(number, residuals, smoothing=weight)
