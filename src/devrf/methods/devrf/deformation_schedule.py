@@ -6,8 +6,12 @@ from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
+from typing import Literal
 
 from devrf.errors import DevrfError
+
+# In time, from a visit of a level to the next.
+Order = Literal["forward", "backward"]
 
 
 @dataclass(frozen=True)
@@ -24,6 +28,7 @@ class DeformationPhase:
         init_from_previous: whether the frame starts from the result of the frame before it.
         has_previous: whether the frames before these have been learned at this level, or are at
             rest.
+        has_next: whether the frames after these have been learned, at this level or one before.
     """
 
     level: int
@@ -34,6 +39,7 @@ class DeformationPhase:
     learning_rate_factor: float
     init_from_previous: bool
     has_previous: bool
+    has_next: bool
 
     @property
     def kind(self) -> str:
@@ -59,6 +65,10 @@ class DeformationSchedule:
     that one is known from the level before. With a single stretch visit 0 would be empty, and
     frame 1 gets its share as above.
 
+    A level whose order is ``backward`` makes the same visits from the last to the first; where
+    frame 0 is alone, its share goes to the last frame. A level may have the side of the one before
+    it: the same grids are then gone through once more.
+
     Attributes:
         sides: the motion grids have about side³ voxels at each level, coarse to fine.
         iterations_per_frame: share of a frame at each level.
@@ -68,6 +78,8 @@ class DeformationSchedule:
         rays: of a batch.
         parallel_frames: K of each level, 1 at the coarsest, where a frame starts from the one
             before it; None: 1 throughout.
+        order: of the frames of each level, ``forward`` in time at the coarsest; None: ``forward``
+            throughout.
     """
 
     sides: Sequence[int] = (10, 20, 40, 80, 160)
@@ -76,6 +88,7 @@ class DeformationSchedule:
     decay: float = 10 ** (-1 / 4)
     rays: int = 8192
     parallel_frames: Sequence[int] | None = None
+    order: Sequence[Order] | None = None
 
     def __post_init__(self) -> None:
         if len(self.sides) != len(self.iterations_per_frame) or not self.sides:
@@ -106,10 +119,27 @@ class DeformationSchedule:
                 "schedule.deformation.parallel_frames: expected 1 at the first level, where a "
                 f"frame starts from the one before it, not {at_once[0]}"
             )
+        self._check_order()
         if not self.coarse_to_fine:
             object.__setattr__(self, "sides", (self.sides[-1],))
             object.__setattr__(self, "iterations_per_frame", (sum(self.iterations_per_frame),))
             object.__setattr__(self, "parallel_frames", (at_once[-1],))
+            object.__setattr__(self, "order", None)
+
+    def _check_order(self) -> None:
+        order = self.order
+        if order is None:
+            return
+        if len(order) != len(self.sides) or not set(order) <= {"forward", "backward"}:
+            raise DevrfError(
+                "schedule.deformation.order: expected forward or backward for each of .sides, or "
+                f"null, not {list(order)}"
+            )
+        if order[0] != "forward":
+            raise DevrfError(
+                "schedule.deformation.order: expected forward at the first level, where a frame "
+                f"starts from the one before it, not {order[0]}"
+            )
 
     def visits(self, level: int, frames: int) -> int:
         """L of T = ``frames`` frames: visits of a level, and the distance of parallel frames."""
@@ -125,7 +155,7 @@ class DeformationSchedule:
         return sum(self._lengths(frames))
 
     def growths(self, frames: int) -> list[int]:
-        """Iterations at which the motion grid grows."""
+        """Iterations at which a further level begins; the motion grid grows if its side does."""
         return list(accumulate(self._lengths(frames)[:-1]))
 
     def _lengths(self, frames: int) -> list[int]:
@@ -141,7 +171,9 @@ class DeformationSchedule:
         share = self.iterations_per_frame[level]
         first = 1 if apart == frames else 0  # frame 0 alone
         visit = min(max((iteration - begin) // share, first), apart - 1)
-        visited = tuple(range(visit or apart, frames, apart))
+        backward = self.order is not None and self.order[level] == "backward"
+        place = first + apart - 1 - visit if backward else visit
+        visited = tuple(range(place or apart, frames, apart))
         return DeformationPhase(
             level=level,
             frames=visited,
@@ -150,5 +182,6 @@ class DeformationSchedule:
             side=self.sides[level],
             learning_rate_factor=self.decay**level,
             init_from_previous=self.coarse_to_fine and level == 0 and visit > 1,
-            has_previous=visit > 0,
+            has_previous=visit > 0 and not backward,
+            has_next=level > 0,
         )

@@ -30,6 +30,7 @@ from devrf.methods.devrf.losses import (
     visibility,
 )
 from devrf.methods.devrf.model import DeVRFModel
+from devrf.methods.devrf.motion_priors import MotionPriors
 from devrf.methods.devrf.pixel_selection import frame_pools, images_of
 from devrf.methods.devrf.settings import DEFORMATION_LOSS, MotionSettings, Precision
 from devrf.methods.devrf.voxel_stage import VoxelStage
@@ -69,7 +70,8 @@ class DeformationStage(VoxelStage):
                 ``load_checkpoint``); its fields are frozen.
             schedule: resolutions, iterations and frames.
             motion: learning rate and how batches are drawn.
-            loss: weights of the loss terms; ``tv`` is the total variation of both fields.
+            loss: weights of the loss terms; ``tv`` is the total variation of both fields,
+                ``elastic`` and ``acceleration`` are the motion's priors.
             iterations_per_step: optimiser iterations in one Lightning step.
             graphs: whether a GPU replays iterations from CUDA graphs: ``auto`` where it can.
             decoder_precision: what the colour network computes in; ``auto``: ``bfloat16`` on a
@@ -80,6 +82,9 @@ class DeformationStage(VoxelStage):
         self.motion = motion or MotionSettings()
         weights = dict(loss)
         self.tv = weights.pop("tv", 0.0)
+        self.priors = MotionPriors(
+            elastic=weights.pop("elastic", 0.0), acceleration=weights.pop("acceleration", 0.0)
+        )
         self.losses = WeightedLoss(MOTION_TERMS, weights)
         still = rest.model
         self.scene_model = DeVRFModel(
@@ -165,6 +170,7 @@ class DeformationStage(VoxelStage):
         if len(self.active) != len(phase.frames):
             self._allocate(len(phase.frames))
         self.active.check_out(phase.frames)
+        self.priors.enter(phase.frames, self.field, learned=phase.has_next)
 
     def _allocate(self, count: int) -> None:
         """Make memory for ``count`` active frames at the field's present resolution."""
@@ -173,6 +179,7 @@ class DeformationStage(VoxelStage):
         self.active.allocate(0, self.field, self.scene_model.occupancy)
         self._optimizer.replace(0, [])
         self.active.allocate(count, self.field, self.scene_model.occupancy)
+        self.priors.allocate(count, self.field, self.scene_model.occupancy)
         slices = [frame.slices for frame in self.active]
         smoothing = total_variation_weight(self.tv, max(self.field.shape), self.schedule.rays)
         learned = [tensor for pair in slices for tensor in pair]
@@ -263,7 +270,8 @@ class DeformationStage(VoxelStage):
         )
         with span("losses"):
             total, terms = self.losses(prediction)
-            return total, {**terms, **visibility(prediction)}
+            prior, further = self.priors(batch.number, frame)
+            return total + prior, {**terms, **further, **visibility(prediction)}
 
     def converged(self, losses: Tensor) -> bool:
         """Whether each active frame's loss has stopped falling, if the schedule asks for that."""

@@ -19,6 +19,8 @@ DEFORMATION_LOSS = {
     "tv": 1.0,
     "per_sample_color": 0.1,
     "entropy": 0.01,
+    "elastic": 0.0,
+    "acceleration": 0.0,
 }
 
 
