@@ -65,35 +65,6 @@ def test_a_whole_schedule_sees_the_motion_better_than_the_rest_pose(
     assert min(gains[2:]) > 0.5 and sum(gains[2:]) / 4 > 1
 
 
-@pytest.mark.parametrize(
-    ("levels", "order", "followed"),
-    [
-        (1, None, [1, 2]),
-        (2, None, [1, 2, 1, 2]),
-        # Flow leads from the frame before, which a level that goes backward has not learned.
-        (2, ("forward", "backward"), [1, 2]),
-    ],
-)
-def test_frames_start_along_the_flow_at_as_many_levels_as_asked(
-    rest: LoadedCheckpoint,
-    datamodule: SceneDataModule,
-    trainer: Callable[..., Trainer],
-    monkeypatch: pytest.MonkeyPatch,
-    levels: int,
-    order: Any,
-    followed: list[int],
-) -> None:
-    found: list[int] = []
-    monkeypatch.setattr(
-        "devrf.methods.devrf.deformation_stage.start_from_tracks",
-        lambda field, number, *rest: found.append(number),
-    )
-    schedule = replace(SHORT, iterations_per_frame=(1, 1), order=order)
-    motion = replace(FAST, start="flow", flow_levels=levels)
-    trainer(max_epochs=1).fit(DeformationStage(rest, schedule, motion), datamodule=datamodule)
-    assert found == followed
-
-
 class Peak(Callback):
     """Puts a peak into Δ_f before the first step, and looks at the moments behind it."""
 

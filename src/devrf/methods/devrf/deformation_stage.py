@@ -203,7 +203,7 @@ class DeformationStage(VoxelStage):
 
     def _starts_along_flow(self, phase: DeformationPhase) -> bool:
         asked = self.motion.start == "flow" and self.views.flow is not None
-        return asked and phase.level < self.motion.flow_levels and phase.has_previous
+        return asked and phase.level == 0 and phase.has_previous
 
     def _prefetch_after(self, phase: DeformationPhase) -> None:
         """Begin to fetch the next phase's frames, unless they change before it begins."""

@@ -94,8 +94,6 @@ class MotionSettings:
         start: where a frame starts from at the coarsest level: ``previous`` is the result of
             the frame before it; ``flow`` moves that along the observed optical flow, if there is
             any (docs/method.md#flow-initialisation).
-        flow_levels: how many levels, coarsest first, ``start=flow`` does so at; at a finer one it
-            corrects what the level before has learned of the frame.
         store: where the displacements of all frames are kept while one is learned: ``device``,
             ``host``, or ``auto``: on the device if they fit there beside all else. Each of
             several processes keeps them on its device.
@@ -110,17 +108,11 @@ class MotionSettings:
     pixels: Literal["all", "occupied"] = "all"
     occupancy_every: int = 25
     start: Literal["previous", "flow"] = "previous"
-    flow_levels: int = 1
     store: Literal["auto", "device", "host"] = "auto"
     store_half: bool = False
     min_rel_improvement: float | None = None
 
     def __post_init__(self) -> None:
-        if self.flow_levels < 1:
-            raise DevrfError(
-                f"schedule.motion.flow_levels: expected at least 1, not {self.flow_levels}; "
-                "schedule.motion.start=previous starts no frame along the flow"
-            )
         if self.min_rel_improvement is not None and not 0 < self.min_rel_improvement <= 1:
             raise DevrfError(
                 "schedule.motion.min_rel_improvement: expected above 0, at most 1, or null, not "
