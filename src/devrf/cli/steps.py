@@ -26,7 +26,7 @@ from devrf.cli.resume import archive_previous
 from devrf.cli.train import learn
 from devrf.cli.workers import launch_workers
 from devrf.errors import DevrfError
-from devrf.methods.devrf.losses import MOTION_TERMS, WeightedLoss
+from devrf.methods.devrf.losses import GRID_TERMS, MOTION_TERMS, WeightedLoss
 from devrf.ops.dispatch import using
 
 log = logging.getLogger(__name__)
@@ -159,7 +159,7 @@ def _check(run: RunContext, asked: Plan) -> None:
     for name in run.learning_stages:
         run.stage_builder(name)
     if "deformation" in config:
-        weights = {k: v for k, v in config.deformation.loss.items() if k != "tv"}
+        weights = {k: v for k, v in config.deformation.loss.items() if k not in GRID_TERMS}
         WeightedLoss(MOTION_TERMS, weights)
     run.evaluation.check()
     check_objective(config.objective, run.evaluation.metrics)

@@ -142,6 +142,9 @@ def test_a_further_level_goes_backward_through_the_frames() -> None:
     ]
     phases = deformation_phases(schedule, 5)
     assert [p.has_next for p in phases] == [False] * 4 + [True] * 7
+    # The rate falls where the grid grows.
+    factors = [p.learning_rate_factor for p in phases]
+    assert factors == [1.0] * 4 + [10 ** (-1 / 4)] * 7
     assert not any(p.has_previous for p in phases[4:])
 
 

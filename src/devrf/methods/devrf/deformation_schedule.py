@@ -5,7 +5,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import accumulate
+from itertools import accumulate, pairwise
 from typing import Literal
 
 from devrf.errors import DevrfError
@@ -67,14 +67,14 @@ class DeformationSchedule:
 
     A level whose order is ``backward`` makes the same visits from the last to the first; where
     frame 0 is alone, its share goes to the last frame. A level may have the side of the one before
-    it: the same grids are then gone through once more.
+    it: the same grids are then gone through once more, at the same rate.
 
     Attributes:
         sides: the motion grids have about side³ voxels at each level, coarse to fine.
         iterations_per_frame: share of a frame at each level.
         coarse_to_fine: False spends all shares at the finest resolution, at the base rate, each
             frame starting from rest (``ablation=base``, docs/method.md#ablations).
-        decay: factor of the learning rate from a level to the next.
+        decay: factor of the learning rate from a level to the next, if its side is another one.
         rays: of a batch.
         parallel_frames: K of each level, 1 at the coarsest, where a frame starts from the one
             before it; None: 1 throughout.
@@ -168,7 +168,7 @@ class DeformationSchedule:
         begins = [0, *self.growths(frames)]
         level = bisect_right(begins, iteration) - 1
         begin, apart = begins[level], self.visits(level, frames)
-        share = self.iterations_per_frame[level]
+        share, sides = self.iterations_per_frame[level], self.sides[: level + 1]
         first = 1 if apart == frames else 0  # frame 0 alone
         visit = min(max((iteration - begin) // share, first), apart - 1)
         backward = self.order is not None and self.order[level] == "backward"
@@ -180,7 +180,7 @@ class DeformationSchedule:
             start=begin + (0 if visit == first else visit * share),
             stop=begin + (visit + 1) * share,
             side=self.sides[level],
-            learning_rate_factor=self.decay**level,
+            learning_rate_factor=self.decay ** sum(a != b for a, b in pairwise(sides)),
             init_from_previous=self.coarse_to_fine and level == 0 and visit > 1,
             has_previous=visit > 0 and not backward,
             has_next=level > 0,

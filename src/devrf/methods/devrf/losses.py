@@ -161,6 +161,8 @@ MOTION_TERMS = {
     "cycle": cycle,
     "flow": flow,
 }
+# Terms of the motion's grids alone, whatever rays see; the stage computes them by other means.
+GRID_TERMS = ("tv", "elastic", "acceleration")
 
 
 @dataclass(frozen=True)

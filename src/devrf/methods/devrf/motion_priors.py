@@ -14,7 +14,7 @@ from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.rendering.occupancy import Occupancy
 
 # c of docs/method.md#elastic: the strain beyond which a cell counts as torn, not as stretched.
-TEARING = 0.5
+TEARING = 0.1
 
 
 @dataclass
