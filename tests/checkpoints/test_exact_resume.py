@@ -57,6 +57,15 @@ ALONG_FLOW = MotionSettings(
 TOGETHER = DeformationSchedule(
     sides=(4, 6), iterations_per_frame=(4, 6), rays=64, parallel_frames=(1, 2)
 )
+# Then once more, backward: frames 1 and 3 in 28–31, frame 2 in 32–35.
+BACKWARD = replace(
+    TOGETHER,
+    sides=(4, 6, 6),
+    iterations_per_frame=(4, 6, 4),
+    parallel_frames=(1, 2, 2),
+    order=("forward", "forward", "backward"),
+)
+PRIORS = {"render": 1.0, "cycle": 100.0, "tv": 1.0, "elastic": 0.1}
 BY_TURNS = MotionSettings(occupancy_every=3)
 # The field would not keep exactly what a visit has learned.
 ROUNDED = MotionSettings(occupancy_every=3, store="host", store_half=True)
@@ -218,6 +227,19 @@ def test_the_refinement_goes_on_exactly(learn, rest: LoadedCheckpoint) -> None:
     whole = learn(build)
     assert_same(learn(build, 30, 31, 33, 35), whole)
     assert whole["iteration"] == 36
+
+
+def test_a_second_sweep_with_the_elastic_prior_goes_on_exactly(
+    learn, rest: LoadedCheckpoint, four_frames: SceneDataModule
+) -> None:
+    def build() -> ScheduledStage:
+        stage = copy.deepcopy(rest)
+        return DeformationStage(stage, BACKWARD, ROUNDED, PRIORS, iterations_per_step=1)
+
+    # Mid-visit, around a look at the occupancy, around visits and levels.
+    leaves = (2, 13, 16, 20, 27, 28, 30, 31, 32, 34)
+    whole = learn(build, data=four_frames)
+    assert_same(learn(build, *leaves, data=four_frames), whole)
 
 
 def test_a_step_of_many_iterations_goes_on_exactly(learn, rest: LoadedCheckpoint) -> None:

@@ -120,6 +120,33 @@ def test_frames_of_two_stretches_are_visited_together() -> None:
     assert tuple(in_words(phases[k].frames) for k in (0, 14)) == ("frame 1", "frames 1, 8")
 
 
+def test_a_further_level_goes_backward_through_the_frames() -> None:
+    schedule = DeformationSchedule(
+        sides=(4, 6, 6),
+        iterations_per_frame=(6, 4, 2),
+        parallel_frames=(1, 1, 2),
+        order=("forward", "backward", "backward"),
+    )
+    assert course(schedule, 5) == [
+        (0, (1,), 0, 12),
+        *((0, (k,), 6 * k, 6 * k + 6) for k in (2, 3, 4)),
+        # Frame 0's share goes to the frame that is visited first.
+        (1, (4,), 30, 38),
+        (1, (3,), 38, 42),
+        (1, (2,), 42, 46),
+        (1, (1,), 46, 50),
+        # Frames 0 to 2 and 3 to 4.
+        (2, (2,), 50, 52),
+        (2, (1, 4), 52, 54),
+        (2, (3,), 54, 56),
+    ]
+    phases = deformation_phases(schedule, 5)
+    # The rate falls where the grid grows.
+    factors = [p.learning_rate_factor for p in phases]
+    assert factors == [1.0] * 4 + [10 ** (-1 / 4)] * 7
+    assert not any(p.has_previous for p in phases[4:])
+
+
 @pytest.mark.parametrize(
     ("frames", "at_once", "visits"),
     [
@@ -255,6 +282,9 @@ def test_a_wrong_canonical_schedule_is_an_error(wrong: dict[str, Any]) -> None:
         {"parallel_frames": (1, 8, 8, 4, 0)},
         {"parallel_frames": (2, 8, 8, 4, 2)},
         {"parallel_frames": (2, 0, 8, 4, 2), "coarse_to_fine": False},
+        {"order": ("forward", "backward")},
+        {"order": ("forward", "forward", "forward", "forward", "sideways")},
+        {"order": ("backward", "forward", "forward", "forward", "forward")},
     ],
     ids=str,
 )

@@ -5,9 +5,13 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import accumulate
+from itertools import accumulate, pairwise
+from typing import Literal
 
 from devrf.errors import DevrfError
+
+# In time, from a visit of a level to the next.
+Order = Literal["forward", "backward"]
 
 
 @dataclass(frozen=True)
@@ -59,15 +63,21 @@ class DeformationSchedule:
     that one is known from the level before. With a single stretch visit 0 would be empty, and
     frame 1 gets its share as above.
 
+    A level whose order is ``backward`` makes the same visits from the last to the first; where
+    frame 0 is alone, its share goes to the last frame. A level may have the side of the one before
+    it: the same grids are then gone through once more, at the same rate.
+
     Attributes:
         sides: the motion grids have about side³ voxels at each level, coarse to fine.
         iterations_per_frame: share of a frame at each level.
         coarse_to_fine: False spends all shares at the finest resolution, at the base rate, each
             frame starting from rest (``ablation=base``, docs/method.md#ablations).
-        decay: factor of the learning rate from a level to the next.
+        decay: factor of the learning rate from a level to the next, if its side is another one.
         rays: of a batch.
         parallel_frames: K of each level, 1 at the coarsest, where a frame starts from the one
             before it; None: 1 throughout.
+        order: of the frames of each level, ``forward`` in time at the coarsest; None: ``forward``
+            throughout.
     """
 
     sides: Sequence[int] = (10, 20, 40, 80, 160)
@@ -76,6 +86,7 @@ class DeformationSchedule:
     decay: float = 10 ** (-1 / 4)
     rays: int = 8192
     parallel_frames: Sequence[int] | None = None
+    order: Sequence[Order] | None = None
 
     def __post_init__(self) -> None:
         if len(self.sides) != len(self.iterations_per_frame) or not self.sides:
@@ -106,10 +117,27 @@ class DeformationSchedule:
                 "schedule.deformation.parallel_frames: expected 1 at the first level, where a "
                 f"frame starts from the one before it, not {at_once[0]}"
             )
+        self._check_order()
         if not self.coarse_to_fine:
             object.__setattr__(self, "sides", (self.sides[-1],))
             object.__setattr__(self, "iterations_per_frame", (sum(self.iterations_per_frame),))
             object.__setattr__(self, "parallel_frames", (at_once[-1],))
+            object.__setattr__(self, "order", None)
+
+    def _check_order(self) -> None:
+        order = self.order
+        if order is None:
+            return
+        if len(order) != len(self.sides) or not set(order) <= {"forward", "backward"}:
+            raise DevrfError(
+                "schedule.deformation.order: expected forward or backward for each of .sides, or "
+                f"null, not {list(order)}"
+            )
+        if order[0] != "forward":
+            raise DevrfError(
+                "schedule.deformation.order: expected forward at the first level, where a frame "
+                f"starts from the one before it, not {order[0]}"
+            )
 
     def visits(self, level: int, frames: int) -> int:
         """L of T = ``frames`` frames: visits of a level, and the distance of parallel frames."""
@@ -125,7 +153,7 @@ class DeformationSchedule:
         return sum(self._lengths(frames))
 
     def growths(self, frames: int) -> list[int]:
-        """Iterations at which the motion grid grows."""
+        """Iterations at which a further level begins; the motion grid grows if its side does."""
         return list(accumulate(self._lengths(frames)[:-1]))
 
     def _lengths(self, frames: int) -> list[int]:
@@ -138,17 +166,19 @@ class DeformationSchedule:
         begins = [0, *self.growths(frames)]
         level = bisect_right(begins, iteration) - 1
         begin, apart = begins[level], self.visits(level, frames)
-        share = self.iterations_per_frame[level]
+        share, sides = self.iterations_per_frame[level], self.sides[: level + 1]
         first = 1 if apart == frames else 0  # frame 0 alone
         visit = min(max((iteration - begin) // share, first), apart - 1)
-        visited = tuple(range(visit or apart, frames, apart))
+        backward = self.order is not None and self.order[level] == "backward"
+        place = first + apart - 1 - visit if backward else visit
+        visited = tuple(range(place or apart, frames, apart))
         return DeformationPhase(
             level=level,
             frames=visited,
             start=begin + (0 if visit == first else visit * share),
             stop=begin + (visit + 1) * share,
             side=self.sides[level],
-            learning_rate_factor=self.decay**level,
+            learning_rate_factor=self.decay ** sum(a != b for a, b in pairwise(sides)),
             init_from_previous=self.coarse_to_fine and level == 0 and visit > 1,
-            has_previous=visit > 0,
+            has_previous=visit > 0 and not backward,
         )

@@ -25,11 +25,13 @@ from devrf.methods.devrf.appearance_learning import AppearanceLearning
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule
 from devrf.methods.devrf.deformed_occupancy import deformed_occupancy
+from devrf.methods.devrf.elastic import occupied_cells
 from devrf.methods.devrf.flow_initialisation import follow, start_from_tracks
 from devrf.methods.devrf.frame_memory import rest_on_host
 from devrf.methods.devrf.losses import (
     MOTION_TERMS,
     FlowMean,
+    MotionGrid,
     MotionPrediction,
     WeightedLoss,
     flow,
@@ -124,6 +126,8 @@ class DeformationStage(VoxelStage):
         )
         self.active = ActiveFrames(self)
         self._previous_images: Tensor | None = None
+        # The cells of the motion grid that hold matter at rest; None where no loss asks.
+        self._matter: Tensor | None = None
 
     @property
     def field(self) -> DeformationField:
@@ -244,6 +248,10 @@ class DeformationStage(VoxelStage):
         for group in range(len(self._optimizer.param_groups)):
             self._optimizer.replace(group, [])
         self.active.allocate(count, *fields)
+        self._matter = None
+        if count and self.losses.weights.get("elastic"):
+            occupancy = self.scene_model.occupancy
+            self._matter = occupied_cells(occupancy, self.field.box, self.field.shape)
         smoothing = total_variation_weight(self.tv, max(self.field.shape), self.schedule.rays)
         learned = [tensor for frame in self.active for tensor in frame.slices]
         self._optimizer.replace(0, learned, smoothing=smoothing)
@@ -333,7 +341,9 @@ class DeformationStage(VoxelStage):
         """Render a batch of the frame through its warp; compare images and motion."""
         if isinstance(self.phase, RefinementPhase):
             return self.refinement.loss(views, pixels)
-        frame, capacity = self.active[batch.number], batch.capacity
+        frame, capacity, grid = self.active[batch.number], batch.capacity, None
+        if self._matter is not None:
+            grid = MotionGrid(frame.forward, frame.box, self._matter)
         prediction = MotionPrediction(
             *self.render_pixels(
                 views, pixels, frame.occupancy, capacity, frame.warp, frame.appearance
@@ -343,6 +353,7 @@ class DeformationStage(VoxelStage):
             views.cameras,
             self.previous_images,
             self.scene_model.space,
+            grid,
         )
         with span("losses"):
             total, terms = self.losses(prediction)

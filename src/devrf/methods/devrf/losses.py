@@ -14,8 +14,10 @@ from torch import Tensor
 
 from devrf.data.batch import RayBatch
 from devrf.errors import DevrfError
+from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.space import WORLD, Space
+from devrf.methods.devrf.elastic import elastic_energy
 from devrf.methods.devrf.volume_rendering import VoxelOutput, Warp
 
 Predicted = TypeVar("Predicted")
@@ -76,6 +78,21 @@ PHOTOMETRIC_TERMS = {
 
 
 @dataclass(frozen=True)
+class MotionGrid:
+    """The forward slice of a frame.
+
+    Attributes:
+        displacement: (X, Y, Z, 3) Δ_f(·, t).
+        box: where it lives.
+        occupied: (X−1, Y−1, Z−1) 1 for the cells that hold matter at rest, else 0.
+    """
+
+    displacement: Tensor
+    box: Box
+    occupied: Tensor
+
+
+@dataclass(frozen=True)
 class MotionPrediction(Prediction):
     """A prediction through the warp of one frame t, with what the motion terms need.
 
@@ -86,6 +103,7 @@ class MotionPrediction(Prediction):
         previous_image: (N,) int64, for each image the one that its flow leads to (the same view
             one frame earlier), or the image itself where there is none.
         space: the space that points are in.
+        grid: the forward slice itself, for terms that need no samples; None where none counts.
     """
 
     unwarp: Warp
@@ -93,6 +111,7 @@ class MotionPrediction(Prediction):
     cameras: Cameras
     previous_image: Tensor
     space: Space = WORLD
+    grid: MotionGrid | None = None
 
 
 def cycle(prediction: MotionPrediction) -> Tensor:
@@ -126,6 +145,14 @@ def flow(prediction: MotionPrediction, mean: FlowMean = "rays") -> Tensor:
     if mean == "rays":
         return total / batch.flow_valid.sum().clamp(min=1)
     return total / (2 * output.count_on(batch.flow_valid)).clamp(min=1)
+
+
+def elastic(prediction: MotionPrediction) -> Tensor:
+    """L_elastic: how much the forward slice stretches matter (docs/method.md#elastic)."""
+    grid = prediction.grid
+    if grid is None:
+        return prediction.output.color.new_zeros(())
+    return elastic_energy(grid.displacement, grid.box, grid.occupied)
 
 
 def induced_flow(
@@ -176,6 +203,7 @@ MOTION_TERMS: dict[str, Callable[[MotionPrediction], Tensor]] = {
     **{("render" if name == "color" else name): term for name, term in PHOTOMETRIC_TERMS.items()},
     "cycle": cycle,
     "flow": flow,
+    "elastic": elastic,
     "residual": residual,
 }
 

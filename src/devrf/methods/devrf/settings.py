@@ -19,6 +19,7 @@ DEFORMATION_LOSS = {
     "tv": 1.0,
     "per_sample_color": 0.1,
     "entropy": 0.01,
+    "elastic": 0.0,
 }
 APPEARANCE_LOSS = {"residual": 1e-3, "tv": 0.002}
 
