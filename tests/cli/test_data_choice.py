@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import fields
 from pathlib import Path
 
@@ -37,7 +38,10 @@ READERS = (BlenderReader, LlffReader, NerfiesReader, NerfstudioReader)
     ],
 )
 def test_when_it_is_chosen(arguments: list[str], chosen: bool) -> None:
-    assert with_data_choice(arguments) == arguments + ["data=auto"] * chosen
+    found = with_data_choice(arguments)
+    assert sorted(found) == sorted(arguments + ["data=auto"] * chosen)
+    if chosen:  # beside the folder: Hydra takes all overrides from one place
+        assert re.match(r"\+*data\.root=", found[found.index("data=auto") + 1])
 
 
 def test_it_has_the_options_of_all_readers() -> None:

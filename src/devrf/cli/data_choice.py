@@ -21,13 +21,14 @@ OF_ALL = ("_target_", "flow_cache")
 def with_data_choice(arguments: Sequence[str]) -> list[str]:
     """The command line, with ``data=auto`` where a scene's folder is given and no reader."""
     given = list(arguments)
-    rooted = any(re.match(r"\+{0,2}data\.root=", one) for one in given)
+    rooted = [k for k, one in enumerate(given) if re.match(r"\+{0,2}data\.root=", one)]
     if not rooted or any(re.match(r"[+~]{0,2}data(=|$)", one) for one in given):
         return given
     chosen = [one.partition("=")[2] for one in given if one.startswith("experiment=")]
     if any(_reads_files(name) for names in chosen for name in names.split(",")):
         return given
-    return [*given, "data=auto"]
+    place = rooted[0]  # Hydra takes all overrides from one place
+    return [*given[:place], "data=auto", *given[place:]]
 
 
 def _reads_files(experiment: str) -> bool:

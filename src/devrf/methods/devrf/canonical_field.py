@@ -172,4 +172,4 @@ class CanonicalField(nn.Module):
         self.box = Box.of(state["low"], state["high"])
         # Files of the first revisions of format 3 have no aspect.
         for name in SIZES:
-            setattr(self, name, state.get(name, getattr(self, name)))
+            setattr(self, name, {"aspect": 1.0, **state}[name])
