@@ -70,7 +70,7 @@ def test_a_scene_in_a_folder_with_any_name(devrf, tmp_path, tiny):
     assert (tmp_path / "o [1]" / "run.log").is_file()
     read = devrf("data=inward", f"data.root={folder}", "stage=inspect", "trainer=cpu")
     assert (read.status, read.err) == (0, "")
-    (run,) = tmp_path.glob("outputs/*/default/images/inspect.png")
+    (run,) = tmp_path.glob("outputs/*/quickstart/images/inspect.png")
     assert run.is_file()
 
 

@@ -96,6 +96,7 @@ def test_no_alarm_in_other_scenes(devrf, tiny, arguments) -> None:
         "data.frames=6",
         "evaluation.metrics=[]",
         "video.frames=1",
+        "video.height=40",
     )
     own = ("field=", "data.height", "data.static_test_views")
     overrides = [one for one in tiny if not one.startswith(own)]

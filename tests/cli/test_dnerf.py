@@ -16,6 +16,7 @@ SMALL = (
     "ray_stage.model.settings.steps=16",
     "ray_stage.model.settings.occupancy_side=8",
     "video.frames=3",
+    "video.height=40",
     "trainer=cpu",
 )
 ROBOT = (

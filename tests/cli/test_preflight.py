@@ -186,6 +186,7 @@ def test_the_estimate_is_near_what_is_taken(warm, tiny, tmp_path, size) -> None:
         *SIZES[size],
         "hydra.run.dir=run",
         "video.frames=1",
+        "video.height=40",
         "evaluation.metrics=[]",
         "callbacks.saving.every_seconds=0",
         "callbacks.saving.share=1.0",

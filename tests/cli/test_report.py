@@ -112,7 +112,13 @@ def test_a_sweep_without_scores_ends_without_a_report(devrf, tmp_path, tiny):
 def test_equal_runs_are_one_row_whatever_was_typed(devrf, tmp_path, trained):
     shutil.copytree(trained[0], tmp_path / "outputs" / "one")
     # The defaults typed out, another seed, and an archived run of the first.
-    typed = ("experiment=quickstart", "sampling=quick", "seed=1", "video.frames=2")
+    typed = (
+        "experiment=quickstart",
+        "sampling=quick",
+        "seed=1",
+        "video.frames=2",
+        "video.height=40",
+    )
     afresh = (*typed, "evaluation.metrics=[]", "resume=false")
     assert devrf("hydra.run.dir=outputs/one", *afresh).status == 0
     checkpoint = "ckpt=outputs/one/checkpoints/deformation.ckpt"

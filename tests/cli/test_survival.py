@@ -35,6 +35,7 @@ COMMAND = (
     "trainer.log_every_n_steps=3",
     "evaluation.metrics=[]",
     "video.frames=1",
+    "video.height=40",
     "hydra.run.dir=run",
 )
 # These differ from run to run; "run" in metrics.json holds the process and its command.

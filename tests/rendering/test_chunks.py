@@ -68,11 +68,11 @@ def test_an_image_is_the_same_with_less_memory(
     whole = Renderer(rest.model).picture(rays, 0.0, 1.0)
     usual, tried = module.render, []
 
-    def render(some, *others):
+    def render(some, *others, **named):
         tried.append(len(some))
         if len(some) > 450:
             raise torch.OutOfMemoryError("CUDA out of memory.")
-        return usual(some, *others)
+        return usual(some, *others, **named)
 
     monkeypatch.setattr(module, "render", render)
     same(Renderer(rest.model).picture(rays, 0.0, 1.0), whole)
