@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from devrf.cli.arguments import PATHS, in_quotes, with_quoted_paths
+from devrf.cli.arguments import PATHS, with_quoted_paths
 from devrf.cli.completion import candidates
+from devrf.cli.overrides import in_quotes
 
 PARSER = OverridesParser.create()
 

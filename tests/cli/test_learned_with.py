@@ -139,7 +139,7 @@ def test_a_command_is_recorded_without_what_is_of_that_command_alone(tmp_path, m
         "ckpt=c",
         "seed=2",
     ]
-    root = f"data.root='{tmp_path}/a b'"
+    root = f'data.root="{tmp_path}/a b"'
     assert recorded([*typed, "hydra/launcher=joblib"]) == [root, "+x=1", "~y", "seed=2"]
 
 

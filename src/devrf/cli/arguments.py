@@ -14,6 +14,8 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 
+from devrf.cli.overrides import in_quotes
+
 # Keys whose values are files or folders.
 PATHS = {
     *("data.root", "data.export", "data.flow_cache", "ckpt", "fetch.into"),
@@ -30,14 +32,6 @@ def with_quoted_paths(arguments: Sequence[str]) -> list[str]:
     """
     multirun = not {"-m", "--multirun"}.isdisjoint(arguments)
     return [_quoted_path(argument, multirun) for argument in arguments]
-
-
-def in_quotes(text: str) -> str:
-    """``text`` as Hydra's grammar takes it for text, whatever it holds."""
-    mark = "'" if '"' in text and "'" not in text else '"'
-    # Backslashes count as escapes only before a quotation mark and at the end.
-    escaped = re.sub(rf"(\\*)({mark}|$)", lambda m: m[1] * 2 + (m[2] and f"\\{mark}"), text)
-    return f"{mark}{escaped}{mark}"
 
 
 def _quoted_path(argument: str, multirun: bool) -> str:

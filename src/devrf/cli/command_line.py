@@ -22,5 +22,4 @@ def as_hydra_takes_it(typed: Sequence[str]) -> list[str]:
     meant = with_paper_experiment(with_quoted_paths(typed))
     if not any(one.startswith(OF_A_RUN) for one in meant):
         meant = with_data_choice(meant)
-    # A run's recorded paths are quoted, too.
-    return with_quoted_paths(with_data_choice(completed(meant)))
+    return with_data_choice(completed(meant))

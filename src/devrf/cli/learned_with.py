@@ -23,14 +23,13 @@ from omegaconf.errors import OmegaConfBaseException
 
 from devrf.cli.config import config_folder, scene_folder_name
 from devrf.cli.overrides import Overrides, quoted, recorded, root_of, text_of
+from devrf.cli.stages import OF_A_CHECKPOINT, PIPELINE, STEPS
 from devrf.errors import DevrfError
 
 log = logging.getLogger(__name__)
 
 # Stages that a checkpoint is not looked for: they learn from nothing, or only read a scene.
-FROM_NOTHING = {"pipeline", "fetch", "inspect", "prepare", "report"}
-# Stages that show or score a checkpoint, beside what it is the checkpoint of.
-OF_A_CHECKPOINT = {"evaluate", "render", "still"}
+FROM_NOTHING = {PIPELINE, *STEPS} - {*OF_A_CHECKPOINT}
 
 # Where the present command's settings come from, until a log is there to say so.
 _source: list[str] = []
@@ -119,7 +118,7 @@ def _of_sweep(typed: Overrides) -> list[str]:
 def _of_folder(typed: Overrides) -> list[str]:
     """What the run in the command's folder was learned with."""
     given = typed.value("hydra.run.dir")
-    if given is None and (typed.value("stage") or "pipeline") in FROM_NOTHING:
+    if given is None and (typed.value("stage") or PIPELINE) in FROM_NOTHING:
         return []
     folder = _composed_folder(typed) if given is None else Path(given)
     last = None if folder is None else _last_checkpoint(folder)

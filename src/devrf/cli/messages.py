@@ -14,9 +14,9 @@ from pathlib import Path
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf.errors import OmegaConfBaseException
 
-from devrf.cli.arguments import in_quotes
 from devrf.cli.config import config_folder
 from devrf.cli.config_check import unknown_key
+from devrf.cli.overrides import in_quotes
 from devrf.cli.stages import meant_stage
 from devrf.errors import DevrfError, did_you_mean
 

@@ -84,11 +84,16 @@ def recorded(overrides: Iterable[str]) -> list[str]:
 
 
 def quoted(text: str) -> str:
-    """A value as Hydra's grammar takes it literally."""
-    if re.fullmatch(r"[A-Za-z0-9_./-]+", text):
-        return text
-    escaped = text.replace("'", "\\'")
-    return f"'{escaped}'"
+    """A value as Hydra's grammar takes it literally, in quotes where it needs them."""
+    return text if re.fullmatch(r"[A-Za-z0-9_./-]+", text) else in_quotes(text)
+
+
+def in_quotes(text: str) -> str:
+    """``text`` as Hydra's grammar takes it for text, whatever it holds."""
+    mark = "'" if '"' in text and "'" not in text else '"'
+    # Backslashes count as escapes only before a quotation mark and at the end.
+    escaped = re.sub(rf"(\\*)({mark}|$)", lambda m: m[1] * 2 + (m[2] and f"\\{mark}"), text)
+    return f"{mark}{escaped}{mark}"
 
 
 def text_of(override: Override) -> str:

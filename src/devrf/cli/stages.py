@@ -10,6 +10,8 @@ from devrf.errors import did_you_mean
 PIPELINE = "pipeline"
 # Stages that learn nothing; the protocol's stages come beside these.
 STEPS = ("prepare", "inspect", "evaluate", "render", "still", "report", "fetch")
+# Of these, what uses a checkpoint.
+OF_A_CHECKPOINT = ("evaluate", "render", "still")
 # What users of other programs write, and what it is here.
 SYNONYMS = {
     **dict.fromkeys(("train", "fit", "learn", "run", "start"), "stage=pipeline"),

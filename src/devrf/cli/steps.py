@@ -27,7 +27,7 @@ from devrf.cli.render import render
 from devrf.cli.report import report
 from devrf.cli.resume import archive_previous, beginning
 from devrf.cli.scene_stages import learnable
-from devrf.cli.stages import meant_stage
+from devrf.cli.stages import OF_A_CHECKPOINT, meant_stage
 from devrf.cli.still import picture
 from devrf.cli.train import learn
 from devrf.cli.workers import launch_workers
@@ -52,8 +52,6 @@ STEPS: dict[str, Step] = {
     "fetch": fetch,
 }
 PIPELINE = ("evaluate", "render")
-# Steps that use no checkpoint.
-FROM_NOTHING = {"prepare", "inspect", "report", "fetch"}
 MOVED = {"benchmark": "run python benchmarks/training.py with the other overrides"}
 
 # Lightning's messages on accelerators, tips and data loaders say nothing about this run.
@@ -198,7 +196,7 @@ def _check(run: RunContext, asked: Plan) -> None:
     """Find errors in the config of every step before the first begins."""
     config = run.config
     begins = asked.learning and run.protocol[asked.learning[0]].builds_on is None
-    if config.ckpt is not None and (begins or not FROM_NOTHING.isdisjoint(asked.further)):
+    if config.ckpt is not None and (begins or not {*asked.further} <= {*OF_A_CHECKPOINT}):
         raise DevrfError(
             f"ckpt: stage={config.stage} starts from nothing; with ckpt=PATH give a stage that "
             "builds on another, stage=evaluate, stage=render or stage=still"
