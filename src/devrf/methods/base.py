@@ -30,6 +30,7 @@ class DynamicModel(nn.Module, ABC):
     Attributes:
         name: the method's name: what ``method=`` chooses, and tables say.
         losses: the names of its loss terms.
+        protocols: the names of the protocols that it learns by; None: every one.
         box: what holds the scene, in the space of the fields.
         space: the space that the fields live in: world units, or NDC.
         depth_limits: distances along a ray before and behind which nothing is sampled, in the
@@ -38,6 +39,7 @@ class DynamicModel(nn.Module, ABC):
 
     name: ClassVar[str]
     losses: ClassVar[tuple[str, ...]] = ("color",)
+    protocols: ClassVar[tuple[str, ...] | None] = None
     box: Box
     space: Space
     depth_limits: tuple[float, float]
@@ -53,6 +55,18 @@ class DynamicModel(nn.Module, ABC):
     def from_config(cls, config: Mapping[str, Any]) -> DynamicModel:
         """The module that :meth:`config` described, with other values in it."""
         return cls(**config)
+
+    def check_protocol(self, protocol: str) -> None:
+        """Refuse a protocol that the method cannot learn by.
+
+        Raises:
+            DevrfError: :attr:`protocols` does not name it.
+        """
+        if self.protocols is not None and protocol not in self.protocols:
+            known = " or ".join(f"protocol={name}" for name in self.protocols)
+            raise DevrfError(
+                f"protocol: method={self.name} does not learn by protocol={protocol}; give {known}"
+            )
 
     def setup(self, scene: Scene) -> None:
         """Take from a scene what the method needs: bounds, the frames' times, priors.
