@@ -21,7 +21,7 @@ from devrf.geometry.box import Box
 from devrf.geometry.space import Space
 from devrf.rendering.output import RenderOutput
 from devrf.rendering.view import View
-from devrf.scenes.scene import Scene
+from devrf.scenes.scene import Scene, Views
 
 
 class DynamicModel(nn.Module, ABC):
@@ -31,6 +31,8 @@ class DynamicModel(nn.Module, ABC):
         name: the method's name: what ``method=`` chooses, and tables say.
         losses: the names of its loss terms.
         protocols: the names of the protocols that it learns by; None: every one.
+        priors: what it wants of a scene beside images and backward flow, where it can be had:
+            ``forward_flow``.
         box: what holds the scene, in the space of the fields.
         space: the space that the fields live in: world units, or NDC.
         depth_limits: distances along a ray before and behind which nothing is sampled, in the
@@ -40,6 +42,7 @@ class DynamicModel(nn.Module, ABC):
     name: ClassVar[str]
     losses: ClassVar[tuple[str, ...]] = ("color",)
     protocols: ClassVar[tuple[str, ...] | None] = None
+    priors: ClassVar[tuple[str, ...]] = ()
     box: Box
     space: Space
     depth_limits: tuple[float, float]
@@ -76,6 +79,23 @@ class DynamicModel(nn.Module, ABC):
         Raises:
             DevrfError: the scene lacks what the method needs.
         """
+
+    def learn_from(self, views: Sequence[Views], terms: Collection[str]) -> None:
+        """Look at the images whose rays will be rendered; called when a stage begins or goes on.
+
+        Args:
+            views: on the model's device; :attr:`devrf.data.batch.RayBatch.image` numbers their
+                images through, in this order.
+            terms: the loss terms that count.
+        """
+
+    def further_pixels(self, generator: torch.Generator) -> tuple[Tensor, Tensor] | None:
+        """Pixels that the next batch has beside those drawn from all images; None: none.
+
+        Returns:
+            image (K,), numbered as for :meth:`learn_from`, and row-major number (K,), int64.
+        """
+        return None
 
     @abstractmethod
     def forward(self, batch: RayBatch) -> RenderOutput:
