@@ -1,0 +1,51 @@
+"""Where NSFF samples rays: there is no second pass."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from devrf.geometry.box import Box
+from devrf.geometry.clock import FrameClock
+from devrf.geometry.rays import Rays
+from devrf.methods.nerf.hierarchical import flattened, limits, stratified
+from devrf.methods.nerf.occupancy_frames import OccupancyFrames
+from devrf.methods.nerf.ray_samples import RaySamples
+
+
+def evenly(
+    rays: Rays, box: Box, depths: tuple[float, float], count: int, *, jitter: bool
+) -> RaySamples:
+    """``count`` samples of each ray, one in each of equal stretches of its way through a box."""
+    near, far = limits(rays, box, depths)
+    return flattened(rays, stratified(near, far, count, jitter=jitter), far)
+
+
+def frames_around(times: Tensor, time: Tensor) -> tuple[Tensor, Tensor]:
+    """The frames (R,) int64 before and after each time; twice the same on a frame.
+
+    Args:
+        times: (T,) the clock's, ascending.
+        time: (R,) in [0, 1].
+    """
+    after = torch.searchsorted(times, time.contiguous() - FrameClock.TOLERANCE)
+    after = after.clamp(max=len(times) - 1)
+    on_frame = (times[after] - time).abs() <= FrameClock.TOLERANCE
+    return torch.where(on_frame, after, (after - 1).clamp(min=0)), after
+
+
+def occupied(
+    rays: Rays,
+    frames: tuple[Tensor, Tensor],
+    box: Box,
+    depths: tuple[float, float],
+    occupancy: OccupancyFrames,
+    steps: int,
+    *,
+    jitter: bool,
+) -> RaySamples:
+    """Even steps, ``steps`` along the box's diagonal, where something may be at either frame."""
+    diagonal = sum(edge**2 for edge in box.size) ** 0.5
+    unit = float(rays.directions.norm(dim=1).amax()) if len(rays) else 1.0
+    step = diagonal / (steps * unit)
+    return occupancy.march(rays, frames, box, depths, step, jitter=jitter)
