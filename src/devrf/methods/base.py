@@ -8,6 +8,7 @@ stills, evaluation) asks for :meth:`DynamicModel.at` alone.
 
 from __future__ import annotations
 
+import fnmatch
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, ClassVar
@@ -19,6 +20,7 @@ from devrf.data.batch import RayBatch
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.space import Space
+from devrf.methods.protocol import ProtocolStage
 from devrf.rendering.output import RenderOutput
 from devrf.rendering.view import View
 from devrf.scenes.scene import Scene, Views
@@ -135,17 +137,26 @@ class DynamicModel(nn.Module, ABC):
     def freeze(self, parts: Sequence[str]) -> None:
         """Keep some parts as they are, and let the others learn.
 
+        Args:
+            parts: their names; ``canonical*`` is every part whose name begins so.
+
         Raises:
             DevrfError: the method has no such part.
         """
-        own = self.parts()
+        own, kept = self.parts(), set[str]()
         for name in parts:
-            if name not in own:
+            matching = fnmatch.filter(own, name)
+            if not matching:
                 known = ", ".join(own)
                 raise DevrfError(f"protocol: {self.name} has no part {name!r}; it has {known}")
+            kept |= set(matching)
         for name, parameters in own.items():
             for parameter in parameters:
-                parameter.requires_grad_(name not in parts)
+                parameter.requires_grad_(name not in kept)
+
+    def follow(self, step: ProtocolStage) -> None:
+        """Called when a stage of a protocol begins: keeps its frozen parts as they are."""
+        self.freeze(step.frozen)
 
     def on_iteration(self, step: int, total: int) -> None:
         """Called before iteration ``step`` of ``total``: for encoding windows and curricula."""

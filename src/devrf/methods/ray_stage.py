@@ -167,7 +167,7 @@ class RayStage(ScheduledStage):
         if not self._ready:
             self.scene_model.setup(self._scene_of_stage())
             self._ready = True
-        self.scene_model.freeze(self.step_of_protocol.frozen)
+        self.scene_model.follow(self.step_of_protocol)
         if self._optimizer is not None:
             return
         schedule, groups = self.schedule, self.scene_model.param_groups()
