@@ -67,14 +67,27 @@ def test_a_method_learns_by_the_protocols_that_it_has_stages_for(
     run = RunContext(config, tmp_path)
     assert (config.method, run.protocol.name) == (method, protocol)
     assert run.learning_stages
+    model = config.get("ray_stage") and instantiate(config.ray_stage.model, _convert_="all")
+    known = getattr(model, "protocols", None) or NAMES["protocol"]
     for step in run.protocol.steps:
-        if run.stage_key(step.name) not in config:
+        if run.stage_key(step.name) not in config or protocol not in known:
             refused = f"protocol: method={method} does not learn by protocol={protocol}"
             with pytest.raises(DevrfError, match=refused):
                 run.stage_builder(step.name)
             continue
         if step.builds_on is None:
             assert isinstance(run.stage_builder(step.name)(), ScheduledStage)
+
+
+PROFILES = sorted(path.stem for path in (config_folder() / "method/profile").glob("*.yaml"))
+
+
+@pytest.mark.parametrize("name", PROFILES)
+def test_a_method_is_built_in_each_of_its_sizes(composed, tmp_path, name):
+    method, _, profile = name.rpartition("_")
+    config = composed(f"method={method}", "protocol=joint", f"profile={profile}")
+    check_config(config)
+    assert isinstance(RunContext(config, tmp_path).stage_builder("joint")(), ScheduledStage)
 
 
 @pytest.mark.parametrize("page", sorted({scene.collection.page for scene in catalogue()}))

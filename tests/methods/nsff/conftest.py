@@ -20,8 +20,8 @@ from devrf.scenes.procedural.forward import ProceduralForwardScene
 from devrf.scenes.scene import Scene
 
 TINY = NSFFSettings(
-    width=8, depth=2, bands=2, direction_bands=1, density_noise=0.0, sampling="occupancy",
-    samples=8, steps=16, occupancy_side=8, hard_rays=4,
+    width=8, depth=2, skip=None, bands=2, direction_bands=1, density_noise=0.0,
+    sampling="occupancy", samples=8, steps=16, occupancy_side=8, hard_rays=4,
     warmup=Warmup(steps_per_frame=1, least_frames=1, most_frames=2, chained_from=1.0),
 )  # fmt: skip
 QUICK = RaySchedule(

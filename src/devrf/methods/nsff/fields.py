@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass
 
 import torch
@@ -11,6 +12,7 @@ from devrf.methods.nerf.encoding import SinusoidalEncoding
 from devrf.methods.nerf.mlp import Trunk
 from devrf.methods.nsff.blending import Blend, blended, shared
 from devrf.methods.nsff.settings import NSFFSettings
+from devrf.system.machine import multiplies_bfloat16
 
 # The flow's weights begin in ±SMALL, so that the first flows are next to zero.
 SMALL = 1e-4
@@ -62,10 +64,10 @@ class HeadedField(nn.Module):
         """
         super().__init__()
         width = settings.width
-        self._half = settings.precision == "bfloat16"
+        self._precision = settings.precision
         self.encode = SinusoidalEncoding(inputs, settings.bands)
         self.encode_direction = SinusoidalEncoding(3, settings.direction_bands)
-        self.trunk = Trunk(self.encode.size, width, settings.depth)
+        self.trunk = Trunk(self.encode.size, width, settings.depth, skip=settings.skip)
         self.density = nn.Linear(width, 1)
         self.further = nn.Linear(width, further)
         self.feature = nn.Linear(width, width)
@@ -84,8 +86,11 @@ class HeadedField(nn.Module):
         """
         encoded = self.encode(values)
         direction = self.encode_direction(viewdirs).index_select(0, ray)
-        half = self._half and self.training
-        with torch.autocast(values.device.type, torch.bfloat16, enabled=half):
+        reduced = self._precision == "bfloat16"
+        if self._precision == "auto":
+            reduced = multiplies_bfloat16(values.device)
+        reduced = reduced and self.training
+        with torch.autocast(values.device.type, torch.bfloat16) if reduced else nullcontext():
             x = self.trunk(encoded)
             raw, further = self.density(x)[:, 0], self.further(x)
             x = torch.relu(self.branch(torch.cat([self.feature(x), direction], dim=-1)))

@@ -28,7 +28,7 @@ from devrf.methods.nsff.losses import OF_A_SHARE, TERMS, LossInput
 from devrf.methods.nsff.placement import Placement
 from devrf.methods.nsff.priors import ImagePriors
 from devrf.methods.nsff.renders import BlendedOutput, Renders
-from devrf.methods.nsff.sampling import evenly, frames_around, occupied
+from devrf.methods.nsff.sampling import evenly, occupied
 from devrf.methods.nsff.settings import NSFFSettings
 from devrf.ops.compositing import sum_by_ray
 from devrf.rendering.output import RenderOutput
@@ -91,7 +91,7 @@ class NSFF(DynamicModel):
         if s.sampling == "occupancy":
             shape = box.grid_shape(s.occupancy_side**3)
             self.occupancy = OccupancyFrames(len(scene.clock), shape).to(self.device)
-            if scene.kind == "inward" and scene.space.straight:
+            if s.hull and scene.kind == "inward" and scene.space.straight:
                 self.occupancy.carve(scene, box)
 
     def config(self) -> dict[str, Any]:
@@ -208,9 +208,15 @@ class NSFF(DynamicModel):
         """Samples, their lengths in normalised units; without mattes the last one is endless."""
         s = self.settings
         if s.sampling == "occupancy":
-            frames = frames_around(self.times, time)
+            before, after, _ = self.clock.between(time)
             samples = occupied(
-                rays, frames, self.box, self.depth_limits, self.occupancy, s.steps, jitter=jitter
+                rays,
+                (before, after),
+                self.box,
+                self.depth_limits,
+                self.occupancy,
+                s.steps,
+                jitter=jitter,
             )
         else:
             samples = evenly(rays, self.box, self.depth_limits, s.samples, jitter=jitter)

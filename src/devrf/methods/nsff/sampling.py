@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
 from devrf.geometry.box import Box
-from devrf.geometry.clock import FrameClock
 from devrf.geometry.rays import Rays
 from devrf.methods.nerf.hierarchical import flattened, limits, stratified
 from devrf.methods.nerf.occupancy_frames import OccupancyFrames
@@ -19,19 +17,6 @@ def evenly(
     """``count`` samples of each ray, one in each of equal stretches of its way through a box."""
     near, far = limits(rays, box, depths)
     return flattened(rays, stratified(near, far, count, jitter=jitter), far)
-
-
-def frames_around(times: Tensor, time: Tensor) -> tuple[Tensor, Tensor]:
-    """The frames (R,) int64 before and after each time; twice the same on a frame.
-
-    Args:
-        times: (T,) the clock's, ascending.
-        time: (R,) in [0, 1].
-    """
-    after = torch.searchsorted(times, time.contiguous() - FrameClock.TOLERANCE)
-    after = after.clamp(max=len(times) - 1)
-    on_frame = (times[after] - time).abs() <= FrameClock.TOLERANCE
-    return torch.where(on_frame, after, (after - 1).clamp(min=0)), after
 
 
 def occupied(

@@ -57,6 +57,7 @@ class NSFFSettings:
     Attributes:
         width: units of each layer of both trunks.
         depth: layers of each trunk.
+        skip: the layer, counted from 0, that the input enters again; None: the middle one.
         bands: octaves of positions and times.
         direction_bands: octaves of viewing directions.
         density_scale: density of a softplus of 1, per half of the box's longest edge.
@@ -65,20 +66,24 @@ class NSFFSettings:
             the box's longest edge; None: 1 in NDC, 0.2 elsewhere.
         blend: how static and dynamic densities join: ``v`` (a learned share) or ``additive``.
         sampling: ``stratified`` (one sample in each of equal stretches of a ray) or ``occupancy``
-            (even steps where something may be, told by the visual hull of each frame's mattes).
+            (even steps where something may be).
         samples: of a ray (stratified).
         steps: samples along the box's diagonal (occupancy).
         occupancy_side: the masks have about side³ cells (occupancy).
+        hull: whether these are the visual hulls of each frame's mattes, where there are any, which
+            the published method never had; else nothing is left out (occupancy).
         neighbours: whether a ray is rendered from ``both`` neighbouring frames in each iteration,
             or from ``one`` at random.
         hard_rays: rays within the motion masks that a batch has beside the others in the first N₀
             iterations.
-        precision: of the trunks while they are learned, ``float32`` or ``bfloat16``.
+        precision: what the trunks compute in while they learn: float32, bfloat16, or ``auto``
+            (bfloat16 on a GPU that multiplies it). All else is in float32.
         warmup: when the losses change.
     """
 
     width: int = 256
     depth: int = 8
+    skip: int | None = 5
     bands: int = 10
     direction_bands: int = 4
     density_scale: float = 10.0
@@ -89,9 +94,10 @@ class NSFFSettings:
     samples: int = 128
     steps: int = 128
     occupancy_side: int = 128
+    hull: bool = True
     neighbours: Literal["both", "one"] = "both"
     hard_rays: int = 512
-    precision: Literal["float32", "bfloat16"] = "float32"
+    precision: Literal["auto", "float32", "bfloat16"] = "float32"
     warmup: Warmup = field(default_factory=Warmup)
 
     def __post_init__(self) -> None:
