@@ -52,6 +52,12 @@ def test_frozen_parts_are_in_no_group_and_the_others_learn() -> None:
     assert len(model.param_groups()) == 2
 
 
+def test_parts_can_be_named_by_their_beginning() -> None:
+    model = Toy()
+    model.freeze(["canon*"])
+    assert [group["name"] for group in model.param_groups()] == ["deformation"]
+
+
 def test_an_unknown_part_is_named_with_those_there_are() -> None:
     model = Toy()
     with pytest.raises(DevrfError, match="toy has no part 'rest'; it has canonical, deformation"):

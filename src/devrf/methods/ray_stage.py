@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
@@ -170,10 +170,11 @@ class RayStage(ScheduledStage):
     def setup(self, stage: str) -> None:
         """Give the model what it needs of the scene, and make the optimiser."""
         super().setup(stage)
+        self.trainer.datamodule.provide(self.scene_model.priors)  # type: ignore[attr-defined]
         if not self._ready:
             self.scene_model.setup(self._scene_of_stage())
             self._ready = True
-        self.scene_model.freeze(self.step_of_protocol.frozen)
+        self.scene_model.follow(self.step_of_protocol)
         if self._optimizer is not None:
             return
         schedule, groups = self.schedule, self.scene_model.param_groups()
@@ -193,6 +194,7 @@ class RayStage(ScheduledStage):
         self.phase = phase
         views = [self._training_views(name) for name in self._captures]
         self.pools = [FramePool.of(one) for one in views]
+        self.scene_model.learn_from(views, self.weights)
         groups = self.optimizer.param_groups
         self.bind(self.schedule.rays, [[p for group in groups for p in group["params"]]])
 
@@ -213,7 +215,7 @@ class RayStage(ScheduledStage):
     def draw(self, batch: ParallelBatch) -> Pixels:
         """Random pixels: of the static images first, where both captures are learned from.
 
-        Images are numbered through, the static ones first.
+        Images are numbered through, the static ones first. Last are those the model asks for.
         """
         with span("batch"):
             rays = rays_per_rank(self.schedule.rays)
@@ -229,8 +231,13 @@ class RayStage(ScheduledStage):
                 flats.append(flat)
                 offset += pool.images
                 left = None if left is None else max(1, left - pool.frames)
-            background = background_color(self.scene.background, rays, self.generator)
-            return Pixels(torch.cat(images), torch.cat(flats), background)
+            further = self.scene_model.further_pixels(self.generator)
+            if further is not None:
+                images.append(further[0])
+                flats.append(further[1])
+            image = torch.cat(images)
+            background = background_color(self.scene.background, len(image), self.generator)
+            return Pixels(image, torch.cat(flats), background)
 
     def _shown_frames(self, pool: FramePool) -> int:
         """How many frames the curriculum shows by now."""
@@ -258,15 +265,14 @@ class RayStage(ScheduledStage):
         for one in views if isinstance(views, tuple) else (views,):
             own = (pixels.image >= offset) & (pixels.image < offset + len(one))
             place, background = own.nonzero()[:, 0], pixels.background
-            parts.append(
-                gather_batch(
-                    one,
-                    pixels.image[place] - offset,
-                    pixels.flat[place],
-                    background if background.dim() == 1 else background[place],
-                    space,
-                )
+            part = gather_batch(
+                one,
+                pixels.image[place] - offset,
+                pixels.flat[place],
+                background if background.dim() == 1 else background[place],
+                space,
             )
+            parts.append(replace(part, image=pixels.image[place]))
             offset += len(one)
         return parts[0] if len(parts) == 1 else concatenated(parts)
 

@@ -290,6 +290,7 @@ class CanonicalStage(VoxelStage):
             return
         self.update_occupancy()
         self.scene_model.canonical.clear(~self.scene_model.occupancy.mask, alpha=1e-6)
+        super().on_train_end()
 
     def resize_to(self, state: dict[str, Tensor]) -> None:
         """Take a radiance field in place of the search's, if that is what was stored."""

@@ -54,7 +54,7 @@ class ProceduralScene(Recipe):
         watching, unseen = dynamic_rig(self.train_views, reach=reach, rig=rig, **size)
         film = Filming(shape, reach, self.supersample, self.light)
         if inside:
-            room = self.in_surroundings()
+            room = self.filmed()
             film = Filming(room, REACH, self.supersample, self.light, STEPS, opaque=True)
         static, dynamic = (
             film.at_rest(learned, tested),
@@ -74,7 +74,7 @@ class ProceduralScene(Recipe):
         )
         return Scene(self.shape, "inward", static, dynamic, bounds, "white")
 
-    def in_surroundings(self) -> Shape:
+    def filmed(self) -> Shape:
         """The moving shape, in its room if there is one."""
         shape = self.model()
         if self.surroundings == "none":

@@ -64,6 +64,10 @@ class ProceduralForwardScene(Recipe):
         bounds = forward_bounds([at_rest.train, moving.train], space, source)
         return Scene(self.name, "forward", at_rest, moving, bounds, "white", space)
 
+    def filmed(self) -> Shape:
+        """The toy and its stage."""
+        return self.model()
+
     def model(self) -> Shape:
         """The toy and its stage themselves, for exact answers at any point and time."""
         return Surrounded(Plush(float(self.speed)), Backdrop(weave=self.texture == "fine"))
