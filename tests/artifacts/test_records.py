@@ -54,14 +54,17 @@ def test_times_that_no_training_view_has_are_scored_apart() -> None:
         view("d", 1.0, 40.0),
     ]
     found = dynamic_scores(views, FrameClock((0.0, 0.5)))
-    assert (found["psnr"], found["rest_pose_psnr"]) == (21.0, 9.0)
+    assert (found["psnr"], found["rest_pose_psnr"]) == (28.0, 9.0)
+    assert (found["training_times"]["psnr"], found["training_times"]["images"]) == (21.0, 2)
     # Between two frames, and beyond the last.
     expected = {"psnr": 35.0, "ssim": 0.5, "rest_pose_psnr": 9.0, "images": 2}
     assert found["novel_times"] == expected
-    assert "novel_times" not in dynamic_scores(views, FrameClock((0.0, 0.25, 0.5, 1.0)))
-    # Where all times are novel the section is of all images all the same.
+    usual = dynamic_scores(views, FrameClock((0.0, 0.25, 0.5, 1.0)))
+    assert not {"novel_times", "training_times"} & usual.keys()
+    # Where all times are novel that section is of all images.
     alone = dynamic_scores(views[1:2], FrameClock((0.0, 0.5)))
     assert alone["psnr"] == alone["novel_times"]["psnr"] == 30.0
+    assert "training_times" not in alone
 
 
 def test_numbers_are_rounded_for_people() -> None:

@@ -41,13 +41,15 @@ def dynamic_scores(views: Sequence[HeldOutView], clock: FrameClock) -> dict[str,
         clock: of the training views' times.
 
     Returns:
-        Means over the images at times that a training view has, or over all if none is.
-        ``novel_times``, only where there are such: means over the images at other times, and how
-        many ``images`` these are.
+        Means over all images. ``novel_times``, only where there are such: means over the images
+        at times that no training view has, and how many ``images`` these are. ``training_times``,
+        then, too, and if there are any: the same over the others.
     """
     novel = [view for view in views if not clock.knows(view.time)]
     known = [view for view in views if clock.knows(view.time)]
-    found: dict[str, Any] = _with_rest_pose(known or views)
+    found: dict[str, Any] = _with_rest_pose(views)
+    if novel and known:
+        found["training_times"] = {**_with_rest_pose(known), "images": len(known)}
     if novel:
         found["novel_times"] = {**_with_rest_pose(novel), "images": len(novel)}
     return found

@@ -29,8 +29,8 @@ from devrf.system.files import write_json
 
 log = logging.getLogger(__name__)
 
-# Held-out images of the dynamic capture at times that no training view has.
-NOVEL = "novel_times"
+# Held-out images of the dynamic capture at times that a training view has, and at others.
+OF_TIMES = ("training_times", "novel_times")
 # Figures of the training, from the checkpoint, that stand beside the scores.
 TRAINING = ("seconds", "iterations", "iterations_per_second", "peak_gpu_gb", "num_rollbacks")
 # How iterations were carried out: which kernels and graphs really ran.
@@ -81,10 +81,14 @@ def _tell(
     sections: Mapping[str, Mapping[str, Any]],
     frames: Mapping[str, Sequence[HeldOutView]],
 ) -> None:
-    """Log the scores and give them to the trackers, those of novel times as a section."""
-    novel = sections.get("dynamic", {}).get(NOVEL)
-    plain = {name: {k: v for k, v in one.items() if k != NOVEL} for name, one in sections.items()}
-    shown = {name: plain[name] for name in frames} | ({} if novel is None else {NOVEL: novel})
+    """Log the scores and give them to the trackers, those of some times as further sections."""
+    plain = {
+        name: {key: value for key, value in one.items() if key not in OF_TIMES}
+        for name, one in sections.items()
+    }
+    dynamic = sections.get("dynamic", {})
+    of_times = {name: dynamic[name] for name in OF_TIMES if name in dynamic}
+    shown = {name: plain[name] for name in frames} | of_times
     for name, values in shown.items():
         log.info("%s: %s", name.replace("_", " "), in_words(values))
     _track(run, plain | shown, shown, frames)

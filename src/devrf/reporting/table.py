@@ -53,8 +53,11 @@ GPU = Column("GPU (GB)", "peak_gpu_gb", False, 1, True, "no run is known to have
 TIME = Column("Time", "train_seconds", False, None, True)
 COLUMNS = (PSNR, SSIM, LPIPS, GPU, TIME)
 TITLES = [column.title for column in COLUMNS]
-# Shown where a run was scored at times that no training view has; the paper has no such column.
-NOVEL = Column("PSNR at novel times", "dynamic.novel_times.psnr", True, 2)
+# Shown where a run was scored at times that no training view has; the paper has no such columns.
+OF_TIMES = (
+    Column("PSNR at training times", "dynamic.training_times.psnr", True, 2),
+    Column("PSNR at novel times", "dynamic.novel_times.psnr", True, 2),
+)
 # How a time below so many seconds is written: the unit's seconds, digits, the unit.
 TIMES = (
     (9.95, 1, 1, " s"),
@@ -156,9 +159,9 @@ def tabulate(found: Collection, published_scenes: PublishedScenes = "matching") 
 
 
 def _columns(runs: pd.DataFrame) -> tuple[Column, ...]:
-    """The paper's columns, and that of novel times where a run has it."""
-    has_novel = NOVEL.key in runs and bool(_values(runs, NOVEL).notna().any())
-    return (*COLUMNS[:1], NOVEL, *COLUMNS[1:]) if has_novel else COLUMNS
+    """The paper's columns, and those of training and novel times that a run has."""
+    known = [one for one in OF_TIMES if one.key in runs and _values(runs, one).notna().any()]
+    return (*COLUMNS[:1], *known, *COLUMNS[1:])
 
 
 def _values(runs: pd.DataFrame, column: Column) -> pd.Series:
