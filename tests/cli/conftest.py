@@ -45,6 +45,8 @@ SHORT = (
     "video.height=40",
     "trainer=cpu",
 )
+# The plots of training take a tenth of the time of such a run.
+PLAIN = "~callbacks.curve"
 
 
 @dataclass(frozen=True)
@@ -91,14 +93,14 @@ def tiny_data() -> tuple[str, ...]:
 
 @pytest.fixture(scope="session")
 def tiny() -> tuple[str, ...]:
-    """Overrides that make the embedded scene and the schedules tiny."""
-    return (*TINY, *SHORT)
+    """Overrides that make the embedded scene and the schedules tiny, and draw no plot."""
+    return (*TINY, *SHORT, PLAIN)
 
 
 @pytest.fixture(scope="session")
 def short() -> tuple[str, ...]:
-    """Overrides that make the schedules tiny, for a scene of any kind."""
-    return SHORT
+    """Overrides that make the schedules tiny, for a scene of any kind, and draw no plot."""
+    return (*SHORT, PLAIN)
 
 
 @pytest.fixture(scope="session")
@@ -122,12 +124,10 @@ def devrf(tmp_path: Path) -> Devrf:
 
 
 @pytest.fixture(scope="session")
-def trained(
-    tmp_path_factory: pytest.TempPathFactory, tiny: tuple[str, ...]
-) -> Iterator[tuple[Path, Outcome]]:
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Outcome]]:
     """The folder of a whole tiny run and what the command said; to be read only."""
     folder = tmp_path_factory.mktemp("trained")
-    outcome = call(folder, *tiny)
+    outcome = call(folder, *TINY, *SHORT)
     yield folder / "outputs" / "robot" / "quickstart", outcome
 
 
