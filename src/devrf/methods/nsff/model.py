@@ -133,6 +133,11 @@ class NSFF(DynamicModel):
         """N₀."""
         return self.settings.warmup.steps(len(self.clock))
 
+    @property
+    def _endless(self) -> bool:
+        """Whether the last sample of a ray stands for all behind it."""
+        return not (self._cut_out and self.space.straight)
+
     def learn_from(self, views: Sequence[Views], terms: Collection[str]) -> None:
         """Look for priors; what is missing is said, and its terms are left out."""
         self._images = ImagePriors(views, self.space)
@@ -181,7 +186,7 @@ class NSFF(DynamicModel):
             fields.optical_depth(dynamic.raw, samples.length, noise),
             fields.optical_depth(static.raw, samples.length, noise),
         )
-        blend = fields.blended(*depths, static.blend, ray, len(rays))
+        blend = fields.blended(*depths, static.blend, ray, len(rays), endless=self._endless)
         moving, still = blend.dynamic[:, None], blend.static[:, None]
         seen = sum_by_ray(moving * dynamic.color + still * static.color, ray, len(rays))
         with torch.no_grad():
@@ -216,7 +221,7 @@ class NSFF(DynamicModel):
             )
         else:
             samples = evenly(rays, self.box, self.depth_limits, s.samples, jitter=jitter)
-        if not (self._cut_out and self.space.straight):
+        if self._endless:
             samples = samples.endless()
         return RaySamples(
             samples.ray,
