@@ -11,7 +11,7 @@ from __future__ import annotations
 import fnmatch
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
@@ -169,6 +169,10 @@ class DynamicModel(nn.Module, ABC):
             time: in [0, 1].
             half: let networks work in half precision where device and method can.
         """
+
+    def to_view(self, device: torch.device) -> Self:
+        """The model on ``device``, to be looked at; what only some times need may come later."""
+        return self.to(device)
 
     @property
     def device(self) -> torch.device:
