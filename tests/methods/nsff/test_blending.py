@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from devrf.methods.nsff.blending import blended, shared
+from devrf.methods.nsff.blending import blended, closed, shared
 from devrf.ops.compositing import composite, sum_by_ray
 
 RAY = torch.tensor([0, 0, 0, 1, 1])
@@ -48,6 +48,17 @@ def test_opacities_are_scaled_by_their_shares() -> None:
     assert blend.transmittance.item() == pytest.approx(7 / 8 * 5 / 8)
     # What is absorbed, 1 − 35/64, is divided as 1 to 3.
     assert blend.dynamic.item() == pytest.approx((1 - 35 / 64) / 4)
+
+
+def test_an_endless_last_sample_leaves_nothing_to_see() -> None:
+    """On ray 0 of three; ray 1 has no sample, ray 2 an opaque one of which a quarter is dynamic."""
+    ray, v = torch.tensor([0, 0, 2]), torch.tensor([0.5, 0.5, 0.25])
+    endless = torch.tensor([0.0, 1e10, 1e10])
+    blend = closed(blended(*shared(endless, endless, v), ray, 3), v, ray)
+    torch.testing.assert_close(blend.transmittance, torch.tensor([0.0, 1.0, 0.0]))
+    total = blend.dynamic + blend.static
+    torch.testing.assert_close(total, torch.tensor([0.0, 1.0, 1.0]))
+    torch.testing.assert_close(blend.dynamic[2], torch.tensor(0.25))
 
 
 def test_added_densities_divide_what_they_absorb() -> None:

@@ -113,6 +113,18 @@ def test_what_is_missing_is_said_once_and_counts_nothing(
     assert set(terms) == set(model.losses) - {"flow", "depth"}
 
 
+def test_flow_in_one_direction_counts_alone(
+    tiny: NSFFSettings, tiny_scene: Scene, caplog: pytest.LogCaptureFixture
+) -> None:
+    model = NSFF(tiny)
+    model.setup(tiny_scene)
+    with caplog.at_level(logging.INFO):
+        model.learn_from([tiny_scene.dynamic.train], model.losses)
+    assert [r.message.rpartition(": ")[2] for r in caplog.records] == [
+        "half of flow (no forward flow)"
+    ]
+
+
 def test_added_densities_have_no_terms_of_a_share(
     tiny: NSFFSettings, tiny_scene: Scene, caplog: pytest.LogCaptureFixture
 ) -> None:

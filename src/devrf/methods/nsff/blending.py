@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from devrf.ops.compositing import composite
+from devrf.ops.compositing import composite, sum_by_ray
 
 # No sample is more opaque than 1 − LEAST: its optical depth stays finite.
 LEAST = 1e-6
@@ -58,3 +58,24 @@ def blended(dynamic: Tensor, static: Tensor, ray: Tensor, rays: int) -> Blend:
     opacity, other = -torch.expm1(-dynamic), -torch.expm1(-static)
     moving = weight * opacity / (opacity + other).clamp(min=1e-10)
     return Blend(moving, weight - moving, transmittance)
+
+
+def closed(blend: Blend, share: Tensor, ray: Tensor) -> Blend:
+    """The blend of rays whose last sample stands for all behind it: nothing is left to see.
+
+    However dense both fields are there, (1 − α_d)(1 − α_s) = (1 − v) v is left of it.
+
+    Args:
+        blend: of S samples of R rays.
+        share: (S,) v.
+        ray: (S,) int64, ascending.
+    """
+    following = torch.cat([ray[1:], ray.new_full((1,), -1)])[: len(ray)]
+    last = (ray != following).to(share)
+    rest = last * blend.transmittance[ray]
+    ends = sum_by_ray(last, ray, len(blend.transmittance))
+    return Blend(
+        blend.dynamic + rest * share,
+        blend.static + rest * (1 - share),
+        blend.transmittance * (1 - ends),
+    )

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from devrf.methods.nerf.encoding import SinusoidalEncoding
 from devrf.methods.nerf.mlp import Trunk
-from devrf.methods.nsff.blending import Blend, blended, shared
+from devrf.methods.nsff.blending import Blend, blended, closed, shared
 from devrf.methods.nsff.settings import NSFFSettings
 from devrf.system.machine import multiplies_bfloat16
 
@@ -155,8 +155,20 @@ class TwoFields(nn.Module):
         """τ = σ δ (S,) with σ = scale · softplus(raw + noise); ``length`` in normalised units."""
         return nn.functional.softplus(raw + noise) * self._scale * length
 
-    def blended(self, dynamic: Tensor, static: Tensor, v: Tensor, ray: Tensor, rays: int) -> Blend:
-        """Weights of optical depths (S,) of both fields; v (S,) does not count where they add."""
-        if not self.additive:
-            dynamic, static = shared(dynamic, static, v)
-        return blended(dynamic, static, ray, rays)
+    def blended(
+        self, dynamic: Tensor, static: Tensor, v: Tensor, ray: Tensor, rays: int, *, endless: bool
+    ) -> Blend:
+        """Weights of optical depths (S,) of both fields.
+
+        Args:
+            dynamic: (S,) τ_d, front to back within each ray.
+            static: (S,) τ_s.
+            v: (S,) the share of the dynamic part; does not count where densities add.
+            ray: (S,) int64, ascending.
+            rays: R.
+            endless: whether the last sample of each ray stands for all behind it.
+        """
+        if self.additive:
+            return blended(dynamic, static, ray, rays)
+        blend = blended(*shared(dynamic, static, v), ray, rays)
+        return closed(blend, v, ray) if endless else blend

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -204,3 +204,21 @@ TERMS: Mapping[str, Callable[[LossInput], Tensor]] = {
 }
 # Terms of what there is not where densities add.
 OF_A_SHARE = ("dynamic", "disocclusion")
+
+
+def missing_terms(priors: ImagePriors, terms: Collection[str], *, additive: bool) -> dict[str, str]:
+    """Which of the ``terms`` have nothing to be computed from, and why.
+
+    Args:
+        priors: of the images that are learned from.
+        terms: names of what counts.
+        additive: whether densities add.
+    """
+    found = {}
+    if not any(priors.has_flow):
+        found["flow"] = "no optical flow"
+    if not priors.has_depth:
+        found["depth"] = "no depth"
+    if additive:
+        found |= dict.fromkeys(OF_A_SHARE, "no blend v")
+    return {name: why for name, why in found.items() if name in terms}

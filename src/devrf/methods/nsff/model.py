@@ -24,7 +24,7 @@ from devrf.methods.nerf.occupancy_frames import OccupancyFrames
 from devrf.methods.nerf.ray_samples import RaySamples
 from devrf.methods.nerf.ray_view import RayView
 from devrf.methods.nsff.fields import TwoFields
-from devrf.methods.nsff.losses import OF_A_SHARE, TERMS, LossInput
+from devrf.methods.nsff.losses import TERMS, LossInput, missing_terms
 from devrf.methods.nsff.placement import Placement
 from devrf.methods.nsff.priors import ImagePriors
 from devrf.methods.nsff.renders import BlendedOutput, Renders
@@ -133,19 +133,20 @@ class NSFF(DynamicModel):
         """N₀."""
         return self.settings.warmup.steps(len(self.clock))
 
+    @property
+    def _endless(self) -> bool:
+        """Whether the last sample of a ray stands for all behind it."""
+        return not (self._cut_out and self.space.straight)
+
     def learn_from(self, views: Sequence[Views], terms: Collection[str]) -> None:
         """Look for priors; what is missing is said, and its terms are left out."""
         self._images = ImagePriors(views, self.space)
-        flows, missing = self._images.has_flow, dict[str, str]()
-        if "flow" in terms and not any(flows):
-            missing["flow"] = "no optical flow"
-        elif "flow" in terms and not all(flows):
-            log.info("nsff: optical flow is known %s alone", "forward" if flows[0] else "backward")
-        if "depth" in terms and not self._images.has_depth:
-            missing["depth"] = "no depth" if self.space.straight else "no end to its space"
-        if self.settings.blend == "additive":
-            missing |= {name: "no blend v" for name in OF_A_SHARE if name in terms}
+        missing = missing_terms(self._images, terms, additive=self.fields.additive)
         self._absent = frozenset(missing)
+        if "flow" in terms and sum(self._images.has_flow) == 1:
+            missing["half of flow"] = (
+                f"no {'backward' if self._images.has_flow[0] else 'forward'} flow"
+            )
         if self.settings.hard_rays and self._images.moving is None:
             missing["hard_rays"] = "no motion masks"
         if missing:
@@ -185,7 +186,7 @@ class NSFF(DynamicModel):
             fields.optical_depth(dynamic.raw, samples.length, noise),
             fields.optical_depth(static.raw, samples.length, noise),
         )
-        blend = fields.blended(*depths, static.blend, ray, len(rays))
+        blend = fields.blended(*depths, static.blend, ray, len(rays), endless=self._endless)
         moving, still = blend.dynamic[:, None], blend.static[:, None]
         seen = sum_by_ray(moving * dynamic.color + still * static.color, ray, len(rays))
         with torch.no_grad():
@@ -220,7 +221,7 @@ class NSFF(DynamicModel):
             )
         else:
             samples = evenly(rays, self.box, self.depth_limits, s.samples, jitter=jitter)
-        if not (self._cut_out and self.space.straight):
+        if self._endless:
             samples = samples.endless()
         return RaySamples(
             samples.ray,

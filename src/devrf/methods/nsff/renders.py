@@ -205,7 +205,7 @@ class Renders:
             weight, end = composite(depth, ray, self.rays)
             return self._color(weight, found.color, ray, end), weight
         static, v = self.output.depths[1][kept], self.output.static.blend[kept]
-        blend = self.fields.blended(depth, static, v, ray, self.rays)
+        blend = self.fields.blended(depth, static, v, ray, self.rays, endless=False)
         color = self._color(blend.dynamic, found.color, ray, blend.transmittance)
         still = blend.static[:, None] * self.output.static.color[kept]
         return color + sum_by_ray(still, ray, self.rays), blend.dynamic
