@@ -83,6 +83,12 @@ def call(folder: Path, *arguments: str) -> Outcome:
 
 
 @pytest.fixture(scope="session")
+def tiny_data() -> tuple[str, ...]:
+    """Overrides that make the embedded scene tiny, whatever the method."""
+    return TINY
+
+
+@pytest.fixture(scope="session")
 def tiny() -> tuple[str, ...]:
     """Overrides that make the embedded scene and the schedules tiny."""
     return (*TINY, *SHORT)

@@ -65,6 +65,16 @@ def test_an_unknown_part_is_named_with_those_there_are() -> None:
     assert all(p.requires_grad for p in model.parameters())  # nothing half-done
 
 
+def test_a_protocol_that_a_method_does_not_learn_by_is_refused() -> None:
+    class Together(Toy):
+        protocols = ("joint", "dynamic")
+
+    Toy().check_protocol("mine")  # what names none learns by all
+    Together().check_protocol("dynamic")
+    with pytest.raises(DevrfError, match="toy does not learn by protocol=two_stage; give protocol"):
+        Together().check_protocol("two_stage")
+
+
 def test_it_is_built_from_its_config_and_takes_its_state() -> None:
     model = Toy(width=5)
     other = Toy.from_config(model.config())

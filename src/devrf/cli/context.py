@@ -97,7 +97,7 @@ class RunContext:
                 f"protocol: method={self.config.method} does not learn by "
                 f"protocol={self.protocol.name}; it has no stage {name!r}"
             )
-        build: Callable[..., ScheduledStage] = instantiate(
+        build: partial[ScheduledStage] = instantiate(
             self.config[key], _partial_=True, _convert_="all"
         )
         if key == name:
@@ -107,6 +107,7 @@ class RunContext:
                     f"freeze what they build on; expected true, not {self.protocol.freeze}"
                 )
             return build
+        build.keywords["model"].check_protocol(self.protocol.name)
         return partial(build, step=self.protocol[name], static_share=self.protocol.static_share)
 
     @cached_property

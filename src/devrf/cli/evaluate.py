@@ -9,7 +9,7 @@ from typing import Any
 
 from devrf.artifacts.contact_sheet import write_contact_sheet
 from devrf.artifacts.records import frame_rows, in_words, mean_scores, provenance, write_frames
-from devrf.checkpoints.checkpoint import CheckpointMetadata
+from devrf.checkpoints.checkpoint import CheckpointMetadata, TrainingFigures
 from devrf.checkpoints.checkpoint_file import digest_of
 from devrf.cli import job
 from devrf.cli.context import GIVEN_REST, OWN_REST, RunContext
@@ -25,12 +25,14 @@ log = logging.getLogger(__name__)
 
 # Figures of the training, from the checkpoint, that stand beside the scores.
 TRAINING = ("seconds", "iterations", "iterations_per_second", "peak_gpu_gb", "num_rollbacks")
+# How iterations were carried out: which kernels and graphs really ran.
+EXECUTION = ("kernels", "startup_seconds", "graph_captures", "short_lists", "peak_reserved_gb")
 
 
 def evaluate(run: RunContext) -> None:
     """Score what was learned on held-out views; write metrics and contact sheets."""
     loaded = run.load()
-    model, records = loaded.model.to(run.device), loaded.metadata.records
+    model, records = loaded.model.to_view(run.device), loaded.metadata.records
     suite = run.evaluation.suite(run.device)
     frames: dict[str, list[HeldOutView]] = {"static": _score(run, model, "static", suite)}
     last = loaded.metadata.stage
@@ -85,10 +87,10 @@ def _track(
         tracker.show_table("frames", frame_rows(frames))
 
 
-Records = Mapping[str, Mapping[str, float | None]]
+Records = Mapping[str, TrainingFigures]
 
 
-def _training(records: Records, stage: str) -> dict[str, float | None]:
+def _training(records: Records, stage: str) -> TrainingFigures:
     return {name: records.get(stage, {}).get(name) for name in TRAINING}
 
 
@@ -102,7 +104,9 @@ def _origin(run: RunContext, described: CheckpointMetadata) -> dict[str, Any]:
     for of_stage in (*described.earlier_configs.values(), described.training_config):
         settings |= of_stage
     frames = scene.clock.frames_of(scene.dynamic.train.times)
-    learned = {k: records.get(k, {}).get("wall_seconds") for k in stages_with_images(run)}
+    own = {name: records.get(name, {}) for name in stages_with_images(run)}
+    learned = {name: record.get("wall_seconds") for name, record in own.items()}
+    execution = {name: {key: record.get(key) for key in EXECUTION} for name, record in own.items()}
     return {
         "choices": job.choices(),
         "overrides": job.overrides(),
@@ -114,6 +118,7 @@ def _origin(run: RunContext, described: CheckpointMetadata) -> dict[str, Any]:
         "train_views": int(frames.bincount().max()) if scene.moves else None,
         "test_frames": len(scene.dynamic.test),
         "wall_seconds": {**learned, "evaluate": run.step_seconds},
+        "execution": execution,
     }
 
 

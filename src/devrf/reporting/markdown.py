@@ -18,8 +18,10 @@ MARKDOWN = Style(escaped, ("{}", "**{}**", "<ins>{}</ins>", "*{}*"), "*{}*")
 PLAIN = Style(str, ("{} ", "{}¹", "{}²", "{}³"))
 
 
-def markdown(table: Table, figures: Mapping[str, str]) -> str:
-    """The whole report, with links to ``figures``, by what they show."""
+def markdown(
+    table: Table, figures: Mapping[str, str], films: Mapping[str, str] | None = None
+) -> str:
+    """The whole report, with links to ``figures`` and ``films``, by what they show."""
     found = table.found
     failed = f", {len(found.failures)} failed" if len(found.failures) else ""
     count = len(found.runs)
@@ -42,6 +44,9 @@ def markdown(table: Table, figures: Mapping[str, str]) -> str:
     if figures:
         parts.append("## Plots")
         parts += [f"![{escaped(shows)}](<{link}>)" for shows, link in figures.items()]
+    if films:
+        parts.append("## Videos")
+        parts.append("\n".join(f"- [{escaped(show)}](<{link}>)" for show, link in films.items()))
     return "\n\n".join(filter(None, parts)) + "\n"
 
 

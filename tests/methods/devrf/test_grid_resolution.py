@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from devrf.errors import DevrfError
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
@@ -62,3 +63,5 @@ def test_planes_are_told_by_the_scene_where_none_are_given(forward_scene: Scene)
 def test_a_scene_seen_from_all_around_keeps_its_numbers(tiny_scene: Scene) -> None:
     schedule = CanonicalSchedule(voxels_per_pixel=0.5)
     assert fitted_to(tiny_scene, schedule, Architecture()) == (schedule, Architecture())
+    with pytest.raises(DevrfError, match=r"field\.planes=7: planes are of forward-facing scenes"):
+        fitted_to(tiny_scene, schedule, Architecture(planes=7))

@@ -17,7 +17,6 @@ from devrf.engine.graphs import Graphs
 from devrf.engine.parallel_batch import ParallelBatch
 from devrf.engine.phase import Phase
 from devrf.errors import DevrfError
-from devrf.geometry.ndc import NormalizedDevice
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.canonical_schedule import CanonicalPhase, CanonicalSchedule
@@ -132,7 +131,6 @@ class CanonicalStage(VoxelStage):
         super().setup(stage)
         if hasattr(self, "scene_model"):
             return
-        self._check_space()
         asked = self.schedule
         self.schedule, self.architecture = fitted_to(self.scene, asked, self.architecture)
         if self.schedule.side != asked.side:
@@ -159,15 +157,6 @@ class CanonicalStage(VoxelStage):
             learned = list(canonical.get_submodule(name).parameters())
             groups.append({"params": learned, "lr": rate, "base_lr": rate, "name": name})
         self._optimizer = GridAdam(groups)
-
-    def _check_space(self) -> None:
-        """Check that only a scene in NDC has planes."""
-        planes = self.architecture.planes
-        if planes is not None and not isinstance(self.scene.space, NormalizedDevice):
-            raise DevrfError(
-                f"field.planes={planes}: planes are of forward-facing scenes, and this scene is "
-                "not: give field=inward or field=small"
-            )
 
     def render_settings(self, phase: CanonicalPhase) -> RenderSettings:
         """How rays are sampled in a phase."""
@@ -301,6 +290,7 @@ class CanonicalStage(VoxelStage):
             return
         self.update_occupancy()
         self.scene_model.canonical.clear(~self.scene_model.occupancy.mask, alpha=1e-6)
+        super().on_train_end()
 
     def resize_to(self, state: dict[str, Tensor]) -> None:
         """Take a radiance field in place of the search's, if that is what was stored."""

@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from devrf.errors import DevrfError
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
@@ -26,11 +27,18 @@ def fitted_to(
     In NDC, where no number of planes is given it becomes the one that the static views resolve,
     and ``voxels_per_pixel`` becomes the ``side`` of a grid so fine (docs/method.md#forward-facing).
     In contracted space sides are longer (docs/method.md#scene-contraction).
+
+    Raises:
+        DevrfError: the architecture has planes, and the scene is not in NDC.
     """
-    space = scene.space
+    space, planes = scene.space, architecture.planes
     if not isinstance(space, NormalizedDevice):
+        if planes is not None:
+            raise DevrfError(
+                f"field.planes={planes}: planes are of forward-facing scenes, and this scene is "
+                "not: give field=inward or field=small"
+            )
         return schedule.in_space(space), architecture
-    planes = architecture.planes
     if planes is None:
         planes = resolved_planes(scene.static.train.cameras.positions, space)
         architecture = replace(architecture, planes=planes)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import torch
 
+from devrf.scenes.procedural.shape import Shape
 from devrf.scenes.scene import Scene
 from devrf.scenes.validation import MIN_SIDE, number, scene_error
 
@@ -67,6 +68,10 @@ class Recipe(ABC):
     @abstractmethod
     def render(self) -> Scene:
         """The scene, from checked numbers."""
+
+    @abstractmethod
+    def filmed(self) -> Shape:
+        """All that the cameras see, for exact answers at any point and time."""
 
     def _check(self) -> None:
         for key, (least, most) in _COUNTS.items():
