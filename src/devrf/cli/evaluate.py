@@ -4,11 +4,17 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from statistics import mean
 from typing import Any
 
 from devrf.artifacts.contact_sheet import write_contact_sheet
-from devrf.artifacts.records import frame_rows, in_words, mean_scores, provenance, write_frames
+from devrf.artifacts.records import (
+    dynamic_scores,
+    frame_rows,
+    in_words,
+    mean_scores,
+    provenance,
+    write_frames,
+)
 from devrf.checkpoints.checkpoint import CheckpointMetadata, TrainingFigures
 from devrf.checkpoints.checkpoint_file import digest_of
 from devrf.cli import job
@@ -23,6 +29,8 @@ from devrf.system.files import write_json
 
 log = logging.getLogger(__name__)
 
+# Held-out images of the dynamic capture at times that a training view has, and at others.
+OF_TIMES = ("training_times", "novel_times")
 # Figures of the training, from the checkpoint, that stand beside the scores.
 TRAINING = ("seconds", "iterations", "iterations_per_second", "peak_gpu_gb", "num_rollbacks")
 # How iterations were carried out: which kernels and graphs really ran.
@@ -41,15 +49,17 @@ def evaluate(run: RunContext) -> None:
     moved = model.moves and last != rest
     static = mean_scores(frames["static"])
     sections: dict[str, Any] = {"static": static}
+    size = {"checkpoint_mb": round(run.checkpoint(last).stat().st_size / 1e6, 3)}
     if rest is not None or not moved:
-        sections["static"] = sections[rest or last] = {**static, **_training(records, rest or last)}
+        stage = rest or last
+        own = {**static, **_training(records, stage), **({} if moved else size)}
+        sections["static"] = sections[stage] = own
     if moved:
         frames["dynamic"] = _score(run, model, "dynamic", suite)
         dynamic = sections["dynamic"] = {
-            **mean_scores(frames["dynamic"]),
-            "rest_pose_psnr": round(mean(v.rest_pose_psnr for v in frames["dynamic"]), 4),
+            **dynamic_scores(frames["dynamic"], run.scene.clock),
             **_training(records, last),
-            "checkpoint_mb": round(run.checkpoint(last).stat().st_size / 1e6, 3),
+            **size,
         }
         if rest is not None:
             sections[last] = dynamic
@@ -63,14 +73,31 @@ def evaluate(run: RunContext) -> None:
     if not run.scene.moves:
         head["at_rest"] = True
     write_json(run.folder / "metrics.json", {**head, **sections, "run": ran})
-    for name in frames:
-        log.info("%s: %s", name, in_words(sections[name]))
-    _track(run, sections, frames)
+    _tell(run, sections, frames)
+
+
+def _tell(
+    run: RunContext,
+    sections: Mapping[str, Mapping[str, Any]],
+    frames: Mapping[str, Sequence[HeldOutView]],
+) -> None:
+    """Log the scores and give them to the trackers, those of some times as further sections."""
+    plain = {
+        name: {key: value for key, value in one.items() if key not in OF_TIMES}
+        for name, one in sections.items()
+    }
+    dynamic = sections.get("dynamic", {})
+    of_times = {name: dynamic[name] for name in OF_TIMES if name in dynamic}
+    shown = {name: plain[name] for name in frames} | of_times
+    for name, values in shown.items():
+        log.info("%s: %s", name.replace("_", " "), in_words(values))
+    _track(run, plain | shown, shown, frames)
 
 
 def _track(
     run: RunContext,
     scores: Mapping[str, Mapping[str, float | None]],
+    shown: Mapping[str, Mapping[str, float | None]],
     frames: Mapping[str, Sequence[HeldOutView]],
 ) -> None:
     """Give the trackers scores and tables."""
@@ -83,7 +110,7 @@ def _track(
                 if value is not None
             }
         )
-        tracker.show_table("metrics", [{"section": name, **scores[name]} for name in frames])
+        tracker.show_table("metrics", [{"section": name, **own} for name, own in shown.items()])
         tracker.show_table("frames", frame_rows(frames))
 
 

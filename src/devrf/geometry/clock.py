@@ -65,6 +65,10 @@ class FrameClock:
             return Moment(frame, frame, 0.0)
         return Moment(frame, frame + 1, (time - before) / (self.times[frame + 1] - before))
 
+    def knows(self, time: float) -> bool:
+        """Whether ``time`` is that of a frame."""
+        return abs(self.times[self.at(time).before] - time) <= self.TOLERANCE
+
     def frames_of(self, times: Tensor) -> Tensor:
         """The nearest frame of each time: int64, the shape of ``times``."""
         clock = torch.tensor(self.times, dtype=torch.float64, device=times.device)

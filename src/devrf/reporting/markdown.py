@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 
-from devrf.reporting.table import COLUMNS, Block, Table
+from devrf.reporting.table import Block, Table
 from devrf.reporting.text import Style, caption, credit, printed, reasons
 
 
@@ -59,14 +59,15 @@ def plain(table: Table) -> str:
 
 def _block(table: Table, block: Block) -> str:
     frame = printed(table, [block], MARKDOWN).droplevel(0, axis=1)
-    left = len(frame.columns) - len(COLUMNS)
-    align = ["left"] * left + ["right"] * len(COLUMNS)
+    left = len(frame.columns) - len(table.columns)
+    align = ["left"] * left + ["right"] * len(table.columns)
     return str(frame.to_markdown(index=False, disable_numparse=True, colalign=align))
 
 
 def _plain_block(table: Table, block: Block) -> str:
     frame = printed(table, [block], PLAIN).droplevel(0, axis=1)
-    heads, cells = frame.iloc[:, : -len(COLUMNS)], frame.iloc[:, -len(COLUMNS) :]
+    count = len(table.columns)
+    heads, cells = frame.iloc[:, :-count], frame.iloc[:, -count:]
     heads = heads.apply(lambda column: column.str.ljust(column.str.len().max()))
     cells.index = heads.agg("  ".join, axis=1)
     cells.columns = [f"{heading} " for heading in cells.columns]

@@ -52,6 +52,8 @@ class CanonicalSchedule:
             voxels; afterwards those that a batch has touched.
         voxels_per_pixel: in forward-facing scenes, grid points for each pixel of a row or column;
             decides ``side``. None: ``side`` is as it says.
+        crop: in forward-facing scenes, whether the grid, each time it grows, gives up the depths
+            at which the static views see nothing (docs/method.md#crop).
     """
 
     search_iterations: int = 5000
@@ -65,6 +67,7 @@ class CanonicalSchedule:
     least_views: int = 3
     dense_tv_iterations: int = 0
     voxels_per_pixel: float | None = None
+    crop: bool = False
     phases: tuple[CanonicalPhase, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:

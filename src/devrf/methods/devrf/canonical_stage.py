@@ -20,6 +20,7 @@ from devrf.errors import DevrfError
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.canonical_schedule import CanonicalPhase, CanonicalSchedule
+from devrf.methods.devrf.depth_crop import crop_to_visible
 from devrf.methods.devrf.free_space import possible_matter, view_count_weight
 from devrf.methods.devrf.grid_resolution import fitted_to
 from devrf.methods.devrf.losses import (
@@ -174,8 +175,7 @@ class CanonicalStage(VoxelStage):
         if previous is not None and previous.kind != phase.kind:
             self._begin_fine(phase)
         elif previous is not None:
-            model.canonical.resize(phase.voxels)
-            self.update_occupancy()
+            self._grow(phase)
         self.pool = canonical_pool(views, model, everywhere=phase.kind == "search")
         if not len(self.pool):
             raise DevrfError(
@@ -183,6 +183,20 @@ class CanonicalStage(VoxelStage):
                 "data.box and data.near, or lower schedule.rates.density"
             )
         self.setup_optimizer()
+
+    def _grow(self, phase: CanonicalPhase) -> None:
+        """Crop the field, if asked to, and give it the resolution of ``phase``."""
+        field = self.scene_model.canonical
+        if self.schedule.crop:
+            assert self.pool is not None
+            views = self.trainer.datamodule.training_views(  # type: ignore[attr-defined]
+                self.capture, self.device
+            )
+            crop_to_visible(self.scene_model, self.scene, views, self.pool)
+        # Cropping leaves a share of the voxels that the field was built for.
+        kept = field.base_voxels / round(self.schedule.side**3)
+        field.resize(round(phase.voxels * kept))
+        self.update_occupancy()
 
     def _begin_fine(self, phase: CanonicalPhase) -> None:
         """Keep what the search found as the occupancy, and start the radiance field."""

@@ -14,8 +14,8 @@ from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.scenes.scene import Scene
 
 # Between two planes a point moves by so many pixels from one outermost static view to the other:
-# less, and the views tell no two planes apart.
-PIXELS_PER_PLANE = 2.0
+# less, and the views hardly tell two planes apart, while fog before the scene takes long to clear.
+PIXELS_PER_PLANE = 4.0
 FEWEST, MOST = 32, 256
 
 

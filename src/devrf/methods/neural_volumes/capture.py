@@ -45,7 +45,7 @@ def encoder_images(scene: Scene, settings: NeuralVolumesSettings) -> Tensor:
     if len(cameras) < wanted:
         raise DevrfError(
             f"{KEY}.encoder_views: expected {wanted} fixed training cameras with an image of every "
-            f"frame, and {scene.name} has {len(cameras)}; give at most so many, or more cameras"
+            f"frame, and {scene.name} has {len(cameras)}; set it no higher, or give more cameras"
         )
     last = max(wanted - 1, 1)
     chosen = [cameras[k * (len(cameras) - 1) // last] for k in range(wanted)]

@@ -56,7 +56,10 @@ class ProceduralScene(Recipe):
         if inside:
             room = self.filmed()
             film = Filming(room, REACH, self.supersample, self.light, STEPS, opaque=True)
-        static, dynamic = film.at_rest(learned, tested), film.moving(watching, unseen, self.frames)
+        static, dynamic = (
+            film.at_rest(learned, tested),
+            film.moving(watching, unseen, self.frames, self.unseen_frames),
+        )
         if inside:
             everyone = [static.train, static.test, dynamic.train, dynamic.test]
             space, bounds = inward_space("auto", static.train, dynamic.train, everyone)

@@ -58,7 +58,7 @@ class ProceduralForwardScene(Recipe):
         learned, tested = static[order % HOLDOUT != 0], static[order % HOLDOUT == 0]
         watching, unseen = dynamic_rig(self.train_views, **size)
         at_rest = film.at_rest(learned, tested)
-        moving = film.moving(watching, unseen, self.frames)
+        moving = film.moving(watching, unseen, self.frames, self.unseen_frames)
         space = reference_space(static, NEAR)
         source = "all that the cameras see (procedural scene)"
         bounds = forward_bounds([at_rest.train, moving.train], space, source)
