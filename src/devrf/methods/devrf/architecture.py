@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from devrf.geometry.box import Box
+from devrf.geometry.space import Space
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.color_decoder import ColorDecoder, SigmoidColor
 
@@ -19,6 +20,7 @@ class Architecture:
         frequencies: octaves of the viewing direction that the decoder sees; 0 for the
             direction alone.
         alpha_init: opacity of a voxel of the radiance field before anything is learned.
+        contracted_alpha_init: the same in contracted space (docs/method.md#scene-contraction).
         search_alpha_init: the same in the coarse geometry search.
         planes: planes of an NDC grid, one behind another; None: in NDC as many as the scene's
             views tell apart (:mod:`devrf.methods.devrf.grid_resolution`), elsewhere cubic voxels.
@@ -30,9 +32,14 @@ class Architecture:
     width: int = 128
     frequencies: int = 4
     alpha_init: float = 1e-2
+    contracted_alpha_init: float = 2e-2
     search_alpha_init: float = 1e-6
     planes: int | None = None
     aspect: float = 1.0
+
+    def in_space(self, space: Space) -> Architecture:
+        """The sizes that hold in ``space``: contracted space has its own ``alpha_init``."""
+        return self if space.straight else replace(self, alpha_init=self.contracted_alpha_init)
 
     def search_field(self, box: Box, voxels: int) -> CanonicalField:
         """The field of the coarse geometry search: colours straight from three channels."""

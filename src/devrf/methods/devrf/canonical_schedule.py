@@ -52,6 +52,9 @@ class CanonicalSchedule:
             voxels; afterwards those that a batch has touched.
         voxels_per_pixel: in forward-facing scenes, grid points for each pixel of a row or column;
             decides ``side``. None: ``side`` is as it says.
+        directions_from: so many iterations from the search's end colours do not depend on the
+            viewing direction. None: 0; in contracted space half of ``iterations``
+            (docs/method.md#scene-contraction).
     """
 
     search_iterations: int = 5000
@@ -65,6 +68,7 @@ class CanonicalSchedule:
     least_views: int = 3
     dense_tv_iterations: int = 0
     voxels_per_pixel: float | None = None
+    directions_from: int | None = None
     phases: tuple[CanonicalPhase, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -80,6 +84,11 @@ class CanonicalSchedule:
             raise DevrfError(
                 "schedule.canonical.voxels_per_pixel: expected above 0, at most 4, or null, not "
                 f"{self.voxels_per_pixel}"
+            )
+        if self.directions_from is not None and self.directions_from < 0:
+            raise DevrfError(
+                "schedule.canonical.directions_from: expected 0 or more, or null, not "
+                f"{self.directions_from}"
             )
         if self.side**3 < 8 * 2 ** len(self.doublings):
             raise DevrfError(
@@ -113,17 +122,24 @@ class CanonicalSchedule:
         """Whether the total variation of ``iteration`` reaches untouched voxels too."""
         return 0 <= iteration - self.search_iterations < self.dense_tv_iterations
 
-    def in_space(self, space: Space) -> CanonicalSchedule:
-        """The same schedule with sides longer by the space's factor.
+    def learns_directions(self, iteration: int) -> bool:
+        """Whether ``iteration`` teaches the network what viewing directions change."""
+        return iteration - self.search_iterations >= (self.directions_from or 0)
 
-        So voxels have the size that they would have over the inner box alone
-        (docs/method.md#scene-contraction).
+    def in_space(self, space: Space) -> CanonicalSchedule:
+        """The same schedule with sides longer by the space's factor, and ``directions_from`` set.
+
+        See docs/method.md#scene-contraction.
         """
-        factor = space.side_factor
-        if factor == 1:
+        if space.straight:
             return self
-        search = round(self.search_side * factor)
-        return replace(self, side=self.side * factor, search_side=search)
+        start, factor = self.directions_from, space.side_factor
+        return replace(
+            self,
+            side=self.side * factor,
+            search_side=round(self.search_side * factor),
+            directions_from=self.iterations // 2 if start is None else start,
+        )
 
     def learning_rate_factor(self, iteration: int) -> float:
         """0.1^(n / decay_iterations), n from the start of the search or of the radiance field."""
