@@ -16,8 +16,8 @@ from devrf.scenes.validation import scene_error
 
 SpaceChoice = Literal["auto", "world", "contracted"]
 
-# Thickness of the shell in half edges of the inner box, as in the paper of contraction. In a thinner
-# one walls are a voxel or two deep, and are learned as fog before them (measured).
+# Thickness of the shell in half edges of the inner box, as in the paper of contraction. In a
+# thinner one walls are a voxel or two deep, and are learned as fog before them (measured).
 SHELL = 1.0
 # Nothing is nearer to a camera than this share of its distance to what it looks at. With less, fog
 # before each lens explains its picture and spoils those of others (measured).
