@@ -138,11 +138,24 @@ def test_contracted_space_learns_directions_in_the_second_half_unless_told_other
     assert replace(schedule, directions_from=0).in_space(SPACE).directions_from == 0
 
 
-def test_the_field_starts_denser_in_contracted_space() -> None:
-    sizes = Architecture(alpha_init=0.01, contracted_alpha_init=0.25)
-    assert sizes.in_space(WORLD) is sizes
-    field = sizes.in_space(SPACE).radiance_field(SPACE.box, 27, 27)
-    torch.testing.assert_close(field.voxel_alpha(1.0), torch.full((3, 3, 3), 0.25))
+def test_grids_start_coarse_and_double_evenly_in_contracted_space() -> None:
+    # 50 · 1.2 = 60 voxels a side from 15: six doublings, over 600 of 800 iterations.
+    schedule = CanonicalSchedule(side=50, iterations=800, doublings=(10,), contracted_start=15)
+    grown = schedule.in_space(SPACE)
+    assert grown.doublings == (100, 200, 300, 400, 500, 600)
+    first = next(phase for phase in grown.phases if phase.kind == "fine")
+    assert first.voxels == pytest.approx(15**3, rel=1e-3)
+    assert replace(schedule, contracted_start=None).in_space(SPACE).doublings == (10,)
+    assert replace(schedule, contracted_start=200).in_space(SPACE).doublings == ()
+
+
+def test_the_fields_opacity_does_not_depend_on_its_resolution() -> None:
+    sizes = Architecture(alpha_init=0.01, contracted_opacity=0.75)
+    assert sizes.in_space(WORLD, 2.0) is sizes
+    # A line through two voxels, of opacity a half each: 1 − ¼.
+    field = sizes.in_space(SPACE, 2.0).radiance_field(SPACE.box, 27, 27)
+    torch.testing.assert_close(field.voxel_alpha(1.0), torch.full((3, 3, 3), 0.5))
+    assert sizes.in_space(SPACE, 4.0).alpha_init == pytest.approx(1 - 0.25**0.25)
 
 
 def test_a_room_is_learned_and_moves_inside_the_inner_box(

@@ -260,6 +260,7 @@ def test_deformation_phases_tile_every_schedule(
         {"decay_iterations": 0},
         {"rays": 0},
         {"directions_from": -1},
+        {"contracted_start": 1},
     ],
     ids=str,
 )

@@ -25,12 +25,13 @@ def fitted_to(
 
     In NDC, where no number of planes is given it becomes the one that the static views resolve,
     and ``voxels_per_pixel`` becomes the ``side`` of a grid so fine (docs/method.md#forward-facing).
-    In contracted space sides are longer, the field starts denser, and directions are learned later
+    In contracted space sides are longer, grids start coarser, and directions are learned later
     (docs/method.md#scene-contraction).
     """
     space = scene.space
     if not isinstance(space, NormalizedDevice):
-        return schedule.in_space(space), architecture.in_space(space)
+        schedule = schedule.in_space(space)
+        return schedule, architecture.in_space(space, schedule.side)
     planes = architecture.planes
     if planes is None:
         planes = resolved_planes(scene.static.train.cameras.positions, space)
