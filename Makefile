@@ -14,7 +14,8 @@ CONSTRAINTS ?= constraints.txt
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --disable-pip-version-check \
 	$(if $(CONSTRAINTS),--constraint $(CONSTRAINTS)) --editable
-PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --durations 15
+PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist worksteal \
+	--durations 15
 
 .PHONY: quickstart test docs fuzz format shell clean
 

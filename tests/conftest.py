@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import logging
 import os
+import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator
@@ -52,6 +53,32 @@ def single_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def quick_interpreter() -> Iterator[None]:
+    """Triton's interpreter, in a third of its time.
+
+    It prepares its language anew for each call of a function within a kernel, though the kernel
+    has; and it looks for overflow wherever numbers are added, which places in small grids cannot
+    come to.
+    """
+    interpreter = sys.modules.get("triton.runtime.interpreter")
+    if interpreter is None:
+        yield
+        return
+    function, builder = interpreter.InterpretedFunction, interpreter.interpreter_builder
+    usual = function.__call__
+
+    def call(self: Any, *args: Any, **constants: Any) -> Any:
+        if self.fn.__module__.startswith("triton."):
+            return usual(self, *args, **constants)
+        return self.rewrite()(*args, **constants)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(function, "__call__", call)
+        patch.setattr(builder, "options", replace(builder.options, sanitize_overflow=False))
+        yield
 
 
 @pytest.fixture(autouse=True)

@@ -12,8 +12,16 @@ import pytest
 import torch
 
 import devrf
-from devrf.artifacts.records import git_revision, in_words, mean_scores, provenance, write_frames
+from devrf.artifacts.records import (
+    dynamic_scores,
+    git_revision,
+    in_words,
+    mean_scores,
+    provenance,
+    write_frames,
+)
 from devrf.evaluation.held_out import HeldOutView
+from devrf.geometry.clock import FrameClock
 
 METRICS = ["psnr", "ssim", "rest_pose_psnr", "depth_error", "flow_error"]
 
@@ -36,6 +44,27 @@ def test_means_are_over_what_is_known() -> None:
         "flow_error": 3.0,
         "lpips": None,
     }
+
+
+def test_times_that_no_training_view_has_are_scored_apart() -> None:
+    views = [
+        view("a", 0.0, 20.0),
+        view("b", 0.25, 30.0),
+        view("c", 0.5, 22.0),
+        view("d", 1.0, 40.0),
+    ]
+    found = dynamic_scores(views, FrameClock((0.0, 0.5)))
+    assert (found["psnr"], found["rest_pose_psnr"]) == (28.0, 9.0)
+    assert (found["training_times"]["psnr"], found["training_times"]["images"]) == (21.0, 2)
+    # Between two frames, and beyond the last.
+    expected = {"psnr": 35.0, "ssim": 0.5, "rest_pose_psnr": 9.0, "images": 2}
+    assert found["novel_times"] == expected
+    usual = dynamic_scores(views, FrameClock((0.0, 0.25, 0.5, 1.0)))
+    assert not {"novel_times", "training_times"} & usual.keys()
+    # Where all times are novel that section is of all images.
+    alone = dynamic_scores(views[1:2], FrameClock((0.0, 0.5)))
+    assert alone["psnr"] == alone["novel_times"]["psnr"] == 30.0
+    assert "training_times" not in alone
 
 
 def test_numbers_are_rounded_for_people() -> None:

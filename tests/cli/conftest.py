@@ -9,6 +9,7 @@ import logging
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,6 +45,8 @@ SHORT = (
     "video.height=40",
     "trainer=cpu",
 )
+# The plots of training take a tenth of the time of such a run.
+PLAIN = "~callbacks.curve"
 
 
 @dataclass(frozen=True)
@@ -83,15 +86,21 @@ def call(folder: Path, *arguments: str) -> Outcome:
 
 
 @pytest.fixture(scope="session")
+def tiny_data() -> tuple[str, ...]:
+    """Overrides that make the embedded scene tiny, whatever the method."""
+    return TINY
+
+
+@pytest.fixture(scope="session")
 def tiny() -> tuple[str, ...]:
-    """Overrides that make the embedded scene and the schedules tiny."""
-    return (*TINY, *SHORT)
+    """Overrides that make the embedded scene and the schedules tiny, and draw no plot."""
+    return (*TINY, *SHORT, PLAIN)
 
 
 @pytest.fixture(scope="session")
 def short() -> tuple[str, ...]:
-    """Overrides that make the schedules tiny, for a scene of any kind."""
-    return SHORT
+    """Overrides that make the schedules tiny, for a scene of any kind, and draw no plot."""
+    return (*SHORT, PLAIN)
 
 
 @pytest.fixture(scope="session")
@@ -115,12 +124,10 @@ def devrf(tmp_path: Path) -> Devrf:
 
 
 @pytest.fixture(scope="session")
-def trained(
-    tmp_path_factory: pytest.TempPathFactory, tiny: tuple[str, ...]
-) -> Iterator[tuple[Path, Outcome]]:
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Outcome]]:
     """The folder of a whole tiny run and what the command said; to be read only."""
     folder = tmp_path_factory.mktemp("trained")
-    outcome = call(folder, *tiny)
+    outcome = call(folder, *TINY, *SHORT)
     yield folder / "outputs" / "robot" / "quickstart", outcome
 
 
@@ -160,17 +167,41 @@ class Warm:
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self._process = process
+        self._hanging: list[int] = []
 
     def __call__(self, folder: Path, *arguments: str, **how: Any) -> Outcome:
         """``devrf ARGUMENTS`` in ``folder``; ``warm_process.py`` describes ``how``."""
-        assert self._process.stdin is not None and self._process.stdout is not None
         said = folder / "said.txt"
         before = said.stat().st_size if said.exists() else 0
-        asked = {"folder": str(folder), "arguments": arguments, **how}
+        status = self._answer(folder=str(folder), arguments=arguments, **how)
+        return Outcome(status, said.read_text()[before:], "")
+
+    def hanging(self, folder: Path, *arguments: str) -> int:
+        """``devrf ARGUMENTS stage=prepare``, begun in a process that works on; its number."""
+        arguments = (*arguments, "stage=prepare")
+        child = self._answer(folder=str(folder), arguments=arguments, hangs=True)
+        self._hanging.append(child)
+        for _ in range(6000):
+            if list(folder.rglob("begun")):
+                return child
+            time.sleep(0.01)
+        raise AssertionError((folder / "said.txt").read_text())
+
+    def end(self, child: int) -> None:
+        """Kill a process that hangs."""
+        self._hanging.remove(child)
+        self._answer(end=child)
+
+    def end_all(self) -> None:
+        """Kill the processes that still hang."""
+        for child in list(self._hanging):
+            self.end(child)
+
+    def _answer(self, **asked: Any) -> int:
+        assert self._process.stdin is not None and self._process.stdout is not None
         self._process.stdin.write(json.dumps(asked) + "\n")
         self._process.stdin.flush()
-        status = int(json.loads(self._process.stdout.readline()))
-        return Outcome(status, said.read_text()[before:], "")
+        return int(json.loads(self._process.stdout.readline()))
 
 
 @pytest.fixture(scope="session")

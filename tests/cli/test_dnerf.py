@@ -19,15 +19,6 @@ SMALL = (
     "video.height=40",
     "trainer=cpu",
 )
-ROBOT = (
-    "data.width=24",
-    "data.height=20",
-    "data.static_views=6",
-    "data.static_test_views=2",
-    "data.train_views=2",
-    "data.frames=3",
-    "data.supersample=1",
-)
 TOY = (
     "data=procedural_forward",
     "data.width=24",
@@ -40,8 +31,8 @@ TOY = (
 
 
 @pytest.mark.parametrize("protocol", ["joint", "two_stage", "dynamic"])
-def test_a_protocol_trains_scores_and_films(devrf, tmp_path, protocol):
-    done = devrf(*SMALL, *ROBOT, f"protocol={protocol}", "hydra.run.dir=run")
+def test_a_protocol_trains_scores_and_films(devrf, tmp_path, tiny_data, protocol):
+    done = devrf(*SMALL, *tiny_data, f"protocol={protocol}", "hydra.run.dir=run")
     assert done.status == 0, done.err
     found = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert (found["method"], found["protocol"]) == ("dnerf", protocol)
@@ -51,7 +42,7 @@ def test_a_protocol_trains_scores_and_films(devrf, tmp_path, protocol):
     names = {path.stem for path in (tmp_path / "run" / "checkpoints").glob("*.ckpt")}
     assert names == {"two_stage": {"canonical", "deformation"}}.get(protocol, {protocol})
     # Whatever was learned is not learned again.
-    again = devrf(*SMALL, *ROBOT, f"protocol={protocol}", "hydra.run.dir=run")
+    again = devrf(*SMALL, *tiny_data, f"protocol={protocol}", "hydra.run.dir=run")
     assert again.status == 0 and "learned already" in again.out
 
 
@@ -61,8 +52,8 @@ def test_a_forward_facing_scene(devrf, tmp_path):
     assert (tmp_path / "run" / "videos" / "spiral.mp4").is_file()
 
 
-def test_it_has_a_folder_of_its_own(devrf, tmp_path):
-    done = devrf(*SMALL, *ROBOT, "protocol=joint", "stage=joint")
+def test_it_has_a_folder_of_its_own(devrf, tmp_path, tiny_data):
+    done = devrf(*SMALL, *tiny_data, "protocol=joint", "stage=joint")
     assert done.status == 0, done.err
     assert (tmp_path / "outputs/robot/peer_small-dnerf-joint/checkpoints/joint.ckpt").is_file()
 
@@ -75,6 +66,6 @@ def test_it_has_a_folder_of_its_own(devrf, tmp_path):
         (["ray_stage.model.settings.sampling=random"], "expected one of hierarchical, occupancy"),
     ],
 )
-def test_what_cannot_be_is_said_in_one_line(devrf, asked, said):
-    done = devrf(*SMALL, *ROBOT, *asked)
+def test_what_cannot_be_is_said_in_one_line(devrf, tiny_data, asked, said):
+    done = devrf(*SMALL, *tiny_data, *asked)
     assert done.status == 2 and said in done.err and done.err.count("\n") == 1

@@ -146,6 +146,8 @@ def test_results_of_an_earlier_run_survive_a_mistake(devrf, tmp_path, tiny):
     assert devrf(*tiny, "stage=canonical", "hydra.run.dir=run").status == 0
     before = (tmp_path / "run" / "checkpoints" / "canonical.ckpt").read_bytes()
     assert devrf(*tiny, "stage=deformation", "hydra.run.dir=run", "data.frames=1").status == 2
+    anew = ("stage=canonical", "resume=false", "field=forward_small")
+    assert devrf(*tiny, "hydra.run.dir=run", *anew).status == 2
     assert (tmp_path / "run" / "checkpoints" / "canonical.ckpt").read_bytes() == before
 
 

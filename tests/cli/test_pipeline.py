@@ -52,6 +52,9 @@ def test_what_is_known_of_an_embedded_scene_is_measured(trained):
 
 def test_a_run_says_how_it_came_about(trained):
     ran = metrics(trained[0])["run"]
+    assert set(ran["execution"]) == {"canonical", "deformation"}
+    for how in ran["execution"].values():
+        assert (how["kernels"], how["graph_captures"], how["short_lists"]) == ("torch", 0, 0)
     assert ran["parameters"] > 1000 and ran["device"] and ran["torch"]
     assert ran["choices"]["data"] == "procedural" and ran["choices"]["ablation"] == "full"
     assert ran["choices"]["experiment"] is None and "hydra/launcher" not in ran["choices"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import os
 import re
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -16,34 +15,12 @@ from devrf.cli import run_lock
 from devrf.cli.run_lock import exclusive
 from devrf.errors import DevrfError
 
-# A run that says that it has begun, and goes on for longer than any test.
-HANGING = """
-import sys, time
-import devrf.cli.steps, devrf.__main__
-def hang(run):
-    (run.folder / "begun").touch()
-    print("begun", flush=True)
-    time.sleep(600)
-devrf.cli.steps.STEPS["prepare"] = hang
-devrf.__main__.entry()
-"""
-
 
 @pytest.fixture
-def hanging(start, tmp_path):
+def hanging(warm, tmp_path):
     """``hanging(*arguments)``: a process that works in a folder below the test's, and hangs."""
-    started = []
-
-    def hang(*arguments: str) -> subprocess.Popen[str]:
-        process = start(tmp_path, "-c", HANGING, *arguments, "stage=prepare")
-        started.append(process)
-        assert any(line == "begun\n" for line in process.stdout)
-        return process
-
-    yield hang
-    for process in started:
-        process.kill()
-        process.communicate()
+    yield lambda *arguments: warm.hanging(tmp_path, *arguments)
+    warm.end_all()
 
 
 def seen(folder: Path) -> dict[str, tuple[int, int]]:
@@ -53,7 +30,9 @@ def seen(folder: Path) -> dict[str, tuple[int, int]]:
     return {name: (stat.st_mtime_ns, stat.st_size) for name, stat in found.items()}
 
 
-def test_the_second_process_is_refused_until_the_first_is_killed(devrf, hanging, tiny, tmp_path):
+def test_the_second_process_is_refused_until_the_first_is_killed(
+    devrf, hanging, warm, tiny, tmp_path
+):
     command = (*tiny, "stage=canonical", "hydra.run.dir=run")
     first = hanging("hydra.run.dir=run")
     before = seen(tmp_path)
@@ -61,7 +40,7 @@ def test_the_second_process_is_refused_until_the_first_is_killed(devrf, hanging,
         outcome = devrf(*command, stage)
         assert outcome.status == 2
         assert re.fullmatch(
-            rf"devrf: run: another devrf process \(pid {first.pid} on \S+, since \S+ \S+\) works "
+            rf"devrf: run: another devrf process \(pid {first} on \S+, since \S+ \S+\) works "
             r"in this folder; wait for it, or use hydra.run.dir=FOLDER\n",
             outcome.err,
         )
@@ -69,8 +48,7 @@ def test_the_second_process_is_refused_until_the_first_is_killed(devrf, hanging,
     assert devrf(*command, "hydra.run.dir=other").status == 0
     # A report of other runs may be written meanwhile.
     assert "no finished run below run" in devrf("stage=report", "report.runs=run").err
-    first.kill()
-    first.wait()
+    warm.end(first)
     assert devrf(*command).status == 0
     assert (tmp_path / "run" / "checkpoints" / "canonical.ckpt").is_file()
     assert os.listdir(tmp_path / "run" / ".devrf") == ["lock"]
@@ -84,19 +62,20 @@ def test_a_mistake_beside_a_run_that_has_just_begun_leaves_its_folder(devrf, han
     assert seen(tmp_path) == before
 
 
-def test_a_sweep_and_its_jobs_have_their_folders_to_themselves(devrf, hanging, tiny, tmp_path):
+def test_a_sweep_and_its_jobs_have_their_folders_to_themselves(
+    devrf, hanging, warm, tiny, tmp_path
+):
     sweep = ("stage=canonical", "hydra.sweep.dir=sweep", "seed=0,1")
     first = hanging("-m", "hydra.sweep.dir=sweep", "seed=0,1")
     before = seen(tmp_path)
     outcome = devrf("-m", *tiny, *sweep)
     assert outcome.status == 2 and outcome.err.count("\n") == 1
-    assert outcome.err.startswith(f"devrf: sweep: another devrf process (pid {first.pid} on ")
+    assert outcome.err.startswith(f"devrf: sweep: another devrf process (pid {first} on ")
     assert outcome.err.endswith("wait for it, or use hydra.sweep.dir=FOLDER\n")
     single = devrf(*tiny, "stage=canonical", "hydra.run.dir=sweep/0_robot")
-    assert single.status == 2 and f"(pid {first.pid} on" in single.err
+    assert single.status == 2 and f"(pid {first} on" in single.err
     assert seen(tmp_path) == before
-    first.kill()
-    first.wait()
+    warm.end(first)
     assert devrf("-m", *tiny, *sweep).status == 0
 
 

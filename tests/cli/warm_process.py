@@ -12,6 +12,8 @@ the signal that ended it. The keys, all but the first two optional:
 * ``signals``: the numbers of the signals to send.
 * ``most_bytes``: how large a file may become, as on a disk that is full.
 * ``most_memory``: bytes that the process may take beside what it has already.
+* ``hangs``: the stage ``prepare`` makes a file ``begun`` in the run's folder and goes on for longer
+  than any test. The answer is the number of the process, which ``{"end": NUMBER}`` kills.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ import gc
 import json
 import os
 import resource
+import signal
 import sys
 import threading
 import time
@@ -32,7 +35,7 @@ from hydra.core.plugins import Plugins
 
 import devrf.artifacts.film
 import devrf.callbacks
-import devrf.cli.steps  # noqa: F401
+import devrf.cli.steps
 from devrf.__main__ import entry
 from devrf.checkpoints import checkpoint_file
 from devrf.ops.adam import GridAdam
@@ -98,6 +101,8 @@ def run(asked: dict[str, Any]) -> int:
     if "most_memory" in asked:
         taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (taken + asked["most_memory"],) * 2)
+    if asked.get("hangs"):
+        devrf.cli.steps.STEPS["prepare"] = hang
     fuse = Fuse(asked)
     fuse.install()
     sys.argv = ["devrf", *asked["arguments"]]
@@ -112,6 +117,12 @@ def run(asked: dict[str, Any]) -> int:
     return status
 
 
+def hang(context: Any) -> None:
+    """Say that the run has begun, and go on."""
+    (context.folder / "begun").touch()
+    time.sleep(600)
+
+
 def main() -> None:
     """Fork for each command that is asked for."""
     torch.set_num_threads(1)
@@ -119,13 +130,21 @@ def main() -> None:
     gc.freeze()  # what is there stays shared with the children
     print("ready", flush=True)
     for line in sys.stdin:
-        child = os.fork()
+        asked = json.loads(line)
+        if "end" in asked:
+            child = asked["end"]
+            os.kill(child, signal.SIGKILL)
+        else:
+            child = os.fork()
         if child == 0:
             status = 99
             try:
-                status = run(json.loads(line))
+                status = run(asked)
             finally:
                 os._exit(status)
+        if asked.get("hangs"):
+            print(child, flush=True)
+            continue
         _, how = os.waitpid(child, 0)
         print(json.dumps(os.waitstatus_to_exitcode(how)), flush=True)
 

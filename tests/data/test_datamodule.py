@@ -16,7 +16,9 @@ from devrf.data.inward import InwardFacingDataModule
 from devrf.data.nerfies import NerfiesDataModule
 from devrf.data.nerfstudio import NerfstudioDataModule
 from devrf.data.procedural import ProceduralDataModule
+from devrf.data.rendered import RenderedDataModule
 from devrf.errors import DevrfError
+from devrf.scenes.export_blender import export_blender
 from devrf.scenes.scene import Scene
 
 
@@ -116,3 +118,47 @@ def test_a_datamodule_has_the_options_of_its_reader_with_their_types():
     hints = get_type_hints(NerfiesDataModule.__init__)
     assert hints["downscale"] == int | str and hints["frames"] == int | None
     assert inspect.signature(ProceduralDataModule).parameters["export"].default is None
+
+
+def test_exact_forward_flow_undoes_backward_flow_once_it_is_asked_for(tiny_recipe):
+    module = RenderedDataModule(tiny_recipe, None)
+    before = module.training_views("dynamic", torch.device("cpu"))
+    assert before.forward_flow is None
+    module.provide(("forward_flow",))
+    views = module.training_views("dynamic", torch.device("cpu"))
+    forward, backward, depth = views.forward_flow, views.flow, views.depth
+    assert forward is not None and backward is not None and depth is not None
+    # The last frame has none; what is seen in others has.
+    assert not forward.valid[views.times == 1].any()
+    assert torch.equal(forward.valid[:2], depth[:2].isfinite())
+    # Two views of three frames: from image 0 to image 2 and back.
+    place = forward.valid[0].nonzero()
+    ends = place + forward.vectors[0][forward.valid[0]].flip(-1)
+    column, row = ends[:, 1].round().long(), ends[:, 0].round().long()
+    inside = (row >= 0) & (row < views.height) & (column >= 0) & (column < views.width)
+    met = inside.nonzero()[:, 0][backward.valid[2][row[inside], column[inside]]]
+    back = ends[met] + backward.vectors[2][row[met], column[met]].flip(-1)
+    away = (back - place[met]).norm(dim=-1)
+    assert len(met) > 20 and float(away.median()) < 1.0
+
+
+@pytest.mark.parametrize("written", [True, False])
+def test_forward_flow_is_read_from_files_else_estimated_beside_the_backward_one(
+    tiny_scene, tmp_path, written
+):
+    folder = tmp_path / "scene"
+    export_blender(tiny_scene, folder)
+    flows = next(folder.glob("dynamic_*views")) / "train_flow"
+    if written:
+        for path in flows.glob("*_bwd.npz"):
+            number = int(path.name[:3]) - 2  # two views
+            path.with_name(f"{number:03d}_fwd.npz").write_bytes(path.read_bytes())
+    module = InwardFacingDataModule(folder, flow_cache=tmp_path / "flow.npz")
+    assert module.scene.dynamic.train.forward_flow is None
+    module.provide(("forward_flow",))
+    views = module.scene.dynamic.train
+    assert views.forward_flow is not None and views.flow is not None
+    assert views.forward_flow.valid[0].any() and not views.forward_flow.valid[-1].any()
+    same = torch.equal(views.forward_flow.vectors[0], views.flow.vectors[2])
+    assert same == written
+    assert (tmp_path / "flow_forward.npz").exists() != written

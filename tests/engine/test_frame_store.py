@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from contextlib import nullcontext
 from typing import Any
 
 import pytest
@@ -87,7 +88,7 @@ def test_offloaded_frames_stay_as_they_are_and_are_read_in_single_precision(
 
 
 def test_a_prefetched_frame_is_discarded_once_it_has_been_written(store: FrameStore) -> None:
-    fetched: Any = ((store.to_canonical[1], store.to_time[1]), object())
+    fetched = store.to_canonical[1], store.to_time[1]
     store._fetched = {1: fetched, 2: fetched}
     store.write(1, pair())
     assert list(store._fetched) == [2]
@@ -97,8 +98,9 @@ def test_a_prefetched_frame_is_discarded_once_it_has_been_written(store: FrameSt
 
 def test_prefetched_frames_are_not_copied(store: FrameStore) -> None:
     stream: Any = (number for number in ())  # cannot be copied, like a stream
-    store._fetched = {1: ((store.to_time[1], store.to_time[1]), stream)}
-    assert copy.deepcopy(store)._fetched == {}
+    store._fetched, store._side = {1: (store.to_time[1], store.to_time[1])}, stream
+    twin = copy.deepcopy(store)
+    assert twin._fetched == {} and twin._side is None
 
 
 def test_a_stored_state_of_another_shape_is_taken(store: FrameStore) -> None:
@@ -106,3 +108,32 @@ def test_a_stored_state_of_another_shape_is_taken(store: FrameStore) -> None:
     other.load_state_dict(store.state_dict())
     assert torch.equal(other.to_time, store.to_time)
     assert torch.equal(other.to_canonical, store.to_canonical)
+
+
+def test_frames_are_fetched_on_one_stream_for_good(
+    store: FrameStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[object] = []
+
+    class Stream:
+        device = torch.device("cpu")
+
+        def __init__(self, device: torch.device) -> None:
+            made.append(self)
+
+        def wait_stream(self, other: object) -> None:
+            pass
+
+    class Here:
+        is_cuda, device = True, torch.device("cpu")
+
+    monkeypatch.setattr(torch.cuda, "Stream", Stream)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda device: None)
+    monkeypatch.setattr(torch.cuda, "stream", lambda stream: nullcontext())
+    store.on_host = True
+    del store.here
+    store.here = Here()  # type: ignore[assignment]
+    for frames in ([1, 2], [3], [1]):
+        store.prefetch(frames)
+        assert sorted(store._fetched) == frames
+    assert len(made) == 1

@@ -221,6 +221,7 @@ def test_a_replay_is_the_same_work_on_the_same_memory_and_learns_the_same(
     # One graph for each phase, or for each level, whose frames share it.
     assert len(capturer.graphs) == (3 if isinstance(replayed, CanonicalStage) else 2)
     assert all(graph.first for graph in capturer.graphs)
+    assert replayed.loop.num_captures == len(capturer.graphs)
     static = learn(build, trainer, datamodule, "triton")
     exact = learn(build, trainer, datamodule, "torch")
     assert static.optimizer.keeps_gradients and not exact.optimizer.keeps_gradients
@@ -325,5 +326,6 @@ def test_work_is_captured_after_its_warm_up() -> None:
     for call in range(5):
         repeated()
         assert repeated.is_warm == (call == GraphedStep.WARM_UP - 1)
+        assert repeated.has_captured == (call == GraphedStep.WARM_UP)
     assert done == ["warm", "work", "captured", *["replayed"] * 4]
     assert not repeated.failed

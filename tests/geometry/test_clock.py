@@ -72,3 +72,20 @@ def test_frames_of_many_frames_takes_no_memory_of_their_square() -> None:
 def test_a_clock_without_rest_or_out_of_order_is_an_error(times: tuple[float, ...]) -> None:
     with pytest.raises(ValueError, match="frame clock"):
         FrameClock(times)
+
+
+def test_a_clock_knows_the_times_of_its_frames_up_to_rounding() -> None:
+    clock = FrameClock((0.0, 1 / 3, 0.8))
+    known = (0.0, float(torch.tensor(1 / 3)), 0.333333, 0.8)
+    assert all(clock.knows(time) for time in known)
+    assert not any(clock.knows(time) for time in (0.3, 0.34, 0.9, 1.0))
+
+
+def test_many_times_lie_where_each_of_them_does() -> None:
+    clock = FrameClock((0.0, 0.4, 1.0))
+    times = torch.tensor([-0.1, 0.0, 0.1, 0.4, 0.7, 1.0, 1.2])
+    before, after, weight = clock.between(times)
+    alone = [clock.at(time) for time in times.tolist()]
+    assert before.tolist() == [one.before for one in alone]
+    assert after.tolist() == [one.after for one in alone]
+    torch.testing.assert_close(weight, torch.tensor([one.weight for one in alone]))

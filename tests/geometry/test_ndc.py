@@ -58,3 +58,13 @@ def test_points_of_a_world_ray_lie_on_its_ndc_ray(rng: torch.Generator) -> None:
     # With o on the near plane and o + d at infinity, the point at depth z is at 1 − n/z.
     share = 1 - NDC.near / depth
     torch.testing.assert_close(rays.at(torch.arange(50), share), device)
+
+
+def test_infinity_is_far_away_and_its_pixel_stays() -> None:
+    # Half to the right in the picture: at any depth x / −z is 0.5, as the slope is 1.
+    points = torch.tensor([[0.5, 0.0, 1.0]], requires_grad=True)
+    world = NDC.to_world(points)
+    assert world.isfinite().all() and bool((world[:, 2] < -9e5).all())
+    torch.testing.assert_close(-world[:, 0] / world[:, 2], torch.tensor([0.5]))
+    (world[:, 0] / world[:, 2]).sum().backward()
+    assert points.grad is not None and points.grad.isfinite().all()

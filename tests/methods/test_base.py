@@ -52,11 +52,27 @@ def test_frozen_parts_are_in_no_group_and_the_others_learn() -> None:
     assert len(model.param_groups()) == 2
 
 
+def test_parts_can_be_named_by_their_beginning() -> None:
+    model = Toy()
+    model.freeze(["canon*"])
+    assert [group["name"] for group in model.param_groups()] == ["deformation"]
+
+
 def test_an_unknown_part_is_named_with_those_there_are() -> None:
     model = Toy()
     with pytest.raises(DevrfError, match="toy has no part 'rest'; it has canonical, deformation"):
         model.freeze(["canonical", "rest"])
     assert all(p.requires_grad for p in model.parameters())  # nothing half-done
+
+
+def test_a_protocol_that_a_method_does_not_learn_by_is_refused() -> None:
+    class Together(Toy):
+        protocols = ("joint", "dynamic")
+
+    Toy().check_protocol("mine")  # what names none learns by all
+    Together().check_protocol("dynamic")
+    with pytest.raises(DevrfError, match="toy does not learn by protocol=two_stage; give protocol"):
+        Together().check_protocol("two_stage")
 
 
 def test_it_is_built_from_its_config_and_takes_its_state() -> None:

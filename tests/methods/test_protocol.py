@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from devrf.errors import DevrfError
@@ -37,3 +39,12 @@ def test_what_cannot_be_is_named(stages: dict[str, dict[str, object]], said: str
 def test_a_joint_batch_has_rays_of_both_captures() -> None:
     with pytest.raises(DevrfError, match="protocol.static_share: expected between 0 and 1"):
         Protocol("joint", {"joint": {"capture": "both"}}, static_share=1.0)
+
+
+@pytest.mark.parametrize(
+    ("freeze", "frozen"), [(True, ["canonical"]), (False, []), ("all", ["canonical*"])]
+)
+def test_what_is_frozen_can_be_chosen_at_once(freeze: Any, frozen: list[str]) -> None:
+    protocol = Protocol("mine", {"canonical": STATIC, "motion": MOVING}, freeze=freeze)
+    assert list(protocol["motion"].frozen) == frozen
+    assert list(protocol["canonical"].frozen) == []

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from hydra.core.hydra_config import HydraConfig
-from hydra.utils import instantiate
+from hydra.utils import get_class, instantiate
 from omegaconf import OmegaConf
 
 from devrf.cli.config import config_folder
@@ -40,7 +40,11 @@ def rooted(composed, folder, *overrides):
     return composed(*overrides, f"data.root={folder}/scene")
 
 
-@pytest.mark.parametrize("choice", [name for name in FILES if not name.startswith("method=")])
+# What is learned is not DeVRF's two stages.
+OTHER_METHODS = ("method=", "comparison=")
+
+
+@pytest.mark.parametrize("choice", [name for name in FILES if not name.startswith(OTHER_METHODS)])
 def test_it_composes_and_builds(composed, tmp_path, choice):
     needed = NEEDS.get(choice)
     if needed and importlib.util.find_spec(needed) is None:
@@ -67,14 +71,51 @@ def test_a_method_learns_by_the_protocols_that_it_has_stages_for(
     run = RunContext(config, tmp_path)
     assert (config.method, run.protocol.name) == (method, protocol)
     assert run.learning_stages
+    learns = True
+    if "ray_stage" in config:
+        known = get_class(config.ray_stage.model._target_).protocols
+        learns = known is None or protocol in known
     for step in run.protocol.steps:
-        if run.stage_key(step.name) not in config:
+        if not learns or run.stage_key(step.name) not in config:
             refused = f"protocol: method={method} does not learn by protocol={protocol}"
             with pytest.raises(DevrfError, match=refused):
                 run.stage_builder(step.name)
             continue
         if step.builds_on is None:
             assert isinstance(run.stage_builder(step.name)(), ScheduledStage)
+
+
+@pytest.mark.parametrize("row", NAMES["comparison"])
+def test_a_row_of_the_tables_is_a_method_and_a_protocol_that_it_learns_by(composed, tmp_path, row):
+    config = composed(f"comparison={row}", "profile=small")
+    check_config(config)
+    run = RunContext(config, tmp_path)
+    name = row.removesuffix("_paper")
+    assert name.startswith(config.method)
+    usual = "two_stage" if name == "devrf" else "joint"
+    assert run.protocol.name == (name.removeprefix(config.method).removeprefix("_") or usual)
+    assert isinstance(run.stage_builder(run.protocol.steps[0].name)(), ScheduledStage)
+
+
+@pytest.mark.parametrize("table", ["comparison_table", "views_study", "published_table"])
+def test_a_table_compares_rows_that_there_are(composed, table):
+    composed(f"experiment={table}")
+    swept = HydraConfig.get().sweeper.params
+    assert {*swept.comparison.split(",")} <= {*NAMES["comparison"]}
+    if "table" in table:
+        assert len(swept.comparison.split(",")) == 13  # 12 of the peers, and DeVRF
+    assert {*swept.get("data", "procedural").split(",")} <= {*NAMES["data"]}
+
+
+PROFILES = sorted(path.stem for path in (config_folder() / "method/profile").glob("*.yaml"))
+
+
+@pytest.mark.parametrize("name", PROFILES)
+def test_a_method_is_built_in_each_of_its_sizes(composed, tmp_path, name):
+    method, _, profile = name.rpartition("_")
+    config = composed(f"method={method}", "protocol=joint", f"profile={profile}")
+    check_config(config)
+    assert isinstance(RunContext(config, tmp_path).stage_builder("joint")(), ScheduledStage)
 
 
 @pytest.mark.parametrize("page", sorted({scene.collection.page for scene in catalogue()}))

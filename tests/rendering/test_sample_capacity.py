@@ -18,8 +18,10 @@ def test_it_grows_by_half_at_least_and_shrinks_only_from_great_waste() -> None:
 
     assert needing(4097, 800) == (6144, 1024)
     assert needing(20000, 1024) == (25088, 1024)  # 1.25 times what was needed, in 256s
-    assert needing(6000, 512) == (25088, 1024)
-    assert needing(1000, 100) == (5120, 512)
-    capacity.note(torch.tensor(900), torch.tensor(400))
-    assert capacity.measure() and (capacity.visible, capacity.significant) == (1280, 512)
+    assert needing(14000, 600) == (25088, 1024)  # less than 1.5 times what fits
+    assert needing(13000, 400) == (16384, 512)
+    assert capacity.num_short == 2
+    capacity.note(torch.tensor(12000), torch.tensor(300))
+    assert capacity.measure() and (capacity.visible, capacity.significant) == (15104, 512)
     assert needing(4000, 4000) == (5120, 5120)
+    assert capacity.num_short == 3

@@ -5,7 +5,10 @@ from __future__ import annotations
 import pandas as pd
 import pytest
 
-from devrf.reporting.table import GPU, LPIPS, PSNR, SSIM, TIME, ranked, shown
+from devrf.reporting.latex import latex
+from devrf.reporting.markdown import markdown, plain
+from devrf.reporting.published import published
+from devrf.reporting.table import GPU, LPIPS, PSNR, SSIM, TIME, TITLES, ranked, shown
 
 FULL = "Ours w/ c2f, tv, cycle, flow"
 
@@ -47,6 +50,29 @@ def test_seeds_are_averaged_with_their_spread_where_all_have_a_value(table, ran)
         ran(str(seed), scores=scores, seconds=(140, seconds), seed=seed)
     ((cells),) = texts(table().blocks[0].measured).values()
     assert cells == ["30.00 ± 1.00", "0.950 ± 0.000", "–", "–", "5.0 ± 1.0 min"]
+
+
+def test_novel_times_have_a_column_where_a_run_has_them(table, ran):
+    ran("one", scene="lego", scores={"novel_times": {"psnr": 25.5}})
+    ran("other", scene="lego", ablation="base")
+    found = table()
+    titles = [column.title for column in found.columns]
+    assert titles == ["PSNR", "PSNR at novel times", "SSIM", "LPIPS", "GPU (GB)", "Time"]
+    (block,) = found.blocks
+    assert texts(block.measured)[FULL][1] == "25.50"
+    assert [cells[1] for label, cells in texts(block.measured).items() if label != FULL] == ["–"]
+    # The paper has no such column.
+    assert {cells[1] for cells in texts(block.published).values()} == {"–"}
+    label = block.published.index[0]
+    printed = published().texts.loc[("lego", label), "PSNR"]
+    assert block.published["text"].loc[label, "PSNR"] == printed
+    for text in (markdown(found, {}), plain(found), latex(found)):
+        assert "PSNR at novel times" in text and "25.50" in text
+
+
+def test_runs_without_novel_times_have_the_papers_columns(table, ran):
+    ran("one")
+    assert [column.title for column in table().columns] == TITLES
 
 
 @pytest.mark.parametrize(

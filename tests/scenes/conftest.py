@@ -307,14 +307,14 @@ class LlffFolder:
             image[..., 0] = first + k
             iio.imwrite(folder / f"{k:03d}.png", image)
 
-    def flow(self, view: int, name: str, value: float) -> None:
+    def flow(self, view: int, name: str, value: float, direction: str = "bwd") -> None:
         """A flow file of ``view`` whose vectors are all (value, −value)."""
         folder = self.dynamic / f"view{view}" / "images_4_flow"
         folder.mkdir(exist_ok=True)
         vectors = np.full((self.HEIGHT, self.WIDTH, 2), value, dtype=np.float32)
         vectors[..., 1] *= -1
         mask = np.ones((self.HEIGHT, self.WIDTH), dtype=bool)
-        np.savez(folder / f"{name}_bwd.npz", flow=vectors, mask=mask)
+        np.savez(folder / f"{name}_{direction}.npz", flow=vectors, mask=mask)
 
 
 @pytest.fixture

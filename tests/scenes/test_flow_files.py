@@ -70,6 +70,16 @@ def test_files_are_found_by_their_place_in_the_list(tmp_path):
     assert torch.equal(flow.vectors[:, 0, 0], torch.tensor([[0.0, 0], [2, 1], [2.5, 1.25]]))
 
 
+def test_forward_flow_has_files_of_its_own(tmp_path):
+    for direction, value in (("bwd", 1.0), ("fwd", 2.0)):
+        write_flow(
+            tmp_path / f"001_{direction}.npz", np.full((4, 6, 2), value), np.ones((4, 6), bool)
+        )
+    for direction, value in (("bwd", 1.0), ("fwd", 2.0)):
+        flow = read_flow(tmp_path, [1], [True], (6, 4), (6, 4), direction)
+        assert flow is not None and bool((flow.vectors == value).all())
+
+
 def test_no_file_at_all_means_no_flow(tmp_path, caplog):
     with caplog.at_level(logging.INFO):
         assert read_flow(tmp_path, [0, 1], [False, True], (9, 9), (9, 9)) is None

@@ -83,7 +83,7 @@ def test_in_a_room_every_ray_meets_something(tiny_room: Scene) -> None:
 
 
 def test_nothing_in_the_room_moves(tiny_room_recipe: ProceduralScene) -> None:
-    shape = tiny_room_recipe.in_surroundings()
+    shape = tiny_room_recipe.filmed()
     wall = torch.tensor([[6.0, 1.0, 1.0], [0.5, 3.0, -1.1]])
     assert torch.equal(moved(shape, wall, 0.0, 1.0), wall)
 

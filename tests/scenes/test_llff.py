@@ -160,6 +160,21 @@ def test_flow_finds_its_frame(llff_folder, names, found):
     assert train.flow.valid.flatten(1).any(dim=1).tolist() == [False] * 2 + [True] * 4
 
 
+def test_forward_flow_leaves_out_the_last_frame(llff_folder):
+    for name, value in (("000", 1.0), ("001", 2.0), ("002", 9.0)):
+        llff_folder.flow(1, name, value, "fwd")
+    reader = LlffReader(llff_folder.root)
+    train = reader.read().dynamic.train
+    assert train.flow is None and train.forward_flow is None
+    found = reader.forward_flow(train)
+    assert found is not None
+    assert found.vectors[:, 3, 5, 0].tolist() == [1, 0, 2, 0, 0, 0]
+    assert found.valid.flatten(1).any(dim=1).tolist() == [True, False, True, False, False, False]
+    # Frames that are left out have no neighbours.
+    thinned = LlffReader(llff_folder.root, frames=2)
+    assert thinned.forward_flow(thinned.read().dynamic.train) is None
+
+
 def test_missing_flow_files_leave_images_without_flow(llff_folder, caplog):
     llff_folder.flow(2, "002", 5.0)
     with caplog.at_level(logging.WARNING):

@@ -49,6 +49,17 @@ def shifting(height: int, width: int, alpha: bool = False) -> Views:
     return views_of(pixels, [0.0, 0.5, 1.0], [0, 0, 0])
 
 
+def test_forward_flow_leads_to_the_next_frame_and_is_kept_apart(tmp_path):
+    views = shifting(64, 96)
+    flow = estimate_flow(views, "dis", tmp_path / "flow.npz", forward=True)
+    assert not flow.valid[2].any() and bool((flow.vectors[2] == 0).all())
+    inner = (slice(0, 2), slice(12, -12), slice(12, -12))
+    assert float(flow.valid[inner].float().mean()) > 0.95
+    assert float((flow.vectors[inner] - SHIFT)[flow.valid[inner]].norm(dim=-1).mean()) < 0.25
+    # Backward flow does not take the file of the forward one for its own.
+    assert estimate_flow(views, "dis", tmp_path / "flow.npz").valid[2].any()
+
+
 @pytest.mark.parametrize("size", [(130, 180), (64, 96)])
 def test_dis_recovers_a_known_shift(size):
     flow = estimate_flow(shifting(*size), "dis")

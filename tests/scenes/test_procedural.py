@@ -204,3 +204,31 @@ def test_wrong_numbers_are_named(recipe: Any, key: str, value: object, said: str
     with pytest.raises(DevrfError, match=f"data.{key}.*{said}") as caught:
         replace(recipe, **{key: value})()
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("recipe", [INWARD, FORWARD], ids=["inward", "forward"])
+def test_frames_may_be_left_to_the_held_out_camera(recipe: Any) -> None:
+    whole, partly = recipe(), replace(recipe, novel_times_every=2)()
+    # Of the frames 0, 1, 2, 3 the second is not learned from; the last one always is.
+    assert partly.clock.times == pytest.approx((0.0, 2 / 3, 1.0))
+    assert torch.equal(partly.dynamic.test.pixels, whole.dynamic.test.pixels)
+    kept = whole.dynamic.train.frames != 1
+    train = partly.dynamic.train
+    assert torch.equal(train.pixels, whole.dynamic.train.pixels[kept])
+    assert train.names == tuple(n for n in whole.dynamic.train.names if "frame 001" not in n)
+    # Flow leads one learned frame back: the frame after the gap from 2/3 to 0.
+    after, before = whole.dynamic.train[(train_place(whole, 2))], train[train_place(partly, 1)]
+    assert torch.equal(after.pixels, before.pixels)
+    assert not torch.equal(after.flow.vectors, before.flow.vectors)  # type: ignore[union-attr]
+
+
+def train_place(scene: Scene, frame: int) -> Tensor:
+    """The places of a frame's images among the training views."""
+    assert scene.dynamic.train.frames is not None
+    return (scene.dynamic.train.frames == frame).nonzero()[:, 0]
+
+
+@pytest.mark.parametrize("every", [1, 4, 2.5, True])
+def test_every_how_many_frames_can_be_held_out(every: Any) -> None:
+    with pytest.raises(DevrfError, match=r"data.novel_times_every: must be a whole .* 2 … 3, or"):
+        replace(INWARD, novel_times_every=every)()

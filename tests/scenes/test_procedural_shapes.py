@@ -7,23 +7,24 @@ import torch
 from torch import Tensor
 
 from devrf.scenes.procedural import Flower, Material, Plush, Robot, Shape, facing_rig, moved
-from devrf.scenes.procedural.backdrop import FLOOR, WALL, OnStage
+from devrf.scenes.procedural.backdrop import FLOOR, WALL, Backdrop
 from devrf.scenes.procedural.cameras import dynamic_rig
 from devrf.scenes.procedural.filming import Filming
 from devrf.scenes.procedural.march import HIT
 from devrf.scenes.procedural.plush import TABLE
 from devrf.scenes.procedural.plush_parts import BASE, REACH
+from devrf.scenes.procedural.surrounded import Surrounded
 from devrf.scenes.procedural.truth import extent
 
 ALONE = [Robot(), Flower(), Robot(2.0), Flower(2.0)]
-SHAPES = [*ALONE, OnStage(Plush()), OnStage(Plush(2.0))]
+SHAPES = [*ALONE, Surrounded(Plush(), Backdrop()), Surrounded(Plush(2.0), Backdrop())]
 each_alone = pytest.mark.parametrize("shape", ALONE, ids=repr)
 each_shape = pytest.mark.parametrize("shape", SHAPES, ids=repr)
 
 
 def surface(shape: Shape, time: float) -> Tensor:
     """World points (S, 3) that three cameras see of the shape at ``time``."""
-    if isinstance(shape, OnStage):
+    if isinstance(shape, Surrounded):
         cameras, _ = facing_rig.dynamic_rig(3, width=32, height=24)
         depth = Filming(shape, 9.0, 1, steps=400).pictures(cameras, time).depth
     else:
@@ -51,7 +52,7 @@ def test_distance_never_exceeds_that_to_a_seen_surface_point(shape: Shape, time:
     seen = surface(shape, time)
     generator = torch.Generator().manual_seed(0)
     points = 3 * torch.rand(1000, 3, generator=generator) - 1.5
-    if isinstance(shape, OnStage):
+    if isinstance(shape, Surrounded):
         points = points + torch.tensor(BASE)
         points[:, 1].clamp_(min=FLOOR)
         points[:, 2].clamp_(min=WALL)
@@ -83,7 +84,7 @@ def test_material_keeps_its_color_and_stays_on_the_surface_or_inside(shape: Shap
 
 
 def test_the_stage_stands_still() -> None:
-    shape = OnStage(Plush())
+    shape = Surrounded(Plush(), Backdrop())
     points = surface(shape, 1.0)
     material = shape.material(points, 1.0)
     assert set(material.part.tolist()) >= {0, 1, 2, 3, 4}

@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import imageio
-import numpy as np
 from torch import Tensor
 
 from devrf.artifacts.colors import to_bytes
 from devrf.artifacts.grid import image_grid, scaled
 from devrf.artifacts.still import sized, still
+from devrf.artifacts.video_file import write_pictures
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value, truth_image
 from devrf.geometry.cameras import Cameras
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Background, Views
-from devrf.system.files import atomic_write
 
 # Upper bound of the bytes of a pixel in a video: measured on images of 400 pixels and less.
 PIXEL = 0.2
@@ -112,20 +109,8 @@ def held_out_pictures(
 
 
 def write_video(path: Path, images: Iterator[Tensor], fps: float) -> None:
-    """Write images (H, W, 3) in [0, 1] of one size as an mp4 (H.264), ``fps`` a second.
-
-    A last row or column is repeated where that makes the side even, as H.264 needs it.
-    """
-    with atomic_write(path) as partial:
-        writer = imageio.get_writer(
-            partial, format="FFMPEG", fps=fps, codec="libx264", quality=8, macro_block_size=2
-        )
-        # As a context manager of its own it would leave ffmpeg running, and writing, on an error.
-        with closing(writer):
-            for image in images:
-                shown = to_bytes(image).numpy()
-                odd = [(0, side % 2) for side in shown.shape[:2]]
-                writer.append_data(np.pad(shown, [*odd, (0, 0)], mode="edge"))
+    """Write images (H, W, 3) in [0, 1] of one size as an mp4 (H.264), ``fps`` a second."""
+    write_pictures(path, (to_bytes(image).numpy() for image in images), fps)
 
 
 def film_bytes(film: FilmSettings, cameras: Cameras) -> int:

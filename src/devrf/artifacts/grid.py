@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
-from pathlib import Path
 
-import matplotlib
 import numpy as np
 import torch
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 from torch import Tensor
 
 from devrf.artifacts.colors import to_bytes
+from devrf.artifacts.lettering import fitted_font, font
 
 # Grey levels of text, and of the lines around images, most of which have a white background.
 INK, LINE = "#262626", "#c8c8c8"
@@ -40,7 +38,7 @@ def image_grid(
     height, width = rows[0][0].shape[:2]
     size = text or min(max(round(TEXT * height), SMALLEST_TEXT), LARGEST_TEXT)
     gap = size // 3 + 1
-    widths = (_font(size).getlength(line) for label in labels for line in label)
+    widths = (font(size).getlength(line) for label in labels for line in label)
     left = round(max(widths, default=-3 * gap)) + 3 * gap
     top = 2 * size if headings else 0
     page = Image.new(
@@ -51,7 +49,7 @@ def image_grid(
     pen = ImageDraw.Draw(page)
     columns = [left + k * (width + gap) for k in range(len(rows[0]))]
     for x, heading in zip(columns, headings, strict=False):
-        pen.text((x + width / 2, top / 2), heading, INK, _fitted(heading, size, width), "mm")
+        pen.text((x + width / 2, top / 2), heading, INK, fitted_font(heading, size, width), "mm")
     for number, row in enumerate(rows):
         y = top + number * (height + gap)
         for x, image in zip(columns, row, strict=True):
@@ -63,7 +61,7 @@ def image_grid(
         if labels:
             lines = "\n".join(labels[number])
             middle = (left / 2, y + height / 2)
-            pen.multiline_text(middle, lines, INK, _font(size), "mm", spacing=gap, align="center")
+            pen.multiline_text(middle, lines, INK, font(size), "mm", spacing=gap, align="center")
     return torch.from_numpy(np.array(page)).float() / 255
 
 
@@ -82,15 +80,3 @@ def scaled(image: Tensor, height: int, width: int | None = None) -> Tensor:
     source = Image.fromarray(to_bytes(image).cpu().numpy())
     resized = source.resize((width, height), Image.Resampling.LANCZOS)
     return torch.from_numpy(np.array(resized)).float() / 255
-
-
-def _fitted(text: str, size: int, width: int) -> ImageFont.FreeTypeFont:
-    """The largest font up to ``size`` in which the text is no wider than ``width`` pixels."""
-    needed = _font(size).getlength(text)
-    return _font(max(1, int(size * min(1.0, 0.98 * width / max(needed, 1.0)))))
-
-
-@cache
-def _font(size: int) -> ImageFont.FreeTypeFont:
-    """matplotlib's own font, which has more letters than Pillow's."""
-    return ImageFont.truetype(Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans.ttf", size)

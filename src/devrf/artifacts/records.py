@@ -8,6 +8,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from statistics import mean
 from typing import Any
 
 import lightning
@@ -16,6 +17,7 @@ import torch
 
 import devrf
 from devrf.evaluation.held_out import HeldOutView
+from devrf.geometry.clock import FrameClock
 from devrf.system.files import atomic_write
 
 
@@ -29,6 +31,33 @@ def mean_scores(views: Sequence[HeldOutView]) -> dict[str, float | None]:
     means = pd.DataFrame([view.scores for view in views], dtype=float).mean().round(5)
     means = means.drop("rest_pose_psnr")
     return {str(name): None if pd.isna(mean) else float(mean) for name, mean in means.items()}
+
+
+def dynamic_scores(views: Sequence[HeldOutView], clock: FrameClock) -> dict[str, Any]:
+    """Means over held-out images in motion, ``rest_pose_psnr`` among them.
+
+    Args:
+        views: scored images.
+        clock: of the training views' times.
+
+    Returns:
+        Means over all images. ``novel_times``, only where there are such: means over the images
+        at times that no training view has, and how many ``images`` these are. ``training_times``,
+        then, too, and if there are any: the same over the others.
+    """
+    novel = [view for view in views if not clock.knows(view.time)]
+    known = [view for view in views if clock.knows(view.time)]
+    found: dict[str, Any] = _with_rest_pose(views)
+    if novel and known:
+        found["training_times"] = {**_with_rest_pose(known), "images": len(known)}
+    if novel:
+        found["novel_times"] = {**_with_rest_pose(novel), "images": len(novel)}
+    return found
+
+
+def _with_rest_pose(views: Sequence[HeldOutView]) -> dict[str, float | None]:
+    rest_pose = round(mean(view.rest_pose_psnr for view in views), 4)
+    return {**mean_scores(views), "rest_pose_psnr": rest_pose}
 
 
 def write_frames(path: Path, captures: Mapping[str, Sequence[HeldOutView]]) -> None:

@@ -1,4 +1,4 @@
-"""Records the time, iterations and memory of training."""
+"""Records the time, iterations and memory of training, and how its iterations were carried out."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from lightning import Callback, LightningModule, Trainer
 
 from devrf.callbacks.previews import Previews
 from devrf.engine.stage import ScheduledStage
+from devrf.ops.dispatch import triton_runs
 from devrf.system.speed import wait
 
 
@@ -19,47 +20,66 @@ class TrainingRecord(Callback):
     def __init__(self) -> None:
         self._started = 0.0
         self._seconds_before = 0.0
-        self._peak_before: float | None = None
+        self._peaks_before: tuple[float, float] | None = None
+        self._startup = 0.0
+        self._kernels = "torch"
         self._device: torch.device | None = None
         self._previews: list[Previews] = []
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Start the clock and the memory's high-water mark."""
+        """Check and compile the kernels; then start the clock and the memory's high-water mark."""
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
         self._previews = [one for one in callbacks if isinstance(one, Previews)]
         self._device = pl_module.device
+        before = time.perf_counter()
+        if triton_runs(torch.zeros(1, device=self._device)):
+            self._kernels = "triton"
         if self._device.type == "cuda":
             torch.cuda.reset_peak_memory_stats(self._device)
         self._started = time.perf_counter()
+        self._startup = self._started - before
 
     def state_dict(self) -> dict[str, Any]:
         """Seconds and peak memory so far."""
-        return {"seconds": self._seconds(), "peak_gpu_gb": self._peak()}
+        return {"seconds": self._seconds(), "peaks": self._peaks()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Count on from what :meth:`state_dict` gave."""
         self._seconds_before = state_dict["seconds"]
-        self._peak_before = state_dict["peak_gpu_gb"]
+        self._peaks_before = state_dict["peaks"]
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Fill the record: wall-clock seconds without previews, memory in GiB (None on a CPU)."""
+        """Fill the record: wall-clock seconds without previews, memory in GiB (None on a CPU).
+
+        ``peak_gpu_gb`` is what tensors took, ``peak_reserved_gb`` what torch's allocator held, with
+        its caches and the pools of CUDA graphs.
+        """
         assert isinstance(pl_module, ScheduledStage)
         wait(pl_module.device)
         seconds, done = self._seconds(), pl_module.iteration - pl_module.skipped
+        allocated, reserved = self._peaks() or (None, None)
         pl_module.record = {
             "seconds": round(seconds, 2),
             "iterations": done,
             "iterations_per_second": round(done / seconds, 2),
-            "peak_gpu_gb": self._peak(),
+            "peak_gpu_gb": allocated,
+            "peak_reserved_gb": reserved,
             "num_rollbacks": pl_module.num_rollbacks,
+            "kernels": self._kernels,
+            "startup_seconds": round(self._startup, 2),
+            "graph_captures": pl_module.loop.num_captures,
+            "short_lists": pl_module.loop.num_short_lists,
         }
 
     def _seconds(self) -> float:
         looking = sum(previews.seconds for previews in self._previews)
         return self._seconds_before + time.perf_counter() - self._started - looking
 
-    def _peak(self) -> float | None:
+    def _peaks(self) -> tuple[float, float] | None:
+        """GiB allocated and reserved at the peaks so far."""
         if self._device is None or self._device.type != "cuda":
-            return self._peak_before
-        peak = torch.cuda.max_memory_allocated(self._device) / 2**30
-        return round(max(peak, self._peak_before or 0.0), 3)
+            return self._peaks_before
+        before = self._peaks_before or (0.0, 0.0)
+        allocated = torch.cuda.max_memory_allocated(self._device) / 2**30
+        reserved = torch.cuda.max_memory_reserved(self._device) / 2**30
+        return round(max(allocated, before[0]), 3), round(max(reserved, before[1]), 3)

@@ -25,6 +25,8 @@ from devrf.scenes.scene import Scene
 
 # The stage's attribute that holds the model: what its entries of a state begin with.
 MODEL = "scene_model."
+# What training took: by name, numbers, and words that say how it ran.
+TrainingFigures = dict[str, float | str | None]
 
 
 class StoredModel(Protocol):
@@ -60,7 +62,7 @@ class CheckpointMetadata:
     stage: str
     model: dict[str, Any]
     protocol: str | None = None
-    records: dict[str, dict[str, float | None]] = field(default_factory=dict)
+    records: dict[str, TrainingFigures] = field(default_factory=dict)
     training_config: dict[str, Any] = field(default_factory=dict)
     earlier_configs: dict[str, dict[str, Any]] = field(default_factory=dict)
     command: list[str] | None = None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -110,7 +111,9 @@ def _settings(target: str, path: str) -> dict[str, tuple[Any, Any]]:
         why = " ".join(str(error).split())
         raise DevrfError(f"{path}_target_: cannot load {target!r} ({why})") from None
     try:
-        hints = get_type_hints(part.__init__ if inspect.isclass(part) else part)
+        # A dataclass may inherit fields whose types only its base's module knows.
+        own_init = inspect.isclass(part) and not is_dataclass(part)
+        hints = get_type_hints(part.__init__ if own_init else part)
     except (NameError, TypeError):  # names imported only for a type checker
         hints = {}
     return {

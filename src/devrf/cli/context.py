@@ -89,7 +89,7 @@ class RunContext:
         """A function that builds a stage, given ``rest`` if it builds on another.
 
         Raises:
-            DevrfError: the method has no such stage.
+            DevrfError: the method has no such stage, or the protocol asks what it cannot do.
         """
         key = self.stage_key(name)
         if key not in self.config:
@@ -97,11 +97,17 @@ class RunContext:
                 f"protocol: method={self.config.method} does not learn by "
                 f"protocol={self.protocol.name}; it has no stage {name!r}"
             )
-        build: Callable[..., ScheduledStage] = instantiate(
+        build: partial[ScheduledStage] = instantiate(
             self.config[key], _partial_=True, _convert_="all"
         )
         if key == name:
+            if self.protocol.freeze is not True:
+                raise DevrfError(
+                    f"protocol.freeze: method={self.config.method} has stages of its own, which "
+                    f"freeze what they build on; expected true, not {self.protocol.freeze}"
+                )
             return build
+        build.keywords["model"].check_protocol(self.protocol.name)
         return partial(build, step=self.protocol[name], static_share=self.protocol.static_share)
 
     @cached_property

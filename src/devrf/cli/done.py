@@ -1,7 +1,8 @@
 """What a pipeline has scored and filmed is not done again.
 
-A step notes what it was done with (checkpoint, settings, data, version) and the files it wrote. It
-is done as long as all of these are as they were. A step that is asked for by name is done again.
+A step notes what it was done with (checkpoint, settings, data, logger, version) and the files it
+wrote. It is done as long as all of these are as they were. A step that is asked for by name is done
+again.
 """
 
 from __future__ import annotations
@@ -16,7 +17,6 @@ from typing import Any
 from omegaconf import OmegaConf
 
 import devrf
-from devrf.callbacks.csv_logger import ResumableCSVLogger
 from devrf.checkpoints.checkpoint_file import digest_of
 from devrf.cli.context import RunContext
 from devrf.cli.run_lock import PLACE
@@ -39,12 +39,9 @@ def done(run: RunContext, step: str) -> list[str]:
     noted, present = _notes(run.folder).get(step), _done_with(run, step)
     if noted is None or present is None:
         return []
-    if present["tracker"] is None:  # what was tracked need not be tracked again
-        noted["with"]["tracker"] = None
-    if noted["with"] != present:
-        return []
     files: list[str] = noted["files"]
-    return files if all((run.folder / name).is_file() for name in files) else []
+    there = all((run.folder / name).is_file() for name in files)
+    return files if there and noted["with"] == present else []
 
 
 @contextmanager
@@ -81,18 +78,15 @@ def _done_with(run: RunContext, step: str) -> dict[str, Any] | None:
     if data.get("root") is not None:
         data["root"] = str(Path(data["root"]).resolve())
     logger = OmegaConf.select(run.config, "logger._target_")
-    tracker = None if str(logger).endswith(ResumableCSVLogger.__name__) else logger
-    found = {"checkpoint": checkpoint, "version": devrf.__version__, "tracker": tracker, **parts}
-    plain: dict[str, Any] = json.loads(json.dumps(found))
-    return plain
+    return {"checkpoint": checkpoint, "version": devrf.__version__, "logger": logger, **parts}
 
 
 def _notes(folder: Path) -> dict[str, Any]:
     try:
-        found = json.loads((folder / PLACE / NOTE).read_text())
+        notes: dict[str, Any] = json.loads((folder / PLACE / NOTE).read_text())
     except (OSError, ValueError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return notes
 
 
 def _stamps(folder: Path) -> dict[str, int]:

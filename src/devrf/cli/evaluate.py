@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from statistics import mean
 from typing import Any
 
 from devrf.artifacts.contact_sheet import write_contact_sheet
-from devrf.artifacts.records import frame_rows, in_words, mean_scores, provenance, write_frames
-from devrf.checkpoints.checkpoint import CheckpointMetadata
+from devrf.artifacts.records import (
+    dynamic_scores,
+    frame_rows,
+    in_words,
+    mean_scores,
+    provenance,
+    write_frames,
+)
+from devrf.checkpoints.checkpoint import CheckpointMetadata, TrainingFigures
 from devrf.checkpoints.checkpoint_file import digest_of
 from devrf.cli import job
 from devrf.cli.context import GIVEN_REST, OWN_REST, RunContext
@@ -23,14 +29,18 @@ from devrf.system.files import write_json
 
 log = logging.getLogger(__name__)
 
+# Held-out images of the dynamic capture at times that a training view has, and at others.
+OF_TIMES = ("training_times", "novel_times")
 # Figures of the training, from the checkpoint, that stand beside the scores.
 TRAINING = ("seconds", "iterations", "iterations_per_second", "peak_gpu_gb", "num_rollbacks")
+# How iterations were carried out: which kernels and graphs really ran.
+EXECUTION = ("kernels", "startup_seconds", "graph_captures", "short_lists", "peak_reserved_gb")
 
 
 def evaluate(run: RunContext) -> None:
     """Score what was learned on held-out views; write metrics and contact sheets."""
     loaded = run.load()
-    model, records = loaded.model.to(run.device), loaded.metadata.records
+    model, records = loaded.model.to_view(run.device), loaded.metadata.records
     suite = run.evaluation.suite(run.device)
     frames: dict[str, list[HeldOutView]] = {"static": _score(run, model, "static", suite)}
     last = loaded.metadata.stage
@@ -39,15 +49,17 @@ def evaluate(run: RunContext) -> None:
     moved = model.moves and last != rest
     static = mean_scores(frames["static"])
     sections: dict[str, Any] = {"static": static}
+    size = {"checkpoint_mb": round(run.checkpoint(last).stat().st_size / 1e6, 3)}
     if rest is not None or not moved:
-        sections["static"] = sections[rest or last] = {**static, **_training(records, rest or last)}
+        stage = rest or last
+        own = {**static, **_training(records, stage), **({} if moved else size)}
+        sections["static"] = sections[stage] = own
     if moved:
         frames["dynamic"] = _score(run, model, "dynamic", suite)
         dynamic = sections["dynamic"] = {
-            **mean_scores(frames["dynamic"]),
-            "rest_pose_psnr": round(mean(v.rest_pose_psnr for v in frames["dynamic"]), 4),
+            **dynamic_scores(frames["dynamic"], run.scene.clock),
             **_training(records, last),
-            "checkpoint_mb": round(run.checkpoint(last).stat().st_size / 1e6, 3),
+            **size,
         }
         if rest is not None:
             sections[last] = dynamic
@@ -61,14 +73,31 @@ def evaluate(run: RunContext) -> None:
     if not run.scene.moves:
         head["at_rest"] = True
     write_json(run.folder / "metrics.json", {**head, **sections, "run": ran})
-    for name in frames:
-        log.info("%s: %s", name, in_words(sections[name]))
-    _track(run, sections, frames)
+    _tell(run, sections, frames)
+
+
+def _tell(
+    run: RunContext,
+    sections: Mapping[str, Mapping[str, Any]],
+    frames: Mapping[str, Sequence[HeldOutView]],
+) -> None:
+    """Log the scores and give them to the trackers, those of some times as further sections."""
+    plain = {
+        name: {key: value for key, value in one.items() if key not in OF_TIMES}
+        for name, one in sections.items()
+    }
+    dynamic = sections.get("dynamic", {})
+    of_times = {name: dynamic[name] for name in OF_TIMES if name in dynamic}
+    shown = {name: plain[name] for name in frames} | of_times
+    for name, values in shown.items():
+        log.info("%s: %s", name.replace("_", " "), in_words(values))
+    _track(run, plain | shown, shown, frames)
 
 
 def _track(
     run: RunContext,
     scores: Mapping[str, Mapping[str, float | None]],
+    shown: Mapping[str, Mapping[str, float | None]],
     frames: Mapping[str, Sequence[HeldOutView]],
 ) -> None:
     """Give the trackers scores and tables."""
@@ -81,14 +110,14 @@ def _track(
                 if value is not None
             }
         )
-        tracker.show_table("metrics", [{"section": name, **scores[name]} for name in frames])
+        tracker.show_table("metrics", [{"section": name, **own} for name, own in shown.items()])
         tracker.show_table("frames", frame_rows(frames))
 
 
-Records = Mapping[str, Mapping[str, float | None]]
+Records = Mapping[str, TrainingFigures]
 
 
-def _training(records: Records, stage: str) -> dict[str, float | None]:
+def _training(records: Records, stage: str) -> TrainingFigures:
     return {name: records.get(stage, {}).get(name) for name in TRAINING}
 
 
@@ -102,7 +131,9 @@ def _origin(run: RunContext, described: CheckpointMetadata) -> dict[str, Any]:
     for of_stage in (*described.earlier_configs.values(), described.training_config):
         settings |= of_stage
     frames = scene.clock.frames_of(scene.dynamic.train.times)
-    learned = {k: records.get(k, {}).get("wall_seconds") for k in stages_with_images(run)}
+    own = {name: records.get(name, {}) for name in stages_with_images(run)}
+    learned = {name: record.get("wall_seconds") for name, record in own.items()}
+    execution = {name: {key: record.get(key) for key in EXECUTION} for name, record in own.items()}
     return {
         "choices": job.choices(),
         "overrides": job.overrides(),
@@ -114,6 +145,7 @@ def _origin(run: RunContext, described: CheckpointMetadata) -> dict[str, Any]:
         "train_views": int(frames.bincount().max()) if scene.moves else None,
         "test_frames": len(scene.dynamic.test),
         "wall_seconds": {**learned, "evaluate": run.step_seconds},
+        "execution": execution,
     }
 
 

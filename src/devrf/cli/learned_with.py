@@ -176,7 +176,7 @@ def _command(checkpoint: Path) -> list[str] | None:
     from devrf.checkpoints.checkpoint import metadata_of  # loads torch
 
     # A damaged file is reported when the whole of it is read.
-    with suppress(DevrfError, OSError, HydraException, TypeError):
+    with suppress(DevrfError, OSError, HydraException):
         command = metadata_of(checkpoint).command
         return None if command is None else recorded(command)
     return None

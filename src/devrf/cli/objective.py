@@ -8,8 +8,8 @@ from typing import Any
 from devrf.cli.evaluate import TRAINING
 from devrf.errors import DevrfError, did_you_mean
 
-OF_BOTH = ("psnr", "ssim", *TRAINING)
-OF_MOTION = ("rest_pose_psnr", "checkpoint_mb")
+OF_BOTH = ("psnr", "ssim", *TRAINING, "checkpoint_mb")
+OF_MOTION = ("rest_pose_psnr",)
 # The two sections of metrics.json, and their names after DeVRF's stages.
 STATIC, DYNAMIC = ("static", "canonical"), ("dynamic", "deformation")
 

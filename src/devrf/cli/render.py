@@ -25,7 +25,7 @@ def render(run: RunContext) -> None:
     """Film the held-out views over time, and an orbit (or a spiral) while time runs."""
     stored, scene = run.load(), run.scene
     film: FilmSettings = instantiate(run.config.video)
-    renderer = Renderer(stored.model.to(run.device), half=film.half)
+    renderer = Renderer(stored.model.to_view(run.device), half=film.half)
     views = (scene.dynamic if scene.moves else scene.static).test
     film, captured = _within_limit(film, renderer, views), film.sized(scene.static.train.cameras)
     images = held_out_images(views, film.frames)

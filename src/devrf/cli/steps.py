@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import logging
 import warnings
@@ -10,6 +11,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import torch
 from hydra.utils import instantiate
 from lightning import seed_everything
 from omegaconf import DictConfig
@@ -183,6 +185,14 @@ def _for_the_scene(run: RunContext, asked: Plan) -> Plan:
 def _learn(run: RunContext, asked: Plan) -> None:
     for name in learnable(run, asked.learning):
         _take(run, name, partial(learn, name=name))
+        _release(run.device)
+
+
+def _release(device: torch.device) -> None:
+    """Free what a stage's trainer holds in circles: it would count as the next stage's memory."""
+    gc.collect()
+    if device.type == "cuda":
+        torch.cuda.empty_cache()
 
 
 def _take(run: RunContext, name: str, step: Step) -> None:

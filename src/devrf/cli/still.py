@@ -30,7 +30,7 @@ def picture(run: RunContext) -> None:
         stored = run.load()  # refuses another scene
         viewpoints = Viewpoints.of(run.scene)
     camera = settings.camera(viewpoints)
-    renderer = Renderer(stored.model.to(run.device), half=settings.half)
+    renderer = Renderer(stored.model.to_view(run.device), half=settings.half)
     color, depth = still(renderer, camera, settings.time, background_value(viewpoints.background))
     path = _unused(run.folder / "images" / f"{settings.name}.png")
     for place, image in ((path, color), (path.with_stem(f"{path.stem}_depth"), depth)):

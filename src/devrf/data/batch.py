@@ -120,7 +120,8 @@ class RayBatch:
         background: (3,) or (R, 3) RGB behind the matte.
         time: (R,) the time of each ray in [0, 1].
         frame: (R,) int64, the frame of the scene's clock that is nearest to that time.
-        image: (R,) int64, the image of each ray among the views it was drawn from.
+        image: (R,) int64, the image of each ray among the views it was drawn from; those of
+            several captures are numbered through.
         pixel: (R, 2) x, y of the pixels' centres.
         flow: (R, 2) pixels, backward optical flow, 0 where it is not valid; or None.
         flow_valid: (R,) bool, or None.

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import torch
+from kornia.filters import gaussian_blur2d
 from torch import Tensor
-from torch.nn.functional import conv2d, grid_sample, max_pool2d, pad
+from torch.nn.functional import grid_sample, max_pool2d
 
 from devrf.data.correspondence import previous_images
 from devrf.scenes.scene import Views
@@ -12,7 +13,7 @@ from devrf.scenes.scene import Views
 # Images of which colours are followed, evenly spread, and frames that they are followed back.
 IMAGES, STEPS = 64, 4
 # Colours are smoothed before they are compared: what is finer than the pixels flickers as it moves.
-SIGMA = 1.5
+SIGMA, TAPS = 1.5, 9
 # Pixels nearer than this to the matte's edge, or to an occlusion, are left out.
 MARGIN = 4
 
@@ -93,11 +94,7 @@ def _smooth(views: Views, image: int) -> Tensor:
 
 def _gaussian(image: Tensor) -> Tensor:
     """(C, H, W) smoothed, the border repeated."""
-    reach = round(3 * SIGMA)
-    kernel = torch.exp(-(torch.arange(-reach, reach + 1.0) ** 2) / (2 * SIGMA**2))
-    kernel = kernel / kernel.sum()
-    along = conv2d(pad(image[:, None], (reach, reach, 0, 0), "replicate"), kernel.view(1, 1, 1, -1))
-    return conv2d(pad(along, (0, 0, reach, reach), "replicate"), kernel.view(1, 1, -1, 1))[:, 0]
+    return gaussian_blur2d(image[None], TAPS, (SIGMA, SIGMA), "replicate")[0]
 
 
 def _look_up(image: Tensor, place: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from typing import Any
 
 import torch
@@ -37,6 +37,17 @@ class SceneDataModule(LightningDataModule, ABC):
         if self._scene is None:
             self._scene = self.load()
         return self._scene
+
+    def provide(self, priors: Collection[str]) -> None:
+        """Add to the scene what a method wants of it, where it can be had.
+
+        Args:
+            priors: names of what is wanted: ``forward_flow`` of the dynamic training views.
+        """
+
+    def replace(self, scene: Scene) -> None:
+        """Serve ``scene`` from now on, which knows more of the same images."""
+        self._scene, self._on_device = scene, {}
 
     def prepare_data(self) -> None:
         """Read the scene in one process of several, before the others find what it has kept."""

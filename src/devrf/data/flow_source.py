@@ -6,9 +6,9 @@ import logging
 from dataclasses import replace
 from pathlib import Path
 
-from devrf.scenes.optical_flow import camera_turn, estimate_flow, frame_pairs
+from devrf.scenes.optical_flow import FlowMethod, camera_turn, estimate_flow, frame_pairs
 from devrf.scenes.reader import FlowSource
-from devrf.scenes.scene import Scene
+from devrf.scenes.scene import OpticalFlow, Scene
 
 log = logging.getLogger(__name__)
 
@@ -49,3 +49,33 @@ def with_flow(scene: Scene, source: FlowSource, cache: Path | None) -> Scene:
         flow = replace(flow, valid=flow.valid & train.valid_mask)
     dynamic = replace(scene.dynamic, train=replace(train, flow=flow))
     return replace(scene, dynamic=dynamic)
+
+
+def with_forward_flow(
+    scene: Scene, source: FlowSource, cache: Path | None, files: OpticalFlow | None
+) -> Scene:
+    """The scene with forward flow of its moving training views, where it can be had.
+
+    It is had as backward flow is: see :func:`with_flow`.
+
+    Args:
+        scene: with backward flow, or without.
+        source: as of :func:`with_flow`.
+        cache: an ``.npz`` beside which the estimate is kept, or None.
+        files: what was read from files, if any.
+
+    Raises:
+        DevrfError: what :func:`devrf.scenes.optical_flow.estimate_flow` raises.
+    """
+    train, flow = scene.dynamic.train, files
+    possible = bool(frame_pairs(train)) and camera_turn(train) <= JUMP_DEGREES
+    if flow is None and possible and source in ("auto", "dis", "raft"):
+        if cache is not None:
+            cache = cache.with_name(f"{cache.stem}_forward{cache.suffix}")
+        method: FlowMethod = "raft" if source == "raft" else "dis"
+        flow = estimate_flow(train, method, cache, forward=True)
+    if flow is None:
+        return scene
+    if train.valid_mask is not None:
+        flow = replace(flow, valid=flow.valid & train.valid_mask)
+    return replace(scene, dynamic=replace(scene.dynamic, train=replace(train, forward_flow=flow)))

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Collection
 from pathlib import Path
 
 from devrf.data.datamodule import SceneDataModule
-from devrf.data.flow_source import with_flow
+from devrf.data.flow_source import with_flow, with_forward_flow
 from devrf.scenes.reader import SceneReader
 from devrf.scenes.scene import Scene
 
@@ -31,5 +32,19 @@ class RecordedDataModule(SceneDataModule):
             )
             if scene.moves:
                 log.info("%s: room for motion: %s", scene.name, bounds.source)
+        return with_flow(scene, self.reader.flow, self._cache)
+
+    def provide(self, priors: Collection[str]) -> None:
+        """Read or estimate forward flow, if a method wants it."""
+        scene, reader = self.scene, self.reader
+        if "forward_flow" in priors and scene.dynamic.train.forward_flow is None and scene.moves:
+            files = None
+            if reader.wants_flow_files:
+                files = reader.forward_flow(scene.dynamic.train)
+            self.replace(with_forward_flow(scene, reader.flow, self._cache, files))
+
+    @property
+    def _cache(self) -> Path | None:
+        """Where estimated flow is kept."""
         cache = self.reader.flow_cache
-        return with_flow(scene, self.reader.flow, None if cache is None else Path(cache))
+        return None if cache is None else Path(cache)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
+from dataclasses import replace
 from pathlib import Path
 
 from devrf.data.datamodule import SceneDataModule
+from devrf.scenes.procedural.recipe import Recipe
+from devrf.scenes.procedural.truth import forward_flow
 from devrf.scenes.scene import Scene
 
 
@@ -26,3 +29,11 @@ class RenderedDataModule(SceneDataModule):
     def load(self) -> Scene:
         """Render the scene."""
         return self.recipe()
+
+    def provide(self, priors: Collection[str]) -> None:
+        """Compute exact forward flow, if a method wants it."""
+        scene, train = self.scene, self.scene.dynamic.train
+        wanted = "forward_flow" in priors and train.forward_flow is None
+        if wanted and isinstance(self.recipe, Recipe):
+            train = replace(train, forward_flow=forward_flow(self.recipe.filmed(), train))
+            self.replace(replace(scene, dynamic=replace(scene.dynamic, train=train)))

@@ -43,7 +43,9 @@ class FrameStore(nn.Module):
             self.register_buffer(name, torch.zeros(frames, *shape, 3))
         # An empty tensor that is moved with the module: its device is the module's.
         self.register_buffer("here", torch.zeros(0), persistent=False)
-        self._fetched: dict[int, tuple[Directions, torch.cuda.Stream]] = {}
+        self._fetched: dict[int, Directions] = {}
+        # One for good: the allocator keeps the memory of each stream apart.
+        self._side: torch.cuda.Stream | None = None
 
     @torch.no_grad()
     def read(self, frame: int, into: Directions) -> None:
@@ -53,9 +55,10 @@ class FrameStore(nn.Module):
         """
         source = (self.to_canonical[frame], self.to_time[frame])
         if frame in self._fetched:
-            source, side = self._fetched.pop(frame)
+            source = self._fetched.pop(frame)
             present = torch.cuda.current_stream(self.here.device)
-            present.wait_stream(side)
+            assert self._side is not None
+            present.wait_stream(self._side)
             for tensor in source:
                 tensor.record_stream(present)
         for tensor, value in zip(into, source, strict=True):
@@ -93,14 +96,16 @@ class FrameStore(nn.Module):
         if not (self.on_host and self.here.is_cuda):
             return
         device, self._fetched = self.here.device, {}
-        side = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+        if self._side is None or self._side.device != device:
+            self._side = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
+        side = self._side
         # Pending writes to the frames must finish first.
         side.wait_stream(torch.cuda.current_stream(device))
         with torch.cuda.stream(side):
             for frame in frames:
                 backward = self.to_canonical[frame].to(device, non_blocking=True)
                 forward = self.to_time[frame].to(device, non_blocking=True)
-                self._fetched[frame] = ((backward, forward), side)
+                self._fetched[frame] = (backward, forward)
 
     @torch.no_grad()
     def copy_previous(self, frame: int) -> None:
@@ -157,7 +162,7 @@ class FrameStore(nn.Module):
 
     def __getstate__(self) -> dict[str, Any]:
         """The state of a copy, without frames that are being fetched."""
-        return {**self.__dict__, "_fetched": {}}
+        return {**self.__dict__, "_fetched": {}, "_side": None}
 
     def _load_from_state_dict(
         self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any

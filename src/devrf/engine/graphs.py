@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from typing import Literal
+from contextlib import suppress
+from typing import Any, Literal
 
 import torch
 
@@ -20,34 +21,57 @@ Work = Callable[[], None]
 
 
 class CudaGraphCapture:
-    """Captures on a CUDA device."""
+    """Captures on a CUDA device, on one side stream that warm-ups share.
+
+    cuBLAS keeps a workspace for each stream that it was used on.
+    """
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
+        self._side = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
 
     def warm_up(self, work: Work) -> None:
-        """Run ``work`` before its capture, on a side stream.
+        """Run ``work`` before its capture, on the side stream.
 
         Autograd nodes that it creates must not refer to the default stream.
         """
         present = torch.cuda.current_stream(self.device)
-        side = torch.cuda.Stream(self.device)  # type: ignore[no-untyped-call]
-        side.wait_stream(present)
-        with torch.cuda.stream(side):
-            work()
-        present.wait_stream(side)
-
-    def capture(self, work: Work) -> torch.cuda.CUDAGraph:
-        """A graph of ``work``, with a memory pool of its own; capturing does not run it."""
-        before = torch.cuda.current_stream(self.device)
-        graph = torch.cuda.CUDAGraph()
+        self._side.wait_stream(present)
         try:
-            with torch.cuda.device(self.device), torch.cuda.graph(graph):
+            with torch.cuda.stream(self._side):
                 work()
         finally:
-            # After a failed capture torch leaves the capturing stream current.
+            present.wait_stream(self._side)
+
+    def capture(self, work: Work) -> torch.cuda.CUDAGraph:
+        """A graph of ``work``, with a memory pool of its own; capturing does not run it.
+
+        Other threads may use the device meanwhile.
+        """
+        before = torch.cuda.current_stream(self.device)
+        graph, pool = torch.cuda.CUDAGraph(), torch.cuda.graph_pool_handle()
+        captured = False
+        try:
+            with (
+                torch.cuda.device(self.device),
+                torch.cuda.graph(
+                    graph, pool=pool, stream=self._side, capture_error_mode="thread_local"
+                ),
+            ):
+                work()
+            captured = True
+        finally:
+            # After a failed capture torch leaves the capturing stream current, and its allocator
+            # filling the graph's pool.
             torch.cuda.set_stream(before)
+            if not captured:
+                self._leave(pool)
         return graph
+
+    def _leave(self, pool: Any) -> None:
+        """Let the allocator return to its usual pool; without effect if it already has."""
+        with suppress(RuntimeError):
+            torch._C._cuda_endAllocateToPool(self.device.index or 0, pool)
 
 
 class GraphedStep:
@@ -80,6 +104,11 @@ class GraphedStep:
         """Whether the last warm-up call has just been made: the next call captures."""
         return self._calls == self.WARM_UP
 
+    @property
+    def has_captured(self) -> bool:
+        """Whether the last call has just captured the graph that it replayed."""
+        return self._graph is not None and self._calls == self.WARM_UP + 1
+
     def __call__(self) -> None:
         """Run the work once."""
         self._calls += 1
@@ -98,5 +127,11 @@ class GraphedStep:
             self._graph = capturer.capture(self._work)
         except Exception as error:
             self._capturer, self.failed = None, True
-            reason = f"{type(error).__name__}: {error}".splitlines()[0]
-            log.warning("graphs: iterations are done one by one, not replayed (%s)", reason)
+            log.warning("graphs: iterations are done one by one, not replayed (%s)", _cause(error))
+
+
+def _cause(error: BaseException) -> str:
+    """What came first, in one line: ending an invalid capture raises an error of its own."""
+    while error.__context__ is not None:
+        error = error.__context__
+    return f"{type(error).__name__}: {error}".splitlines()[0]

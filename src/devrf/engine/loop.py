@@ -39,6 +39,9 @@ class Loop:
         batches: the batches of an iteration; empty before :meth:`bind`.
         micro_batching: divides batches when memory runs out.
         metrics: losses and their terms since they were last taken.
+        num_captures: how many CUDA graphs have been captured.
+        num_short_lists: how often a list of samples was found to have been too short, so that a
+            batch's last rays had lost theirs.
     """
 
     def __init__(self, graphs: Graphs = "auto") -> None:
@@ -46,10 +49,12 @@ class Loop:
         self.batches: list[ParallelBatch] = []
         self.micro_batching = MicroBatching()
         self.metrics = MetricAccumulator()
+        self.num_captures = self.num_short_lists = 0
         self._rays = 0
         self._device = torch.device("cpu")
         self._streams = StreamParallel()
         self._graphed: GraphedStep | None = None
+        self._capture: CudaGraphCapture | None = None
 
     @property
     def capacities(self) -> list[SampleCapacity]:
@@ -115,8 +120,10 @@ class Loop:
 
     def poll(self) -> None:
         """Adapt the capacities to the sample counts that have reached the host."""
+        before = sum(capacity.num_short for capacity in self.capacities)
         if any([capacity.poll() for capacity in self.capacities]):  # a list: poll all of them
             self.recapture()  # it has the former lengths
+        self.num_short_lists += sum(capacity.num_short for capacity in self.capacities) - before
 
     def _make_capacities(self) -> None:
         rays = -(-rays_per_rank(self._rays) // self.micro_batching.count)
@@ -176,6 +183,8 @@ class Loop:
         # A profiler cannot attribute a replayed graph to parts.
         with stage.optimizer.stepping_by(work if measured() else graphed):
             optimizer.step()
+        if graphed.has_captured:
+            self.num_captures += 1
         if graphed.is_warm:
             for capacity in self.capacities:
                 capacity.measure()
@@ -184,5 +193,8 @@ class Loop:
 
     def _capturer(self) -> CudaGraphCapture | None:
         """Captures iterations; None unless there is exactly one process, on a GPU."""
-        possible = self.graphs == "auto" and self._device.type == "cuda" and world_size() == 1
-        return CudaGraphCapture(self._device) if possible else None
+        if self.graphs != "auto" or self._device.type != "cuda" or world_size() > 1:
+            return None
+        if self._capture is None or self._capture.device != self._device:
+            self._capture = CudaGraphCapture(self._device)
+        return self._capture

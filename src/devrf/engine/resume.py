@@ -55,7 +55,7 @@ def save(stage: ScheduledStage, checkpoint: dict[str, Any]) -> None:
     # Without the optimiser's state a checkpoint is for rendering, not for resuming.
     if "optimizer_states" not in checkpoint:
         if stage.iteration >= stage.total_iterations:
-            compact = stage.current_model().stored_state()
+            compact = stage.finished_state()
             checkpoint["state_dict"] = {f"{MODEL}{k}": v for k, v in compact.items()}
         return
     checkpoint["progress"] = {

@@ -19,7 +19,7 @@ from lightning import LightningModule
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
 
-from devrf.checkpoints.checkpoint import CheckpointMetadata
+from devrf.checkpoints.checkpoint import CheckpointMetadata, TrainingFigures
 from devrf.checkpoints.progress import set_rng_state
 from devrf.data.batch import Pixels
 from devrf.engine import resume
@@ -83,8 +83,8 @@ class ScheduledStage(LightningModule, ABC):
         self.iteration = 0
         self.skipped = 0
         self.phase: Phase | None = None
-        self.record: dict[str, float | None] = {}
-        self.earlier_records: dict[str, dict[str, float | None]] = {}
+        self.record: TrainingFigures = {}
+        self.earlier_records: dict[str, TrainingFigures] = {}
         self.generator = torch.Generator()
         self.seed = 0
         self.training_config: dict[str, Any] = {}
@@ -95,6 +95,7 @@ class ScheduledStage(LightningModule, ABC):
         self.lr_scale = 1.0
         self.abort_reason: str | None = None
         self._progress: dict[str, Any] | None = None
+        self._finished: dict[str, Any] | None = None
 
     # What a subclass defines.
 
@@ -247,6 +248,7 @@ class ScheduledStage(LightningModule, ABC):
 
     def on_fit_start(self) -> None:
         """Give every process the same tensors."""
+        self._finished = None
         broadcast([*self.parameters(), *self.buffers()])
 
     def on_train_start(self) -> None:
@@ -313,6 +315,15 @@ class ScheduledStage(LightningModule, ABC):
         """Seed the generator for the next step, differently in each process."""
         mixed = np.random.SeedSequence([self.seed, rank(), self.iteration, self.num_rollbacks])
         self.generator.manual_seed(int(mixed.generate_state(1, np.uint64)[0]))
+
+    def on_train_end(self) -> None:
+        """Pack what was learned while it is on its GPU: Lightning moves the stage to the host."""
+        if self.device.type == "cuda" and self.iteration >= self.total_iterations and rank() == 0:
+            self._finished = self.current_model().stored_state()
+
+    def finished_state(self) -> dict[str, Any]:
+        """The model's state for the finished stage's checkpoint."""
+        return self._finished or self.current_model().stored_state()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add the state that is not in tensors."""

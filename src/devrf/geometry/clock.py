@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -64,8 +65,38 @@ class FrameClock:
             return Moment(frame, frame, 0.0)
         return Moment(frame, frame + 1, (time - before) / (self.times[frame + 1] - before))
 
+    def knows(self, time: float) -> bool:
+        """Whether ``time`` is that of a frame."""
+        return abs(self.times[self.at(time).before] - time) <= self.TOLERANCE
+
     def frames_of(self, times: Tensor) -> Tensor:
         """The nearest frame of each time: int64, the shape of ``times``."""
         clock = torch.tensor(self.times, dtype=torch.float64, device=times.device)
         middles = (clock[1:] + clock[:-1]) / 2
         return torch.searchsorted(middles, times.double().contiguous())
+
+    def between(self, times: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """As :meth:`at`, of many times, without waiting for a device.
+
+        Args:
+            times: (...,) of any shape.
+
+        Returns:
+            The frames before and after each time, int64, and the share of the one after, all of
+            the shape of ``times``.
+        """
+        clock = _kept(self.times, times.dtype, times.device)
+        after = torch.searchsorted(clock, times.contiguous() - self.TOLERANCE)
+        after = after.clamp(max=len(self) - 1)
+        on_frame = (clock[after] - times).abs() <= self.TOLERANCE
+        before = torch.where(on_frame | (times > clock[-1]), after, (after - 1).clamp(min=0))
+        gap = clock[after] - clock[before]
+        alone = gap <= 0
+        return before, after, torch.where(alone, 0, (times - clock[before]) / gap.where(~alone, 1))
+
+
+@lru_cache(maxsize=64)
+def _kept(times: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    # A tensor made in inference mode could not be used for training later.
+    with torch.inference_mode(False):
+        return torch.tensor(times, dtype=dtype, device=device)

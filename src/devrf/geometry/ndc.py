@@ -16,6 +16,10 @@ from torch import Tensor
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
 
+# What is exactly at z' = 1 counts as so much nearer, two million near planes away: at infinity its
+# pixel would be no number, and so would all that is learned from it.
+BEFORE_INFINITY = 1e-6
+
 
 @dataclass(frozen=True)
 class NormalizedDevice:
@@ -51,10 +55,14 @@ class NormalizedDevice:
         return torch.stack([-sx * x / z, -sy * y / z, 1 + 2 * self.near / z], dim=-1)
 
     def to_world(self, points: Tensor) -> Tensor:
-        """World points (..., 3) of NDC (..., 3) with z' < 1: the inverse of :meth:`from_world`."""
+        """World points (..., 3) of NDC (..., 3) with z' < 1: the inverse of :meth:`from_world`.
+
+        What is at infinity comes out far away, at a finite distance.
+        """
         sx, sy = self._slopes
         x, y, z = points.unbind(-1)
-        depth = 2 * self.near / (z - 1)
+        gap = z - 1
+        depth = 2 * self.near / torch.where(gap == 0, -BEFORE_INFINITY, gap)
         return torch.stack([-x * depth / sx, -y * depth / sy, depth], dim=-1)
 
     def rays(self, rays: Rays) -> Rays:

@@ -8,9 +8,10 @@ stills, evaluation) asks for :meth:`DynamicModel.at` alone.
 
 from __future__ import annotations
 
+import fnmatch
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
@@ -19,9 +20,10 @@ from devrf.data.batch import RayBatch
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.space import Space
+from devrf.methods.protocol import ProtocolStage
 from devrf.rendering.output import RenderOutput
 from devrf.rendering.view import View
-from devrf.scenes.scene import Scene
+from devrf.scenes.scene import Scene, Views
 
 
 class DynamicModel(nn.Module, ABC):
@@ -30,6 +32,9 @@ class DynamicModel(nn.Module, ABC):
     Attributes:
         name: the method's name: what ``method=`` chooses, and tables say.
         losses: the names of its loss terms.
+        protocols: the names of the protocols that it learns by; None: every one.
+        priors: what it wants of a scene beside images and backward flow, where it can be had:
+            ``forward_flow``.
         box: what holds the scene, in the space of the fields.
         space: the space that the fields live in: world units, or NDC.
         depth_limits: distances along a ray before and behind which nothing is sampled, in the
@@ -38,6 +43,8 @@ class DynamicModel(nn.Module, ABC):
 
     name: ClassVar[str]
     losses: ClassVar[tuple[str, ...]] = ("color",)
+    protocols: ClassVar[tuple[str, ...] | None] = None
+    priors: ClassVar[tuple[str, ...]] = ()
     box: Box
     space: Space
     depth_limits: tuple[float, float]
@@ -54,6 +61,18 @@ class DynamicModel(nn.Module, ABC):
         """The module that :meth:`config` described, with other values in it."""
         return cls(**config)
 
+    def check_protocol(self, protocol: str) -> None:
+        """Refuse a protocol that the method cannot learn by.
+
+        Raises:
+            DevrfError: :attr:`protocols` does not name it.
+        """
+        if self.protocols is not None and protocol not in self.protocols:
+            known = " or ".join(f"protocol={name}" for name in self.protocols)
+            raise DevrfError(
+                f"protocol: method={self.name} does not learn by protocol={protocol}; give {known}"
+            )
+
     def setup(self, scene: Scene) -> None:
         """Take from a scene what the method needs: bounds, the frames' times, priors.
 
@@ -62,6 +81,23 @@ class DynamicModel(nn.Module, ABC):
         Raises:
             DevrfError: the scene lacks what the method needs.
         """
+
+    def learn_from(self, views: Sequence[Views], terms: Collection[str]) -> None:
+        """Look at the images whose rays will be rendered; called when a stage begins or goes on.
+
+        Args:
+            views: on the model's device; :attr:`devrf.data.batch.RayBatch.image` numbers their
+                images through, in this order.
+            terms: the loss terms that count.
+        """
+
+    def further_pixels(self, generator: torch.Generator) -> tuple[Tensor, Tensor] | None:
+        """Pixels that the next batch has beside those drawn from all images; None: none.
+
+        Returns:
+            image (K,), numbered as for :meth:`learn_from`, and row-major number (K,), int64.
+        """
+        return None
 
     @abstractmethod
     def forward(self, batch: RayBatch) -> RenderOutput:
@@ -101,17 +137,26 @@ class DynamicModel(nn.Module, ABC):
     def freeze(self, parts: Sequence[str]) -> None:
         """Keep some parts as they are, and let the others learn.
 
+        Args:
+            parts: their names; ``canonical*`` is every part whose name begins so.
+
         Raises:
             DevrfError: the method has no such part.
         """
-        own = self.parts()
+        own, kept = self.parts(), set[str]()
         for name in parts:
-            if name not in own:
+            matching = fnmatch.filter(own, name)
+            if not matching:
                 known = ", ".join(own)
                 raise DevrfError(f"protocol: {self.name} has no part {name!r}; it has {known}")
+            kept |= set(matching)
         for name, parameters in own.items():
             for parameter in parameters:
-                parameter.requires_grad_(name not in parts)
+                parameter.requires_grad_(name not in kept)
+
+    def follow(self, step: ProtocolStage) -> None:
+        """Called when a stage of a protocol begins: keeps its frozen parts as they are."""
+        self.freeze(step.frozen)
 
     def on_iteration(self, step: int, total: int) -> None:
         """Called before iteration ``step`` of ``total``: for encoding windows and curricula."""
@@ -124,6 +169,10 @@ class DynamicModel(nn.Module, ABC):
             time: in [0, 1].
             half: let networks work in half precision where device and method can.
         """
+
+    def to_view(self, device: torch.device) -> Self:
+        """The model on ``device``, to be looked at; what only some times need may come later."""
+        return self.to(device)
 
     @property
     def device(self) -> torch.device:

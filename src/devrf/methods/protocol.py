@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 
 from devrf.errors import DevrfError
@@ -19,7 +19,8 @@ class ProtocolStage:
         name: of the stage, its checkpoint, and ``stage=``.
         capture: the part of the scene that is learned from.
         iterations: share of the method's iterations, in (0, 1].
-        frozen: parts of the method that stay as they are.
+        frozen: parts of the method that stay as they are; ``canonical*`` is every part whose name
+            begins so.
         builds_on: the stage whose result is taken up; None begins afresh.
     """
 
@@ -50,11 +51,15 @@ class Protocol:
         stages: settings of each :class:`ProtocolStage` by its name, in their order.
         static_share: share of static rays in each batch of a stage that learns from both
             captures.
+        freeze: what of the stages' ``frozen`` holds: ``true``, as they say; ``false``, nothing is
+            frozen; ``all``, their parts with all that enters these (of a method whose frozen part
+            has inputs that an earlier stage left shut, such as HyperNeRF).
     """
 
     name: str
     stages: Mapping[str, Any]
     static_share: float = 0.5
+    freeze: bool | Literal["all"] = True
     steps: tuple[ProtocolStage, ...] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -63,7 +68,10 @@ class Protocol:
                 f"protocol.static_share: expected between 0 and 1, not {self.static_share}"
             )
         try:
-            steps = tuple(ProtocolStage(name, **given) for name, given in self.stages.items())
+            steps = tuple(
+                self._frozen_as_asked(ProtocolStage(name, **given))
+                for name, given in self.stages.items()
+            )
         except TypeError as error:
             raise DevrfError(f"protocol.stages: {error}") from None
         names = [step.name for step in steps]
@@ -74,6 +82,11 @@ class Protocol:
                     f"{step.builds_on!r}"
                 )
         object.__setattr__(self, "steps", steps)
+
+    def _frozen_as_asked(self, step: ProtocolStage) -> ProtocolStage:
+        if self.freeze is True:
+            return step
+        return replace(step, frozen=[f"{part}*" for part in step.frozen] if self.freeze else ())
 
     def __getitem__(self, name: str) -> ProtocolStage:
         """The stage called ``name``.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
@@ -60,6 +60,8 @@ class RaySchedule:
         betas: of Adam.
         eps: of Adam.
         curriculum: share of a stage during which frames are added in the order of their times.
+        moments: times of a batch, for a method whose cost grows with them; of a batch of both
+            captures the static images' time is one of them. None: any number.
         iterations_per_step: optimiser iterations in one Lightning step.
     """
 
@@ -70,6 +72,7 @@ class RaySchedule:
     betas: Sequence[float] = (0.9, 0.999)
     eps: float = 1e-8
     curriculum: float = 0.0
+    moments: int | None = None
     iterations_per_step: int = 10
 
     def __post_init__(self) -> None:
@@ -78,6 +81,10 @@ class RaySchedule:
                 raise DevrfError(
                     f"ray_stage.schedule.{name}: expected at least 1, not {getattr(self, name)}"
                 )
+        if self.moments is not None and self.moments < 1:
+            raise DevrfError(
+                f"ray_stage.schedule.moments: expected at least 1, or null, not {self.moments}"
+            )
         if not 0 <= self.curriculum < 1:
             raise DevrfError(
                 f"ray_stage.schedule.curriculum: expected 0 or more, below 1, not {self.curriculum}"
@@ -163,10 +170,11 @@ class RayStage(ScheduledStage):
     def setup(self, stage: str) -> None:
         """Give the model what it needs of the scene, and make the optimiser."""
         super().setup(stage)
+        self.trainer.datamodule.provide(self.scene_model.priors)  # type: ignore[attr-defined]
         if not self._ready:
             self.scene_model.setup(self._scene_of_stage())
             self._ready = True
-        self.scene_model.freeze(self.step_of_protocol.frozen)
+        self.scene_model.follow(self.step_of_protocol)
         if self._optimizer is not None:
             return
         schedule, groups = self.schedule, self.scene_model.param_groups()
@@ -186,6 +194,7 @@ class RayStage(ScheduledStage):
         self.phase = phase
         views = [self._training_views(name) for name in self._captures]
         self.pools = [FramePool.of(one) for one in views]
+        self.scene_model.learn_from(views, self.weights)
         groups = self.optimizer.param_groups
         self.bind(self.schedule.rays, [[p for group in groups for p in group["params"]]])
 
@@ -206,7 +215,7 @@ class RayStage(ScheduledStage):
     def draw(self, batch: ParallelBatch) -> Pixels:
         """Random pixels: of the static images first, where both captures are learned from.
 
-        Images are numbered through, the static ones first.
+        Images are numbered through, the static ones first. Last are those the model asks for.
         """
         with span("batch"):
             rays = rays_per_rank(self.schedule.rays)
@@ -214,13 +223,21 @@ class RayStage(ScheduledStage):
             if len(self.pools) > 1:
                 counts = [round(rays * self.static_share), rays - round(rays * self.static_share)]
             images, flats, offset = [], [], 0
+            left = self.schedule.moments
             for pool, count in zip(self.pools, counts, strict=True):
-                image, flat = pool.draw(count, self._shown_frames(pool), self.generator)
+                shown = self._shown_frames(pool)
+                image, flat = pool.draw(count, shown, self.generator, moments=left)
                 images.append(image + offset)
                 flats.append(flat)
                 offset += pool.images
-            background = background_color(self.scene.background, rays, self.generator)
-            return Pixels(torch.cat(images), torch.cat(flats), background)
+                left = None if left is None else max(1, left - pool.frames)
+            further = self.scene_model.further_pixels(self.generator)
+            if further is not None:
+                images.append(further[0])
+                flats.append(further[1])
+            image = torch.cat(images)
+            background = background_color(self.scene.background, len(image), self.generator)
+            return Pixels(image, torch.cat(flats), background)
 
     def _shown_frames(self, pool: FramePool) -> int:
         """How many frames the curriculum shows by now."""
@@ -248,15 +265,14 @@ class RayStage(ScheduledStage):
         for one in views if isinstance(views, tuple) else (views,):
             own = (pixels.image >= offset) & (pixels.image < offset + len(one))
             place, background = own.nonzero()[:, 0], pixels.background
-            parts.append(
-                gather_batch(
-                    one,
-                    pixels.image[place] - offset,
-                    pixels.flat[place],
-                    background if background.dim() == 1 else background[place],
-                    space,
-                )
+            part = gather_batch(
+                one,
+                pixels.image[place] - offset,
+                pixels.flat[place],
+                background if background.dim() == 1 else background[place],
+                space,
             )
+            parts.append(replace(part, image=pixels.image[place]))
             offset += len(one)
         return parts[0] if len(parts) == 1 else concatenated(parts)
 
@@ -302,12 +318,28 @@ class FramePool:
         """How many frames there are."""
         return len(self.ends)
 
-    def draw(self, count: int, frames: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """``count`` pixels of the first so many ``frames``, with replacement: image and number."""
-        pool = self.pool
-        pick = torch.randint(
-            self.ends[frames - 1], (count,), device=pool.image.device, generator=generator
-        )
+    def draw(
+        self, count: int, frames: int, generator: torch.Generator, *, moments: int | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """``count`` pixels with replacement: image and number, (count,) int64 each.
+
+        Args:
+            count: how many.
+            frames: so many of the first frames are drawn from.
+            generator: of the random choice, on the pool's device.
+            moments: so many frames alone, as many pixels of each, frame after frame; None: all.
+        """
+        pool, device = self.pool, self.pool.image.device
+        if moments is None or moments >= frames:
+            last = self.ends[frames - 1]
+            pick = torch.randint(last, (count,), device=device, generator=generator)
+        else:
+            ends = torch.tensor((0, *self.ends), device=device)
+            chosen = torch.randperm(frames, device=device, generator=generator)[:moments]
+            frame = chosen[torch.arange(count, device=device) * moments // count]
+            size = ends[frame + 1] - ends[frame]
+            part = torch.rand(count, dtype=torch.float64, device=device, generator=generator)
+            pick = ends[frame] + (part * size).long()
         return pool.image[pick].long(), pool.flat[pick].long()
 
 

@@ -105,6 +105,21 @@ def sum_by_ray(values: Tensor, ray: Tensor, rays: int) -> Tensor:
     return values.new_zeros((rays, *values.shape[1:])).index_add(0, ray, values)
 
 
+def color_and_depth(
+    seen: Tensor, reached: Tensor, mass: Tensor, transmittance: Tensor, background: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Colour Σ w_i c_i + T_end · background (R, 3) and depth Σ w_i z_i / Σ w_i (R,) of rays.
+
+    Args:
+        seen: (R, 3) Σ w_i c_i.
+        reached: (R,) Σ w_i z_i.
+        mass: (R,) Σ w_i; where it is 0, so is the depth.
+        transmittance: (R,) T_end.
+        background: (3,) or (R, 3) RGB.
+    """
+    return seen + transmittance[:, None] * background, reached / mass.clamp(min=1e-6)
+
+
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, depth: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:

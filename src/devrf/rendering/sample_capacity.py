@@ -19,6 +19,7 @@ class SampleCapacity:
     Attributes:
         visible: length of the list of visible samples.
         significant: length of the list of those whose colour is needed; at most ``visible``.
+        num_short: how often a list was found to have been too short.
     """
 
     # Initial places for each ray.
@@ -26,7 +27,7 @@ class SampleCapacity:
     # A list that was too short gets SPARE times what was needed, and grows at least by GROWTH.
     SPARE, GROWTH = 1.25, 1.5
     # A list is shortened if it is this many times too long: fog clears during training.
-    WASTE = 4
+    WASTE = 1.5
     # Lengths are multiples of this.
     GRAIN = 256
 
@@ -38,7 +39,8 @@ class SampleCapacity:
         self._needed = torch.zeros(2, dtype=torch.int64, device=device)
         self._seen = torch.zeros(2, dtype=torch.int64, pin_memory=device.type == "cuda")
         self._under_way: torch.cuda.Event | None = None
-        self._asked = self._said = False
+        self._asked = False
+        self.num_short = 0
 
     def note(self, visible: Tensor, significant: Tensor) -> None:
         """Record on the device how many samples () a batch had."""
@@ -68,23 +70,25 @@ class SampleCapacity:
         visible, significant = self._seen.tolist()
         return self._fit(visible, significant, waste=self.WASTE)
 
-    def _fit(self, visible: int, significant: int, waste: int) -> bool:
+    def _fit(self, visible: int, significant: int, waste: float) -> bool:
         before = self.visible, self.significant
-        if (visible > self.visible or significant > self.significant) and not self._said:
-            self._said = True
-            log.info(
-                "a batch had %d samples, %d of them to be coloured, for %d and %d places: its "
-                "last rays lost theirs, and the lists grow",
-                *(visible, significant, *before),
-            )
+        if visible > self.visible or significant > self.significant:
+            if not self.num_short:
+                log.info(
+                    "a batch had %d samples, %d of them to be coloured, for %d and %d places: its "
+                    "last rays lost theirs, and the lists grow",
+                    *(visible, significant, *before),
+                )
+            self.num_short += 1
         self.visible = self._length(self.visible, visible, waste)
         self.significant = min(self._length(self.significant, significant, waste), self.visible)
         return before != (self.visible, self.significant)
 
-    def _length(self, length: int, needed: int, waste: int) -> int:
+    def _length(self, length: int, needed: int, waste: float) -> int:
         if needed > length:
             return _rounded(max(self.GROWTH * length, self.SPARE * needed))
-        return min(length, _rounded(waste * self.SPARE * needed))
+        fitting = _rounded(self.SPARE * needed)
+        return fitting if length > waste * fitting else length
 
 
 def _rounded(places: float) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-from devrf.reporting.table import COLUMNS, Block, Table
+from devrf.reporting.table import Block, Table
 from devrf.reporting.text import Style, caption, credit, printed, reasons
 
 SIDE_BY_SIDE = 3
@@ -58,12 +58,12 @@ def latex(table: Table) -> str:
 def _tables(table: Table, blocks: Sequence[Block], words: str) -> str:
     frame = printed(table, blocks, STYLE)
     width = len(frame.columns)
-    left = "l" * (width - len(COLUMNS) * len(blocks))
+    left = "l" * (width - len(table.columns) * len(blocks))
     style = frame.style.hide(axis="index").set_table_styles(
         [{"selector": command, "props": options} for command, options in COMMANDS.items()]
     )
     text = style.to_latex(
-        column_format="|".join([left, *["c" * len(COLUMNS)] * len(blocks)]),
+        column_format="|".join([left, *["c" * len(table.columns)] * len(blocks)]),
         multicol_align="c|",
         environment="table*",
         position="t",

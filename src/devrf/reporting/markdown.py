@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 
-from devrf.reporting.table import COLUMNS, Block, Table
+from devrf.reporting.table import Block, Table
 from devrf.reporting.text import Style, caption, credit, printed, reasons
 
 
@@ -18,8 +18,10 @@ MARKDOWN = Style(escaped, ("{}", "**{}**", "<ins>{}</ins>", "*{}*"), "*{}*")
 PLAIN = Style(str, ("{} ", "{}¹", "{}²", "{}³"))
 
 
-def markdown(table: Table, figures: Mapping[str, str]) -> str:
-    """The whole report, with links to ``figures``, by what they show."""
+def markdown(
+    table: Table, figures: Mapping[str, str], films: Mapping[str, str] | None = None
+) -> str:
+    """The whole report, with links to ``figures`` and ``films``, by what they show."""
     found = table.found
     failed = f", {len(found.failures)} failed" if len(found.failures) else ""
     count = len(found.runs)
@@ -42,6 +44,9 @@ def markdown(table: Table, figures: Mapping[str, str]) -> str:
     if figures:
         parts.append("## Plots")
         parts += [f"![{escaped(shows)}](<{link}>)" for shows, link in figures.items()]
+    if films:
+        parts.append("## Videos")
+        parts.append("\n".join(f"- [{escaped(show)}](<{link}>)" for show, link in films.items()))
     return "\n\n".join(filter(None, parts)) + "\n"
 
 
@@ -54,14 +59,15 @@ def plain(table: Table) -> str:
 
 def _block(table: Table, block: Block) -> str:
     frame = printed(table, [block], MARKDOWN).droplevel(0, axis=1)
-    left = len(frame.columns) - len(COLUMNS)
-    align = ["left"] * left + ["right"] * len(COLUMNS)
+    left = len(frame.columns) - len(table.columns)
+    align = ["left"] * left + ["right"] * len(table.columns)
     return str(frame.to_markdown(index=False, disable_numparse=True, colalign=align))
 
 
 def _plain_block(table: Table, block: Block) -> str:
     frame = printed(table, [block], PLAIN).droplevel(0, axis=1)
-    heads, cells = frame.iloc[:, : -len(COLUMNS)], frame.iloc[:, -len(COLUMNS) :]
+    count = len(table.columns)
+    heads, cells = frame.iloc[:, :-count], frame.iloc[:, -count:]
     heads = heads.apply(lambda column: column.str.ljust(column.str.len().max()))
     cells.index = heads.agg("  ".join, axis=1)
     cells.columns = [f"{heading} " for heading in cells.columns]

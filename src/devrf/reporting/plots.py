@@ -77,9 +77,14 @@ def plots(table: Table) -> list[Plot]:
         ("metrics_against_views", "Metrics against dynamic training views", against_views(table)),
     ]
     for scene in table.runs["scene"].unique():
-        name = re.sub(r"[^\w.-]+", "_", f"psnr_over_time_{scene}")
+        name = file_name(f"psnr_over_time_{scene}")
         found.append((name, f"{scene}: PSNR over time", psnr_over_time(table, scene)))
     return [Plot(name, shows, figure) for name, shows, figure in found if figure is not None]
+
+
+def file_name(text: str) -> str:
+    """Text as the name of a file, without what a file system or a link may refuse."""
+    return re.sub(r"[^\w.-]+", "_", text)
 
 
 @mpl.rc_context(STYLE)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import pandas as pd
@@ -52,6 +53,11 @@ GPU = Column("GPU (GB)", "peak_gpu_gb", False, 1, True, "no run is known to have
 TIME = Column("Time", "train_seconds", False, None, True)
 COLUMNS = (PSNR, SSIM, LPIPS, GPU, TIME)
 TITLES = [column.title for column in COLUMNS]
+# Shown where a run was scored at times that no training view has; the paper has no such columns.
+OF_TIMES = (
+    Column("PSNR at training times", "dynamic.training_times.psnr", True, 2),
+    Column("PSNR at novel times", "dynamic.novel_times.psnr", True, 2),
+)
 # How a time below so many seconds is written: the unit's seconds, digits, the unit.
 TIMES = (
     (9.95, 1, 1, " s"),
@@ -67,7 +73,7 @@ class Block:
 
     Both frames are indexed by label. Their columns have two levels: ``head`` has ``name``,
     ``protocol`` and ``counts`` (a set of numbers of runs averaged); ``value`` (NaN where unknown),
-    ``text`` and ``rank`` (1, 2, 3 for the best, else 0) have every title.
+    ``text`` and ``rank`` (1, 2, 3 for the best, else 0) have the title of each column.
 
     Attributes:
         title: the scene's name, or what was averaged.
@@ -86,15 +92,18 @@ class Table:
 
     Attributes:
         found: the runs and failures that it is about.
+        columns: those of its rows.
         runs: the runs whose dynamic capture was scored, or of a scene at rest the static one;
             labelled.
         rows: means over runs, indexed by scene and label: ``name``, ``protocol``, ``line``,
-            ``views``, ``count`` and every title; NaN unless all runs of the row have the value.
+            ``views``, ``count`` and each column's title; NaN unless all runs of the row have the
+            value.
         blocks: one for each scene, then the average if there is more than one.
         notes: remarks on columns and rows, a sentence each.
     """
 
     found: Collection
+    columns: tuple[Column, ...]
     runs: pd.DataFrame
     rows: pd.DataFrame
     blocks: tuple[Block, ...]
@@ -117,13 +126,15 @@ def tabulate(found: Collection, published_scenes: PublishedScenes = "matching") 
     scored = _values(found.runs, PSNR).notna()
     again = _scored_again(found.runs[scored])
     runs = labelled(found.runs[scored].drop(index=again.index))
-    for column in COLUMNS:
+    columns = _columns(runs)
+    titles = [column.title for column in columns]
+    for column in columns:
         runs[column.title] = _values(runs, column)
     groups = runs.groupby(["scene", "label"], sort=False)
     heads = groups[["name", "protocol", "line", "views"]].first().assign(count=groups.size())
-    complete = groups[TITLES].count().eq(heads["count"], axis=0)
-    rows = heads.join(groups[TITLES].mean().where(complete))
-    spread = groups[TITLES].std().where(complete)
+    complete = groups[titles].count().eq(heads["count"], axis=0)
+    rows = heads.join(groups[titles].mean().where(complete))
+    spread = groups[titles].std().where(complete)
 
     ours, known = list(runs["scene"].unique()), list(published().tables)
     beside = {"none": [], "all": known, "matching": [scene for scene in ours if scene in known]}
@@ -133,15 +144,24 @@ def tabulate(found: Collection, published_scenes: PublishedScenes = "matching") 
         measured = _cells(
             _of(rows, [scene]).assign(counts=lambda found: found["count"].map(lambda n: {n})),
             _of(spread, [scene]),
+            columns,
             runs.loc[runs["scene"] == scene, "run.device"],
         )
-        blocks.append(Block(scene, measured, _published([scene], theirs)))
+        blocks.append(Block(scene, measured, _published([scene], theirs, columns)))
     if len(ours) > 1:
         title = f"average over {len(ours)} scenes"
-        average = Block(title, _average(runs, rows, ours), _published(ours, theirs))
+        average = Block(
+            title, _average(runs, rows, ours, columns), _published(ours, theirs, columns)
+        )
         blocks += [average] if len(average.measured) else []
     notes = _notes(runs, found.runs.loc[~scored, "folder"], again)
-    return Table(found, runs, rows, tuple(blocks), tuple(notes))
+    return Table(found, columns, runs, rows, tuple(blocks), tuple(notes))
+
+
+def _columns(runs: pd.DataFrame) -> tuple[Column, ...]:
+    """The paper's columns, and those of training and novel times that a run has."""
+    known = [one for one in OF_TIMES if one.key in runs and _values(runs, one).notna().any()]
+    return (*COLUMNS[:1], *known, *COLUMNS[1:])
 
 
 def _values(runs: pd.DataFrame, column: Column) -> pd.Series:
@@ -183,42 +203,53 @@ def _of(frame: pd.DataFrame, scenes: list[str]) -> pd.DataFrame:
     return frame[frame.index.get_level_values("scene").isin(scenes)].droplevel("scene")
 
 
-def _cells(rows: pd.DataFrame, spread: pd.DataFrame, devices: pd.Series | None) -> pd.DataFrame:
+def _cells(
+    rows: pd.DataFrame,
+    spread: pd.DataFrame,
+    columns: Sequence[Column],
+    devices: pd.Series | None,
+) -> pd.DataFrame:
     """Rows as a block holds them, with their standard deviations (or NaN).
 
     Memory and time are ranked only if all ``devices`` agree; nothing is without devices.
     """
-    texts, ranks = rows[TITLES].astype(object), pd.DataFrame(0, rows.index, TITLES)
-    for column in COLUMNS:
+    titles = [column.title for column in columns]
+    texts, ranks = rows[titles].astype(object), pd.DataFrame(0, rows.index, titles)
+    for column in columns:
         both = zip(rows[column.title], spread[column.title], strict=True)
         texts[column.title] = [shown(value, column, deviation) for value, deviation in both]
         if devices is not None and (devices.nunique(dropna=False) == 1 or not column.of_hardware):
             ranks[column.title] = ranked(rows[column.title], column)
     heads = rows[["name", "protocol", "counts"]]
-    parts = {"head": heads, "value": rows[TITLES], "text": texts, "rank": ranks}
+    parts = {"head": heads, "value": rows[titles], "text": texts, "rank": ranks}
     return pd.concat(parts, axis=1)
 
 
-def _average(runs: pd.DataFrame, rows: pd.DataFrame, scenes: list[str]) -> pd.DataFrame:
+def _average(
+    runs: pd.DataFrame, rows: pd.DataFrame, scenes: list[str], columns: Sequence[Column]
+) -> pd.DataFrame:
     """Means over all scenes of the configurations that were run on all of them.
 
     Without a spread: the difference between scenes is no uncertainty of a measurement.
     """
-    groups = rows.groupby("label", sort=False)
-    means = _over_scenes(rows[TITLES], scenes).join(groups[["name", "protocol"]].first())
+    groups, titles = rows.groupby("label", sort=False), [column.title for column in columns]
+    means = _over_scenes(rows[titles], scenes).join(groups[["name", "protocol"]].first())
     means = means.assign(counts=groups["count"].agg(set))[groups.size() == len(scenes)]
     devices = runs.loc[runs["label"].isin(means.index), "run.device"]
-    return _cells(means, means[TITLES] * math.nan, devices)
+    return _cells(means, means[titles] * math.nan, columns, devices)
 
 
-def _published(scenes: list[str], theirs: list[str]) -> pd.DataFrame:
+def _published(scenes: list[str], theirs: list[str], columns: Sequence[Column]) -> pd.DataFrame:
     """The paper's rows of a scene, or their means over several; none unless it has them all."""
     asked = scenes if set(scenes) <= set(theirs) else []
     values = _over_scenes(_of(published().values, asked), scenes).dropna()
+    values = values.reindex(columns=[column.title for column in columns])
     rows = values.assign(name=values.index, protocol="", counts=[{1} for _ in values.index])
-    cells = _cells(rows, values * math.nan, devices=None)
+    cells = _cells(rows, values * math.nan, columns, devices=None)
     if len(scenes) == 1:
-        cells["text"] = _of(published().texts[TITLES], asked)
+        cells["text"] = _of(published().texts[TITLES], asked).reindex(
+            columns=values.columns, fill_value=UNKNOWN
+        )
     return cells
 
 

@@ -9,7 +9,7 @@ import pandas as pd
 
 from devrf.reporting.published import published
 from devrf.reporting.runs import Collection
-from devrf.reporting.table import COLUMNS, Block, Table
+from devrf.reporting.table import Block, Column, Table
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ def _rows(
     table: Table, blocks: Sequence[Block], frames: Sequence[pd.DataFrame], style: Style, label: str
 ) -> pd.DataFrame:
     """A row for each label of any frame."""
-    cells = [_marked(frame, style) for frame in frames]
+    cells = [_marked(frame, style, table.columns) for frame in frames]
     titles = [style.escape(block.title) for block in blocks]
     found = pd.concat(cells, axis=1, keys=titles, sort=False)
     heads = pd.concat([frame["head"] for frame in frames]).groupby(level=0)
@@ -60,17 +60,17 @@ def _rows(
     return pd.concat([pd.DataFrame(lead).reindex(found.index), found], axis=1)
 
 
-def _marked(frame: pd.DataFrame, style: Style) -> pd.DataFrame:
+def _marked(frame: pd.DataFrame, style: Style, columns: Sequence[Column]) -> pd.DataFrame:
     def mark(rank: int, text: str) -> str:
         return style.marks[rank].format(style.escape(text))
 
-    columns = {
+    cells = {
         style.escape(column.heading): list(
             map(mark, frame["rank", column.title], frame["text", column.title])
         )
-        for column in COLUMNS
+        for column in columns
     }
-    return pd.DataFrame(columns, index=frame.index, dtype=object)
+    return pd.DataFrame(cells, index=frame.index, dtype=object)
 
 
 def _repeats(counts: set[int]) -> str:

@@ -1,4 +1,4 @@
-"""The report's files: collected, tabulated, plotted and written into one folder."""
+"""The report's files: collected, tabulated, plotted, filmed and written into one folder."""
 
 from __future__ import annotations
 
@@ -7,14 +7,19 @@ from pathlib import Path
 
 import pandas as pd
 
+from devrf.artifacts.video_file import write_pictures
 from devrf.errors import DevrfError
+from devrf.reporting.film import scene_film
 from devrf.reporting.latex import latex
 from devrf.reporting.markdown import markdown, plain
-from devrf.reporting.plots import plots
+from devrf.reporting.plots import file_name, plots
 from devrf.reporting.runs import collect
 from devrf.reporting.settings import ReportSettings
 from devrf.reporting.table import Table, tabulate
 from devrf.system.files import atomic_write
+
+# Pictures a second of the videos that show rows side by side.
+FPS = 10
 
 
 @dataclass(frozen=True)
@@ -27,7 +32,7 @@ class Report:
 
 
 def write_report(settings: ReportSettings) -> Report:
-    """Write ``report.md``, ``report.csv``, ``report.tex`` and the plots.
+    """Write ``report.md``, ``report.csv``, ``report.tex``, the plots and the videos.
 
     Raises:
         DevrfError: no such folder, or nothing below it that a run left; nothing is written.
@@ -40,8 +45,8 @@ def write_report(settings: ReportSettings) -> Report:
             "that were scored (stage=pipeline or stage=evaluate)"
         )
     table = tabulate(found, settings.published)
-    figures = _write_plots(table, folder)
-    _write(folder / "report.md", markdown(table, figures))
+    figures, films = _write_plots(table, folder), _write_films(table, folder)
+    _write(folder / "report.md", markdown(table, figures, films))
     _write(folder / "report.tex", latex(table))
     _write(folder / "report.csv", csv(table))
     return Report(table, plain(table), folder / "report.md")
@@ -77,6 +82,18 @@ def _write_plots(table: Table, folder: Path) -> dict[str, str]:
             with atomic_write(folder / "figures" / f"{plot.name}{suffix}") as partial:
                 plot.figure.savefig(partial)
         links[plot.shows] = f"figures/{plot.name}.png"
+    return links
+
+
+def _write_films(table: Table, folder: Path) -> dict[str, str]:
+    """Write a video of all rows for each scene that has several; links as of the plots."""
+    links: dict[str, str] = {}
+    for scene in table.runs["scene"].unique():
+        pictures = scene_film(table, scene)
+        if pictures is not None:
+            name = f"{file_name(f'side_by_side_{scene}')}.mp4"
+            write_pictures(folder / "videos" / name, pictures, FPS)
+            links[f"{scene}: truth and renderings side by side"] = f"videos/{name}"
     return links
 
 

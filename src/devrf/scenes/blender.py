@@ -11,12 +11,12 @@ from pydantic.dataclasses import dataclass
 
 from devrf.scenes.absent_images import Missing
 from devrf.scenes.capture_folders import chosen_dynamic, dynamic_folders
-from devrf.scenes.flow_files import read_flow
+from devrf.scenes.flow_files import FlowDirection, read_flow
 from devrf.scenes.image_files import image_size
 from devrf.scenes.layout import Layout, fewer, load_layout, static_alone, without_static_set
 from devrf.scenes.paths import existing_folder, scene_folder
 from devrf.scenes.reader import Count, InwardReader, Time
-from devrf.scenes.scene import Scene, Views
+from devrf.scenes.scene import OpticalFlow, Scene, Views
 from devrf.scenes.splits import Split, at_rest, in_motion, one_moment, one_moment_in_words
 from devrf.scenes.transforms import Transforms, read_transforms
 from devrf.scenes.validation import scene_error
@@ -57,9 +57,18 @@ class BlenderReader(InwardReader):
         elif self.wants_flow_files and layout.dynamic_train.transforms.skipped:
             log.info("flow files dropped: they are numbered by images of which some are absent")
         elif self.wants_flow_files:
-            train = _with_flow(dynamic.train, layout.dynamic_train, flow_folder)
-            dynamic = replace(dynamic, train=train)
+            flow = _flow(dynamic.train, layout.dynamic_train, flow_folder, "bwd")
+            dynamic = replace(dynamic, train=replace(dynamic.train, flow=flow))
         return self.scene(folder, static, dynamic)
+
+    def forward_flow(self, views: Views) -> OpticalFlow | None:
+        """See :meth:`devrf.scenes.reader.SceneReader.forward_flow`."""
+        folder = scene_folder(self.root)
+        layout, flow_folder = _layout(folder, self.dynamic, self.static_until, self.missing)
+        layout, thinned = fewer(layout, self.train_views, self.frames)
+        if thinned or not layout.moves or layout.dynamic_train.transforms.skipped:
+            return None
+        return _flow(views, layout.dynamic_train, flow_folder, "fwd")
 
 
 def _layout(
@@ -99,17 +108,18 @@ def _train_and_test(folder: Path, root: Path, missing: Missing) -> tuple[Transfo
     return train, read_transforms(held_out, root, missing)
 
 
-def _with_flow(views: Views, split: Split, folder: Path) -> Views:
-    first = split.times.min()
+def _flow(views: Views, split: Split, folder: Path, direction: FlowDirection) -> OpticalFlow | None:
+    first, last = split.times.min(), split.times.max()
     if any(not known.distortion.none for known in split.transforms.intrinsics):
         log.warning("flow files in %s left out: they are of images before undistortion", folder)
-        return views
+        return None
     used = int(split.index[0])
-    flow = read_flow(
+    expected = views.times > first + 1e-6 if direction == "bwd" else views.times < last - 1e-6
+    return read_flow(
         folder,
         split.index.tolist(),
-        (views.times > first + 1e-6).tolist(),
+        expected.tolist(),
         image_size(split.transforms.images[used], split.transforms.intrinsics[used].size),
         (views.width, views.height),
+        direction,
     )
-    return replace(views, flow=flow)

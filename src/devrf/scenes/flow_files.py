@@ -1,4 +1,4 @@
-"""Optical flow from files: ``<index>_bwd.npz`` next to the images of a dynamic set."""
+"""Optical flow from files: ``<index>_bwd.npz``, ``<index>_fwd.npz`` next to a dynamic set."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +23,8 @@ from devrf.scenes.scene import OpticalFlow
 log = logging.getLogger(__name__)
 
 REMEDY = "compute the flow again, or set data.flow=none"
+# Backward or forward: what a file's name ends with.
+FlowDirection = Literal["bwd", "fwd"]
 # Bytes a pixel of vectors and mask once they are read.
 _BYTES = 9
 
@@ -29,7 +32,7 @@ _BYTES = 9
 def read_flow_file(
     path: Path, width: int, height: int
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
-    """One backward flow.
+    """One image's flow.
 
     Args:
         path: an npz with ``flow`` (H, W, 2), pixels, x then y, and ``mask`` (H, W).
@@ -62,15 +65,17 @@ def read_flow(
     expected: Sequence[bool],
     source_size: tuple[int, int],
     size: tuple[int, int],
+    direction: FlowDirection = "bwd",
 ) -> OpticalFlow | None:
-    """The backward flow of N images.
+    """The backward flow of N images, or the forward one.
 
     Args:
         folder: where the ``<index>_bwd.npz`` lie.
         index: N positions in the list of frames, which the files are numbered by.
-        expected: N flags: whether the image has an earlier frame, and so a file.
+        expected: N flags: whether the image has an earlier frame (a later one), and so a file.
         source_size: (width, height) of the images before downscaling.
         size: (width, height) after downscaling.
+        direction: ``fwd`` reads ``<index>_fwd.npz``.
 
     Returns:
         Flow in pixels of the smaller images, or None when not one expected file is there.
@@ -79,13 +84,13 @@ def read_flow(
         DevrfError: what :func:`read_flow_file` raises.
     """
     files = {
-        row: folder / f"{number:03d}_bwd.npz"
+        row: folder / f"{number:03d}_{direction}.npz"
         for row, (number, wanted) in enumerate(zip(index, expected, strict=True))
         if wanted
     }
     present = {row: path for row, path in files.items() if os.path.isfile(path)}
     if not present:
-        log.info("no optical flow: no NNN_bwd.npz in %s", folder)
+        log.info("no optical flow: no NNN_%s.npz in %s", direction, folder)
         return None
     if len(present) < len(files):
         log.warning(
@@ -100,7 +105,7 @@ def read_flow(
 def stacked_flow(
     files: Mapping[int, Path], count: int, source_size: tuple[int, int], size: tuple[int, int]
 ) -> OpticalFlow:
-    """The backward flow of ``count`` images; those without a file have none.
+    """The flow of ``count`` images; those without a file have none.
 
     Args:
         files: which image's flow is in which file; at least one.

@@ -44,14 +44,32 @@ def forward_bounds(everyone: list[Views], space: NormalizedDevice, source: str) 
     Raises:
         DevrfError: a camera sees something that is not before the reference camera.
     """
-    ends = torch.cat([_seen(views, space) for views in everyone])
+    return Bounds(
+        box_between(everyone, space), near=0.0, far=1.0, motion=None, scale=1.0, source=source
+    )
+
+
+def box_between(
+    everyone: list[Views], space: NormalizedDevice, front: float = -1.0, back: float = 1.0
+) -> Box:
+    """The box, in NDC, of what cameras see from one depth to another.
+
+    Args:
+        everyone: the views whose cameras count.
+        space: the scene's NDC.
+        front: z' of the nearest points, −1 at the near plane.
+        back: z' of the furthest points, 1 at infinity.
+
+    Raises:
+        DevrfError: a camera sees something that is not before the reference camera.
+    """
+    ends = torch.cat([_seen(views, space, (front, back)) for views in everyone])
     low, high = ends.amin(dim=0).tolist(), ends.amax(dim=0).tolist()
-    box = Box.of([low[0], low[1], -1.0], [high[0], high[1], 1.0])
-    return Bounds(box, near=0.0, far=1.0, motion=None, scale=1.0, source=source)
+    return Box.of([low[0], low[1], front], [high[0], high[1], back])
 
 
-def _seen(views: Views, space: NormalizedDevice) -> Tensor:
-    """NDC (8 · N, 3) where the rays through the corners of N images start and end."""
+def _seen(views: Views, space: NormalizedDevice, depths: tuple[float, float]) -> Tensor:
+    """NDC (8 · N, 3) of the rays through the corners of N images at two ``depths`` z'."""
     cameras = views.cameras
     edge = [(0, 0), (cameras.width, 0), (0, cameras.height), (cameras.width, cameras.height)]
     corners = torch.tensor(edge, dtype=cameras.focal.dtype).repeat(len(cameras), 1)
@@ -76,4 +94,4 @@ def _seen(views: Views, space: NormalizedDevice) -> Tensor:
             "normalised device coordinates to hold what it sees; correct its position, or leave "
             "the image out",
         )
-    return ends.flatten(0, 1)
+    return torch.cat([device.origins + (z + 1) / 2 * device.directions for z in depths])

@@ -16,7 +16,7 @@ from torch import Tensor
 from devrf.scenes.bounds import STILL
 from devrf.scenes.capture_folders import chosen_dynamic, dynamic_folders
 from devrf.scenes.downscale import Downscale, folder_factor
-from devrf.scenes.flow_files import stacked_flow
+from devrf.scenes.flow_files import FlowDirection, stacked_flow
 from devrf.scenes.forward_bounds import forward_bounds, reference_space
 from devrf.scenes.image_files import Size, image_size
 from devrf.scenes.image_folders import image_folder, listed_images
@@ -27,7 +27,7 @@ from devrf.scenes.llff_poses import POSES, PosedSet, read_dynamic_poses, read_st
 from devrf.scenes.llff_video import VIDEO, video_captures
 from devrf.scenes.paths import existing_folder, scene_folder
 from devrf.scenes.reader import Count, Holdout, SceneReader, Time
-from devrf.scenes.scene import Capture, Scene, Views
+from devrf.scenes.scene import Capture, OpticalFlow, Scene, Views
 from devrf.scenes.validation import scene_error
 from devrf.scenes.view_folders import ViewFolder, flow_files, view_folders
 
@@ -87,6 +87,19 @@ class LlffReader(SceneReader):
         _warn_of_cameras_beyond(self.near, learned + held_out)
         name = self.name_of(folder)
         return Scene(name, "forward", static, dynamic, bounds, self.background, space)
+
+    def forward_flow(self, views: Views) -> OpticalFlow | None:
+        """See :meth:`devrf.scenes.reader.SceneReader.forward_flow`."""
+        folder = scene_folder(self.root)
+        if not (dynamic_folders(folder) or self.dynamic):
+            return None
+        moving = chosen_dynamic(folder, self.dynamic)
+        folders = view_folders(moving, folder_factor(static_folder(folder), self.downscale))
+        if self.frames is not None and self.frames < len(folders[0].images):
+            return None
+        _, train = _chosen_views(moving, len(folders), self.test_view, self.train_views)
+        sizes = read_dynamic_poses(moving).last(len(folders)).sizes
+        return _flow(views, [folders[v] for v in train], sizes[train[0]], "fwd")
 
     def _captures(self, folder: Path) -> tuple[Capture, Capture]:
         """The static and the dynamic capture; of a scene at rest the same twice."""
@@ -185,7 +198,8 @@ def _dynamic(options: LlffReader, folder: Path, root: Path, downscale: int) -> C
     if options.wants_flow_files and len(kept) < total:
         log.info("flow files dropped: data.frames=%s leaves out neighbours", frames)
     elif options.wants_flow_files:
-        train_set = _with_flow(train_set, [views[v] for v in train], posed.sizes[train[0]])
+        flow = _flow(train_set, [views[v] for v in train], posed.sizes[train[0]], "bwd")
+        train_set = replace(train_set, flow=flow)
     return Capture(train_set, test_set)
 
 
@@ -233,14 +247,17 @@ def _moving(
     )
 
 
-def _with_flow(views: Views, folders: list[ViewFolder], camera: Size) -> Views:
-    files = flow_files(folders)
+def _flow(
+    views: Views, folders: list[ViewFolder], camera: Size, direction: FlowDirection
+) -> OpticalFlow | None:
+    files = flow_files(folders, direction)
     if not files:
-        log.info("no optical flow: no <frame>_bwd.npz in %s and its like", folders[0].flow)
-        return views
+        where = folders[0].flow
+        log.info("no optical flow: no <frame>_%s.npz in %s and its like", direction, where)
+        return None
     rows = {frame * len(folders) + view: path for (view, frame), path in sorted(files.items())}
     source = image_size(folders[0].images[0], camera)
-    return replace(views, flow=stacked_flow(rows, len(views), source, (views.width, views.height)))
+    return stacked_flow(rows, len(views), source, (views.width, views.height))
 
 
 def _names(images: list[Path], root: Path) -> tuple[str, ...]:

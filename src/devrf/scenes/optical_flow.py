@@ -29,7 +29,9 @@ CLOSED_SHARE = 0.05
 ALPHA_THRESHOLD = 127
 
 
-def estimate_flow(views: Views, method: FlowMethod, cache: Path | None = None) -> OpticalFlow:
+def estimate_flow(
+    views: Views, method: FlowMethod, cache: Path | None = None, *, forward: bool = False
+) -> OpticalFlow:
     """Backward optical flow of each image to the one a frame earlier in its view.
 
     A fixed camera's images follow one another by time; a moving camera's images (each its own
@@ -42,6 +44,7 @@ def estimate_flow(views: Views, method: FlowMethod, cache: Path | None = None) -
         method: "dis" (OpenCV, on the CPU) or "raft" (torchvision, on the GPU if there is one).
         cache: an npz to read the flow from, or to write it to; ignored and written again when
             it belongs to other images or is damaged.
+        forward: the same with frames swapped: to the image a frame later.
 
     Raises:
         DevrfError: an unknown method, its library or weights are missing, the images have no
@@ -59,7 +62,7 @@ def estimate_flow(views: Views, method: FlowMethod, cache: Path | None = None) -
             f"cannot be estimated between images of more than {LONGEST_SIDE} px a side; use a "
             "larger data.downscale, or set data.flow=none",
         )
-    key = content_key(views, method)
+    key = content_key(views, f"{method} forward" if forward else method)
     if cache is not None:
         stored = load_flow(cache, key, (len(views), views.height, views.width))
         if stored is not None:
@@ -69,14 +72,15 @@ def estimate_flow(views: Views, method: FlowMethod, cache: Path | None = None) -
     between = estimator(method)
     count = (len(views), views.height, views.width)
     flow = OpticalFlow(torch.zeros((*count, 2)), torch.zeros(count, dtype=torch.bool))
-    for done, (image, earlier) in enumerate(pairs):
-        now, before = _on_white(views.pixels[image]), _on_white(views.pixels[earlier])
-        backward, forward = between(now, before), between(before, now)
-        valid = consistent(backward, forward)
+    for done, pair in enumerate(pairs):
+        image, other = pair[::-1] if forward else pair
+        now, then = _on_white(views.pixels[image]), _on_white(views.pixels[other])
+        there, back = between(now, then), between(then, now)
+        valid = consistent(there, back)
         if views.has_alpha:
             valid &= views.pixels[image, ..., 3].cpu() > ALPHA_THRESHOLD
         flow.valid[image] = valid
-        flow.vectors[image] = backward * valid[..., None]
+        flow.vectors[image] = there * valid[..., None]
         if (done + 1) % 100 == 0:
             log.info("optical flow: %d of %d pairs", done + 1, len(pairs))
     log.info(

@@ -16,7 +16,7 @@ from devrf.scenes.absent_images import Missing
 from devrf.scenes.downscale import Downscale
 from devrf.scenes.inward_space import SpaceChoice, inward_space
 from devrf.scenes.json_files import Number
-from devrf.scenes.scene import Background, Capture, Scene
+from devrf.scenes.scene import Background, Capture, OpticalFlow, Scene, Views
 from devrf.scenes.validation import LARGEST, checked_box, first_error
 
 FlowSource = Literal["auto", "files", "dis", "raft", "none"]
@@ -85,6 +85,17 @@ class SceneReader(ABC):
         Raises:
             DevrfError: a file is wrong, or does not go with an option; the message names it.
         """
+
+    def forward_flow(self, views: Views) -> OpticalFlow | None:
+        """Forward flow from the scene's files; None where there are none, or no place for them.
+
+        Args:
+            views: the dynamic training views, as :meth:`read` gave them.
+
+        Raises:
+            DevrfError: a file is wrong; the message names it.
+        """
+        return None
 
     @property
     def wants_flow_files(self) -> bool:

@@ -21,7 +21,9 @@ CaptureName = Literal["static", "dynamic"]
 
 @dataclass(frozen=True)
 class OpticalFlow:
-    """Backward optical flow of N images: where each pixel was one frame earlier in its own view.
+    """Optical flow of N images: backward, where each pixel was one frame earlier in its own view.
+
+    Forward flow is the same of one frame later.
 
     Attributes:
         vectors: (N, H, W, 2) float32, pixels, x then y: (pixel one frame earlier) − (this pixel).
@@ -45,6 +47,7 @@ class Views:
             moving camera, the image's own number.
         names: N file names or labels, for messages and tables.
         flow: backward optical flow, or None where there is none.
+        forward_flow: forward optical flow; None where there is none, or no method asked for it.
         depth: (N, H, W) float32 distance along each pixel's ray in world units, +inf where the
             ray hits nothing; None where it is unknown.
         ambiguous_orientation: (N,) bool, files whose EXIF orientation says that they are to be seen
@@ -61,6 +64,7 @@ class Views:
     view: Tensor
     names: tuple[str, ...]
     flow: OpticalFlow | None = None
+    forward_flow: OpticalFlow | None = None
     depth: Tensor | None = None
     ambiguous_orientation: Tensor | None = None
     valid_mask: Tensor | None = None
@@ -106,14 +110,13 @@ class Views:
 
     def _mapped(self, change: Callable[[Any], Any]) -> Views:
         """The views with ``change`` made to all tensors and cameras."""
-        flow = self.flow
-        changed = {
-            field.name: change(getattr(self, field.name))
-            for field in fields(self)
-            if field.name not in ("names", "flow") and getattr(self, field.name) is not None
-        }
-        if flow is not None:
-            changed["flow"] = OpticalFlow(change(flow.vectors), change(flow.valid))
+        changed: dict[str, Any] = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, OpticalFlow):
+                changed[field.name] = OpticalFlow(change(value.vectors), change(value.valid))
+            elif value is not None and field.name != "names":
+                changed[field.name] = change(value)
         return replace(self, **changed)
 
 

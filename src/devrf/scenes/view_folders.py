@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from devrf.scenes.flow_files import FlowDirection
 from devrf.scenes.image_folders import image_folder, listed_images
 from devrf.scenes.paths import entries
 from devrf.scenes.validation import scene_error
@@ -18,7 +19,6 @@ log = logging.getLogger(__name__)
 _VIEW = re.compile(r"view([1-9]\d{0,5})")
 _FROM_ZERO = re.compile(r"view0\d*")
 _DIGITS = re.compile(r"\d+")
-_SUFFIX = "_bwd.npz"
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class ViewFolder:
     Attributes:
         images: T files in order of time.
         downscale: integer factor by which they are yet to be made smaller.
-        flow: the folder where backward flow of these files would lie.
+        flow: the folder where optical flow of these files would lie.
     """
 
     images: list[Path]
@@ -83,8 +83,12 @@ def view_folders(folder: Path, downscale: int) -> list[ViewFolder]:
     return views
 
 
-def flow_files(views: list[ViewFolder]) -> dict[tuple[int, int], Path]:
-    """Which file holds the backward flow of (view, frame); frame 0 has none.
+def flow_files(
+    views: list[ViewFolder], direction: FlowDirection = "bwd"
+) -> dict[tuple[int, int], Path]:
+    """Which file holds the backward flow of (view, frame), which frame 0 has not.
+
+    Forward flow is in ``<frame>_fwd.npz``, and the last frame has none.
 
     ``<frame>_bwd.npz`` may name a frame in three ways: by its image's name (``0007`` for
     ``0007.png``), by the last number in it (``7`` for ``img_0007.png``), or by its position,
@@ -95,13 +99,13 @@ def flow_files(views: list[ViewFolder]) -> dict[tuple[int, int], Path]:
         lambda position, image: _last_number(image.stem),
         lambda position, image: position,
     )
-    best: dict[tuple[int, int], Path] = {}
+    suffix, best = f"_{direction}.npz", dict[tuple[int, int], Path]()
     for way in ways:
         found: dict[tuple[int, int], Path] = {}
         for v, view in enumerate(views):
             named: dict[str | int | None, Path] = {}
             for path in entries(view.flow) if os.path.isdir(view.flow) else ():
-                name = path.name.removesuffix(_SUFFIX)
+                name = path.name.removesuffix(suffix)
                 if name == path.name or not os.path.isfile(path):
                     continue
                 named[name] = path
@@ -109,7 +113,8 @@ def flow_files(views: list[ViewFolder]) -> dict[tuple[int, int], Path]:
                     named[int(name)] = path
             for k, image in enumerate(view.images):
                 path_of = named.get(way(k, image))
-                if k > 0 and path_of is not None:
+                without = 0 if direction == "bwd" else len(view.images) - 1
+                if k != without and path_of is not None:
                     found[v, k] = path_of
         if len(found) > len(best):
             best = found

@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from devrf.errors import DevrfError
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
@@ -20,13 +21,13 @@ SPACE = NormalizedDevice(200, 100, (150.0, 120.0), near=1.0)
 @pytest.mark.parametrize(
     ("apart", "near", "planes"),
     [
-        (0.8, 1.0, 61),  # 150 · 0.8 / 1 = 120 pixels, 2 to each of 60 steps
-        (0.8, 0.5, 121),
+        (1.6, 1.0, 61),  # 150 · 1.6 / 1 = 240 pixels, 4 to each of 60 steps
+        (1.6, 0.5, 121),
         (0.01, 1.0, 32),  # hardly any parallax
         (50.0, 1.0, 256),
     ],
 )
-def test_planes_are_two_pixels_of_parallax_apart(apart: float, near: float, planes: int) -> None:
+def test_planes_are_four_pixels_of_parallax_apart(apart: float, near: float, planes: int) -> None:
     # The distance along the line of sight does not count.
     positions = torch.tensor([[0.0, 0, 0], [0.6 * apart, 0.8 * apart, 9.0], [0.1 * apart, 0, 0]])
     assert resolved_planes(positions, replace(SPACE, near=near)) == planes
@@ -62,3 +63,5 @@ def test_planes_are_told_by_the_scene_where_none_are_given(forward_scene: Scene)
 def test_a_scene_seen_from_all_around_keeps_its_numbers(tiny_scene: Scene) -> None:
     schedule = CanonicalSchedule(voxels_per_pixel=0.5)
     assert fitted_to(tiny_scene, schedule, Architecture()) == (schedule, Architecture())
+    with pytest.raises(DevrfError, match=r"field\.planes=7: planes are of forward-facing scenes"):
+        fitted_to(tiny_scene, schedule, Architecture(planes=7))

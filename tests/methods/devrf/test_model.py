@@ -127,3 +127,16 @@ def test_a_model_built_from_its_config_takes_its_state(model: DeVRFModel, space:
     rays = looking_down(31)
     for time in (0.0, 0.8):
         assert torch.equal(picture(other, rays, time).color, picture(model, rays, time).color)
+
+
+def test_to_be_viewed_frames_stay_where_they_are_until_they_are_looked_at(
+    model: DeVRFModel,
+) -> None:
+    assert model.deformation is not None
+    resting = model.deformation.to_canonical
+    before = model.deformation.warp(torch.full((1, 3), 0.1), 0.75)
+    moved = model.to_view(torch.device("cpu"))
+    moved.to(torch.float64)  # as another device would: everything but the frames follows
+    assert moved.deformation is not None and moved.deformation.to_canonical is resting
+    assert moved.canonical.density.values.dtype == torch.float64
+    assert torch.equal(moved.float().deformation.warp(torch.full((1, 3), 0.1), 0.75), before)

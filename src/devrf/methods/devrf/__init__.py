@@ -2,7 +2,8 @@
 
 1. Canonical field: ``architecture``, ``voxel_grid``, ``canonical_field``, ``color_decoder``.
 2. Rays, samples, compositing: ``volume_rendering``; then ``losses``.
-3. Canonical stage: ``canonical_schedule``, ``free_space``, ``canonical_stage``.
+3. Canonical stage: ``canonical_schedule``, ``grid_resolution``, ``free_space``, ``depth_crop``,
+   ``canonical_stage``.
 4. Deformation field: ``deformation_field``, ``grid_warp``, ``deformed_occupancy``.
 5. Deformation stage: ``deformation_schedule``, ``deformation_stage``; beyond the paper
    ``flow_initialisation`` and ``convergence``.

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
-from devrf.ops.corners import shape_of, to_grid
-from devrf.ops.trilinear import interpolate, kept_gradient
+from devrf.methods.devrf.frame_field import FrameField
+from devrf.methods.devrf.voxel_grid import look_up
 
 
 @dataclass(frozen=True)
@@ -60,11 +60,10 @@ class ColorResidual:
 
     def __call__(self, points: Tensor) -> Tensor:
         """A (M, 3) at canonical ``points`` (M, 3); differentiable in the grid and the points."""
-        coords = to_grid(points, self.box, shape_of(self.grid))
-        return interpolate(self.grid, coords, gradient=kept_gradient(self.grid))
+        return look_up(self.grid, points, self.box)
 
 
-class AppearanceField(nn.Module):
+class AppearanceField(FrameField):
     """Residuals A_t (T, X, Y, Z, 3) over a box: c = sigmoid(decoder(f(q), d) + A_t(q)).
 
     Frame 0 is zero and never trained: the scene at rest looks as the canonical field says.
@@ -80,9 +79,7 @@ class AppearanceField(nn.Module):
 
     def __init__(self, box: Box, clock: FrameClock, *, voxels: int) -> None:
         """Residuals of zero for the clock's T frames, each on about ``voxels`` voxels."""
-        super().__init__()
-        self.box = box
-        self.clock = clock
+        super().__init__(box, clock)
         self.register_buffer("values", torch.zeros(len(clock), *box.grid_shape(voxels), 3))
 
     @property
@@ -106,16 +103,6 @@ class AppearanceField(nn.Module):
         """Initialise ``frames``, from 1 on, from the frames before them."""
         for frame in frames:
             self.values[frame] = self.values[frame - 1]
-
-    def get_extra_state(self) -> dict[str, Any]:
-        """Box and clock, as plain numbers."""
-        low, high = list(self.box.low), list(self.box.high)
-        return {"low": low, "high": high, "times": list(self.clock.times)}
-
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`get_extra_state` gave."""
-        self.box = Box.of(state["low"], state["high"])
-        self.clock = FrameClock(tuple(state["times"]))
 
     def _load_from_state_dict(
         self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any

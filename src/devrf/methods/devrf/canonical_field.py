@@ -27,8 +27,8 @@ class CanonicalField(nn.Module):
         voxels: N, about how many voxels the grids have.
         base_voxels: how many they have at full resolution.
         alpha_init: opacity of one base voxel before anything is learned.
-        planes: P, in NDC the number of planes along the rays at every resolution; None for cubic
-            voxels.
+        planes: P, in NDC the number of planes along the rays at every resolution, from the box's
+            front to its back; None for cubic voxels.
         aspect: in NDC, grid points across a unit of x to those across a unit of y.
     """
 
@@ -96,13 +96,18 @@ class CanonicalField(nn.Module):
         """
         if self.planes is None:
             return step * self.box.voxel_size(self.voxels)
-        return step / (self.planes - 1)
+        return step * self._share_of_depth / (self.planes - 1)
 
     def step_in_base_voxels(self, step: float) -> float:
-        """δ = step · s / s_base, in NDC step · 256 / P (docs/method.md#step-length)."""
+        """δ = step · s / s_base, in NDC step · 256 / P · D / 2 (docs/method.md#step-length)."""
         if self.planes is None:
             return step * self.box.voxel_size(self.voxels) / self.box.voxel_size(self.base_voxels)
-        return step * 256 / self.planes
+        return step * 256 / self.planes * self._share_of_depth
+
+    @property
+    def _share_of_depth(self) -> float:
+        """D / 2: the box's share of the depth from the near plane to infinity, in NDC."""
+        return self.box.size[2] / 2
 
     @property
     def shift(self) -> float:
@@ -163,6 +168,24 @@ class CanonicalField(nn.Module):
         shape = self.grid_shape(voxels)
         self.density.resize(shape)
         self.color.resize(shape)
+
+    @torch.no_grad()
+    def crop(self, box: Box) -> None:
+        """Keep what is in ``box``, a part of the field's own, at the same resolution.
+
+        Of a field with planes; new parameters result.
+        """
+        assert self.planes is not None, "only fields with planes are cropped"
+        before = self.box
+        planes = max(2, round((self.planes - 1) * box.size[2] / self.box.size[2]) + 1)
+        (width, height, _), (whole_width, whole_height, _) = box.size, self.box.size
+        share = width * height * planes / (whole_width * whole_height * self.planes)
+        self.box, self.planes = box, planes
+        self.voxels, self.base_voxels = round(self.voxels * share), round(self.base_voxels * share)
+        points = box.grid_points(self.grid_shape(self.voxels), self.density.values)
+        for grid in (self.density, self.color):
+            values = grid(points.view(-1, 3), before)
+            grid.values = nn.Parameter(values.view(*points.shape[:3], -1))
 
     @torch.no_grad()
     def clear(self, where: Tensor, alpha: float) -> None:

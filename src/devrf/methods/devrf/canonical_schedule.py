@@ -59,6 +59,8 @@ class CanonicalSchedule:
         contracted_start: in contracted space the grid starts with about as many voxels along an
             edge, and doubles at equal intervals over the first three quarters of ``iterations``
             in place of ``doublings``. None: ``doublings`` hold there, too.
+        crop: in forward-facing scenes, whether the grid, each time it grows, gives up the depths
+            at which the static views see nothing (docs/method.md#crop).
     """
 
     search_iterations: int = 5000
@@ -74,6 +76,7 @@ class CanonicalSchedule:
     voxels_per_pixel: float | None = None
     directions_from: int | None = None
     contracted_start: float | None = 26
+    crop: bool = False
     phases: tuple[CanonicalPhase, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:

@@ -17,10 +17,10 @@ from devrf.engine.graphs import Graphs
 from devrf.engine.parallel_batch import ParallelBatch
 from devrf.engine.phase import Phase
 from devrf.errors import DevrfError
-from devrf.geometry.ndc import NormalizedDevice
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.canonical_schedule import CanonicalPhase, CanonicalSchedule
+from devrf.methods.devrf.depth_crop import crop_to_visible
 from devrf.methods.devrf.free_space import possible_matter, view_count_weight
 from devrf.methods.devrf.grid_resolution import fitted_to
 from devrf.methods.devrf.losses import (
@@ -132,7 +132,6 @@ class CanonicalStage(VoxelStage):
         super().setup(stage)
         if hasattr(self, "scene_model"):
             return
-        self._check_space()
         asked = self.schedule
         self.schedule, self.architecture = fitted_to(self.scene, asked, self.architecture)
         if self.schedule.side != asked.side:
@@ -160,15 +159,6 @@ class CanonicalStage(VoxelStage):
             groups.append({"params": learned, "lr": rate, "base_lr": rate, "name": name})
         self._optimizer = GridAdam(groups)
 
-    def _check_space(self) -> None:
-        """Check that only a scene in NDC has planes."""
-        planes = self.architecture.planes
-        if planes is not None and not isinstance(self.scene.space, NormalizedDevice):
-            raise DevrfError(
-                f"field.planes={planes}: planes are of forward-facing scenes, and this scene is "
-                "not: give field=inward or field=small"
-            )
-
     def render_settings(self, phase: CanonicalPhase) -> RenderSettings:
         """How rays are sampled in a phase."""
         bounds, sampling = self.scene.bounds, self.sampling
@@ -185,8 +175,7 @@ class CanonicalStage(VoxelStage):
         if previous is not None and previous.kind != phase.kind:
             self._begin_fine(phase)
         elif previous is not None:
-            model.canonical.resize(phase.voxels)
-            self.update_occupancy()
+            self._grow(phase)
         self.pool = canonical_pool(views, model, everywhere=phase.kind == "search")
         if not len(self.pool):
             raise DevrfError(
@@ -194,6 +183,20 @@ class CanonicalStage(VoxelStage):
                 "data.box and data.near, or lower schedule.rates.density"
             )
         self.setup_optimizer()
+
+    def _grow(self, phase: CanonicalPhase) -> None:
+        """Crop the field, if asked to, and give it the resolution of ``phase``."""
+        field = self.scene_model.canonical
+        if self.schedule.crop:
+            assert self.pool is not None
+            views = self.trainer.datamodule.training_views(  # type: ignore[attr-defined]
+                self.capture, self.device
+            )
+            crop_to_visible(self.scene_model, self.scene, views, self.pool)
+        # Cropping leaves a share of the voxels that the field was built for.
+        kept = field.base_voxels / round(self.schedule.side**3)
+        field.resize(round(phase.voxels * kept))
+        self.update_occupancy()
 
     def _begin_fine(self, phase: CanonicalPhase) -> None:
         """Keep what the search found as the occupancy, and start the radiance field."""
@@ -309,6 +312,7 @@ class CanonicalStage(VoxelStage):
         self.scene_model.canonical.learn_directions(True)
         self.update_occupancy()
         self.scene_model.canonical.clear(~self.scene_model.occupancy.mask, alpha=1e-6)
+        super().on_train_end()
 
     def resize_to(self, state: dict[str, Tensor]) -> None:
         """Take a radiance field in place of the search's, if that is what was stored."""

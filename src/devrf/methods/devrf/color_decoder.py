@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import FunctionCtx
 
 
 class SigmoidColor(nn.Module):
@@ -79,7 +82,8 @@ class ColorDecoder(nn.Module):
             by_ray = self.from_direction(self._encode(viewdirs))
             if not self.learns_directions:
                 by_ray = by_ray.detach()
-            x = torch.relu(self.from_feature(features) + by_ray.index_select(0, ray))
+            from_ray: Tensor = RowOfRay.apply(by_ray, ray)  # type: ignore[no-untyped-call]
+            x = torch.relu(self.from_feature(features) + from_ray)
             x = torch.relu(self.hidden(x))
         logits = self.output(x.to(self.output.weight.dtype))
         return torch.sigmoid(logits if residual is None else logits + residual)
@@ -87,3 +91,25 @@ class ColorDecoder(nn.Module):
     def _encode(self, viewdirs: Tensor) -> Tensor:
         angles = (viewdirs[:, None, :] * self.octaves[:, None]).flatten(1)
         return torch.cat([viewdirs, angles.sin(), angles.cos()], dim=-1)
+
+
+class RowOfRay(torch.autograd.Function):
+    """rows[ray] (S, C) of ``rows`` (R, C); its gradient is summed over a ray in single precision.
+
+    Many samples add to one row: sums of bfloat16 lose digits, and GPUs before sm_90 add them in
+    loops of compare and swap.
+    """
+
+    @staticmethod
+    def forward(ctx: FunctionCtx, rows: Tensor, ray: Tensor) -> Tensor:
+        """Look the rows up."""
+        ctx.save_for_backward(ray)
+        ctx.rays = len(rows)  # type: ignore[attr-defined]
+        return rows.index_select(0, ray)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        """Sum over the samples of each ray."""
+        (ray,) = ctx.saved_tensors
+        sums = gradient.new_zeros((ctx.rays, gradient.shape[1]), dtype=torch.float32)
+        return sums.index_add_(0, ray, gradient.float()).to(gradient.dtype), None

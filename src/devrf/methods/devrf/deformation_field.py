@@ -5,15 +5,16 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from devrf.engine.frame_store import FrameStore
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
+from devrf.methods.devrf.frame_field import FrameField
 from devrf.methods.devrf.grid_warp import GridWarp
 
 
-class DeformationField(nn.Module):
+class DeformationField(FrameField):
     """Displacements (T, X, Y, Z, 3) over a box, backward and forward (docs/method.md#warp).
 
     A point x at time t is seen in canonical space at q = x + Δ_b(x, t); a canonical point q is at
@@ -32,10 +33,8 @@ class DeformationField(nn.Module):
         self, box: Box, clock: FrameClock, *, voxels: int, still_outside: bool = False
     ) -> None:
         """Zero displacements of the clock's T frames, each on about ``voxels`` voxels."""
-        super().__init__()
+        super().__init__(box, clock)
         self.still_outside = still_outside
-        self.box = box
-        self.clock = clock
         self.frames = FrameStore(len(clock), box.grid_shape(voxels))
 
     @property
@@ -91,13 +90,11 @@ class DeformationField(nn.Module):
         self.frames.resize(self.box.grid_shape(voxels))
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Box and clock, as plain numbers."""
-        low, high = list(self.box.low), list(self.box.high)
+        """Box and clock, as plain numbers, and whether nothing moves outside."""
         outside = {"still_outside": True} if self.still_outside else {}
-        return {"low": low, "high": high, "times": list(self.clock.times), **outside}
+        return super().get_extra_state() | outside
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_extra_state` gave."""
-        self.box = Box.of(state["low"], state["high"])
-        self.clock = FrameClock(tuple(state["times"]))
+        super().set_extra_state(state)
         self.still_outside = bool(state.get("still_outside"))

@@ -298,6 +298,7 @@ class DeformationStage(VoxelStage):
         """Write the last frames back."""
         self.active.close()
         self.refinement.end()
+        super().on_train_end()
 
     @property
     def views(self) -> Views:

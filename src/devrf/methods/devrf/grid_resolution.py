@@ -7,14 +7,15 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from devrf.errors import DevrfError
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.scenes.scene import Scene
 
 # Between two planes a point moves by so many pixels from one outermost static view to the other:
-# less, and the views tell no two planes apart.
-PIXELS_PER_PLANE = 2.0
+# less, and the views hardly tell two planes apart, while fog before the scene takes long to clear.
+PIXELS_PER_PLANE = 4.0
 FEWEST, MOST = 32, 256
 
 
@@ -27,12 +28,19 @@ def fitted_to(
     and ``voxels_per_pixel`` becomes the ``side`` of a grid so fine (docs/method.md#forward-facing).
     In contracted space sides are longer, grids start coarser, and directions are learned later
     (docs/method.md#scene-contraction).
+
+    Raises:
+        DevrfError: the architecture has planes, and the scene is not in NDC.
     """
-    space = scene.space
+    space, planes = scene.space, architecture.planes
     if not isinstance(space, NormalizedDevice):
+        if planes is not None:
+            raise DevrfError(
+                f"field.planes={planes}: planes are of forward-facing scenes, and this scene is "
+                "not: give field=inward or field=small"
+            )
         schedule = schedule.in_space(space)
         return schedule, architecture.in_space(space, schedule.side)
-    planes = architecture.planes
     if planes is None:
         planes = resolved_planes(scene.static.train.cameras.positions, space)
         architecture = replace(architecture, planes=planes)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import nn
@@ -152,6 +152,12 @@ class DeVRFModel(DynamicModel):
         if lists is None or (lists.field, lists.settings) != present:
             lists = self._lists[half] = ListRenderer(*present, half=half)
         return DeVRFView(self.occupancy, self.deformation, lists, self.space, time, self.appearance)
+
+    def to_view(self, device: torch.device) -> Self:
+        """The model on ``device``; displacements follow when their frame is looked at."""
+        if self.deformation is not None and not self.deformation.to_canonical.is_cuda:
+            self.deformation.frames.on_host = True
+        return self.to(device)
 
     @property
     def device(self) -> torch.device:

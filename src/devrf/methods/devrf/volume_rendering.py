@@ -15,7 +15,7 @@ from devrf.geometry.rays import Rays
 from devrf.methods.devrf.appearance import ColorResidual
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.settings import RenderSettings
-from devrf.ops.compositing import composite, sum_by_ray, transmittances
+from devrf.ops.compositing import color_and_depth, composite, sum_by_ray, transmittances
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.output import RenderOutput
 from devrf.rendering.sampling import Samples, march
@@ -133,10 +133,11 @@ def render(
         seen = sum_by_ray(weight[:, None] * color, samples.ray, len(rays))
         with torch.no_grad():
             mass = sum_by_ray(weight, samples.ray, len(rays))
-            depth = sum_by_ray(weight * samples.distance, samples.ray, len(rays))
+            reached = sum_by_ray(weight * samples.distance, samples.ray, len(rays))
+        image, depth = color_and_depth(seen, reached, mass, transmittance, background)
     return VoxelOutput(
-        color=seen + transmittance[:, None] * background,
-        depth=depth / mass.clamp(min=1e-6),
+        color=image,
+        depth=depth,
         transmittance=transmittance,
         samples=samples,
         canonical=canonical,

@@ -8,9 +8,19 @@ import torch
 from torch import Tensor, nn
 
 from devrf.geometry.box import Box
-from devrf.ops.corners import to_grid
+from devrf.ops.corners import shape_of, to_grid
 from devrf.ops.resampling import resample
 from devrf.ops.trilinear import interpolate, kept_gradient
+
+
+def look_up(grid: Tensor, points: Tensor, box: Box) -> Tensor:
+    """Trilinear values (M, C) of a ``grid`` (X, Y, Z, C) over ``box`` at ``points`` (M, 3).
+
+    Outside they are the border's. Differentiable in the grid and the points; a gradient that the
+    grid has already is added to in place.
+    """
+    coords = to_grid(points, box, shape_of(grid))
+    return interpolate(grid, coords, gradient=kept_gradient(grid))
 
 
 class VoxelGrid(nn.Module):
@@ -34,8 +44,7 @@ class VoxelGrid(nn.Module):
 
     def forward(self, points: Tensor, box: Box) -> Tensor:
         """Trilinear values (M, C) at ``points`` (M, 3) in ``box``; outside, the border's."""
-        coords = to_grid(points, box, self.shape)
-        return interpolate(self.values, coords, gradient=kept_gradient(self.values))
+        return look_up(self.values, points, box)
 
     @torch.no_grad()
     def resize(self, shape: tuple[int, int, int]) -> None:

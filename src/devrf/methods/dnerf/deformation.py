@@ -15,7 +15,9 @@ SMALL = 1e-4
 class TranslationField(nn.Module):
     """Δ(x, t) = D(γ(x), γ(t)), and exactly 0 at t = 0 (docs/methods/dnerf.md#deformation)."""
 
-    def __init__(self, width: int, depth: int, bands: int, time_bands: int) -> None:
+    def __init__(
+        self, width: int, depth: int, bands: int, time_bands: int, skip: int | None = None
+    ) -> None:
         """Build the network.
 
         Args:
@@ -23,12 +25,13 @@ class TranslationField(nn.Module):
             depth: layers.
             bands: octaves of the position.
             time_bands: octaves of the time.
+            skip: the layer that γ(x) enters again; None: the middle one.
         """
         super().__init__()
         self.encode_position = SinusoidalEncoding(3, bands)
         self.encode_time = SinusoidalEncoding(1, time_bands)
         position, time = self.encode_position.size, self.encode_time.size
-        self.trunk = Trunk(position + time, width, depth, skipped=position)
+        self.trunk = Trunk(position + time, width, depth, skipped=position, skip=skip)
         self.output = nn.Linear(width, 3)
         nn.init.uniform_(self.output.weight, -SMALL, SMALL)
         nn.init.zeros_(self.output.bias)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from devrf.geometry.rays import Rays
-from devrf.ops.compositing import composite, sum_by_ray
+from devrf.ops.compositing import color_and_depth, composite, sum_by_ray
 from devrf.rendering.output import RenderOutput
 
 # Opaque at any density that a softplus gives.
@@ -72,9 +72,10 @@ def volume_render(
     seen = sum_by_ray(weight[:, None] * color, ray, rays)
     with torch.no_grad():
         mass = sum_by_ray(weight, ray, rays)
-        depth = sum_by_ray(weight * samples.distance, ray, rays) / mass.clamp(min=1e-6)
+        reached = sum_by_ray(weight * samples.distance, ray, rays)
+    image, depth = color_and_depth(seen, reached, mass, transmittance, background)
     return RenderOutput(
-        color=seen + transmittance[:, None] * background,
+        color=image,
         depth=depth,
         transmittance=transmittance,
         extras={"weight": weight, "ray": ray},

@@ -1,4 +1,4 @@
-"""A shape on a pedestal before a painted wall and floor, which fill every image."""
+"""A pedestal before a painted wall and floor, which fill every image."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from devrf.scenes.procedural.sdf import rounded_box
-from devrf.scenes.procedural.shape import Material, Shape
+from devrf.scenes.procedural.shape import Material
 
 # The wall is the plane z = WALL, the floor the plane y = FLOOR; world units, y up.
 WALL = -4.6
@@ -19,8 +19,8 @@ _CENTER = (0.0, (FLOOR - 0.72) / 2, -2.6)
 _HALF = (0.56, (-0.72 - FLOOR) / 2, 0.44)
 _ROUNDING = 0.04
 
-# Parts: the wall is 0, the floor 1; the shape's own come after the pedestal.
-_PEDESTAL, _FIRST = 2, 3
+# The number of the part: the wall is 0, the floor 1.
+_PEDESTAL = 2
 
 Vector = tuple[float, float, float]
 Wave = tuple[Vector, float, Vector]
@@ -50,57 +50,31 @@ _DARKEST, _LIGHTEST = (0.42, 0.45, 0.52), (0.86, 0.88, 0.90)
 
 
 @dataclass(frozen=True)
-class OnStage:
-    """A :class:`~devrf.scenes.procedural.shape.Shape` with something behind it everywhere.
-
-    Parts 0, 1 and 2 are wall, floor and pedestal, which stand still; the shape's own follow.
+class Backdrop:
+    """Wall, floor and pedestal, in that order.
 
     Attributes:
-        shape: what stands on the pedestal, and moves.
         weave: whether the paint is fine, for images of about 240 pixels or more; else soft.
     """
 
-    shape: Shape
     weave: bool = False
 
-    def distance(self, points: Tensor, time: float) -> Tensor:
-        """The smaller of the shape's distance bound and the stage's distance (M,)."""
-        return torch.minimum(self.shape.distance(points, time), _still(points).amin(dim=0))
+    @property
+    def parts(self) -> int:
+        """How many there are."""
+        return 3
 
-    def material(self, points: Tensor, time: float) -> Material:
-        """The nearest thing's material; that of the stage is where it is."""
-        still, part = _still(points).min(dim=0)
-        own = self.shape.material(points, time)
-        nearer = self.shape.distance(points, time) < still
-        return Material(
-            torch.where(nearer[:, None], own.rest, points),
-            torch.where(nearer, own.part + _FIRST, part),
-        )
-
-    def forward(self, material: Material, time: float) -> Tensor:
-        """Where the shape goes; the stage stays."""
-        moved = self.shape.forward(_of_shape(material), time)
-        return torch.where((material.part >= _FIRST)[:, None], moved, material.rest)
+    def distances(self, points: Tensor) -> Tensor:
+        """Distances (3, M) to wall, floor and pedestal."""
+        x, y, z = points.unbind(-1)
+        a, b, c = _CENTER
+        pedestal = rounded_box(x - a, y - b, z - c, _HALF, _ROUNDING)
+        return torch.stack([z - WALL, y - FLOOR, pedestal])
 
     def color(self, material: Material) -> Tensor:
-        """The shape's paint, or the stage's."""
+        """The paint (M, 3): the pedestal stands out from the floor."""
         painted = _mural(material.rest, (*_WAVES, *_WEAVE) if self.weave else _WAVES)
-        # The pedestal stands out from the floor.
-        painted = torch.where((material.part == _PEDESTAL)[:, None], 0.5 * painted, painted)
-        own = self.shape.color(_of_shape(material))
-        return torch.where((material.part >= _FIRST)[:, None], own, painted)
-
-
-def _of_shape(material: Material) -> Material:
-    """The material with the shape's own part numbers, where it is of the shape."""
-    return Material(material.rest, (material.part - _FIRST).clamp_min(0))
-
-
-def _still(points: Tensor) -> Tensor:
-    """Distances (3, M) to wall, floor and pedestal."""
-    x, y, z = points.unbind(-1)
-    a, b, c = _CENTER
-    return torch.stack([z - WALL, y - FLOOR, rounded_box(x - a, y - b, z - c, _HALF, _ROUNDING)])
+        return torch.where((material.part == _PEDESTAL)[:, None], 0.5 * painted, painted)
 
 
 def _mural(points: Tensor, waves: Sequence[Wave]) -> Tensor:

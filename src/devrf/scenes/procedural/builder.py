@@ -11,8 +11,9 @@ from devrf.scenes.procedural.filming import Filming
 from devrf.scenes.procedural.flower import Flower
 from devrf.scenes.procedural.recipe import Recipe
 from devrf.scenes.procedural.robot import Robot
-from devrf.scenes.procedural.room import REACH, STEPS, InRoom
+from devrf.scenes.procedural.room import REACH, STEPS, Room
 from devrf.scenes.procedural.shape import BoundedShape, Shape
+from devrf.scenes.procedural.surrounded import Surrounded
 from devrf.scenes.procedural.truth import extent
 from devrf.scenes.scene import Bounds, Scene
 from devrf.scenes.validation import check_choice
@@ -53,9 +54,12 @@ class ProceduralScene(Recipe):
         watching, unseen = dynamic_rig(self.train_views, reach=reach, rig=rig, **size)
         film = Filming(shape, reach, self.supersample, self.light)
         if inside:
-            room = self.in_surroundings()
+            room = self.filmed()
             film = Filming(room, REACH, self.supersample, self.light, STEPS, opaque=True)
-        static, dynamic = film.at_rest(learned, tested), film.moving(watching, unseen, self.frames)
+        static, dynamic = (
+            film.at_rest(learned, tested),
+            film.moving(watching, unseen, self.frames, self.unseen_frames),
+        )
         if inside:
             everyone = [static.train, static.test, dynamic.train, dynamic.test]
             space, bounds = inward_space("auto", static.train, dynamic.train, everyone)
@@ -70,13 +74,13 @@ class ProceduralScene(Recipe):
         )
         return Scene(self.shape, "inward", static, dynamic, bounds, "white")
 
-    def in_surroundings(self) -> Shape:
+    def filmed(self) -> Shape:
         """The moving shape, in its room if there is one."""
         shape = self.model()
         if self.surroundings == "none":
             return shape
         where = extent(shape)
-        return InRoom(shape, where.reach, floor=where.motion.low[2])
+        return Surrounded(shape, Room(floor=where.motion.low[2]), where.reach)
 
     def model(self) -> BoundedShape:
         """The moving shape itself, for exact answers at any point and time."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -54,15 +55,22 @@ class Filming:
         """One image from each camera at time 0."""
         return Capture(self._still(train, "train"), self._still(test, "test"))
 
-    def moving(self, train: Cameras, test: Cameras, frames: int) -> Capture:
+    def moving(
+        self, train: Cameras, test: Cameras, frames: int, unseen: Sequence[int] = ()
+    ) -> Capture:
         """All fixed cameras at frame 0, then all at frame 1, …, with the exact backward flow.
 
         Args:
             train: V cameras to learn from.
             test: held-out cameras.
             frames: number of frames T ≥ 2, at times k / (T − 1).
+            unseen: frames that the cameras to learn from leave out.
         """
-        return Capture(self._moving(train, frames, "train"), self._moving(test, frames, "test"))
+        every = range(frames)
+        seen = [frame for frame in every if frame not in unseen]
+        return Capture(
+            self._moving(train, seen, frames, "train"), self._moving(test, every, frames, "test")
+        )
 
     def _still(self, cameras: Cameras, split: str) -> Views:
         pictures = self.pictures(cameras, 0.0)
@@ -75,23 +83,23 @@ class Filming:
             depth=pictures.depth,
         )
 
-    def _moving(self, cameras: Cameras, frames: int, split: str) -> Views:
-        times = torch.arange(frames) / (frames - 1)
+    def _moving(self, cameras: Cameras, shown: Sequence[int], frames: int, split: str) -> Views:
+        times = torch.tensor(shown) / (frames - 1)
         clock: list[float] = times.tolist()
         pictures = [self.pictures(cameras, time) for time in clock]
         nowhere = torch.zeros_like(pictures[0].depth)
         flows = [OpticalFlow(torch.stack([nowhere, nowhere], dim=-1), nowhere.bool())]
         for earlier, time, picture in zip(clock, clock[1:], pictures[1:], strict=False):
             flows.append(backward_flow(self.shape, cameras, picture.depth, time, earlier))
-        view = torch.arange(len(cameras)).repeat(frames)
-        frame = torch.arange(frames).repeat_interleave(len(cameras))
+        view = torch.arange(len(cameras)).repeat(len(shown))
+        frame = torch.arange(len(shown)).repeat_interleave(len(cameras))
         return Views(
             pixels=torch.cat([p.pixels for p in pictures]),
             cameras=cameras[view],
             times=times[frame],
             view=view,
             names=tuple(
-                f"dynamic {split} frame {k:03d} view {v}"
+                f"dynamic {split} frame {shown[k]:03d} view {v}"
                 for k, v in zip(frame.tolist(), view.tolist(), strict=True)
             ),
             flow=OpticalFlow(

@@ -8,12 +8,13 @@ from typing import Literal
 import torch
 
 from devrf.scenes.forward_bounds import forward_bounds, reference_space
-from devrf.scenes.procedural.backdrop import OnStage
+from devrf.scenes.procedural.backdrop import Backdrop
 from devrf.scenes.procedural.facing_rig import dynamic_rig, static_rig
 from devrf.scenes.procedural.filming import Filming
 from devrf.scenes.procedural.plush import Plush
 from devrf.scenes.procedural.recipe import Recipe
 from devrf.scenes.procedural.shape import Shape
+from devrf.scenes.procedural.surrounded import Surrounded
 from devrf.scenes.scene import Scene
 
 # Radius of a ball about the origin that holds all that the cameras see of wall and floor.
@@ -57,12 +58,16 @@ class ProceduralForwardScene(Recipe):
         learned, tested = static[order % HOLDOUT != 0], static[order % HOLDOUT == 0]
         watching, unseen = dynamic_rig(self.train_views, **size)
         at_rest = film.at_rest(learned, tested)
-        moving = film.moving(watching, unseen, self.frames)
+        moving = film.moving(watching, unseen, self.frames, self.unseen_frames)
         space = reference_space(static, NEAR)
         source = "all that the cameras see (procedural scene)"
         bounds = forward_bounds([at_rest.train, moving.train], space, source)
         return Scene(self.name, "forward", at_rest, moving, bounds, "white", space)
 
+    def filmed(self) -> Shape:
+        """The toy and its stage."""
+        return self.model()
+
     def model(self) -> Shape:
         """The toy and its stage themselves, for exact answers at any point and time."""
-        return OnStage(Plush(float(self.speed)), weave=self.texture == "fine")
+        return Surrounded(Plush(float(self.speed)), Backdrop(weave=self.texture == "fine"))

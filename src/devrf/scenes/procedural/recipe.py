@@ -9,6 +9,8 @@ from dataclasses import dataclass
 
 import torch
 
+from devrf.scenes.holdout import every_nth
+from devrf.scenes.procedural.shape import Shape
 from devrf.scenes.scene import Scene
 from devrf.scenes.validation import MIN_SIDE, number, scene_error
 
@@ -42,6 +44,8 @@ class Recipe(ABC):
         speed: scales how far everything moves; 0 is still.
         supersample: n × n rays a pixel.
         light: share of the lamp in the lighting, 0 … 1: how much motion changes the colours.
+        novel_times_every: n: every n-th frame is seen by the held-out camera alone, the last
+            frame excepted; None: all frames are learned from.
     """
 
     width: int = 96
@@ -52,6 +56,15 @@ class Recipe(ABC):
     speed: float = 1.0
     supersample: int = 2
     light: float = 0.2
+    novel_times_every: int | None = None
+
+    @property
+    def unseen_frames(self) -> list[int]:
+        """The frames that are not learned from."""
+        if self.novel_times_every is None:
+            return []
+        _, held_out = every_nth(self.frames, self.novel_times_every)
+        return [frame for frame in held_out if frame < self.frames - 1]
 
     def __call__(self) -> Scene:
         """Render everything.
@@ -68,6 +81,10 @@ class Recipe(ABC):
     def render(self) -> Scene:
         """The scene, from checked numbers."""
 
+    @abstractmethod
+    def filmed(self) -> Shape:
+        """All that the cameras see, for exact answers at any point and time."""
+
     def _check(self) -> None:
         for key, (least, most) in _COUNTS.items():
             value = getattr(self, key, least)
@@ -76,6 +93,11 @@ class Recipe(ABC):
             if not least <= value <= most:
                 bound = f"at least {least}" if value < least else f"at most {most}"
                 raise scene_error(f"data.{key}", f"must be {bound}, not {value}")
+        every = self.novel_times_every
+        whole = isinstance(every, int) and not isinstance(every, bool)
+        if every is not None and not (whole and 2 <= every < self.frames):
+            expected = f"must be a whole number in 2 … {self.frames - 1}, or null, not {every!r}"
+            raise scene_error("data.novel_times_every", expected)
         for key, highest in (("speed", _FASTEST), ("light", 1.0)):
             given = getattr(self, key)
             amount = number(given)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from devrf.scenes.procedural.shape import Material, Shape
+from devrf.scenes.procedural.shape import Material
 from devrf.scenes.procedural.solids import Solid, SolidTable, Xyz
 from devrf.scenes.procedural.texture import Paint, Rgb
 
@@ -66,62 +66,24 @@ _FURNITURE = (
     _box((-1.5, -4.95, 2.8), (1.0, 0.08, 0.7), SAGE, LINEN, 1.2, 0.04),
 )
 _TABLE = SolidTable(_FURNITURE)
-_FIRST = len(_SURFACES) + len(_FURNITURE)
 
 
 @dataclass(frozen=True)
-class InRoom:
-    """A :class:`~devrf.scenes.procedural.shape.Shape` in a room, which stands still.
-
-    The first parts are the room's: floor, ceiling, walls, furniture; the shape's own follow.
+class Room:
+    """Floor, ceiling, four walls and furniture, in that order.
 
     Attributes:
-        shape: what stands in the middle, and moves.
-        reach: radius of a ball about the origin that holds the shape at all times, world units.
         floor: height of the floor, world units.
     """
 
-    shape: Shape
-    reach: float
     floor: float
 
-    def distance(self, points: Tensor, time: float) -> Tensor:
-        """The smaller of the shape's distance bound and the room's distance (M,).
+    @property
+    def parts(self) -> int:
+        """How many there are."""
+        return len(_SURFACES) + len(_FURNITURE)
 
-        Far from the shape its bound is the distance to a ball around it, which is cheap.
-        """
-        still = self._still(points).amin(dim=0)
-        ball = points.norm(dim=-1) - self.reach
-        near = (ball < 0.1 * self.reach).nonzero().squeeze(-1)
-        ball[near] = self.shape.distance(points[near], time)
-        return torch.minimum(still, ball)
-
-    def material(self, points: Tensor, time: float) -> Material:
-        """The nearest thing's material; that of the room is where it is."""
-        still, part = self._still(points).min(dim=0)
-        own = self.shape.material(points, time)
-        nearer = self.shape.distance(points, time) < still
-        return Material(
-            torch.where(nearer[:, None], own.rest, points),
-            torch.where(nearer, own.part + _FIRST, part),
-        )
-
-    def forward(self, material: Material, time: float) -> Tensor:
-        """Where the shape goes; the room stays."""
-        moved = self.shape.forward(_of_shape(material), time)
-        return torch.where((material.part >= _FIRST)[:, None], moved, material.rest)
-
-    def color(self, material: Material) -> Tensor:
-        """The shape's paint, or the room's."""
-        own = self.shape.color(_of_shape(material))
-        lifted = material.rest - material.rest.new_tensor([0.0, 0.0, self.floor])
-        furniture = (material.part - len(_SURFACES)).clamp(0, len(_FURNITURE) - 1)
-        painted = _TABLE.painted.color(Material(lifted, furniture))
-        surface = _papered(lifted, material.part.clamp(max=len(_SURFACES) - 1))
-        painted = torch.where((material.part < len(_SURFACES))[:, None], surface, painted)
-        return torch.where((material.part >= _FIRST)[:, None], own, painted)
-
-    def _still(self, points: Tensor) -> Tensor:
+    def distances(self, points: Tensor) -> Tensor:
         """Distances (K, M) to floor, ceiling, walls and furniture."""
         x, y, z = points.unbind(-1)
         z = z - self.floor
@@ -130,10 +92,13 @@ class InRoom:
         lifted = torch.stack([x, y, z])[:, None] - _TABLE.center.to(points).T[..., None]
         return torch.cat([faces, _TABLE.distances(*lifted)])
 
-
-def _of_shape(material: Material) -> Material:
-    """The material with the shape's own part numbers, where it is of the shape."""
-    return Material(material.rest, (material.part - _FIRST).clamp_min(0))
+    def color(self, material: Material) -> Tensor:
+        """The paper or the paint (M, 3)."""
+        lifted = material.rest - material.rest.new_tensor([0.0, 0.0, self.floor])
+        furniture = (material.part - len(_SURFACES)).clamp(0, len(_FURNITURE) - 1)
+        painted = _TABLE.painted.color(Material(lifted, furniture))
+        surface = _papered(lifted, material.part.clamp(max=len(_SURFACES) - 1))
+        return torch.where((material.part < len(_SURFACES))[:, None], surface, painted)
 
 
 def _papered(points: Tensor, surface: Tensor) -> Tensor:

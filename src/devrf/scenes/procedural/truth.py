@@ -10,7 +10,7 @@ from torch import Tensor
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.procedural.shape import BoundedShape, Shape
-from devrf.scenes.scene import OpticalFlow
+from devrf.scenes.scene import OpticalFlow, Views
 
 # Motion is sampled at this many times; the margin covers what happens between them.
 _TIMES = 97
@@ -78,3 +78,21 @@ def backward_flow(
     flow = depth.new_zeros(*depth.shape, 2)
     flow[valid] = before - pixels
     return OpticalFlow(flow, valid)
+
+
+def forward_flow(shape: Shape, views: Views) -> OpticalFlow:
+    """Exact forward optical flow of the images of fixed cameras; the last frame's has none.
+
+    Args:
+        shape: what is seen.
+        views: N images of a scene, all cameras at each of its frames, with depth.
+    """
+    assert views.depth is not None
+    times = torch.unique(views.times)
+    vectors = views.depth.new_zeros(*views.depth.shape, 2)
+    valid = torch.zeros_like(views.depth, dtype=torch.bool)
+    for time, later in zip(times, times[1:], strict=False):
+        at = (views.times == time).nonzero()[:, 0]
+        flow = backward_flow(shape, views.cameras[at], views.depth[at], float(time), float(later))
+        vectors[at], valid[at] = flow.vectors, flow.valid
+    return OpticalFlow(vectors, valid)

@@ -16,7 +16,7 @@ from devrf.methods.devrf.grid_warp import GridWarp
 from devrf.methods.devrf.settings import RenderSettings
 from devrf.methods.devrf.static_shape.sample_search import search
 from devrf.methods.devrf.volume_rendering import VoxelOutput
-from devrf.ops.compositing import composite_segments, sum_segments
+from devrf.ops.compositing import color_and_depth, composite_segments, sum_segments
 from devrf.ops.search import PackedSamples, SampleSubset, select
 from devrf.ops.trilinear import kept_gradient
 from devrf.ops.warped_depth import warped_depth
@@ -90,9 +90,10 @@ def render_static(
         with torch.no_grad():
             distance = torch.stack([samples.distance, torch.ones_like(samples.distance)], dim=1)
             reached, mass = sum_segments(weight, distance, chosen.first).unbind(1)
+        image, depth = color_and_depth(seen, reached, mass, transmittance, background)
     return VoxelOutput(
-        color=seen + transmittance[:, None] * background,
-        depth=reached / mass.clamp(min=1e-6),
+        color=image,
+        depth=depth,
         transmittance=transmittance,
         samples=samples,
         canonical=canonical,

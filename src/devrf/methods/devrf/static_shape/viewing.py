@@ -14,7 +14,7 @@ from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.grid_warp import GridWarp
 from devrf.methods.devrf.settings import RenderSettings
 from devrf.methods.devrf.static_shape.sample_search import search
-from devrf.ops.compositing import composite_segments, sum_segments
+from devrf.ops.compositing import color_and_depth, composite_segments, sum_segments
 from devrf.ops.search import PackedSamples, select
 from devrf.ops.warped_depth import warped_depth
 from devrf.rendering.occupancy import Occupancy
@@ -84,11 +84,8 @@ class ListRenderer:
             torch.cat([color, distance, torch.ones_like(distance)], dim=1),
             chosen.first,
         )
-        return RenderedImage(
-            color=seen[:, :3] + left[:, None] * background,
-            depth=seen[:, 3] / seen[:, 4].clamp(min=1e-6),
-            opacity=1 - left,
-        )
+        image, depth = color_and_depth(seen[:, :3], seen[:, 3], seen[:, 4], left, background)
+        return RenderedImage(color=image, depth=depth, opacity=1 - left)
 
     def _search(
         self, rays: Rays, occupancy: Occupancy, warp: GridWarp

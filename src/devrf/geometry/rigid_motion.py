@@ -1,0 +1,39 @@
+"""Rigid motion given by six numbers: a rotation vector, and a velocity."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+# Below this squared angle three terms of the series are exact to single precision.
+SMALL = 1e-4
+
+
+def rigid_motion(points: Tensor, rotation: Tensor, velocity: Tensor) -> Tensor:
+    """x′ = e^{[r]} x + G v: the exponential of se(3), a motion along a screw.
+
+    With θ = |r|, [r] y = r × y, A = sin θ / θ, B = (1 − cos θ) / θ², C = (θ − sin θ) / θ³:
+    e^{[r]} = I + A [r] + B [r]² and G = I + B [r] + C [r]². Smooth at θ = 0, where A, B and C are
+    taken from their series.
+
+    Args:
+        points: (..., 3) x.
+        rotation: (..., 3) r, radians along the axis.
+        velocity: (..., 3) v, in the unit of the points.
+
+    Returns:
+        (..., 3) x′.
+    """
+    square: Tensor = (rotation * rotation).sum(dim=-1, keepdim=True)
+    near = square < SMALL
+    # The branch that is not taken must have finite gradients, too.
+    safe = torch.where(near, torch.ones_like(square), square)
+    angle = safe.sqrt()
+    sine, cosine = angle.sin(), angle.cos()
+    a: Tensor = torch.where(near, 1 - square / 6, sine / angle)
+    b: Tensor = torch.where(near, 0.5 - square / 24, (1 - cosine) / safe)
+    c: Tensor = torch.where(near, 1 / 6 - square / 120, (angle - sine) / (safe * angle))
+    turned: Tensor = torch.linalg.cross(rotation, points)
+    driven: Tensor = torch.linalg.cross(rotation, velocity)
+    twice: Tensor = torch.linalg.cross(rotation, b * turned + c * driven)
+    return points + a * turned + velocity + b * driven + twice

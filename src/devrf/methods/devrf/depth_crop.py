@@ -1,0 +1,109 @@
+"""At which depths of a forward-facing scene there is something (docs/method.md#crop)."""
+
+from __future__ import annotations
+
+import logging
+
+import torch
+from torch import Tensor
+
+from devrf.data.batch import PixelPool, gather_batch
+from devrf.geometry.box import Box
+from devrf.geometry.ndc import NormalizedDevice
+from devrf.methods.devrf.model import DeVRFModel
+from devrf.methods.devrf.volume_rendering import render
+from devrf.scenes.forward_bounds import box_between
+from devrf.scenes.scene import Scene, Views
+
+log = logging.getLogger(__name__)
+
+# As many rays are looked along, so many at a time.
+RAYS, CHUNK = 8192, 2048
+# This share of all that is seen may lie in front of the box, and as much behind it: remains of fog.
+FOG = 0.1
+# So may the surfaces of this share of the rays: specks.
+SPECKS = 1e-3
+# Room in front, into which things may move, and behind, in shares of the depth that is seen.
+IN_FRONT, BEHIND = 0.25, 0.05
+
+
+def crop_to_visible(model: DeVRFModel, scene: Scene, views: Views, pool: PixelPool) -> None:
+    """Crop the canonical field in NDC to the depths that show in the static views.
+
+    Sideways it keeps what the learning cameras see at those depths.
+
+    Args:
+        model: the scene at rest as learned so far; its field is changed.
+        scene: gives space and cameras.
+        views: the static training views, on the model's device.
+        pool: the pixels of ``views`` that the field is learned from.
+    """
+    space, field = scene.space, model.canonical
+    if not isinstance(space, NormalizedDevice):
+        return
+    ends = visible_depths(*seen_along_rays(model, views, pool))
+    front, back = with_room(ends, field.box)
+    learned_from = [scene.static.train, scene.dynamic.train]
+    box = box_between(learned_from, space, front, back).clipped(field.box)
+    before = field.density.values.numel()
+    field.crop(box)
+    share = field.density.values.numel() / before
+    log.info("fields live in %s now, in %.0f%% of the voxels", box, 100 * share)
+
+
+@torch.no_grad()
+def seen_along_rays(
+    model: DeVRFModel, views: Views, pool: PixelPool
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Samples on rays through pixels of ``pool``: depths z', weights, and rays, each (S,)."""
+    # Evenly spread, not random: several processes have to find the same.
+    chosen = torch.linspace(0, len(pool) - 1, min(RAYS, len(pool)), dtype=torch.float64)
+    found: list[tuple[Tensor, Tensor, Tensor]] = []
+    for k, part in enumerate(torch.split(chosen.long().to(pool.image.device), CHUNK)):
+        image, flat = pool.image[part].long(), pool.flat[part].long()
+        black = torch.zeros(3, device=model.device)
+        rays = gather_batch(views, image, flat, black, model.space).rays
+        seen = render(rays, model.canonical, model.occupancy, model.settings, black)
+        found.append((seen.samples.points[:, 2], seen.weight, seen.samples.ray + k * CHUNK))
+    depths, weights, rays_of = (torch.cat(parts) for parts in zip(*found, strict=True))
+    return depths, weights, rays_of
+
+
+def visible_depths(depths: Tensor, weights: Tensor, ray: Tensor) -> tuple[float, float]:
+    """The depths between which all but fog and specks is seen.
+
+    Where a ray meets a surface, half of what it sees is before it. While nothing is known, all is
+    fog, and no depth is given up.
+
+    Args:
+        depths: (S,) of samples, ascending on each ray.
+        weights: (S,) how much of its ray each is.
+        ray: (S,) int64 their rays, ascending.
+    """
+    ascending, order = depths.sort()
+    of_all = _ends(ascending, weights[order].double(), FOG)
+    weights = weights.double()
+    total = weights.cumsum(0)
+    _, count = torch.unique_consecutive(ray, return_counts=True)
+    last = count.cumsum(0) - 1
+    before = torch.cat([total.new_zeros(1), total[last[:-1]]])
+    half = torch.searchsorted(total, (before + total[last]) / 2).clamp(max=len(total) - 1)
+    surfaces = depths[half].sort().values
+    of_surfaces = _ends(surfaces, torch.ones_like(surfaces, dtype=torch.double), SPECKS)
+    return min(of_all[0], of_surfaces[0]), max(of_all[1], of_surfaces[1])
+
+
+def _ends(ascending: Tensor, weights: Tensor, outside: float) -> tuple[float, float]:
+    """Depths before and behind which a share ``outside`` of the weights (S,) is."""
+    total = weights.cumsum(0)
+    ends = total.new_tensor([outside, 1 - outside]) * total[-1]
+    place = torch.searchsorted(total, ends).clamp(max=len(ascending) - 1)
+    first, last = ascending[place].tolist()
+    return first, last
+
+
+def with_room(ends: tuple[float, float], box: Box) -> tuple[float, float]:
+    """Depths with room for motion in front and a margin behind, within ``box``."""
+    first, last = ends
+    depth = max(last - first, 0.05 * box.size[2])
+    return max(first - IN_FRONT * depth, box.low[2]), min(last + BEHIND * depth, box.high[2])

@@ -1,0 +1,123 @@
+"""HyperNeRF (Park et al., SIGGRAPH Asia 2021): Nerfies in slices of a larger space."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import torch
+from torch import Tensor, nn
+
+from devrf.errors import DevrfError
+from devrf.methods.hypernerf.slicing import SlicingSurface
+from devrf.methods.nerf.codes import TimeCodes
+from devrf.methods.nerf.encoding import SinusoidalEncoding, octave_window
+from devrf.methods.nerf.settings import FieldSettings
+from devrf.methods.nerfies.model import Nerfies, NerfiesSettings
+from devrf.methods.protocol import ProtocolStage
+
+
+@dataclass(frozen=True)
+class HyperNeRFSettings(NerfiesSettings):
+    """Sizes and sampling; the defaults are the published ones (docs/methods/hypernerf.md).
+
+    Attributes:
+        slicing: ``surface``, w differs from point to point (the paper's DS); ``plane``, w is one
+            for each frame (AP).
+        ambient: length of w.
+        ambient_bands: octaves of w; w does not enter by itself.
+        ambient_delay: share of a stage before ambient space is opened.
+        ambient_window: share of a stage during which it is then opened.
+        slicing_width: units of each layer of the surface.
+        slicing_depth: layers of the surface.
+        slicing_skip: the layer that the surface's input enters again; None: the middle one.
+        slicing_bands: octaves of the surface's positions.
+    """
+
+    slicing: Literal["surface", "plane"] = "surface"
+    ambient: int = 2
+    ambient_bands: int = 1
+    ambient_delay: float = 0.004
+    ambient_window: float = 0.04
+    slicing_width: int = 64
+    slicing_depth: int = 6
+    slicing_skip: int | None = 4
+    slicing_bands: int = 6
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("ambient", "ambient_bands"):
+            if getattr(self, name) < 1:
+                raise DevrfError(
+                    f"{self.key}.{name}: expected at least 1, not {getattr(self, name)}; "
+                    "method=nerfies has no ambient space"
+                )
+        if not (self.ambient_delay >= 0 <= self.ambient_window) or (
+            self.ambient_delay + self.ambient_window > 1
+        ):
+            raise DevrfError(
+                f"{self.key}: expected shares ambient_delay and ambient_window of at most 1 "
+                f"together, not {self.ambient_delay} and {self.ambient_window}"
+            )
+
+
+class HyperNeRF(Nerfies):
+    """(σ, c) = T(W(x, ω_t), γ_β(w), d) with w = H(x, ω_t); β = 0 is Nerfies exactly.
+
+    Attributes:
+        opened: () β, how many octaves of w enter T; stored with the weights.
+    """
+
+    name: ClassVar[str] = "hypernerf"
+    settings_class: ClassVar[type[FieldSettings]] = HyperNeRFSettings
+    settings: HyperNeRFSettings
+    opened: Tensor
+
+    def __init__(self, settings: HyperNeRFSettings | None = None) -> None:
+        """Build the networks.
+
+        Args:
+            settings: sizes and sampling.
+        """
+        s = settings or HyperNeRFSettings()
+        encode = SinusoidalEncoding(s.ambient, s.ambient_bands, identity=False)
+        super().__init__(s, encode.size)
+        self.encode = encode
+        self.register_buffer("opened", torch.zeros(()))
+        self._shut = False
+        if s.slicing == "surface":
+            self.slicing = SlicingSurface(
+                s.slicing_width, s.slicing_depth, s.slicing_bands, s.code, s.ambient, s.slicing_skip
+            )
+
+    def set_times(self, times: tuple[float, ...]) -> None:
+        """Take the frames' times, and draw a code for each, and a w if that is the frame's."""
+        super().set_times(times)
+        if self.settings.slicing == "plane":
+            self.planes = TimeCodes(times, self.settings.ambient).to(self.device)
+
+    def follow(self, step: ProtocolStage) -> None:
+        """Static images alone do not open ambient space."""
+        super().follow(step)
+        self._shut = step.capture == "static"
+
+    def on_iteration(self, step: int, total: int) -> None:
+        """Open the warp's octaves, and those of w: β grows evenly from 0 after a delay."""
+        super().on_iteration(step, total)
+        s = self.settings
+        since, share = step - s.ambient_delay * total, s.ambient_window * total
+        opened = min(max(since, 0.0) / share, 1.0) if share else float(since >= 0)
+        self.opened.fill_(0.0 if self._shut else opened * s.ambient_bands)
+
+    def bend(self, points: Tensor, time: Tensor) -> tuple[Tensor, Tensor | None]:
+        """W(x, ω) and γ_β(w)."""
+        code = self.codes(time)
+        w = self.planes(time) if self.settings.slicing == "plane" else self.slicing(points, code)
+        window = octave_window(self.opened, self.settings.ambient_bands)
+        return self.warp(points, code), self.encode(w, window)
+
+    def parts(self) -> dict[str, Iterable[nn.Parameter]]:
+        """Those of Nerfies; what slices; and, apart from T, the weights by which w enters it."""
+        slicing = self.planes if self.settings.slicing == "plane" else self.slicing
+        return {**super().parts(), "ambient": slicing.parameters()}

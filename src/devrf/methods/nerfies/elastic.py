@@ -1,0 +1,75 @@
+"""The elastic loss: a warp should turn what it moves, not stretch it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+from torch.func import jvp, vmap
+
+# Below this squared singular value nothing is told apart: log² stays finite.
+LEAST = 1e-12
+# c: strains above it count less and less.
+SCALE = 0.03
+
+
+def jacobians(warp: Callable[[Tensor], Tensor], points: Tensor) -> Tensor:
+    """J = ∂x′/∂x (S, 3, 3) at points (S, 3) of a warp that moves each for itself."""
+
+    def along(direction: Tensor) -> Tensor:
+        change: Tensor = jvp(warp, (points,), (direction.expand_as(points),))[1]
+        return change
+
+    columns = torch.eye(3, dtype=points.dtype, device=points.device)
+    found: Tensor = vmap(along, out_dims=-1)(columns)
+    return found
+
+
+def strain(jacobian: Tensor) -> Tensor:
+    """Σ_j log² s_j (S,) of the singular values s of J (S, 3, 3): 0 for a rotation.
+
+    They are the roots of the eigenvalues of JᵀJ, so this is ¼ Σ log² λ_j, with finite gradients
+    also where eigenvalues are equal.
+    """
+    square = jacobian.transpose(-1, -2) @ jacobian
+    eigenvalues = torch.linalg.eigvalsh(square).clamp(min=LEAST)
+    squares: Tensor = eigenvalues.log().square()
+    return squares.sum(dim=-1) / 4
+
+
+def robust(square: Tensor, scale: float) -> Tensor:
+    """ρ(s²; c) = 2u / (u + 4), u = s² / c² (Geman–McClure): from 0 to 2.
+
+    Args:
+        square: s² ≥ 0 of any shape.
+        scale: c.
+    """
+    u = square / scale**2
+    return 2 * u / (u + 4)
+
+
+def drawn(weight: Tensor, ray: Tensor, rays: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """One sample of each of some rays, drawn in proportion to its weight.
+
+    A sum over a ray's samples Σ w_i f_i is estimated without bias by (Σ w_i) f of the one drawn.
+
+    Args:
+        weight: (S,) w ≥ 0.
+        ray: (S,) int64, ascending: the ray of each sample.
+        rays: (K,) int64, which rays.
+        count: how many rays there are.
+
+    Returns:
+        The samples (M,) int64 of those of the rays that have any weight, and the rays' Σ w_i (M,).
+    """
+    reached = weight.double().cumsum(0)
+    total = torch.zeros(count, dtype=reached.dtype, device=weight.device).index_add(
+        0, ray, weight.double()
+    )
+    mass, start = total[rays], (total.cumsum(0) - total)[rays]
+    some = (mass > 0).nonzero()[:, 0]
+    mass, start = mass[some], start[some]
+    wanted = start + torch.rand_like(mass) * mass
+    picked = torch.searchsorted(reached, wanted, right=True).clamp(max=max(len(weight) - 1, 0))
+    return picked, mass.to(weight.dtype)

@@ -1,0 +1,169 @@
+"""Nerfies (Park et al., ICCV 2021): a radiance field, and rigid motions that lead to it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, Self
+
+import torch
+from torch import Tensor, nn
+
+from devrf.data.batch import RayBatch
+from devrf.errors import DevrfError
+from devrf.methods.nerf.codes import TimeCodes
+from devrf.methods.nerf.deformable import DeformableField
+from devrf.methods.nerf.mlp import Initialisation
+from devrf.methods.nerf.settings import FieldSettings
+from devrf.methods.nerfies.elastic import SCALE, drawn, jacobians, robust, strain
+from devrf.methods.nerfies.warp import RigidWarp
+from devrf.methods.protocol import ProtocolStage
+from devrf.rendering.output import RenderOutput
+
+
+@dataclass(frozen=True)
+class NerfiesSettings(FieldSettings):
+    """Sizes and sampling; the defaults are the published ones (docs/methods/nerfies.md).
+
+    Attributes:
+        code: length of a frame's code.
+        warp_width: units of each layer of the warp.
+        warp_depth: layers of the warp.
+        warp_skip: the layer that the warp's input enters again; None: the middle one.
+        warp_bands: octaves of the warp's positions.
+        window: share of a stage during which these octaves are opened one after another.
+        elastic: ``drawn``, one sample of a ray by weight; ``full``, the sum over all samples.
+        elastic_rays: rays of a batch that the elastic term looks at; 0: all.
+    """
+
+    skip: int | None = 4
+    bands: int = 8
+    initialisation: Initialisation = "glorot"
+    coarse: int = 128
+    fine: int = 128
+    separate_coarse: bool = True
+    code: int = 8
+    warp_width: int = 128
+    warp_depth: int = 6
+    warp_skip: int | None = 4
+    warp_bands: int = 6
+    window: float = 0.32
+    elastic: Literal["drawn", "full"] = "drawn"
+    elastic_rays: int = 0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 <= self.window <= 1:
+            raise DevrfError(f"{self.key}.window: expected a share from 0 to 1, not {self.window}")
+        if self.elastic_rays < 0:
+            raise DevrfError(
+                f"{self.key}.elastic_rays: expected 0 or more, not {self.elastic_rays}"
+            )
+
+
+class Nerfies(DeformableField):
+    """(σ, c) = T(W(x, ω_t), d).
+
+    The warp is free at time 0, as published, unless a stage has learned T from the static images
+    alone: T then is the scene at time 0, and the warp leaves that as it is.
+
+    Attributes:
+        rest_is_canonical: whether nothing is warped at time 0.
+    """
+
+    name: ClassVar[str] = "nerfies"
+    losses: ClassVar[tuple[str, ...]] = ("color", "elastic")
+    settings_class: ClassVar[type[FieldSettings]] = NerfiesSettings
+    settings: NerfiesSettings
+
+    def __init__(self, settings: NerfiesSettings | None = None, ambient: int = 0) -> None:
+        """Build the networks.
+
+        Args:
+            settings: sizes and sampling.
+            ambient: length of what enters T beside the position.
+        """
+        s = settings or NerfiesSettings()
+        super().__init__(s, ambient)
+        self.rest_is_canonical = False
+        self.warp = RigidWarp(s.warp_width, s.warp_depth, s.warp_bands, s.code, s.warp_skip)
+
+    def set_times(self, times: tuple[float, ...]) -> None:
+        """Take the frames' times, and draw a code for each."""
+        super().set_times(times)
+        self.codes = TimeCodes(times, self.settings.code).to(self.device)
+
+    def config(self) -> dict[str, Any]:
+        """As for all, and whether time 0 is the canonical state."""
+        return {**super().config(), "rest_is_canonical": self.rest_is_canonical}
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> Self:
+        """Networks of the same sizes in the same place."""
+        model = super().from_config(config)
+        model.rest_is_canonical = config["rest_is_canonical"]
+        return model
+
+    def follow(self, step: ProtocolStage) -> None:
+        """What is learned from the static images alone is the canonical state."""
+        super().follow(step)
+        self.rest_is_canonical |= step.capture == "static"
+
+    def on_iteration(self, step: int, total: int) -> None:
+        """Open the warp's octaves: α grows evenly from 0."""
+        share = self.settings.window * total
+        opened = min(step / share, 1.0) if share else 1.0
+        self.warp.opened.fill_(opened * self.settings.warp_bands)
+
+    def deform(self, points: Tensor, time: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Where points lead, and what enters T beside; nothing moves where rest is canonical."""
+        if not self.rest_is_canonical:
+            return self.bend(points, time)
+        moving = (time > 0).nonzero()[:, 0]
+        bent, ambient = self.bend(points.index_select(0, moving), time.index_select(0, moving))
+        if ambient is not None:
+            nothing = ambient.new_zeros(len(points), ambient.shape[1])
+            ambient = nothing.index_copy(0, moving, ambient)
+        return points.index_copy(0, moving, bent), ambient
+
+    def bend(self, points: Tensor, time: Tensor) -> tuple[Tensor, Tensor | None]:
+        """As :meth:`deform`, at any time alike."""
+        return self.warp(points, self.codes(time)), None
+
+    def parts(self) -> dict[str, Iterable[nn.Parameter]]:
+        """The radiance fields, the warp, and the frames' codes."""
+        motion = {"warp": self.warp.parameters(), "codes": self.codes.parameters()}
+        return {**self.radiance_parts(), **motion}
+
+    def loss_terms(
+        self, output: RenderOutput, batch: RayBatch, names: Collection[str]
+    ) -> dict[str, Tensor]:
+        """``color``; ``elastic``: the mean over rays of Σ_i w_i · c ρ(Σ_j log² s_j; c).
+
+        s are the singular values of ∂x′/∂x at sample i, and c = 0.03. The factor c before ρ is
+        that of the released code; w has no gradient (docs/methods/nerfies.md#elastic).
+        """
+        terms = super().loss_terms(output, batch, names)
+        if "elastic" in names:
+            terms["elastic"] = self._elastic(output, len(batch.time))
+        return terms
+
+    def _elastic(self, output: RenderOutput, rays: int) -> Tensor:
+        """Of the coarse samples where these have a field of their own, as published."""
+        first = "coarse_" if "coarse_points" in output.extras else ""
+        points, time, weight, ray = (
+            output.extras[first + name].detach() for name in ("points", "time", "weight", "ray")
+        )
+        count = min(self.settings.elastic_rays or rays, rays)
+        chosen = torch.randperm(rays, device=ray.device)[:count]
+        if self.settings.elastic == "drawn":
+            sample, mass = drawn(weight, ray, chosen, rays)
+        else:
+            sample = torch.isin(ray, chosen).nonzero()[:, 0]
+            mass = weight[sample]
+        if self.rest_is_canonical:
+            moving = (time[sample] > 0).nonzero()[:, 0]
+            sample, mass = sample[moving], mass[moving]
+        code = self.codes(time[sample])
+        stretch = strain(jacobians(lambda x: self.warp(x, code), points[sample]))
+        return (mass * SCALE * robust(stretch, SCALE)).sum() / count

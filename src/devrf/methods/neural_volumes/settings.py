@@ -1,0 +1,78 @@
+"""Sizes and sampling of Neural Volumes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from devrf.errors import DevrfError
+
+KEY = "ray_stage.model.settings"
+
+
+@dataclass(frozen=True)
+class NeuralVolumesSettings:
+    """Sizes and sampling; the defaults are the published ones (docs/methods/neural_volumes.md).
+
+    Attributes:
+        code: numbers that describe a moment.
+        encoder_views: training cameras whose images of a moment are encoded.
+        encoder_size: height and width that these images are fitted into, in pixels.
+        encoder_channels: of each convolution, which halves the image.
+        encoder_width: units of the layer that joins the cameras.
+        template_channels: of each level, from 1³ on; the volume has 2^levels voxels along an edge.
+        warp: ``conv`` (a grid of displacements) or ``affine`` (a mixture of affine maps).
+        warp_side: grid points of the warp along an edge, a power of two.
+        warp_width: channels of each level (conv).
+        warp_scale: displacement for an output of 1 (conv); the cube's edge is 2.
+        maps: how many affine maps are mixed (affine).
+        density_scale: opacity per unit length of a softplus of 1, in the same unit.
+        step: between samples, in the same unit.
+        hull: whether what is outside the visual hull of each frame's mattes is left out, which the
+            published method never had; else the whole cube is sampled.
+        occupancy_side: the hulls have about side³ cells.
+    """
+
+    code: int = 256
+    encoder_views: int = 3
+    encoder_size: Sequence[int] = (384, 512)
+    encoder_channels: Sequence[int] = (64, 64, 128, 128, 256, 256, 256)
+    encoder_width: int = 512
+    template_channels: Sequence[int] = (1024, 512, 512, 256, 256, 128, 128)
+    warp: Literal["conv", "affine"] = "conv"
+    warp_side: int = 32
+    warp_width: int = 128
+    warp_scale: float = 2 / 1024
+    maps: int = 16
+    density_scale: float = 1.0
+    step: float = 4 / 256
+    hull: bool = False
+    occupancy_side: int = 128
+
+    def __post_init__(self) -> None:
+        least = {"code": 1, "encoder_views": 1, "encoder_width": 1, "warp_width": 1, "maps": 1}
+        for name, smallest in {**least, "occupancy_side": 2}.items():
+            if getattr(self, name) < smallest:
+                raise _refused(name, f"at least {smallest}", getattr(self, name))
+        for name in ("density_scale", "step", "warp_scale"):
+            if not getattr(self, name) > 0:
+                raise _refused(name, "more than 0", getattr(self, name))
+        for name in ("encoder_channels", "template_channels"):
+            if not getattr(self, name) or min(getattr(self, name)) < 1:
+                raise _refused(name, "one or more numbers above 0", list(getattr(self, name)))
+        if self.warp_side < 2 or self.warp_side & (self.warp_side - 1):
+            raise _refused("warp_side", "a power of two", self.warp_side)
+        multiple = 2 ** len(self.encoder_channels)
+        size = self.encoder_size
+        if len(size) != 2 or any(edge < multiple or edge % multiple for edge in size):
+            raise _refused("encoder_size", f"two multiples of {multiple}", list(size))
+
+    @property
+    def warp_channels(self) -> list[int]:
+        """Of each level of the convolutional warp, from 1³ on."""
+        return [self.warp_width] * (self.warp_side.bit_length() - 1)
+
+
+def _refused(name: str, expected: str, given: object) -> DevrfError:
+    return DevrfError(f"{KEY}.{name}: expected {expected}, not {given}")

@@ -1,0 +1,94 @@
+"""Decoded volumes of a few moments, and what rays see of them: opacity that adds up."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from devrf.methods.nerf.ray_samples import RaySamples
+from devrf.ops.compositing import sum_by_ray
+from devrf.rendering.output import RenderOutput
+
+
+@dataclass(frozen=True)
+class Volumes:
+    """Volumes of M moments over the cube [−1, 1]³.
+
+    Attributes:
+        template: (M, 4, T, T, T), axes z, y, x: RGB in [0, 1], and opacity per unit length.
+        warp: (M, 3, W, W, W), axes z, y, x: where in the template a point of the cube is found.
+    """
+
+    template: Tensor
+    warp: Tensor
+
+    def at(self, points: Tensor, moment: Tensor) -> Tensor:
+        """RGB and opacity per unit length (S, 4) at ``points``; nothing beyond the template.
+
+        Args:
+            points: (S, 3) in the cube.
+            moment: (S,) int64, the moment of each.
+        """
+        order = moment.argsort(stable=True)
+        counts = torch.bincount(moment, minlength=len(self.template)).tolist()
+        parts = torch.split(points.index_select(0, order), counts)
+        found = [
+            _sampled(self.template[k], _sampled(self.warp[k], part))
+            for k, part in enumerate(parts)
+            if len(part)
+        ]
+        values = torch.cat(found) if found else points.new_zeros(0, 4)
+        return torch.zeros_like(values).index_copy(0, order, values)
+
+
+def _sampled(volume: Tensor, points: Tensor) -> Tensor:
+    """Trilinear values (S, C) of a volume (C, Z, Y, X) at ``points`` (S, 3); 0 outside."""
+    found = grid_sample(volume[None], points[None, None, None], align_corners=True)
+    return found.view(len(volume), -1).t()
+
+
+def added_opacity(amount: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
+    """Each sample's share of what is seen, and what is opaque of each ray.
+
+    A_i = min(1, A_{i−1} + a_i) and w_i = A_i − A_{i−1}: for example a = (0.75, 0.5, 1) on one ray
+    gives w = (0.75, 0.25, 0) and A = 1 (docs/methods/neural_volumes.md#rendering).
+
+    Args:
+        amount: (S,) a_i = α_i δ_i ≥ 0, front to back within each ray.
+        ray: (S,) int64, ascending.
+        rays: R.
+
+    Returns:
+        w (S,) and A (R,).
+    """
+    # In double precision: a running sum over all rays loses the digits of the last ones.
+    reached = amount.double().cumsum(0)
+    count = torch.bincount(ray, minlength=rays)
+    before_ray = torch.cat([reached.new_zeros(1), reached])[count.cumsum(0) - count]
+    behind = reached - before_ray.index_select(0, ray)
+    weight = behind.clamp(max=1) - (behind - amount).clamp(max=1)
+    return weight.to(amount.dtype), sum_by_ray(amount, ray, rays).clamp(max=1)
+
+
+def seen(samples: RaySamples, values: Tensor, background: Tensor) -> RenderOutput:
+    """C = Σ w_i c_i + (1 − A) · background.
+
+    Args:
+        samples: S samples of R rays.
+        values: (S, 4) RGB and opacity per unit of the samples' lengths.
+        background: (3,) or (R, 3) RGB.
+    """
+    ray, rays = samples.ray, samples.rays
+    weight, opacity = added_opacity(values[:, 3] * samples.length, ray, rays)
+    color = sum_by_ray(weight[:, None] * values[:, :3], ray, rays)
+    transmittance = 1 - opacity
+    with torch.no_grad():
+        depth = sum_by_ray(weight * samples.distance, ray, rays) / opacity.clamp(min=1e-6)
+    return RenderOutput(
+        color=color + transmittance[:, None] * background,
+        depth=depth,
+        transmittance=transmittance,
+    )

@@ -1,0 +1,174 @@
+"""NSFF's two trunks: what is always there, and what is there at a time and where it goes."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from devrf.methods.nerf.encoding import SinusoidalEncoding
+from devrf.methods.nerf.mlp import Trunk
+from devrf.methods.nsff.blending import Blend, blended, closed, shared
+from devrf.methods.nsff.settings import NSFFSettings
+from devrf.system.machine import multiplies_bfloat16
+
+# The flow's weights begin in ±SMALL, so that the first flows are next to zero.
+SMALL = 1e-4
+FORWARD, BACKWARD = 0, 1
+
+
+@dataclass(frozen=True)
+class StaticSamples:
+    """The static field at S points.
+
+    Attributes:
+        raw: (S,) density before its activation.
+        color: (S, 3) RGB.
+        blend: (S,) v in [0, 1], the share of the dynamic part.
+    """
+
+    raw: Tensor
+    color: Tensor
+    blend: Tensor
+
+
+@dataclass(frozen=True)
+class DynamicSamples:
+    """The dynamic field at S points, each at a time.
+
+    Attributes:
+        raw: (S,) density before its activation.
+        color: (S, 3) RGB.
+        flow: (S, 2, 3) displacement to the next frame and to the one before, in normalised space.
+        occlusion: (S, 2) in [0, 1], the probability that the frame there does not show the point.
+    """
+
+    raw: Tensor
+    color: Tensor
+    flow: Tensor
+    occlusion: Tensor
+
+
+class HeadedField(nn.Module):
+    """A radiance field with one more linear head on its trunk."""
+
+    def __init__(self, inputs: int, further: int, settings: NSFFSettings) -> None:
+        """Build the network.
+
+        Args:
+            inputs: length of what is encoded.
+            further: numbers of the additional head.
+            settings: sizes.
+        """
+        super().__init__()
+        width = settings.width
+        self._precision = settings.precision
+        self.encode = SinusoidalEncoding(inputs, settings.bands)
+        self.encode_direction = SinusoidalEncoding(3, settings.direction_bands)
+        self.trunk = Trunk(self.encode.size, width, settings.depth, skip=settings.skip)
+        self.density = nn.Linear(width, 1)
+        self.further = nn.Linear(width, further)
+        self.feature = nn.Linear(width, width)
+        self.branch = nn.Linear(width + self.encode_direction.size, width // 2)
+        self.color = nn.Linear(width // 2, 3)
+
+    def forward(
+        self, values: Tensor, viewdirs: Tensor, ray: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Density before its activation (S,), RGB (S, 3), and the additional head's numbers (S, K).
+
+        Args:
+            values: (S, inputs) in normalised space; in [−1, 1] where training rays were.
+            viewdirs: (R, 3) unit viewing directions of the rays.
+            ray: (S,) int64, the ray of each sample.
+        """
+        encoded = self.encode(values)
+        direction = self.encode_direction(viewdirs).index_select(0, ray)
+        reduced = self._precision == "bfloat16"
+        if self._precision == "auto":
+            reduced = multiplies_bfloat16(values.device)
+        reduced = reduced and self.training
+        with torch.autocast(values.device.type, torch.bfloat16) if reduced else nullcontext():
+            x = self.trunk(encoded)
+            raw, further = self.density(x)[:, 0], self.further(x)
+            x = torch.relu(self.branch(torch.cat([self.feature(x), direction], dim=-1)))
+            color = self.color(x)
+        return raw.float(), torch.sigmoid(color.float()), further.float()
+
+
+class StaticField(HeadedField):
+    """S(γ(x), γ(d)) → σ_s, c_s, v (docs/methods/nsff.md#model)."""
+
+    def __init__(self, settings: NSFFSettings) -> None:
+        super().__init__(3, 1, settings)
+
+    def at(self, points: Tensor, viewdirs: Tensor, ray: Tensor) -> StaticSamples:
+        """The field at points (S, 3); other arguments as for :meth:`HeadedField.forward`."""
+        raw, color, further = self(points, viewdirs, ray)
+        return StaticSamples(raw, color, torch.sigmoid(further[:, 0]))
+
+
+class DynamicField(HeadedField):
+    """D(γ(x, 2t − 1), γ(d)) → σ_d, c_d, f⁺, f⁻, o⁺, o⁻ (docs/methods/nsff.md#model).
+
+    Attributes:
+        reach: the most that a point moves along an axis from a frame to the next.
+    """
+
+    def __init__(self, settings: NSFFSettings) -> None:
+        super().__init__(4, 8, settings)
+        self.reach = 1.0
+        with torch.no_grad():
+            self.further.weight[:6].uniform_(-SMALL, SMALL)
+            self.further.bias[:6].zero_()
+
+    def at(self, points: Tensor, time: Tensor, viewdirs: Tensor, ray: Tensor) -> DynamicSamples:
+        """The field at points (S, 3) and times (S,) in [0, 1]; else as :meth:`forward`."""
+        values = torch.cat([points, 2 * time[:, None] - 1], dim=-1)
+        raw, color, further = self(values, viewdirs, ray)
+        flow = self.reach * torch.tanh(further[:, :6]).view(-1, 2, 3)
+        return DynamicSamples(raw, color, flow, torch.sigmoid(further[:, 6:]))
+
+
+class TwoFields(nn.Module):
+    """Both fields, and how their densities join.
+
+    Attributes:
+        static: what is always there.
+        dynamic: what is there at a time.
+    """
+
+    def __init__(self, settings: NSFFSettings) -> None:
+        """Build both networks."""
+        super().__init__()
+        self.static, self.dynamic = StaticField(settings), DynamicField(settings)
+        self.additive = settings.blend == "additive"
+        self._scale, self._noise = settings.density_scale, settings.density_noise
+
+    def noise(self, raw: Tensor) -> Tensor | float:
+        """Noise for densities like ``raw`` (S,) while they are learned; 0 otherwise."""
+        return self._noise * torch.randn_like(raw) if self.training and self._noise else 0.0
+
+    def optical_depth(self, raw: Tensor, length: Tensor, noise: Tensor | float) -> Tensor:
+        """τ = σ δ (S,) with σ = scale · softplus(raw + noise); ``length`` in normalised units."""
+        return nn.functional.softplus(raw + noise) * self._scale * length
+
+    def blended(
+        self, dynamic: Tensor, static: Tensor, v: Tensor, ray: Tensor, rays: int, *, endless: bool
+    ) -> Blend:
+        """Weights of optical depths (S,) of both fields.
+
+        Args:
+            dynamic: (S,) τ_d, front to back within each ray.
+            static: (S,) τ_s.
+            v: (S,) the share of the dynamic part; does not count where densities add.
+            ray: (S,) int64, ascending.
+            rays: R.
+            endless: whether the last sample of each ray stands for all behind it.
+        """
+        if self.additive:
+            return blended(dynamic, static, ray, rays)
+        blend = blended(*shared(dynamic, static, v), ray, rays)
+        return closed(blend, v, ray) if endless else blend

@@ -1,0 +1,69 @@
+"""Where NSFF's networks live: normalised space, and its maps to the world."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from devrf.geometry.box import Box
+from devrf.geometry.ndc import NormalizedDevice
+from devrf.geometry.space import Space
+
+# Points beyond, which a flow may lead to, count as being there: infinity is at 1.
+FURTHEST = 0.99
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Normalised space: the fields' box, centred, its longest edge being 2.
+
+    Attributes:
+        box: holds the scene, in the fields' space.
+        space: the fields' space.
+    """
+
+    box: Box
+    space: Space
+
+    @property
+    def half_edge(self) -> float:
+        """What 1 in normalised space is in the fields' space."""
+        return self.box.longest / 2
+
+    @property
+    def unit(self) -> float:
+        """World units that :meth:`euclidean` counts as 1: about as large as what is near."""
+        if isinstance(self.space, NormalizedDevice):
+            return self.space.near
+        return self.space.inner(self.box).longest / 2
+
+    def normalised(self, points: Tensor) -> Tensor:
+        """Normalised points (..., 3) of the fields' space."""
+        return (points - points.new_tensor(self.box.middle)) / self.half_edge
+
+    def fields(self, points: Tensor) -> Tensor:
+        """Points (..., 3) of the fields' space: the inverse of :meth:`normalised`."""
+        return points * self.half_edge + points.new_tensor(self.box.middle)
+
+    def world(self, points: Tensor) -> Tensor:
+        """World points (..., 3) of normalised ones; in NDC none behind :data:`FURTHEST`."""
+        own = self.fields(points)
+        if isinstance(self.space, NormalizedDevice):
+            limit = own.new_tensor([float("inf"), float("inf"), FURTHEST])
+            own = own.minimum(limit)
+        return self.space.to_world(own)
+
+    def euclidean(self, points: Tensor) -> Tensor:
+        """World points (..., 3) of normalised ones, in units of :attr:`unit`."""
+        return self.world(points) / self.unit
+
+    def within(self, points: Tensor, share: float) -> Tensor:
+        """Mask (S,) of normalised points (S, 3) that are near enough to be held smooth.
+
+        In NDC those of the nearest ``share`` of depths, elsewhere all that cameras look at.
+        """
+        own = self.fields(points)
+        if isinstance(self.space, NormalizedDevice):
+            return (own[..., 2] + 1) / 2 <= share
+        return self.space.inner(self.box).contains(own)

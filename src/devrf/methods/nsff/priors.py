@@ -1,0 +1,142 @@
+"""What training images tell beside their colours: flow both ways, depth, and what moves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from devrf.data.batch import PixelPool, RayBatch, wanted_pixels
+from devrf.geometry.cameras import Cameras
+from devrf.geometry.space import Space
+from devrf.methods.nsff.fields import FORWARD
+from devrf.scenes.optical_flow import frame_pairs
+from devrf.scenes.scene import OpticalFlow, Views
+
+# A pixel is in the motion mask where its flow is longer than this, in pixels.
+MOVING = 1.0
+
+
+class ImagePriors:
+    """Flow, depth and neighbours of the images that rays are drawn from, numbered through.
+
+    Attributes:
+        cameras: of all images.
+        neighbour: (N, 2) int64, the image one frame later and the one before in the same view; its
+            own number where there is none.
+        moving: the pixels of fixed cameras that move; None where none is known to.
+    """
+
+    def __init__(self, views: Sequence[Views], space: Space) -> None:
+        """Look at the images.
+
+        Args:
+            views: of each capture, on one device.
+            space: the fields' space.
+        """
+        self._views, self._space = tuple(views), space
+        every = [one.cameras for one in views]
+        self.cameras = Cameras(
+            torch.cat([one.camera_to_world for one in every]),
+            torch.cat([one.focal for one in every]),
+            torch.cat([one.center for one in every]),
+            every[0].width,
+            every[0].height,
+        )
+        self.neighbour = torch.arange(len(self.cameras))[:, None].repeat(1, 2)
+        # The number of each capture's first image.
+        self._offsets = [sum(map(len, views[:k])) for k in range(len(views))]
+        pools = []
+        for one, offset in zip(views, self._offsets, strict=True):
+            for image, earlier in frame_pairs(one):
+                self.neighbour[earlier + offset, 0] = image + offset
+                self.neighbour[image + offset, 1] = earlier + offset
+            if (pool := _moving(one)) is not None:
+                pools.append(PixelPool(pool.image + offset, pool.flat))
+        self.neighbour = self.neighbour.to(views[0].times.device)
+        self.moving = None
+        if pools:
+            self.moving = PixelPool(
+                torch.cat([pool.image for pool in pools]), torch.cat([pool.flat for pool in pools])
+            )
+
+    @property
+    def has_flow(self) -> tuple[bool, bool]:
+        """Whether some image has forward flow, and whether some has backward flow."""
+        there = [[_known(_flow(one, side)) for one in self._views] for side in (0, 1)]
+        return any(there[0]), any(there[1])
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether some image has depth that rays of the fields' space can be compared with."""
+        return self._space.straight and any(one.depth is not None for one in self._views)
+
+    def flow(self, batch: RayBatch, side: int) -> tuple[Tensor, Tensor]:
+        """Optical flow (R, 2) in pixels of a batch's rays, and (R,) bool where it is known.
+
+        Args:
+            batch: rays of these images.
+            side: ``FORWARD`` or ``BACKWARD``.
+        """
+        vectors = torch.zeros_like(batch.pixel)
+        valid = torch.zeros_like(batch.time, dtype=torch.bool)
+
+        def take(views: Views, own: Tensor, row: Tensor) -> None:
+            flow = _flow(views, side)
+            if flow is not None:
+                valid[own] = flow.valid.flatten()[row]
+                vectors[own] = flow.vectors.flatten(0, 2)[row]
+
+        self._look_up(batch, take)
+        # What was observed where it is not valid may be anything, NaN included.
+        return torch.where(valid[:, None], vectors, 0.0), valid
+
+    def distance(self, batch: RayBatch) -> Tensor:
+        """How far along a batch's rays, in their own units, surfaces are (R,); inf: unknown."""
+        depth = torch.full_like(batch.time, torch.inf)
+
+        def take(views: Views, own: Tensor, row: Tensor) -> None:
+            if views.depth is not None:
+                depth[own] = views.depth.flatten()[row]
+
+        self._look_up(batch, take)
+        known = depth.isfinite()
+        world = self.cameras.rays(batch.image, batch.pixel)
+        points = world.origins + world.directions * torch.where(known, depth, 1.0)[:, None]
+        along = batch.rays.directions
+        away = self._space.from_world(points) - batch.rays.origins
+        found = (away * along).sum(dim=1) / along.square().sum(dim=1)
+        return torch.where(known, found, torch.inf)
+
+    def _look_up(self, batch: RayBatch, take: Callable[[Views, Tensor, Tensor], None]) -> None:
+        """Call ``take`` with each capture, its rays' numbers, and their pixels' row-major ones."""
+        column, line = batch.pixel.long().unbind(1)
+        for one, offset in zip(self._views, self._offsets, strict=True):
+            own = (batch.image >= offset) & (batch.image < offset + len(one))
+            ray = own.nonzero()[:, 0]
+            image = batch.image[ray] - offset
+            take(one, ray, (image * one.height + line[ray]) * one.width + column[ray])
+
+
+def _flow(views: Views, side: int) -> OpticalFlow | None:
+    return views.forward_flow if side == FORWARD else views.flow
+
+
+def _known(flow: OpticalFlow | None) -> bool:
+    return flow is not None and bool(flow.valid.any())
+
+
+def _moving(views: Views) -> PixelPool | None:
+    """The pixels whose flow is longer than ``MOVING``, if the cameras are fixed."""
+    if len(set(views.view.tolist())) == len(views):
+        return None
+    wanted = torch.zeros(len(views), views.height * views.width, dtype=torch.bool)
+    wanted = wanted.to(views.times.device)
+    for flow in (views.flow, views.forward_flow):
+        if flow is not None:
+            long = flow.vectors.norm(dim=-1) > MOVING
+            wanted |= (flow.valid & long).flatten(1)
+    images = torch.arange(len(views), device=wanted.device)
+    pool = wanted_pixels(views, images, wanted)
+    return pool if len(pool) else None

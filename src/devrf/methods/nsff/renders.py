@@ -1,0 +1,229 @@
+"""The pictures of a batch that losses compare: blended, dynamic alone, and from other frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from devrf.data.batch import RayBatch
+from devrf.methods.nerf.ray_samples import RaySamples
+from devrf.methods.nsff.blending import Blend
+from devrf.methods.nsff.fields import BACKWARD, FORWARD, DynamicSamples, StaticSamples, TwoFields
+from devrf.ops.compositing import composite, sum_by_ray
+from devrf.rendering.output import RenderOutput
+
+
+@dataclass(frozen=True, kw_only=True)
+class BlendedOutput(RenderOutput):
+    """A rendering of R rays from S samples, and what it was made of.
+
+    Attributes:
+        samples: lengths in normalised units.
+        points: (S, 3) the samples in normalised space.
+        static: the static field there.
+        dynamic: the dynamic field there, at the rays' times.
+        depths: (S,) optical depths of the dynamic and of the static field alone.
+        blend: their weights.
+    """
+
+    samples: RaySamples
+    points: Tensor
+    static: StaticSamples
+    dynamic: DynamicSamples
+    depths: tuple[Tensor, Tensor]
+    blend: Blend
+
+
+@dataclass(frozen=True)
+class Warp:
+    """R rays of one frame rendered with the dynamic field of another: C_{j→i}.
+
+    Attributes:
+        there: (R,) bool, whether that frame exists.
+        frame: (R,) int64, the other frame j.
+        side: (R,) int64, whether it comes after (``FORWARD``) or before (``BACKWARD``).
+        kept: (K,) int64, the samples of the rays whose frame exists.
+        ray: (K,) int64, theirs.
+        moved: (K, 3) f_{i→j}, by which they were displaced last.
+        occlusion: (K,) o_{i→j}.
+        points: (K, 3) where they are in frame j.
+        found: the dynamic field there.
+        color: (R, 3) RGB.
+        weight: (K,) of the dynamic field.
+    """
+
+    there: Tensor
+    frame: Tensor
+    side: Tensor
+    kept: Tensor
+    ray: Tensor
+    moved: Tensor
+    occlusion: Tensor
+    points: Tensor
+    found: DynamicSamples
+    color: Tensor
+    weight: Tensor
+
+
+class Renders:
+    """Further renders of a batch, each made when a loss first asks for it.
+
+    Attributes:
+        fields: the networks.
+        output: the batch as it was rendered.
+        batch: the rays, and the truth at their pixels.
+    """
+
+    def __init__(
+        self,
+        fields: TwoFields,
+        times: Tensor,
+        output: BlendedOutput,
+        batch: RayBatch,
+        *,
+        both: bool,
+        weighted: bool,
+    ) -> None:
+        """Keep what there is to know.
+
+        Args:
+            fields: the networks.
+            times: (T,) of the frames.
+            output: the batch as it was rendered.
+            batch: R rays.
+            both: render from both neighbouring frames; else from one at random.
+            weighted: weigh rays by how much of them is dynamic: the first N₀ iterations are over.
+        """
+        self.fields, self.output, self.batch = fields, output, batch
+        self._times, self._both, self._weighted = times, both, weighted
+
+    @property
+    def rays(self) -> int:
+        """R."""
+        return len(self.batch.rays)
+
+    @cached_property
+    def dynamic_share(self) -> Tensor:
+        """(R,) sg(Σ w_d), how much of each ray is dynamic; 1 in the first N₀ iterations."""
+        if not self._weighted:
+            return torch.ones_like(self.batch.time)
+        return sum_by_ray(self.output.blend.dynamic, self.output.samples.ray, self.rays).detach()
+
+    @cached_property
+    def alone(self) -> tuple[Tensor, Tensor]:
+        """C_d (R, 3) and weights (S,) of the dynamic field without the static one."""
+        samples = self.output.samples
+        weight, end = composite(self.output.depths[0], samples.ray, self.rays)
+        return self._color(weight, self.output.dynamic.color, samples.ray, end), weight
+
+    @property
+    def seen(self) -> tuple[Tensor, Tensor]:
+        """Weights (S,) that depth and flow are rendered with, and the part of them that moves.
+
+        Those of the dynamic field alone, or of both where densities add.
+        """
+        if not self.fields.additive:
+            return self.alone[1], self.alone[1]
+        blend = self.output.blend
+        return blend.dynamic + blend.static, blend.dynamic
+
+    @cached_property
+    def warps(self) -> list[Warp]:
+        """The rays rendered from one or both neighbouring frames."""
+        if self._both:
+            sides = [torch.full_like(self.batch.frame, side) for side in (FORWARD, BACKWARD)]
+        else:
+            # At the ends of the recording there is one neighbour alone.
+            side = (torch.rand_like(self.batch.time) < 0.5).long()
+            side = torch.where(self.batch.frame == 0, FORWARD, side)
+            sides = [torch.where(self.batch.frame == len(self._times) - 1, BACKWARD, side)]
+        every = torch.arange(len(self.output.points), device=self.batch.time.device)
+        anyone = torch.ones_like(self.batch.time, dtype=torch.bool)
+        return [
+            self._warp(side, self.batch.frame, anyone, every, self.output.points, self.output)
+            for side in sides
+        ]
+
+    def chained(self, number: int) -> Warp:
+        """The rays rendered from two frames away, flows chained, beyond a neighbour.
+
+        Args:
+            number: of an iteration, so that sides alternate.
+        """
+        near = self.warps[number % len(self.warps)]
+        return self._warp(near.side, near.frame, near.there, near.kept, near.points, near)
+
+    def _warp(
+        self,
+        side: Tensor,
+        frame: Tensor,
+        there: Tensor,
+        kept: Tensor,
+        points: Tensor,
+        source: BlendedOutput | Warp,
+    ) -> Warp:
+        """One frame further to each ray's ``side`` (R,) from ``frame`` (R,), where there is one.
+
+        Args:
+            side: (R,).
+            frame: (R,).
+            there: (R,) whether that frame exists.
+            kept: (K,) samples of the rays whose frame exists.
+            points: (K, 3) where they are in that frame.
+            source: has the dynamic field there.
+        """
+        samples, count = self.output.samples, len(self._times)
+        frame = frame + torch.where(side == FORWARD, 1, -1)
+        there = there & (frame >= 0) & (frame < count)
+        frame = frame.clamp(0, count - 1)
+        going = there[samples.ray[kept]].nonzero()[:, 0]
+        kept = kept[going]
+        ray = samples.ray[kept]
+        toward = side[ray]
+        before = source.dynamic if isinstance(source, BlendedOutput) else source.found
+        moved, occlusion = before.flow[going, toward], before.occlusion[going, toward]
+        points = points[going] + moved
+        found = self.fields.dynamic.at(
+            points, self._times[frame[ray]], self.batch.rays.viewdirs, ray
+        )
+        color, weight = self._composited(found, kept, ray)
+        return Warp(there, frame, side, kept, ray, moved, occlusion, points, found, color, weight)
+
+    def _composited(
+        self, found: DynamicSamples, kept: Tensor, ray: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """C (R, 3) of samples with another frame's dynamic field, and its weights (K,).
+
+        The static part stays as it is where densities add; else it is left out.
+        """
+        length = self.output.samples.length[kept]
+        depth = self.fields.optical_depth(found.raw, length, self.fields.noise(found.raw))
+        if not self.fields.additive:
+            weight, end = composite(depth, ray, self.rays)
+            return self._color(weight, found.color, ray, end), weight
+        static, v = self.output.depths[1][kept], self.output.static.blend[kept]
+        blend = self.fields.blended(depth, static, v, ray, self.rays, endless=False)
+        color = self._color(blend.dynamic, found.color, ray, blend.transmittance)
+        still = blend.static[:, None] * self.output.static.color[kept]
+        return color + sum_by_ray(still, ray, self.rays), blend.dynamic
+
+    def _color(self, weight: Tensor, color: Tensor, ray: Tensor, end: Tensor) -> Tensor:
+        seen = sum_by_ray(weight[:, None] * color, ray, self.rays)
+        return seen + end[:, None] * self.batch.background
+
+    def trust(self, warp: Warp) -> Tensor:
+        """Ŵ_{j→i} (R,): how far each ray's render from another frame can be compared.
+
+        1 − Σ sg(w_{j→i}) o_{i→j}, so that the background is trusted; where densities add
+        1 − |Σ sg(w_{j→i} − w_i)|. 0 where there is no such frame.
+        """
+        weight = warp.weight.detach()
+        if self.fields.additive:
+            own = self.output.blend.dynamic[warp.kept].detach()
+            found = 1 - sum_by_ray(weight - own, warp.ray, self.rays).abs()
+        else:
+            found = 1 - sum_by_ray(weight * warp.occlusion, warp.ray, self.rays)
+        return found.clamp(min=0) * warp.there

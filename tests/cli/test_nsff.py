@@ -1,0 +1,74 @@
+"""NSFF from the command line: trained, scored and filmed like any method."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+TINY = (
+    "method=nsff",
+    "experiment=peer_small",
+    "ray_stage.schedule.iterations=2",
+    "ray_stage.schedule.rays=32",
+    "ray_stage.schedule.iterations_per_step=1",
+    "ray_stage.model.settings.width=8",
+    "ray_stage.model.settings.depth=2",
+    "ray_stage.model.settings.steps=16",
+    "ray_stage.model.settings.samples=8",
+    "ray_stage.model.settings.occupancy_side=8",
+    "video.frames=3",
+    "video.height=40",
+    "trainer=cpu",
+)
+ROBOT = (
+    "data.width=24",
+    "data.height=20",
+    "data.static_views=6",
+    "data.static_test_views=2",
+    "data.train_views=2",
+    "data.frames=3",
+    "data.supersample=1",
+)
+TOY = (
+    "data=procedural_forward",
+    "data.width=24",
+    "data.height=20",
+    "data.static_views=8",
+    "data.train_views=2",
+    "data.frames=3",
+    "data.supersample=1",
+)
+
+
+@pytest.mark.parametrize(
+    ("protocol", "scene", "film"),
+    [("joint", TOY, "spiral"), ("dynamic", ROBOT, "held_out")],
+)
+def test_a_protocol_trains_scores_and_films(devrf, tmp_path, protocol, scene, film):
+    done = devrf(*TINY, *scene, f"protocol={protocol}", "hydra.run.dir=run")
+    assert done.status == 0, done.err
+    found = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert (found["method"], found["protocol"]) == ("nsff", protocol)
+    assert 3 < found["dynamic"]["psnr"] < 40 and 3 < found["static"]["psnr"] < 40
+    assert {"rest_pose_psnr", "seconds", "iterations", "checkpoint_mb"} <= set(found["dynamic"])
+    assert (tmp_path / "run" / "videos" / f"{film}.mp4").stat().st_size > 1000
+    picture = devrf("hydra.run.dir=run", "stage=still", "still.time=0.37", "still.height=20")
+    assert picture.status == 0, picture.err
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ([], "protocol: method=nsff does not learn by protocol=two_stage; give protocol=joint or"),
+        (["protocol=joint", "ray_stage.model.settings.blend=w"], "expected one of v, additive"),
+        (["protocol=joint", "ray_stage.model.settings.sampling=hierarchical"],
+         "expected one of stratified, occupancy"),
+        (["protocol=joint", "+ray_stage.loss.elastic=1"], "ray_stage.loss: nsff has no term"),
+        (["protocol=joint", "ray_stage.model.settings.warmup.least_frames=99"],
+         "warmup.least_frames: expected 1 … most_frames (30), not 99"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_said_in_one_line(devrf, asked, said):
+    done = devrf(*TINY, *ROBOT, *asked)
+    assert done.status == 2 and said in done.err and done.err.count("\n") == 1

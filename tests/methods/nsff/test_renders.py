@@ -1,0 +1,131 @@
+"""Renders from other frames: where nothing moves, and where everything moves alike."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from devrf.data.batch import RayBatch
+from devrf.methods.nerf.ray_samples import RaySamples, volume_render
+from devrf.methods.nsff.fields import BACKWARD, FORWARD
+from devrf.methods.nsff.model import NSFF
+from devrf.methods.nsff.renders import BlendedOutput, Renders
+
+
+def rendered(model: NSFF, batch: RayBatch, *, both: bool = True) -> Renders:
+    output = model(batch)
+    assert isinstance(output, BlendedOutput)
+    return Renders(model.fields, model.times, output, batch, both=both, weighted=False)
+
+
+def share(model: NSFF, v: float) -> None:
+    """Make v the same everywhere, nearly 0 or 1."""
+    torch.nn.init.zeros_(model.fields.static.further.weight)
+    torch.nn.init.constant_(model.fields.static.further.bias, 1000 * (2 * v - 1))
+
+
+def move(model: NSFF, forward: tuple[float, ...], backward: tuple[float, ...]) -> None:
+    """Make the flows the same everywhere."""
+    head = model.fields.dynamic.further
+    wanted = torch.tensor([*forward, *backward]) / model.fields.dynamic.reach
+    with torch.no_grad():
+        head.weight[:6], head.bias[:6] = 0.0, torch.atanh(wanted)
+
+
+def test_without_a_share_it_is_a_static_field(placed: NSFF, batch: RayBatch) -> None:
+    share(placed, 0.0)
+    out = rendered(placed, batch).output
+    samples = out.samples
+    density = torch.nn.functional.softplus(out.static.raw) * placed.settings.density_scale
+    plain = volume_render(samples, density, out.static.color, batch.background)
+    torch.testing.assert_close(out.color, plain.color, atol=1e-5, rtol=1e-5)
+    later = placed(replace(batch, time=torch.ones_like(batch.time)))
+    torch.testing.assert_close(later.color, out.color, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("both", [True, False])
+def test_without_motion_and_time_another_frame_is_this_one(
+    placed: NSFF, batch: RayBatch, both: bool
+) -> None:
+    share(placed, 1.0)
+    move(placed, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    placed.times[:] = batch.time[0]  # all frames at one time
+    renders = rendered(placed, batch, both=both)
+    assert len(renders.warps) == (2 if both else 1)
+    for warp in renders.warps:
+        torch.testing.assert_close(warp.color, renders.alone[0])
+        torch.testing.assert_close(warp.color, renders.output.color, atol=1e-5, rtol=1e-5)
+        assert warp.there.all()
+
+
+def test_a_translation_is_chained(placed: NSFF, batch: RayBatch) -> None:
+    """At frame 0 of three; two steps of a constant flow lead twice as far."""
+    move(placed, (0.05, 0.0, -0.02), (-0.05, 0.0, 0.02))
+    first = replace(batch, frame=torch.zeros_like(batch.frame), time=torch.zeros_like(batch.time))
+    renders = rendered(placed, first)
+    after, before = renders.warps
+    assert after.there.all() and not before.there.any() and len(before.kept) == 0
+    assert (renders.trust(before) == 0).all() and (renders.trust(after) > 0).all()
+    further = renders.chained(0)
+    start = renders.output.points
+    step = torch.tensor([0.05, 0.0, -0.02])
+    torch.testing.assert_close(further.points, start + 2 * step, atol=1e-5, rtol=0)
+    torch.testing.assert_close(after.points, start + step, atol=1e-5, rtol=0)
+    # There and back again.
+    back = after.found.flow[:, BACKWARD]
+    torch.testing.assert_close(after.moved + back, torch.zeros_like(back), atol=1e-5, rtol=0)
+    assert (further.frame == 2).all() and not renders.chained(1).there.any()
+
+
+def test_one_neighbour_is_at_either_side_and_exists(placed: NSFF, batch: RayBatch) -> None:
+    frame = torch.tensor([0, 1, 2, 0, 1, 2, 0, 2])
+    many = replace(batch, frame=frame, time=placed.times[frame])
+    sides = set()
+    for _ in range(8):
+        (warp,) = rendered(placed, many, both=False).warps
+        assert warp.there.all()
+        assert (warp.side[frame == 0] == FORWARD).all()
+        assert (warp.side[frame == 2] == BACKWARD).all()
+        sides.update(warp.side[frame == 1].tolist())
+    assert sides == {FORWARD, BACKWARD}
+
+
+def test_what_the_other_frame_does_not_show_is_not_trusted(placed: NSFF, batch: RayBatch) -> None:
+    head = placed.fields.dynamic.further
+    with torch.no_grad():
+        head.weight[6:], head.bias[6:] = 0.0, 50.0  # o = 1 everywhere
+    renders = rendered(placed, batch)
+    for warp in renders.warps:
+        seen = torch.zeros(8).index_add(0, warp.ray, warp.weight)
+        torch.testing.assert_close(renders.trust(warp), 1 - seen)
+
+
+def test_added_densities_keep_the_static_part_in_other_frames(
+    placed: NSFF, batch: RayBatch
+) -> None:
+    placed.fields.additive = True
+    move(placed, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    placed.times[:] = batch.time[0]
+    renders = rendered(placed, batch)
+    for warp in renders.warps:
+        torch.testing.assert_close(warp.color, renders.output.color)
+        torch.testing.assert_close(renders.trust(warp), torch.ones(8))
+
+
+def test_times_between_frames_are_times_too(placed: NSFF, batch: RayBatch) -> None:
+    torch.nn.init.normal_(placed.fields.dynamic.trunk.layers[0].weight)
+    share(placed, 1.0)
+    pictures = [
+        placed.render_rays(batch.rays, torch.full((8,), t), batch.background).color
+        for t in (0.5, 0.6, 0.75)
+    ]
+    assert not torch.equal(pictures[0], pictures[1])
+    assert not torch.equal(pictures[1], pictures[2])
+
+
+def test_samples_have_normalised_lengths(placed: NSFF, batch: RayBatch) -> None:
+    samples: RaySamples = rendered(placed, batch).output.samples
+    way = torch.zeros(8).index_add(0, samples.ray, samples.length)
+    assert 0 < way.max() <= 2 * 3**0.5
