@@ -27,7 +27,7 @@ class Space(Protocol):
 
     @property
     def side_factor(self) -> float:
-        """How many times longer a grid's side must be here than over :meth:`inner`."""
+        """How many times longer a grid's side is here than the one that is asked for."""
         ...
 
     def inner(self, box: Box) -> Box:

@@ -119,6 +119,25 @@ def test_without_frequencies_the_decoder_sees_the_direction_alone() -> None:
     assert decoder(torch.zeros(3, 3), dirs, torch.arange(3)).unique(dim=0).shape[0] == 3
 
 
+def test_directions_can_be_forgotten_and_are_learned_when_they_are_let(
+    rng: torch.Generator,
+) -> None:
+    field = SMALL.radiance_field(Box((0.0,) * 3, (1.0,) * 3), 27, 27)
+    field.forget_directions()
+    points, ray, dirs = torch.rand(3, 3, generator=rng), torch.zeros(3).long(), torch.eye(3)
+    seen = [field.rgb(points, dirs[k : k + 1], ray) for k in range(3)]
+    assert torch.equal(seen[0], seen[1]) and torch.equal(seen[0], seen[2])
+    assert isinstance(field.decoder, ColorDecoder)
+    weight = field.decoder.from_direction.weight
+    changes = [field.learn_directions(whether) for whether in (True, False, False)]
+    assert changes == [False, True, False]
+    field.rgb(points, dirs[:1], ray).sum().backward()
+    assert weight.grad is None and field.decoder.hidden.weight.grad is not None
+    assert field.learn_directions(True)
+    field.rgb(points, dirs[:1], ray).sum().backward()
+    assert weight.grad is not None and bool(weight.grad.any())
+
+
 def test_the_search_field_shows_its_channels_through_a_sigmoid(cube: Box) -> None:
     field = SMALL.search_field(cube, 64)
     with torch.no_grad():

@@ -15,10 +15,12 @@ from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.geometry.contraction import ContractedSpace
 from devrf.geometry.rays import Rays
+from devrf.geometry.space import WORLD
 from devrf.methods.devrf.active_frame import ActiveFrame
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.devrf.color_decoder import ColorDecoder
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
@@ -119,11 +121,41 @@ def test_a_checkpoint_shows_the_same(model: DeVRFModel) -> None:
     assert not torch.equal(at_rest.opacity, moved.opacity)
 
 
-def test_grids_are_longer_by_the_shell() -> None:
-    schedule = CanonicalSchedule(side=64, search_side=48)
+def test_grids_are_longer_by_four_fifths_of_the_box() -> None:
+    schedule = CanonicalSchedule(side=50, search_side=40)
     longer = schedule.in_space(SPACE)
-    assert (longer.side, longer.search_side) == (96, 72)
-    assert schedule.in_space(replace(SPACE, shell=1.0)).phases[-1].voxels == 128**3
+    assert (longer.side, longer.search_side) == (pytest.approx(60), 48)
+    assert schedule.in_space(replace(SPACE, shell=1.0)).phases[-1].voxels == 80**3
+    assert schedule.in_space(WORLD) is schedule
+
+
+def test_contracted_space_learns_directions_in_the_second_half_unless_told_otherwise() -> None:
+    schedule = CanonicalSchedule(search_iterations=5, iterations=60, doublings=())
+    assert schedule.learns_directions(5)
+    half = schedule.in_space(SPACE)
+    assert half.directions_from == 30
+    assert [half.learns_directions(n) for n in (5, 34, 35)] == [False, False, True]
+    assert replace(schedule, directions_from=0).in_space(SPACE).directions_from == 0
+
+
+def test_grids_start_coarse_and_double_evenly_in_contracted_space() -> None:
+    # 50 · 1.2 = 60 voxels a side from 15: six doublings, over 600 of 800 iterations.
+    schedule = CanonicalSchedule(side=50, iterations=800, doublings=(10,), contracted_start=15)
+    grown = schedule.in_space(SPACE)
+    assert grown.doublings == (100, 200, 300, 400, 500, 600)
+    first = next(phase for phase in grown.phases if phase.kind == "fine")
+    assert first.voxels == pytest.approx(15**3, rel=1e-3)
+    assert replace(schedule, contracted_start=None).in_space(SPACE).doublings == (10,)
+    assert replace(schedule, contracted_start=200).in_space(SPACE).doublings == ()
+
+
+def test_the_fields_opacity_does_not_depend_on_its_resolution() -> None:
+    sizes = Architecture(alpha_init=0.01, contracted_opacity=0.75)
+    assert sizes.in_space(WORLD, 2.0) is sizes
+    # A line through two voxels, of opacity a half each: 1 − ¼.
+    field = sizes.in_space(SPACE, 2.0).radiance_field(SPACE.box, 27, 27)
+    torch.testing.assert_close(field.voxel_alpha(1.0), torch.full((3, 3, 3), 0.5))
+    assert sizes.in_space(SPACE, 4.0).alpha_init == pytest.approx(1 - 0.25**0.25)
 
 
 def test_a_room_is_learned_and_moves_inside_the_inner_box(
@@ -142,7 +174,12 @@ def test_a_room_is_learned_and_moves_inside_the_inner_box(
     stage = CanonicalStage(schedule, BUILD)
     fitted = trainer(max_epochs=1)
     fitted.fit(stage, datamodule=data)
-    assert stage.scene_model.box == room.bounds.box and stage.schedule.side == 30
+    assert stage.scene_model.box == room.bounds.box and stage.schedule.side == 32
+    # Directions came in at iteration 30: colours have begun to depend on them, little so far.
+    decoder = stage.scene_model.canonical.decoder
+    assert isinstance(decoder, ColorDecoder) and decoder.learns_directions
+    weight = decoder.from_direction.weight
+    assert 0 < float(weight.detach().abs().max()) < 0.1
     mean = room.static.train.pixels.float().div(255).mean(dim=(0, 1, 2))
     blank = float((room.static.train.pixels.float() / 255 - mean).square().mean())
     assert float(fitted.callback_metrics["static/color"]) < 0.8 * blank

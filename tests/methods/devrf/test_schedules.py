@@ -259,6 +259,8 @@ def test_deformation_phases_tile_every_schedule(
         {"side": 2},  # 8 voxels cannot be halved four times
         {"decay_iterations": 0},
         {"rays": 0},
+        {"directions_from": -1},
+        {"contracted_start": 1},
     ],
     ids=str,
 )

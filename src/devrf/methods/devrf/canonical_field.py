@@ -149,6 +149,19 @@ class CanonicalField(nn.Module):
         """Whether colours come from a network: not in the coarse geometry search."""
         return isinstance(self.decoder, ColorDecoder)
 
+    def forget_directions(self) -> None:
+        """Make colours the same from everywhere, until directions are learned."""
+        assert isinstance(self.decoder, ColorDecoder)
+        self.decoder.forget_directions()
+
+    def learn_directions(self, whether: bool) -> bool:
+        """Let the network learn from viewing directions, or not; whether that is a change."""
+        decoder = self.decoder
+        if not isinstance(decoder, ColorDecoder) or decoder.learns_directions == whether:
+            return False
+        decoder.learns_directions = whether
+        return True
+
     def resize(self, voxels: int) -> None:
         """Resample both grids to about ``voxels`` voxels; new parameters result."""
         self.voxels = voxels

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -52,6 +53,12 @@ class CanonicalSchedule:
             voxels; afterwards those that a batch has touched.
         voxels_per_pixel: in forward-facing scenes, grid points for each pixel of a row or column;
             decides ``side``. None: ``side`` is as it says.
+        directions_from: so many iterations from the search's end colours do not depend on the
+            viewing direction. None: 0; in contracted space half of ``iterations``
+            (docs/method.md#scene-contraction).
+        contracted_start: in contracted space the grid starts with about as many voxels along an
+            edge, and doubles at equal intervals over the first three quarters of ``iterations``
+            in place of ``doublings``. None: ``doublings`` hold there, too.
         crop: in forward-facing scenes, whether the grid, each time it grows, gives up the depths
             at which the static views see nothing (docs/method.md#crop).
     """
@@ -67,6 +74,8 @@ class CanonicalSchedule:
     least_views: int = 3
     dense_tv_iterations: int = 0
     voxels_per_pixel: float | None = None
+    directions_from: int | None = None
+    contracted_start: float | None = 26
     crop: bool = False
     phases: tuple[CanonicalPhase, ...] = field(init=False, repr=False)
 
@@ -83,6 +92,16 @@ class CanonicalSchedule:
             raise DevrfError(
                 "schedule.canonical.voxels_per_pixel: expected above 0, at most 4, or null, not "
                 f"{self.voxels_per_pixel}"
+            )
+        if self.directions_from is not None and self.directions_from < 0:
+            raise DevrfError(
+                "schedule.canonical.directions_from: expected 0 or more, or null, not "
+                f"{self.directions_from}"
+            )
+        if self.contracted_start is not None and self.contracted_start < 2:
+            raise DevrfError(
+                "schedule.canonical.contracted_start: expected at least 2, or null, not "
+                f"{self.contracted_start}"
             )
         if self.side**3 < 8 * 2 ** len(self.doublings):
             raise DevrfError(
@@ -116,17 +135,32 @@ class CanonicalSchedule:
         """Whether the total variation of ``iteration`` reaches untouched voxels too."""
         return 0 <= iteration - self.search_iterations < self.dense_tv_iterations
 
-    def in_space(self, space: Space) -> CanonicalSchedule:
-        """The same schedule with sides longer by the space's factor.
+    def learns_directions(self, iteration: int) -> bool:
+        """Whether ``iteration`` teaches the network what viewing directions change."""
+        return iteration - self.search_iterations >= (self.directions_from or 0)
 
-        So voxels have the size that they would have over the inner box alone
-        (docs/method.md#scene-contraction).
+    def in_space(self, space: Space) -> CanonicalSchedule:
+        """The same schedule with what contracted space changes (docs/method.md#scene-contraction).
+
+        Sides are longer by the space's factor; ``doublings`` and ``directions_from`` are filled in.
         """
-        factor = space.side_factor
-        if factor == 1:
+        if space.straight:
             return self
-        search = round(self.search_side * factor)
-        return replace(self, side=self.side * factor, search_side=search)
+        side, late = self.side * space.side_factor, self.directions_from
+        return replace(
+            self,
+            side=side,
+            search_side=round(self.search_side * space.side_factor),
+            doublings=self._doublings_from(self.contracted_start, side),
+            directions_from=self.iterations // 2 if late is None else late,
+        )
+
+    def _doublings_from(self, start: float | None, side: float) -> Sequence[int]:
+        """Equal intervals between the doublings that lead from ``start`` voxels to ``side``."""
+        if start is None:
+            return self.doublings
+        count = max(0, round(3 * math.log2(side / start)))
+        return tuple(3 * self.iterations * (k + 1) // (4 * count) for k in range(count))
 
     def learning_rate_factor(self, iteration: int) -> float:
         """0.1^(n / decay_iterations), n from the start of the search or of the radiance field."""

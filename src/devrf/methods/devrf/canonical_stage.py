@@ -228,7 +228,11 @@ class CanonicalStage(VoxelStage):
             box = box.clipped(bounds.box)
         share = 100 * occupancy.share
         log.info("%.1f%% of the searched box may be occupied; fields live in %s", share, box)
-        return self.architecture.radiance_field(box, phase.voxels, round(self.schedule.side**3))
+        base_voxels = round(self.schedule.side**3)
+        field = self.architecture.radiance_field(box, phase.voxels, base_voxels)
+        if self.schedule.directions_from:
+            field.forget_directions()
+        return field
 
     @torch.no_grad()
     def update_occupancy(self) -> None:
@@ -274,11 +278,14 @@ class CanonicalStage(VoxelStage):
         self.bind(self.schedule.rays, [learned], static_shape=static_shape)
 
     def prepare(self) -> None:
-        """From the schedule's iteration on, smooth only what batches touch."""
-        touched_only = not self.schedule.smooths_all(self.iteration)
-        if touched_only != self.optimizer.param_groups[0]["touched_only"]:
-            for group in self.optimizer.param_groups[:2]:
-                group["touched_only"] = touched_only
+        """From the schedule's iterations on, smooth what batches touch, and learn directions."""
+        schedule, groups = self.schedule, self.optimizer.param_groups[:2]
+        touched_only = not schedule.smooths_all(self.iteration)
+        changed = touched_only != groups[0]["touched_only"]
+        for group in groups:
+            group["touched_only"] = touched_only
+        learns = schedule.learns_directions(self.iteration)
+        if self.scene_model.canonical.learn_directions(learns) or changed:
             self.loop.recapture()
 
     def draw(self, batch: ParallelBatch) -> Pixels:
@@ -302,6 +309,7 @@ class CanonicalStage(VoxelStage):
         """Empty what was never occupied, so that no deformed sample meets leftover fog."""
         if self.iteration < self.total_iterations:
             return
+        self.scene_model.canonical.learn_directions(True)
         self.update_occupancy()
         self.scene_model.canonical.clear(~self.scene_model.occupancy.mask, alpha=1e-6)
         super().on_train_end()

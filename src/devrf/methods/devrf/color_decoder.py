@@ -28,6 +28,9 @@ class ColorDecoder(nn.Module):
     """c = sigmoid(MLP(f, d, sin(2^k d), cos(2^k d))) (docs/method.md#colour).
 
     The first layer is split: its direction part is computed once a ray, not once a sample.
+
+    Attributes:
+        learns_directions: whether gradients reach the direction part of the first layer.
     """
 
     octaves: Tensor
@@ -47,6 +50,11 @@ class ColorDecoder(nn.Module):
         self.hidden = nn.Linear(width, width)
         self.output = nn.Linear(width, 3)
         nn.init.zeros_(self.output.bias)
+        self.learns_directions = True
+
+    def forget_directions(self) -> None:
+        """Make colours the same from everywhere, until directions are learned."""
+        nn.init.zeros_(self.from_direction.weight)
 
     def forward(
         self,
@@ -72,6 +80,8 @@ class ColorDecoder(nn.Module):
         reduced = precision != torch.float32
         with torch.autocast(features.device.type, precision, enabled=reduced):
             by_ray = self.from_direction(self._encode(viewdirs))
+            if not self.learns_directions:
+                by_ray = by_ray.detach()
             from_ray: Tensor = RowOfRay.apply(by_ray, ray)  # type: ignore[no-untyped-call]
             x = torch.relu(self.from_feature(features) + from_ray)
             x = torch.relu(self.hidden(x))

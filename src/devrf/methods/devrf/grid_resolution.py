@@ -26,7 +26,8 @@ def fitted_to(
 
     In NDC, where no number of planes is given it becomes the one that the static views resolve,
     and ``voxels_per_pixel`` becomes the ``side`` of a grid so fine (docs/method.md#forward-facing).
-    In contracted space sides are longer (docs/method.md#scene-contraction).
+    In contracted space sides are longer, grids start coarser, and directions are learned later
+    (docs/method.md#scene-contraction).
 
     Raises:
         DevrfError: the architecture has planes, and the scene is not in NDC.
@@ -38,7 +39,8 @@ def fitted_to(
                 f"field.planes={planes}: planes are of forward-facing scenes, and this scene is "
                 "not: give field=inward or field=small"
             )
-        return schedule.in_space(space), architecture
+        schedule = schedule.in_space(space)
+        return schedule, architecture.in_space(space, schedule.side)
     if planes is None:
         planes = resolved_planes(scene.static.train.cameras.positions, space)
         architecture = replace(architecture, planes=planes)
