@@ -191,7 +191,8 @@ class DeformationStage(VoxelStage):
                 on_host=rest_on_host(self.trainer, model, self.schedule, motion),
                 half=motion.store_half,
             )
-            self.appearance.setup(model, self.field.clock, self._optimizer)
+            recorded = self.scene.dynamic.train
+            self.appearance.setup(model, self.field.clock, self._optimizer, recorded)
             if self.refinement.settings.iterations:
                 self.refinement.add_groups()
         scale = self.field.box.longest if motion.unit == "box" else 1.0
