@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from devrf.data.color_change import color_change
+from devrf.data.color_change import color_change, color_drift
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.scene import OpticalFlow, Views
 
@@ -45,6 +45,18 @@ def test_four_frames_of_fading_are_told() -> None:
     assert color_change(moving_wave(fade=5)) == pytest.approx(4 * 5 / 255, abs=2e-3)
 
 
+def test_what_fades_drifts_in_proportion_to_the_recordings_length() -> None:
+    # From four frames to the six that there are, 5 grey levels a frame, over six steps.
+    assert color_drift(moving_wave(fade=5)) == pytest.approx(6 * 5 / 255, abs=4e-3)
+
+
+def test_change_that_does_not_grow_with_time_is_no_drift() -> None:
+    views = moving_wave()
+    views.pixels[::2] += 10  # flickers: even frames are lighter
+    assert color_change(views) == pytest.approx(0.0, abs=2e-3)
+    assert color_drift(views) == pytest.approx(0.0, abs=4e-3)
+
+
 def test_flow_that_is_not_valid_is_not_followed() -> None:
     views = moving_wave(fade=5)
     assert views.flow is not None
@@ -56,6 +68,7 @@ def test_flow_that_is_not_valid_is_not_followed() -> None:
 
 def test_without_flow_nothing_is_told() -> None:
     assert color_change(replace(moving_wave(), flow=None)) is None
+    assert color_drift(replace(moving_wave(), flow=None)) is None
     still = moving_wave()
     assert still.flow is not None
     still.flow.valid[:] = False

@@ -12,6 +12,8 @@ from devrf.scenes.scene import Views
 
 # Images of which colours are followed, evenly spread, and frames that they are followed back.
 IMAGES, STEPS = 64, 4
+# From which drift on colours are not those of the rest state (docs/method.md#color-drift).
+CHANGING = 0.07
 # Colours are smoothed before they are compared: what is finer than the pixels flickers as it moves.
 SIGMA, TAPS = 1.5, 9
 # Pixels nearer than this to the matte's edge, or to an occlusion, are left out.
@@ -32,21 +34,48 @@ def color_change(views: Views) -> float | None:
     Returns:
         The mean over images, channels and pixels; None where no flow can be followed.
     """
-    if views.flow is None:
+    change, _ = _mean_change(views, STEPS)
+    return change
+
+
+def color_drift(views: Views) -> float | None:
+    """By how much colours change in the whole recording, if they go on as they do for a few frames.
+
+    See docs/method.md#color-drift: noise and blur change colours as much over two times ``STEPS``
+    frames as over ``STEPS``, so what lies between the two is change of the scene.
+
+    Args:
+        views: the dynamic training views.
+
+    Returns:
+        The change, of which 1 is from black to white; None where no flow can be followed, or where
+        the recording has no more than ``STEPS`` steps.
+    """
+    near, steps = _mean_change(views, STEPS)
+    far, more = _mean_change(views, 2 * STEPS)
+    if near is None or far is None or more == steps:
         return None
+    whole = len(set(views.times.tolist())) - 1
+    return (far - near) / (more - steps) * whole
+
+
+def _mean_change(views: Views, steps: int) -> tuple[float | None, int]:
+    """The mean change over ``steps`` frames, or over the most that there are, and how many."""
+    if views.flow is None:
+        return None, 0
     previous = previous_images(views).tolist()
-    chains = [_chain(image, previous) for image in range(len(views))]
+    chains = [_chain(image, previous, steps) for image in range(len(views))]
     longest = max(len(chain) for chain in chains)
     followed = [chain for chain in chains if len(chain) == longest > 1]
     spread = followed[:: -(-len(followed) // IMAGES) or 1]
     changes = [change for chain in spread if (change := _change(views, chain)) is not None]
-    return sum(changes) / len(changes) if changes else None
+    return sum(changes) / len(changes) if changes else None, longest - 1
 
 
-def _chain(image: int, previous: list[int]) -> list[int]:
-    """An image and those before it in its view, ``STEPS`` at most."""
+def _chain(image: int, previous: list[int], steps: int) -> list[int]:
+    """An image and those before it in its view, ``steps`` at most."""
     chain = [image]
-    while len(chain) <= STEPS and previous[chain[-1]] != chain[-1]:
+    while len(chain) <= steps and previous[chain[-1]] != chain[-1]:
         chain.append(previous[chain[-1]])
     return chain
 

@@ -113,6 +113,22 @@ def test_what_grows_darker_is_learned_by_the_residual_alone(
     assert not values[0].any() and values[1:].mean() < 0
 
 
+@pytest.mark.parametrize(("drift", "wanted"), [(0.01, False), (0.1, True), (None, False)])
+def test_auto_learns_colours_that_drift(
+    rest: LoadedCheckpoint,
+    tiny_scene: Scene,
+    monkeypatch: pytest.MonkeyPatch,
+    drift: float | None,
+    wanted: bool,
+) -> None:
+    monkeypatch.setattr("devrf.methods.devrf.appearance_learning.color_drift", lambda views: drift)
+    stage = DeformationStage(rest, SHORT, FAST, appearance=replace(LEARNED, learn="auto"))
+    given = stage.scene_model, tiny_scene.clock, stage.optimizer, tiny_scene.dynamic.train
+    stage.appearance.setup(*given)
+    assert (stage.scene_model.appearance is not None) == wanted
+    assert [group["name"] for group in stage.optimizer.param_groups][1:] == ["appearance"] * wanted
+
+
 def test_a_level_before_the_first_leaves_colours_alone(
     rest: LoadedCheckpoint, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
 ) -> None:

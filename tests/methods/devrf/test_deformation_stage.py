@@ -112,6 +112,25 @@ def test_total_variation_alone_smooths_both_directions(
     torch.testing.assert_close(peak.mean, expected)
 
 
+class Weights(Callback):
+    """Notes the weight of the elastic term at each side of the motion grid."""
+
+    def __init__(self) -> None:
+        self.seen: dict[int, float] = {}
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, *args: Any) -> None:
+        self.seen[pl_module.phase.level] = pl_module.losses.weights["elastic"]
+
+
+def test_each_level_has_its_stiffness(
+    rest: LoadedCheckpoint, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
+) -> None:
+    schedule = DeformationSchedule((4, 6), (2, 2), rays=16, stiffness=(0.0, 3.0))
+    stage, weights = DeformationStage(rest, schedule, loss={"render": 1, "elastic": 0.2}), Weights()
+    trainer(weights, max_epochs=1).fit(stage, datamodule=datamodule)
+    assert weights.seen == {0: 0.0, 1: pytest.approx(0.6)}
+
+
 class Look(Callback):
     """Notes the active frame's slices, and what others see of them while it is learned."""
 

@@ -287,6 +287,8 @@ def test_a_wrong_canonical_schedule_is_an_error(wrong: dict[str, Any]) -> None:
         {"order": ("forward", "backward")},
         {"order": ("forward", "forward", "forward", "forward", "sideways")},
         {"order": ("backward", "forward", "forward", "forward", "forward")},
+        {"stiffness": (0.0, 1.0)},
+        {"stiffness": (0.0, 1.0, 1.0, 1.0, -1.0)},
     ],
     ids=str,
 )

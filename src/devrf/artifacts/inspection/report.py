@@ -11,7 +11,7 @@ from devrf.artifacts.inspection.advice import Advice, image_sets
 from devrf.artifacts.inspection.camera_advice import camera_advice
 from devrf.artifacts.inspection.image_advice import OPAQUE, image_advice, mean_share
 from devrf.artifacts.inspection.layout import box_middle, widest_gap
-from devrf.data.color_change import color_change
+from devrf.data.color_change import color_change, color_drift
 from devrf.geometry.clock import FrameClock
 from devrf.scenes.optical_flow import frame_pairs
 from devrf.scenes.scene import Scene, Views
@@ -75,6 +75,7 @@ class Inspection:
             a forward-facing scene or where it cannot be told.
         flow: optical flow, or None where there is none.
         color_change: see :func:`devrf.data.color_change.color_change`.
+        color_drift: see :func:`devrf.data.color_change.color_drift`.
         advice: what may be wrong.
     """
 
@@ -85,6 +86,7 @@ class Inspection:
     gap: float | None
     flow: FlowFacts | None
     color_change: float | None
+    color_drift: float | None
     advice: tuple[Advice, ...]
 
 
@@ -101,6 +103,7 @@ def inspect_scene(scene: Scene) -> Inspection:
         gap=widest_gap(cameras, middle) if scene.kind == "inward" else None,
         flow=_flow_facts(scene.dynamic.train),
         color_change=color_change(scene.dynamic.train),
+        color_drift=color_drift(scene.dynamic.train),
         advice=(*camera_advice(scene), *image_advice(scene)),
     )
 

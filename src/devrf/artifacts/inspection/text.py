@@ -11,6 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from devrf.artifacts.inspection.report import FlowFacts, Inspection, ViewsFacts
+from devrf.data.color_change import CHANGING
 from devrf.scenes.scene import Scene
 
 HEADING = "set,images,views x times,size,alpha masks,masks,focal length,distance".split(",")
@@ -67,11 +68,19 @@ def _facts(found: Inspection) -> list[tuple[str, str]]:
         ("optical flow", _flow(found.flow)),
     ]
     if found.color_change is not None:
-        change = f"differ by {100 * found.color_change:.1f} % over a few frames"
-        rows.append(("colours along the flow", change))
+        rows.append(("colours along the flow", _colors(found.color_change, found.color_drift)))
     if found.gap is not None:
         rows.insert(2, ("static views", f"widest sector without one: {found.gap:.0f} degrees"))
     return rows
+
+
+def _colors(change: float, drift: float | None) -> str:
+    """How much colours change, and whether that is worth learning."""
+    said = f"differ by {100 * change:.1f} % over a few frames"
+    if drift is None:
+        return said
+    said += f", drift by {100 * drift:.1f} % over all"
+    return f"{said}: try schedule.appearance.learn=always" if drift >= CHANGING else said
 
 
 def _space(scene: Scene) -> str:

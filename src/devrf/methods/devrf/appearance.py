@@ -21,14 +21,15 @@ class AppearanceSettings:
     """Whether and how the appearance is learned, beside the displacements.
 
     Attributes:
-        learn: ``never`` or ``always``.
+        learn: ``never``, ``always``, or ``auto``: where the images say that colours drift
+            (docs/method.md#color-drift).
         side: the grid of a frame has about side³ voxels.
         learning_rate: logits a step: how far a value moves at most.
         first_level: the first level that learns it, from 0; the last one where there are fewer.
             The levels before find the motion alone.
     """
 
-    learn: Literal["never", "always"] = "never"
+    learn: Literal["never", "always", "auto"] = "never"
     side: int = 64
     learning_rate: float = 0.1
     first_level: int = 1

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 
 from torch import Tensor
 
+from devrf.data.color_change import CHANGING, color_drift
 from devrf.errors import DevrfError
 from devrf.geometry.clock import FrameClock
 from devrf.methods.devrf.appearance import AppearanceField, AppearanceSettings
@@ -13,6 +15,9 @@ from devrf.methods.devrf.deformation_schedule import DeformationPhase, Deformati
 from devrf.methods.devrf.losses import total_variation_weight
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.ops.adam import GridAdam
+from devrf.scenes.scene import Views
+
+log = logging.getLogger(__name__)
 
 GROUP = "appearance"
 
@@ -60,17 +65,36 @@ class AppearanceLearning:
 
     @property
     def weights(self) -> dict[str, float]:
-        """The weights of further loss terms of the stage; none where nothing is learned."""
+        """The weights of further loss terms of the stage; none where nothing can be learned."""
         return {} if self.settings.learn == "never" else {"residual": self._residual}
 
-    def setup(self, model: DeVRFModel, clock: FrameClock, optimizer: GridAdam) -> None:
-        """Build the residuals, zero, and their parameter group, empty as yet."""
-        if self.settings.learn == "never":
+    def setup(
+        self, model: DeVRFModel, clock: FrameClock, optimizer: GridAdam, views: Views
+    ) -> None:
+        """Build the residuals, zero, and their parameter group, empty as yet, if they are learned.
+
+        Args:
+            model: gets the residuals.
+            clock: the times of the frames.
+            optimizer: gets the group.
+            views: the dynamic training views, on the host.
+        """
+        if not self._wanted(views):
             return
         voxels, rate = self.settings.side**3, self.settings.learning_rate
         model.appearance = AppearanceField(model.box, clock, voxels=voxels)
         group = {"params": [], "lr": rate, "base_lr": rate, "name": GROUP}
         optimizer.add_param_group(group)
+
+    def _wanted(self, views: Views) -> bool:
+        """Whether residuals are learned from ``views``."""
+        if self.settings.learn != "auto":
+            return self.settings.learn == "always"
+        drift = color_drift(views)
+        changing = drift is not None and drift >= CHANGING
+        said = "cannot be followed" if drift is None else f"drift by {100 * drift:.1f} %"
+        log.info("colours %s: their change is %s", said, "learned" if changing else "not learned")
+        return changing
 
     def at_level(self, model: DeVRFModel, level: int) -> AppearanceField | None:
         """The residuals, if ``level`` learns them."""

@@ -78,6 +78,7 @@ class DeformationSchedule:
             before it; None: 1 throughout.
         order: of the frames of each level, ``forward`` in time at the coarsest; None: ``forward``
             throughout.
+        stiffness: factor of ``loss.deformation.elastic`` at each level; None: 1 throughout.
     """
 
     sides: Sequence[int] = (10, 20, 40, 80, 160)
@@ -87,6 +88,7 @@ class DeformationSchedule:
     rays: int = 8192
     parallel_frames: Sequence[int] | None = None
     order: Sequence[Order] | None = None
+    stiffness: Sequence[float] | None = None
 
     def __post_init__(self) -> None:
         if len(self.sides) != len(self.iterations_per_frame) or not self.sides:
@@ -118,11 +120,14 @@ class DeformationSchedule:
                 f"frame starts from the one before it, not {at_once[0]}"
             )
         self._check_order()
+        self._check_stiffness()
         if not self.coarse_to_fine:
             object.__setattr__(self, "sides", (self.sides[-1],))
             object.__setattr__(self, "iterations_per_frame", (sum(self.iterations_per_frame),))
             object.__setattr__(self, "parallel_frames", (at_once[-1],))
             object.__setattr__(self, "order", None)
+            if self.stiffness is not None:
+                object.__setattr__(self, "stiffness", (self.stiffness[-1],))
 
     def _check_order(self) -> None:
         order = self.order
@@ -137,6 +142,16 @@ class DeformationSchedule:
             raise DevrfError(
                 "schedule.deformation.order: expected forward at the first level, where a frame "
                 f"starts from the one before it, not {order[0]}"
+            )
+
+    def _check_stiffness(self) -> None:
+        stiffness = self.stiffness
+        if stiffness is None:
+            return
+        if len(stiffness) != len(self.sides) or min(stiffness) < 0:
+            raise DevrfError(
+                "schedule.deformation.stiffness: expected a number, at least 0, for each of "
+                f".sides, or null, not {list(stiffness)}"
             )
 
     def visits(self, level: int, frames: int) -> int:

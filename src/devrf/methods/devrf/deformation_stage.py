@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -111,6 +112,7 @@ class DeformationStage(VoxelStage):
         self.appearance = AppearanceLearning(chosen, self.schedule, appearance_loss)
         weights.update(self.appearance.weights)
         self.losses = WeightedLoss(MOTION_TERMS | {"flow": partial(flow, mean=flow_mean)}, weights)
+        self._elastic = weights.get("elastic", 0.0)
         still = rest.model
         fields = still.canonical, still.occupancy
         self.refinement = Refinement(self, refinement or RefinementSettings(), refinement_loss)
@@ -191,7 +193,8 @@ class DeformationStage(VoxelStage):
                 on_host=rest_on_host(self.trainer, model, self.schedule, motion),
                 half=motion.store_half,
             )
-            self.appearance.setup(model, self.field.clock, self._optimizer)
+            recorded = self.scene.dynamic.train
+            self.appearance.setup(model, self.field.clock, self._optimizer, recorded)
             if self.refinement.settings.iterations:
                 self.refinement.add_groups()
         scale = self.field.box.longest if motion.unit == "box" else 1.0
@@ -248,6 +251,7 @@ class DeformationStage(VoxelStage):
         for group in range(len(self._optimizer.param_groups)):
             self._optimizer.replace(group, [])
         self.active.allocate(count, *fields)
+        self._stiffen(self.phase.level)
         self._matter = None
         if count and self.losses.weights.get("elastic"):
             occupancy = self.scene_model.occupancy
@@ -261,6 +265,13 @@ class DeformationStage(VoxelStage):
             static_shape = self.static_shape(self.scene_model.canonical.density.values)
             parameters = [frame.learned for frame in self.active]
             self.bind(self.schedule.rays, parameters, static_shape=static_shape)
+
+    def _stiffen(self, level: int) -> None:
+        """Give the elastic term its weight at ``level``."""
+        stiffness = self.schedule.stiffness
+        if stiffness is not None:
+            weights = {**self.losses.weights, "elastic": stiffness[level] * self._elastic}
+            self.losses = replace(self.losses, weights=weights)
 
     def _initialise(self, phase: DeformationPhase) -> None:
         """Start each frame from the one before it; along the observed flow, if asked to."""
