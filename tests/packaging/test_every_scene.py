@@ -44,6 +44,7 @@ FORWARD = ["field=forward", "loss=forward", "field.planes=8", "schedule.canonica
 # The embedded scenes in sizes that take no time.
 EMBEDDED = {
     "procedural": ["data.static_views=8", "data.static_test_views=2"],
+    "flower": ["data.static_views=8", "data.static_test_views=2"],
     "procedural_forward": ["data.static_views=7"],
 }
 
