@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import pytest
@@ -28,16 +29,22 @@ RECIPES = {"robot": INWARD, "flower": replace(INWARD, shape="flower"), "plush": 
 Built = tuple[Any, Scene]
 
 
-@pytest.fixture(scope="module", params=RECIPES)
+@cache
+def rendered(name: str) -> Built:
+    """A recipe and its scene."""
+    return RECIPES[name], RECIPES[name]()
+
+
+@pytest.fixture(params=RECIPES)
 def built(request: pytest.FixtureRequest) -> Built:
     """A recipe and its scene."""
-    return RECIPES[request.param], RECIPES[request.param]()
+    return rendered(request.param)
 
 
-@pytest.fixture(scope="module", params=["robot", "flower"])
+@pytest.fixture(params=["robot", "flower"])
 def inward(request: pytest.FixtureRequest) -> Built:
     """A recipe of an inward-facing scene, and the scene."""
-    return RECIPES[request.param], RECIPES[request.param]()
+    return rendered(request.param)
 
 
 def all_views(scene: Scene) -> list[Views]:
@@ -116,15 +123,15 @@ def test_the_same_recipe_gives_the_same_scene(built: Built) -> None:
 def test_flow_leads_to_the_same_color(inward: Built) -> None:
     # The images themselves agree: away from silhouettes, a pixel looks as it did where its
     # flow points to. The albedo alone is compared, so the lamp is off.
-    recipe = replace(inward[0], light=0.0, width=96, height=80, frames=12, static_views=1)
-    train = recipe().dynamic.train
+    counts = {"static_views": 1, "static_test_views": 1, "train_views": 1, "frames": 12}
+    train = replace(inward[0], light=0.0, width=96, height=80, **counts)().dynamic.train
     errors, still = [], []
-    for k in range(3, 12):
+    for k in range(1, 12):
         inside = train.flow.valid[k] & (train.pixels[k, :, :, 3] == 255)
         row, column = inside.nonzero().unbind(-1)
         target = torch.stack([column, row], dim=-1) + 0.5 + train.flow.vectors[k, row, column]
         size = torch.tensor([96.0, 80.0])
-        earlier = train.pixels[k - 3].permute(2, 0, 1)[None].float() / 255
+        earlier = train.pixels[k - 1].permute(2, 0, 1)[None].float() / 255
         there = torch.nn.functional.grid_sample(
             earlier, (target / size * 2 - 1)[None, None], align_corners=False
         )[0, :, 0].T
@@ -206,9 +213,10 @@ def test_wrong_numbers_are_named(recipe: Any, key: str, value: object, said: str
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("recipe", [INWARD, FORWARD], ids=["inward", "forward"])
-def test_frames_may_be_left_to_the_held_out_camera(recipe: Any) -> None:
-    whole, partly = recipe(), replace(recipe, novel_times_every=2)()
+@pytest.mark.parametrize("name", ["robot", "plush"])
+def test_frames_may_be_left_to_the_held_out_camera(name: str) -> None:
+    recipe, whole = rendered(name)
+    partly = replace(recipe, novel_times_every=2)()
     # Of the frames 0, 1, 2, 3 the second is not learned from; the last one always is.
     assert partly.clock.times == pytest.approx((0.0, 2 / 3, 1.0))
     assert torch.equal(partly.dynamic.test.pixels, whole.dynamic.test.pixels)

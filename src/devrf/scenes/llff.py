@@ -13,11 +13,9 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
-from devrf.scenes.bounds import STILL
 from devrf.scenes.capture_folders import chosen_dynamic, dynamic_folders
 from devrf.scenes.downscale import Downscale, folder_factor
 from devrf.scenes.flow_files import FlowDirection, stacked_flow
-from devrf.scenes.forward_bounds import forward_bounds, reference_space
 from devrf.scenes.image_files import Size, image_size
 from devrf.scenes.image_folders import image_folder, listed_images
 from devrf.scenes.images import load_images
@@ -25,6 +23,7 @@ from devrf.scenes.json_files import Positive
 from devrf.scenes.layout import refuse_at_rest
 from devrf.scenes.llff_poses import POSES, PosedSet, read_dynamic_poses, read_static_poses
 from devrf.scenes.llff_video import VIDEO, video_captures
+from devrf.scenes.one_sided import one_sided_scene
 from devrf.scenes.paths import existing_folder, scene_folder
 from devrf.scenes.reader import Count, Holdout, SceneReader, Time
 from devrf.scenes.scene import Capture, OpticalFlow, Scene, Views
@@ -32,9 +31,6 @@ from devrf.scenes.validation import scene_error
 from devrf.scenes.view_folders import ViewFolder, flow_files, view_folders
 
 log = logging.getLogger(__name__)
-
-# Where the room for motion comes from.
-SEEN = "all that the cameras see (forward-facing)"
 
 
 @dataclass(frozen=True)
@@ -74,19 +70,8 @@ class LlffReader(SceneReader):
         """See :meth:`devrf.scenes.reader.SceneReader.read`."""
         folder = scene_folder(self.root)
         static, dynamic = self._captures(folder)
-        space = reference_space(static.train.cameras, self.near)
-        # The captures of a scene at rest, and of a video, share images.
-        learned, held_out = (
-            list({id(v): v for v in both}.values())
-            for both in ((static.train, dynamic.train), (static.test, dynamic.test))
-        )
-        moves = dynamic.train is not static.train or len(set(dynamic.train.times.tolist())) > 1
-        bounds = forward_bounds(learned, space, SEEN if moves else STILL)
-        # The held-out cameras need not see inside the box, but they have to look the same way.
-        forward_bounds(held_out, space, "")
-        _warn_of_cameras_beyond(self.near, learned + held_out)
         name = self.name_of(folder)
-        return Scene(name, "forward", static, dynamic, bounds, self.background, space)
+        return one_sided_scene(name, static, dynamic, self.near, self.background)
 
     def forward_flow(self, views: Views) -> OpticalFlow | None:
         """See :meth:`devrf.scenes.reader.SceneReader.forward_flow`."""
@@ -262,15 +247,3 @@ def _flow(
 
 def _names(images: list[Path], root: Path) -> tuple[str, ...]:
     return tuple(str(image.relative_to(root)) for image in images)
-
-
-def _warn_of_cameras_beyond(near: float, everyone: list[Views]) -> None:
-    """A camera beyond the near plane would look through what is behind it."""
-    for views in everyone:
-        beyond = (views.cameras.positions[:, 2] <= -near).nonzero().flatten()
-        if len(beyond):
-            log.warning(
-                "%d cameras are beyond the near plane, %s the first of them; set data.near higher",
-                len(beyond),
-                views.names[int(beyond[0])],
-            )

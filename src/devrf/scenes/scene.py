@@ -161,6 +161,11 @@ class Bounds:
     reason: str = ""
     box_source: str = ""
 
+    @property
+    def whole(self) -> Box:
+        """Holds the static scene and everything that moves."""
+        return self.box if self.motion is None else self.box.union(self.motion)
+
 
 @dataclass(frozen=True)
 class Scene:

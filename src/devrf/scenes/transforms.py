@@ -10,15 +10,15 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import torch
-from pydantic import AfterValidator, Field, TypeAdapter
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter
 from torch import Tensor
 
 from devrf.scenes.absent_images import Missing, present_images
 from devrf.scenes.intrinsics import CameraKeys, Intrinsics, frame_intrinsics, intrinsics_of
-from devrf.scenes.json_files import Name, Number, Vector4, read_json
+from devrf.scenes.json_files import Name, Number, Positive, Vector3, Vector4, read_json
 from devrf.scenes.paths import inside
 from devrf.scenes.poses import FARTHEST, in_reach, is_rotation
 from devrf.scenes.validation import scene_error
@@ -51,6 +51,24 @@ class Frame(CameraKeys):
 FileNames = Annotated[list[Name], Field(fail_fast=True)]
 
 
+class SceneBounds(BaseModel):
+    """What devrf itself writes of a scene that it has captured; other programs pass it over.
+
+    Attributes:
+        space: in which the scene is learned: ``ndc`` for cameras that face it from one side.
+        near: distance before which nothing is, world units; of ``ndc`` the near plane's.
+        far: distance behind which nothing is, world units; None: unknown.
+        box: the part that is looked at, low and high corner, world units; None: unknown.
+    """
+
+    model_config = ConfigDict(extra="forbid")
+
+    space: Literal["world", "contracted", "ndc"]
+    near: Positive | None = None
+    far: Positive | None = None
+    box: tuple[Vector3, Vector3] | None = None
+
+
 class TransformsFile(CameraKeys):
     """What a transforms file says.
 
@@ -59,12 +77,14 @@ class TransformsFile(CameraKeys):
         train_filenames: images to learn from, as nerfstudio lists them; None: no list.
         val_filenames: images held out while a run goes on.
         test_filenames: images held out to the end.
+        scene_bounds: where the scene is, if devrf has written the file.
     """
 
     frames: Annotated[list[Frame], Field(fail_fast=True, min_length=1)]
     train_filenames: FileNames | None = None
     val_filenames: FileNames | None = None
     test_filenames: FileNames | None = None
+    scene_bounds: SceneBounds | None = None
 
 
 _FILE = TypeAdapter(TransformsFile)
@@ -83,6 +103,7 @@ class Transforms:
         masks: N existing files inside the scene's folder, or None of an image without one; None
             where they were not asked for.
         skipped: how many images of the file are absent, and left out.
+        bounds: where the scene is, if the file says so.
     """
 
     file: Path
@@ -92,6 +113,7 @@ class Transforms:
     times: tuple[float, ...] | None
     masks: tuple[Path | None, ...] | None = None
     skipped: int = 0
+    bounds: SceneBounds | None = None
 
     def __getitem__(self, index: Sequence[int]) -> Transforms:
         """The images at the positions ``index``, at least one, in that order."""
@@ -103,6 +125,7 @@ class Transforms:
             None if self.times is None else tuple(self.times[i] for i in index),
             None if self.masks is None else tuple(self.masks[i] for i in index),
             self.skipped,
+            self.bounds,
         )
 
 
@@ -160,6 +183,7 @@ def posed_images(
         tuple(known) or None,
         tuple(_mask(frame, file, root) for frame in frames) if masked else None,
         skipped=len(listing.frames) - len(frames),
+        bounds=listing.scene_bounds,
     )
 
 

@@ -1,0 +1,128 @@
+"""The world of a captured scene: its origin, axes and unit, and where in it the scene is."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from devrf.errors import DevrfError
+from devrf.geometry.average_pose import average_pose, relative_to
+from devrf.scenes.colmap_model import SparseModel
+
+log = logging.getLogger(__name__)
+
+Facing = Literal["auto", "forward", "inward"]
+
+# Cameras that all look within so many degrees of one direction face the scene from one side.
+ONE_SIDE = 45.0
+# Of the points so many per cent on either side may be wrong.
+OUTLIERS = 1.0
+# In the forward-facing world, the unit that makes the nearest point's distance 1/0.75: LLFF's.
+NEAREST = 1 / 0.75
+# Median distance of cameras around a scene from its middle, in world units.
+AROUND = 4.0
+
+
+@dataclass(frozen=True)
+class World:
+    """The normalised scene.
+
+    Attributes:
+        poses: (N, 3, 4) float64 camera-to-world, OpenGL axes, world units.
+        points: (P, 3) float64.
+        space: ``ndc`` or ``contracted``.
+        near: distance before which nothing is, world units.
+        far: distance behind which no sparse point is, world units.
+        box: low and high corner of what is looked at; None of ``ndc``.
+    """
+
+    poses: Tensor
+    points: Tensor
+    space: Literal["ndc", "contracted"]
+    near: float
+    far: float
+    box: tuple[list[float], list[float]] | None
+
+
+def normalised(model: SparseModel, facing: Facing = "auto") -> World:
+    """The scene of a model in a world of its own origin, axes and unit.
+
+    Args:
+        model: cameras and points, in any world.
+        facing: from where the cameras look.
+
+    Raises:
+        DevrfError: there are no points to say where the scene is.
+    """
+    poses, points = model.poses, torch.from_numpy(model.points)
+    depths = torch.cat([model.depths(k) for k in range(len(model.images))])
+    depths = depths[depths > 0]
+    if len(depths) < 50:
+        raise DevrfError(
+            f"{model.folder}: {len(depths)} sparse points, too few to say where the scene is; "
+            "film it with more texture in sight"
+        )
+    near, far = (float(np.percentile(depths.numpy(), p)) for p in (OUTLIERS, 100 - OUTLIERS))
+    if facing == "auto":
+        facing = "forward" if widest_angle(poses) <= ONE_SIDE else "inward"
+        log.info("cameras look %s-facing; capture.facing says otherwise", facing)
+    if facing == "forward":
+        return _forward(poses, points, near, far)
+    return _inward(poses, points, near, far)
+
+
+def widest_angle(poses: Tensor) -> float:
+    """The largest angle in degrees between a camera's axis and their mean."""
+    axes = -poses[:, :, 2]
+    mean = normalize(axes.sum(dim=0), dim=0)
+    return float(torch.rad2deg((axes @ mean).clamp(-1, 1).acos()).max())
+
+
+def _forward(poses: Tensor, points: Tensor, near: float, far: float) -> World:
+    frame, scale = average_pose(poses), NEAREST / near
+    return World(*_moved(poses, points, frame, scale), "ndc", 1.0, far * scale, None)
+
+
+def _inward(poses: Tensor, points: Tensor, near: float, far: float) -> World:
+    middle = _looked_at(poses, points)
+    # z up, as far as the cameras were held upright.
+    up = normalize(poses[:, :, 1].sum(dim=0), dim=0)
+    aside = torch.eye(3, dtype=poses.dtype)[int(up.abs().argmin())]
+    right = normalize(torch.linalg.cross(aside, up), dim=0)
+    frame = torch.stack([right, torch.linalg.cross(up, right), up, middle], dim=1)
+    scale = AROUND / float((poses[:, :, 3] - middle).norm(dim=1).median())
+    poses, points = _moved(poses, points, frame, scale)
+    # What the sparse points around the middle span, and no more than the cameras go round.
+    around = points[points.norm(dim=1) < AROUND]
+    if len(around) < 10:
+        around = points
+    low, high = (
+        np.clip(np.percentile(around.numpy(), p, axis=0), -AROUND, AROUND)
+        for p in (2 * OUTLIERS, 100 - 2 * OUTLIERS)
+    )
+    margin = 0.1 * np.maximum(high - low, 0.1 * AROUND)
+    box = (low - margin).tolist(), (high + margin).tolist()
+    return World(poses, points, "contracted", 0.5 * near * scale, far * scale, box)
+
+
+def _looked_at(poses: Tensor, points: Tensor) -> Tensor:
+    """The point (3,) nearest to all axes, or the points' median where they hardly meet."""
+    across = torch.eye(3, dtype=poses.dtype) - poses[:, :, 2:3] * poses[:, :, 2].unsqueeze(1)
+    whole = across.mean(dim=0)
+    if float(torch.linalg.eigvalsh(whole)[0]) < 1e-2:
+        return points.median(dim=0).values
+    found: Tensor = torch.linalg.solve(whole, (across @ poses[:, :, 3:])[..., 0].mean(dim=0))
+    return found
+
+
+def _moved(poses: Tensor, points: Tensor, frame: Tensor, scale: float) -> tuple[Tensor, Tensor]:
+    """Poses and points in the world in which ``frame`` is the identity, ``scale`` times larger."""
+    turned = relative_to(frame, poses)
+    turned[:, :, 3] *= scale
+    return turned, (points - frame[:, 3]) @ frame[:, :3] * scale

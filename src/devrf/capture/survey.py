@@ -1,0 +1,135 @@
+"""A first look at footage: how sharp each frame is, and how much moves between frames."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from devrf.capture.footage import Picture, pictures
+from devrf.errors import DevrfError
+
+# Frames are looked at with so many pixels of the longer side: much smaller ones hide blur, larger
+# ones show the sensor's noise.
+LONGER_SIDE = 640
+# Motion is compared where noise and compression have been averaged away.
+MOTION_SIDE = 160
+# So many grey levels of change are noise.
+NOISE = 2.0
+
+Grey = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What was seen of one video.
+
+    Attributes:
+        size: width and height of its frames in pixels.
+        times: N times in seconds, the first frame's 0.
+        sharpness: N values in [0, 1], see :func:`sharpness`.
+        motion: N values, how much has changed since the frame before (grey levels, mean over the
+            image of what exceeds noise); 0 of the first frame.
+    """
+
+    size: tuple[int, int]
+    times: tuple[float, ...]
+    sharpness: tuple[float, ...]
+    motion: tuple[float, ...]
+
+    @property
+    def rate(self) -> float:
+        """Frames a second, the median."""
+        return 1 / float(np.median(np.diff(self.times)))
+
+    def plain(self) -> dict[str, Any]:
+        """As JSON can hold it."""
+        return asdict(self)
+
+    @staticmethod
+    def of(plain: dict[str, Any]) -> Survey:
+        """What :meth:`plain` made."""
+        parts = (tuple(plain[key]) for key in ("size", "times", "sharpness", "motion"))
+        return Survey(*parts)
+
+
+def survey(path: Path, followed: Iterable[tuple[float, Picture]] | None = None) -> Survey:
+    """Look at all frames of a video, or at all photographs of a folder.
+
+    Args:
+        path: the footage.
+        followed: its frames, if the caller watches the progress; None: they are read here.
+
+    Raises:
+        DevrfError: what :func:`devrf.capture.footage.pictures` raises, or the frames have
+            several sizes.
+    """
+    size: tuple[int, int] | None = None
+    times, sharp, motion = list[float](), list[float](), list[float]()
+    before: Grey | None = None
+    for time, picture in followed or pictures(path):
+        height, width = picture.shape[:2]
+        if size not in (None, (width, height)):
+            raise DevrfError(
+                f"{path}: image {len(times) + 1} has {width}x{height} px, those before it have "
+                f"{size}; bring all images to one size"
+            )
+        size = width, height
+        grey = _grey(picture, LONGER_SIDE)
+        small = cv2.GaussianBlur(_shrunk(grey, MOTION_SIDE), (0, 0), 1.0).astype(np.float32)
+        times.append(time)
+        sharp.append(sharpness(grey))
+        change = 0.0 if before is None else moved(before, small)
+        motion.append(change)
+        before = small
+    assert size is not None  # there is a first frame, or reading has failed
+    return Survey(size, tuple(times), tuple(sharp), tuple(motion))
+
+
+def sharpness(grey: Grey) -> float:
+    """How sharp an image is, from 0 (blurred) to 1, whatever it shows.
+
+    What a strong blur takes away of the differences between neighbouring pixels, as a share of
+    them: much of a sharp image, little of one that is blurred already (Crété et al., "The blur
+    effect", 2007). The less sharp of both directions counts.
+
+    Args:
+        grey: (H, W).
+    """
+    shares = []
+    for axis, kernel in ((0, (1, 9)), (1, (9, 1))):
+        there = np.abs(np.diff(grey, axis=axis))
+        blurred = cv2.blur(grey, kernel)
+        left = np.abs(np.diff(blurred, axis=axis))
+        lost = np.maximum(there - left, 0).sum()
+        shares.append(float(lost / there.sum()) if there.sum() > 0 else 0.0)
+    return min(shares)
+
+
+def moved(before: Grey, after: Grey) -> float:
+    """Mean over the image of the change that exceeds noise, grey levels.
+
+    The median change is taken off first: exposure and key frames change all pixels alike.
+    """
+    change = after - before
+    change = np.abs(change - np.median(change))
+    return float(np.maximum(change - NOISE, 0).mean())
+
+
+def _grey(picture: Picture, longer: int) -> Grey:
+    grey = np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), np.float32)
+    return _shrunk(grey, longer)
+
+
+def _shrunk(grey: Grey, longer: int) -> Grey:
+    """The image with at most ``longer`` pixels of its longer side."""
+    factor = longer / max(grey.shape)
+    if factor >= 1:
+        return grey
+    width, height = (max(1, round(side * factor)) for side in grey.shape[::-1])
+    return np.asarray(cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA), np.float32)
