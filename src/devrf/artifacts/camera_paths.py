@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -13,6 +15,11 @@ from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Views
+
+# The cameras of a film of some settings, around a scene or before it.
+Ring = Callable[[FilmSettings], Cameras]
+# Cameras and as many times in [0, 1].
+Shots = tuple[Cameras, list[float]]
 
 
 def orbit(cameras: Cameras, box: Box, settings: FilmSettings) -> Cameras:
@@ -48,6 +55,28 @@ def spiral(cameras: Cameras, focus: float, settings: FilmSettings) -> Cameras:
     offsets = (cameras.positions - middle) @ axes.T
     radii = 0.9 * offsets.abs().quantile(0.8, dim=0)
     return _ring(cameras, middle, radii[:, None] * axes, middle - focus * back, up, settings)
+
+
+def bullet_time(ring: Ring, moment: float, settings: FilmSettings) -> Shots:
+    """Once around the scene while its time stands still at ``moment``."""
+    return ring(settings), [moment] * settings.frames
+
+
+def time_freeze(ring: Ring, moment: float, settings: FilmSettings) -> Shots:
+    """Time runs to ``moment`` and stands still while the camera goes round; then it runs on.
+
+    Each takes a third of the frames.
+    """
+    before = after = settings.frames // 3
+    around = settings.frames - before - after
+    cameras = ring(replace(settings, frames=around))
+    index = [0] * before + list(range(around)) + [0] * after
+    times = [
+        *torch.linspace(0, moment, before + 1)[:-1].tolist(),
+        *[moment] * around,
+        *torch.linspace(moment, 1, after).tolist(),
+    ]
+    return cameras[index], times
 
 
 def held_out_images(views: Views, frames: int) -> list[int]:

@@ -41,6 +41,9 @@ class FilmSettings:
         max_seconds: what rendering a video may take; where it would take longer, fewer frames
             are rendered, over the same duration. None: no limit.
         half: whether the colour network works in half precision, on a CUDA device only.
+        path: a file of keyframes (:mod:`~devrf.artifacts.path_files`), ``bullet_time`` or
+            ``time_freeze``: the one video to render; None: the held-out view and the orbit.
+        time: in [0, 1], when the last two of them stop.
     """
 
     frames: int = 60
@@ -50,8 +53,12 @@ class FilmSettings:
     height: int | None = None
     max_seconds: float | None = None
     half: bool = False
+    path: str | None = None
+    time: float = 0.5
 
     def __post_init__(self) -> None:
+        if not 0 <= self.time <= 1:
+            raise DevrfError(f"video.time: expected 0 to 1, not {self.time}")
         if self.height is not None and self.height < SMALLEST:
             raise DevrfError(f"video.height: expected at least {SMALLEST}, not {self.height}")
         if self.max_seconds is not None and not self.max_seconds > 0:
@@ -68,11 +75,24 @@ class FilmSettings:
         return replace(self, frames=frames, fps=self.fps * frames / self.frames)
 
 
-def orbit_pictures(renderer: Renderer, cameras: Cameras, background: float) -> Iterator[Tensor]:
-    """Colour beside depth (H', W', 3) from each of N cameras, while time runs from 0 to 1."""
+def orbit_pictures(
+    renderer: Renderer,
+    cameras: Cameras,
+    background: float,
+    times: Sequence[float] | None = None,
+) -> Iterator[Tensor]:
+    """Colour beside depth (H', W', 3) from each of N cameras.
+
+    Args:
+        renderer: of the learned scene.
+        cameras: N cameras.
+        background: grey level.
+        times: N times in [0, 1], of cameras that may be anywhere; None: time runs from 0 to 1.
+    """
     for index in range(len(cameras)):
-        time = index / max(len(cameras) - 1, 1)
-        color, depth = still(renderer, cameras, time, background, index)
+        time = index / max(len(cameras) - 1, 1) if times is None else times[index]
+        crop = None if times is None else renderer.reach(cameras.positions[index])
+        color, depth = still(renderer, cameras, time, background, index, crop)
         yield image_grid([[color, depth]], [f"time {time:.2f}", "depth: near is bright"])
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 from devrf.artifacts.colors import depth_colors
 from devrf.checkpoints.viewpoints import Viewpoints
 from devrf.errors import DevrfError
+from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.rendering.renderer import Renderer
 
@@ -67,7 +68,12 @@ def sized(cameras: Cameras, height: int | None) -> Cameras:
 
 
 def still(
-    renderer: Renderer, cameras: Cameras, time: float, background: float, index: int = 0
+    renderer: Renderer,
+    cameras: Cameras,
+    time: float,
+    background: float,
+    index: int = 0,
+    crop: Box | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Colour (H, W, 3) and depth as colours (H, W, 3) of what a camera sees, in [0, 1].
 
@@ -77,9 +83,10 @@ def still(
         time: in [0, 1].
         background: grey level.
         index: which of the cameras.
+        crop: what is outside this box is left out.
     """
     model, shape = renderer.model, (cameras.height, cameras.width)
-    image = renderer.view(cameras, index, time, background)
+    image = renderer.view(cameras, index, time, background, crop)
     near, far = model.space.depth_range(model.box, model.depth_limits, cameras.positions[index])
     depth, opacity = image.depth.view(shape).cpu(), image.opacity.view(shape).cpu()
     color = image.color.view(*shape, 3).clamp(0, 1).cpu()

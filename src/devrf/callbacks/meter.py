@@ -30,8 +30,7 @@ class Meter(Callback):
     ) -> None:
         """Log in the steps in which Lightning logs; nothing is read from the device."""
         assert isinstance(pl_module, ScheduledStage)
-        every: int = trainer.log_every_n_steps  # type: ignore[attr-defined]
-        if not trainer.should_stop and (every == 0 or (batch_idx + 1) % every):
+        if not pl_module.logs(batch_idx):
             return
         now, done = time.perf_counter(), pl_module.iteration
         since, before = self._last
@@ -48,9 +47,9 @@ class Meter(Callback):
             values["frame"] = pl_module.phase.frames[0]  # a column has one number
         if pl_module.device.type == "cuda":
             values["peak_gpu_gb"] = torch.cuda.max_memory_allocated(pl_module.device) / 2**30
-        psnr = batch_psnr(outputs or {})
+        psnr = batch_psnr(pl_module.logged if outputs else {})
         if psnr is not None:
             pl_module.log(f"{pl_module.capture}/psnr", psnr)
-        pl_module.log_dict(
-            {f"{pl_module.capture}/{k}": float(v) for k, v in values.items() if v is not None}
-        )
+        # Tensors on the host: Lightning would copy numbers to the device, and wait.
+        known = {name: torch.tensor(float(v)) for name, v in values.items() if v is not None}
+        pl_module.log_dict({f"{pl_module.capture}/{name}": v for name, v in known.items()})

@@ -11,15 +11,20 @@ import time
 from pathlib import Path
 from typing import Any
 
+import torch
 from lightning import Callback, LightningModule, Trainer
 
 from devrf.callbacks.divergence_guard import DivergenceGuard
 from devrf.checkpoints.checkpoint import save_checkpoint
 from devrf.checkpoints.progress import progress_file, progress_files
+from devrf.engine.ddp import largest
 from devrf.engine.stage import ScheduledStage
 from devrf.errors import DevrfError
 
 log = logging.getLogger(__name__)
+
+# How often several processes tell one another of signals, and after how many steps at the latest.
+AGREE_SECONDS, MOST_STEPS = 1.0, 200
 
 
 class PeriodicCheckpoint(Callback):
@@ -56,6 +61,8 @@ class PeriodicCheckpoint(Callback):
         self._asked = False
         self._failing = False
         self._due = 0.0
+        # Steps since processes last agreed, until they do next, and when that was.
+        self._steps, self._next, self._last = 0, 1, 0.0
 
     def ask_to_stop(self) -> None:
         """End the training after the present Lightning step, with a progress file written."""
@@ -66,7 +73,9 @@ class PeriodicCheckpoint(Callback):
         assert isinstance(pl_module, ScheduledStage)
         self._failing = False
         self.saved = pl_module.iteration or None
-        self._due = time.monotonic() + self.every_seconds
+        self._last = time.monotonic()
+        self._due = self._last + self.every_seconds
+        self._steps, self._next = 0, 1
         if trainer.is_global_zero:
             for path in self.folder.glob(f".partial-{pl_module.name}*.ckpt"):
                 path.unlink(missing_ok=True)
@@ -78,8 +87,7 @@ class PeriodicCheckpoint(Callback):
         assert isinstance(pl_module, ScheduledStage)
         asked, due = self._asked, time.monotonic() >= self._due
         if trainer.world_size > 1:  # what one process is asked, all must do
-            agreed = trainer.strategy.reduce_boolean_decision
-            asked, due = agreed(asked, all=False), agreed(due and trainer.is_global_zero, all=False)
+            asked, due = self._agreed(trainer.is_global_zero, pl_module.device)
         if pl_module.iteration >= pl_module.total_iterations:
             return  # the stage is done: its checkpoint is next
         # Lightning writes this step's row of the curves after this hook: a run that was killed in
@@ -96,6 +104,22 @@ class PeriodicCheckpoint(Callback):
                 self._write(trainer, pl_module)
         if asked:
             self._asked, trainer.should_stop = False, True
+
+    def _agreed(self, leads: bool, device: torch.device) -> tuple[bool, bool]:
+        """Whether any process was asked to stop, and whether rank 0's next file is due.
+
+        Processes wait for one another to tell that, so they do it about every ``AGREE_SECONDS``, as
+        rank 0 counts them, and in between nothing is asked or due.
+        """
+        self._steps += 1
+        if self._steps < self._next:
+            return False, False
+        now = time.monotonic()
+        pace = AGREE_SECONDS * self._steps / max(now - self._last, 1e-6)
+        mine = [self._asked, leads and now >= self._due, int(min(pace, MOST_STEPS)) * leads]
+        asked, due, steps = largest(mine, device)
+        self._steps, self._next, self._last = 0, max(1, steps), now
+        return bool(asked), bool(due)
 
     def _write(self, trainer: Trainer, stage: ScheduledStage) -> None:
         began, path = time.monotonic(), progress_file(self.folder, stage.name, stage.iteration)

@@ -46,7 +46,7 @@ class TrainingRecord(Callback):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Count on from what :meth:`state_dict` gave."""
         self._seconds_before = state_dict["seconds"]
-        self._peaks_before = state_dict["peaks"]
+        self._peaks_before = state_dict.get("peaks")
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Fill the record: wall-clock seconds without previews, memory in GiB (None on a CPU).
