@@ -1,0 +1,120 @@
+"""``stage=export``: geometry that moves, for other programs."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import torch
+from hydra.utils import instantiate
+
+from devrf.artifacts.export.frame import UpFrame
+from devrf.artifacts.export.gltf import write_gltf
+from devrf.artifacts.export.moving_mesh import ForwardMap, MovingMesh, carried
+from devrf.artifacts.export.points import seen_points
+from devrf.artifacts.export.sequence import mesh_files, point_files, write_sequence
+from devrf.artifacts.export.settings import ExportSettings
+from devrf.artifacts.export.surface import canonical_surface
+from devrf.artifacts.export.usd import write_usd
+from devrf.cli.context import RunContext
+from devrf.errors import DevrfError
+from devrf.evaluation.held_out import background_value
+from devrf.geometry.cameras import Cameras
+from devrf.methods.base import DynamicModel
+from devrf.rendering.renderer import Renderer
+from devrf.scenes.scene import Scene
+from devrf.system.progress import followed
+
+log = logging.getLogger(__name__)
+
+# Files of the formats that have one for all times.
+SINGLE = {"gltf": "scene.glb", "usd": "scene.usdc"}
+
+
+def export(run: RunContext) -> None:
+    """Write the surface of what was learned, as it moves, or coloured points of each time."""
+    settings: ExportSettings = instantiate(run.config.export, _convert_="all")
+    stored, scene = run.load(), run.scene
+    model: DynamicModel = stored.model.to_view(run.device)
+    folder = run.folder / "export" if settings.into is None else Path(settings.into)
+    times = settings.moments(scene.clock) if model.moves else (0.0,)
+    if _takes_surface(model, settings):
+        mesh = _moving_mesh(model, scene, settings, times)
+        path = _write_mesh(folder, mesh, scene, settings)
+        faces, vertices = len(mesh.faces), mesh.vertices.shape[1]
+        log.info(
+            "%d faces, %d vertices at %d times written to %s", faces, vertices, len(times), path
+        )
+    else:
+        path = folder / "points"
+        renderer, behind = Renderer(model, times=1), background_value(scene.background)
+        cameras, count = scene.static.train.cameras, settings.points
+        clouds = (seen_points(renderer, cameras, time, behind, count) for time in times)
+        drawn = followed(point_files(clouds), len(times), "points")
+        write_sequence(path, "ply", times, drawn, "points", settings.seconds)
+        log.info("coloured points at %d times written to %s", len(times), path)
+
+
+def _takes_surface(model: DynamicModel, settings: ExportSettings) -> bool:
+    """Whether a surface is exported, not points.
+
+    Raises:
+        DevrfError: what is asked for cannot be had of the method.
+    """
+    has = model.surface() is not None and model.forward_map(0.0) is not None
+    wanted = has if settings.content == "auto" else settings.content == "surface"
+    if wanted and not has:
+        raise DevrfError(
+            f"export.content: method={model.name} has no surface that a forward field carries "
+            "through time; give export.content=points export.format=ply"
+        )
+    if not wanted and settings.format != "ply":
+        why = "" if has else f"method={model.name} is exported as coloured points, and "
+        raise DevrfError(
+            f"export.format: {why}points are written as ply, not as {settings.format}; give "
+            "export.format=ply"
+        )
+    return wanted
+
+
+def _moving_mesh(
+    model: DynamicModel, scene: Scene, settings: ExportSettings, times: tuple[float, ...]
+) -> MovingMesh:
+    field, device = model.surface(), model.device
+    assert field is not None
+    cameras = scene.static.train.cameras
+    surface = canonical_surface(field, model.space, model.depth_limits, cameras, settings, device)
+
+    def forward(time: float) -> ForwardMap:
+        found = model.forward_map(time)
+        assert found is not None
+        return found
+
+    return carried(surface, forward, model.space, times, device)
+
+
+def _write_mesh(folder: Path, mesh: MovingMesh, scene: Scene, settings: ExportSettings) -> Path:
+    """Write in the wanted format; the file, or the folder of files."""
+    if settings.format == "ply" or settings.format == "obj":
+        path = folder / settings.format
+        write_sequence(
+            path, settings.format, mesh.times, mesh_files(mesh), "surface", settings.seconds
+        )
+        return path
+    path = folder / SINGLE[settings.format]
+    frame = UpFrame.of(scene.static.train.cameras, settings.up, settings.metres)
+    write = write_gltf if settings.format == "gltf" else write_usd
+    write(path, mesh, _named_cameras(scene), frame, settings.seconds)
+    return path
+
+
+def _named_cameras(scene: Scene) -> dict[str, Cameras]:
+    """The cameras of the training images, each place of the dynamic ones once."""
+    static = scene.static.train.cameras
+    named = {f"static_{k}": static[[k]] for k in range(len(static))}
+    if scene.moves:
+        views = scene.dynamic.train
+        for view in torch.unique(views.view).tolist():
+            first = int((views.view == view).nonzero()[0])
+            named[f"dynamic_{view}"] = views.cameras[[first]]
+    return named
