@@ -1,7 +1,9 @@
 # make quickstart   install into .venv and learn the embedded scene: nothing else to set up
 # make test         install with the development tools, then lint, types, architecture, tests
 # make docs         build the documentation into site/; needs no network once installed
-# make fuzz         the readers' fuzz tests with 100 000 inputs (make test has 1000)
+# make gpu-check    install into .venv and check what this machine's GPU does, in minutes
+# make fuzz         what is too long for make test: the readers' fuzz tests with 100 000 inputs
+#                   (make test has 1000), every launch of the kernels compiled for two GPUs
 # make format       format the code and mend what the linter can
 # make shell        a shell in which .venv is active
 # make clean        remove .venv and everything that tools leave behind
@@ -17,7 +19,7 @@ INSTALL := $(BIN)/python -m pip install --disable-pip-version-check \
 PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist worksteal \
 	--durations 15
 
-.PHONY: quickstart test docs fuzz format shell clean
+.PHONY: quickstart test docs gpu-check fuzz format shell clean
 
 quickstart: $(VENV)/.installed
 	$(BIN)/python -m devrf experiment=quickstart
@@ -38,8 +40,12 @@ docs: $(VENV)/.installed-dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 	@echo "The documentation: site/index.html"
 
+gpu-check: $(VENV)/.installed
+	$(BIN)/python -m devrf stage=selfcheck
+
 fuzz: $(VENV)/.installed-dev
-	DEVRF_FUZZ_INPUTS=100000 $(PYTEST) tests/scenes/fuzz
+	DEVRF_FUZZ_INPUTS=100000 DEVRF_ALL_LAUNCHES=1 $(PYTEST) tests/scenes/fuzz \
+		tests/ops/kernels/test_compilation.py
 
 format: $(VENV)/.installed-dev
 	$(BIN)/ruff check --fix .

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import gc
 import mmap
 import os
 import sys
+from types import ModuleType
 
 import pytest
 
 from devrf.artifacts.records import peak_host_memory
-from devrf.system.process import forget_peak_memory, tune_for_cpu
+from devrf.system.process import forget_peak_memory, importing, tune_for_cpu
 
 
 @pytest.fixture(autouse=True)
@@ -43,3 +45,29 @@ def test_a_peak_that_is_past_is_forgotten() -> None:
     after = peak_host_memory()
     assert before is not None and after is not None
     assert after < before
+
+
+@pytest.mark.parametrize("before", [True, False])
+def test_while_modules_are_imported_no_garbage_is_looked_for(before: bool) -> None:
+    enabled = gc.isenabled()
+    try:
+        (gc.enable if before else gc.disable)()
+        with pytest.raises(ImportError), importing():
+            assert not gc.isenabled()
+            raise ImportError
+        assert gc.isenabled() is before
+    finally:
+        (gc.enable if enabled else gc.disable)()
+
+
+def test_new_modules_are_left_alone_by_later_looks(monkeypatch: pytest.MonkeyPatch) -> None:
+    def kept(name: str) -> bool:
+        return not any(one is sys.modules[name] for one in gc.get_objects())
+
+    monkeypatch.setitem(sys.modules, "known", ModuleType("known"))
+    with importing():
+        pass
+    assert not kept("known")
+    with importing():
+        monkeypatch.setitem(sys.modules, "new", ModuleType("new"))
+    assert kept("new")

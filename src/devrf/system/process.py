@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import ctypes
+import gc
 import os
 import sys
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 # glibc's malloc.h
@@ -33,6 +35,23 @@ def tune_for_cpu() -> None:
     mallopt(M_MMAP_THRESHOLD, 32 * 2**20)  # the most that glibc accepts
     mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
     mallopt(M_TOP_PAD, 64 * 2**20)
+
+
+@contextmanager
+def importing() -> Iterator[None]:
+    """Python looks for no garbage among what is imported inside, now or later: it stays.
+
+    The program's imports take a fifth less then.
+    """
+    enabled, modules = gc.isenabled(), len(sys.modules)
+    gc.disable()
+    try:
+        yield
+    finally:
+        if len(sys.modules) > modules:
+            gc.freeze()
+        if enabled:
+            gc.enable()
 
 
 def forget_peak_memory() -> None:
