@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import socket
+import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from types import SimpleNamespace
@@ -13,12 +14,15 @@ import pytest
 import torch
 from torch import distributed
 
+from devrf.callbacks import PeriodicCheckpoint, periodic_checkpoint
 from devrf.data.datamodule import SceneDataModule
+from devrf.engine import ddp
 from devrf.engine.ddp import (
     assert_replicas_equal,
     average,
     average_gradients,
     broadcast,
+    largest,
     rank,
     rays_per_rank,
     world_size,
@@ -41,6 +45,39 @@ def conversation(number: int, port: int, answer: Connection) -> None:
         parameters[1].grad = torch.tensor([[2.0], [0.0], [-8.0]])
     average_gradients(parameters)
     found["gradients"] = [p.grad.flatten().tolist() for p in parameters]
+
+    # Grids of three points, of which rays reach few, and of two, of which they reach all.
+    ddp.LARGE = 6
+    usual, sent = distributed.all_reduce, []
+
+    def noted(tensor: Any, *given: Any, **how: Any) -> Any:
+        sent.append(tensor.numel())
+        return usual(tensor, *given, **how)
+
+    distributed.all_reduce = noted
+    few, most = torch.zeros(3, 1, 1, 2), torch.zeros(1, 3, 1, 2)
+    few.grad = torch.tensor([[0.0, 0.0], [0.0, 2.0], [0.0, 0.0]]).view_as(few) * number
+    most.grad = torch.full_like(most, 1.0 + number)
+    kept = few.grad
+    unreached = torch.zeros(3, 1, 1, 2)
+    average_gradients([few, most, unreached])
+    assert few.grad is kept
+    found["grids"] = [few.grad.flatten().tolist(), most.grad.flatten().tolist()]
+    found["grids"].append(unreached.grad.flatten().tolist())
+    found["sent"] = sent
+    distributed.all_reduce = usual
+
+    here = torch.device("cpu")
+    found["largest"] = largest([number, 5 - number, True], here)
+    saving = PeriodicCheckpoint()
+    if number == 1:
+        saving.ask_to_stop()
+    # A step of rank 0 has taken 10 ms, one of the other 1 s.
+    periodic_checkpoint.time = SimpleNamespace(monotonic=lambda: 1.0 if number else 0.01)
+    # The other one's request, and rank 0's file; then nothing until a second has passed.
+    found["agreed"] = [saving._agreed(number == 0, here) for _ in range(3)]
+    periodic_checkpoint.time = time
+    found["next"] = saving._next
 
     found["means"] = average(torch.tensor([[3.0 * number, 1.0]])).tolist()
 
@@ -97,6 +134,11 @@ def test_two_processes(found: list[dict[str, Any]]) -> None:
         assert (one["rank"], one["size"], one["rays"]) == (number, 2, 4)
         # Means; a missing gradient counts as zero.
         assert one["gradients"] == [[1.5, 6.0], [1.0, 0.0, -4.0], [0.0]]
+        assert one["grids"] == [[0, 0, 0, 1, 0, 0], [1.5] * 6, [0] * 6]
+        # Which points are reached; then all of the second grid, one of the first, none of the last.
+        assert one["sent"] == [9, 6, 2]
+        assert one["largest"] == [1, 5, 1]
+        assert one["agreed"] == [(True, True), (False, False), (False, False)]
         assert one["means"] == [[1.5, 1.0]]
         # The tensors of process 0, of any type and layout.
         assert one["first"] == [[True, False, True], [[0, 3], [1, 4], [2, 5]], 5]
@@ -108,6 +150,11 @@ def test_every_process_names_tensors_that_differ(found: list[dict[str, Any]], ca
         assert "the processes have learned different fields (other)" in one[case]
 
 
+def test_processes_agree_about_once_a_second_as_rank_0_counts(found: list[dict[str, Any]]) -> None:
+    first, second = (one["next"] for one in found)
+    assert first == second == 100
+
+
 def test_one_process_changes_nothing() -> None:
     parameter = torch.zeros(2, requires_grad=True)
     average_gradients([parameter])
@@ -115,6 +162,7 @@ def test_one_process_changes_nothing() -> None:
     assert (rank(), world_size(), rays_per_rank(7)) == (0, 1, 7)
     value = torch.tensor(2.0)
     assert average(value) is value
+    assert largest([3, True], torch.device("cpu")) == [3, 1]
     broadcast([parameter])
     assert_replicas_equal({"parameter": parameter})
 

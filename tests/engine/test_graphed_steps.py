@@ -11,6 +11,7 @@ import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -30,7 +31,15 @@ from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.settings import MotionSettings
 from devrf.ops.dispatch import Kind, using
-from devrf.ops.kernels import adam, compositing, search, trilinear, warped_depth
+from devrf.ops.kernels import (
+    adam,
+    compositing,
+    photometric,
+    pixel_rays,
+    search,
+    trilinear,
+    warped_depth,
+)
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.sample_capacity import SampleCapacity
 
@@ -83,6 +92,8 @@ def short_work(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(SampleCapacity, "GRAIN", 64)
     monkeypatch.setattr(GraphedStep, "WARM_UP", 1)
 
+
+KERNELS = (adam, compositing, photometric, pixel_rays, search, trilinear, warped_depth)
 
 # Operations that wait for the device, or whose results have a shape that depends on data.
 WAITING = {
@@ -150,7 +161,7 @@ def watching() -> Iterator[Watch]:
             usual(kernel, programs, on, *args, **constants)
 
     with pytest.MonkeyPatch.context() as patch, watch:
-        for module in (adam, compositing, search, trilinear, warped_depth):
+        for module in KERNELS:
             patch.setattr(module, "launch", launch)
         yield watch
 
@@ -260,6 +271,41 @@ def test_one_graph_contains_all_frames_that_are_learned_in_parallel(
     assert stage.scene_model.deformation is not None
     learned = [bool(frame.any()) for frame in stage.scene_model.deformation.to_canonical]
     assert learned == [False, True, False, True]
+
+
+def test_before_a_capture_lists_have_been_long_enough_for_every_view(
+    rest: LoadedCheckpoint,
+    trainer: Callable[..., Trainer],
+    datamodule: SceneDataModule,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The views take turns: a list that is measured on one of them may be too short for another."""
+    noted: list[str] = []
+    usual = DeformationStage.draw
+
+    def draw(self: DeformationStage, batch: Any) -> Any:
+        noted.append(f"view {self.iteration % len(self.active[0].pools)}")
+        return usual(self, batch)
+
+    class Noting:
+        def warm_up(self, work: Work) -> None:
+            work()
+
+        def capture(self, work: Work) -> Any:
+            noted.append("captured")
+            return SimpleNamespace(replay=work)
+
+    # Lists of fixed length, in PyTorch: which view is drawn from has nothing to do with kernels.
+    monkeypatch.setattr(DeformationStage, "static_shape", lambda self, density: True)
+    monkeypatch.setattr(DeformationStage, "draw", draw)
+    monkeypatch.setattr(SampleCapacity, "measure", lambda self: noted.append("measured"))
+    stage = moving(rest)
+    assert isinstance(stage, DeformationStage)
+    stage.schedule = replace(MOVING, sides=(3,), iterations_per_frame=(2,))
+    stage.loop._capturer = Noting  # type: ignore[assignment,method-assign]
+    trainer(max_epochs=1).fit(stage, datamodule=datamodule)
+    first = ["view 0", "view 1", "measured", "view 0", "captured"]
+    assert noted[:6] == [*first, "view 1"] and noted.count("captured") == 1
 
 
 @pytest.mark.parametrize(

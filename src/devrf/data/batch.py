@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from devrf.geometry.rays import Rays
-from devrf.geometry.space import WORLD, Space
 from devrf.scenes.scene import Views
 
 
@@ -96,7 +95,8 @@ class Pixels:
         """Become as many others, in the same memory."""
         self.image.copy_(others.image)
         self.flat.copy_(others.flat)
-        self.background.copy_(others.background)
+        if self.background is not others.background:
+            self.background.copy_(others.background)
 
     def between(self, start: int, stop: int) -> Pixels:
         """The pixels from ``start`` up to ``stop``, sharing memory."""
@@ -105,8 +105,9 @@ class Pixels:
         return Pixels(self.image[kept], self.flat[kept], behind)
 
     def clone(self) -> Pixels:
-        """The same pixels in other memory."""
-        return Pixels(self.image.clone(), self.flat.clone(), self.background.clone())
+        """The same pixels in other memory; a plain background is shared."""
+        behind = self.background if self.background.dim() == 1 else self.background.clone()
+        return Pixels(self.image.clone(), self.flat.clone(), behind)
 
 
 @dataclass(frozen=True)
@@ -142,52 +143,6 @@ class RayBatch:
 def pixel_positions(flat: Tensor, width: int) -> Tensor:
     """Centres (R, 2), x then y, of pixels given by their row-major number (R,)."""
     return torch.stack([flat % width, flat // width], dim=-1) + 0.5
-
-
-def gather_batch(
-    views: Views,
-    image: Tensor,
-    flat: Tensor,
-    background: Tensor,
-    space: Space = WORLD,
-) -> RayBatch:
-    """The batch of given pixels.
-
-    Args:
-        views: images and cameras, on the device of the indices.
-        image: (R,) int64, which image.
-        flat: (R,) int64, row-major pixel number within it.
-        background: (3,) or (R, 3) RGB in [0, 1] that colours are composited on.
-        space: the space that the fields live in.
-
-    Returns:
-        Rays in the fields' space with the truth at their pixels.
-    """
-    assert views.frames is not None, "views of a scene know their frames"
-    pixel = pixel_positions(flat, views.width)
-    row = image * (views.height * views.width) + flat
-    value = views.pixels.flatten(0, 2)[row].float() / 255
-    alpha = value[:, 3] if views.has_alpha else None
-    color = value[:, :3]
-    if alpha is not None:
-        color = background + alpha[:, None] * (color - background)
-    flow = flow_valid = None
-    if views.flow is not None:
-        flow_valid = views.flow.valid.flatten()[row]
-        # What was observed where it is not valid may be anything, NaN included.
-        flow = torch.where(flow_valid[:, None], views.flow.vectors.flatten(0, 2)[row], 0.0)
-    return RayBatch(
-        rays=space.rays(views.cameras.rays(image, pixel)),
-        color=color,
-        alpha=alpha,
-        background=background,
-        time=views.times[image],
-        frame=views.frames[image],
-        image=image,
-        pixel=pixel,
-        flow=flow,
-        flow_valid=flow_valid,
-    )
 
 
 def background_color(name: str, rays: int, generator: torch.Generator) -> Tensor:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import signal
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -16,6 +16,10 @@ from lightning.pytorch.strategies import DDPStrategy
 from torch import Tensor, distributed
 
 from devrf.errors import DevrfError
+
+# A grid of so many values or more exchanges only the points that were reached, if these are at
+# most a share of all: finding and gathering them costs time, too.
+LARGE, MOST_REACHED = 2**18, 0.5
 
 
 class ManualDDP(DDPStrategy):
@@ -97,21 +101,62 @@ def average_gradients(parameters: Iterable[Tensor]) -> None:
     """Replace each gradient by its mean over the processes.
 
     A missing gradient counts as zero, so that all processes exchange the same tensors whichever
-    parameters their rays have reached.
+    parameters their rays have reached. Of a large grid (X, Y, Z, C) only the points are exchanged
+    that a ray of any process has reached, unless these are most of them.
     """
     size = world_size()
     if size == 1:
         return
-    gradients = []
+    dense: list[Tensor] = []
+    grids: list[Tensor] = []
     for parameter in parameters:
         if parameter.grad is None:
             parameter.grad = torch.zeros_like(parameter)
-        gradients.append(parameter.grad)
-    pending = [distributed.all_reduce(gradient, async_op=True) for gradient in gradients]
-    for work, gradient in zip(pending, gradients, strict=True):
+        large = parameter.ndim == 4 and parameter.numel() >= LARGE
+        if large and not parameter.grad.is_contiguous():
+            parameter.grad = parameter.grad.contiguous()
+        (grids if large else dense).append(parameter.grad)
+    reached: list[tuple[Tensor, Tensor]] = []
+    for gradient, points in zip(grids, _reached_points(grids), strict=True):
+        rows = gradient.view(-1, gradient.shape[-1])
+        if len(points) > MOST_REACHED * len(rows):
+            dense.append(gradient)
+        elif len(points):
+            reached.append((rows, points))
+    parts = [rows.index_select(0, points) for rows, points in reached]
+    exchanged = [*dense, *parts]
+    pending = [distributed.all_reduce(tensor, async_op=True) for tensor in exchanged]
+    for work, tensor in zip(pending, exchanged, strict=True):
         assert work is not None
         work.wait()
-        gradient.div_(size)
+        tensor.div_(size)
+    for (rows, points), part in zip(reached, parts, strict=True):
+        rows.index_copy_(0, points, part)
+
+
+def _reached_points(gradients: Sequence[Tensor]) -> list[Tensor]:
+    """For each (X, Y, Z, C) the points, counted along the grid, at which any process has values."""
+    if not gradients:
+        return []
+    own = [(gradient != 0).any(dim=-1).view(-1) for gradient in gradients]
+    anywhere = torch.cat(own).to(torch.uint8)
+    distributed.all_reduce(anywhere, distributed.ReduceOp.MAX)
+    parts = torch.split(anywhere, [len(one) for one in own])
+    return [part.nonzero()[:, 0] for part in parts]
+
+
+def largest(values: Sequence[int], device: torch.device) -> list[int]:
+    """For each value the largest of all processes; waits for them.
+
+    Args:
+        values: as many in each process.
+        device: of this process, for the exchange.
+    """
+    if world_size() == 1:
+        return list(values)
+    found = torch.tensor(values, dtype=torch.int64, device=device)
+    distributed.all_reduce(found, distributed.ReduceOp.MAX)
+    return [int(value) for value in found.tolist()]
 
 
 def average(values: Tensor) -> Tensor:

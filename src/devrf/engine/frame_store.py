@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from devrf.ops.resampling import resample
+from devrf.system.page_locked import page_locked
 
 log = logging.getLogger(__name__)
 
@@ -147,7 +148,7 @@ class FrameStore(nn.Module):
             return torch.empty(shape, dtype=dtype, device=self.here.device)
         if torch.cuda.is_available():
             try:
-                return torch.empty(shape, dtype=dtype, pin_memory=True)
+                return page_locked(shape, dtype)
             except RuntimeError as error:
                 reason = str(error).splitlines()[0]
                 log.warning("displacements are fetched slowly: no page-locked memory (%s)", reason)

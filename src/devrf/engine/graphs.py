@@ -75,7 +75,7 @@ class CudaGraphCapture:
 
 
 class GraphedStep:
-    """Runs the same work at each call: from Python for ``WARM_UP`` calls, then from a graph.
+    """Runs the same work at each call: from Python for some warm-up calls, then from a graph.
 
     If the capture fails, a warning says why, and every later call runs the work from Python.
 
@@ -86,13 +86,17 @@ class GraphedStep:
     # Kernels are compiled, and library workspaces and constants allocated, before the capture.
     WARM_UP = 3
 
-    def __init__(self, work: Work, capturer: CudaGraphCapture | None) -> None:
+    def __init__(
+        self, work: Work, capturer: CudaGraphCapture | None, warm_up: int | None = None
+    ) -> None:
         """Prepare to run ``work``, which must not wait for the device.
 
         Args:
             work: what each call runs.
             capturer: captures it; None: never capture.
+            warm_up: warm-up calls; None: ``WARM_UP``.
         """
+        self._warm_up = self.WARM_UP if warm_up is None else warm_up
         self._work = work
         self._capturer = capturer
         self._calls = 0
@@ -102,18 +106,18 @@ class GraphedStep:
     @property
     def is_warm(self) -> bool:
         """Whether the last warm-up call has just been made: the next call captures."""
-        return self._calls == self.WARM_UP
+        return self._calls == self._warm_up
 
     @property
     def has_captured(self) -> bool:
         """Whether the last call has just captured the graph that it replayed."""
-        return self._graph is not None and self._calls == self.WARM_UP + 1
+        return self._graph is not None and self._calls == self._warm_up + 1
 
     def __call__(self) -> None:
         """Run the work once."""
         self._calls += 1
         if self._graph is None and self._capturer is not None:
-            if self._calls <= self.WARM_UP:
+            if self._calls <= self._warm_up:
                 self._capturer.warm_up(self._work)
                 return
             self._try(self._capturer)

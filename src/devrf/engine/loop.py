@@ -178,7 +178,9 @@ class Loop:
                 stage.optimizer.apply()
 
         if self._graphed is None:
-            self._graphed = GraphedStep(work, self._capturer())
+            # Over every training view, so that the lists that are captured are long enough for all.
+            warm_up = max(GraphedStep.WARM_UP, stage.view_cycle)
+            self._graphed = GraphedStep(work, self._capturer(), warm_up)
         graphed = self._graphed  # the attribute is reset if memory runs out in the step
         # A profiler cannot attribute a replayed graph to parts.
         with stage.optimizer.stepping_by(work if measured() else graphed):

@@ -66,6 +66,7 @@ class ScheduledStage(LightningModule, ABC):
         lr_scale: factor of the scheduled learning rates; below 1 after a rollback.
         abort_reason: why the stage ended before its schedule; None while it has not.
         loop: carries the iterations out.
+        logged: what was last logged by :meth:`training_step`: means () by name, on the host.
     """
 
     name: str
@@ -94,6 +95,7 @@ class ScheduledStage(LightningModule, ABC):
         self.num_rollbacks = 0
         self.lr_scale = 1.0
         self.abort_reason: str | None = None
+        self.logged: dict[str, Tensor] = {}
         self._progress: dict[str, Any] | None = None
         self._finished: dict[str, Any] | None = None
 
@@ -148,6 +150,11 @@ class ScheduledStage(LightningModule, ABC):
 
     def prepare(self) -> None:
         """Called before each iteration; may wait for the device."""
+
+    @property
+    def view_cycle(self) -> int:
+        """In how many iterations a batch has come from every training view."""
+        return 1
 
     def converged(self, losses: Tensor) -> bool:
         """Whether the rest of the present phase can be skipped.
@@ -283,12 +290,24 @@ class ScheduledStage(LightningModule, ABC):
             self.skipped += stop - self.iteration
             self.iteration = stop
         self._reseed()
-        named = {f"{self.capture}/{k}": value for k, value in means.items()}
-        # A tensor on the host: Lightning would copy a number to the device, and wait.
-        self.log_dict({**named, "step": torch.tensor(float(self.iteration))})
         if self.iteration >= self.total_iterations:
             self.trainer.should_stop = True
+        # Reading from a GPU waits for it: there only what is written is read.
+        if self.device.type != "cuda" or self.logs(batch_idx):
+            self._log(means)
         return means
+
+    def logs(self, batch_idx: int) -> bool:
+        """Whether loggers write the values of a step, which its last hook asks as well."""
+        every: int = self.trainer.log_every_n_steps  # type: ignore[attr-defined]
+        return self.trainer.should_stop or (every > 0 and (batch_idx + 1) % every == 0)
+
+    def _log(self, means: dict[str, Tensor]) -> None:
+        """Log a step's means, which one copy brings to the host: the only wait for the device."""
+        self.logged = dict(zip(means, torch.stack(list(means.values())).cpu(), strict=True))
+        named = {f"{self.capture}/{k}": value for k, value in self.logged.items()}
+        # A tensor on the host: Lightning would copy a number to the device, and wait.
+        self.log_dict({**named, "step": torch.tensor(float(self.iteration))})
 
     def _iterate(self, views: Any, most: int) -> None:
         """Run a step's iterations, no more than ``most``; abort if memory runs out."""

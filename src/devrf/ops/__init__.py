@@ -4,7 +4,7 @@ Imports go down this list, never up:
 
 | module | functions |
 |---|---|
-| ``selfcheck`` | ``check_kernels``: compares both implementations on a device |
+| ``selfcheck`` | ``check_kernels``, ``compare``: both implementations, compared on a device |
 | ``adam`` | ``GridAdam``: the optimiser made of ``adam_step``'s steps |
 | ``search`` | ``find_samples``: visible samples of rays; ``select``: a subset of them |
 | ``adam_step`` | ``adam_step``, ``smooth_adam_step``: one step on one tensor |

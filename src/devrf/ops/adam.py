@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from devrf.ops.adam_step import AdamRule, adam_step, smooth_adam_step
+from devrf.ops.adam_step import AdamRule, adam_steps, smooth_adam_step
 from devrf.ops.dispatch import triton_runs
 from devrf.ops.total_variation import add_total_variation_gradient
 
@@ -52,6 +52,8 @@ class GridAdam(torch.optim.Optimizer):
         }
         self.keeps_gradients = False
         self._rates: dict[int, Tensor] = {}
+        # The number that each of these holds.
+        self._filled: dict[Tensor, float] = {}
         self._spare: dict[Tensor, Tensor] = {}
         self._work = self.apply
         super().__init__(params, defaults)
@@ -68,8 +70,10 @@ class GridAdam(torch.optim.Optimizer):
                 rate = self._rates.get(number)
                 if rate is None or rate.device != device:
                     rate = self._rates[number] = torch.zeros((), dtype=torch.float64, device=device)
-                # A fill does not wait for the device, unlike a copy from the host.
-                rate.fill_(group["lr"])
+                if self._filled.get(rate) != group["lr"]:
+                    # A fill does not wait for the device, unlike a copy from the host.
+                    rate.fill_(group["lr"])
+                    self._filled[rate] = group["lr"]
         with torch.enable_grad():
             self._work()
         return result
@@ -90,32 +94,55 @@ class GridAdam(torch.optim.Optimizer):
     @torch.no_grad()
     def apply(self) -> None:
         """Step at the rates that :meth:`step` has put on the device."""
-        for number, group in enumerate(self.param_groups):
+        learned = [self._learned(group) for group in self.param_groups]
+        steps = [self._state_of(parameter)["steps"] for group in learned for parameter in group]
+        if steps:
+            torch._foreach_add_(steps, 1)
+        smoothed: list[Tensor] = []
+        for number, (group, parameters) in enumerate(zip(self.param_groups, learned, strict=True)):
             rate = group["lr"] if isinstance(group["lr"], Tensor) else self._rates.get(number)
-            for parameter in group["params"]:
-                assert rate is not None
-                self._step(parameter, group, rate)
+            options = {name: group[name] for name in ("betas", "eps", "skip_zero", "per_voxel_lr")}
+            taken = [self._tensors_of(parameter) for parameter in parameters]
+            if not taken:
+                continue
+            assert rate is not None
+            rules = [AdamRule(rate, step, **options) for *_, step in taken]
+            tensors = [four for *four, _ in taken]
+            smoothing, touched_only = group["smoothing"], group["touched_only"]
+            if smoothing and not touched_only and triton_runs(*tensors[0]):
+                for each, rule in zip(tensors, rules, strict=True):
+                    values, gradient, mean, square = each
+                    spare = self._spare_of(values)
+                    smooth_adam_step(
+                        values, spare, gradient, mean, square, rule, smoothing=smoothing
+                    )
+                    smoothed.append(values)
+                continue
+            if smoothing:
+                for values, gradient, *_ in tensors:
+                    add_total_variation_gradient(
+                        values, gradient, smoothing, touched_only=touched_only
+                    )
+            adam_steps(tensors, rules, clear=self.keeps_gradients)
+        if smoothed:
+            torch._foreach_copy_(smoothed, [self._spare_of(values) for values in smoothed])
 
-    def _step(self, parameter: Tensor, group: dict[str, Any], rate: Tensor) -> None:
-        smoothing, touched_only = group["smoothing"], group["touched_only"]
-        if parameter.grad is None:
-            if not smoothing or touched_only:
-                return
-            parameter.grad = torch.zeros_like(parameter)
-        gradient, state = parameter.grad, self._state_of(parameter)
-        state["steps"] += 1
-        options = {name: group[name] for name in ("betas", "eps", "skip_zero", "per_voxel_lr")}
-        rule = AdamRule(rate, state["steps"], **options)
-        moments = state["mean"], state["square"]
-        tensors = (parameter, gradient, *moments)
-        if smoothing and not touched_only and triton_runs(*tensors):
-            spare = self._spare_of(parameter)
-            smooth_adam_step(parameter, spare, gradient, *moments, rule, smoothing=smoothing)
-            parameter.copy_(spare)
-            return
-        if smoothing:
-            add_total_variation_gradient(parameter, gradient, smoothing, touched_only=touched_only)
-        adam_step(parameter, gradient, *moments, rule, clear=self.keeps_gradients)
+    def _learned(self, group: dict[str, Any]) -> list[Tensor]:
+        """The group's parameters that have a gradient, or get one from their total variation."""
+        found = []
+        for parameter in group["params"]:
+            if parameter.grad is None:
+                if not group["smoothing"] or group["touched_only"]:
+                    continue
+                parameter.grad = torch.zeros_like(parameter)
+            found.append(parameter)
+        return found
+
+    def _tensors_of(self, parameter: Tensor) -> tuple[Tensor, ...]:
+        """A parameter, its gradient, its two moments and its number of steps."""
+        state = self._state_of(parameter)
+        assert parameter.grad is not None
+        return parameter, parameter.grad, state["mean"], state["square"], state["steps"]
 
     def _state_of(self, parameter: Tensor) -> dict[str, Any]:
         """The parameter's number of steps () and its moments; zero at first."""

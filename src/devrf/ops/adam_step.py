@@ -7,6 +7,7 @@ present values.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -68,6 +69,31 @@ def adam_step(
     _step(values, gradient, mean, square, rule)
     if clear:
         gradient.zero_()
+
+
+def adam_steps(
+    tensors: Sequence[Sequence[Tensor]], rules: Sequence[AdamRule], *, clear: bool = True
+) -> None:
+    """As :func:`adam_step` for each of several tensors, whose rules differ in ``step`` alone.
+
+    Triton steps them in a single launch, unless a rule has options, or gradients are made anew at
+    each step: their addresses are kept.
+
+    Args:
+        tensors: values, gradient and both moments of each.
+        rules: the settings of each.
+        clear: whether to set the gradients to zero afterwards.
+    """
+    plain = not (rules[0].skip_zero or rules[0].per_voxel_lr is not None) if rules else False
+    every = [tensor for four in tensors for tensor in four]
+    contiguous = all(tensor.is_contiguous() for tensor in every)
+    if len(tensors) > 1 and plain and clear and contiguous and triton_runs(*every):
+        from devrf.ops.kernels.adam import step_several
+
+        step_several(tensors, [rule.step for rule in rules], rules[0])
+        return
+    for (values, gradient, mean, square), rule in zip(tensors, rules, strict=True):
+        adam_step(values, gradient, mean, square, rule, clear=clear)
 
 
 def smooth_adam_step(

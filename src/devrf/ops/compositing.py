@@ -87,6 +87,42 @@ def sum_segments(weights: Tensor, values: Tensor, first: Tensor) -> Tensor:
     return sum_by_ray(weights[:, None] * values, ray, len(first))[:-1]
 
 
+def composite_colors(
+    weights: Tensor,
+    colors: Tensor,
+    distance: Tensor,
+    first: Tensor,
+    transmittance: Tensor,
+    background: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """:func:`color_and_depth` of rays whose samples are listed, in one pass over them.
+
+    Args:
+        weights: (S,) w.
+        colors: (S, 3) c, finite in the padding too.
+        distance: (S,) z.
+        first: (R + 1,) as for :func:`composite_segments`.
+        transmittance: (R,) T_end.
+        background: (3,) or (R, 3) RGB; it gets no gradient.
+
+    Returns:
+        Colour (R, 3), differentiable once in ``weights``, ``colors`` and ``transmittance``, and
+        depth (R,), which is not differentiable.
+    """
+    if triton_runs(weights, colors, distance, transmittance, background):
+        from devrf.ops.kernels.compositing import CompositeColors
+
+        image, depth = CompositeColors.apply(  # type: ignore[no-untyped-call]
+            weights, colors, transmittance, distance, first, background
+        )
+        return image, depth
+    seen = sum_segments(weights, colors, first)
+    with torch.no_grad():
+        along = torch.stack([distance, torch.ones_like(distance)], dim=1)
+        reached, mass = sum_segments(weights, along, first).unbind(1)
+    return color_and_depth(seen, reached, mass, transmittance, background)
+
+
 def transmittances(depth: Tensor, ray: Tensor, rays: int) -> Tensor:
     """Transmittance T_i (S,) before each sample; arguments as for :func:`composite`.
 

@@ -46,7 +46,8 @@ class PackedSamples:
         first: (R + 1,) int64, the place where each ray's samples begin; the last entry is the
             number of places used.
         total: () int64, the number of visible samples; more than C if some were dropped.
-        overflow: () bool, whether any were dropped.
+        steps: (R,) how many samples each ray was to be searched for.
+        longest: how many it was searched for at most.
     """
 
     ray: Tensor
@@ -55,7 +56,13 @@ class PackedSamples:
     significant: Tensor
     first: Tensor
     total: Tensor
-    overflow: Tensor
+    steps: Tensor
+    longest: int
+
+    @property
+    def overflow(self) -> Tensor:
+        """() bool, whether any samples were dropped."""
+        return (self.total > len(self.ray)) | (self.steps > self.longest).any()
 
 
 @dataclass(frozen=True)
@@ -66,13 +73,33 @@ class SampleSubset:
         index: (K,) int64, their places in the original list; any place in the padding.
         first: (R + 1,) int64, as in :class:`PackedSamples`, for the new list.
         total: () int64, the number of selected samples; more than K if some were dropped.
-        overflow: () bool, whether any were dropped.
     """
 
     index: Tensor
     first: Tensor
     total: Tensor
-    overflow: Tensor
+
+    @property
+    def overflow(self) -> Tensor:
+        """() bool, whether any samples were dropped."""
+        return self.total > len(self.index)
+
+
+@dataclass(frozen=True)
+class ListedSubset(SampleSubset):
+    """Some of the samples of a list with what the list says of them.
+
+    Attributes:
+        ray: (K,) int64, the ray of each; in the padding any ray, spread over all.
+        distance: (K,) along the ray.
+        points: (K, 3) positions.
+        present: (K,) bool, which places hold a sample.
+    """
+
+    ray: Tensor
+    distance: Tensor
+    points: Tensor
+    present: Tensor
 
 
 @torch.no_grad()
@@ -132,7 +159,8 @@ def find_samples(
             *(step, longest, capacity, mask_box, box, shift, delta),
             (thresholds.alpha, thresholds.stop, thresholds.weight),
         )
-        return PackedSamples(*found)
+        ray, distance, points, significant, first, total = found
+        return PackedSamples(ray, distance, points, significant, first, total, count, longest)
     rays = len(origins)
     samples = count.clamp(max=longest)
     ray = torch.repeat_interleave(samples)
@@ -159,7 +187,8 @@ def find_samples(
         pad(significant[kept], (0, room)),
         first.clamp(max=capacity),
         total,
-        (total > capacity) | (count > longest).any(),
+        count,
+        longest,
     )
 
 
@@ -192,6 +221,30 @@ def select(flags: Tensor, first: Tensor, capacity: int) -> SampleSubset:
     # One extra place receives everything that is not selected.
     target = torch.where(flags, running[:-1], capacity).clamp_(max=capacity)
     index = torch.arange(capacity + 1, device=flags.device).scatter_(0, target, place)
-    return SampleSubset(
-        index[:capacity], running[first].clamp_(max=capacity), total, total > capacity
+    return SampleSubset(index[:capacity], running[first].clamp_(max=capacity), total)
+
+
+@torch.no_grad()
+def select_listed(found: PackedSamples, capacity: int) -> ListedSubset:
+    """The significant samples of a list, as :func:`select` selects them, in a list of their own."""
+    rays = len(found.first) - 1
+    if capacity <= len(found.ray) and triton_runs(found.distance, found.points):
+        from devrf.ops.kernels.search import select_on_device
+
+        listed = found.ray, found.distance, found.points
+        return ListedSubset(
+            *select_on_device(found.significant, found.first, *listed, rays, capacity)
+        )
+    chosen = select(found.significant, found.first, capacity)
+    place = torch.arange(capacity, device=chosen.index.device)
+    present = place < chosen.first[-1]
+    ray = torch.where(present, found.ray.index_select(0, chosen.index), place % max(rays, 1))
+    return ListedSubset(
+        chosen.index,
+        chosen.first,
+        chosen.total,
+        ray,
+        found.distance.index_select(0, chosen.index),
+        found.points.index_select(0, chosen.index),
+        present,
     )

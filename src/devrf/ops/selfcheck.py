@@ -13,11 +13,13 @@ import torch
 from torch import Tensor
 
 from devrf.errors import DevrfError
-from devrf.ops.adam_step import AdamRule, adam_step, smooth_adam_step
-from devrf.ops.compositing import composite_segments, sum_segments
+from devrf.ops.adam_step import AdamRule, adam_step, adam_steps, smooth_adam_step
+from devrf.ops.compositing import composite_colors, composite_segments, sum_segments
 from devrf.ops.corners import Triple
 from devrf.ops.dispatch import Kind, using
-from devrf.ops.search import Thresholds, find_samples
+from devrf.ops.photometric import photometric_sum
+from devrf.ops.pixel_rays import gather_pixels, steps_in_box
+from devrf.ops.search import Thresholds, find_samples, select_listed
 from devrf.ops.total_variation import add_total_variation_gradient
 from devrf.ops.trilinear import interpolate
 from devrf.ops.warped_depth import warped_depth
@@ -43,6 +45,9 @@ class Draw:
         return self(*shape).requires_grad_()
 
 
+Case = Callable[[Draw], Results]
+
+
 @dataclass(frozen=True)
 class _Box:
     low: Triple = (-1.0, -0.9, -0.8)
@@ -57,14 +62,44 @@ def check_kernels(device: torch.device) -> None:
         Exception: whatever Triton raises where it cannot work.
     """
     for case in CASES:
-        pairs = zip(_run(case, "torch", device), _run(case, "triton", device), strict=True)
-        for expected, found in pairs:
-            if not torch.allclose(found, expected, rtol=TOLERANCE, atol=TOLERANCE):
-                name = case.__name__.replace("_", " ")
-                raise DevrfError(f"{name}: off by {(found - expected).abs().max().item():.2g}")
+        compared = compare(case, device)
+        if not compared.agrees:
+            raise DevrfError(f"{compared.name}: off by {compared.max_error:.2g}")
 
 
-def _run(case: Callable[[Draw], Results], kind: Kind, device: torch.device) -> list[Tensor]:
+@dataclass(frozen=True)
+class Comparison:
+    """How far both implementations of a function are apart.
+
+    Attributes:
+        name: of the function, in words.
+        agrees: whether every result is within ``TOLERANCE``, relative or absolute.
+        max_error: the largest absolute difference; of the first result that does not agree, if
+            there is one.
+    """
+
+    name: str
+    agrees: bool
+    max_error: float
+
+
+def compare(case: Case, device: torch.device) -> Comparison:
+    """Run one of ``CASES`` in both implementations.
+
+    Raises:
+        Exception: whatever Triton raises where it cannot work.
+    """
+    name, largest = case.__name__.replace("_", " "), 0.0
+    pairs = zip(_run(case, "torch", device), _run(case, "triton", device), strict=True)
+    for expected, found in pairs:
+        error = (found - expected).abs().max().item()
+        if not torch.allclose(found, expected, rtol=TOLERANCE, atol=TOLERANCE):
+            return Comparison(name, False, error)
+        largest = max(largest, error)
+    return Comparison(name, True, largest)
+
+
+def _run(case: Case, kind: Kind, device: torch.device) -> list[Tensor]:
     with using(kind), torch.inference_mode(False), torch.enable_grad():
         return [result.detach().float() for result in case(Draw(device))]
 
@@ -92,6 +127,31 @@ def warped_depths(draw: Draw, frames: Sequence[int] = (1, 2)) -> Results:
         up_q, up_tau = draw(50, 3), draw(50)
         loss = (q * up_q).sum() + (tau * up_tau).sum()
         results += torch.autograd.grad(loss, leaves)
+    return tuple(results)
+
+
+def pixel_rays(draw: Draw, channels: Sequence[int] = (3, 4)) -> Results:
+    """Pixels of two images, with and without alpha and flow, and their rays through a box."""
+    results: list[Tensor] = []
+    for count in channels:
+        image, flat = (draw(40) > 0).long(), (9.99 + 9.99 * draw(40)).long()
+        shown = (127.5 + 127 * draw(2, 4, 5, count)).to(torch.uint8)
+        flow = (draw(2, 4, 5, 2), draw(2, 4, 5) > 0) if count == 4 else None
+        found = gather_pixels(
+            image,
+            flat,
+            shown,
+            draw(2, 3, 4),
+            2 + draw(2, 2),
+            draw(2, 2),
+            draw(40, 3) if count == 4 else draw(3),
+            draw(2),
+            (draw(2) > 0).long(),
+            flow,
+        )
+        results += [tensor for tensor in found if tensor is not None]
+        rays = 2 * draw(40, 3), draw(40, 3)
+        results += steps_in_box(*rays, box=_Box(), step=0.07, near=0.1, far=2.0)
     return tuple(results)
 
 
@@ -129,6 +189,8 @@ def sample_search(draw: Draw, frames: Sequence[int] = (1, 2)) -> Results:
             found.total,
             found.overflow,
         ]
+        chosen = select_listed(found, 12)
+        results += [value for value in vars(chosen).values() if isinstance(value, Tensor)]
     return tuple(results)
 
 
@@ -141,6 +203,22 @@ def compositing(draw: Draw) -> Results:
     sums = sum_segments(weights, values, first)
     loss = (weights * draw(85)).sum() + (end * draw(5)).sum() + (sums * draw(5, 3)).sum()
     return weights, end, sums, *torch.autograd.grad(loss, (depth, values))
+
+
+def compositing_colors(draw: Draw) -> Results:
+    """The same rays: their colours, depths, and photometric terms with and without alpha."""
+    first = torch.tensor([0, 0, 3, 3, 43, 44, 77]).to(draw.device)
+    results: list[Tensor] = []
+    for alpha, background in ((None, draw(3)), (draw(6).abs(), draw(6, 3))):
+        weights, colors, left = draw.leaf(85), draw.leaf(85, 3), draw.leaf(6)
+        listed = weights.abs(), colors, draw(85)
+        image, depth = composite_colors(*listed, first, left, background)
+        found = photometric_sum(
+            image, left, weights, colors, first, draw(6, 3), alpha, (1.0, 0.1, 0.01, 0.2)
+        )
+        results += [image, depth, *found]
+        results += torch.autograd.grad(3 * found.total, (weights, colors, left))
+    return tuple(results)
 
 
 def total_variation(draw: Draw) -> Results:
@@ -169,14 +247,19 @@ def adam(draw: Draw) -> Results:
         adam_step(values, gradient, mean, square, rule)
         smooth_adam_step(values, smooth, again, mean, square, rule, smoothing=0.3)
         results += [values, smooth, gradient, again, mean, square]
-    return tuple(results)
+    several = [[*(draw(size) for _ in range(3)), draw(size).square()] for size in (7, 1500)]
+    rate, steps = draw(1)[0].abs(), [torch.full_like(draw(1)[0], k).double() for k in (1, 3)]
+    adam_steps(several, [AdamRule(rate, step) for step in steps])
+    return (*results, *(tensor for four in several for tensor in four))
 
 
-CASES: tuple[Callable[[Draw], Results], ...] = (
+CASES: tuple[Case, ...] = (
     interpolation,
     warped_depths,
+    pixel_rays,
     sample_search,
     compositing,
+    compositing_colors,
     total_variation,
     adam,
 )

@@ -38,14 +38,14 @@ SEARCHED = CanonicalSchedule(
 
 
 class Watch(Callback):
-    """Keeps what was logged and which grids there were after each Lightning step."""
+    """Keeps the loss and which grids there were after each Lightning step."""
 
     def __init__(self) -> None:
         self.loss: list[float] = []
         self.seen: list[tuple[str, tuple[int, int, int], str]] = []
 
-    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, *_: Any) -> None:
-        self.loss.append(float(trainer.callback_metrics[f"{pl_module.capture}/loss"]))
+    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, *_: Any) -> None:
+        self.loss.append(float(outputs["loss"]))
         decoder = type(pl_module.scene_model.canonical.decoder).__name__
         self.seen.append((pl_module.phase.kind, pl_module.resolution, decoder))
 

@@ -53,7 +53,7 @@ SCHEDULE = DeformationSchedule(sides=(4, 20), iterations_per_frame=(1, 1))
 def rests(moving: DeVRFModel, monkeypatch: pytest.MonkeyPatch) -> Callable[..., bool]:
     """``rests(store, device, free, …)``: whether frames rest on the host."""
 
-    def found(store: Any, device: str, free: int = 0, *, processes: int = 1, half: bool = False):
+    def found(store: Any, device: str, free: int = 0, *, processes: int = 1, half: Any = "auto"):
         monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (free, 2 * free))
         strategy = SimpleNamespace(root_device=torch.device(device))
         trainer: Any = SimpleNamespace(strategy=strategy, world_size=processes)
@@ -72,5 +72,7 @@ def test_where_it_was_asked_for(rests: Callable[..., bool]) -> None:
 
 def test_on_the_device_if_there_is_room(rests: Callable[..., bool]) -> None:
     assert not rests("auto", "cuda", 2_600_000)
-    assert rests("auto", "cuda", 1_900_000)
+    assert rests("auto", "cuda", 1_900_000, half=False)
     assert not rests("auto", "cuda", 1_900_000, half=True)
+    # Half precision is a GPU's default.
+    assert not rests("auto", "cuda", 1_900_000)

@@ -9,8 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from devrf.data.batch import RayBatch, gather_batch
+from devrf.data.batch import RayBatch
 from devrf.data.correspondence import previous_images
+from devrf.engine.gathering import gather_batch
 from devrf.geometry.cameras import Cameras
 from devrf.methods.devrf.losses import (
     MotionPrediction,

@@ -30,7 +30,9 @@ def test_no_pixel_that_meets_matter_is_left_out(cube: Box, width: int, height: i
     cameras = Cameras.looking_at(
         torch.tensor([[2.5, 1.0, 1.0]]), torch.zeros(1, 3), focal=30.0, width=width, height=height
     )
-    found = rays_hit_occupied(cameras, 0, model, occupancy)
+    together = rays_hit_occupied(cameras, torch.tensor([0, 0, 0]), model, occupancy)
+    found = together[0]
+    assert torch.equal(together, found.expand(3, -1))
     samples = march(cameras.image_rays(0), cube, occupancy, step=0.03, near=0.1, far=9.0)
     seen = torch.zeros(width * height, dtype=torch.bool)
     seen[samples.ray] = True

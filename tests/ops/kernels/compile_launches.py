@@ -1,4 +1,9 @@
-"""Compiles every launch of the check of the kernels for GPUs that need not be there.
+"""Compiles what the check of the kernels launches for GPUs that need not be there.
+
+    compile_launches.py once|all CAPABILITY…
+
+compiles each kernel ``once`` for each GPU, or with ``all`` sets of constants that it is launched
+with.
 
 Run by test_compilation.py in a process of its own, without Triton's interpreter. The functions are
 called on CPU tensors; their launches are recorded instead of run, then each is compiled to PTX and
@@ -75,7 +80,7 @@ def kernel_names() -> set[str]:
     }
 
 
-def main(capabilities: list[int]) -> None:
+def main(extent: str, capabilities: list[int]) -> None:
     names = kernel_names()
     JITFunction.run = record
     dispatch.reaches = lambda device: True
@@ -90,9 +95,10 @@ def main(capabilities: list[int]) -> None:
     found = []
     done: set[str] = set()
     for (name, *_), (source, options) in recorded.items():
-        # The last capability for every set of constants, the others once for each kernel.
-        for capability in capabilities[-1:] if name in done else capabilities:
-            done.add(name)
+        if extent == "once" and name in done:
+            continue
+        done.add(name)
+        for capability in capabilities:
             compiled = triton.compile(source, GPUTarget("cuda", capability, 32), options)
             ptx, cubin = compiled.asm["ptx"], compiled.asm["cubin"]
             found.append(
@@ -106,4 +112,4 @@ def main(capabilities: list[int]) -> None:
     print(json.dumps({"kernels": sorted(names), "compiled": found}))
 
 
-main([int(argument) for argument in sys.argv[1:]])
+main(sys.argv[1], [int(argument) for argument in sys.argv[2:]])

@@ -138,8 +138,14 @@ class CanonicalStage(VoxelStage):
             log.info("schedule.canonical.side: %g is %.4g here", asked.side, self.schedule.side)
         box, first = self.scene.bounds.box, self.schedule.phase(0)
         schedule, shape = self.schedule, box.grid_shape(self.schedule.search_side**3)
+        # The stage is moved to this device later.
+        device = self.trainer.strategy.root_device
         possible = possible_matter(
-            self.scene, shape, carve=schedule.carve, least_views=schedule.least_views
+            self.scene,
+            shape,
+            carve=schedule.carve,
+            least_views=schedule.least_views,
+            device=device,
         )
         occupancy = Occupancy(possible, box)
         if first.kind == "search":

@@ -77,20 +77,29 @@ class ColorDecoder(nn.Module):
         Returns:
             RGB (S, 3) in [0, 1].
         """
-        reduced = precision != torch.float32
-        with torch.autocast(features.device.type, precision, enabled=reduced):
-            by_ray = self.from_direction(self._encode(viewdirs))
-            if not self.learns_directions:
-                by_ray = by_ray.detach()
-            from_ray: Tensor = RowOfRay.apply(by_ray, ray)  # type: ignore[no-untyped-call]
-            x = torch.relu(self.from_feature(features) + from_ray)
-            x = torch.relu(self.hidden(x))
-        logits = self.output(x.to(self.output.weight.dtype))
-        return torch.sigmoid(logits if residual is None else logits + residual)
+        by_ray = _linear(self.from_direction, self._encode(viewdirs), precision)
+        if not self.learns_directions:
+            by_ray = by_ray.detach()
+        from_ray: Tensor = RowOfRay.apply(by_ray, ray)  # type: ignore[no-untyped-call]
+        # In place: no layer's gradient needs what it gave before its activation.
+        x = _linear(self.from_feature, features, precision).add_(from_ray).relu_()
+        x = _linear(self.hidden, x, precision).relu_()
+        logits: Tensor = self.output(x.to(self.output.weight.dtype))
+        if residual is not None:
+            logits += residual
+        return torch.sigmoid_(logits)
 
     def _encode(self, viewdirs: Tensor) -> Tensor:
         angles = (viewdirs[:, None, :] * self.octaves[:, None]).flatten(1)
         return torch.cat([viewdirs, angles.sin(), angles.cos()], dim=-1)
+
+
+def _linear(layer: nn.Linear, x: Tensor, precision: torch.dtype) -> Tensor:
+    """``layer`` of ``x`` (S, C), computed in ``precision``; float32 leaves the layer its own."""
+    if precision == torch.float32:
+        return torch.nn.functional.linear(x, layer.weight, layer.bias)
+    bias = None if layer.bias is None else layer.bias.to(precision)
+    return torch.nn.functional.linear(x.to(precision), layer.weight.to(precision), bias)
 
 
 class RowOfRay(torch.autograd.Function):

@@ -16,6 +16,7 @@ from devrf.data.batch import Pixels, all_pixels
 from devrf.data.correspondence import previous_images
 from devrf.engine.ddp import broadcast
 from devrf.engine.graphs import Graphs
+from devrf.engine.late_reading import LateReading
 from devrf.engine.parallel_batch import ParallelBatch
 from devrf.engine.phase import Phase
 from devrf.errors import DevrfError
@@ -127,6 +128,7 @@ class DeformationStage(VoxelStage):
             [{"params": [placeholder], "lr": self.motion.learning_rate, "name": "motion"}]
         )
         self.active = ActiveFrames(self)
+        self._late = LateReading()
         self._previous_images: Tensor | None = None
         # The cells of the motion grid that hold matter at rest; None where no loss asks.
         self._matter: Tensor | None = None
@@ -191,7 +193,7 @@ class DeformationStage(VoxelStage):
             )
             self.field.frames.offload(
                 on_host=rest_on_host(self.trainer, model, self.schedule, motion),
-                half=motion.store_half,
+                half=motion.rests_half(self.trainer.strategy.root_device),
             )
             recorded = self.scene.dynamic.train
             self.appearance.setup(model, self.field.clock, self._optimizer, recorded)
@@ -239,6 +241,7 @@ class DeformationStage(VoxelStage):
         if len(self.active) != len(phase.frames):
             self._allocate(len(phase.frames))
         self.active.check_out(phase.frames)
+        self._late.reset()
 
     def _allocate(self, count: int) -> None:
         """Make memory for ``count`` active frames at the field's present resolution."""
@@ -347,6 +350,13 @@ class DeformationStage(VoxelStage):
         pools = self.active[batch.number].pools
         return self.draw_pixels(pools[self.iteration % len(pools)])
 
+    @property
+    def view_cycle(self) -> int:
+        """As many as there are pools, which batches are drawn from in turn."""
+        if isinstance(self.phase, RefinementPhase):
+            return 1
+        return max(len(frame.pools) for frame in self.active)
+
     def loss(
         self, batch: ParallelBatch, views: Views, pixels: Pixels
     ) -> tuple[Tensor, dict[str, Tensor]]:
@@ -376,13 +386,18 @@ class DeformationStage(VoxelStage):
         least = self.motion.min_rel_improvement
         if least is None or isinstance(self.phase, RefinementPhase):
             return False
-        for frame, loss in zip(self.active, losses.tolist(), strict=True):
+        # On a GPU one step late: it then always has the next step's work.
+        known = self._late.exchange(losses) if losses.is_cuda else losses.tolist()
+        if known is None:
+            return False
+        for frame, loss in zip(self.active, known, strict=True):
             frame.losses.append(loss)
         return all(convergence.converged(frame.losses, least) for frame in self.active)
 
     def rollback(self, iteration: int, lr_scale: float) -> None:
         """Go on from an earlier iteration of the present frames, with an occupancy found anew."""
         super().rollback(iteration, lr_scale)
+        self._late.reset()
         for frame in self.active:
             frame.losses = []
         self.update_occupancy()
@@ -395,13 +410,15 @@ class DeformationStage(VoxelStage):
 
     def phase_state(self) -> dict[str, Any]:
         """The state of each active frame, and its losses so far."""
-        area, exact = self.views.height * self.views.width, self.motion.store_half
+        area = self.views.height * self.views.width
+        exact = self.motion.rests_half(self.device)
         return {
             "frames": [
                 frame.state(images_of(self.views, frame.number), area, exact=exact)
                 for frame in self.active
             ],
             "losses": [list(frame.losses) for frame in self.active],
+            "late": self._late.waiting,
         }
 
     def restore(self, phase: Phase, kept: dict[str, Any]) -> None:
@@ -416,3 +433,5 @@ class DeformationStage(VoxelStage):
         for frame, state, losses in states:
             frame.load_state(state, images_of(views, frame.number), views.height * views.width)
             frame.losses = list(losses)
+        # Progress files of earlier revisions have none.
+        self._late.reset(kept.get("late"))

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from devrf.data.batch import PixelPool, gather_batch
+from devrf.data.batch import PixelPool
+from devrf.engine.gathering import gather_batch
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.space import WORLD, Space
 from devrf.methods.devrf.deformation_field import DeformationField
@@ -164,7 +165,7 @@ def _fit(
         steps: Adam steps; the rate falls linearly from half a pixel a step.
     """
     change = torch.zeros_like(like).requires_grad_()
-    optimizer = torch.optim.Adam([change], lr=0.5 / scale)
+    optimizer = torch.optim.Adam([change], lr=0.5 / scale, fused=change.is_cuda)
     decay = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda n: 1 - n / steps)
     for _ in range(steps):
         optimizer.zero_grad()

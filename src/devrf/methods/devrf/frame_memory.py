@@ -59,7 +59,8 @@ def rest_on_host(
     motion_box, frames = model.deformation.box, len(model.deformation.clock)
     shape = motion_box.grid_shape(schedule.sides[-1] ** 3)
     parallel = schedule.max_parallel_frames(-1, frames)
-    fits = fits_on_device(free, frames, shape, half=motion.store_half, parallel=parallel)
+    half = motion.rests_half(device)
+    fits = fits_on_device(free, frames, shape, half=half, parallel=parallel)
     if not fits:
         log.info("motion: %.1f GB are free on the GPU; the frames rest on the host", free / 1e9)
     return not fits

@@ -12,9 +12,16 @@ from devrf.scenes.visual_hull import visual_hull
 
 
 def possible_matter(
-    scene: Scene, shape: tuple[int, int, int], *, carve: bool, least_views: int = 1
+    scene: Scene,
+    shape: tuple[int, int, int],
+    *,
+    carve: bool,
+    least_views: int = 1,
+    device: torch.device | None = None,
 ) -> Tensor:
     """Where matter can be at rest: (X, Y, Z) bool on the host, on a grid over the scene's box.
+
+    It is found on ``device``; None: on the host.
 
     Not nearer to a camera than its near plane: fog before a lens would explain its image
     perfectly. Not where fewer than ``least_views`` cameras look, if there are so many: fog would
@@ -22,18 +29,19 @@ def possible_matter(
     have mattes and all show the rest state, and the box is not endless.
     """
     views, box, space = scene.static.train, scene.bounds.box, scene.space
-    possible = torch.ones(shape, dtype=torch.bool)
-    points = space.to_world(box.grid_points(shape, views.cameras.focal))
+    cameras = views.cameras if device is None else views.cameras.to(device)
+    possible = torch.ones(shape, dtype=torch.bool, device=device)
+    points = space.to_world(box.grid_points(shape, cameras.focal))
     positions, near = views.cameras.positions, scene.bounds.near
     places = space.from_world(positions)
     for position in positions[(box.nearest(places) - places).norm(dim=1) < near]:
-        possible &= (points - position).norm(dim=-1) > near
+        possible &= (points - position.to(points)).norm(dim=-1) > near
     if 1 < least_views <= len(positions):
-        possible &= view_count(views.cameras, points) >= least_views
+        possible &= view_count(cameras, points) >= least_views
     at_rest = float(views.times.max() - views.times.min()) <= FrameClock.TOLERANCE
     if carve and space.straight and views.has_alpha and at_rest:
-        possible &= visual_hull(views, box, shape)
-    return possible
+        possible &= visual_hull(views, box, shape, device)
+    return possible.cpu()
 
 
 def view_count(cameras: Cameras, points: Tensor) -> Tensor:

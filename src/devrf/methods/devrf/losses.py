@@ -19,6 +19,8 @@ from devrf.geometry.cameras import Cameras
 from devrf.geometry.space import WORLD, Space
 from devrf.methods.devrf.elastic import elastic_energy
 from devrf.methods.devrf.volume_rendering import VoxelOutput, Warp
+from devrf.ops.dispatch import triton_runs
+from devrf.ops.photometric import TERMS, photometric_sum
 
 Predicted = TypeVar("Predicted")
 
@@ -228,10 +230,38 @@ class WeightedLoss(Generic[Predicted]):
 
     def __call__(self, prediction: Predicted) -> tuple[Tensor, dict[str, Tensor]]:
         """The weighted sum, and each term's unweighted value by name, detached."""
-        values = {
-            name: self.terms[name](prediction) for name, weight in self.weights.items() if weight
-        }
-        total = sum((self.weights[name] * value for name, value in values.items()), start=0.0)
+        counted = {name: weight for name, weight in self.weights.items() if weight}
+        together = self._photometric(prediction, counted)
+        values = {} if together is None else together[1]
+        apart = {name: self.terms[name](prediction) for name in counted if name not in values}
+        total: Tensor | float = 0.0 if together is None else together[0]
+        for name, value in apart.items():
+            total = total + counted[name] * value
         if not isinstance(total, Tensor):
             raise DevrfError("loss: every weight is zero; at least one term must count")
-        return total, {name: value.detach() for name, value in values.items()}
+        return total, {**values, **{name: value.detach() for name, value in apart.items()}}
+
+    def _photometric(
+        self, prediction: Predicted, counted: Mapping[str, float]
+    ) -> tuple[Tensor, dict[str, Tensor]] | None:
+        """The photometric terms' weighted sum and values, where one kernel computes them all."""
+        if not isinstance(prediction, Prediction):
+            return None
+        output, batch = prediction.output, prediction.batch
+        if output.first is None or not triton_runs(output.color, output.sample_color):
+            return None
+        names: dict[object, str] = {self.terms[name]: name for name in counted}
+        functions = [PHOTOMETRIC_TERMS[name] for name in TERMS]
+        weights = [counted[names[term]] if term in names else 0.0 for term in functions]
+        found = photometric_sum(
+            output.color,
+            output.transmittance,
+            output.weight,
+            output.sample_color,
+            output.first,
+            batch.color,
+            batch.alpha,
+            weights,
+        )
+        each = zip(functions, found.terms.unbind(), strict=True)
+        return found.total, {names[term]: value for term, value in each if term in names}

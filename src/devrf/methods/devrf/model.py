@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
+from functools import partial
 from typing import Any, ClassVar, Self
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from devrf.data.batch import RayBatch
 from devrf.geometry.box import Box
@@ -23,6 +24,7 @@ from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformed_occupancy import deformed_occupancy
 from devrf.methods.devrf.settings import RenderSettings
 from devrf.methods.devrf.static_shape.viewing import ListRenderer
+from devrf.methods.devrf.surface import CanonicalSurface
 from devrf.methods.devrf.view import DeVRFView
 from devrf.methods.devrf.volume_rendering import Warp, render
 from devrf.rendering.occupancy import Occupancy
@@ -152,6 +154,16 @@ class DeVRFModel(DynamicModel):
         if lists is None or (lists.field, lists.settings) != present:
             lists = self._lists[half] = ListRenderer(*present, half=half)
         return DeVRFView(self.occupancy, self.deformation, lists, self.space, time, self.appearance)
+
+    def surface(self) -> CanonicalSurface:
+        """The canonical field."""
+        return CanonicalSurface(self.canonical, self.occupancy)
+
+    def forward_map(self, time: float) -> Callable[[Tensor], Tensor]:
+        """q → q + Δ_f(q, t) (docs/method.md#warp)."""
+        if self.deformation is None:
+            return lambda points: points
+        return torch.no_grad()(partial(self.deformation.unwarp, time=time))
 
     def to_view(self, device: torch.device) -> Self:
         """The model on ``device``; displacements follow when their frame is looked at."""

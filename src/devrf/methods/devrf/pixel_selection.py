@@ -15,34 +15,42 @@ from devrf.scenes.scene import Views
 
 # Rays are followed through blocks of so many pixels a side.
 BLOCK = 2
+# Images whose rays are made together: on a CPU what its caches hold, on a GPU what keeps it busy.
+ON_CPU, ON_GPU = 1, 16
 
 
 @torch.no_grad()
 def rays_hit_occupied(
-    cameras: Cameras, image: int, model: DeVRFModel, occupancy: Occupancy
+    cameras: Cameras, images: Tensor, model: DeVRFModel, occupancy: Occupancy
 ) -> Tensor:
-    """Mask (H·W,): the pixels of an image whose rays pass near anything occupied.
+    """Mask (K, H·W): the pixels of images whose rays pass near anything occupied.
 
     One ray stands for a block of pixels, at a quarter of the cost:
     :meth:`~devrf.rendering.occupancy.Occupancy.near` reaches far enough for its neighbours too.
 
     Args:
         cameras: all cameras, on the model's device.
-        image: which of them.
+        images: (K,) int64, which of them.
         model: gives box, space, near and far.
-        occupancy: where something may be at the time of the image.
+        occupancy: where something may be at the time of the images.
     """
     width, height = (-(-size // BLOCK) for size in (cameras.width, cameras.height))
     coarse = cameras.resized(width, height)
-    hit = hits(
-        model.space.rays(coarse.image_rays(image)),
-        model.canonical.box,
-        occupancy,
-        near=model.settings.near,
-        far=model.settings.far,
-    )
-    rows = hit.view(height, width).repeat_interleave(BLOCK, dim=0)[: cameras.height]
-    return rows.repeat_interleave(BLOCK, dim=1)[:, : cameras.width].reshape(-1)
+    pixels, found = coarse.pixel_grid(), []
+    together = ON_GPU if images.is_cuda else ON_CPU
+    for start in range(0, len(images), together):
+        some = images[start : start + together]
+        rays = coarse.rays(some.repeat_interleave(len(pixels)), pixels.repeat(len(some), 1))
+        hit = hits(
+            model.space.rays(rays),
+            model.canonical.box,
+            occupancy,
+            near=model.settings.near,
+            far=model.settings.far,
+        )
+        rows = hit.view(-1, height, width).repeat_interleave(BLOCK, dim=1)[:, : cameras.height]
+        found.append(rows.repeat_interleave(BLOCK, dim=2)[:, :, : cameras.width].flatten(1))
+    return torch.cat(found)
 
 
 def canonical_pool(views: Views, model: DeVRFModel, *, everywhere: bool) -> PixelPool:
@@ -51,9 +59,8 @@ def canonical_pool(views: Views, model: DeVRFModel, *, everywhere: bool) -> Pixe
     images = torch.arange(len(views), device=device)
     if everywhere:
         return all_pixels(views, images)
-    cameras = views.cameras.to(device)
-    hit = [rays_hit_occupied(cameras, k, model, model.occupancy) for k in range(len(views))]
-    return wanted_pixels(views, images, torch.stack(hit))
+    hit = rays_hit_occupied(views.cameras.to(device), images, model, model.occupancy)
+    return wanted_pixels(views, images, hit)
 
 
 @torch.no_grad()
@@ -82,12 +89,10 @@ def frame_pools(
     images = images_of(views, frame)
     if len(images) == 0:
         raise DevrfError(f"dynamic training set: no image at frame {frame}")
-    pools = [
-        _occupied(views, image, model, occupancy)
-        if occupied_only
-        else all_pixels(views, image[None])
-        for image in images
-    ]
+    if occupied_only:
+        pools = _occupied(views, images, model, occupancy)
+    else:
+        pools = [all_pixels(views, image[None]) for image in images]
     if not join_views:
         return pools
     image, flat = ([getattr(pool, name) for pool in pools] for name in ("image", "flat"))
@@ -100,10 +105,15 @@ def images_of(views: Views, frame: int) -> Tensor:
     return (views.frames == frame).nonzero()[:, 0]
 
 
-def _occupied(views: Views, image: Tensor, model: DeVRFModel, occupancy: Occupancy) -> PixelPool:
-    """Pixels on the matte, or whose rays hit something occupied; all if there are none."""
-    wanted = rays_hit_occupied(views.cameras, int(image), model, occupancy)
+def _occupied(
+    views: Views, images: Tensor, model: DeVRFModel, occupancy: Occupancy
+) -> list[PixelPool]:
+    """Each image's pixels on the matte, or whose rays hit something occupied; all if none do."""
+    wanted = rays_hit_occupied(views.cameras, images, model, occupancy)
     if views.has_alpha:
-        wanted |= views.pixels[image, :, :, 3].flatten() > 0
-    pool = wanted_pixels(views, image[None], wanted[None])
-    return pool if len(pool) else all_pixels(views, image[None])
+        wanted |= views.pixels[images][..., 3].flatten(1) > 0
+    pools = []
+    for image, mask in zip(images, wanted, strict=True):
+        pool = wanted_pixels(views, image[None], mask[None])
+        pools.append(pool if len(pool) else all_pixels(views, image[None]))
+    return pools

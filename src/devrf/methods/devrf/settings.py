@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+import torch
+
 from devrf.errors import DevrfError
 
 # What the colour network computes in.
@@ -97,7 +99,8 @@ class MotionSettings:
         store: where the displacements of all frames are kept while one is learned: ``device``,
             ``host``, or ``auto``: on the device if they fit there beside all else. Each of
             several processes keeps them on its device.
-        store_half: whether they are kept in half precision; active frames never are.
+        store_half: whether they are kept in half precision; ``auto``: on a GPU. Active frames
+            never are.
         min_rel_improvement: a visit ends early when two Lightning steps have taken less than
             this share off its loss; None goes through the whole schedule.
     """
@@ -109,7 +112,7 @@ class MotionSettings:
     occupancy_every: int = 25
     start: Literal["previous", "flow"] = "previous"
     store: Literal["auto", "device", "host"] = "auto"
-    store_half: bool = False
+    store_half: bool | Literal["auto"] = "auto"
     min_rel_improvement: float | None = None
 
     def __post_init__(self) -> None:
@@ -118,3 +121,7 @@ class MotionSettings:
                 "schedule.motion.min_rel_improvement: expected above 0, at most 1, or null, not "
                 f"{self.min_rel_improvement}"
             )
+
+    def rests_half(self, device: torch.device) -> bool:
+        """Whether frames are kept in half precision while a stage learns on ``device``."""
+        return device.type == "cuda" if self.store_half == "auto" else self.store_half

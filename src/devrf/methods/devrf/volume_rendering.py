@@ -37,6 +37,7 @@ class VoxelOutput(RenderOutput):
         weight: (K,) their weights w_i.
         sample_color: (K, 3) their colours c_i.
         residual: (K, 3) A_t(q_i) in logits; None without one.
+        first: (R + 1,) where each ray's samples begin in a list of fixed length; None elsewhere.
     """
 
     samples: Samples
@@ -44,6 +45,7 @@ class VoxelOutput(RenderOutput):
     weight: Tensor
     sample_color: Tensor
     residual: Tensor | None = None
+    first: Tensor | None = None
 
     def mean_over_samples(self, values: Tensor) -> Tensor:
         """The mean () of values (K,) of samples, padding left out; 0 without samples."""

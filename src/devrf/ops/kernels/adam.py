@@ -8,7 +8,11 @@ read and written only there.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any
 
+import torch
 import triton
 import triton.language as tl
 from torch import Tensor
@@ -60,6 +64,50 @@ def step_in_one_pass(
         WIDE=_is_wide(values),
         BLOCK=_block(length),
     )
+
+
+def step_several(tensors: Sequence[Sequence[Tensor]], steps: Sequence[Tensor], rule: Any) -> None:
+    """As devrf.ops.adam_step.adam_steps, of rules without options; gradients are set to zero.
+
+    Args:
+        tensors: values, gradient, mean and square of each.
+        steps: () float64, of each.
+        rule: gives rate, betas and eps.
+    """
+    device, (beta1, beta2) = tensors[0][0].device, rule.betas
+    rows = tuple(
+        tuple(tensor.data_ptr() for tensor in (*four, step))
+        for four, step in zip(tensors, steps, strict=True)
+    )
+    addresses, pieces = _table(rows, tuple(four[0].numel() for four in tensors), device)
+    launch(
+        adam_several_kernel,
+        len(pieces),
+        addresses,
+        *(addresses, pieces, rule.rate),
+        *(1 - beta1, 1 - beta2, -math.log(beta1), -math.log(beta2), rule.eps),
+        BLOCK=LARGEST,
+    )
+
+
+@lru_cache(maxsize=64)
+def _table(
+    rows: tuple[tuple[int, ...], ...], lengths: tuple[int, ...], device: torch.device
+) -> tuple[Tensor, Tensor]:
+    """Addresses (N, 5) of tensors, and the tensor, first number and length (P, 3) of each program.
+
+    Kept on the device: to copy them there at every step, the host would wait for the device.
+    """
+    pieces = [
+        (number, start, length)
+        for number, length in enumerate(lengths)
+        for start in range(0, length, LARGEST)
+    ]
+    with torch.inference_mode(False):
+        return (
+            torch.tensor(rows, dtype=torch.int64).to(device),
+            torch.tensor(pieces, dtype=torch.int64).view(-1, 3).to(device),
+        )
 
 
 def add_gradient_in_one_pass(
@@ -214,3 +262,41 @@ def adam_kernel(
     if PER_VOXEL_LR:
         move *= tl.load(per_voxel_lr + at // CHANNELS, mask=active, other=0.0)
     tl.store(into + at, tl.where(active, own - move, own), mask=written)
+
+
+@triton.jit
+def adam_several_kernel(
+    addresses,
+    pieces,
+    rate,
+    share1,
+    share2,
+    decay1,
+    decay2,
+    eps,
+    BLOCK: tl.constexpr,
+):
+    """A piece of one of several tensors; as :func:`adam_kernel` without its options."""
+    program = tl.program_id(0)
+    tensor = tl.load(pieces + program * 3)
+    at = tl.load(pieces + program * 3 + 1) + tl.arange(0, BLOCK)
+    here = at < tl.load(pieces + program * 3 + 2)
+    own = addresses + tensor * 5
+    values = tl.load(own).to(tl.pointer_type(tl.float32))
+    gradient = tl.load(own + 1).to(tl.pointer_type(tl.float32))
+    mean = tl.load(own + 2).to(tl.pointer_type(tl.float32))
+    square = tl.load(own + 3).to(tl.pointer_type(tl.float32))
+    step = tl.load(own + 4).to(tl.pointer_type(tl.float64))
+    g = tl.load(gradient + at, mask=here, other=0.0)
+    tl.store(gradient + at, tl.zeros((BLOCK,), dtype=tl.float32), mask=here & (g != 0.0))
+    m = tl.load(mean + at, mask=here, other=0.0)
+    s = tl.load(square + at, mask=here, other=0.0)
+    m += share1 * (g - m)
+    s += share2 * (g * g - s)
+    tl.store(mean + at, m, mask=here)
+    tl.store(square + at, s, mask=here)
+    time = tl.load(step).to(tl.float32)
+    size = tl.load(rate).to(tl.float32) / opacity(time * decay1)
+    move = size * m / (tl.sqrt(s / opacity(time * decay2)) + eps)
+    before = tl.load(values + at, mask=here, other=0.0)
+    tl.store(values + at, before - move, mask=here)

@@ -15,8 +15,10 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from devrf.ops.kernels.cells import load_vectors, store_vectors
 from devrf.ops.kernels.launch import launch
 from devrf.ops.kernels.numbers import opacity
+from devrf.ops.kernels.padding import PADDING, padding_programs
 
 # A program is one warp, which processes a block of samples at a time, one for each thread.
 WARP = {"BLOCK": 32, "num_warps": 1}
@@ -65,6 +67,55 @@ class SumSegments(torch.autograd.Function):
         sizes = {**_width(values), **WARP}
         launch(sum_backward_kernel, len(first) - 1, values, *given, *into, **sizes)
         return *into, None
+
+
+class CompositeColors(torch.autograd.Function):
+    """As devrf.ops.compositing.composite_colors."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        weights: Tensor,
+        colors: Tensor,
+        transmittance: Tensor,
+        distance: Tensor,
+        first: Tensor,
+        background: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        rays = len(first) - 1
+        weights, colors = weights.contiguous(), colors.contiguous()
+        transmittance, first = transmittance.contiguous(), first.contiguous()
+        background, apart = background.contiguous(), 0 if background.dim() == 1 else 3
+        image, depth = colors.new_empty(rays, 3), colors.new_empty(rays)
+        launch(
+            colors_kernel,
+            rays,
+            colors,
+            *(weights, colors, transmittance, distance.contiguous(), first, background),
+            *(image, depth, apart),
+            **WARP,
+        )
+        ctx.save_for_backward(weights, colors, first, background)
+        ctx.apart = apart
+        ctx.mark_non_differentiable(depth)
+        return image, depth
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, upstream: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
+        weights, colors, first, background = ctx.saved_tensors
+        rays, places = len(first) - 1, len(weights)
+        into = torch.empty_like(weights), torch.empty_like(colors), colors.new_empty(rays)
+        launch(
+            colors_backward_kernel,
+            rays + padding_programs(places),
+            colors,
+            *(weights, colors, first, background, upstream.contiguous(), *into),
+            *(rays, places, ctx.apart),
+            PADDING=PADDING,
+            **WARP,
+        )
+        return *into, None, None, None
 
 
 def _width(values: Tensor) -> dict[str, int]:
@@ -173,3 +224,93 @@ def sum_backward_kernel(
         tl.store(into_weights + at, tl.sum(value * gradient[None, :], axis=1), mask=here)
         tl.store(into_values + place, weight[:, None] * gradient[None, :], mask=wanted)
         start += BLOCK
+
+
+@triton.jit(do_not_specialize=["apart"])
+def colors_kernel(
+    weights,
+    colors,
+    transmittance,
+    distance,
+    first,
+    background,
+    image,
+    depth,
+    apart,
+    BLOCK: tl.constexpr,
+):
+    """Σ w_i·c_i + T_end·background and Σ w_i·z_i / Σ w_i of a ray.
+
+    ``apart`` is 3 where each ray has a background of its own, else 0.
+    """
+    ray = tl.program_id(0).to(tl.int64)
+    start = tl.load(first + ray)
+    stop = tl.load(first + ray + 1)
+    lane = tl.arange(0, BLOCK)
+    red = 0.0
+    green = 0.0
+    blue = 0.0
+    reached = 0.0
+    mass = 0.0
+    while start < stop:
+        at = start + lane
+        here = at < stop
+        weight = tl.load(weights + at, mask=here, other=0.0)
+        r, g, b = load_vectors(colors, at * 3, here)
+        red += tl.sum(weight * r, 0)
+        green += tl.sum(weight * g, 0)
+        blue += tl.sum(weight * b, 0)
+        reached += tl.sum(weight * tl.load(distance + at, mask=here, other=0.0), 0)
+        mass += tl.sum(weight, 0)
+        start += BLOCK
+    left = tl.load(transmittance + ray)
+    behind = background + ray * apart
+    tl.store(image + ray * 3, red + left * tl.load(behind))
+    tl.store(image + ray * 3 + 1, green + left * tl.load(behind + 1))
+    tl.store(image + ray * 3 + 2, blue + left * tl.load(behind + 2))
+    tl.store(depth + ray, reached / tl.maximum(mass, 1e-6))
+
+
+@triton.jit(do_not_specialize=["rays", "places", "apart"])
+def colors_backward_kernel(
+    weights,
+    colors,
+    first,
+    background,
+    upstream,
+    into_weights,
+    into_colors,
+    into_transmittance,
+    rays,
+    places,
+    apart,
+    BLOCK: tl.constexpr,
+    PADDING: tl.constexpr,
+):
+    """g·c to the weights, g·w to the colours, g·background to the transmittance."""
+    program = tl.program_id(0)
+    if program < rays:
+        ray = program.to(tl.int64)
+        red = tl.load(upstream + ray * 3)
+        green = tl.load(upstream + ray * 3 + 1)
+        blue = tl.load(upstream + ray * 3 + 2)
+        behind = background + ray * apart
+        change = red * tl.load(behind) + green * tl.load(behind + 1) + blue * tl.load(behind + 2)
+        tl.store(into_transmittance + ray, change)
+        start = tl.load(first + ray)
+        stop = tl.load(first + ray + 1)
+        lane = tl.arange(0, BLOCK)
+        while start < stop:
+            at = start + lane
+            here = at < stop
+            weight = tl.load(weights + at, mask=here, other=0.0)
+            r, g, b = load_vectors(colors, at * 3, here)
+            tl.store(into_weights + at, red * r + green * g + blue * b, mask=here)
+            store_vectors(into_colors, at * 3, red * weight, green * weight, blue * weight, here)
+            start += BLOCK
+    else:
+        place = (program - rays).to(tl.int64) * PADDING + tl.arange(0, PADDING)
+        empty = (place >= tl.load(first + rays)) & (place < places)
+        nothing = tl.zeros((PADDING,), dtype=tl.float32)
+        tl.store(into_weights + place, nothing, mask=empty)
+        store_vectors(into_colors, place * 3, nothing, nothing, nothing, empty)

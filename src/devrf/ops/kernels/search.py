@@ -15,7 +15,7 @@ import triton.language as tl
 from torch import Tensor
 
 from devrf.ops.corners import Corners, scales, shape_of
-from devrf.ops.kernels.cells import cell, scalar_at, store_vectors
+from devrf.ops.kernels.cells import cell, load_vectors, scalar_at, store_vectors
 from devrf.ops.kernels.launch import launch
 from devrf.ops.kernels.numbers import opacity, softplus
 from devrf.ops.kernels.warped_depth import displaced
@@ -84,9 +84,34 @@ def find_samples_on_device(
     launch(list_kernel, rays, origins, *along, *counts, *found, stride, capacity, step, **WARP)
     programs = triton.cdiv(capacity, PADDING_BLOCK)
     launch(pad_kernel, programs, origins, first, *found, rays, capacity, BLOCK=PADDING_BLOCK)
-    total = ends[-1]
-    overflow = (total > capacity) | (count > longest).any()
-    return ray, distance, points, significant.view(torch.bool), first, total, overflow
+    return ray, distance, points, significant.view(torch.bool), first, ends[-1]
+
+
+def select_on_device(
+    flags: Tensor,
+    first: Tensor,
+    ray: Tensor,
+    distance: Tensor,
+    points: Tensor,
+    rays: int,
+    capacity: int,
+) -> tuple[Tensor, ...]:
+    """The tensors of devrf.ops.search.ListedSubset."""
+    places, running = len(flags), flags.cumsum(0)
+    index, owner = (ray.new_empty(capacity) for _ in range(2))
+    reached, begin = distance.new_empty(capacity), torch.empty_like(first)
+    where, present = points.new_empty(capacity, 3), torch.empty_like(flags[:capacity])
+    launch(
+        select_kernel,
+        triton.cdiv(max(places, rays + 1), PADDING_BLOCK),
+        distance,
+        *(flags.contiguous().view(torch.uint8), running, first.contiguous()),
+        *(ray.contiguous(), distance.contiguous(), points.contiguous()),
+        *(index, begin, owner, reached, where, present.view(torch.uint8)),
+        *(places, rays, capacity),
+        BLOCK=PADDING_BLOCK,
+    )
+    return index, begin, running[-1], owner, reached, where, present
 
 
 @triton.jit
@@ -292,3 +317,52 @@ def pad_kernel(first, rays, distances, points, significant, count, capacity, BLO
     tl.store(distances + place, nothing, mask=empty)
     store_vectors(points, at, nothing, nothing, nothing, empty)
     tl.store(significant + place, nothing.to(tl.uint8), mask=empty)
+
+
+@triton.jit(do_not_specialize=["places", "count", "capacity"])
+def select_kernel(
+    flags,
+    running,
+    first,
+    rays,
+    distances,
+    points,
+    index,
+    begin,
+    owner,
+    reached,
+    where,
+    present,
+    places,
+    count,
+    capacity,
+    BLOCK: tl.constexpr,
+):
+    """Copies flagged samples to the places that the flags' ``running`` sum gives; the padding.
+
+    A place of the padding copies the sample of the same number, which differ: atomic additions of
+    gradients to them do not collide. ``begin`` is where each of the ``count`` rays begins.
+    """
+    place = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    here = place < places
+    flag = tl.load(flags + place, mask=here, other=0) != 0
+    rank = tl.load(running + place, mask=here, other=0) - 1
+    kept = here & flag & (rank < capacity)
+    empty = (place >= tl.load(running + places - 1)) & (place < capacity)
+    ray = tl.load(rays + place, mask=here, other=0)
+    distance = tl.load(distances + place, mask=here, other=0.0)
+    x, y, z = load_vectors(points, place * 3, here)
+    tl.store(index + rank, place, mask=kept)
+    tl.store(owner + rank, ray, mask=kept)
+    tl.store(reached + rank, distance, mask=kept)
+    store_vectors(where, rank * 3, x, y, z, kept)
+    tl.store(present + rank, (rank >= 0).to(tl.uint8), mask=kept)
+    tl.store(index + place, place, mask=empty)
+    tl.store(owner + place, place % count, mask=empty)
+    tl.store(reached + place, distance, mask=empty)
+    store_vectors(where, place * 3, x, y, z, empty)
+    tl.store(present + place, (place < 0).to(tl.uint8), mask=empty)
+    bounds = place <= count
+    start = tl.load(first + place, mask=bounds, other=0)
+    before = tl.load(running + start - 1, mask=bounds & (start > 0), other=0)
+    tl.store(begin + place, tl.minimum(before, capacity), mask=bounds)

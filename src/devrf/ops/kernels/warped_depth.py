@@ -90,11 +90,17 @@ class WarpedDepth(torch.autograd.Function):
         )
         ctx.save_for_backward(points, density, before, after, warped)
         ctx.slices, ctx.numbers, ctx.buffers = slices, numbers, buffers
+        ctx.set_materialize_grads(False)
+        if not any(ctx.needs_input_grad[2 : 2 + slices]):
+            # Points get no gradient: without slices nothing that is looked up at q need find one.
+            ctx.mark_non_differentiable(warped)
         return warped, tau
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, warped_gradient: Tensor, tau_gradient: Tensor) -> tuple[Any, ...]:
+    def backward(
+        ctx: Any, warped_gradient: Tensor | None, tau_gradient: Tensor | None
+    ) -> tuple[Any, ...]:
         points, density, before, after, warped = ctx.saved_tensors
         used = (True, ctx.slices > 0, ctx.slices > 1)
         needs, gradients, into = [], [], []
@@ -107,6 +113,11 @@ class WarpedDepth(torch.autograd.Function):
             gradients.append(own)
             # Any pointer where no gradient is needed.
             into.append(grid if not need else buffer if own is None else own)
+        if tau_gradient is None:
+            tau_gradient = points.new_zeros(len(points))
+        if warped_gradient is None:
+            # The kernel reads it for slices alone; any pointer serves where there are none.
+            warped_gradient = torch.zeros_like(points) if any(needs[1:]) else points
         upstream = (warped_gradient.contiguous(), tau_gradient.contiguous())
         launch(
             warped_depth_backward_kernel,

@@ -7,9 +7,10 @@ from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.grid_warp import GridWarp
 from devrf.methods.devrf.settings import RenderSettings
 from devrf.methods.devrf.volume_rendering import STOP
+from devrf.ops.pixel_rays import steps_in_box
 from devrf.ops.search import PackedSamples, Thresholds, find_samples
 from devrf.rendering.occupancy import Occupancy
-from devrf.rendering.sampling import most_steps, steps_through
+from devrf.rendering.sampling import most_steps
 
 
 def search(
@@ -36,7 +37,7 @@ def search(
     """
     step = field.step_length(settings.step)
     limits = {"step": step, "near": settings.near, "far": settings.far}
-    entry, count = steps_through(rays, field.box, **limits)
+    entry, count = steps_in_box(rays.origins, rays.directions, box=field.box, **limits)
     if wait:
         longest = int(count.amax()) if len(rays) else 0
     else:

@@ -16,8 +16,8 @@ from devrf.methods.devrf.grid_warp import GridWarp
 from devrf.methods.devrf.settings import RenderSettings
 from devrf.methods.devrf.static_shape.sample_search import search
 from devrf.methods.devrf.volume_rendering import VoxelOutput
-from devrf.ops.compositing import color_and_depth, composite_segments, sum_segments
-from devrf.ops.search import PackedSamples, SampleSubset, select
+from devrf.ops.compositing import composite_colors, composite_segments
+from devrf.ops.search import select_listed
 from devrf.ops.trilinear import kept_gradient
 from devrf.ops.warped_depth import warped_depth
 from devrf.rendering.occupancy import Occupancy
@@ -77,20 +77,19 @@ def render_static(
     with span("compositing"):
         weight, transmittance = composite_segments(tau, found.first)
     with span("sampling"):
-        chosen = select(found.significant, found.first, capacity.significant)
+        chosen = select_listed(found, capacity.significant)
         capacity.note(found.total, chosen.total)
-        samples, present = _listed(found, chosen, len(rays))
+        samples = Samples(
+            chosen.ray, chosen.distance, chosen.points, len(rays), present=chosen.present
+        )
         canonical = canonical.index_select(0, chosen.index)
-        weight = torch.where(present, weight.index_select(0, chosen.index), 0.0)
+        weight = weight.index_select(0, chosen.index) * chosen.present
     with span("decoder"):
         residual = None if appearance is None else appearance(canonical)
         color = field.rgb(canonical, rays.viewdirs, samples.ray, precision, residual)
     with span("compositing"):
-        seen = sum_segments(weight, color, chosen.first)
-        with torch.no_grad():
-            distance = torch.stack([samples.distance, torch.ones_like(samples.distance)], dim=1)
-            reached, mass = sum_segments(weight, distance, chosen.first).unbind(1)
-        image, depth = color_and_depth(seen, reached, mass, transmittance, background)
+        listed = weight, color, samples.distance, chosen.first
+        image, depth = composite_colors(*listed, transmittance, background)
     return VoxelOutput(
         color=image,
         depth=depth,
@@ -100,14 +99,5 @@ def render_static(
         weight=weight,
         sample_color=color,
         residual=residual,
+        first=chosen.first,
     )
-
-
-def _listed(found: PackedSamples, chosen: SampleSubset, rays: int) -> tuple[Samples, Tensor]:
-    """The chosen samples, and which places hold one; the padding's rays are spread over all."""
-    place = torch.arange(len(chosen.index), device=chosen.index.device)
-    present = place < chosen.first[-1]
-    ray = torch.where(present, found.ray.index_select(0, chosen.index), place % max(rays, 1))
-    distance = found.distance.index_select(0, chosen.index)
-    points = found.points.index_select(0, chosen.index)
-    return Samples(ray, distance, points, rays, present), present

@@ -1,0 +1,198 @@
+"""The photometric terms: one program for each ray, the sum over rays in a second launch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from devrf.ops.kernels.cells import load_vectors, store_vectors
+from devrf.ops.kernels.launch import launch
+from devrf.ops.kernels.padding import PADDING, padding_programs
+
+WARP = {"BLOCK": 32, "num_warps": 1}
+# A transmittance is at least so far from 0 and 1 in the entropy; as in devrf.ops.photometric.
+NEAREST: tl.constexpr = tl.constexpr(1e-6)
+
+
+class PhotometricInOnePass(torch.autograd.Function):
+    """As devrf.ops.photometric.photometric_sum."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        image: Tensor,
+        transmittance: Tensor,
+        sample_color: Tensor,
+        sample_weight: Tensor,
+        first: Tensor,
+        truth: Tensor,
+        alpha: Tensor | None,
+        weights: Sequence[float],
+    ) -> tuple[Tensor, Tensor]:
+        rays = len(image)
+        known = tuple(
+            tensor.contiguous()
+            # The transmittance stands in for a missing matte, which is not read.
+            for tensor in (image, transmittance, sample_color, sample_weight, first, truth)
+        ) + ((transmittance if alpha is None else alpha).contiguous(),)
+        parts = image.new_empty(rays, 5)
+        has_alpha = alpha is not None
+        launch(
+            photometric_kernel, rays, image, *known, parts, *weights, rays, ALPHA=has_alpha, **WARP
+        )
+        sums = parts.sum(dim=0)
+        total, terms = sums[4], sums[:4]
+        ctx.save_for_backward(*known)
+        ctx.weights, ctx.has_alpha = weights, has_alpha
+        ctx.mark_non_differentiable(terms)
+        return total, terms
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, upstream: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
+        image, transmittance, sample_color, *_ = known = ctx.saved_tensors
+        into = torch.empty_like(image), torch.empty_like(transmittance)
+        colors = torch.empty_like(sample_color)
+        rays, places = len(image), len(sample_color)
+        launch(
+            photometric_backward_kernel,
+            rays + padding_programs(places),
+            image,
+            *(*known, upstream.contiguous(), *into, colors),
+            *(*ctx.weights, rays, places),
+            ALPHA=ctx.has_alpha,
+            PADDING=PADDING,
+            **WARP,
+        )
+        return *into, colors, None, None, None, None, None
+
+
+@triton.jit
+def entropy(p):
+    """−(p log p + (1 − p) log(1 − p))."""
+    return -(p * tl.log(p) + (1.0 - p) * tl.log(1.0 - p))
+
+
+@triton.jit(do_not_specialize=["rays"])
+def photometric_kernel(
+    image,
+    transmittance,
+    sample_color,
+    sample_weight,
+    first,
+    truth,
+    alpha,
+    parts,
+    of_color,
+    of_samples,
+    of_entropy,
+    of_matte,
+    rays,
+    ALPHA: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """A ray's share of each term, and of their weighted sum."""
+    ray = tl.program_id(0).to(tl.int64)
+    red = tl.load(truth + ray * 3)
+    green = tl.load(truth + ray * 3 + 1)
+    blue = tl.load(truth + ray * 3 + 2)
+    off_red = tl.load(image + ray * 3) - red
+    off_green = tl.load(image + ray * 3 + 1) - green
+    off_blue = tl.load(image + ray * 3 + 2) - blue
+    share = 1.0 / rays
+    color = share * (off_red * off_red + off_green * off_green + off_blue * off_blue) / 3.0
+    stop = tl.load(first + ray + 1)
+    start = tl.load(first + ray)
+    lane = tl.arange(0, BLOCK)
+    missed = 0.0
+    while start < stop:
+        at = start + lane
+        here = at < stop
+        r, g, b = load_vectors(sample_color, at * 3, here)
+        weight = tl.load(sample_weight + at, mask=here, other=0.0)
+        r -= red
+        g -= green
+        b -= blue
+        missed += tl.sum(weight * (r * r + g * g + b * b), 0)
+        start += BLOCK
+    missed = missed * share
+    left = tl.load(transmittance + ray)
+    unsure = share * entropy(tl.minimum(tl.maximum(left, NEAREST), 1.0 - NEAREST))
+    bare = 0.0
+    if ALPHA:
+        bare = left - (1.0 - tl.load(alpha + ray))
+    matte = share * bare * bare
+    tl.store(parts + ray * 5, color)
+    tl.store(parts + ray * 5 + 1, missed)
+    tl.store(parts + ray * 5 + 2, unsure)
+    tl.store(parts + ray * 5 + 3, matte)
+    total = of_color * color + of_samples * missed + of_entropy * unsure + of_matte * matte
+    tl.store(parts + ray * 5 + 4, total)
+
+
+@triton.jit(do_not_specialize=["rays", "places"])
+def photometric_backward_kernel(
+    image,
+    transmittance,
+    sample_color,
+    sample_weight,
+    first,
+    truth,
+    alpha,
+    upstream,
+    into_image,
+    into_transmittance,
+    into_color,
+    of_color,
+    of_samples,
+    of_entropy,
+    of_matte,
+    rays,
+    places,
+    ALPHA: tl.constexpr,
+    BLOCK: tl.constexpr,
+    PADDING: tl.constexpr,
+):
+    """Gradients of a ray's colour and transmittance, and of its samples' colours."""
+    program = tl.program_id(0)
+    if program < rays:
+        ray = program.to(tl.int64)
+        share = tl.load(upstream) / rays
+        red = tl.load(truth + ray * 3)
+        green = tl.load(truth + ray * 3 + 1)
+        blue = tl.load(truth + ray * 3 + 2)
+        slope = of_color * share * 2.0 / 3.0
+        tl.store(into_image + ray * 3, slope * (tl.load(image + ray * 3) - red))
+        tl.store(into_image + ray * 3 + 1, slope * (tl.load(image + ray * 3 + 1) - green))
+        tl.store(into_image + ray * 3 + 2, slope * (tl.load(image + ray * 3 + 2) - blue))
+        left = tl.load(transmittance + ray)
+        p = tl.minimum(tl.maximum(left, NEAREST), 1.0 - NEAREST)
+        free = (left >= NEAREST) & (left <= 1.0 - NEAREST)
+        change = tl.where(free, of_entropy * share * (tl.log(1.0 - p) - tl.log(p)), 0.0)
+        if ALPHA:
+            change += of_matte * share * 2.0 * (left - (1.0 - tl.load(alpha + ray)))
+        tl.store(into_transmittance + ray, change)
+        start = tl.load(first + ray)
+        stop = tl.load(first + ray + 1)
+        lane = tl.arange(0, BLOCK)
+        while start < stop:
+            at = start + lane
+            here = at < stop
+            r, g, b = load_vectors(sample_color, at * 3, here)
+            steep = 2.0 * of_samples * share * tl.load(sample_weight + at, mask=here, other=0.0)
+            r = steep * (r - red)
+            g = steep * (g - green)
+            b = steep * (b - blue)
+            store_vectors(into_color, at * 3, r, g, b, here)
+            start += BLOCK
+    else:
+        place = (program - rays).to(tl.int64) * PADDING + tl.arange(0, PADDING)
+        empty = (place >= tl.load(first + rays)) & (place < places)
+        nothing = tl.zeros((PADDING,), dtype=tl.float32)
+        store_vectors(into_color, place * 3, nothing, nothing, nothing, empty)

@@ -1,0 +1,128 @@
+"""From drawn pixels to their rays and what the images show there; and a ray's steps in a box.
+
+Each in one launch where Triton runs. :func:`devrf.engine.gathering.gather_batch` is made of the
+first; the second gives what :func:`devrf.rendering.sampling.steps_through` gives.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from devrf.ops.corners import Corners
+from devrf.ops.dispatch import triton_runs
+
+
+class GatheredPixels(NamedTuple):
+    """R pixels of images, with the world rays through them.
+
+    Attributes:
+        origins: (R, 3) the cameras' centres, world units.
+        directions: (R, 3) unit directions in world space.
+        color: (R, 3) RGB in [0, 1], composited on the background.
+        alpha: (R,) matte in [0, 1]; None for images without one.
+        time: (R,) the images' times.
+        frame: (R,) int64, the images' frames.
+        pixel: (R, 2) x, y of the pixels' centres.
+        flow: (R, 2) observed flow in pixels, 0 where it is not valid; None without flow.
+        flow_valid: (R,) bool; None without flow.
+    """
+
+    origins: Tensor
+    directions: Tensor
+    color: Tensor
+    alpha: Tensor | None
+    time: Tensor
+    frame: Tensor
+    pixel: Tensor
+    flow: Tensor | None
+    flow_valid: Tensor | None
+
+
+def gather_pixels(
+    image: Tensor,
+    flat: Tensor,
+    pixels: Tensor,
+    poses: Tensor,
+    focal: Tensor,
+    center: Tensor,
+    background: Tensor,
+    times: Tensor,
+    frames: Tensor,
+    flow: tuple[Tensor, Tensor] | None = None,
+) -> GatheredPixels:
+    """Rays and truth of R pixels; nothing is differentiable.
+
+    A ray's direction is the camera's rotation of ((x − c_x) / f_x, −(y − c_y) / f_y, −1), of
+    length 1; its colour is ``background + alpha · (rgb − background)``.
+
+    Args:
+        image: (R,) int64, the image of each pixel.
+        flat: (R,) int64, its row-major number in the image.
+        pixels: (N, H, W, 3 or 4) uint8.
+        poses: (N, 3, 4) camera to world, OpenGL axes.
+        focal: (N, 2) in pixels.
+        center: (N, 2) principal points in pixels.
+        background: (3,) or (R, 3) RGB.
+        times: (N,) of the images.
+        frames: (N,) int64, of the images.
+        flow: vectors (N, H, W, 2) and whether they are valid (N, H, W), or None.
+    """
+    large = [pixels, *(flow or ())]
+    if all(table.is_contiguous() for table in large) and triton_runs(poses, focal, center, times):
+        from devrf.ops.kernels.pixel_rays import gather_on_device
+
+        return GatheredPixels(
+            *gather_on_device(
+                image, flat, pixels, poses, focal, center, background, times, frames, flow
+            )
+        )
+    _, height, width, channels = pixels.shape
+    pixel = torch.stack([flat % width, flat // width], dim=-1) + 0.5
+    row = image * (height * width) + flat
+    value = pixels.reshape(-1, channels)[row].float() / 255
+    color, alpha = value[:, :3], value[:, 3] if channels == 4 else None
+    if alpha is not None:
+        color = background + alpha[:, None] * (color - background)
+    x, y = ((pixel - center[image]) / focal[image]).unbind(-1)
+    local = torch.stack([x, -y, -torch.ones_like(x)], dim=-1)
+    pose = poses[image]
+    directions = (pose[:, :, :3] * local[:, None, :]).sum(dim=-1)
+    directions = torch.nn.functional.normalize(directions, dim=-1)
+    seen = valid = None
+    if flow is not None:
+        valid = flow[1].reshape(-1)[row]
+        # What was observed where it is not valid may be anything, NaN included.
+        seen = torch.where(valid[:, None], flow[0].reshape(-1, 2)[row], 0.0)
+    return GatheredPixels(
+        pose[:, :, 3], directions, color, alpha, times[image], frames[image], pixel, seen, valid
+    )
+
+
+def steps_in_box(
+    origins: Tensor, directions: Tensor, *, box: Corners, step: float, near: float, far: float
+) -> tuple[Tensor, Tensor]:
+    """Distance (R,) of each ray's first sample, and number (R,) int64 of samples up to its exit.
+
+    Args:
+        origins: (R, 3) of rays in the box's units.
+        directions: (R, 3) of rays.
+        box: what the samples lie in.
+        step: distance between samples, in units of the directions.
+        near: distance before which nothing is sampled.
+        far: distance behind which nothing is sampled.
+    """
+    if triton_runs(origins, directions):
+        from devrf.ops.kernels.pixel_rays import steps_on_device
+
+        return steps_on_device(origins, directions, box, step, near, far)
+    low, high = (origins.new_tensor(corner) for corner in (box.low, box.high))
+    d = torch.where(directions.abs() < 1e-9, torch.full_like(directions, 1e-9), directions)
+    to_low, to_high = (low - origins) / d, (high - origins) / d
+    entry = torch.minimum(to_low, to_high).amax(dim=-1).clamp(min=near)
+    leave = torch.maximum(to_low, to_high).amin(dim=-1).clamp(max=far)
+    # Including a sample exactly at the exit.
+    count = torch.where(leave >= entry, ((leave - entry) / step + 1e-3).floor() + 1, 0.0)
+    return entry, count.long()
