@@ -3,14 +3,15 @@
 A method's module is configured by ``conf/method/<name>.yaml``; which data trains which of its
 parts is said by ``conf/protocol/*.yaml``, and carried out by a stage (``methods.ray_stage`` for any
 method, ``methods.devrf`` has two of its own). Everything that shows a learned scene (films,
-stills, evaluation) asks for :meth:`DynamicModel.at` alone.
+stills, evaluation) asks for :meth:`DynamicModel.at` alone; exports also for
+:meth:`DynamicModel.surface` and :meth:`DynamicModel.forward_map`, which a method may have.
 """
 
 from __future__ import annotations
 
 import fnmatch
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any, ClassVar, Self
 
 import torch
@@ -22,6 +23,7 @@ from devrf.geometry.box import Box
 from devrf.geometry.space import Space
 from devrf.methods.protocol import ProtocolStage
 from devrf.rendering.output import RenderOutput
+from devrf.rendering.surface_field import SurfaceField
 from devrf.rendering.view import View
 from devrf.scenes.scene import Scene, Views
 
@@ -169,6 +171,21 @@ class DynamicModel(nn.Module, ABC):
             time: in [0, 1].
             half: let networks work in half precision where device and method can.
         """
+
+    def surface(self) -> SurfaceField | None:
+        """The scene at rest as a field of which a surface can be taken; None: there is none.
+
+        Exports ask for it, and for :meth:`forward_map`; of a method that has not both they take
+        what :meth:`at` shows.
+        """
+        return None
+
+    def forward_map(self, time: float) -> Callable[[Tensor], Tensor] | None:
+        """q → x(q, t): where canonical points (M, 3) are at ``time``, both in the fields' space.
+
+        The identity at time 0. None: the method knows only the way back, from x to q, or none.
+        """
+        return None
 
     def to_view(self, device: torch.device) -> Self:
         """The model on ``device``, to be looked at; what only some times need may come later."""

@@ -17,9 +17,9 @@ from devrf.data.batch import (
     all_pixels,
     background_color,
     concatenated,
-    gather_batch,
 )
 from devrf.engine.ddp import rays_per_rank
+from devrf.engine.gathering import gather_batch
 from devrf.engine.parallel_batch import ParallelBatch
 from devrf.engine.phase import Phase
 from devrf.engine.stage import ScheduledStage

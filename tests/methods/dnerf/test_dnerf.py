@@ -12,7 +12,6 @@ import torch
 from lightning import Callback, Trainer
 
 from devrf.checkpoints.checkpoint import (
-    ChecksummedCheckpointIO,
     load_checkpoint,
     save_checkpoint,
 )
@@ -110,17 +109,9 @@ def test_two_stages_leave_the_canonical_part_as_it_is(
 
 
 def test_dynamic_never_reads_the_static_set(
-    trainer: Trainers, datamodule: SceneDataModule, poisoned: SceneDataModule
+    assert_never_reads_the_static_set: Callable[[Callable[[], RayStage]], None],
 ) -> None:
-    step = ProtocolStage("dynamic", "dynamic")
-    clean = stage(step)
-    fit(clean, trainer, datamodule)
-    dark = stage(step)
-    fit(dark, trainer, poisoned)
-    for name, value in clean.state_dict().items():
-        if isinstance(value, torch.Tensor):
-            assert torch.equal(value, dark.state_dict()[name])
-    assert clean.scene_model.box == dark.scene_model.box
+    assert_never_reads_the_static_set(lambda: stage(ProtocolStage("dynamic", "dynamic")))
 
 
 @pytest.mark.parametrize(("share", "static"), [(0.5, 16), (0.25, 8)])
@@ -165,27 +156,9 @@ def test_a_checkpoint_shows_what_was_learned(
 
 
 def test_a_killed_run_goes_on_to_the_same_weights(
-    trainer: Trainers, datamodule: SceneDataModule, tmp_path: Path
+    assert_goes_on_exactly: Callable[[Callable[[], RayStage]], None],
 ) -> None:
-    whole = stage()
-    fit(whole, trainer, datamodule)
-    path = tmp_path / "progress.ckpt"
-
-    class StopHalfWay(Callback):
-        def on_train_batch_end(self, fitted: Trainer, *arguments: Any) -> None:
-            save_checkpoint(fitted, path, weights_only=False)
-            fitted.should_stop = True
-
-    trainer(StopHalfWay(), max_epochs=1).fit(stage(), datamodule=datamodule)
-    on = stage()
-    torch.manual_seed(123)
-    resumed = trainer(max_epochs=1)
-    resumed.strategy.checkpoint_io = ChecksummedCheckpointIO()
-    resumed.fit(on, datamodule=datamodule, ckpt_path=str(path))
-    assert on.iteration == 4
-    for name, value in whole.state_dict().items():
-        if isinstance(value, torch.Tensor):
-            assert torch.equal(value, on.state_dict()[name]), name
+    assert_goes_on_exactly(stage)
 
 
 def test_an_unknown_term_and_an_unknown_part_are_named(

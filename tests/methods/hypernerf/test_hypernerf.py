@@ -9,15 +9,14 @@ from typing import Literal
 
 import pytest
 import torch
-from lightning import Callback, Trainer
+from lightning import Trainer
 
 from devrf.checkpoints.checkpoint import (
-    ChecksummedCheckpointIO,
     load_checkpoint,
     save_checkpoint,
 )
-from devrf.data.batch import gather_batch
 from devrf.data.datamodule import SceneDataModule
+from devrf.engine.gathering import gather_batch
 from devrf.errors import DevrfError
 from devrf.methods.hypernerf.model import HyperNeRF, HyperNeRFSettings
 from devrf.methods.nerfies.model import Nerfies, NerfiesSettings
@@ -127,45 +126,24 @@ def test_two_stages_freeze_all_or_all_but_what_ambient_space_enters_by(
 
 @EITHER
 def test_a_killed_run_goes_on_to_the_same_weights(
-    slicing: Slicing, trainer: Trainers, datamodule: SceneDataModule, tmp_path: Path
+    slicing: Slicing, assert_goes_on_exactly: Callable[[Callable[[], RayStage]], None]
 ) -> None:
     def stage() -> RayStage:
         torch.manual_seed(0)
         model = HyperNeRF(replace(TINY, slicing=slicing))
         return RayStage(model, QUICK, {"color": 1.0, "elastic": 0.01}, JOINT)
 
-    whole, path = stage(), tmp_path / "progress.ckpt"
-    fit(whole, trainer, datamodule)
-
-    class StopHalfWay(Callback):
-        def on_train_batch_end(self, fitted: Trainer, *arguments: object) -> None:
-            save_checkpoint(fitted, path, weights_only=False)
-            fitted.should_stop = True
-
-    trainer(StopHalfWay(), max_epochs=1).fit(stage(), datamodule=datamodule)
-    on = stage()
-    torch.manual_seed(123)
-    resumed = trainer(max_epochs=1)
-    resumed.strategy.checkpoint_io = ChecksummedCheckpointIO()
-    resumed.fit(on, datamodule=datamodule, ckpt_path=str(path))
-    assert on.iteration == 4
-    for name, value in whole.scene_model.state_dict().items():
-        assert torch.equal(value, on.scene_model.state_dict()[name]), name
+    assert_goes_on_exactly(stage)
 
 
 def test_dynamic_never_reads_the_static_set(
-    trainer: Trainers, datamodule: SceneDataModule, poisoned: SceneDataModule
+    assert_never_reads_the_static_set: Callable[[Callable[[], RayStage]], None],
 ) -> None:
     def stage() -> RayStage:
         torch.manual_seed(0)
         return RayStage(HyperNeRF(TINY), QUICK, LOSS, ProtocolStage("dynamic", "dynamic"))
 
-    clean = stage()
-    fit(clean, trainer, datamodule)
-    dark = stage()
-    fit(dark, trainer, poisoned)
-    for name, value in clean.scene_model.state_dict().items():
-        assert torch.equal(value, dark.scene_model.state_dict()[name]), name
+    assert_never_reads_the_static_set(stage)
 
 
 def test_what_cannot_be_is_said() -> None:

@@ -7,7 +7,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from devrf.data.batch import RayBatch, gather_batch
+from devrf.data.batch import RayBatch
+from devrf.engine.gathering import gather_batch
 from devrf.methods.hypernerf.model import HyperNeRF, HyperNeRFSettings
 from devrf.scenes.scene import Scene
 

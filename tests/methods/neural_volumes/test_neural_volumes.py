@@ -12,7 +12,6 @@ import torch
 from lightning import Callback, Trainer
 
 from devrf.checkpoints.checkpoint import (
-    ChecksummedCheckpointIO,
     load_checkpoint,
     save_checkpoint,
 )
@@ -124,42 +123,15 @@ def test_a_batch_has_few_moments(
 
 
 def test_dynamic_never_reads_the_static_set(
-    trainer: Trainers, datamodule: SceneDataModule, tiny_scene: Scene
+    assert_never_reads_the_static_set: Callable[[Callable[[], RayStage]], None],
 ) -> None:
-    static = tiny_scene.static
-    dark = replace(static.train, pixels=torch.zeros_like(static.train.pixels))
-    poisoned = replace(tiny_scene, static=Capture(dark, static.test))
-    clean = stage(DYNAMIC)
-    fit(clean, trainer, datamodule)
-    other = stage(DYNAMIC)
-    fit(other, trainer, RenderedDataModule(lambda: poisoned, None))
-    for name, value in clean.scene_model.state_dict().items():
-        assert torch.equal(value, other.scene_model.state_dict()[name]), name
-    assert clean.scene_model.box == other.scene_model.box
+    assert_never_reads_the_static_set(lambda: stage(DYNAMIC))
 
 
 def test_a_killed_run_goes_on_to_the_same_weights(
-    trainer: Trainers, datamodule: SceneDataModule, tmp_path: Path
+    assert_goes_on_exactly: Callable[[Callable[[], RayStage]], None],
 ) -> None:
-    whole = stage()
-    fit(whole, trainer, datamodule)
-    path = tmp_path / "progress.ckpt"
-
-    class StopHalfWay(Callback):
-        def on_train_batch_end(self, fitted: Trainer, *arguments: Any) -> None:
-            save_checkpoint(fitted, path, weights_only=False)
-            fitted.should_stop = True
-
-    trainer(StopHalfWay(), max_epochs=1).fit(stage(), datamodule=datamodule)
-    on = stage()
-    torch.manual_seed(123)
-    resumed = trainer(max_epochs=1)
-    resumed.strategy.checkpoint_io = ChecksummedCheckpointIO()
-    resumed.fit(on, datamodule=datamodule, ckpt_path=str(path))
-    assert on.iteration == 4
-    for name, value in whole.state_dict().items():
-        if isinstance(value, torch.Tensor):
-            assert torch.equal(value, on.state_dict()[name]), name
+    assert_goes_on_exactly(stage)
 
 
 def test_what_it_cannot_learn_from_is_refused(

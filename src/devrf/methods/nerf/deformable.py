@@ -19,7 +19,8 @@ from devrf.geometry.space import WORLD, Space
 from devrf.geometry.space_config import space_config, space_from
 from devrf.methods.base import DynamicModel
 from devrf.methods.nerf.hierarchical import flattened, importance, limits, stratified
-from devrf.methods.nerf.occupancy_frames import OccupancyFrames
+from devrf.methods.nerf.occupancy_frames import OccupancyFrames, diagonal_step
+from devrf.methods.nerf.placement import Placement
 from devrf.methods.nerf.radiance_field import RadianceField
 from devrf.methods.nerf.ray_samples import RaySamples, volume_render
 from devrf.methods.nerf.ray_view import RayView
@@ -88,18 +89,18 @@ class DeformableField(DynamicModel):
 
     def _place(self, box: Box, space: Space, depths: tuple[float, float]) -> None:
         self.box, self.space, self.depth_limits = box, space, depths
+        self.placement = Placement(box, space)
 
     def setup(self, scene: Scene) -> None:
         """Take the scene's bounds and times; carve the frames' occupancy from their mattes."""
         bounds, s = scene.bounds, self.settings
-        box = bounds.box if bounds.motion is None else bounds.box.union(bounds.motion)
+        box = bounds.whole
         self._place(box, scene.space, (bounds.near, bounds.far))
         self.set_times(scene.clock.times)
         if s.sampling == "occupancy":
-            shape = box.grid_shape(s.occupancy_side**3)
-            self.occupancy = OccupancyFrames(len(scene.clock), shape).to(self.device)
-            if s.hull and scene.kind == "inward" and scene.space.straight:
-                self.occupancy.carve(scene, box)
+            self.occupancy = OccupancyFrames.of(
+                scene, box, s.occupancy_side, self.device, hull=s.hull
+            )
 
     def config(self) -> dict[str, Any]:
         """Settings, and where and when the scene is."""
@@ -166,11 +167,13 @@ class DeformableField(DynamicModel):
         """What samples of rays come to in a radiance field."""
         if not self.space.straight:
             samples = samples.endless()
-        points, when = self._normalised(samples.points), time.index_select(0, samples.ray)
+        points, when = self.placement.normalised(samples.points), time.index_select(0, samples.ray)
         canonical, ambient = self.deform(points, when)
         with self._reduced():
             density, color = field(canonical, rays.viewdirs, samples.ray, ambient)
-        seen = volume_render(self._scaled(samples), density.float(), color.float(), background)
+        seen = volume_render(
+            samples.scaled(self.placement.half_edge), density.float(), color.float(), background
+        )
         return RenderOutput(
             color=seen.color,
             depth=seen.depth,
@@ -199,25 +202,19 @@ class DeformableField(DynamicModel):
     @torch.no_grad()
     def _weights(self, field: RadianceField, samples: RaySamples, time: Tensor) -> Tensor:
         """Weights (S,) of samples, from their densities alone."""
-        points, when = self._normalised(samples.points), time.index_select(0, samples.ray)
+        points, when = self.placement.normalised(samples.points), time.index_select(0, samples.ray)
         with self._reduced():
             density = field.sigma(*self.deform(points, when))
-        length = self._scaled(samples).length
+        length = samples.length / self.placement.half_edge
         weight, _ = composite(density.float() * length, samples.ray, samples.rays)
         return weight
 
     def _march(self, rays: Rays, time: Tensor, *, jitter: bool) -> RaySamples:
         """Even steps where something may be at the frames around each ray's time."""
         before, after, _ = self.clock.between(time)
-        diagonal = sum(edge**2 for edge in self.box.size) ** 0.5
-        unit = float(rays.directions.norm(dim=1).amax()) if len(rays) else 1.0
+        step = diagonal_step(self.box, rays, self.settings.steps)
         return self.occupancy.march(
-            rays,
-            (before, after),
-            self.box,
-            self.depth_limits,
-            diagonal / (self.settings.steps * unit),
-            jitter=jitter,
+            rays, (before, after), self.box, self.depth_limits, step, jitter=jitter
         )
 
     def _reduced(self) -> AbstractContextManager[None]:
@@ -227,19 +224,6 @@ class DeformableField(DynamicModel):
         if not (reduced and self.training):
             return nullcontext()
         return torch.autocast(self.device.type, torch.bfloat16)
-
-    @property
-    def _half_edge(self) -> float:
-        return self.box.longest / 2
-
-    def _normalised(self, points: Tensor) -> Tensor:
-        """Points (S, 3) of the fields' space, the box's longest edge being 2."""
-        return (points - points.new_tensor(self.box.middle)) / self._half_edge
-
-    def _scaled(self, samples: RaySamples) -> RaySamples:
-        """The same samples, their lengths in normalised units."""
-        length = samples.length / self._half_edge
-        return RaySamples(samples.ray, samples.distance, length, samples.points, samples.rays)
 
     def loss_terms(
         self, output: RenderOutput, batch: RayBatch, names: Collection[str]

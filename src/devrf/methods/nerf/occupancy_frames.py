@@ -16,6 +16,13 @@ from devrf.scenes.scene import Scene
 from devrf.scenes.visual_hull import visual_hull
 
 
+def diagonal_step(box: Box, rays: Rays, steps: int) -> float:
+    """One of ``steps`` even steps along the box's diagonal, in units of the longest direction."""
+    diagonal: float = sum(edge**2 for edge in box.size) ** 0.5
+    unit = float(rays.directions.norm(dim=1).amax()) if len(rays) else 1.0
+    return diagonal / (steps * unit)
+
+
 class OccupancyFrames(nn.Module):
     """Masks (T, X, Y, Z) of T frames over a box.
 
@@ -29,6 +36,24 @@ class OccupancyFrames(nn.Module):
         """Exclude nothing."""
         super().__init__()
         self.register_buffer("mask", torch.ones(frames, *shape, dtype=torch.bool))
+
+    @classmethod
+    def of(
+        cls, scene: Scene, box: Box, side: int, device: torch.device, *, hull: bool
+    ) -> OccupancyFrames:
+        """Masks of each of the scene's frames over ``box``, of about ``side``³ cells.
+
+        Args:
+            scene: seen from all around its mattes carve the masks; else nothing is excluded.
+            box: in the fields' space.
+            side: cells along an edge of a cube of the box's size.
+            device: where the masks are.
+            hull: whether to carve at all.
+        """
+        masks = cls(len(scene.clock), box.grid_shape(side**3)).to(device)
+        if hull and scene.kind == "inward" and scene.space.straight:
+            masks.carve(scene, box)
+        return masks
 
     @torch.no_grad()
     def carve(self, scene: Scene, box: Box) -> None:

@@ -46,6 +46,10 @@ class RaySamples:
         unit = rays.directions.norm(dim=1).index_select(0, ray)
         return RaySamples(ray, distance, unit * stretch, rays.at(ray, distance), len(rays))
 
+    def scaled(self, unit: float) -> RaySamples:
+        """The same samples, their lengths in units of ``unit`` (of the fields' space)."""
+        return replace(self, length=self.length / unit)
+
     def endless(self) -> RaySamples:
         """The same samples, the last of each ray standing for all that is behind it."""
         following = torch.cat([self.ray[1:], self.ray.new_full((1,), -1)])[: len(self.ray)]

@@ -91,9 +91,9 @@ class NeuralVolumes(DynamicModel):
         self._place(box, (bounds.near, bounds.far), scene.clock.times)
         self.images = encoder_images(scene, s).to(self.device)
         if s.hull:
-            shape = box.grid_shape(s.occupancy_side**3)
-            self.occupancy = OccupancyFrames(len(scene.clock), shape).to(self.device)
-            self.occupancy.carve(scene, box)
+            self.occupancy = OccupancyFrames.of(
+                scene, box, s.occupancy_side, self.device, hull=True
+            )
 
     def config(self) -> dict[str, Any]:
         """Settings, and where and when the scene is."""

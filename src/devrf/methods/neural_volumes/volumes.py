@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from devrf.methods.nerf.ray_samples import RaySamples
-from devrf.ops.compositing import sum_by_ray
+from devrf.ops.compositing import color_and_depth, sum_by_ray
 from devrf.rendering.output import RenderOutput
 
 
@@ -83,12 +83,9 @@ def seen(samples: RaySamples, values: Tensor, background: Tensor) -> RenderOutpu
     """
     ray, rays = samples.ray, samples.rays
     weight, opacity = added_opacity(values[:, 3] * samples.length, ray, rays)
-    color = sum_by_ray(weight[:, None] * values[:, :3], ray, rays)
+    found = sum_by_ray(weight[:, None] * values[:, :3], ray, rays)
     transmittance = 1 - opacity
     with torch.no_grad():
-        depth = sum_by_ray(weight * samples.distance, ray, rays) / opacity.clamp(min=1e-6)
-    return RenderOutput(
-        color=color + transmittance[:, None] * background,
-        depth=depth,
-        transmittance=transmittance,
-    )
+        reached, mass = sum_by_ray(weight * samples.distance, ray, rays), opacity.detach()
+    color, depth = color_and_depth(found, reached, mass, transmittance, background)
+    return RenderOutput(color=color, depth=depth, transmittance=transmittance)

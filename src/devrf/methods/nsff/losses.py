@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from devrf.methods.nerf.placement import Placement
 from devrf.methods.nsff.fields import BACKWARD, FORWARD
-from devrf.methods.nsff.placement import Placement
 from devrf.methods.nsff.priors import ImagePriors
 from devrf.methods.nsff.renders import Renders, Warp
 from devrf.ops.compositing import sum_by_ray

@@ -20,17 +20,17 @@ from devrf.geometry.rays import Rays
 from devrf.geometry.space import WORLD, Space
 from devrf.geometry.space_config import space_config, space_from
 from devrf.methods.base import DynamicModel
-from devrf.methods.nerf.occupancy_frames import OccupancyFrames
+from devrf.methods.nerf.occupancy_frames import OccupancyFrames, diagonal_step
+from devrf.methods.nerf.placement import Placement
 from devrf.methods.nerf.ray_samples import RaySamples
 from devrf.methods.nerf.ray_view import RayView
 from devrf.methods.nsff.fields import TwoFields
 from devrf.methods.nsff.losses import TERMS, LossInput, missing_terms
-from devrf.methods.nsff.placement import Placement
 from devrf.methods.nsff.priors import ImagePriors
 from devrf.methods.nsff.renders import BlendedOutput, Renders
-from devrf.methods.nsff.sampling import evenly, occupied
+from devrf.methods.nsff.sampling import evenly
 from devrf.methods.nsff.settings import NSFFSettings
-from devrf.ops.compositing import sum_by_ray
+from devrf.ops.compositing import color_and_depth, sum_by_ray
 from devrf.rendering.output import RenderOutput
 from devrf.scenes.scene import Scene, Views
 
@@ -84,15 +84,14 @@ class NSFF(DynamicModel):
     def setup(self, scene: Scene) -> None:
         """Take the scene's bounds and times; carve the frames' occupancy from their mattes."""
         bounds, s = scene.bounds, self.settings
-        box = bounds.box if bounds.motion is None else bounds.box.union(bounds.motion)
+        box = bounds.whole
         limits, times = (bounds.near, bounds.far), scene.clock.times
         cut_out = scene.static.train.cut_out or scene.dynamic.train.cut_out
         self._place(box, scene.space, limits, times, cut_out=cut_out)
         if s.sampling == "occupancy":
-            shape = box.grid_shape(s.occupancy_side**3)
-            self.occupancy = OccupancyFrames(len(scene.clock), shape).to(self.device)
-            if s.hull and scene.kind == "inward" and scene.space.straight:
-                self.occupancy.carve(scene, box)
+            self.occupancy = OccupancyFrames.of(
+                scene, box, s.occupancy_side, self.device, hull=s.hull
+            )
 
     def config(self) -> dict[str, Any]:
         """Settings, and where and when the scene is."""
@@ -192,9 +191,10 @@ class NSFF(DynamicModel):
         with torch.no_grad():
             weight = blend.dynamic + blend.static
             mass = sum_by_ray(weight, ray, len(rays))
-            depth = sum_by_ray(weight * samples.distance, ray, len(rays)) / mass.clamp(min=1e-6)
+            reached = sum_by_ray(weight * samples.distance, ray, len(rays))
+        color, depth = color_and_depth(seen, reached, mass, blend.transmittance, background)
         return BlendedOutput(
-            color=seen + blend.transmittance[:, None] * background,
+            color=color,
             depth=depth,
             transmittance=blend.transmittance,
             samples=samples,
@@ -210,26 +210,15 @@ class NSFF(DynamicModel):
         s = self.settings
         if s.sampling == "occupancy":
             before, after, _ = self.clock.between(time)
-            samples = occupied(
-                rays,
-                (before, after),
-                self.box,
-                self.depth_limits,
-                self.occupancy,
-                s.steps,
-                jitter=jitter,
+            step = diagonal_step(self.box, rays, s.steps)
+            samples = self.occupancy.march(
+                rays, (before, after), self.box, self.depth_limits, step, jitter=jitter
             )
         else:
             samples = evenly(rays, self.box, self.depth_limits, s.samples, jitter=jitter)
         if self._endless:
             samples = samples.endless()
-        return RaySamples(
-            samples.ray,
-            samples.distance,
-            samples.length / self.placement.half_edge,
-            samples.points,
-            samples.rays,
-        )
+        return samples.scaled(self.placement.half_edge)
 
     def loss_terms(
         self, output: RenderOutput, batch: RayBatch, names: Collection[str]

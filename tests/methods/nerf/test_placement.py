@@ -9,7 +9,7 @@ from devrf.geometry.box import Box
 from devrf.geometry.contraction import ContractedSpace
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.space import WORLD
-from devrf.methods.nsff.placement import Placement
+from devrf.methods.nerf.placement import Placement
 
 CUBE = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 

@@ -1,4 +1,4 @@
-"""Where NSFF's networks live: normalised space, and its maps to the world."""
+"""Where networks live: normalised space, and its maps to the world."""
 
 from __future__ import annotations
 
