@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import copy
+import gc
 import logging
 import os
+import re
 import sys
 import threading
 import warnings
@@ -19,11 +21,16 @@ os.environ.setdefault("TRITON_INTERPRET", "1")
 
 import pytest
 import torch
+from hydra._internal.hydra import Hydra
+from hydra._internal.sources_registry import SourcesRegistry
+from hydra.core.plugins import Plugins
+from hydra.plugins.config_source import ConfigResult, ConfigSource
 from hypothesis import settings
 from lightning import Callback, Trainer
 
 from devrf.callbacks import GridUpscaling, LearningRateDecay
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
+from devrf.cli.config import config_folder
 from devrf.data.datamodule import SceneDataModule
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
@@ -57,28 +64,81 @@ def single_thread() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def quick_interpreter() -> Iterator[None]:
-    """Triton's interpreter, in a third of its time.
+    """Triton's interpreter, in a quarter of its time.
 
     It prepares its language anew for each call of a function within a kernel, though the kernel
-    has; and it looks for overflow wherever numbers are added, which places in small grids cannot
-    come to.
+    has, or for functions of its own the first call; it lists the types of numbers each time it
+    looks one up; and it looks for overflow wherever numbers are added, which places in small grids
+    cannot come to.
     """
     interpreter = sys.modules.get("triton.runtime.interpreter")
     if interpreter is None:
         yield
         return
     function, builder = interpreter.InterpretedFunction, interpreter.interpreter_builder
-    usual = function.__call__
+    usual, type_of = function.__call__, interpreter._get_np_dtype
+    prepared: set[Any] = set()
+    types: dict[str, Any] = {}
 
     def call(self: Any, *args: Any, **constants: Any) -> Any:
-        if self.fn.__module__.startswith("triton."):
+        if self.fn.__module__.startswith("triton.") and self.fn not in prepared:
+            prepared.add(self.fn)
             return usual(self, *args, **constants)
         return self.rewrite()(*args, **constants)
 
+    def known_type(asked: Any) -> Any:
+        if asked.name not in types:
+            types[asked.name] = type_of(asked)
+        return types[asked.name]
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(function, "__call__", call)
+        patch.setattr(interpreter, "_get_np_dtype", known_type)
         patch.setattr(builder, "options", replace(builder.options, sanitize_overflow=False))
         yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def quick_composition() -> Iterator[None]:
+    """Configs composed in half of Hydra's time.
+
+    It reads every file anew for each command, though files do not change while tests run; and it
+    composes a first time only to see in which mode to run, which some files and overrides say.
+    """
+    Plugins.instance()  # registers the sources
+    files = SourcesRegistry.instance().resolve("file")
+    read, asked = files.load_config, Hydra.get_mode
+    known: dict[tuple[str, str], ConfigResult] = {}
+    files_of_sweeps = {
+        file.stem
+        for file in config_folder().rglob("*.yaml")
+        if "mode: MULTIRUN" in file.read_text()
+    }
+
+    def load_config(self: ConfigSource, config_path: str) -> ConfigResult:
+        if not self.path.startswith(str(config_folder())):
+            return read(self, config_path)
+        place = self.path, config_path
+        if place not in known:
+            known[place] = read(self, config_path)
+        return copy.deepcopy(known[place])
+
+    def get_mode(self: Hydra, config_name: str | None, overrides: list[str]) -> Any:
+        words = {word for one in overrides for word in re.split(r"[=,+]", one)}
+        if words & {"hydra.mode", "hydra", *files_of_sweeps}:
+            return asked(self, config_name, overrides)
+        return None
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(files, "load_config", load_config)
+        patch.setattr(Hydra, "get_mode", get_mode)
+        yield
+
+
+def pytest_collection_finish() -> None:
+    """Keep Python from looking for garbage, again and again, among all that was imported."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True)

@@ -18,7 +18,10 @@ from typing import Any
 import pytest
 
 import devrf as package
+import devrf.cli.steps  # what every command loads is there before the garbage collector looks
 from devrf.__main__ import entry
+from devrf.scenes.procedural.recipe import Recipe
+from devrf.scenes.scene import Scene
 
 # A scene of 24 x 20 pixels and schedules of a few iterations: seconds, and no quality.
 TINY = (
@@ -26,6 +29,16 @@ TINY = (
     "data.height=20",
     "data.static_views=6",
     "data.static_test_views=2",
+    "data.train_views=2",
+    "data.frames=3",
+    "data.supersample=1",
+)
+# A forward-facing one.
+FACING = (
+    "data=procedural_forward",
+    "data.width=24",
+    "data.height=20",
+    "data.static_views=8",
     "data.train_views=2",
     "data.frames=3",
     "data.supersample=1",
@@ -60,6 +73,16 @@ class Outcome:
 
 Devrf = Callable[..., Outcome]
 
+render = Recipe.__call__
+rendered: dict[str, Scene] = {}
+
+
+def known_scene(recipe: Recipe) -> Scene:
+    """The scene of a recipe, rendered once: the same recipe always gives the same scene."""
+    if repr(recipe) not in rendered:
+        rendered[repr(recipe)] = render(recipe)
+    return rendered[repr(recipe)]
+
 
 def call(folder: Path, *arguments: str) -> Outcome:
     """``devrf ARGUMENTS`` with ``folder`` as the working folder."""
@@ -69,6 +92,7 @@ def call(folder: Path, *arguments: str) -> Outcome:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         patch.setattr(sys, "argv", ["devrf", *arguments])
+        patch.setattr(Recipe, "__call__", known_scene)
         patch.setenv("HYDRA_FULL_ERROR", "0")  # restored afterwards: the entry point changes it
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(complained):
             try:
@@ -89,6 +113,12 @@ def call(folder: Path, *arguments: str) -> Outcome:
 def tiny_data() -> tuple[str, ...]:
     """Overrides that make the embedded scene tiny, whatever the method."""
     return TINY
+
+
+@pytest.fixture(scope="session")
+def tiny_facing() -> tuple[str, ...]:
+    """Overrides that choose the embedded forward-facing scene and make it tiny."""
+    return FACING
 
 
 @pytest.fixture(scope="session")

@@ -6,18 +6,7 @@ import json
 
 import pytest
 
-ROBOT = (
-    "data.width=24",
-    "data.height=20",
-    "data.static_views=6",
-    "data.static_test_views=2",
-    "data.train_views=2",
-    "data.frames=3",
-    "data.supersample=1",
-    "trainer=cpu",
-    "video.frames=2",
-    "video.height=20",
-)
+FILM = ("trainer=cpu", "video.frames=2", "video.height=20")
 SETTINGS = "ray_stage.model.settings"
 SMALL = (
     "experiment=peer_small",
@@ -28,15 +17,13 @@ SMALL = (
     f"{SETTINGS}.steps=16",
     f"{SETTINGS}.occupancy_side=8",
 )
-TOY = ("data=procedural_forward", "data.width=24", "data.height=20", "data.static_views=8",
-       "data.train_views=2", "data.frames=3", "data.supersample=1", "trainer=cpu",
-       "video.frames=2", "video.height=20")  # fmt: skip
 
 
 @pytest.mark.parametrize("method", ["nerfies", "hypernerf"])
 @pytest.mark.parametrize("protocol", ["joint", "two_stage", "dynamic"])
-def test_a_protocol_trains_scores_and_films(devrf, tmp_path, method, protocol):
-    asked = (f"method={method}", *SMALL, *ROBOT, f"protocol={protocol}", "hydra.run.dir=run")
+def test_a_protocol_trains_scores_and_films(devrf, tmp_path, tiny_data, method, protocol):
+    scene = (*tiny_data, *FILM)
+    asked = (f"method={method}", *SMALL, *scene, f"protocol={protocol}", "hydra.run.dir=run")
     done = devrf(*asked, "ray_stage.loss.elastic=1e-3")
     assert done.status == 0, done.err
     found = json.loads((tmp_path / "run" / "metrics.json").read_text())
@@ -48,15 +35,17 @@ def test_a_protocol_trains_scores_and_films(devrf, tmp_path, method, protocol):
     assert names == {"two_stage": {"canonical", "deformation"}}.get(protocol, {protocol})
 
 
-def test_a_forward_facing_scene(devrf, tmp_path):
-    done = devrf("method=hypernerf", *SMALL, *TOY, "protocol=joint", "hydra.run.dir=run")
+def test_a_forward_facing_scene(devrf, tmp_path, tiny_facing):
+    done = devrf(
+        "method=hypernerf", *SMALL, *tiny_facing, *FILM, "protocol=joint", "hydra.run.dir=run"
+    )
     assert done.status == 0, done.err
     assert (tmp_path / "run" / "videos" / "spiral.mp4").is_file()
 
 
 @pytest.mark.parametrize("method", ["dnerf", "nerfies", "hypernerf"])
 @pytest.mark.parametrize("profile", ["fast", "paper"])
-def test_sizes_for_a_gpu_take_two_steps_on_a_cpu(devrf, tmp_path, method, profile):
+def test_sizes_for_a_gpu_take_two_steps_on_a_cpu(devrf, tmp_path, tiny_data, method, profile):
     done = devrf(
         f"method={method}",
         f"experiment=peer_{profile}",
@@ -65,7 +54,8 @@ def test_sizes_for_a_gpu_take_two_steps_on_a_cpu(devrf, tmp_path, method, profil
         "ray_stage.schedule.iterations=2",
         "ray_stage.schedule.rays=8",
         f"{SETTINGS}.occupancy_side=16",
-        *ROBOT,
+        *tiny_data,
+        *FILM,
         "hydra.run.dir=run",
     )
     assert done.status == 0, done.err
@@ -83,6 +73,6 @@ def test_sizes_for_a_gpu_take_two_steps_on_a_cpu(devrf, tmp_path, method, profil
         (["method=devrf", "protocol.freeze=false"], "protocol.freeze: method=devrf has stages"),
     ],
 )
-def test_what_cannot_be_is_said_in_one_line(devrf, asked, said):
-    done = devrf("experiment=peer_small", *ROBOT, *asked)
+def test_what_cannot_be_is_said_in_one_line(devrf, tiny_data, asked, said):
+    done = devrf("experiment=peer_small", *tiny_data, *FILM, *asked)
     assert done.status == 2 and said in done.err and done.err.count("\n") == 1, done.err

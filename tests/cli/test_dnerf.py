@@ -19,15 +19,6 @@ SMALL = (
     "video.height=40",
     "trainer=cpu",
 )
-TOY = (
-    "data=procedural_forward",
-    "data.width=24",
-    "data.height=20",
-    "data.static_views=8",
-    "data.train_views=2",
-    "data.frames=3",
-    "data.supersample=1",
-)
 
 
 @pytest.mark.parametrize("protocol", ["joint", "two_stage", "dynamic"])
@@ -46,8 +37,8 @@ def test_a_protocol_trains_scores_and_films(devrf, tmp_path, tiny_data, protocol
     assert again.status == 0 and "learned already" in again.out
 
 
-def test_a_forward_facing_scene(devrf, tmp_path):
-    done = devrf(*SMALL, *TOY, "protocol=joint", "hydra.run.dir=run")
+def test_a_forward_facing_scene(devrf, tmp_path, tiny_facing):
+    done = devrf(*SMALL, *tiny_facing, "protocol=joint", "hydra.run.dir=run")
     assert done.status == 0, done.err
     assert (tmp_path / "run" / "videos" / "spiral.mp4").is_file()
 
@@ -69,3 +60,14 @@ def test_it_has_a_folder_of_its_own(devrf, tmp_path, tiny_data):
 def test_what_cannot_be_is_said_in_one_line(devrf, tiny_data, asked, said):
     done = devrf(*SMALL, *tiny_data, *asked)
     assert done.status == 2 and said in done.err and done.err.count("\n") == 1
+
+
+def test_it_is_exported_as_points(devrf, tmp_path, tiny_data):
+    here = ("hydra.run.dir=run", "trainer=cpu")
+    assert devrf(*SMALL, *tiny_data, "protocol=joint", "stage=joint", *here).status == 0
+    refused = devrf("stage=export", *here)
+    assert refused.status == 2 and refused.err.count("\n") == 1
+    assert "method=dnerf is exported as coloured points" in refused.err
+    done = devrf("stage=export", "export.format=ply", "export.points=20", *here)
+    assert (done.status, done.err) == (0, "")
+    assert len(list((tmp_path / "run" / "export" / "points").glob("frame_*.ply"))) == 3

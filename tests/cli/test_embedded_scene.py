@@ -1,4 +1,4 @@
-"""An experiment beside ``data=procedural`` is the one with sizes for the embedded scenes."""
+"""An experiment beside an embedded scene is the one with sizes for the embedded scenes."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from devrf.cli.embedded_scene import with_embedded_experiment
     [
         (["experiment=best_small", "data=procedural"], "experiment=best_small_procedural"),
         (["data=procedural", "experiment=best_small"], "experiment=best_small_procedural"),
+        (["experiment=best_small", "data=flower"], "experiment=best_small_procedural"),
         (["experiment=best_small", "data=inward", "data.root=x"], "experiment=best_small"),
         (["experiment=best_small", "data.root=x"], "experiment=best_small"),
         (["experiment=quickstart", "data=procedural"], "experiment=quickstart"),

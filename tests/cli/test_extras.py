@@ -18,6 +18,10 @@ import pytest
             'data.flow=raft: torchvision is not installed; run pip install "devrf[raft]", or set '
             "data.flow=dis",
         ),
+        (
+            ["stage=export"],
+            'stage=export: skimage is not installed; run pip install "devrf[export]"',
+        ),
     ],
 )
 def test_the_extra_is_named_first(devrf, tmp_path, monkeypatch, arguments, expected):
@@ -25,6 +29,17 @@ def test_the_extra_is_named_first(devrf, tmp_path, monkeypatch, arguments, expec
     outcome = devrf(*arguments)
     assert (outcome.status, outcome.err) == (2, f"devrf: {expected}\n")
     assert not list(tmp_path.iterdir())
+
+
+def test_usd_needs_a_package_that_the_other_formats_do_not(devrf, monkeypatch):
+    monkeypatch.setattr("devrf.cli.extras.find_spec", lambda package: package != "pxr" or None)
+    outcome = devrf("stage=export", "export.format=usd")
+    assert (outcome.status, outcome.err) == (
+        2,
+        'devrf: export.format=usd: pxr is not installed; run pip install "devrf[export]", or set '
+        "export.format=gltf\n",
+    )
+    assert "no such checkpoint" in devrf("stage=export").err
 
 
 def test_flow_that_was_estimated_before_needs_no_estimator(devrf, tmp_path, monkeypatch):

@@ -159,16 +159,16 @@ def test_help_names_stages_groups_and_examples(devrf):
 
 
 def test_as_a_process_of_its_own(python, tmp_path):
-    done = python(tmp_path, "-m", "devrf", "data=inward", "data.root=nowhere")
-    expected = "devrf: nowhere: no such folder; set data.root to the scene's folder\n"
+    done = python(tmp_path, "-m", "devrf", "data.widht=3")
+    expected = "devrf: data.widht: no such key; did you mean data.width?\n"
     assert (done.status, done.err) == (2, expected)
     assert not list(tmp_path.iterdir())
 
 
 def test_a_fault_as_a_process_of_its_own(python, tmp_path):
     script = (
-        "import devrf.cli.steps, devrf.__main__\n"
-        "devrf.cli.steps.STEPS['prepare'] = lambda run: 1 / 0\n"
+        "import devrf.cli.app, devrf.__main__\n"
+        "devrf.cli.app.check_extras = lambda config: 1 / 0\n"
         "devrf.__main__.entry()\n"
     )
     done = python(tmp_path, "-c", script, "stage=prepare")

@@ -26,27 +26,18 @@ SMALL = (
     "video.height=40",
     "trainer=cpu",
 )
-ROBOT = (
-    "data.width=24",
-    "data.height=20",
-    "data.static_views=6",
-    "data.static_test_views=2",
-    "data.train_views=2",
-    "data.frames=3",
-    "data.supersample=1",
-)
 
 
 @pytest.mark.parametrize("protocol", ["joint", "dynamic"])
-def test_a_protocol_trains_scores_and_films(devrf, tmp_path, protocol):
-    done = devrf(*SMALL, *ROBOT, f"protocol={protocol}", "hydra.run.dir=run")
+def test_a_protocol_trains_scores_and_films(devrf, tmp_path, tiny_data, protocol):
+    done = devrf(*SMALL, *tiny_data, f"protocol={protocol}", "hydra.run.dir=run")
     assert done.status == 0, done.err
     found = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert (found["method"], found["protocol"]) == ("neural_volumes", protocol)
     assert 3 < found["dynamic"]["psnr"] < 40 and 3 < found["static"]["psnr"] < 40
     assert found["dynamic"]["iterations"] == 2 and found["dynamic"]["rest_pose_psnr"] > 3
     assert (tmp_path / "run" / "videos" / "held_out.mp4").stat().st_size > 1000
-    again = devrf(*SMALL, *ROBOT, f"protocol={protocol}", "hydra.run.dir=run")
+    again = devrf(*SMALL, *tiny_data, f"protocol={protocol}", "hydra.run.dir=run")
     assert again.status == 0 and "learned already" in again.out
 
 
@@ -61,6 +52,6 @@ def test_a_protocol_trains_scores_and_films(devrf, tmp_path, protocol):
         (["ray_stage.model.settings.warp_side=5"], "warp_side: expected a power of two, not 5"),
     ],
 )
-def test_what_cannot_be_is_said_in_one_line(devrf, asked, said):
-    done = devrf(*SMALL, *ROBOT, "protocol=joint", *asked)
+def test_what_cannot_be_is_said_in_one_line(devrf, tiny_data, asked, said):
+    done = devrf(*SMALL, *tiny_data, "protocol=joint", *asked)
     assert done.status == 2 and said in done.err and done.err.count("\n") == 1

@@ -21,32 +21,16 @@ TINY = (
     "video.height=40",
     "trainer=cpu",
 )
-ROBOT = (
-    "data.width=24",
-    "data.height=20",
-    "data.static_views=6",
-    "data.static_test_views=2",
-    "data.train_views=2",
-    "data.frames=3",
-    "data.supersample=1",
-)
-TOY = (
-    "data=procedural_forward",
-    "data.width=24",
-    "data.height=20",
-    "data.static_views=8",
-    "data.train_views=2",
-    "data.frames=3",
-    "data.supersample=1",
-)
 
 
 @pytest.mark.parametrize(
     ("protocol", "scene", "film"),
-    [("joint", TOY, "spiral"), ("dynamic", ROBOT, "held_out")],
+    [("joint", "tiny_facing", "spiral"), ("dynamic", "tiny_data", "held_out")],
 )
-def test_a_protocol_trains_scores_and_films(devrf, tmp_path, protocol, scene, film):
-    done = devrf(*TINY, *scene, f"protocol={protocol}", "hydra.run.dir=run")
+def test_a_protocol_trains_scores_and_films(devrf, tmp_path, request, protocol, scene, film):
+    done = devrf(
+        *TINY, *request.getfixturevalue(scene), f"protocol={protocol}", "hydra.run.dir=run"
+    )
     assert done.status == 0, done.err
     found = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert (found["method"], found["protocol"]) == ("nsff", protocol)
@@ -69,6 +53,6 @@ def test_a_protocol_trains_scores_and_films(devrf, tmp_path, protocol, scene, fi
          "warmup.least_frames: expected 1 … most_frames (30), not 99"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_is_said_in_one_line(devrf, asked, said):
-    done = devrf(*TINY, *ROBOT, *asked)
+def test_what_cannot_be_is_said_in_one_line(devrf, tiny_data, asked, said):
+    done = devrf(*TINY, *tiny_data, *asked)
     assert done.status == 2 and said in done.err and done.err.count("\n") == 1

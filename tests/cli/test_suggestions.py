@@ -18,6 +18,7 @@ from devrf.cli.steps import STEPS as TAKEN
         ("joint", "protocol=joint"),
         ("reprot", "stage=report"),
         ("download", "stage=fetch"),
+        ("convert", "stage=export"),
         ("quickstart", "experiment=quickstart"),
         ("fox", "data.root=fox"),
         ("experiment=quickstrat", "experiment=quickstart"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -14,6 +15,16 @@ from devrf.cli.config import config_folder, register_resolvers
 
 Composed = Callable[..., DictConfig]
 
+known: dict[tuple[str, ...], DictConfig] = {}
+
+
+def whole_config(*overrides: str) -> DictConfig:
+    """The config with Hydra's own part; composed once, whoever asks for it."""
+    if overrides not in known:
+        with initialize_config_dir(str(config_folder()), version_base="1.3"):
+            known[overrides] = compose("config", list(overrides), return_hydra_config=True)
+    return copy.deepcopy(known[overrides])
+
 
 @pytest.fixture
 def composed(tmp_path: Path) -> Iterator[Composed]:
@@ -23,8 +34,7 @@ def composed(tmp_path: Path) -> Iterator[Composed]:
     before = hydra.cfg
 
     def config(*overrides: str) -> DictConfig:
-        with initialize_config_dir(str(config_folder()), version_base="1.3"):
-            whole = compose("config", overrides=list(overrides), return_hydra_config=True)
+        whole = whole_config(*overrides)
         with open_dict(whole):
             whole.hydra.runtime.output_dir = str(tmp_path)
         hydra.set_config(whole)

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
+from devrf.cli.arguments import with_viewer_shorthand
 from devrf.cli.config_check import check_config
 from devrf.cli.data_choice import with_data_choice
 
@@ -20,7 +21,7 @@ SPAN = re.compile(r"`([^`\n]+)`")
 TEST = re.compile(r"(tests/[\w/]+\.py)(?:::(\w+))?")
 LINK = re.compile(r"\]\((?!https?:)([^)#\s]+)")
 COMMAND = re.compile(r"python -m devrf ((?:-m )?[\w./]+=[^\s`]+(?: [\w./]+=[^\s`]+)*)")
-GROUPS = "callbacks|data|evaluation|field|sampling|schedule|still|video"
+GROUPS = "callbacks|data|evaluation|export|field|sampling|schedule|still|video|viewer"
 KEY = re.compile(rf"([a-z_]+(?:\.[a-z_]+)+)=|^((?:{GROUPS})(?:\.[a-z_]+)+)$")
 ROOTS = ("src/", "conf/", "tests/", "docs/", "notebooks/", "benchmarks/")
 PACKAGE = REPOSITORY / "src" / "devrf"
@@ -79,7 +80,7 @@ def test_commands_compose(command, composed):
     # Of the values of a sweep, the first.
     words = [word if "[" in word else word.split(",")[0] for word in command.split()]
     words = [re.sub(r"=(PATH|FOLDER|…)$", "=scene", word) for word in words if word != "-m"]
-    check_config(composed(*with_data_choice(words)))
+    check_config(composed(*with_data_choice(with_viewer_shorthand(words))))
 
 
 def test_keys_exist(composed):

@@ -164,10 +164,44 @@ def test_where_a_run_lives_is_told_from_scene_experiment_and_ablation(composed, 
     assert HydraConfig.get().run.dir == folder
 
 
-def test_the_ablation_table_is_every_ablation_on_both_embedded_scenes(composed):
-    composed("experiment=ablation_table")
-    hydra = HydraConfig.get()
-    ablations = {path.stem for path in (config_folder() / "ablation").glob("*.yaml")}
-    assert hydra.mode.name == "MULTIRUN"
-    assert set(hydra.sweeper.params["ablation"].split(",")) == ablations
-    assert hydra.sweeper.params["data.shape"] == "robot,flower"
+def test_every_ablation_is_in_a_table_of_both_embedded_scenes(composed):
+    rows = []
+    for table, scenes in (
+        ("ablation_table", ("data.shape", "robot,flower")),
+        ("quality_table", ("data", "procedural,flower")),
+    ):
+        composed(f"experiment={table}")
+        hydra = HydraConfig.get()
+        assert hydra.mode.name == "MULTIRUN"
+        assert scenes in hydra.sweeper.params.items()
+        rows += hydra.sweeper.params["ablation"].split(",")
+    assert sorted(rows) == sorted(path.stem for path in (config_folder() / "ablation").glob("*"))
+
+
+STEPS = ("published", "along_flow", "changing_colors", "elastic", "more_sweeps", "refinement")
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "changed"),
+    [
+        (STEPS[0], STEPS[1], {"motion"}),
+        (STEPS[1], STEPS[2], {"appearance"}),
+        (STEPS[2], STEPS[3], {"deformation", "loss"}),
+        (STEPS[3], STEPS[4], {"deformation"}),
+        (STEPS[4], STEPS[5], {"refinement"}),
+        (STEPS[5], "best", {"canonical", "sampling"}),
+    ],
+)
+def test_each_row_of_the_quality_table_adds_one_thing(composed, before, after, changed):
+    found = {}
+    for row in (before, after):
+        config = composed("experiment=quickstart", f"ablation={row}")
+        found[row] = {**config.schedule, "loss": config.loss, "sampling": config.sampling}
+    assert {key for key in found[before] if found[before][key] != found[after][key]} == changed
+
+
+def test_the_last_row_of_the_quality_table_is_best_small_beside_the_embedded_scenes(composed):
+    row = composed("experiment=quickstart", "ablation=best")
+    best = composed("experiment=best_small_procedural")
+    row.schedule.appearance.learn = best.schedule.appearance.learn
+    assert all(row[part] == best[part] for part in ("schedule", "loss", "sampling", "field"))

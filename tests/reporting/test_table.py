@@ -122,6 +122,26 @@ def test_times_of_different_devices_are_not_ranked(table, ran):
     assert "Memory and time are marked only among rows of one device." in found.notes
 
 
+def test_it_says_which_methods_took_their_samples_how(table, ran):
+    def sampled(**settings):
+        return {f"ray_stage.model.settings.{key}": value for key, value in settings.items()}
+
+    ran("a", method="devrf", protocol="two_stage", settings={"schedule.motion.unit": "box"})
+    for name, own in (
+        ("dnerf", sampled(sampling="occupancy", hull=True)),
+        ("nerfies", sampled(sampling="occupancy", hull=False)),
+        ("hypernerf", sampled(sampling="hierarchical", hull=True)),
+        ("neural_volumes", sampled(hull=True)),
+    ):
+        ran(name, method=name, protocol="joint", settings=own)
+    assert [note for note in table().notes if "Samples" in note] == [
+        "Samples by occupancy within hulls of mattes: D-NeRF.",
+        "Samples by occupancy: Nerfies.",
+        "Samples by hierarchical: HyperNeRF.",
+        "Samples by even steps within hulls of mattes: Neural Volumes.",
+    ]
+
+
 def test_the_average_is_over_scenes_that_a_configuration_was_run_on(table, ran):
     for scene, psnr in (("robot", 30.0), ("flower", 33.0)):
         ran(f"{scene}_full", scene, scores={"psnr": psnr})

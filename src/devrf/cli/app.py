@@ -18,6 +18,7 @@ from devrf.cli.paper_scene import check_paper_scene
 from devrf.cli.run_folder import removed_on_user_error
 from devrf.cli.run_lock import exclusive
 from devrf.cli.sweep import forget_failure, run_job
+from devrf.system.process import importing
 
 register_resolvers()
 
@@ -49,7 +50,8 @@ def _checked(config: DictConfig, folder: Path) -> float | None:
     check_config(config)
     check_extras(config)
     # Imported here: --help and a misspelt key are answered before torch has loaded.
-    from devrf.cli.steps import run_stage
+    with importing():
+        from devrf.cli.steps import run_stage
 
     return run_stage(config, folder)
 

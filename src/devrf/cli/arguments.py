@@ -18,7 +18,8 @@ from devrf.cli.overrides import in_quotes
 
 # Keys whose values are files or folders.
 PATHS = {
-    *("data.root", "data.export", "data.flow_cache", "ckpt", "fetch.into"),
+    *("data.root", "data.export", "data.flow_cache", "ckpt", "fetch.into", "export.into"),
+    *("capture.static", "capture.into", "video.path"),
     *("report.runs", "report.into", "evaluation.lpips_weights"),
     *("hydra.run.dir", "hydra.sweep.dir"),
 }
@@ -32,6 +33,15 @@ def with_quoted_paths(arguments: Sequence[str]) -> list[str]:
     """
     multirun = not {"-m", "--multirun"}.isdisjoint(arguments)
     return [_quoted_path(argument, multirun) for argument in arguments]
+
+
+def with_viewer_shorthand(arguments: Sequence[str]) -> list[str]:
+    """The arguments, with ``viewer.training=…`` for ``viewer=true`` and ``viewer=false``.
+
+    ``viewer`` is a group, whose choices Hydra wants to be text.
+    """
+    shorthand = {f"viewer={value}": f"viewer.training={value}" for value in ("true", "false")}
+    return [shorthand.get(one.lower(), one) for one in arguments]
 
 
 def _quoted_path(argument: str, multirun: bool) -> str:

@@ -48,10 +48,12 @@ def run_name(
     return "-".join(parts)
 
 
-def run_folder(stage: str, report: Any, scene: str, name: str) -> str:
+def run_folder(stage: str, report: Any, capture: Any, scene: str, name: str) -> str:
     """A run's folder: by scene and experiment; of a report, where it is written."""
-    if stage == "fetch":
-        return "outputs/fetch"
+    if stage in ("fetch", "selfcheck"):
+        return f"outputs/{stage}"
+    if stage == "capture":
+        return f"outputs/{scene_folder_name(Path(str(capture.into or 'scene')).name)}/capture"
     if stage != "report":
         return f"outputs/{scene}/{name}"
     settings = ReportSettings(report.runs, report.into)
@@ -63,9 +65,9 @@ def run_folder(stage: str, report: Any, scene: str, name: str) -> str:
 def config_record(stage: str) -> str | None:
     """Where in its folder a run's composed config is; a report may lie beside another run's.
 
-    stage=fetch is no run.
+    stage=fetch is no run; stage=view may look at one that goes on.
     """
-    return None if stage in ("report", "fetch") else ".hydra"
+    return None if stage in ("report", "fetch", "view") else ".hydra"
 
 
 def tracked_name(scene: str, mode: Any, folder: str, overrides: str) -> str:

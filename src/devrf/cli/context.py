@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from hydra.utils import instantiate
@@ -18,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from devrf.artifacts.tracking import Tracker, trackers
 from devrf.checkpoints.checkpoint import LoadedCheckpoint, load_checkpoint
 from devrf.checkpoints.checkpoint_file import digest_of
+from devrf.checkpoints.viewpoints import Viewpoints
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.ddp import ManualDDP
 from devrf.engine.stage import ScheduledStage
@@ -25,6 +26,9 @@ from devrf.errors import DevrfError
 from devrf.evaluation.suite import Evaluation
 from devrf.methods.protocol import Protocol
 from devrf.scenes.scene import Scene
+
+if TYPE_CHECKING:
+    from devrf.viewer.session import Session
 
 log = logging.getLogger(__name__)
 
@@ -130,8 +134,20 @@ class RunContext:
         """The logger, if it takes images, videos and tables."""
         return trackers([self.logger])
 
+    @cached_property
+    def page(self) -> Session:
+        """The page that shows the scene while it is learned; opened when first used."""
+        from devrf.viewer.session import Session  # an extra
+
+        settings = instantiate(self.config.viewer)
+        session = Session(settings, Viewpoints.of(self.scene), self.scene, self.folder)
+        log.info("the scene is at %s while it is learned", settings.address)
+        return session
+
     def close(self, *, failed: bool) -> None:
-        """End the tracking of the run, if it began."""
+        """End the tracking of the run, and the viewer's page, if they began."""
+        if "page" in self.__dict__:
+            self.page.close()
         if "logger" in self.__dict__:
             for tracker in self.trackers:
                 tracker.close(failed=failed)

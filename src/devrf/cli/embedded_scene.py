@@ -1,4 +1,4 @@
-"""An experiment of any inward-facing scene beside ``data=procedural``: its own sizes for that."""
+"""An experiment of any inward-facing scene beside an embedded one: its own sizes for that."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 from devrf.cli.config import config_folder
 
-DATA = "procedural"
+SUFFIX = "_procedural"
+EMBEDDED = {"data=procedural", "data=flower"}
 
 
 def with_embedded_experiment(arguments: Sequence[str]) -> list[str]:
@@ -15,8 +16,8 @@ def with_embedded_experiment(arguments: Sequence[str]) -> list[str]:
     Scenes from disk and the embedded ones need other sizes, and other options of their data;
     Hydra cannot choose an experiment by another choice.
     """
-    if f"data={DATA}" not in arguments:
+    if EMBEDDED.isdisjoint(arguments):
         return list(arguments)
-    files = (config_folder() / "experiment").glob(f"*_{DATA}.yaml")
-    known = {f"experiment={path.stem.removesuffix(f'_{DATA}')}" for path in files}
-    return [f"{one}_{DATA}" if one in known else one for one in arguments]
+    files = (config_folder() / "experiment").glob(f"*{SUFFIX}.yaml")
+    known = {f"experiment={path.stem.removesuffix(SUFFIX)}" for path in files}
+    return [f"{one}{SUFFIX}" if one in known else one for one in arguments]

@@ -291,7 +291,8 @@ def _level_needs(
     if motion.store == "host":  # with the next frames, which are being copied
         resident, active = 0, active_bytes(shape) + slices
     else:
-        resident, active = resident_bytes(frames, shape, motion.store_half), active_bytes(shape)
+        half = motion.store_half is True  # auto is not known to be a GPU's
+        resident, active = resident_bytes(frames, shape, half), active_bytes(shape)
     learned = resident_bytes(frames, final, False)
     moments = 2 * resident_bytes(schedule.max_parallel_frames(-1, frames), final, False)
     return StageNeeds(

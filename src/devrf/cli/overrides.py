@@ -12,7 +12,8 @@ from hydra.core.override_parser.types import Override
 
 # Overrides that say what to do with a run, on which machine, and what to log, not what the run is.
 OF_A_COMMAND = {"stage", "ckpt", "resume", "memory_check", "objective", "hparams_search"}
-OF_A_COMMAND |= {"hydra", "report", "still", "trainer", "logger", "callbacks", "kernels"}
+OF_A_COMMAND |= {"hydra", "report", "still", "export", "trainer", "logger", "callbacks", "kernels"}
+OF_A_COMMAND |= {"viewer"}
 # Names code to be run, which a checkpoint, perhaps a stranger's, may not choose.
 CODE = "_target_"
 # Values that are relative to the folder in which they were typed.

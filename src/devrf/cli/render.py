@@ -5,40 +5,83 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
 
 from hydra.utils import instantiate
 from torch import Tensor
 
-from devrf.artifacts.camera_paths import focus_distance, held_out_images, orbit, spiral
+from devrf.artifacts.camera_paths import (
+    bullet_time,
+    focus_distance,
+    held_out_images,
+    orbit,
+    spiral,
+    time_freeze,
+)
 from devrf.artifacts.film import FilmSettings, held_out_pictures, orbit_pictures, write_video
+from devrf.artifacts.keyframes import cameras_of
+from devrf.artifacts.path_files import read_path
 from devrf.artifacts.still import still
 from devrf.cli.context import RunContext
 from devrf.evaluation.held_out import background_value
+from devrf.geometry.cameras import Cameras
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Views
 from devrf.system.progress import followed
 
 log = logging.getLogger(__name__)
 
+# What video.path may be beside a file.
+PRESETS = {"bullet_time": bullet_time, "time_freeze": time_freeze}
+
 
 def render(run: RunContext) -> None:
-    """Film the held-out views over time, and an orbit (or a spiral) while time runs."""
-    stored, scene = run.load(), run.scene
+    """Film the held-out views over time, and an orbit (or a spiral) while time runs.
+
+    With ``video.path`` that path alone is filmed.
+    """
     film: FilmSettings = instantiate(run.config.video)
+    path = None if film.path in (None, *PRESETS) else read_path(Path(str(film.path)))
+    stored, scene = run.load(), run.scene
     renderer = Renderer(stored.model.to_view(run.device), half=film.half)
+    behind = background_value(scene.background)
     views = (scene.dynamic if scene.moves else scene.static).test
+    if path is not None:
+        film = replace(film, frames=path.frames, fps=path.fps)
     film, captured = _within_limit(film, renderer, views), film.sized(scene.static.train.cameras)
-    images = held_out_images(views, film.frames)
-    _write(
-        run, film, "held_out", held_out_pictures(renderer, views, images, film, scene.background)
-    )
     forward = scene.kind == "forward"
-    if forward:
-        path = spiral(captured, focus_distance(renderer, scene.static.train.cameras), film)
+
+    def ring(settings: FilmSettings) -> Cameras:
+        if forward:
+            focus = focus_distance(renderer, scene.static.train.cameras)
+            return spiral(captured, focus, settings)
+        return orbit(captured, renderer.model.box, settings)
+
+    if path is not None:
+        keyframes = path.sampled(film.frames)
+        cameras = cameras_of(keyframes, path.aspect, captured.height)
+        shown = orbit_pictures(renderer, cameras, behind, [one.time for one in keyframes])
+        _write(run, film, Path(str(film.path)).stem, shown)
+    elif film.path is not None:
+        cameras, times = PRESETS[film.path](ring, film.time, film)
+        _write(run, film, film.path, orbit_pictures(renderer, cameras, behind, times))
     else:
-        path = orbit(captured, renderer.model.box, film)
-    shown = orbit_pictures(renderer, path, background_value(scene.background))
-    _write(run, film, "spiral" if forward else "orbit", shown)
+        images = held_out_images(views, film.frames)
+        shown = held_out_pictures(renderer, views, images, film, scene.background)
+        _write(run, film, "held_out", shown)
+        shown = orbit_pictures(renderer, ring(film), behind)
+        _write(run, film, "spiral" if forward else "orbit", shown)
+
+
+def check_path(film: FilmSettings) -> None:
+    """Check that ``video.path`` can be filmed, long before it is.
+
+    Raises:
+        DevrfError: it cannot.
+    """
+    if film.path not in (None, *PRESETS):
+        _ = read_path(Path(str(film.path))).frames
 
 
 def _within_limit(film: FilmSettings, renderer: Renderer, views: Views) -> FilmSettings:

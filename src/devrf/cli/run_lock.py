@@ -94,9 +94,10 @@ def exclusive(folder: Path, config: DictConfig, key: str) -> Iterator[None]:
 def _locks(config: DictConfig) -> bool:
     """Whether a process needs the lock: rank 0 locks for its workers.
 
-    A report only reads, and stage=fetch locks where it writes.
+    A report and the viewer only read, but for a camera path that is written at once; stage=fetch
+    locks where it writes.
     """
-    if config.stage in ("report", "fetch"):
+    if config.stage in ("report", "fetch", "view"):
         return False
     worker = any(os.environ.get(name, "0") != "0" for name in RANKS)
     return not (worker and config.trainer.get("strategy") is not None)

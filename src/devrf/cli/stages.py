@@ -9,19 +9,25 @@ from devrf.errors import did_you_mean
 
 PIPELINE = "pipeline"
 # Stages that learn nothing; the protocol's stages come beside these.
-STEPS = ("prepare", "inspect", "evaluate", "render", "still", "report", "fetch")
+STEPS = (
+    *("prepare", "inspect", "evaluate", "render", "still", "view", "export"),
+    *("report", "fetch", "capture", "selfcheck"),
+)
 # Of these, what uses a checkpoint.
-OF_A_CHECKPOINT = ("evaluate", "render", "still")
+OF_A_CHECKPOINT = ("evaluate", "render", "still", "view", "export")
 # What users of other programs write, and what it is here.
 SYNONYMS = {
     **dict.fromkeys(("train", "fit", "learn", "run", "start"), "stage=pipeline"),
     **dict.fromkeys(("eval", "test", "score", "metrics"), "stage=evaluate"),
-    **dict.fromkeys(("video", "film", "viewer"), "stage=render"),
+    **dict.fromkeys(("video", "film"), "stage=render"),
+    **dict.fromkeys(("viewer", "browser", "viser", "gui"), "stage=view"),
     **dict.fromkeys(("image", "picture", "photo"), "stage=still"),
     **dict.fromkeys(("download", "get"), "stage=fetch"),
-    **dict.fromkeys(("export", "convert"), "stage=prepare"),
+    **dict.fromkeys(("mesh", "gltf", "convert"), "stage=export"),
+    **dict.fromkeys(("footage", "colmap", "sfm", "process"), "stage=capture"),
     **dict.fromkeys(("check", "info", "show"), "stage=inspect"),
     **dict.fromkeys(("compare", "table"), "stage=report"),
+    **dict.fromkeys(("doctor", "diagnose", "self-check"), "stage=selfcheck"),
     "help": "--help",
     "version": "--version",
 }

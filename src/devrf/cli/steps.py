@@ -17,27 +17,32 @@ from lightning import seed_everything
 from omegaconf import DictConfig
 
 from devrf.cli import job
+from devrf.cli.capture import capture
 from devrf.cli.closing import say_what_next
 from devrf.cli.context import RunContext
 from devrf.cli.done import done, noting, say_done
 from devrf.cli.evaluate import evaluate
+from devrf.cli.export import export
 from devrf.cli.fetch import fetch
 from devrf.cli.inspect_scene import inspect, prepare
 from devrf.cli.objective import check_objective, objective
 from devrf.cli.preflight import preflight, shortage_in_words
-from devrf.cli.render import render
+from devrf.cli.render import check_path, render
 from devrf.cli.report import report
 from devrf.cli.resume import archive_previous, beginning
 from devrf.cli.scene_stages import learnable
+from devrf.cli.selfcheck import selfcheck
 from devrf.cli.stages import OF_A_CHECKPOINT, meant_stage
 from devrf.cli.still import picture
 from devrf.cli.train import learn
+from devrf.cli.view import view
 from devrf.cli.workers import launch_workers
 from devrf.engine.ddp import ManualDDP
 from devrf.errors import DevrfError
 from devrf.methods.devrf.appearance_learning import check_weights
 from devrf.methods.devrf.losses import MOTION_TERMS, PHOTOMETRIC_TERMS, WeightedLoss
 from devrf.ops.dispatch import using
+from devrf.viewer.settings import ViewerSettings
 
 log = logging.getLogger(__name__)
 
@@ -50,10 +55,16 @@ STEPS: dict[str, Step] = {
     "evaluate": evaluate,
     "render": render,
     "still": picture,
+    "view": view,
+    "export": export,
     "report": report,
     "fetch": fetch,
+    "capture": capture,
+    "selfcheck": selfcheck,
 }
 PIPELINE = ("evaluate", "render")
+# Steps for which the run's scene and stages need not be right.
+APART = {"report", "fetch", "capture", "selfcheck"}
 MOVED = {"benchmark": "run python benchmarks/training.py with the other overrides"}
 
 # Lightning's messages on accelerators, tips and data loaders say nothing about this run.
@@ -209,9 +220,9 @@ def _check(run: RunContext, asked: Plan) -> None:
     if config.ckpt is not None and (begins or not {*asked.further} <= {*OF_A_CHECKPOINT}):
         raise DevrfError(
             f"ckpt: stage={config.stage} starts from nothing; with ckpt=PATH give a stage that "
-            "builds on another, stage=evaluate, stage=render or stage=still"
+            "builds on another, stage=evaluate, render, still, view or export"
         )
-    if not asked.learning and not {"report", "fetch"}.isdisjoint(asked.further):
+    if not asked.learning and not APART.isdisjoint(asked.further):
         return
     _ = run.datamodule
     for name in run.learning_stages:
@@ -227,5 +238,9 @@ def _check(run: RunContext, asked: Plan) -> None:
         raise DevrfError(
             f"stage: a search needs the objective, which stage={config.stage} does not score"
         )
-    instantiate(config.video)
+    check_path(instantiate(config.video))
     instantiate(config.still)
+    instantiate(config.export)
+    viewer: ViewerSettings = instantiate(config.viewer)
+    if run.leads and ("view" in asked.further or (viewer.training and asked.learning)):
+        viewer.check_free()

@@ -66,6 +66,10 @@ def _fit(run: RunContext, stage: ScheduledStage, begin: ResumePoint) -> None:
     if saving is None:  # no periodic files, but still one at a signal
         saving = PeriodicCheckpoint(run.folder / "checkpoints", every_seconds=math.inf)
         callbacks.append(saving)
+    if run.config.viewer.training and run.leads:
+        from devrf.callbacks.live_view import LiveView  # an extra
+
+        callbacks.append(LiveView(run.page, run.config.viewer.share))
     with StopOnSignal(saving) as stop:
         trainer: Trainer = instantiate(
             run.config.trainer,

@@ -25,13 +25,20 @@ METHODS = {
     "nsff": "NSFF",
     "neural_volumes": "Neural Volumes",
 }
-# As the paper's tables call them, in their order.
+# As the paper's tables call them, in their order; then what experiment=quality_table adds up.
 ABLATIONS = {
     "base": "Ours (base)",
     "c2f": "Ours w/ c2f",
     "c2f_tv": "Ours w/ c2f, tv",
     "c2f_tv_cycle": "Ours w/ c2f, tv, cycle",
     "full": "Ours w/ c2f, tv, cycle, flow",
+    "published": "Ours, the paper's terms",
+    "along_flow": "+ start along flow",
+    "changing_colors": "+ changing colours",
+    "elastic": "+ elastic motion",
+    "more_sweeps": "+ two more sweeps",
+    "refinement": "+ refinement",
+    "best": "+ finer field at rest",
 }
 # Config groups and keys that decide what is logged, not what is learned.
 LOGGING = {"logger", "callbacks", "video", "report", "hydra"}

@@ -268,6 +268,21 @@ def _scored_again(runs: pd.DataFrame) -> pd.Series:
     return again.sort_index()
 
 
+def _sampled(runs: pd.DataFrame) -> list[str]:
+    """How the methods that choose their samples took them, a sentence for each way."""
+    absent = pd.Series(None, runs.index, dtype=object)
+    kind, hull = (
+        runs.get(f"run.settings.ray_stage.model.settings.{key}", absent)
+        for key in ("sampling", "hull")
+    )
+    # A hull of mattes only counts where samples are taken by occupancy; Neural Volumes' always are.
+    carved = hull.eq(True) & kind.fillna("occupancy").eq("occupancy")
+    way = kind.where(kind.notna() | hull.isna(), "even steps")
+    way = way.where(~carved, way.astype(str) + " within hulls of mattes")
+    names = runs["name"].groupby(way, sort=False).unique()
+    return [f"Samples by {one}: {', '.join(found)}." for one, found in names.items()]
+
+
 def _notes(runs: pd.DataFrame, at_rest: pd.Series, again: pd.Series) -> list[str]:
     notes = [
         f"No run has {column.title}: {column.why_missing}."
@@ -276,6 +291,7 @@ def _notes(runs: pd.DataFrame, at_rest: pd.Series, again: pd.Series) -> list[str
     ]
     if runs["run.device"].nunique(dropna=False) > 1:
         notes.append("Memory and time are marked only among rows of one device.")
+    notes += _sampled(runs)
     still = runs.loc[runs["at_rest"].eq(True), "scene"].unique()
     if len(still):
         notes.append(f"At rest, scored on held-out images of the static set: {', '.join(still)}.")
