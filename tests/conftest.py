@@ -7,6 +7,7 @@ import gc
 import logging
 import os
 import re
+import signal
 import sys
 import threading
 import warnings
@@ -18,6 +19,10 @@ from typing import Any
 # Before torch, which loads Triton: Triton decides then whether its interpreter runs kernels.
 # TRITON_INTERPRET=0 in the environment runs the tests of the kernels on a GPU instead.
 os.environ.setdefault("TRITON_INTERPRET", "1")
+# A shell without job control starts what is in the background with SIGINT ignored, and so would
+# be every command that a test starts.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 import pytest
 import torch

@@ -15,8 +15,6 @@ from devrf.system.signals import STOP_SIGNALS, Interrupted, end_at_once, handle_
 @pytest.fixture(autouse=True)
 def as_before() -> Iterator[None]:
     before = {number: signal.getsignal(number) for number in STOP_SIGNALS}
-    # A shell without job control starts what is in the background with SIGINT ignored.
-    signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
