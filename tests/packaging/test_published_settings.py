@@ -87,6 +87,7 @@ def test_loss_weights(paper):
         "per_sample_color": 0.1,
         "entropy": 0.01,
         "elastic": 0.0,
+        "bending": 0.0,
     }
 
 
@@ -113,7 +114,7 @@ def test_the_code_defaults_to_the_paper(paper):
 )
 def test_the_rows_of_the_ablation_tables(composed, ablation, off, coarse_to_fine):
     config = composed("experiment=paper_inward", ROOT, f"ablation={ablation}")
-    never = {"elastic"}
+    never = {"elastic", "bending"}
     without = {name for name, weight in config.loss.deformation.items() if not weight}
     assert without == off | never
     assert config.schedule.deformation.coarse_to_fine is coarse_to_fine

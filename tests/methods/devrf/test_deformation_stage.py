@@ -198,3 +198,33 @@ def test_stages_built_on_one_rest_do_not_meet(
     assert first.field is not second.field
     assert not second.field.to_time[2].any()
     assert first.field.to_canonical[1].abs().max() > 1e-3
+
+
+class StepCounts(Callback):
+    """Adam's count of steps on the motion after each step, level by level."""
+
+    def __init__(self) -> None:
+        self.levels: dict[int, list[int]] = {}
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, *args: Any) -> None:
+        optimizer = pl_module.optimizer
+        steps = optimizer.state[optimizer.param_groups[0]["params"][0]]["steps"]
+        self.levels.setdefault(pl_module.phase.level, []).append(int(steps))
+
+
+@pytest.mark.parametrize(
+    ("moments", "fine"), [("fresh", [1, 2, 3, 4, 1, 2]), ("carried", [1, 2, 3, 4, 5, 6])]
+)
+def test_adam_begins_anew_at_each_visit_or_goes_on_above_the_coarsest_level(
+    rest: LoadedCheckpoint,
+    datamodule: SceneDataModule,
+    trainer: Callable[..., Trainer],
+    moments: Any,
+    fine: list[int],
+) -> None:
+    # Three frames; frame 1 gets the share of frame 0 as well.
+    schedule = DeformationSchedule(sides=(4, 6), iterations_per_frame=(2, 2), rays=16)
+    motion = replace(FAST, moments=moments)
+    stage, counts = DeformationStage(rest, schedule, motion, iterations_per_step=1), StepCounts()
+    trainer(counts, max_epochs=1).fit(stage, datamodule=datamodule)
+    assert counts.levels == {0: [1, 2, 3, 4, 1, 2], 1: fine}

@@ -32,6 +32,7 @@ from devrf.methods.devrf.flow_initialisation import follow, start_from_tracks
 from devrf.methods.devrf.frame_memory import rest_on_host
 from devrf.methods.devrf.losses import (
     MOTION_TERMS,
+    PRIORS,
     FlowMean,
     MotionGrid,
     MotionPrediction,
@@ -203,7 +204,7 @@ class DeformationStage(VoxelStage):
         self._optimizer.param_groups[0]["base_lr"] = motion.learning_rate * scale
 
     def enter(self, phase: Phase) -> None:
-        """Go to the phase's frames: grow the grids if a level begins, fresh Adam."""
+        """Go to the phase's frames: grow the grids if a level begins, fresh Adam if asked for."""
         assert isinstance(phase, DeformationPhase | RefinementPhase)
         previous, self.phase = self.phase, phase
         self.active.write_back()
@@ -215,7 +216,8 @@ class DeformationStage(VoxelStage):
             self._allocate(0)
             self.field.resize(phase.side**3)
         self._initialise(phase)
-        if len(self.active) == len(phase.frames):
+        carried = self.motion.moments == "carried" and phase.level > 0
+        if len(self.active) == len(phase.frames) and not carried:
             for group in range(len(self._optimizer.param_groups)):
                 self._optimizer.forget(group)
         self.activate(phase)
@@ -256,7 +258,7 @@ class DeformationStage(VoxelStage):
         self.active.allocate(count, *fields)
         self._stiffen(self.phase.level)
         self._matter = None
-        if count and self.losses.weights.get("elastic"):
+        if count and any(self.losses.weights.get(name) for name in PRIORS):
             occupancy = self.scene_model.occupancy
             self._matter = occupied_cells(occupancy, self.field.box, self.field.shape)
         smoothing = total_variation_weight(self.tv, max(self.field.shape), self.schedule.rays)

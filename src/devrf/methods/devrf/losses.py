@@ -17,6 +17,7 @@ from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.space import WORLD, Space
+from devrf.methods.devrf.bending import bending_energy
 from devrf.methods.devrf.elastic import elastic_energy
 from devrf.methods.devrf.volume_rendering import VoxelOutput, Warp
 from devrf.ops.dispatch import triton_runs
@@ -157,6 +158,14 @@ def elastic(prediction: MotionPrediction) -> Tensor:
     return elastic_energy(grid.displacement, grid.box, grid.occupied)
 
 
+def bending(prediction: MotionPrediction) -> Tensor:
+    """L_bending: how much the forward slice bends matter (docs/method.md#bending)."""
+    grid = prediction.grid
+    if grid is None:
+        return prediction.output.color.new_zeros(())
+    return bending_energy(grid.displacement, grid.box, grid.occupied)
+
+
 def induced_flow(
     canonical: Tensor,
     unwarp_previous: Warp,
@@ -206,8 +215,13 @@ MOTION_TERMS: dict[str, Callable[[MotionPrediction], Tensor]] = {
     "cycle": cycle,
     "flow": flow,
     "elastic": elastic,
+    "bending": bending,
     "residual": residual,
 }
+
+
+# The terms that look at the forward slice itself, where there is matter.
+PRIORS = ("elastic", "bending")
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ DEFORMATION_LOSS = {
     "per_sample_color": 0.1,
     "entropy": 0.01,
     "elastic": 0.0,
+    "bending": 0.0,
 }
 APPEARANCE_LOSS = {"residual": 1e-3, "tv": 0.002}
 
@@ -101,6 +102,8 @@ class MotionSettings:
             several processes keeps them on its device.
         store_half: whether they are kept in half precision; ``auto``: on a GPU. Active frames
             never are.
+        moments: ``fresh`` begins each visit with a fresh Adam; ``carried`` goes on, above the coarsest
+            level, with the moments of the visit before (docs/method.md#motion-learning-rate).
         min_rel_improvement: a visit ends early when two Lightning steps have taken less than
             this share off its loss; None goes through the whole schedule.
     """
@@ -111,6 +114,7 @@ class MotionSettings:
     pixels: Literal["all", "occupied"] = "all"
     occupancy_every: int = 25
     start: Literal["previous", "flow"] = "previous"
+    moments: Literal["fresh", "carried"] = "fresh"
     store: Literal["auto", "device", "host"] = "auto"
     store_half: bool | Literal["auto"] = "auto"
     min_rel_improvement: float | None = None

@@ -1,0 +1,81 @@
+"""The bending prior: what it leaves alone, and what a curve costs, by hand."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from devrf.geometry.box import Box
+from devrf.methods.devrf.bending import bending_energy as bending
+
+BOX = Box((-1.0, -2.0, 0.0), (1.0, 2.0, 3.0))
+SHAPE = (5, 9, 7)
+
+
+def points() -> Tensor:
+    return BOX.grid_points(SHAPE, torch.zeros((), dtype=torch.float64))
+
+
+def everywhere() -> Tensor:
+    return torch.ones(4, 8, 6, dtype=torch.float64)
+
+
+def robust(energy: float) -> float:
+    return energy * 0.1 / (energy + 0.1)
+
+
+def test_a_uniform_stretch_turn_and_shear_cost_nothing() -> None:
+    matrix = torch.tensor([[0.4, 0.3, 0.0], [-0.7, 0.1, 0.2], [0.0, 0.5, -0.3]]).double()
+    moved = points() @ matrix + torch.tensor([1.0, 2.0, 3.0])
+    assert float(bending(moved, BOX, everywhere())) == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "curved"),
+    [
+        # Δ_z = 0.3 x²: ∂_x ∂_x Δ_z = 0.6.
+        (0, 0, 0.6**2),
+        # Δ_z = 0.3 x y: ∂_x ∂_y Δ_z = ∂_y ∂_x Δ_z = 0.3.
+        (0, 1, 2 * 0.3**2),
+        (1, 2, 2 * 0.3**2),
+        (2, 0, 2 * 0.3**2),
+    ],
+)
+def test_a_curve_costs_what_it_does_by_hand(first: int, second: int, curved: float) -> None:
+    at = points()
+    moved = torch.zeros_like(at)
+    moved[..., 2] = 0.3 * at[..., first] * at[..., second]
+    # ℓ is a twentieth of the box's longest edge, 4.
+    expected = robust(0.2**2 * curved)
+    assert float(bending(moved, BOX, everywhere())) == pytest.approx(expected, rel=1e-9)
+
+
+def test_points_away_from_matter_do_not_count() -> None:
+    moved = torch.zeros(*SHAPE, 3, dtype=torch.float64)
+    moved[1, 1, 1, 0] = 0.5
+    occupied = torch.zeros_like(everywhere())
+    assert bending(moved, BOX, occupied) == 0
+    occupied[-1, -1, -1] = 1  # its only corner inside the border is far from the bump
+    assert bending(moved, BOX, occupied) == 0
+    occupied[0, 0, 0] = 1
+    assert bending(moved, BOX, occupied) > 0
+
+
+def test_a_tear_costs_little_more_than_a_bend() -> None:
+    torn = torch.zeros(*SHAPE, 3, dtype=torch.float64)
+    torn[3:, ..., 0] = 100.0
+    assert 0.03 < float(bending(torn, BOX, everywhere())) < 0.1
+
+
+def test_a_grid_without_inner_points_has_none_to_bend() -> None:
+    flat = torch.ones(2, 2, 2, 3, requires_grad=True)
+    energy = bending(flat, BOX, torch.ones(1, 1, 1))
+    energy.backward()
+    assert energy == 0 and flat.grad is not None and not flat.grad.any()
+
+
+def test_the_gradient_is_that_of_the_energy(rng: torch.Generator) -> None:
+    moved = torch.rand(4, 5, 4, 3, generator=rng, dtype=torch.float64, requires_grad=True)
+    occupied = (torch.rand(3, 4, 3, generator=rng) > 0.4).double()
+    assert torch.autograd.gradcheck(lambda grid: bending(grid, BOX, occupied), (moved,))
