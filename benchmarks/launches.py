@@ -179,6 +179,7 @@ def tracing() -> Iterator[Tracing]:
     from devrf.ops.kernels import (
         adam,
         compositing,
+        motion,
         photometric,
         pixel_rays,
         search,
@@ -187,7 +188,7 @@ def tracing() -> Iterator[Tracing]:
     )
 
     modules: tuple[Any, ...] = (
-        *(adam, compositing, photometric, pixel_rays),
+        *(adam, compositing, motion, photometric, pixel_rays),
         *(search, trilinear, warped_depth),
     )
     trace, usual = Tracing(), [module.launch for module in modules]

@@ -34,6 +34,7 @@ from devrf.ops.dispatch import Kind, using
 from devrf.ops.kernels import (
     adam,
     compositing,
+    motion,
     photometric,
     pixel_rays,
     search,
@@ -93,7 +94,7 @@ def short_work(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(GraphedStep, "WARM_UP", 1)
 
 
-KERNELS = (adam, compositing, photometric, pixel_rays, search, trilinear, warped_depth)
+KERNELS = (adam, compositing, motion, photometric, pixel_rays, search, trilinear, warped_depth)
 
 # Operations that wait for the device, or whose results have a shape that depends on data.
 WAITING = {

@@ -17,6 +17,7 @@ from devrf.ops.adam_step import AdamRule, adam_step, adam_steps, smooth_adam_ste
 from devrf.ops.compositing import composite_colors, composite_segments, sum_segments
 from devrf.ops.corners import Triple
 from devrf.ops.dispatch import Kind, using
+from devrf.ops.motion import ListedSamples, SeenEarlier, motion_sum
 from devrf.ops.photometric import photometric_sum
 from devrf.ops.pixel_rays import gather_pixels, steps_in_box
 from devrf.ops.search import Thresholds, find_samples, select_listed
@@ -221,6 +222,51 @@ def compositing_colors(draw: Draw) -> Results:
     return tuple(results)
 
 
+def motion_terms(draw: Draw) -> Results:
+    """Samples of six rays: with and without flow, in world units and in NDC, and padding."""
+    results: list[Tensor] = []
+    for over_samples, ndc in ((None, None), (False, None), (True, (1.1, 1.3, 1.0))):
+        forward, before, seen = draw.leaf(4, 3, 5, 3), draw(4, 3, 5, 3), None
+        if over_samples is not None:
+            # Cameras that look at the box from 4 units away, turned a little.
+            poses = 0.1 * draw(2, 3, 4) + torch.eye(3, 4).to(draw.device)
+            poses[:, 2, 3] += 4
+            image = torch.tensor([0, 1, 1, 0, 1, 1]).to(draw.device)
+            seen = SeenEarlier(
+                3 * draw(6, 2),
+                draw(6) > -0.5,
+                8 + 8 * draw(6, 2),
+                image,
+                1 - image[:2],
+                poses,
+                20 + draw(2, 2),
+                8 + draw(2, 2),
+            )
+        samples = ListedSamples(
+            draw(150, 3),
+            draw.leaf(150, 3),
+            draw.leaf(150),
+            (2.99 + 2.99 * draw(150)).long(),
+            torch.arange(150, device=draw.device) < 140,
+        )
+        found = motion_sum(
+            samples,
+            forward,
+            before,
+            seen,
+            (10.0, 0.5),
+            box=_Box(),
+            over_samples=bool(over_samples),
+            ndc=ndc,
+        )
+        leaves = samples.canonical, samples.weight, forward
+        gradients = torch.autograd.grad(
+            3 * found.total, leaves, allow_unused=True, materialize_grads=True
+        )
+        results += [*found, *gradients]
+    return tuple(results)
+
+
 def total_variation(draw: Draw) -> Results:
     """The gradient added to entries that have one, and to all."""
     grid, gradient = 2 * draw(4, 3, 5, 3), draw(4, 3, 5, 3).clamp(min=0)
@@ -260,6 +306,7 @@ CASES: tuple[Case, ...] = (
     sample_search,
     compositing,
     compositing_colors,
+    motion_terms,
     total_variation,
     adam,
 )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import torch
@@ -31,12 +30,11 @@ from devrf.methods.devrf.elastic import occupied_cells
 from devrf.methods.devrf.flow_initialisation import follow, start_from_tracks
 from devrf.methods.devrf.frame_memory import rest_on_host
 from devrf.methods.devrf.losses import (
+    FLOW_TERMS,
     MOTION_TERMS,
     FlowMean,
     MotionGrid,
     MotionPrediction,
-    WeightedLoss,
-    flow,
     total_variation_weight,
     visibility,
 )
@@ -51,6 +49,7 @@ from devrf.methods.devrf.settings import (
     Precision,
 )
 from devrf.methods.devrf.voxel_stage import VoxelStage
+from devrf.methods.devrf.weighted_loss import WeightedLoss
 from devrf.ops.adam import GridAdam
 from devrf.scenes.scene import CaptureName, Views
 from devrf.system.profiling import span
@@ -112,7 +111,7 @@ class DeformationStage(VoxelStage):
         chosen = appearance or AppearanceSettings()
         self.appearance = AppearanceLearning(chosen, self.schedule, appearance_loss)
         weights.update(self.appearance.weights)
-        self.losses = WeightedLoss(MOTION_TERMS | {"flow": partial(flow, mean=flow_mean)}, weights)
+        self.losses = WeightedLoss(MOTION_TERMS | {"flow": FLOW_TERMS[flow_mean]}, weights)
         self._elastic = weights.get("elastic", 0.0)
         still = rest.model
         fields = still.canonical, still.occupancy
