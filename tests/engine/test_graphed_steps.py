@@ -33,6 +33,7 @@ from devrf.methods.devrf.settings import MotionSettings
 from devrf.ops.dispatch import Kind, using
 from devrf.ops.kernels import (
     adam,
+    color_network,
     compositing,
     motion,
     photometric,
@@ -94,7 +95,10 @@ def short_work(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(GraphedStep, "WARM_UP", 1)
 
 
-KERNELS = (adam, compositing, motion, photometric, pixel_rays, search, trilinear, warped_depth)
+KERNELS = (
+    *(adam, color_network, compositing, motion, photometric),
+    *(pixel_rays, search, trilinear, warped_depth),
+)
 
 # Operations that wait for the device, or whose results have a shape that depends on data.
 WAITING = {
