@@ -194,6 +194,8 @@ class DeformationStage(VoxelStage):
                 on_host=rest_on_host(self.trainer, model, self.schedule, motion),
                 half=motion.rests_half(self.trainer.strategy.root_device),
             )
+            # Before the clock of training starts.
+            self.field.frames.reserve(box.grid_shape(self.schedule.sides[-1] ** 3))
             recorded = self.scene.dynamic.train
             self.appearance.setup(model, self.field.clock, self._optimizer, recorded)
             if self.refinement.settings.iterations:
