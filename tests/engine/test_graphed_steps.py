@@ -217,7 +217,7 @@ def learn(
 ) -> ScheduledStage:
     torch.manual_seed(3)
     stage = build()
-    stage.loop._capturer = lambda: capturer  # type: ignore[method-assign]
+    stage.loop.capturer = lambda: capturer  # type: ignore[method-assign]
     if capturer is not None:
         draw, prepare = stage.draw, stage.prepare
         stage.draw = lambda batch: watched(lambda: draw(batch))  # type: ignore[method-assign]
@@ -307,7 +307,7 @@ def test_before_a_capture_lists_have_been_long_enough_for_every_view(
     stage = moving(rest)
     assert isinstance(stage, DeformationStage)
     stage.schedule = replace(MOVING, sides=(3,), iterations_per_frame=(2,))
-    stage.loop._capturer = Noting  # type: ignore[assignment,method-assign]
+    stage.loop.capturer = Noting  # type: ignore[assignment,method-assign]
     trainer(max_epochs=1).fit(stage, datamodule=datamodule)
     first = ["view 0", "view 1", "measured", "view 0", "captured"]
     assert noted[:6] == [*first, "view 1"] and noted.count("captured") == 1

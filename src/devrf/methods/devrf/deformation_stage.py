@@ -287,7 +287,8 @@ class DeformationStage(VoxelStage):
                 views, model, clock = self.views, self.scene_model, self.field.clock
                 pool, before = all_pixels(views, images_of(views, number)), clock.times[number - 1]
                 tracks = follow(model, views, pool, self.previous_images, before, self.generator)
-                start_from_tracks(self.field, number, tracks, views.cameras, model.space)
+                seen = tracks, views.cameras, model.space
+                start_from_tracks(self.field, number, *seen, capturer=self.loop.capturer())
                 # Each process has followed pixels of its own.
                 broadcast([self.field.to_canonical[number], self.field.to_time[number]])
 
