@@ -178,7 +178,9 @@ def tracing() -> Iterator[Tracing]:
     """Count launches; Triton's kernels do not run."""
     from devrf.ops.kernels import (
         adam,
+        color_network,
         compositing,
+        motion,
         photometric,
         pixel_rays,
         search,
@@ -187,8 +189,8 @@ def tracing() -> Iterator[Tracing]:
     )
 
     modules: tuple[Any, ...] = (
-        *(adam, compositing, photometric, pixel_rays),
-        *(search, trilinear, warped_depth),
+        *(adam, color_network, compositing, motion, photometric),
+        *(pixel_rays, search, trilinear, warped_depth),
     )
     trace, usual = Tracing(), [module.launch for module in modules]
     for module in modules:

@@ -87,6 +87,34 @@ def test_offloaded_frames_stay_as_they_are_and_are_read_in_single_precision(
     assert store.to_time.shape == (4, 5, 5, 5, 3) and store.to_time.dtype == dtype
 
 
+def test_memory_is_locked_before_it_is_needed_and_once(
+    store: FrameStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    locked: list[tuple[int, ...]] = []
+
+    def page_locked(shape: tuple[int, ...], dtype: torch.dtype) -> torch.Tensor:
+        locked.append(shape)
+        return torch.empty(shape, dtype=dtype)
+
+    monkeypatch.setattr("devrf.engine.frame_store.page_locked", page_locked)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    store.reserve((9, 9, 9))  # frames rest on the device
+    assert not locked
+    store.offload(on_host=True, half=True)
+    locked.clear()
+    store.reserve((9, 9, 9))
+    assert locked == [(4, 9, 9, 9, 3)] * 2
+    assert copy.deepcopy(store)._reserved == []
+    store.resize((5, 5, 5))
+    between = locked[2:]
+    assert between == [(4, 5, 5, 5, 3)] * 2
+    store.resize((9, 9, 9))
+    assert locked[2:] == between and not store._reserved
+    assert store.to_time.data_ptr() != store.to_canonical.data_ptr()
+    store.reserve((9, 9, 9))  # they have that shape
+    assert not store._reserved
+
+
 def test_a_prefetched_frame_is_discarded_once_it_has_been_written(store: FrameStore) -> None:
     fetched = store.to_canonical[1], store.to_time[1]
     store._fetched = {1: fetched, 2: fetched}

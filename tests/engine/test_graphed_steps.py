@@ -33,7 +33,9 @@ from devrf.methods.devrf.settings import MotionSettings
 from devrf.ops.dispatch import Kind, using
 from devrf.ops.kernels import (
     adam,
+    color_network,
     compositing,
+    motion,
     photometric,
     pixel_rays,
     search,
@@ -93,7 +95,10 @@ def short_work(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(GraphedStep, "WARM_UP", 1)
 
 
-KERNELS = (adam, compositing, photometric, pixel_rays, search, trilinear, warped_depth)
+KERNELS = (
+    *(adam, color_network, compositing, motion, photometric),
+    *(pixel_rays, search, trilinear, warped_depth),
+)
 
 # Operations that wait for the device, or whose results have a shape that depends on data.
 WAITING = {
@@ -212,7 +217,7 @@ def learn(
 ) -> ScheduledStage:
     torch.manual_seed(3)
     stage = build()
-    stage.loop._capturer = lambda: capturer  # type: ignore[method-assign]
+    stage.loop.capturer = lambda: capturer  # type: ignore[method-assign]
     if capturer is not None:
         draw, prepare = stage.draw, stage.prepare
         stage.draw = lambda batch: watched(lambda: draw(batch))  # type: ignore[method-assign]
@@ -302,7 +307,7 @@ def test_before_a_capture_lists_have_been_long_enough_for_every_view(
     stage = moving(rest)
     assert isinstance(stage, DeformationStage)
     stage.schedule = replace(MOVING, sides=(3,), iterations_per_frame=(2,))
-    stage.loop._capturer = Noting  # type: ignore[assignment,method-assign]
+    stage.loop.capturer = Noting  # type: ignore[assignment,method-assign]
     trainer(max_epochs=1).fit(stage, datamodule=datamodule)
     first = ["view 0", "view 1", "measured", "view 0", "captured"]
     assert noted[:6] == [*first, "view 1"] and noted.count("captured") == 1

@@ -75,7 +75,7 @@ def memory(monkeypatch: pytest.MonkeyPatch) -> Memory:
     monkeypatch.setattr(CudaGraphCapture, "__init__", start)
     monkeypatch.setattr(CudaGraphCapture, "warm_up", lambda self, work: work())
     monkeypatch.setattr(CudaGraphCapture, "capture", captured)
-    monkeypatch.setattr(Loop, "_capturer", capturer)
+    monkeypatch.setattr(Loop, "capturer", capturer)
     monkeypatch.setattr(MicroBatching, "_accumulate", accumulate)
     monkeypatch.setattr(VoxelStage, "static_shape", lambda self, density: True)
     monkeypatch.setattr(SampleCapacity, "GRAIN", 64)

@@ -40,7 +40,8 @@ from devrf.cli.workers import launch_workers
 from devrf.engine.ddp import ManualDDP
 from devrf.errors import DevrfError
 from devrf.methods.devrf.appearance_learning import check_weights
-from devrf.methods.devrf.losses import MOTION_TERMS, PHOTOMETRIC_TERMS, WeightedLoss
+from devrf.methods.devrf.losses import MOTION_TERMS, PHOTOMETRIC_TERMS
+from devrf.methods.devrf.weighted_loss import WeightedLoss
 from devrf.ops.dispatch import using
 from devrf.viewer.settings import ViewerSettings
 

@@ -45,6 +45,8 @@ class FrameStore(nn.Module):
         # An empty tensor that is moved with the module: its device is the module's.
         self.register_buffer("here", torch.zeros(0), persistent=False)
         self._fetched: dict[int, Directions] = {}
+        # Page-locked memory for later resolutions.
+        self._reserved: list[Tensor] = []
         # One for good: the allocator keeps the memory of each stream apart.
         self._side: torch.cuda.Stream | None = None
 
@@ -142,10 +144,25 @@ class FrameStore(nn.Module):
             moved = self._empty(frames.shape, torch.float16 if half else torch.float32)
             setattr(self, name, moved.copy_(frames))
 
+    def reserve(self, shape: tuple[int, int, int]) -> None:
+        """Lock memory for grids of ``shape`` now, if frames rest in page-locked memory.
+
+        It takes seconds for gigabytes. :meth:`resize` to that shape then takes this memory.
+        """
+        kept = self.to_time
+        if self.on_host and torch.cuda.is_available() and kept.shape[1:4] != shape:
+            whole = (len(kept), *shape, 3)
+            self._reserved = [self._empty(whole, kept.dtype) for _ in NAMES]
+
     def _empty(self, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
         """An uninitialised tensor where displacements are kept."""
         if not self.on_host:
             return torch.empty(shape, dtype=dtype, device=self.here.device)
+        if self._reserved and (self._reserved[-1].shape, self._reserved[-1].dtype) == (
+            shape,
+            dtype,
+        ):
+            return self._reserved.pop()
         if torch.cuda.is_available():
             try:
                 return page_locked(shape, dtype)
@@ -162,8 +179,8 @@ class FrameStore(nn.Module):
         return self
 
     def __getstate__(self) -> dict[str, Any]:
-        """The state of a copy, without frames that are being fetched."""
-        return {**self.__dict__, "_fetched": {}, "_side": None}
+        """The state of a copy, without frames that are being fetched, or memory for others."""
+        return {**self.__dict__, "_fetched": {}, "_reserved": [], "_side": None}
 
     def _load_from_state_dict(
         self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any

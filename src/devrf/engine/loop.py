@@ -180,7 +180,7 @@ class Loop:
         if self._graphed is None:
             # Over every training view, so that the lists that are captured are long enough for all.
             warm_up = max(GraphedStep.WARM_UP, stage.view_cycle)
-            self._graphed = GraphedStep(work, self._capturer(), warm_up)
+            self._graphed = GraphedStep(work, self.capturer(), warm_up)
         graphed = self._graphed  # the attribute is reset if memory runs out in the step
         # A profiler cannot attribute a replayed graph to parts.
         with stage.optimizer.stepping_by(work if measured() else graphed):
@@ -193,9 +193,14 @@ class Loop:
         if graphed.failed:
             self.graphs = "off"  # one warning is enough
 
-    def _capturer(self) -> CudaGraphCapture | None:
-        """Captures iterations; None unless there is exactly one process, on a GPU."""
-        if self.graphs != "auto" or self._device.type != "cuda" or world_size() > 1:
+    def capturer(self) -> CudaGraphCapture | None:
+        """Captures work in graphs; None unless shapes are static, in one process on a GPU."""
+        if (
+            not self.capacities
+            or self.graphs != "auto"
+            or self._device.type != "cuda"
+            or world_size() > 1
+        ):
             return None
         if self._capture is None or self._capture.device != self._device:
             self._capture = CudaGraphCapture(self._device)

@@ -45,12 +45,13 @@ class NormalizedDevice:
         return box
 
     @property
-    def _slopes(self) -> tuple[float, float]:
+    def slopes(self) -> tuple[float, float]:
+        """2f/W and 2f/H."""
         return 2 * self.focal[0] / self.width, 2 * self.focal[1] / self.height
 
     def from_world(self, points: Tensor) -> Tensor:
         """NDC (..., 3) of world points (..., 3) with z < 0."""
-        sx, sy = self._slopes
+        sx, sy = self.slopes
         x, y, z = points.unbind(-1)
         return torch.stack([-sx * x / z, -sy * y / z, 1 + 2 * self.near / z], dim=-1)
 
@@ -59,7 +60,7 @@ class NormalizedDevice:
 
         What is at infinity comes out far away, at a finite distance.
         """
-        sx, sy = self._slopes
+        sx, sy = self.slopes
         x, y, z = points.unbind(-1)
         gap = z - 1
         depth = 2 * self.near / torch.where(gap == 0, -BEFORE_INFINITY, gap)
@@ -72,7 +73,7 @@ class NormalizedDevice:
         """
         o, d = rays.origins, rays.directions
         start = o + d * (-(self.near + o[:, 2:]) / d[:, 2:])
-        sx, sy = self._slopes
+        sx, sy = self.slopes
         origin = self.from_world(start)
         x = -sx * (d[:, 0] / d[:, 2] - start[:, 0] / start[:, 2])
         y = -sy * (d[:, 1] / d[:, 2] - start[:, 1] / start[:, 2])

@@ -8,6 +8,10 @@ Imports go down this list, never up:
 | ``adam`` | ``GridAdam``: the optimiser made of ``adam_step``'s steps |
 | ``search`` | ``find_samples``: visible samples of rays; ``select``: a subset of them |
 | ``adam_step`` | ``adam_step``, ``smooth_adam_step``: one step on one tensor |
+| ``color_network`` | ``listed_colors``, ``decode``: features and directions → RGB |
+| ``motion`` | ``motion_sum``: the cycle and the flow term |
+| ``photometric`` | ``photometric_sum``: the terms that compare rays with images |
+| ``pixel_rays`` | ``gather_pixels``: rays and truth of pixels; ``steps_in_box`` |
 | ``warped_depth`` | ``warped_depth``: points of a moment → canonical positions, optical depths |
 | ``trilinear`` | ``interpolate``: values of a grid between its points |
 | ``compositing`` | ``composite``, ``composite_segments``: weights; ``sum_segments``: sums |

@@ -14,9 +14,11 @@ from torch import Tensor
 
 from devrf.errors import DevrfError
 from devrf.ops.adam_step import AdamRule, adam_step, adam_steps, smooth_adam_step
+from devrf.ops.color_network import ColorNetwork, listed_colors
 from devrf.ops.compositing import composite_colors, composite_segments, sum_segments
 from devrf.ops.corners import Triple
 from devrf.ops.dispatch import Kind, using
+from devrf.ops.motion import ListedSamples, SeenEarlier, motion_sum
 from devrf.ops.photometric import photometric_sum
 from devrf.ops.pixel_rays import gather_pixels, steps_in_box
 from devrf.ops.search import Thresholds, find_samples, select_listed
@@ -221,6 +223,109 @@ def compositing_colors(draw: Draw) -> Results:
     return tuple(results)
 
 
+def color_network(draw: Draw) -> Results:
+    """Colours of listed samples; gradients of points, grid and network, or of points alone."""
+    results: list[Tensor] = []
+    for learned in (True, False):
+        shapes = (24, 5), (24,), (24, 15), (24, 24), (24,), (3, 24), (3,)
+        weights = [draw(*shape).requires_grad_(learned) for shape in shapes]
+        network = ColorNetwork(*[*weights, torch.tensor([1.0, 2.0]).to(draw.device)])
+        grid, points = draw(4, 3, 5, 5).requires_grad_(learned), draw.leaf(150, 3)
+        results += _colors(draw, grid, points, draw(6, 3), network, draw(150, 3), torch.float32)
+    return tuple(results)
+
+
+def reduced_color_network(draw: Draw) -> Results:
+    """The same at the paper's width in half precision, on numbers that it does not round.
+
+    Features and weights are small integers and quarters, the second layer is sparse. Gradients are
+    rounded, to three digits: they are small, so that the tolerance is a hundredth of them.
+    """
+    units, cells = 128, torch.tensor([3, 2, 4])
+    low, high = torch.tensor(_Box.low), torch.tensor(_Box.high)
+    middle = ((0.5 + 0.5 * draw(70, 3).cpu()) * (cells - 1e-3)).floor() + 0.5
+    shapes = (units, 5), (units,), (units, 3), (units, units), (units,), (3, units), (3,)
+    weights = [draw(*shape).sign() for shape in shapes]
+    diagonal = torch.eye(units, device=draw.device)
+    weights[3] *= diagonal + diagonal.roll(1, 0)
+    weights[5] /= units
+    network = ColorNetwork(*[*(weight.requires_grad_() for weight in weights), draw(0)])
+    points = (low + middle / cells * (high - low)).to(draw.device).requires_grad_()
+    bfloat16 = draw.device.type == "cuda" and torch.cuda.is_bf16_supported()
+    return _colors(
+        draw,
+        draw(4, 3, 5, 5).sign().requires_grad_(),
+        points,
+        draw(6, 3).sign(),
+        network,
+        0.2 * draw(70, 3),
+        torch.bfloat16 if bfloat16 else torch.float16,
+    )
+
+
+def _colors(
+    draw: Draw,
+    grid: Tensor,
+    points: Tensor,
+    directions: Tensor,
+    network: ColorNetwork,
+    upstream: Tensor,
+    precision: torch.dtype,
+) -> Results:
+    """Colours of samples with padding behind them, and the gradients of what requires one."""
+    places, used = len(points), int(0.9 * len(points))
+    ray, first = (2.99 + 2.99 * draw(places)).long(), torch.linspace(0, used, 7).long()
+    listed = grid, points, _Box(), directions, ray, first.to(draw.device), network, precision
+    colors = listed_colors(*listed)[:used]
+    leaves = [tensor for tensor in (grid, points, *network) if tensor.requires_grad]
+    return colors, *torch.autograd.grad((colors * upstream[:used]).sum(), leaves)
+
+
+def motion_terms(draw: Draw) -> Results:
+    """Samples of six rays: with and without flow, in world units and in NDC, and padding."""
+    results: list[Tensor] = []
+    for over_samples, ndc in ((None, None), (False, None), (True, (1.1, 1.3, 1.0))):
+        forward, before, seen = draw.leaf(4, 3, 5, 3), draw(4, 3, 5, 3), None
+        if over_samples is not None:
+            # Cameras that look at the box from 4 units away, turned a little.
+            poses = 0.1 * draw(2, 3, 4) + torch.eye(3, 4).to(draw.device)
+            poses[:, 2, 3] += 4
+            image = torch.tensor([0, 1, 1, 0, 1, 1]).to(draw.device)
+            seen = SeenEarlier(
+                3 * draw(6, 2),
+                draw(6) > -0.5,
+                8 + 8 * draw(6, 2),
+                image,
+                1 - image[:2],
+                poses,
+                20 + draw(2, 2),
+                8 + draw(2, 2),
+            )
+        samples = ListedSamples(
+            draw(150, 3),
+            draw.leaf(150, 3),
+            draw.leaf(150),
+            (2.99 + 2.99 * draw(150)).long(),
+            torch.arange(150, device=draw.device) < 140,
+        )
+        found = motion_sum(
+            samples,
+            forward,
+            before,
+            seen,
+            (10.0, 0.5),
+            box=_Box(),
+            over_samples=bool(over_samples),
+            ndc=ndc,
+        )
+        leaves = samples.canonical, samples.weight, forward
+        gradients = torch.autograd.grad(
+            3 * found.total, leaves, allow_unused=True, materialize_grads=True
+        )
+        results += [*found, *gradients]
+    return tuple(results)
+
+
 def total_variation(draw: Draw) -> Results:
     """The gradient added to entries that have one, and to all."""
     grid, gradient = 2 * draw(4, 3, 5, 3), draw(4, 3, 5, 3).clamp(min=0)
@@ -260,6 +365,9 @@ CASES: tuple[Case, ...] = (
     sample_search,
     compositing,
     compositing_colors,
+    color_network,
+    reduced_color_network,
+    motion_terms,
     total_variation,
     adam,
 )

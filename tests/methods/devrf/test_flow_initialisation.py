@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import torch
 
+from devrf.engine.graphs import Work
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
@@ -39,6 +43,31 @@ def test_three_views_of_a_shift_give_the_shift_and_the_way_back() -> None:
     assert (moved - tracks.canonical - SHIFT).norm(dim=1).mean() < 0.02
     back = field.warp(tracks.canonical + SHIFT, 1.0)
     assert (back - tracks.canonical).norm(dim=1).mean() < 0.03
+
+
+def test_steps_of_a_fit_can_be_replayed_and_give_the_same() -> None:
+    cameras, fields, done = three_cameras(), [], []
+
+    class Replaying:
+        """Runs the work again, as a graph does: on the same memory."""
+
+        def warm_up(self, work: Work) -> None:
+            done.append("warm")
+            work()
+
+        def capture(self, work: Work) -> Any:
+            done.append("captured")
+            return SimpleNamespace(replay=work)
+
+    capturer: Any = Replaying()
+    for each in (None, capturer):
+        fields.append(DeformationField(BOX, FrameClock((0.0, 1.0)), voxels=6**3))
+        start_from_tracks(fields[-1], 1, shifted_ball(cameras), cameras, steps=20, capturer=each)
+    assert done == ["warm", "warm", "warm", "captured"] * 2
+    for name in ("to_canonical", "to_time"):
+        found, expected = (getattr(field, name) for field in fields[::-1])
+        assert expected.abs().amax() > 0.05
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
 
 
 def test_wrong_flow_of_a_few_pixels_is_outvoted() -> None:

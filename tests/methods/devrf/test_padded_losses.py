@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
 import pytest
 import torch
@@ -13,7 +12,7 @@ from devrf.data.batch import RayBatch
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.methods.devrf.grid_warp import GridWarp
-from devrf.methods.devrf.losses import MOTION_TERMS, MotionPrediction, flow
+from devrf.methods.devrf.losses import FLOW_TERMS, MOTION_TERMS, MotionPrediction
 from devrf.methods.devrf.volume_rendering import VoxelOutput
 from devrf.rendering.sampling import Samples
 
@@ -93,7 +92,7 @@ class Case:
         )
 
 
-TERMS = {**MOTION_TERMS, "flow over samples": partial(flow, mean="samples")}
+TERMS = {**MOTION_TERMS, "flow over samples": FLOW_TERMS["samples"]}
 
 
 @pytest.mark.parametrize("name", list(TERMS))

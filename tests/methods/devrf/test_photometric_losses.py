@@ -16,13 +16,13 @@ from devrf.geometry.rays import Rays
 from devrf.methods.devrf.losses import (
     PHOTOMETRIC_TERMS,
     Prediction,
-    WeightedLoss,
     background_entropy,
     color_error,
     matte,
     per_sample_color,
 )
 from devrf.methods.devrf.volume_rendering import VoxelOutput
+from devrf.methods.devrf.weighted_loss import WeightedLoss
 from devrf.rendering.sampling import Samples
 
 RAY = torch.tensor([0, 0, 2])

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from devrf.geometry.box import Box
 from devrf.methods.devrf.color_decoder import ColorDecoder
 from devrf.methods.devrf.voxel_grid import VoxelGrid
+from devrf.ops.color_network import listed_colors
 
 # What a checkpoint holds beside the tensors and the box.
 SIZES = ("voxels", "base_voxels", "alpha_init", "planes", "aspect")
@@ -134,12 +135,18 @@ class CanonicalField(nn.Module):
         ray: Tensor,
         precision: torch.dtype = torch.float32,
         residual: Tensor | None = None,
+        first: Tensor | None = None,
     ) -> Tensor:
         """RGB (S, 3) at ``points`` (S, 3) on rays ``ray`` (S,) with ``viewdirs`` (R, 3).
 
         The decoder works in ``precision``; the result is in single precision. ``residual`` (S, 3)
-        is added before the sigmoid.
+        is added before the sigmoid. With ``first`` (R + 1,), where each ray's samples begin, the
+        samples may end in padding, whose colours mean nothing.
         """
+        if first is not None and residual is None and isinstance(self.decoder, ColorDecoder):
+            grid, network = self.color.values, self.decoder.network
+            listed = grid, points, self.box, viewdirs, ray, first, network
+            return listed_colors(*listed, precision)
         features = self.color(points, self.box)
         color: Tensor = self.decoder(features, viewdirs, ray, precision, residual)
         return color

@@ -26,7 +26,6 @@ from devrf.methods.devrf.grid_resolution import fitted_to
 from devrf.methods.devrf.losses import (
     PHOTOMETRIC_TERMS,
     Prediction,
-    WeightedLoss,
     total_variation_weight,
     visibility,
 )
@@ -41,6 +40,7 @@ from devrf.methods.devrf.settings import (
     Sampling,
 )
 from devrf.methods.devrf.voxel_stage import VoxelStage
+from devrf.methods.devrf.weighted_loss import WeightedLoss
 from devrf.ops.adam import GridAdam
 from devrf.rendering.occupancy import Occupancy, bounding_box, dilate
 from devrf.scenes.scene import CaptureName, Views

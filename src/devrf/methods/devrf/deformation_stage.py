@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import torch
@@ -31,13 +30,12 @@ from devrf.methods.devrf.elastic import occupied_cells
 from devrf.methods.devrf.flow_initialisation import follow, start_from_tracks
 from devrf.methods.devrf.frame_memory import rest_on_host
 from devrf.methods.devrf.losses import (
+    FLOW_TERMS,
     MOTION_TERMS,
     PRIORS,
     FlowMean,
     MotionGrid,
     MotionPrediction,
-    WeightedLoss,
-    flow,
     total_variation_weight,
     visibility,
 )
@@ -52,6 +50,7 @@ from devrf.methods.devrf.settings import (
     Precision,
 )
 from devrf.methods.devrf.voxel_stage import VoxelStage
+from devrf.methods.devrf.weighted_loss import WeightedLoss
 from devrf.ops.adam import GridAdam
 from devrf.scenes.scene import CaptureName, Views
 from devrf.system.profiling import span
@@ -113,7 +112,7 @@ class DeformationStage(VoxelStage):
         chosen = appearance or AppearanceSettings()
         self.appearance = AppearanceLearning(chosen, self.schedule, appearance_loss)
         weights.update(self.appearance.weights)
-        self.losses = WeightedLoss(MOTION_TERMS | {"flow": partial(flow, mean=flow_mean)}, weights)
+        self.losses = WeightedLoss(MOTION_TERMS | {"flow": FLOW_TERMS[flow_mean]}, weights)
         self._elastic = weights.get("elastic", 0.0)
         still = rest.model
         fields = still.canonical, still.occupancy
@@ -196,6 +195,8 @@ class DeformationStage(VoxelStage):
                 on_host=rest_on_host(self.trainer, model, self.schedule, motion),
                 half=motion.rests_half(self.trainer.strategy.root_device),
             )
+            # Before the clock of training starts.
+            self.field.frames.reserve(box.grid_shape(self.schedule.sides[-1] ** 3))
             recorded = self.scene.dynamic.train
             self.appearance.setup(model, self.field.clock, self._optimizer, recorded)
             if self.refinement.settings.iterations:
@@ -288,7 +289,8 @@ class DeformationStage(VoxelStage):
                 views, model, clock = self.views, self.scene_model, self.field.clock
                 pool, before = all_pixels(views, images_of(views, number)), clock.times[number - 1]
                 tracks = follow(model, views, pool, self.previous_images, before, self.generator)
-                start_from_tracks(self.field, number, tracks, views.cameras, model.space)
+                seen = tracks, views.cameras, model.space
+                start_from_tracks(self.field, number, *seen, capturer=self.loop.capturer())
                 # Each process has followed pixels of its own.
                 broadcast([self.field.to_canonical[number], self.field.to_time[number]])
 

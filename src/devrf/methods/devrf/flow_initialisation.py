@@ -14,6 +14,7 @@ from torch import Tensor
 
 from devrf.data.batch import PixelPool
 from devrf.engine.gathering import gather_batch
+from devrf.engine.graphs import CudaGraphCapture, GraphedStep
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.space import WORLD, Space
 from devrf.methods.devrf.deformation_field import DeformationField
@@ -98,6 +99,7 @@ def start_from_tracks(
     space: Space = WORLD,
     smoothness: float = 0.01,
     steps: int = 60,
+    capturer: CudaGraphCapture | None = None,
 ) -> None:
     """Fit a frame's two slices, copied from the frame before, to the tracks.
 
@@ -113,6 +115,7 @@ def start_from_tracks(
         space: the space that the field lives in.
         smoothness: weight of differences between neighbouring voxels' changes.
         steps: optimiser steps of each fit.
+        capturer: captures a step of each fit in a CUDA graph; None: steps are done one by one.
     """
     if field.still_outside:
         tracks = tracks[field.box.contains(tracks.canonical)]
@@ -128,7 +131,7 @@ def start_from_tracks(
         pixel, _ = cameras.project(tracks.camera, space.to_world(points))
         return pixel - tracks.pixel
 
-    forward += _fit(misses, forward, scale, smoothness, steps)
+    forward += _fit(misses, forward, scale, smoothness, steps, capturer)
     arrived = tracks.canonical + interpolate(forward, coords)
     there = field.box.to_grid(arrived, field.shape)
 
@@ -136,7 +139,7 @@ def start_from_tracks(
         returned = arrived + interpolate(backward + change, there)
         return (returned - tracks.canonical) * scale
 
-    backward += _fit(errs, backward, scale, smoothness, steps)
+    backward += _fit(errs, backward, scale, smoothness, steps, capturer)
     field.frames.write(frame, (backward, forward))
 
 
@@ -153,7 +156,12 @@ def _pixels_per_unit(tracks: Tracks, cameras: Cameras, space: Space, small: floa
 
 @torch.enable_grad()
 def _fit(
-    residual: Callable[[Tensor], Tensor], like: Tensor, scale: float, smoothness: float, steps: int
+    residual: Callable[[Tensor], Tensor],
+    like: Tensor,
+    scale: float,
+    smoothness: float,
+    steps: int,
+    capturer: CudaGraphCapture | None,
 ) -> Tensor:
     """The smooth change of a grid (X, Y, Z, 3) that makes ``residual(change)`` small.
 
@@ -163,17 +171,29 @@ def _fit(
         scale: pixels per unit of the grid's values.
         smoothness: weight of the squared differences between neighbours, in pixels.
         steps: Adam steps; the rate falls linearly from half a pixel a step.
+        capturer: as for :func:`start_from_tracks`.
     """
-    change = torch.zeros_like(like).requires_grad_()
-    optimizer = torch.optim.Adam([change], lr=0.5 / scale, fused=change.is_cuda)
-    decay = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda n: 1 - n / steps)
-    for _ in range(steps):
-        optimizer.zero_grad()
+    change, fastest = torch.zeros_like(like).requires_grad_(), 0.5 / scale
+    # A graph reads the rate on the device.
+    rate = fastest if capturer is None else torch.full((), fastest, device=like.device)
+    on_gpu = change.is_cuda
+    optimizer = torch.optim.Adam([change], lr=rate, fused=on_gpu, capturable=on_gpu)
+
+    def step() -> None:
+        optimizer.zero_grad(set_to_none=capturer is None)
         missed = residual(change)
         error = torch.nn.functional.huber_loss(missed, torch.zeros_like(missed), delta=1.0)
         rough = sum(change.diff(dim=axis).square().sum() for axis in range(3)) * scale**2
         total: Tensor = error + smoothness * rough / like.shape[:3].numel()
         total.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
-        decay.step()
+
+    graphed = GraphedStep(step, capturer)
+    for number in range(steps):
+        now = fastest * (1 - number / steps)
+        if isinstance(rate, Tensor):
+            rate.fill_(now)
+        else:
+            optimizer.param_groups[0]["lr"] = now
+        graphed()
     return change.detach()

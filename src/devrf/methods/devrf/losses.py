@@ -1,29 +1,25 @@
-"""The losses: terms that compare rays with images, terms that constrain the motion, their sum.
+"""The terms of the losses: those that compare rays with images, those that constrain the motion.
 
 See docs/method.md#photometric-losses and docs/method.md#motion-losses.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, Literal, TypeVar
+from functools import partial
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 from devrf.data.batch import RayBatch
-from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.space import WORLD, Space
 from devrf.methods.devrf.bending import bending_energy
 from devrf.methods.devrf.elastic import elastic_energy
 from devrf.methods.devrf.volume_rendering import VoxelOutput, Warp
-from devrf.ops.dispatch import triton_runs
-from devrf.ops.photometric import TERMS, photometric_sum
-
-Predicted = TypeVar("Predicted")
 
 # What the flow loss is a mean over.
 FlowMean = Literal["rays", "samples"]
@@ -150,6 +146,13 @@ def flow(prediction: MotionPrediction, mean: FlowMean = "rays") -> Tensor:
     return total / (2 * output.count_on(batch.flow_valid)).clamp(min=1)
 
 
+# The flow loss by what it is a mean over.
+FLOW_TERMS: dict[FlowMean, Callable[[MotionPrediction], Tensor]] = {
+    "rays": flow,
+    "samples": partial(flow, mean="samples"),
+}
+
+
 def elastic(prediction: MotionPrediction) -> Tensor:
     """L_elastic: how much the forward slice stretches matter (docs/method.md#elastic)."""
     grid = prediction.grid
@@ -218,64 +221,5 @@ MOTION_TERMS: dict[str, Callable[[MotionPrediction], Tensor]] = {
     "bending": bending,
     "residual": residual,
 }
-
-
 # The terms that look at the forward slice itself, where there is matter.
 PRIORS = ("elastic", "bending")
-
-
-@dataclass(frozen=True)
-class WeightedLoss(Generic[Predicted]):
-    """Σ weight · term over the terms whose weight is not zero; the others are not computed.
-
-    Attributes:
-        terms: what can be computed, by name: prediction → unweighted scalar.
-        weights: how much each counts.
-    """
-
-    terms: Mapping[str, Callable[[Predicted], Tensor]]
-    weights: Mapping[str, float]
-
-    def __post_init__(self) -> None:
-        unknown = sorted(set(self.weights) - set(self.terms))
-        if unknown:
-            known = ", ".join(sorted(self.terms))
-            raise DevrfError(f"loss: unknown term {unknown[0]!r}; the terms are {known}")
-
-    def __call__(self, prediction: Predicted) -> tuple[Tensor, dict[str, Tensor]]:
-        """The weighted sum, and each term's unweighted value by name, detached."""
-        counted = {name: weight for name, weight in self.weights.items() if weight}
-        together = self._photometric(prediction, counted)
-        values = {} if together is None else together[1]
-        apart = {name: self.terms[name](prediction) for name in counted if name not in values}
-        total: Tensor | float = 0.0 if together is None else together[0]
-        for name, value in apart.items():
-            total = total + counted[name] * value
-        if not isinstance(total, Tensor):
-            raise DevrfError("loss: every weight is zero; at least one term must count")
-        return total, {**values, **{name: value.detach() for name, value in apart.items()}}
-
-    def _photometric(
-        self, prediction: Predicted, counted: Mapping[str, float]
-    ) -> tuple[Tensor, dict[str, Tensor]] | None:
-        """The photometric terms' weighted sum and values, where one kernel computes them all."""
-        if not isinstance(prediction, Prediction):
-            return None
-        output, batch = prediction.output, prediction.batch
-        if output.first is None or not triton_runs(output.color, output.sample_color):
-            return None
-        names: dict[object, str] = {self.terms[name]: name for name in counted}
-        functions = [PHOTOMETRIC_TERMS[name] for name in TERMS]
-        weights = [counted[names[term]] if term in names else 0.0 for term in functions]
-        found = photometric_sum(
-            output.color,
-            output.transmittance,
-            output.weight,
-            output.sample_color,
-            output.first,
-            batch.color,
-            batch.alpha,
-            weights,
-        )
-        each = zip(functions, found.terms.unbind(), strict=True)
-        return found.total, {names[term]: value for term, value in each if term in names}

@@ -10,11 +10,12 @@ from torch import Tensor, nn
 
 from devrf.data.batch import PixelPool, Pixels
 from devrf.errors import DevrfError
-from devrf.methods.devrf.losses import PHOTOMETRIC_TERMS, Prediction, WeightedLoss, visibility
+from devrf.methods.devrf.losses import PHOTOMETRIC_TERMS, Prediction, visibility
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.pixel_selection import canonical_pool, frame_pools
 from devrf.methods.devrf.settings import FINE_LOSS, CanonicalRates
 from devrf.methods.devrf.voxel_stage import VoxelStage
+from devrf.methods.devrf.weighted_loss import WeightedLoss
 from devrf.rendering.occupancy import Occupancy, dilate
 from devrf.scenes.scene import Views
 from devrf.system.profiling import span

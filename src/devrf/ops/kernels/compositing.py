@@ -18,7 +18,7 @@ from torch.autograd.function import once_differentiable
 from devrf.ops.kernels.cells import load_vectors, store_vectors
 from devrf.ops.kernels.launch import launch
 from devrf.ops.kernels.numbers import opacity
-from devrf.ops.kernels.padding import PADDING, padding_programs
+from devrf.ops.kernels.padding import PADDING, padding_places, padding_programs
 
 # A program is one warp, which processes a block of samples at a time, one for each thread.
 WARP = {"BLOCK": 32, "num_warps": 1}
@@ -29,10 +29,17 @@ class Composite(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, depth: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
-        rays = len(first) - 1
-        weights, transmittance = torch.zeros_like(depth), torch.zeros_like(depth)
+        rays, places = len(first) - 1, len(depth)
+        weights, transmittance = torch.empty_like(depth), torch.empty_like(depth)
         end = depth.new_empty(rays)
-        launch(composite_kernel, rays, depth, depth, first, weights, transmittance, end, **WARP)
+        launch(
+            composite_kernel,
+            rays + padding_programs(places),
+            depth,
+            *(depth, first, weights, transmittance, end, rays, places),
+            PADDING=PADDING,
+            **WARP,
+        )
         ctx.save_for_backward(first, weights, transmittance, end)
         return weights, end
 
@@ -40,10 +47,17 @@ class Composite(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, weights_gradient: Tensor, end_gradient: Tensor) -> tuple[Tensor, None]:
         first, weights, transmittance, end = ctx.saved_tensors
-        into = torch.zeros_like(weights)
+        into, rays, places = torch.empty_like(weights), len(end), len(weights)
         known = (first, weights, transmittance, end)
         upstream = (weights_gradient.contiguous(), end_gradient.contiguous())
-        launch(composite_backward_kernel, len(end), into, *known, *upstream, into, **WARP)
+        launch(
+            composite_backward_kernel,
+            rays + padding_programs(places),
+            into,
+            *(*known, *upstream, into, rays, places),
+            PADDING=PADDING,
+            **WARP,
+        )
         return into, None
 
 
@@ -97,12 +111,13 @@ class CompositeColors(torch.autograd.Function):
         )
         ctx.save_for_backward(weights, colors, first, background)
         ctx.apart = apart
+        ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(depth)
         return image, depth
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, upstream: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, upstream: Tensor, _: None) -> tuple[Tensor | None, ...]:
         weights, colors, first, background = ctx.saved_tensors
         rays, places = len(first) - 1, len(weights)
         into = torch.empty_like(weights), torch.empty_like(colors), colors.new_empty(rays)
@@ -123,52 +138,79 @@ def _width(values: Tensor) -> dict[str, int]:
     return {"CHANNELS": channels, "PADDED": triton.next_power_of_2(channels)}
 
 
-@triton.jit
-def composite_kernel(depth, first, weights, transmittance, ends, BLOCK: tl.constexpr):
-    """w_i = T_i·α_i with T_i = exp(−Σ_{j<i} τ_j), and T_end."""
+@triton.jit(do_not_specialize=["rays", "places"])
+def composite_kernel(
+    depth,
+    first,
+    weights,
+    transmittance,
+    ends,
+    rays,
+    places,
+    BLOCK: tl.constexpr,
+    PADDING: tl.constexpr,
+):
+    """w_i = T_i·α_i with T_i = exp(−Σ_{j<i} τ_j), and T_end; w is 0 in the padding."""
     ray = tl.program_id(0)
-    begin = tl.load(first + ray)
-    stop = tl.load(first + ray + 1)
-    lane = tl.arange(0, BLOCK)
-    gone = 0.0
-    start = begin
-    while start < stop:
-        at = start + lane
-        here = at < stop
-        tau = tl.load(depth + at, mask=here, other=0.0)
-        previous = tl.load(depth + at - 1, mask=here & (lane > 0), other=0.0)
-        left = tl.exp(-(gone + tl.cumsum(previous, 0)))
-        tl.store(transmittance + at, left, mask=here)
-        tl.store(weights + at, left * opacity(tau), mask=here)
-        gone += tl.sum(tau, 0)
-        start += BLOCK
-    tl.store(ends + ray, tl.exp(-gone))
+    if ray < rays:
+        start = tl.load(first + ray)
+        stop = tl.load(first + ray + 1)
+        lane = tl.arange(0, BLOCK)
+        gone = 0.0
+        while start < stop:
+            at = start + lane
+            here = at < stop
+            tau = tl.load(depth + at, mask=here, other=0.0)
+            previous = tl.load(depth + at - 1, mask=here & (lane > 0), other=0.0)
+            left = tl.exp(-(gone + tl.cumsum(previous, 0)))
+            tl.store(transmittance + at, left, mask=here)
+            tl.store(weights + at, left * opacity(tau), mask=here)
+            gone += tl.sum(tau, 0)
+            start += BLOCK
+        tl.store(ends + ray, tl.exp(-gone))
+    else:
+        place, empty = padding_places(ray - rays, tl.load(first + rays), places, PADDING)
+        tl.store(weights + place, tl.zeros((PADDING,), dtype=tl.float32), mask=empty)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["rays", "places"])
 def composite_backward_kernel(
-    first, weights, transmittance, ends, weights_gradient, end_gradient, into, BLOCK: tl.constexpr
+    first,
+    weights,
+    transmittance,
+    ends,
+    weights_gradient,
+    end_gradient,
+    into,
+    rays,
+    places,
+    BLOCK: tl.constexpr,
+    PADDING: tl.constexpr,
 ):
     """∂/∂τ_i = g_i·T_{i+1} − Σ_{j>i} g_j·w_j − g_end·T_end, from the back to the front."""
     ray = tl.program_id(0)
-    begin = tl.load(first + ray)
-    stop = tl.load(first + ray + 1)
-    lane = tl.arange(0, BLOCK)
-    last = tl.load(end_gradient + ray) * tl.load(ends + ray)
-    start = begin + (tl.cdiv(stop - begin, BLOCK) - 1) * BLOCK
-    while start >= begin:
-        at = start + lane
-        here = at < stop
-        gradient = tl.load(weights_gradient + at, mask=here, other=0.0)
-        weight = tl.load(weights + at, mask=here, other=0.0)
-        left = tl.load(transmittance + at, mask=here, other=0.0) - weight
-        beyond = here & (at + 1 < stop) & (lane < BLOCK - 1)
-        follower = tl.load(weights_gradient + at + 1, mask=beyond, other=0.0)
-        follower *= tl.load(weights + at + 1, mask=beyond, other=0.0)
-        behind = last + tl.cumsum(follower, 0, reverse=True)
-        tl.store(into + at, gradient * left - behind, mask=here)
-        last += tl.sum(gradient * weight, 0)
-        start -= BLOCK
+    if ray < rays:
+        begin = tl.load(first + ray)
+        stop = tl.load(first + ray + 1)
+        lane = tl.arange(0, BLOCK)
+        last = tl.load(end_gradient + ray) * tl.load(ends + ray)
+        start = begin + (tl.cdiv(stop - begin, BLOCK) - 1) * BLOCK
+        while start >= begin:
+            at = start + lane
+            here = at < stop
+            gradient = tl.load(weights_gradient + at, mask=here, other=0.0)
+            weight = tl.load(weights + at, mask=here, other=0.0)
+            left = tl.load(transmittance + at, mask=here, other=0.0) - weight
+            beyond = here & (at + 1 < stop) & (lane < BLOCK - 1)
+            follower = tl.load(weights_gradient + at + 1, mask=beyond, other=0.0)
+            follower *= tl.load(weights + at + 1, mask=beyond, other=0.0)
+            behind = last + tl.cumsum(follower, 0, reverse=True)
+            tl.store(into + at, gradient * left - behind, mask=here)
+            last += tl.sum(gradient * weight, 0)
+            start -= BLOCK
+    else:
+        place, empty = padding_places(ray - rays, tl.load(first + rays), places, PADDING)
+        tl.store(into + place, tl.zeros((PADDING,), dtype=tl.float32), mask=empty)
 
 
 @triton.jit
@@ -309,8 +351,7 @@ def colors_backward_kernel(
             store_vectors(into_colors, at * 3, red * weight, green * weight, blue * weight, here)
             start += BLOCK
     else:
-        place = (program - rays).to(tl.int64) * PADDING + tl.arange(0, PADDING)
-        empty = (place >= tl.load(first + rays)) & (place < places)
+        place, empty = padding_places(program - rays, tl.load(first + rays), places, PADDING)
         nothing = tl.zeros((PADDING,), dtype=tl.float32)
         tl.store(into_weights + place, nothing, mask=empty)
         store_vectors(into_colors, place * 3, nothing, nothing, nothing, empty)

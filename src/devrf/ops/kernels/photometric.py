@@ -13,7 +13,7 @@ from torch.autograd.function import once_differentiable
 
 from devrf.ops.kernels.cells import load_vectors, store_vectors
 from devrf.ops.kernels.launch import launch
-from devrf.ops.kernels.padding import PADDING, padding_programs
+from devrf.ops.kernels.padding import PADDING, padding_places, padding_programs
 
 WARP = {"BLOCK": 32, "num_warps": 1}
 # A transmittance is at least so far from 0 and 1 in the entropy; as in devrf.ops.photometric.
@@ -50,12 +50,13 @@ class PhotometricInOnePass(torch.autograd.Function):
         total, terms = sums[4], sums[:4]
         ctx.save_for_backward(*known)
         ctx.weights, ctx.has_alpha = weights, has_alpha
+        ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(terms)
         return total, terms
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, upstream: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, upstream: Tensor, _: None) -> tuple[Tensor | None, ...]:
         image, transmittance, sample_color, *_ = known = ctx.saved_tensors
         into = torch.empty_like(image), torch.empty_like(transmittance)
         colors = torch.empty_like(sample_color)
@@ -192,7 +193,6 @@ def photometric_backward_kernel(
             store_vectors(into_color, at * 3, r, g, b, here)
             start += BLOCK
     else:
-        place = (program - rays).to(tl.int64) * PADDING + tl.arange(0, PADDING)
-        empty = (place >= tl.load(first + rays)) & (place < places)
+        place, empty = padding_places(program - rays, tl.load(first + rays), places, PADDING)
         nothing = tl.zeros((PADDING,), dtype=tl.float32)
         store_vectors(into_color, place * 3, nothing, nothing, nothing, empty)

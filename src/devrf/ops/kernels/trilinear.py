@@ -77,6 +77,82 @@ def _tile(channels: int) -> dict[str, int]:
     return {"CHANNELS": channels, "PADDED": padded, "BLOCK": max(1, numbers // padded)}
 
 
+@triton.jit
+def rows_between(
+    grid,
+    cx,
+    cy,
+    cz,
+    x,
+    y,
+    z,
+    here,
+    CHANNELS: tl.constexpr,
+    PADDED: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """Σ_corners weight · grid[corner], a tile (BLOCK, PADDED); 0 behind the channels."""
+    i, fx = cell(cx, x)
+    j, fy = cell(cy, y)
+    k, fz = cell(cz, z)
+    channel = tl.arange(0, PADDED)
+    wanted = here[:, None] & (channel < CHANNELS)[None, :]
+    total = tl.zeros((BLOCK, PADDED), dtype=tl.float32)
+    for corner in tl.static_range(8):
+        row = corner_row(i, j, k, y, z, corner)
+        weight = corner_weight(fx, fy, fz, corner)
+        place = row[:, None] * CHANNELS + channel[None, :]
+        total += weight[:, None] * tl.load(grid + place, mask=wanted, other=0.0)
+    return total
+
+
+@triton.jit
+def spread_rows(
+    grid,
+    grid_gradient,
+    change,
+    cx,
+    cy,
+    cz,
+    x,
+    y,
+    z,
+    here,
+    NEEDS_GRID: tl.constexpr,
+    NEEDS_COORDS: tl.constexpr,
+    CHANNELS: tl.constexpr,
+    PADDED: tl.constexpr,
+):
+    """Scatter weight · change (BLOCK, PADDED) to the corners; slopes along the axes."""
+    i, fx = cell(cx, x)
+    j, fy = cell(cy, y)
+    k, fz = cell(cz, z)
+    channel = tl.arange(0, PADDED)
+    wanted = here[:, None] & (channel < CHANNELS)[None, :]
+    # Padding has no gradient; atomic additions of its zeros to one place would be serialised.
+    changed = wanted & (tl.max(tl.abs(change), axis=1) > 0.0)[:, None]
+    along_x = fx * 0.0
+    along_y = fx * 0.0
+    along_z = fx * 0.0
+    for corner in tl.static_range(8):
+        row = corner_row(i, j, k, y, z, corner)
+        wx = share(fx, corner & 4)
+        wy = share(fy, corner & 2)
+        wz = share(fz, corner & 1)
+        place = row[:, None] * CHANNELS + channel[None, :]
+        if NEEDS_GRID:
+            tl.atomic_add(
+                grid_gradient + place, (wx * wy * wz)[:, None] * change, mask=changed, sem="relaxed"
+            )
+        if NEEDS_COORDS:
+            value = tl.load(grid + place, mask=wanted, other=0.0)
+            agreed = tl.sum(value * change, axis=1)
+            along_x += wy * wz * (agreed if corner & 4 else -agreed)
+            along_y += wx * wz * (agreed if corner & 2 else -agreed)
+            along_z += wx * wy * (agreed if corner & 1 else -agreed)
+    return along_x * inside(cx, x), along_y * inside(cy, y), along_z * inside(cz, z)
+
+
 @triton.jit(do_not_specialize=["count", "x", "y", "z"])
 def interpolate_kernel(
     grid,
@@ -94,17 +170,9 @@ def interpolate_kernel(
     point = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = point < count
     cx, cy, cz = load_vectors(coords, point.to(tl.int64) * 3, here)
-    i, fx = cell(cx, x)
-    j, fy = cell(cy, y)
-    k, fz = cell(cz, z)
+    total = rows_between(grid, cx, cy, cz, x, y, z, here, CHANNELS, PADDED, BLOCK)
     channel = tl.arange(0, PADDED)
     wanted = here[:, None] & (channel < CHANNELS)[None, :]
-    total = tl.zeros((BLOCK, PADDED), dtype=tl.float32)
-    for corner in tl.static_range(8):
-        row = corner_row(i, j, k, y, z, corner)
-        weight = corner_weight(fx, fy, fz, corner)
-        place = row[:, None] * CHANNELS + channel[None, :]
-        total += weight[:, None] * tl.load(grid + place, mask=wanted, other=0.0)
     into = point.to(tl.int64)[:, None] * CHANNELS + channel[None, :]
     tl.store(out + into, total, mask=wanted)
 
@@ -131,36 +199,25 @@ def interpolate_backward_kernel(
     here = point < count
     at = point.to(tl.int64) * 3
     cx, cy, cz = load_vectors(coords, at, here)
-    i, fx = cell(cx, x)
-    j, fy = cell(cy, y)
-    k, fz = cell(cz, z)
     channel = tl.arange(0, PADDED)
     wanted = here[:, None] & (channel < CHANNELS)[None, :]
     from_ = point.to(tl.int64)[:, None] * CHANNELS + channel[None, :]
     change = tl.load(upstream + from_, mask=wanted, other=0.0)
-    # Padding has no gradient; atomic additions of its zeros to one place would be serialised.
-    changed = wanted & (tl.max(tl.abs(change), axis=1) > 0.0)[:, None]
-    along_x = fx * 0.0
-    along_y = fx * 0.0
-    along_z = fx * 0.0
-    for corner in tl.static_range(8):
-        row = corner_row(i, j, k, y, z, corner)
-        wx = share(fx, corner & 4)
-        wy = share(fy, corner & 2)
-        wz = share(fz, corner & 1)
-        place = row[:, None] * CHANNELS + channel[None, :]
-        if NEEDS_GRID:
-            tl.atomic_add(
-                grid_gradient + place, (wx * wy * wz)[:, None] * change, mask=changed, sem="relaxed"
-            )
-        if NEEDS_COORDS:
-            value = tl.load(grid + place, mask=wanted, other=0.0)
-            agreed = tl.sum(value * change, axis=1)
-            along_x += wy * wz * (agreed if corner & 4 else -agreed)
-            along_y += wx * wz * (agreed if corner & 2 else -agreed)
-            along_z += wx * wy * (agreed if corner & 1 else -agreed)
+    along_x, along_y, along_z = spread_rows(
+        grid,
+        grid_gradient,
+        change,
+        cx,
+        cy,
+        cz,
+        x,
+        y,
+        z,
+        here,
+        NEEDS_GRID,
+        NEEDS_COORDS,
+        CHANNELS,
+        PADDED,
+    )
     if NEEDS_COORDS:
-        along_x *= inside(cx, x)
-        along_y *= inside(cy, y)
-        along_z *= inside(cz, z)
         store_vectors(coords_gradient, at, along_x, along_y, along_z, here)

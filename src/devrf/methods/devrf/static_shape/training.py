@@ -86,7 +86,7 @@ def render_static(
         weight = weight.index_select(0, chosen.index) * chosen.present
     with span("decoder"):
         residual = None if appearance is None else appearance(canonical)
-        color = field.rgb(canonical, rays.viewdirs, samples.ray, precision, residual)
+        color = field.rgb(canonical, rays.viewdirs, samples.ray, precision, residual, chosen.first)
     with span("compositing"):
         listed = weight, color, samples.distance, chosen.first
         image, depth = composite_colors(*listed, transmittance, background)

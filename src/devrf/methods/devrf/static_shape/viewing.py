@@ -77,7 +77,7 @@ class ListRenderer:
         precision = torch.float16 if self.half and tau.is_cuda else torch.float32
         points, ray = canonical[significant], found.ray[significant]
         residual = None if appearance is None else appearance(points)
-        color = field.rgb(points, rays.viewdirs, ray, precision, residual)
+        color = field.rgb(points, rays.viewdirs, ray, precision, residual, chosen.first)
         distance = found.distance[significant, None]
         seen = sum_segments(
             weight[significant],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from devrf.methods.devrf.color_decoder import RowOfRay
+from devrf.ops.color_network import RowOfRay
 
 
 def test_a_rays_gradient_is_summed_without_losing_digits() -> None:

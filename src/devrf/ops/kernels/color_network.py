@@ -1,0 +1,579 @@
+"""The colour network on listed samples: features, layers and sigmoid of a block in one program.
+
+Products are those of tensor cores, summed in single precision. The backward pass computes the
+layers again, in one launch for what samples lead to and in another for the weights. A program's
+registers would not hold the second layer: it is taken in shares of its units.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from devrf.ops.corners import Corners, scales, shape_of
+from devrf.ops.kernels.cells import load_vectors, store_vectors
+from devrf.ops.kernels.launch import launch
+from devrf.ops.kernels.numbers import sigmoid
+from devrf.ops.kernels.trilinear import rows_between, spread_rows
+
+if TYPE_CHECKING:
+    from devrf.ops.color_network import ColorNetwork
+
+# Samples of a block, and units of the second layer that are computed at a time.
+BLOCK, SHARE = 64, 32
+PRECISIONS = {torch.float32: tl.float32, torch.bfloat16: tl.bfloat16, torch.float16: tl.float16}
+# The least side of a matrix that tensor cores multiply.
+LEAST = 16
+
+
+def colors_in_one_pass(
+    grid: Tensor,
+    points: Tensor,
+    box: Corners,
+    viewdirs: Tensor,
+    ray: Tensor,
+    first: Tensor,
+    network: ColorNetwork,
+    precision: torch.dtype,
+    buffers: Sequence[Tensor | None],
+) -> Tensor:
+    """As devrf.ops.color_network.listed_colors.
+
+    ``buffers`` are the gradients that grid and weights have already; None for those without one.
+    """
+    *weights, octaves = network
+    known = tuple(tensor.contiguous() for tensor in (viewdirs, ray, first, octaves))
+    numbers = (*box.low, *scales(box, shape_of(grid)), *shape_of(grid))
+    units, encoded = weights[2].shape
+    sizes = {
+        "CHANNELS": grid.shape[3],
+        "PADDED": _padded(grid.shape[3]),
+        "DIRECTIONS": encoded,
+        "ENCODED": _padded(encoded),
+        "ANGLES": max(1, (encoded - 3) // 2),
+        "WIDTH": units,
+        "UNITS": _padded(units),
+        "SHARE": min(SHARE, _padded(units)),
+        "PRECISION": PRECISIONS[precision],
+        "BLOCK": BLOCK,
+    }
+    colors: Tensor = ListedColors.apply(
+        points.contiguous(), known, numbers, sizes, buffers, grid.contiguous(), *weights
+    )
+    return colors
+
+
+def _padded(length: int) -> int:
+    return max(LEAST, int(triton.next_power_of_2(length)))
+
+
+class ListedColors(torch.autograd.Function):
+    """As devrf.ops.color_network.listed_colors."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        points: Tensor,
+        known: Sequence[Tensor],
+        numbers: Sequence[float],
+        sizes: dict[str, Any],
+        buffers: Sequence[Tensor | None],
+        grid: Tensor,
+        *learned: Tensor,
+    ) -> Tensor:
+        weights = [weight.contiguous() for weight in learned]
+        viewdirs, ray, first, octaves = known
+        given = (viewdirs, ray, first, octaves, *weights)
+        places, rays = len(points), len(first) - 1
+        features, colors = grid.new_empty(places, grid.shape[3]), torch.empty_like(points)
+        launch(
+            color_network_kernel,
+            triton.cdiv(places, BLOCK),
+            points,
+            *(*given, points, grid, features, colors, places, rays, *numbers),
+            **sizes,
+            num_warps=8,
+        )
+        ctx.save_for_backward(*given, points, grid, features, colors)
+        ctx.numbers, ctx.sizes, ctx.buffers = numbers, sizes, buffers
+        return colors
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Any, ...]:
+        *given, points, grid, features, colors = ctx.saved_tensors
+        learned, asked = (grid, *given[4:]), ctx.needs_input_grad
+        known = (*given, features, colors, upstream.contiguous())
+        into, gradients, needs = [], [], []
+        for tensor, need, buffer in zip(learned, asked[5:], ctx.buffers, strict=True):
+            own = torch.zeros_like(tensor) if need and buffer is None else None
+            gradients.append(own)
+            needs.append(need or buffer is not None)
+            # Any pointer where no gradient is needed.
+            into.append(buffer if buffer is not None else tensor if own is None else own)
+        rays, blocks = len(given[2]) - 1, int(triton.cdiv(len(points), BLOCK))
+        moved = torch.zeros_like(points) if asked[0] else None
+        if needs[0] or moved is not None:
+            launch(
+                color_samples_backward_kernel,
+                blocks,
+                points,
+                *(*known, points, grid, points if moved is None else moved, into[0]),
+                *(rays, *ctx.numbers),
+                NEEDS_POINTS=moved is not None,
+                NEEDS_GRID=needs[0],
+                **ctx.sizes,
+                num_warps=8,
+            )
+        if any(needs[1:]):
+            programs = min(blocks, _processors(points.device))
+            launch(
+                color_weights_backward_kernel,
+                programs * (ctx.sizes["UNITS"] // ctx.sizes["SHARE"]),
+                points,
+                *(*known, *into[1:], rays, programs),
+                NEEDS_DIRECTIONS=needs[3],
+                **ctx.sizes,
+                num_warps=8,
+            )
+        return moved, None, None, None, None, *gradients
+
+
+def _processors(device: torch.device) -> int:
+    """How many programs work at the same time; on a CPU more than one, so that tests add sums."""
+    if device.type != "cuda":
+        return 2
+    return int(torch.cuda.get_device_properties(device).multi_processor_count)
+
+
+@triton.jit
+def product(left, right, PRECISION: tl.constexpr):
+    """A matrix product of numbers in ``PRECISION``, summed in single precision."""
+    return tl.dot(left.to(PRECISION), right.to(PRECISION), input_precision="ieee")
+
+
+@triton.jit
+def matrix(weight, row, column, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
+    """A padded tile of weights (ROWS, COLUMNS)."""
+    there = (row < ROWS)[:, None] & (column < COLUMNS)[None, :]
+    return tl.load(weight + row[:, None] * COLUMNS + column[None, :], mask=there, other=0.0)
+
+
+@triton.jit
+def add_matrix(into, change, row, column, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
+    """Add a padded tile to a gradient (ROWS, COLUMNS)."""
+    there = (row < ROWS)[:, None] & (column < COLUMNS)[None, :]
+    tl.atomic_add(into + row[:, None] * COLUMNS + column[None, :], change, mask=there)
+
+
+@triton.jit
+def encoded_directions(
+    viewdirs,
+    octaves,
+    ray,
+    here,
+    DIRECTIONS: tl.constexpr,
+    ENCODED: tl.constexpr,
+    ANGLES: tl.constexpr,
+):
+    """d, sin(2^k d), cos(2^k d) of each sample's ray: a tile (BLOCK, ENCODED)."""
+    column = tl.arange(0, ENCODED)
+    angle = tl.maximum(column - 3, 0) % ANGLES
+    axis = tl.where(column < 3, column, angle % 3)
+    wanted = here[:, None] & (column < DIRECTIONS)[None, :]
+    along = tl.load(viewdirs + ray[:, None] * 3 + axis[None, :], mask=wanted, other=0.0)
+    times = tl.load(octaves + angle // 3, mask=(column >= 3) & (column < DIRECTIONS), other=1.0)
+    turned = along * times[None, :]
+    waves = tl.where((column < 3 + ANGLES)[None, :], tl.sin(turned), tl.cos(turned))
+    return tl.where(wanted, tl.where((column < 3)[None, :], along, waves), 0.0)
+
+
+@triton.jit
+def lower_units(
+    features,
+    encoded,
+    feature_weight,
+    feature_bias,
+    direction_weight,
+    CHANNELS: tl.constexpr,
+    PADDED: tl.constexpr,
+    DIRECTIONS: tl.constexpr,
+    ENCODED: tl.constexpr,
+    WIDTH: tl.constexpr,
+    UNITS: tl.constexpr,
+    PRECISION: tl.constexpr,
+):
+    """What the first layer gives, (BLOCK, UNITS) in ``PRECISION``."""
+    unit = tl.arange(0, UNITS)
+    weight = matrix(feature_weight, unit, tl.arange(0, PADDED), WIDTH, CHANNELS)
+    x = product(features, tl.trans(weight), PRECISION)
+    weight = matrix(direction_weight, unit, tl.arange(0, ENCODED), WIDTH, DIRECTIONS)
+    x += product(encoded, tl.trans(weight), PRECISION)
+    x += tl.load(feature_bias + unit, mask=unit < WIDTH, other=0.0)[None, :]
+    return tl.maximum(x, 0.0).to(PRECISION)
+
+
+@triton.jit
+def upper_units(
+    lower,
+    hidden_weight,
+    hidden_bias,
+    unit,
+    WIDTH: tl.constexpr,
+    UNITS: tl.constexpr,
+    PRECISION: tl.constexpr,
+):
+    """What units of the second layer give, (BLOCK, SHARE) in ``PRECISION``, and their weights."""
+    weight = matrix(hidden_weight, unit, tl.arange(0, UNITS), WIDTH, WIDTH).to(PRECISION)
+    x = product(lower, tl.trans(weight), PRECISION)
+    x += tl.load(hidden_bias + unit, mask=unit < WIDTH, other=0.0)[None, :]
+    return tl.maximum(x, 0.0).to(PRECISION), weight
+
+
+@triton.jit
+def to_upper(red, green, blue, upper, output_weight, unit, WIDTH: tl.constexpr):
+    """From gradients of logits to those of units of the second layer, (BLOCK, SHARE)."""
+    known = unit < WIDTH
+    change = red[:, None] * tl.load(output_weight + unit, mask=known, other=0.0)[None, :]
+    weight = tl.load(output_weight + WIDTH + unit, mask=known, other=0.0)
+    change += green[:, None] * weight[None, :]
+    weight = tl.load(output_weight + 2 * WIDTH + unit, mask=known, other=0.0)
+    change += blue[:, None] * weight[None, :]
+    return tl.where(upper > 0.0, change, 0.0)
+
+
+@triton.jit
+def to_logits(colors, upstream, at, here):
+    """Gradients of the logits: through the sigmoid."""
+    red, green, blue = load_vectors(colors, at, here)
+    to_red, to_green, to_blue = load_vectors(upstream, at, here)
+    red = to_red * red * (1.0 - red)
+    green = to_green * green * (1.0 - green)
+    return red, green, to_blue * blue * (1.0 - blue)
+
+
+@triton.jit(do_not_specialize=["places", "rays", "x", "y", "z"])
+def color_network_kernel(
+    viewdirs,
+    ray,
+    first,
+    octaves,
+    feature_weight,
+    feature_bias,
+    direction_weight,
+    hidden_weight,
+    hidden_bias,
+    output_weight,
+    output_bias,
+    points,
+    grid,
+    features,
+    colors,
+    places,
+    rays,
+    low_x,
+    low_y,
+    low_z,
+    scale_x,
+    scale_y,
+    scale_z,
+    x,
+    y,
+    z,
+    CHANNELS: tl.constexpr,
+    PADDED: tl.constexpr,
+    DIRECTIONS: tl.constexpr,
+    ENCODED: tl.constexpr,
+    ANGLES: tl.constexpr,
+    WIDTH: tl.constexpr,
+    UNITS: tl.constexpr,
+    SHARE: tl.constexpr,
+    PRECISION: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """Features and colours of a block of samples; the colour is 0 in the padding."""
+    begin = tl.program_id(0) * BLOCK
+    place = begin + tl.arange(0, BLOCK)
+    at = place.to(tl.int64) * 3
+    listed = tl.load(first + rays)
+    red = tl.zeros((BLOCK,), dtype=tl.float32)
+    green = tl.zeros((BLOCK,), dtype=tl.float32)
+    blue = tl.zeros((BLOCK,), dtype=tl.float32)
+    if begin < listed:
+        here = place < listed
+        px, py, pz = load_vectors(points, at, here)
+        found = rows_between(
+            grid,
+            (px - low_x) * scale_x,
+            (py - low_y) * scale_y,
+            (pz - low_z) * scale_z,
+            x,
+            y,
+            z,
+            here,
+            CHANNELS,
+            PADDED,
+            BLOCK,
+        )
+        channel = tl.arange(0, PADDED)
+        wanted = here[:, None] & (channel < CHANNELS)[None, :]
+        tl.store(features + place[:, None] * CHANNELS + channel[None, :], found, mask=wanted)
+        own = tl.load(ray + place, mask=here, other=0)
+        encoded = encoded_directions(viewdirs, octaves, own, here, DIRECTIONS, ENCODED, ANGLES)
+        lower = lower_units(
+            found,
+            encoded,
+            feature_weight,
+            feature_bias,
+            direction_weight,
+            CHANNELS,
+            PADDED,
+            DIRECTIONS,
+            ENCODED,
+            WIDTH,
+            UNITS,
+            PRECISION,
+        )
+        for start in tl.static_range(0, UNITS, SHARE):
+            unit = start + tl.arange(0, SHARE)
+            upper, _ = upper_units(lower, hidden_weight, hidden_bias, unit, WIDTH, UNITS, PRECISION)
+            upper = upper.to(tl.float32)
+            known = unit < WIDTH
+            weight = tl.load(output_weight + unit, mask=known, other=0.0)
+            red += tl.sum(upper * weight[None, :], axis=1)
+            weight = tl.load(output_weight + WIDTH + unit, mask=known, other=0.0)
+            green += tl.sum(upper * weight[None, :], axis=1)
+            weight = tl.load(output_weight + 2 * WIDTH + unit, mask=known, other=0.0)
+            blue += tl.sum(upper * weight[None, :], axis=1)
+        red = tl.where(here, sigmoid(red + tl.load(output_bias)), 0.0)
+        green = tl.where(here, sigmoid(green + tl.load(output_bias + 1)), 0.0)
+        blue = tl.where(here, sigmoid(blue + tl.load(output_bias + 2)), 0.0)
+    store_vectors(colors, at, red, green, blue, place < places)
+
+
+@triton.jit(do_not_specialize=["rays", "x", "y", "z"])
+def color_samples_backward_kernel(
+    viewdirs,
+    ray,
+    first,
+    octaves,
+    feature_weight,
+    feature_bias,
+    direction_weight,
+    hidden_weight,
+    hidden_bias,
+    output_weight,
+    output_bias,
+    features,
+    colors,
+    upstream,
+    points,
+    grid,
+    into_points,
+    into_grid,
+    rays,
+    low_x,
+    low_y,
+    low_z,
+    scale_x,
+    scale_y,
+    scale_z,
+    x,
+    y,
+    z,
+    NEEDS_POINTS: tl.constexpr,
+    NEEDS_GRID: tl.constexpr,
+    CHANNELS: tl.constexpr,
+    PADDED: tl.constexpr,
+    DIRECTIONS: tl.constexpr,
+    ENCODED: tl.constexpr,
+    ANGLES: tl.constexpr,
+    WIDTH: tl.constexpr,
+    UNITS: tl.constexpr,
+    SHARE: tl.constexpr,
+    PRECISION: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """Gradients of a block's features, scattered to the grid, and of its points."""
+    begin = tl.program_id(0) * BLOCK
+    listed = tl.load(first + rays)
+    if begin < listed:
+        place = begin + tl.arange(0, BLOCK)
+        here = place < listed
+        at = place.to(tl.int64) * 3
+        channel = tl.arange(0, PADDED)
+        wanted = here[:, None] & (channel < CHANNELS)[None, :]
+        row = features + place[:, None] * CHANNELS + channel[None, :]
+        found = tl.load(row, mask=wanted, other=0.0)
+        own = tl.load(ray + place, mask=here, other=0)
+        encoded = encoded_directions(viewdirs, octaves, own, here, DIRECTIONS, ENCODED, ANGLES)
+        lower = lower_units(
+            found,
+            encoded,
+            feature_weight,
+            feature_bias,
+            direction_weight,
+            CHANNELS,
+            PADDED,
+            DIRECTIONS,
+            ENCODED,
+            WIDTH,
+            UNITS,
+            PRECISION,
+        )
+        red, green, blue = to_logits(colors, upstream, at, here)
+        below = tl.zeros((BLOCK, UNITS), dtype=tl.float32)
+        for start in tl.static_range(0, UNITS, SHARE):
+            unit = start + tl.arange(0, SHARE)
+            upper, weight = upper_units(
+                lower, hidden_weight, hidden_bias, unit, WIDTH, UNITS, PRECISION
+            )
+            change = to_upper(red, green, blue, upper, output_weight, unit, WIDTH)
+            below += product(change, weight, PRECISION)
+        below = tl.where(lower > 0.0, below, 0.0)
+        weight = matrix(feature_weight, tl.arange(0, UNITS), channel, WIDTH, CHANNELS)
+        px, py, pz = load_vectors(points, at, here)
+        along_x, along_y, along_z = spread_rows(
+            grid,
+            into_grid,
+            product(below, weight, PRECISION),
+            (px - low_x) * scale_x,
+            (py - low_y) * scale_y,
+            (pz - low_z) * scale_z,
+            x,
+            y,
+            z,
+            here,
+            NEEDS_GRID,
+            NEEDS_POINTS,
+            CHANNELS,
+            PADDED,
+        )
+        if NEEDS_POINTS:
+            along_x *= scale_x
+            along_y *= scale_y
+            along_z *= scale_z
+            store_vectors(into_points, at, along_x, along_y, along_z, here)
+
+
+@triton.jit(do_not_specialize=["rays", "programs"])
+def color_weights_backward_kernel(
+    viewdirs,
+    ray,
+    first,
+    octaves,
+    feature_weight,
+    feature_bias,
+    direction_weight,
+    hidden_weight,
+    hidden_bias,
+    output_weight,
+    output_bias,
+    features,
+    colors,
+    upstream,
+    into_feature_weight,
+    into_feature_bias,
+    into_direction_weight,
+    into_hidden_weight,
+    into_hidden_bias,
+    into_output_weight,
+    into_output_bias,
+    rays,
+    programs,
+    NEEDS_DIRECTIONS: tl.constexpr,
+    CHANNELS: tl.constexpr,
+    PADDED: tl.constexpr,
+    DIRECTIONS: tl.constexpr,
+    ENCODED: tl.constexpr,
+    ANGLES: tl.constexpr,
+    WIDTH: tl.constexpr,
+    UNITS: tl.constexpr,
+    SHARE: tl.constexpr,
+    PRECISION: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """The weights' gradients through a share of the second layer, of every ``programs``-th block.
+
+    What reaches the first layer through a share is added to what does through the others.
+    """
+    channel = tl.arange(0, PADDED)
+    column = tl.arange(0, ENCODED)
+    below_unit = tl.arange(0, UNITS)
+    share = tl.program_id(0) // programs
+    unit = share * SHARE + tl.arange(0, SHARE)
+    of_features = tl.zeros((UNITS, PADDED), dtype=tl.float32)
+    of_directions = tl.zeros((UNITS, ENCODED), dtype=tl.float32)
+    of_lower_bias = tl.zeros((UNITS,), dtype=tl.float32)
+    of_hidden = tl.zeros((SHARE, UNITS), dtype=tl.float32)
+    of_upper_bias = tl.zeros((SHARE,), dtype=tl.float32)
+    of_red = tl.zeros((SHARE,), dtype=tl.float32)
+    of_green = tl.zeros((SHARE,), dtype=tl.float32)
+    of_blue = tl.zeros((SHARE,), dtype=tl.float32)
+    reds = tl.zeros((BLOCK,), dtype=tl.float32)
+    greens = tl.zeros((BLOCK,), dtype=tl.float32)
+    blues = tl.zeros((BLOCK,), dtype=tl.float32)
+    listed = tl.load(first + rays)
+    begin = (tl.program_id(0) % programs) * BLOCK
+    while begin < listed:
+        place = begin + tl.arange(0, BLOCK)
+        here = place < listed
+        wanted = here[:, None] & (channel < CHANNELS)[None, :]
+        row = features + place[:, None] * CHANNELS + channel[None, :]
+        found = tl.load(row, mask=wanted, other=0.0)
+        own = tl.load(ray + place, mask=here, other=0)
+        encoded = encoded_directions(viewdirs, octaves, own, here, DIRECTIONS, ENCODED, ANGLES)
+        lower = lower_units(
+            found,
+            encoded,
+            feature_weight,
+            feature_bias,
+            direction_weight,
+            CHANNELS,
+            PADDED,
+            DIRECTIONS,
+            ENCODED,
+            WIDTH,
+            UNITS,
+            PRECISION,
+        )
+        upper, weight = upper_units(
+            lower, hidden_weight, hidden_bias, unit, WIDTH, UNITS, PRECISION
+        )
+        red, green, blue = to_logits(colors, upstream, place.to(tl.int64) * 3, here)
+        reds += red
+        greens += green
+        blues += blue
+        single = upper.to(tl.float32)
+        of_red += tl.sum(red[:, None] * single, axis=0)
+        of_green += tl.sum(green[:, None] * single, axis=0)
+        of_blue += tl.sum(blue[:, None] * single, axis=0)
+        change = to_upper(red, green, blue, upper, output_weight, unit, WIDTH)
+        of_hidden += product(tl.trans(change), lower, PRECISION)
+        of_upper_bias += tl.sum(change, axis=0)
+        below = tl.where(lower > 0.0, product(change, weight, PRECISION), 0.0)
+        of_features += product(tl.trans(below), found, PRECISION)
+        of_lower_bias += tl.sum(below, axis=0)
+        if NEEDS_DIRECTIONS:
+            of_directions += product(tl.trans(below), encoded, PRECISION)
+        begin += programs * BLOCK
+    known = unit < WIDTH
+    add_matrix(into_feature_weight, of_features, below_unit, channel, WIDTH, CHANNELS)
+    add_matrix(into_hidden_weight, of_hidden, unit, below_unit, WIDTH, WIDTH)
+    tl.atomic_add(into_feature_bias + below_unit, of_lower_bias, mask=below_unit < WIDTH)
+    tl.atomic_add(into_hidden_bias + unit, of_upper_bias, mask=known)
+    tl.atomic_add(into_output_weight + unit, of_red, mask=known)
+    tl.atomic_add(into_output_weight + WIDTH + unit, of_green, mask=known)
+    tl.atomic_add(into_output_weight + 2 * WIDTH + unit, of_blue, mask=known)
+    if share == 0:
+        tl.atomic_add(into_output_bias, tl.sum(reds, 0))
+        tl.atomic_add(into_output_bias + 1, tl.sum(greens, 0))
+        tl.atomic_add(into_output_bias + 2, tl.sum(blues, 0))
+    if NEEDS_DIRECTIONS:
+        add_matrix(into_direction_weight, of_directions, below_unit, column, WIDTH, DIRECTIONS)

@@ -1,0 +1,412 @@
+"""Cycle and flow: a thread for each sample; the sums over samples in a second launch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from devrf.ops.corners import Corners, Triple, scales, shape_of
+from devrf.ops.kernels.cells import (
+    cell,
+    corner_row,
+    inside,
+    load_vectors,
+    share,
+    store_vectors,
+)
+from devrf.ops.kernels.launch import launch
+from devrf.ops.kernels.warped_depth import displaced, scatter
+
+if TYPE_CHECKING:
+    from devrf.ops.motion import ListedSamples, SeenEarlier
+
+BLOCK = 128
+# Numbers that the one program of the second launch reads at a time.
+AT_ONCE = 1024
+# As in devrf.ops.motion.
+NEAREST: tl.constexpr = tl.constexpr(1e-8)
+BEFORE_INFINITY: tl.constexpr = tl.constexpr(1e-6)
+
+
+def motion_in_one_pass(
+    samples: ListedSamples,
+    forward: Tensor,
+    before: Tensor,
+    seen: SeenEarlier | None,
+    weights: Sequence[float],
+    box: Corners,
+    over_samples: bool,
+    ndc: Triple | None,
+    gradient: Tensor | None,
+) -> tuple[Tensor, Tensor]:
+    """As devrf.ops.motion.motion_sum; ``gradient`` is what ``forward`` has already, or None."""
+    points, canonical, weight, ray, present = samples
+    known = [points.detach(), ray, present.view(torch.uint8), before.detach()]
+    if seen is None:
+        known += [ray, ray, *[points] * 6]  # any pointers
+    else:
+        vectors, valid, *others = seen
+        known += [valid.view(torch.uint8), seen.image, vectors, seen.pixel, *others[2:]]
+    numbers = (
+        *(*box.low, *scales(box, shape_of(forward)), *shape_of(forward)),
+        *((1.0, 1.0, 1.0) if ndc is None else ndc),
+    )
+    kinds = {"FLOW": seen is not None, "NDC": ndc is not None, "BLOCK": BLOCK}
+    total, terms = Motion.apply(
+        canonical.contiguous(),
+        weight.contiguous(),
+        forward.contiguous(),
+        tuple(tensor.contiguous() for tensor in known),
+        *(numbers, kinds, weights, over_samples, gradient),
+    )
+    return total, terms
+
+
+class Motion(torch.autograd.Function):
+    """As devrf.ops.motion.motion_sum."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        canonical: Tensor,
+        weight: Tensor,
+        forward: Tensor,
+        known: Sequence[Tensor],
+        numbers: Sequence[float],
+        kinds: dict[str, Any],
+        weights: Sequence[float],
+        over_samples: bool,
+        gradient: Tensor | None,
+    ) -> tuple[Tensor, Tensor]:
+        count = len(canonical)
+        programs = int(triton.cdiv(count, BLOCK))
+        parts, sums = canonical.new_empty(programs, 4), canonical.new_empty(5)
+        given = (canonical, weight, forward, *known)
+        launch(motion_kernel, programs, parts, *given, parts, count, *numbers, **kinds)
+        valid = known[4]
+        launch(
+            finish_motion_kernel,
+            1,
+            parts,
+            *(parts, valid, sums, programs, len(valid), *weights),
+            OVER_RAYS=kinds["FLOW"] and not over_samples,
+            BLOCK=AT_ONCE,
+        )
+        ctx.save_for_backward(*given, sums)
+        ctx.numbers, ctx.kinds, ctx.weights, ctx.gradient = numbers, kinds, weights, gradient
+        ctx.set_materialize_grads(False)
+        terms = sums[:2]
+        ctx.mark_non_differentiable(terms)
+        return sums[2], terms
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, upstream: Tensor, _: None) -> tuple[Tensor | None, ...]:
+        *given, sums = ctx.saved_tensors
+        canonical, weight, forward, *_known = given
+        asked, own = ctx.needs_input_grad[2], None
+        into = ctx.gradient
+        if into is None and asked:
+            into = own = torch.zeros_like(forward)
+        moved, changed = torch.empty_like(canonical), torch.empty_like(weight)
+        launch(
+            motion_backward_kernel,
+            triton.cdiv(len(canonical), BLOCK),
+            canonical,
+            *(*given, sums, upstream.contiguous(), moved, changed),
+            *(forward if into is None else into, len(canonical), *ctx.numbers, *ctx.weights),
+            NEEDS_FORWARD=into is not None,
+            **ctx.kinds,
+        )
+        return moved, changed, own, None, None, None, None, None, None
+
+
+@triton.jit
+def to_world(x, y, z, slope_x, slope_y, near, NDC: tl.constexpr):
+    """World coordinates, and the NDC depth's gap to infinity."""
+    gap = z - 1.0
+    if NDC:
+        gap = tl.where(gap == 0.0, -BEFORE_INFINITY, gap)
+        z = 2.0 * near / gap
+        x = -x * z / slope_x
+        y = -y * z / slope_y
+    return x, y, z, gap
+
+
+@triton.jit
+def local_axis(pose, x, y, z, here):
+    """A camera's own axis, the column at ``pose``, times world coordinates from its centre."""
+    along = tl.load(pose, mask=here, other=0.0) * x
+    along += tl.load(pose + 4, mask=here, other=0.0) * y
+    return along + tl.load(pose + 8, mask=here, other=0.0) * z
+
+
+@triton.jit
+def world_axis(pose, x, y, z, here):
+    """The reverse: a world axis, the row at ``pose``, times coordinates in the camera's axes."""
+    along = tl.load(pose, mask=here, other=0.0) * x
+    along += tl.load(pose + 1, mask=here, other=0.0) * y
+    return along + tl.load(pose + 2, mask=here, other=0.0) * z
+
+
+@triton.jit
+def missed_flow(x, y, z, ray, image, vectors, pixel, previous, poses, focal, center, here):
+    """Induced minus observed flow of world points, and what their gradient needs."""
+    camera = tl.load(previous + tl.load(image + ray, mask=here, other=0), mask=here, other=0)
+    pose = poses + camera * 12
+    x -= tl.load(pose + 3, mask=here, other=0.0)
+    y -= tl.load(pose + 7, mask=here, other=0.0)
+    z -= tl.load(pose + 11, mask=here, other=0.0)
+    right = local_axis(pose, x, y, z, here)
+    up = local_axis(pose + 1, x, y, z, here)
+    depth = -local_axis(pose + 2, x, y, z, here)
+    depth = tl.where(tl.abs(depth) < NEAREST, NEAREST, depth)
+    focal_x = tl.load(focal + camera * 2, mask=here, other=0.0)
+    focal_y = tl.load(focal + camera * 2 + 1, mask=here, other=0.0)
+    across = focal_x * right / depth + tl.load(center + camera * 2, mask=here, other=0.0)
+    down = -focal_y * up / depth + tl.load(center + camera * 2 + 1, mask=here, other=0.0)
+    across -= tl.load(pixel + ray * 2, mask=here, other=0.0)
+    across -= tl.load(vectors + ray * 2, mask=here, other=0.0)
+    down -= tl.load(pixel + ray * 2 + 1, mask=here, other=0.0)
+    down -= tl.load(vectors + ray * 2 + 1, mask=here, other=0.0)
+    return across, down, pose, right, up, depth, focal_x, focal_y
+
+
+@triton.jit
+def pulled(grid, cx, cy, cz, gx, gy, gz, x, y, z, here):
+    """Slopes, per grid unit, of the values of a grid (x, y, z, 3) times (gx, gy, gz)."""
+    i, fx = cell(cx, x)
+    j, fy = cell(cy, y)
+    k, fz = cell(cz, z)
+    along_x = fx * 0.0
+    along_y = fx * 0.0
+    along_z = fx * 0.0
+    for corner in tl.static_range(8):
+        dx, dy, dz = load_vectors(grid, corner_row(i, j, k, y, z, corner) * 3, here)
+        agreed = dx * gx + dy * gy + dz * gz
+        wx = share(fx, corner & 4)
+        wy = share(fy, corner & 2)
+        wz = share(fz, corner & 1)
+        along_x += wy * wz * (agreed if corner & 4 else -agreed)
+        along_y += wx * wz * (agreed if corner & 2 else -agreed)
+        along_z += wx * wy * (agreed if corner & 1 else -agreed)
+    return along_x * inside(cx, x), along_y * inside(cy, y), along_z * inside(cz, z)
+
+
+@triton.jit(do_not_specialize=["count", "x", "y", "z"])
+def motion_kernel(
+    canonical,
+    weight,
+    forward,
+    points,
+    ray,
+    present,
+    before,
+    valid,
+    image,
+    vectors,
+    pixel,
+    previous,
+    poses,
+    focal,
+    center,
+    parts,
+    count,
+    low_x,
+    low_y,
+    low_z,
+    scale_x,
+    scale_y,
+    scale_z,
+    x,
+    y,
+    z,
+    slope_x,
+    slope_y,
+    near,
+    FLOW: tl.constexpr,
+    NDC: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """A block's sums of both terms, and of the samples that each is over."""
+    place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    here = (place < count) & (tl.load(present + place, mask=place < count, other=0) != 0)
+    at = place.to(tl.int64) * 3
+    qx, qy, qz = load_vectors(canonical, at, here)
+    cx = (qx - low_x) * scale_x
+    cy = (qy - low_y) * scale_y
+    cz = (qz - low_z) * scale_z
+    mx, my, mz = displaced(forward, forward, 0.0, qx, qy, qz, cx, cy, cz, x, y, z, here, SLICES=1)
+    px, py, pz = load_vectors(points, at, here)
+    mx -= px
+    my -= py
+    mz -= pz
+    missed = tl.where(here, mx * mx + my * my + mz * mz, 0.0)
+    part = parts + tl.program_id(0) * 4
+    tl.store(part, 0.5 * tl.sum(missed, 0))
+    tl.store(part + 1, tl.sum(here.to(tl.float32), 0))
+    error = 0.0 * qx
+    on = here
+    if FLOW:
+        own = tl.load(ray + place, mask=here, other=0)
+        on = here & (tl.load(valid + own, mask=here, other=0) != 0)
+        mx, my, mz = displaced(before, before, 0.0, qx, qy, qz, cx, cy, cz, x, y, z, on, SLICES=1)
+        mx, my, mz, _ = to_world(mx, my, mz, slope_x, slope_y, near, NDC)
+        across, down, _, _, _, _, _, _ = missed_flow(
+            mx, my, mz, own, image, vectors, pixel, previous, poses, focal, center, on
+        )
+        error = tl.load(weight + place, mask=on, other=0.0) * (tl.abs(across) + tl.abs(down))
+    tl.store(part + 2, tl.sum(tl.where(on, error, 0.0), 0))
+    tl.store(part + 3, tl.sum(on.to(tl.float32), 0))
+
+
+@triton.jit(do_not_specialize=["programs", "rays"])
+def finish_motion_kernel(
+    parts,
+    valid,
+    sums,
+    programs,
+    rays,
+    of_cycle,
+    of_flow,
+    OVER_RAYS: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """Cycle, flow, their weighted sum; and one by what each is divided by."""
+    lane = tl.arange(0, BLOCK)
+    cycle = tl.zeros((BLOCK,), dtype=tl.float32)
+    samples = tl.zeros((BLOCK,), dtype=tl.float32)
+    flow = tl.zeros((BLOCK,), dtype=tl.float32)
+    counted = tl.zeros((BLOCK,), dtype=tl.float32)
+    start = 0
+    while start < programs:
+        part = parts + (start + lane) * 4
+        here = start + lane < programs
+        cycle += tl.load(part, mask=here, other=0.0)
+        samples += tl.load(part + 1, mask=here, other=0.0)
+        flow += tl.load(part + 2, mask=here, other=0.0)
+        counted += 2.0 * tl.load(part + 3, mask=here, other=0.0)
+        start += BLOCK
+    if OVER_RAYS:
+        counted = tl.zeros((BLOCK,), dtype=tl.float32)
+        start = 0
+        while start < rays:
+            there = tl.load(valid + start + lane, mask=start + lane < rays, other=0)
+            counted += (there != 0).to(tl.float32)
+            start += BLOCK
+    by_cycle = 1.0 / tl.maximum(tl.sum(samples, 0), 1.0)
+    by_flow = 1.0 / tl.maximum(tl.sum(counted, 0), 1.0)
+    mean_cycle = tl.sum(cycle, 0) * by_cycle
+    mean_flow = tl.sum(flow, 0) * by_flow
+    tl.store(sums, mean_cycle)
+    tl.store(sums + 1, mean_flow)
+    tl.store(sums + 2, of_cycle * mean_cycle + of_flow * mean_flow)
+    tl.store(sums + 3, by_cycle)
+    tl.store(sums + 4, by_flow)
+
+
+@triton.jit(do_not_specialize=["count", "x", "y", "z"])
+def motion_backward_kernel(
+    canonical,
+    weight,
+    forward,
+    points,
+    ray,
+    present,
+    before,
+    valid,
+    image,
+    vectors,
+    pixel,
+    previous,
+    poses,
+    focal,
+    center,
+    sums,
+    upstream,
+    into_canonical,
+    into_weight,
+    into_forward,
+    count,
+    low_x,
+    low_y,
+    low_z,
+    scale_x,
+    scale_y,
+    scale_z,
+    x,
+    y,
+    z,
+    slope_x,
+    slope_y,
+    near,
+    of_cycle,
+    of_flow,
+    NEEDS_FORWARD: tl.constexpr,
+    FLOW: tl.constexpr,
+    NDC: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """Gradients of q and w, and of Δ_f, which are scattered to its grid."""
+    place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    listed = place < count
+    here = listed & (tl.load(present + place, mask=listed, other=0) != 0)
+    at = place.to(tl.int64) * 3
+    qx, qy, qz = load_vectors(canonical, at, here)
+    cx = (qx - low_x) * scale_x
+    cy = (qy - low_y) * scale_y
+    cz = (qz - low_z) * scale_z
+    gx, gy, gz = displaced(forward, forward, 0.0, qx, qy, qz, cx, cy, cz, x, y, z, here, SLICES=1)
+    px, py, pz = load_vectors(points, at, here)
+    slope = tl.where(here, tl.load(upstream) * of_cycle * tl.load(sums + 3), 0.0)
+    gx = slope * (gx - px)
+    gy = slope * (gy - py)
+    gz = slope * (gz - pz)
+    if NEEDS_FORWARD:
+        scatter(into_forward, 1.0, cx, cy, cz, gx, gy, gz, x, y, z, here)
+    along_x, along_y, along_z = pulled(forward, cx, cy, cz, gx, gy, gz, x, y, z, here)
+    gx += along_x * scale_x
+    gy += along_y * scale_y
+    gz += along_z * scale_z
+    change = 0.0 * qx
+    if FLOW:
+        own = tl.load(ray + place, mask=here, other=0)
+        on = here & (tl.load(valid + own, mask=here, other=0) != 0)
+        mx, my, mz = displaced(before, before, 0.0, qx, qy, qz, cx, cy, cz, x, y, z, on, SLICES=1)
+        wx, wy, wz, gap = to_world(mx, my, mz, slope_x, slope_y, near, NDC)
+        across, down, pose, right, up, depth, focal_x, focal_y = missed_flow(
+            wx, wy, wz, own, image, vectors, pixel, previous, poses, focal, center, on
+        )
+        slope = tl.where(on, tl.load(upstream) * of_flow * tl.load(sums + 4), 0.0)
+        change = slope * (tl.abs(across) + tl.abs(down))
+        slope *= tl.load(weight + place, mask=on, other=0.0)
+        to_right = slope * sign(across) * focal_x / depth
+        to_up = -slope * sign(down) * focal_y / depth
+        # ∂/∂z of the camera's own axis, −depth; none where the depth was replaced.
+        to_back = tl.where(depth == NEAREST, 0.0, (to_right * right + to_up * up) / depth)
+        ux = world_axis(pose, to_right, to_up, to_back, on)
+        uy = world_axis(pose + 4, to_right, to_up, to_back, on)
+        uz = world_axis(pose + 8, to_right, to_up, to_back, on)
+        if NDC:
+            far = tl.where(mz == 1.0, 0.0, -wz / gap)
+            uz = far * (uz - mx / slope_x * ux - my / slope_y * uy)
+            ux = -wz / slope_x * ux
+            uy = -wz / slope_y * uy
+        along_x, along_y, along_z = pulled(before, cx, cy, cz, ux, uy, uz, x, y, z, on)
+        gx += tl.where(on, ux + along_x * scale_x, 0.0)
+        gy += tl.where(on, uy + along_y * scale_y, 0.0)
+        gz += tl.where(on, uz + along_z * scale_z, 0.0)
+    store_vectors(into_canonical, at, gx, gy, gz, listed)
+    tl.store(into_weight + place, change, mask=listed)
+
+
+@triton.jit
+def sign(x):
+    """−1, 0 or 1."""
+    return tl.where(x > 0.0, 1.0, tl.where(x < 0.0, -1.0, 0.0))
