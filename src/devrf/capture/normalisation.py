@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -36,26 +36,28 @@ class World:
     Attributes:
         poses: (N, 3, 4) float64 camera-to-world, OpenGL axes, world units.
         points: (P, 3) float64.
-        space: ``ndc`` or ``contracted``.
-        near: distance before which nothing is, world units.
+        space: ``ndc``, ``contracted``, or ``world`` for cameras around what mattes cut out.
+        near: distance before which nothing is, world units; None of ``world``, as ``far``.
         far: distance behind which no sparse point is, world units.
-        box: low and high corner of what is looked at; None of ``ndc``.
+        box: low and high corner of what is looked at; None of ``ndc`` and ``world``, whose
+            reader finds it with the mattes.
     """
 
     poses: Tensor
     points: Tensor
-    space: Literal["ndc", "contracted"]
-    near: float
-    far: float
+    space: Literal["ndc", "contracted", "world"]
+    near: float | None
+    far: float | None
     box: tuple[list[float], list[float]] | None
 
 
-def normalised(model: SparseModel, facing: Facing = "auto") -> World:
+def normalised(model: SparseModel, facing: Facing = "auto", *, cut_out: bool = False) -> World:
     """The scene of a model in a world of its own origin, axes and unit.
 
     Args:
         model: cameras and points, in any world.
         facing: from where the cameras look.
+        cut_out: whether the images have mattes.
 
     Raises:
         DevrfError: there are no points to say where the scene is.
@@ -74,7 +76,8 @@ def normalised(model: SparseModel, facing: Facing = "auto") -> World:
         log.info("cameras look %s-facing; capture.facing says otherwise", facing)
     if facing == "forward":
         return _forward(poses, points, near, far)
-    return _inward(poses, points, near, far)
+    world = _inward(poses, points, near, far)
+    return replace(world, space="world", near=None, far=None, box=None) if cut_out else world
 
 
 def widest_angle(poses: Tensor) -> float:
