@@ -43,6 +43,24 @@ def test_a_model_of_a_few_frames_is_not_the_scene(tmp_path):
         checked_model(folder, MOVING, {})
 
 
+def test_cameras_that_jump_within_a_video_are_refused(tmp_path):
+    names = [f"static/{k:05d}.png" for k in range(6)]
+    moving = Chosen(Path("walk.mp4"), "static", tuple(range(6)))
+    folder = model(tmp_path / "model", *names)
+    # The last two look the other way: half a turn about y.
+    text = (folder / "images.txt").read_text().splitlines(keepends=True)
+    turned = [
+        line.replace(" 1 0 0 0 ", " 0 0 1 0 ") if k >= 8 else line for k, line in enumerate(text)
+    ]
+    (folder / "images.txt").write_text("".join(turned))
+    expected = r"walk\.mp4: between 00003 and 00004, .* its camera seems to turn by 180 degrees"
+    with pytest.raises(DevrfError, match=expected):
+        checked_model(folder, moving, {})
+    (tmp_path / "photographs").mkdir()
+    photographs = Chosen(tmp_path / "photographs", "static", tuple(range(6)))
+    assert len(checked_model(folder, photographs, {}).images) == 6
+
+
 def test_frames_are_cropped_to_common_proportions_and_shrunk(textured):
     a, b = Path("a.mp4"), Path("b.mp4")
     assert common_size({a: (1920, 1080), b: (1280, 720)}, 960) == (960, 540)

@@ -42,13 +42,13 @@ def test_settings_that_do_not_go_together(into):
     assert not CaptureSettings(static="s.mp4", views=["a.mp4"]).monocular
 
 
-def test_footage_that_cannot_be_read(into, tmp_path, film, textured):
+def test_footage_that_cannot_be_read(into, tmp_path, film, textured, capfd):
     missing = tmp_path / "no.mp4"
     assert refused(into, static=missing).startswith(f"{missing}: no such video; correct capture.")
     damaged = tmp_path / "damaged.mp4"
     damaged.write_bytes(b"not a video" * 50)
     assert refused(into, static=damaged).startswith(f"{damaged}: not a readable video; convert it")
-    assert not into.exists()
+    assert not into.exists() and capfd.readouterr().err == ""  # nor do libraries say anything
     short = film("short.mp4", [textured(0)])
     expected = f"{short}: a video of 1 frame, expected at least 2; give a longer one"
     assert refused(into, static=short).startswith(expected)
@@ -66,6 +66,15 @@ def test_a_folder_that_is_something_else(into, film, textured):
     (into / "mine.txt").touch()
     video = film("a.mp4", [textured(k) for k in range(4)])
     assert refused(into, static=video).startswith(f"{into}: is there already, and not from stage=")
+
+
+def test_a_folder_that_cannot_be_made(tmp_path, into, film, textured):
+    (tmp_path / "file").touch()
+    video = film("a.mp4", [textured(k) for k in range(4)])
+    with pytest.raises(
+        DevrfError, match=r"file/scene/capture: cannot be made \(Not a directory\);"
+    ):
+        scene_from_footage(CaptureSettings(static=video, into=tmp_path / "file" / "scene"))
 
 
 def test_views_without_motion_in_common(into, film, textured):

@@ -104,3 +104,16 @@ def test_methods_that_see_the_moving_views_alone_stay_endless(tiny_room: Scene) 
 def test_surroundings_are_checked(tiny_room_recipe: ProceduralScene) -> None:
     with pytest.raises(DevrfError, match=r"data\.surroundings: expected one of none, room"):
         replace(tiny_room_recipe, surroundings="garden")()
+
+
+def test_fine_paint_has_smaller_patterns(tiny_room_recipe: ProceduralScene) -> None:
+    with pytest.raises(DevrfError, match=r"data\.texture: expected one of soft, fine"):
+        replace(tiny_room_recipe, texture="coarse")()
+    room = tiny_room_recipe.filmed()
+    fine = replace(tiny_room_recipe, texture="fine").filmed()
+    # Half a wavelength of the finest wave along a wall changes the fine paint a lot.
+    wall = torch.tensor([[-6.0, 0.3, 1.0], [-6.0, 0.3 + 0.14, 1.0]])
+    changes = [
+        shape.color(shape.material(wall, 0.0)).diff(dim=0).abs().max() for shape in (room, fine)
+    ]
+    assert changes[1] > 2 * changes[0]

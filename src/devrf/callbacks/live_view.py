@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from typing import Any
 
@@ -12,6 +13,8 @@ from devrf.evaluation.held_out import background_value
 from devrf.rendering.renderer import Renderer
 from devrf.viewer.drawing import Drawing
 from devrf.viewer.session import Session
+
+log = logging.getLogger(__name__)
 
 # Seconds between two pictures at least, however fast they are.
 PAUSE = 0.2
@@ -59,6 +62,12 @@ class LiveView(Callback):
         self.session.step(0.0)
         self._last = time.perf_counter()
         self.seconds += self._last - now
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Say what this stage's pictures have taken."""
+        if self.seconds:
+            passed = time.perf_counter() - self._began
+            log.info("viewer: pictures took %.1f of %.1f s", self.seconds, passed)
 
 
 def _renderer(stage: ScheduledStage) -> Renderer:

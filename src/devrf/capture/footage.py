@@ -53,9 +53,11 @@ def pictures(path: Path) -> Iterator[tuple[float, Picture]]:
         return
     if not os.path.isfile(path):
         raise DevrfError(f"{path}: no such video; correct capture.static or capture.views")
-    # FFmpeg would complain on stderr of what is said here in a line.
+    # FFmpeg and OpenCV would complain on stderr of what is said here in a line.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
     video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    cv2.utils.logging.setLogLevel(level)
     try:
         if not video.isOpened():
             raise DevrfError(f"{path}: not a readable video; {_REMEDY}")

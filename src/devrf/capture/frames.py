@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import repeat
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from devrf.capture.footage import Picture, chosen
+from devrf.capture.mattes import Matte, chosen_mattes
 from devrf.errors import DevrfError
 
 Size = tuple[int, int]
@@ -23,11 +25,13 @@ class Chosen:
         path: the footage.
         label: the folder of its images: ``static``, ``view1`` …
         positions: of its frames, ascending where distinct; a frame may be wanted twice.
+        mattes: of all its frames, which become the images' alpha; None: the images have none.
     """
 
     path: Path
     label: str
     positions: tuple[int, ...]
+    mattes: Path | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -52,20 +56,33 @@ def common_size(sizes: dict[Path, Size], longer: int) -> Size:
     return round(width * factor), round(height * factor)
 
 
-def write_frames(folder: Path, footage: Chosen, size: Size) -> Iterator[Path]:
+def write_frames(folder: Path, footage: Chosen, size: Size, filmed: Size) -> Iterator[Path]:
     """Write the images of one video, each when it is asked for.
 
     Frames of other proportions are cropped in the middle; then all are brought to ``size``.
 
+    Args:
+        folder: of images.
+        footage: which of its frames.
+        size: of the images.
+        filmed: of the frames.
+
     Raises:
-        DevrfError: what :func:`devrf.capture.footage.chosen` raises, or an image cannot be
-            written.
+        DevrfError: what :func:`devrf.capture.footage.chosen` and
+            :func:`devrf.capture.mattes.chosen_mattes` raise, or an image cannot be written.
     """
     (folder / footage.label).mkdir(parents=True, exist_ok=True)
     places = dict(zip(footage.positions, footage.names, strict=True))
-    for position, picture in chosen(footage.path, sorted(places)):
+    wanted = sorted(places)
+    mattes: Iterator[tuple[int, Matte] | None] = repeat(None, len(wanted))
+    if footage.mattes is not None:
+        mattes = chosen_mattes(footage.mattes, footage.path, wanted, filmed)
+    for (position, picture), matte in zip(chosen(footage.path, wanted), mattes, strict=False):
         path = folder / places[position]
-        if not cv2.imwrite(str(path), cv2.cvtColor(fitted(picture, size), cv2.COLOR_RGB2BGR)):
+        image = cv2.cvtColor(fitted(picture, size), cv2.COLOR_RGB2BGR)
+        if matte is not None:
+            image = np.dstack([image, fitted(matte[1], size)])
+        if not cv2.imwrite(str(path), image):
             raise DevrfError(f"{path}: cannot be written; see that there is room, and permission")
         yield path
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -36,26 +36,28 @@ class World:
     Attributes:
         poses: (N, 3, 4) float64 camera-to-world, OpenGL axes, world units.
         points: (P, 3) float64.
-        space: ``ndc`` or ``contracted``.
-        near: distance before which nothing is, world units.
+        space: ``ndc``, ``contracted``, or ``world`` for cameras around what mattes cut out.
+        near: distance before which nothing is, world units; None of ``world``, as ``far``.
         far: distance behind which no sparse point is, world units.
-        box: low and high corner of what is looked at; None of ``ndc``.
+        box: low and high corner of what is looked at; None of ``ndc``, and where the reader finds
+            it: with mattes, or where the cameras' axes meet.
     """
 
     poses: Tensor
     points: Tensor
-    space: Literal["ndc", "contracted"]
-    near: float
-    far: float
+    space: Literal["ndc", "contracted", "world"]
+    near: float | None
+    far: float | None
     box: tuple[list[float], list[float]] | None
 
 
-def normalised(model: SparseModel, facing: Facing = "auto") -> World:
+def normalised(model: SparseModel, facing: Facing = "auto", *, cut_out: bool = False) -> World:
     """The scene of a model in a world of its own origin, axes and unit.
 
     Args:
         model: cameras and points, in any world.
         facing: from where the cameras look.
+        cut_out: whether the images have mattes.
 
     Raises:
         DevrfError: there are no points to say where the scene is.
@@ -74,7 +76,8 @@ def normalised(model: SparseModel, facing: Facing = "auto") -> World:
         log.info("cameras look %s-facing; capture.facing says otherwise", facing)
     if facing == "forward":
         return _forward(poses, points, near, far)
-    return _inward(poses, points, near, far)
+    world = _inward(poses, points, near, far)
+    return replace(world, space="world", near=None, far=None, box=None) if cut_out else world
 
 
 def widest_angle(poses: Tensor) -> float:
@@ -90,7 +93,8 @@ def _forward(poses: Tensor, points: Tensor, near: float, far: float) -> World:
 
 
 def _inward(poses: Tensor, points: Tensor, near: float, far: float) -> World:
-    middle = _looked_at(poses, points)
+    met = _axes_meet(poses)
+    middle = points.median(dim=0).values if met is None else met
     # z up, as far as the cameras were held upright.
     up = normalize(poses[:, :, 1].sum(dim=0), dim=0)
     aside = torch.eye(3, dtype=poses.dtype)[int(up.abs().argmin())]
@@ -98,6 +102,11 @@ def _inward(poses: Tensor, points: Tensor, near: float, far: float) -> World:
     frame = torch.stack([right, torch.linalg.cross(up, right), up, middle], dim=1)
     scale = AROUND / float((poses[:, :, 3] - middle).norm(dim=1).median())
     poses, points = _moved(poses, points, frame, scale)
+    near, far = 0.5 * near * scale, far * scale
+    if met is not None:
+        # The reader takes what all cameras see. Sparse points are on floor and walls, too: in their
+        # box the thing would have a fraction of the voxels.
+        return World(poses, points, "contracted", near, far, None)
     # What the sparse points around the middle span, and no more than the cameras go round.
     around = points[points.norm(dim=1) < AROUND]
     if len(around) < 10:
@@ -108,15 +117,15 @@ def _inward(poses: Tensor, points: Tensor, near: float, far: float) -> World:
     )
     margin = 0.1 * np.maximum(high - low, 0.1 * AROUND)
     box = (low - margin).tolist(), (high + margin).tolist()
-    return World(poses, points, "contracted", 0.5 * near * scale, far * scale, box)
+    return World(poses, points, "contracted", near, far, box)
 
 
-def _looked_at(poses: Tensor, points: Tensor) -> Tensor:
-    """The point (3,) nearest to all axes, or the points' median where they hardly meet."""
+def _axes_meet(poses: Tensor) -> Tensor | None:
+    """The point (3,) nearest to all axes; None where they hardly meet."""
     across = torch.eye(3, dtype=poses.dtype) - poses[:, :, 2:3] * poses[:, :, 2].unsqueeze(1)
     whole = across.mean(dim=0)
     if float(torch.linalg.eigvalsh(whole)[0]) < 1e-2:
-        return points.median(dim=0).values
+        return None
     found: Tensor = torch.linalg.solve(whole, (across @ poses[:, :, 3:])[..., 0].mean(dim=0))
     return found
 

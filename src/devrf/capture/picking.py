@@ -12,9 +12,9 @@ from devrf.errors import DevrfError
 
 log = logging.getLogger(__name__)
 
-# Below this, an image of a textured scene is blurred so far that few features are left; of sharp
-# photographs the value is 0.5 and more.
-BLURRED = 0.35
+# Below this, an image of a textured scene is blurred so far that few features are left. Of sharp
+# photographs the value is 0.5 and more; of strong blur up to 0.44, as H.264 makes blocks of it.
+BLURRED = 0.45
 # From fewer images there is no structure from motion worth the name.
 LEAST = 3
 

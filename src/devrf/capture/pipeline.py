@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import shutil
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,16 @@ from devrf.capture.alignment import Timeline, timeline
 from devrf.capture.footage import frame_count, is_folder, pictures
 from devrf.capture.frames import Chosen, common_size, write_frames
 from devrf.capture.kept import digest, kept, stamp
-from devrf.capture.normalisation import World, normalised
+from devrf.capture.mattes import mattes_of
+from devrf.capture.normalisation import AROUND, World, normalised
 from devrf.capture.picking import check_sharp, sharpest
 from devrf.capture.settings import CaptureSettings
 from devrf.capture.structure import check_library, checked_model, reconstruct
+from devrf.capture.subtraction import box_of_motion
 from devrf.capture.survey import Survey, survey
 from devrf.capture.writing import IMAGES, Shot, write_scene
 from devrf.errors import DevrfError
+from devrf.geometry.box import Box
 from devrf.scenes.colmap_model import SparseModel
 from devrf.scenes.holdout import every_nth
 from devrf.scenes.nerfstudio import FILE
@@ -57,18 +61,22 @@ def scene_from_footage(settings: CaptureSettings) -> Path:
     sharp = surveys[still].sharpness
     picked = list(range(len(sharp))) if is_folder(still) else sharpest(sharp, settings.frames)
     check_sharp(still, sharp, picked)
-    moving = Chosen(still, "static", tuple(picked))
+    mattes = _mattes(settings, surveys)
+    moving = Chosen(still, "static", tuple(picked), mattes.get(still))
     clock = Timeline((), (), ())
     if views:
         clock = timeline(views, [surveys[v] for v in views], settings.moments, settings.offsets)
     fixed = [
-        Chosen(path, f"view{k}", positions)
+        Chosen(path, f"view{k}", positions, mattes.get(path))
         for k, (path, positions) in enumerate(zip(views, clock.positions, strict=True), 1)
     ]
     size = common_size({path: one.size for path, one in surveys.items()}, settings.size)
-    _written(into, work, [moving, *fixed], size)
+    filmed = {path: one.size for path, one in surveys.items()}
+    _written(into, work, [moving, *fixed], size, filmed)
     model = _model(into, work, moving, fixed, settings)
-    world = normalised(model, settings.facing)
+    world = normalised(model, settings.facing, cut_out=bool(mattes))
+    if settings.subtracts:
+        world = _around_motion(world, model, into / IMAGES, fixed)
     taken = surveys[still].times if settings.monocular else None
     shots = _shots(model, world, moving, fixed, clock, settings, taken)
     path = write_scene(into, shots, world, settings.camera)
@@ -95,6 +103,12 @@ def _path(given: str | Path) -> Path:
 def _surveyed(path: Path, work: Path) -> Survey:
     # Before a folder is made: a first frame that cannot be read ends here.
     next(pictures(path))
+    try:
+        work.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DevrfError(
+            f"{work}: cannot be made ({error.strerror}); give capture.into another folder"
+        ) from None
 
     def make() -> dict[str, Any]:
         frames = followed(pictures(path), frame_count(path), f"looking at {path.name}")
@@ -108,10 +122,27 @@ def _slug(path: Path) -> str:
     return f"{path.stem}-{digest(str(path.resolve()))[:6]}"
 
 
-def _written(into: Path, work: Path, footage: Sequence[Chosen], size: tuple[int, int]) -> None:
+def _mattes(settings: CaptureSettings, surveys: dict[Path, Survey]) -> dict[Path, Path]:
+    """The mattes of each footage, or none of any."""
+    if settings.mattes is None or settings.subtracts:
+        return {}
+    folder = _path(settings.mattes)
+    return {path: mattes_of(folder, path, len(one.times)) for path, one in surveys.items()}
+
+
+def _written(
+    into: Path,
+    work: Path,
+    footage: Sequence[Chosen],
+    size: tuple[int, int],
+    filmed: dict[Path, tuple[int, int]],
+) -> None:
     """The images, written anew where anything has changed."""
     images = into / IMAGES
-    source = [[one.label, stamp(one.path), one.positions] for one in footage]
+    source = [
+        [one.label, stamp(one.path), one.positions, one.mattes and stamp(one.mattes)]
+        for one in footage
+    ]
 
     def make() -> dict[str, Any]:
         # What they belong to is no longer whole.
@@ -119,7 +150,8 @@ def _written(into: Path, work: Path, footage: Sequence[Chosen], size: tuple[int,
         shutil.rmtree(images, ignore_errors=True)
         for one in footage:
             count = len(set(one.positions))
-            for _ in followed(write_frames(images, one, size), count, f"images of {one.label}"):
+            written = write_frames(images, one, size, filmed[one.path])
+            for _ in followed(written, count, f"images of {one.label}"):
                 pass
         return {"size": size}
 
@@ -142,6 +174,24 @@ def _model(
 
     found = kept(work / "structure.json", [images, options, settings.size], make)
     return checked_model(work / "models" / found["model"], moving, first)
+
+
+def _around_motion(
+    world: World, model: SparseModel, images: Path, fixed: Sequence[Chosen]
+) -> World:
+    """The world with the box of what moves, where it has a box."""
+    if world.space != "contracted":
+        log.warning(
+            "capture.mattes=subtract: a forward-facing scene has no box, it changes nothing"
+        )
+        return world
+    place = {one.name: k for k, one in enumerate(model.images)}
+    first = [place[one.names[0]] for one in fixed]
+    lenses = [_lens(model, model.images[k].camera) for k in first]
+    poses = world.poses[first]
+    around = Box.of([-AROUND] * 3, [AROUND] * 3)
+    box = box_of_motion(images, [one.names for one in fixed], poses, lenses, around)
+    return replace(world, box=(list(box.low), list(box.high)))
 
 
 def _shots(

@@ -9,6 +9,9 @@ from typing import Literal
 
 from devrf.errors import DevrfError
 
+# capture.mattes=subtract
+SUBTRACT = "subtract"
+
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"]
 
 
@@ -36,6 +39,8 @@ class CaptureSettings:
         test_view: which of the fixed views is held out, counted from 1; −1 is the last.
         holdout: one frame of so many of a moving camera is held out; of a single fixed view, one
             moment.
+        mattes: a folder of mattes of all footage, see :mod:`devrf.capture.mattes`; ``subtract``:
+            none, but what moves before the fixed cameras says where the box is; None: neither.
     """
 
     static: str | Path | None = None
@@ -51,6 +56,12 @@ class CaptureSettings:
     facing: Literal["auto", "forward", "inward"] = "auto"
     test_view: int = -1
     holdout: int = 8
+    mattes: str | Path | None = None
+
+    @property
+    def subtracts(self) -> bool:
+        """Whether the background of the fixed views is to be subtracted."""
+        return str(self.mattes) == SUBTRACT
 
     @property
     def monocular(self) -> bool:
@@ -82,6 +93,11 @@ class CaptureSettings:
             raise DevrfError(
                 f"capture.offsets: {len(self.offsets)} offsets for {views} views; give one of "
                 "each, 0 for the first, or null"
+            )
+        if self.subtracts and (views < 2 or self.monocular):
+            raise DevrfError(
+                f"capture.mattes: subtract needs at least 2 views by cameras that stand still, not "
+                f"{0 if self.monocular else views}; give capture.mattes=FOLDER, or leave it out"
             )
         if self.test_view == 0 or (views > 1 and not -views <= self.test_view <= views):
             raise DevrfError(

@@ -11,6 +11,9 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
+import torch
+
+from devrf.capture.footage import is_folder
 from devrf.capture.frames import Chosen
 from devrf.capture.settings import CaptureSettings
 from devrf.errors import DevrfError
@@ -20,6 +23,10 @@ log = logging.getLogger(__name__)
 
 # Of a video, an image is compared with so many that follow it, and then at doubling distances.
 NEIGHBOURS = 10
+# Neighbouring frames of one video do not turn by more degrees than this, and so many times as much
+# as those in the middle: what looks alike has been taken for the same.
+MOST_TURN = 45.0
+MOST_TURNS = 5.0
 # A model of a smaller share of a moving camera's images is not the scene.
 LEAST_SHARE = 0.5
 
@@ -138,7 +145,8 @@ def checked_model(folder: Path, moving: Chosen, fixed: dict[str, Path]) -> Spars
         fixed: the video of each fixed view by its image.
 
     Raises:
-        DevrfError: too few of the moving camera's images are in it, or a fixed view is not.
+        DevrfError: too few of the moving camera's images are in it, or a fixed view is not; or
+            its cameras jump from frame to frame of a video.
     """
     model = read_model(folder)
     placed = {one.name for one in model.images}
@@ -153,6 +161,8 @@ def checked_model(folder: Path, moving: Chosen, fixed: dict[str, Path]) -> Spars
             "%s: %d of %d frames could not be placed, and are left out",
             *(moving.path, len(moving.names) - len(known), len(moving.names)),
         )
+    if not is_folder(moving.path):
+        _check_turns(model, moving, known)
     for name, path in fixed.items():
         if name not in placed:
             raise DevrfError(
@@ -161,3 +171,19 @@ def checked_model(folder: Path, moving: Chosen, fixed: dict[str, Path]) -> Spars
                 "out of capture.views"
             )
     return model
+
+
+def _check_turns(model: SparseModel, moving: Chosen, known: Sequence[str]) -> None:
+    place = {one.name: k for k, one in enumerate(model.images)}
+    turns = model.poses[[place[name] for name in known], :, :3]
+    trace = (turns[1:] * turns[:-1]).sum(dim=(1, 2))
+    degrees = torch.rad2deg(((trace - 1) / 2).clamp(-1, 1).acos())
+    worst = int(degrees.argmax())
+    most = float(degrees[worst])
+    if most > max(MOST_TURN, MOST_TURNS * float(degrees.median())):
+        raise DevrfError(
+            f"{moving.path}: between {Path(known[worst]).stem} and {Path(known[worst + 1]).stem}, "
+            f"frames that follow one another, its camera seems to turn by {most:.0f} degrees: "
+            "different places look alike; give more frames with capture.frames, or "
+            "capture.matching=sequential, or film where there is more texture"
+        )

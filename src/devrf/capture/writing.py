@@ -49,9 +49,9 @@ def write_scene(folder: Path, shots: Sequence[Shot], world: World, model: str) -
         The file.
     """
     path = folder / FILE
-    bounds: dict[str, Any] = {"space": world.space, "near": world.near, "far": world.far}
-    if world.box is not None:
-        bounds["box"] = world.box
+    known = {"near": world.near, "far": world.far, "box": world.box}
+    bounds: dict[str, Any] = {"space": world.space}
+    bounds |= {key: value for key, value in known.items() if value is not None}
     write_json(
         path,
         {

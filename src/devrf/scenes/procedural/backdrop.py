@@ -28,7 +28,7 @@ Wave = tuple[Vector, float, Vector]
 # Waves of the paint: direction (x, y, z) times angular frequency in radians per world unit, a
 # phase, and how much of it goes into red, green and blue. No two wavelengths have a common
 # multiple within the picture, so that no place looks like another.
-_WAVES = (
+WAVES = (
     ((1.1, 0.7, 0.9), 0.3, (0.7, 0.3, -0.1)),
     ((-1.2, 2.3, -1.7), 1.1, (-0.1, 0.5, 0.4)),
     ((3.9, -1.9, 1.3), 2.0, (0.6, 0.5, 0.7)),
@@ -38,7 +38,7 @@ _WAVES = (
 )
 # A weave over the clouds, of wavelengths from 0.11 to 0.27 world units: on the wall five to
 # twelve pixels of an image that is 240 pixels wide.
-_WEAVE = (
+WEAVE = (
     ((23.0, 9.1, 5.3), 0.9, (0.9, 0.5, 0.3)),
     ((-13.7, 29.3, 17.9), 2.2, (0.4, 0.9, 0.6)),
     ((41.3, -7.7, 21.1), 3.7, (0.8, 0.7, 0.8)),
@@ -73,11 +73,11 @@ class Backdrop:
 
     def color(self, material: Material) -> Tensor:
         """The paint (M, 3): the pedestal stands out from the floor."""
-        painted = _mural(material.rest, (*_WAVES, *_WEAVE) if self.weave else _WAVES)
+        painted = mural(material.rest, (*WAVES, *WEAVE) if self.weave else WAVES)
         return torch.where((material.part == _PEDESTAL)[:, None], 0.5 * painted, painted)
 
 
-def _mural(points: Tensor, waves: Sequence[Wave]) -> Tensor:
+def mural(points: Tensor, waves: Sequence[Wave]) -> Tensor:
     """Clouds of colour (M, 3), painted in space: the sum of ``waves``, then bounded."""
     wave = points.new_tensor([w for w, _, _ in waves])
     phase = points.new_tensor([p for _, p, _ in waves])

@@ -22,6 +22,7 @@ SHAPES: dict[str, Callable[[float], BoundedShape]] = {"robot": Robot, "flower": 
 
 
 SURROUNDINGS = ("none", "room")
+TEXTURES = ("soft", "fine")
 
 
 @dataclass(frozen=True)
@@ -35,11 +36,14 @@ class ProceduralScene(Recipe):
         static_test_views: held-out views of the scene at rest.
         surroundings: ``none``: the images have mattes; ``room``: the object stands in a furnished
             room, filmed from inside it, and the images have none.
+        texture: how the room is painted: ``soft``, or ``fine`` for images of about 240 pixels or
+            more, in which no place looks like another.
     """
 
     shape: str = "robot"
     static_test_views: int = field(default=8, kw_only=True)
     surroundings: str = field(default="none", kw_only=True)
+    texture: str = field(default="soft", kw_only=True)
 
     def render(self) -> Scene:
         """The scene, from checked numbers."""
@@ -47,6 +51,7 @@ class ProceduralScene(Recipe):
         where = extent(shape)
         reach, size = where.reach, {"width": self.width, "height": self.height}
         check_choice("data.surroundings", self.surroundings, SURROUNDINGS)
+        check_choice("data.texture", self.texture, TEXTURES)
         inside = self.surroundings == "room"
         rig = HAND_HELD if inside else STUDIO
         views = self.static_views, self.static_test_views
@@ -80,7 +85,8 @@ class ProceduralScene(Recipe):
         if self.surroundings == "none":
             return shape
         where = extent(shape)
-        return Surrounded(shape, Room(floor=where.motion.low[2]), where.reach)
+        room = Room(floor=where.motion.low[2], weave=self.texture == "fine")
+        return Surrounded(shape, room, where.reach)
 
     def model(self) -> BoundedShape:
         """The moving shape itself, for exact answers at any point and time."""

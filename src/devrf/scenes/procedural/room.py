@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from devrf.scenes.procedural.backdrop import WAVES, WEAVE, mural
 from devrf.scenes.procedural.shape import Material
 from devrf.scenes.procedural.solids import Solid, SolidTable, Xyz
 from devrf.scenes.procedural.texture import Paint, Rgb
@@ -16,6 +17,8 @@ from devrf.scenes.procedural.texture import Paint, Rgb
 _HALF, _HEIGHT = (6.0, 5.0), 5.2
 # Radius of a ball about the origin that holds the room.
 REACH = 10.0
+# Fine paint: so much of it is the mural, its waves so much longer than on the wall it was made for.
+_MURAL, _LONGER = 0.6, 1.6
 # Rays that creep past furniture have to reach a wall.
 STEPS = 400
 
@@ -74,9 +77,12 @@ class Room:
 
     Attributes:
         floor: height of the floor, world units.
+        weave: whether everything is finely painted, no place like another, as structure from
+            motion needs it; for images of about 240 pixels or more.
     """
 
     floor: float
+    weave: bool = False
 
     @property
     def parts(self) -> int:
@@ -98,7 +104,10 @@ class Room:
         furniture = (material.part - len(_SURFACES)).clamp(0, len(_FURNITURE) - 1)
         painted = _TABLE.painted.color(Material(lifted, furniture))
         surface = _papered(lifted, material.part.clamp(max=len(_SURFACES) - 1))
-        return torch.where((material.part < len(_SURFACES))[:, None], surface, painted)
+        color = torch.where((material.part < len(_SURFACES))[:, None], surface, painted)
+        if not self.weave:
+            return color
+        return color.lerp(mural(material.rest / _LONGER, (*WAVES, *WEAVE)), _MURAL)
 
 
 def _papered(points: Tensor, surface: Tensor) -> Tensor:
