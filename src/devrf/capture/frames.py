@@ -9,8 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from devrf.capture.footage import Picture, chosen
 from devrf.errors import DevrfError
+from devrf.scenes.footage import Picture, chosen
 
 Size = tuple[int, int]
 
@@ -58,7 +58,7 @@ def write_frames(folder: Path, footage: Chosen, size: Size) -> Iterator[Path]:
     Frames of other proportions are cropped in the middle; then all are brought to ``size``.
 
     Raises:
-        DevrfError: what :func:`devrf.capture.footage.chosen` raises, or an image cannot be
+        DevrfError: what :func:`devrf.scenes.footage.chosen` raises, or an image cannot be
             written.
     """
     (folder / footage.label).mkdir(parents=True, exist_ok=True)

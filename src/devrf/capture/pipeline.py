@@ -9,10 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from devrf.capture.alignment import Timeline, timeline
-from devrf.capture.footage import frame_count, is_folder, pictures
 from devrf.capture.frames import Chosen, common_size, write_frames
 from devrf.capture.kept import digest, kept, stamp
-from devrf.capture.normalisation import World, normalised
 from devrf.capture.picking import check_sharp, sharpest
 from devrf.capture.settings import CaptureSettings
 from devrf.capture.structure import check_library, checked_model, reconstruct
@@ -20,8 +18,10 @@ from devrf.capture.survey import Survey, survey
 from devrf.capture.writing import IMAGES, Shot, write_scene
 from devrf.errors import DevrfError
 from devrf.scenes.colmap_model import SparseModel
+from devrf.scenes.footage import frame_count, is_folder, pictures
 from devrf.scenes.holdout import every_nth
 from devrf.scenes.nerfstudio import FILE
+from devrf.scenes.normalisation import World, normalised
 from devrf.system.progress import followed
 
 log = logging.getLogger(__name__)
@@ -69,6 +69,9 @@ def scene_from_footage(settings: CaptureSettings) -> Path:
     _written(into, work, [moving, *fixed], size)
     model = _model(into, work, moving, fixed, settings)
     world = normalised(model, settings.facing)
+    if settings.facing == "auto":
+        facing = "forward" if world.space == "ndc" else "inward"
+        log.info("cameras look %s-facing; capture.facing says otherwise", facing)
     taken = surveys[still].times if settings.monocular else None
     shots = _shots(model, world, moving, fixed, clock, settings, taken)
     path = write_scene(into, shots, world, settings.camera)
@@ -93,6 +96,8 @@ def _path(given: str | Path) -> Path:
 
 
 def _surveyed(path: Path, work: Path) -> Survey:
+    if not path.exists():
+        raise DevrfError(f"{path}: no such video; correct capture.static or capture.views")
     # Before a folder is made: a first frame that cannot be read ends here.
     next(pictures(path))
 

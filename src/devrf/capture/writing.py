@@ -9,8 +9,8 @@ from typing import Any
 
 from torch import Tensor
 
-from devrf.capture.normalisation import World
 from devrf.scenes.nerfstudio import FILE
+from devrf.scenes.normalisation import World
 from devrf.system.files import write_json
 
 # Below the scene's folder.

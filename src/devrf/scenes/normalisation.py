@@ -1,8 +1,7 @@
-"""The world of a captured scene: its origin, axes and unit, and where in it the scene is."""
+"""The world of a sparse model: its origin, axes and unit, and where in it the scene is."""
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass
 from typing import Literal
 
@@ -11,16 +10,17 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from devrf.errors import DevrfError
 from devrf.geometry.average_pose import average_pose, relative_to
 from devrf.scenes.colmap_model import SparseModel
-
-log = logging.getLogger(__name__)
+from devrf.scenes.poses import in_reach
+from devrf.scenes.validation import scene_error
 
 Facing = Literal["auto", "forward", "inward"]
 
 # Cameras that all look within so many degrees of one direction face the scene from one side.
 ONE_SIDE = 45.0
+# From fewer points, each counted in every image that shows it, nothing is said.
+LEAST_POINTS = 50
 # Of the points so many per cent on either side may be wrong.
 OUTLIERS = 1.0
 # In the forward-facing world, the unit that makes the nearest point's distance 1/0.75: LLFF's.
@@ -58,23 +58,28 @@ def normalised(model: SparseModel, facing: Facing = "auto") -> World:
         facing: from where the cameras look.
 
     Raises:
-        DevrfError: there are no points to say where the scene is.
+        DevrfError: the points or the cameras do not say where the scene is.
     """
     poses, points = model.poses, torch.from_numpy(model.points)
     depths = torch.cat([model.depths(k) for k in range(len(model.images))])
     depths = depths[depths > 0]
-    if len(depths) < 50:
-        raise DevrfError(
-            f"{model.folder}: {len(depths)} sparse points, too few to say where the scene is; "
-            "film it with more texture in sight"
+    if len(depths) < LEAST_POINTS:
+        raise scene_error(
+            model.folder,
+            f"its images show {len(depths)} sparse points, expected {LEAST_POINTS} or more to say "
+            "where the scene is; take it with more texture in sight, or write points3D again",
         )
     near, far = (float(np.percentile(depths.numpy(), p)) for p in (OUTLIERS, 100 - OUTLIERS))
     if facing == "auto":
         facing = "forward" if widest_angle(poses) <= ONE_SIDE else "inward"
-        log.info("cameras look %s-facing; capture.facing says otherwise", facing)
-    if facing == "forward":
-        return _forward(poses, points, near, far)
-    return _inward(poses, points, near, far)
+    world = (_forward if facing == "forward" else _inward)(poses, points, near, far)
+    if not bool(in_reach(world.poses[:, :, 3]).all()) or not 0 < world.near < world.far < np.inf:
+        raise scene_error(
+            model.folder,
+            f"its cameras and points are no scene that cameras look {facing} at (all at one place, "
+            "or far apart); run COLMAP's mapper again",
+        )
+    return world
 
 
 def widest_angle(poses: Tensor) -> float:
