@@ -108,7 +108,8 @@ def chosen(path: Path, positions: Sequence[int]) -> Iterator[tuple[int, Picture]
             if not found:
                 raise scene_error(
                     path,
-                    f"ends after {position} frames, expected at least {last + 1}; write it again",
+                    f"ends after {position} frames, expected {last + 1} or more; convert it again, "
+                    "or ask for fewer",
                 )
             if image is not None:
                 yield position, _rgb(image)

@@ -16,6 +16,7 @@ from torch import Tensor
 from devrf.scenes.capture_folders import chosen_dynamic, dynamic_folders
 from devrf.scenes.downscale import Downscale, folder_factor
 from devrf.scenes.flow_files import FlowDirection, stacked_flow
+from devrf.scenes.holdout import first_of_every
 from devrf.scenes.image_files import Size, image_size
 from devrf.scenes.image_folders import image_folder, listed_images
 from devrf.scenes.images import load_images
@@ -152,8 +153,7 @@ def _posed_images(folder: Path, root: Path, downscale: int) -> Views:
 
 def _held_out(views: Views, holdout: int) -> Capture:
     """A static capture of which one image in ``holdout`` is held out, the first included."""
-    order = torch.arange(len(views))
-    train, test = views[order[order % holdout != 0]], views[order[order % holdout == 0]]
+    train, test = (views[torch.tensor(part)] for part in first_of_every(len(views), holdout))
     return Capture(_numbered(train), _numbered(test))
 
 

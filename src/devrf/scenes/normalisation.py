@@ -6,15 +6,17 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from devrf.geometry.average_pose import average_pose, relative_to
 from devrf.scenes.colmap_model import SparseModel
-from devrf.scenes.poses import in_reach
+from devrf.scenes.poses import FARTHEST, in_reach
 from devrf.scenes.validation import scene_error
 
+Corner = tuple[float, float, float]
 Facing = Literal["auto", "forward", "inward"]
 
 # Cameras that all look within so many degrees of one direction face the scene from one side.
@@ -47,7 +49,7 @@ class World:
     space: Literal["ndc", "contracted"]
     near: float
     far: float
-    box: tuple[list[float], list[float]] | None
+    box: tuple[Corner, Corner] | None
 
 
 def normalised(model: SparseModel, facing: Facing = "auto") -> World:
@@ -73,7 +75,8 @@ def normalised(model: SparseModel, facing: Facing = "auto") -> World:
     if facing == "auto":
         facing = "forward" if widest_angle(poses) <= ONE_SIDE else "inward"
     world = (_forward if facing == "forward" else _inward)(poses, points, near, far)
-    if not bool(in_reach(world.poses[:, :, 3]).all()) or not 0 < world.near < world.far < np.inf:
+    here = bool(in_reach(world.poses[:, :, 3]).all())
+    if not here or not 0 < world.near < world.far <= FARTHEST:  # NaN compares false
         raise scene_error(
             model.folder,
             f"its cameras and points are no scene that cameras look {facing} at (all at one place, "
@@ -112,8 +115,13 @@ def _inward(poses: Tensor, points: Tensor, near: float, far: float) -> World:
         for p in (2 * OUTLIERS, 100 - 2 * OUTLIERS)
     )
     margin = 0.1 * np.maximum(high - low, 0.1 * AROUND)
-    box = (low - margin).tolist(), (high + margin).tolist()
+    box = _corner(low - margin), _corner(high + margin)
     return World(poses, points, "contracted", 0.5 * near * scale, far * scale, box)
+
+
+def _corner(values: npt.NDArray[np.float64]) -> Corner:
+    x, y, z = values.tolist()
+    return x, y, z
 
 
 def _looked_at(poses: Tensor, points: Tensor) -> Tensor:

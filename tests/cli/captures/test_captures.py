@@ -1,4 +1,4 @@
-"""Six captures of the kinds that strangers bring: inspected, learned and reported by their path."""
+"""Eight captures of the kinds that strangers bring: inspected, learned, reported by their path."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ FOUND = {
     "fox": ("nerfstudio", False),
     "phone": ("nerfstudio", False),
     "hand": ("forward", True),
-    "windmill": ("nerfies", True),
+    "windmill": ("dycheck", True),
+    "garden": ("colmap", False),
+    "salmon": ("neural_3d_video", True),
 }
 
 
@@ -24,7 +26,7 @@ FOUND = {
 def place(
     tmp_path_factory: pytest.TempPathFactory, captures: dict[str, Callable[[Path], None]]
 ) -> Path:
-    """A working folder with the six captures in it."""
+    """A working folder with the eight captures in it."""
     folder = tmp_path_factory.mktemp("strangers")
     for name, write in captures.items():
         write(folder / name)
