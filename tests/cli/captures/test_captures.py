@@ -72,6 +72,22 @@ def test_a_capture_needs_no_flag_beside_its_folder(
     assert (place / "outputs" / name / "quickstart/videos/held_out.mp4").stat().st_size > 0
 
 
+def test_the_stage_at_rest_alone_is_scored_alike(
+    place: Path,
+    learned: dict[str, tuple[Any, Any]],
+    devrf_in: Callable[..., Any],
+    short: tuple[str, ...],
+) -> None:
+    """What COLMAP has posed: stage=canonical and evaluate, or the pipeline."""
+    quick = (*short, "schedule.canonical.carve=false", "hydra.run.dir=alone")
+    for stage in ("canonical", "evaluate"):
+        done = devrf_in(place, "data.root=garden", *quick, f"stage={stage}")
+        assert (done.status, done.err) == (0, "")
+    alone = json.loads((place / "alone/metrics.json").read_text())
+    for score in ("psnr", "ssim"):
+        assert alone["static"][score] == metrics_of(place, "garden")["static"][score]
+
+
 def test_they_are_in_one_report(
     place: Path, learned: dict[str, tuple[Any, Any]], devrf_in: Callable[..., Any]
 ) -> None:
