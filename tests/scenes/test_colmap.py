@@ -138,6 +138,40 @@ def test_absent_images_are_counted_or_left_out(folder, message_of):
     assert len(scene.static.train) + len(scene.static.test) == 16
 
 
+@pytest.fixture
+def moving(folder) -> Path:
+    """Three fixed cameras of three frames stand where 00, 02 and 04 were taken."""
+    for view in range(3):
+        name = f"img {2 * view:02d}"
+        (folder / f"images/round/{name}.png").rename(folder / f"images/round/view{view + 1}.png")
+        rewrite(folder, "images", name, f"view{view + 1}")
+        images = folder / f"dynamic_3views/view{view + 1}/images"
+        images.mkdir(parents=True)
+        for t in range(3):
+            shade = np.full((HEIGHT, WIDTH, 4), 255, np.uint8)
+            shade[..., 0] = 10 * view + t
+            iio.imwrite(images / f"{t}.png", shade)
+    return folder
+
+
+def test_fixed_views_are_posed_by_an_image_of_each(moving, message_of):
+    scene = ColmapReader(moving, downscale=1).read()
+    train, test = scene.dynamic.train, scene.dynamic.test
+    assert train.pixels[:, 0, 0, 0].tolist() == [0, 10, 1, 11, 2, 12]
+    assert train.times.tolist() == [0, 0, 0.5, 0.5, 1, 1] and train.view.tolist() == [0, 1] * 3
+    assert test.pixels[:, 0, 0, 0].tolist() == [20, 21, 22]
+    at_rest = dict(zip(scene.static.train.names, scene.static.train.cameras.positions, strict=True))
+    torch.testing.assert_close(at_rest["images/round/view2.png"], train.cameras.positions[1])
+    # What stands where the held-out camera does is not learned from.
+    assert "images/round/view3.png" in scene.static.test.names
+    few = ColmapReader(moving, downscale=1, test_view=1, train_views=1, frames=2).read()
+    assert few.dynamic.train.pixels[:, 0, 0, 0].tolist() == [10, 12]
+    (moving / "dynamic_3views").rename(moving / "dynamic_4views")
+    shutil.copytree(moving / "dynamic_4views/view1", moving / "dynamic_4views/view4")
+    assert "sparse/0: poses no image view4.png, nor one in a folder view4" in message_of(moving)
+    assert "data.dynamic" in message_of(moving, dynamic="dynamic_5views")
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
