@@ -90,11 +90,13 @@ def without_mattes(folder: Path) -> None:
 def test_photographs_are_of_a_scene_without_end(folder):
     without_mattes(folder)
     scene = ColmapReader(folder, downscale=1).read()
-    assert not scene.space.straight and scene.bounds.reason == "data.space=contracted"
+    assert not scene.space.straight
+    assert scene.bounds.reason == scene.bounds.box_source == "the sparse model"
     # Half the depth of the nearest points, which lie on this side of the middle.
     assert 1.0 < scene.bounds.near < 2.0
     given = ColmapReader(folder, downscale=1, near=0.7, box=[[-1, -1, -1], [1, 1, 1]]).read()
     assert given.bounds.near == 0.7 and given.space.low == (-1, -1, -1)
+    assert given.bounds.box_source == "data.box is given"
 
 
 def test_cameras_on_one_side_make_a_forward_facing_scene(tmp_path, ring_cameras, write_sparse):

@@ -78,7 +78,8 @@ class ColmapReader(PosedReader):
         layout = self._layout(folder, model, world.poses, source, factor)
         layout, _ = fewer(layout, self.train_views, self.frames)
         static, dynamic = load_layout(layout, folder, source.downscale)
-        return self.placed(folder, static, dynamic, _bounds(world, static.train.cut_out))
+        bounds = _bounds(world, static.train.cut_out)
+        return self.placed(folder, static, dynamic, bounds, "the sparse model")
 
     def _layout(
         self, folder: Path, model: SparseModel, poses: Tensor, source: ImageFolder, factor: int

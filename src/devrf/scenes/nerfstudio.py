@@ -76,7 +76,8 @@ class NerfstudioReader(PosedReader):
         layout = _layout(folder, self)
         layout, _ = fewer(layout, self.train_views, self.frames)
         static, dynamic = load_layout(layout, folder, self.downscale, self.masks)
-        return self.placed(folder, static, dynamic, layout.static_train.transforms.bounds)
+        bounds = layout.static_train.transforms.bounds
+        return self.placed(folder, static, dynamic, bounds, f"scene_bounds in {FILE}")
 
 
 def _layout(root: Path, options: NerfstudioReader) -> Layout:

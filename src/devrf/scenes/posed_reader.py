@@ -31,7 +31,12 @@ class PosedReader(InwardReader):
     space: SpaceChoice | Literal["ndc"] = "auto"  # type: ignore[assignment]
 
     def placed(
-        self, folder: Path, static: Capture, dynamic: Capture, stated: SceneBounds | None
+        self,
+        folder: Path,
+        static: Capture,
+        dynamic: Capture,
+        stated: SceneBounds | None,
+        source: str,
     ) -> Scene:
         """The scene of two captures.
 
@@ -40,13 +45,19 @@ class PosedReader(InwardReader):
             static: the scene at rest.
             dynamic: the scene in motion; ``static`` itself where it is always at rest.
             stated: where the scene is, if that is known.
+            source: what states it, in words.
 
         Raises:
             DevrfError: the options, or the cameras, do not say where it is.
         """
         reader = _with_bounds(self, stated)
         if reader.space != "ndc":
-            return reader.scene(folder, static, dynamic)
+            scene = reader.scene(folder, static, dynamic)
+            reason = scene.bounds.reason if reader.space == self.space else source
+            found = self.box is None and reader.box is not None
+            box_source = source if found else scene.bounds.box_source
+            bounds = replace(scene.bounds, reason=reason, box_source=box_source)
+            return replace(scene, bounds=bounds)
         if reader.near is None or reader.near <= 0:
             raise scene_error(
                 "data.near",
