@@ -5,15 +5,17 @@ from __future__ import annotations
 import copy
 import gc
 import logging
+import math
 import os
 import re
 import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import Any
 
 # Before torch, which loads Triton: Triton decides then whether its interpreter runs kernels.
@@ -24,6 +26,8 @@ os.environ.setdefault("TRITON_INTERPRET", "1")
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+import cv2
+import numpy as np
 import pytest
 import torch
 from hydra._internal.hydra import Hydra
@@ -33,11 +37,13 @@ from hydra.plugins.config_source import ConfigResult, ConfigSource
 from hypothesis import settings
 from lightning import Callback, Trainer
 
+from devrf.artifacts.video_file import write_pictures
 from devrf.callbacks import GridUpscaling, LearningRateDecay
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.cli.config import config_folder
 from devrf.data.datamodule import SceneDataModule
 from devrf.geometry.box import Box
+from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
 from devrf.geometry.rays import Rays
 from devrf.methods.devrf.appearance import AppearanceField
@@ -195,6 +201,67 @@ def tiny_room_recipe(tiny_recipe: ProceduralScene) -> ProceduralScene:
 def tiny_room(tiny_room_recipe: ProceduralScene) -> Scene:
     """The tiny scene in a room: images without mattes, a scene without end."""
     return tiny_room_recipe()
+
+
+def sparse_model(
+    folder: Path,
+    cameras: Cameras,
+    names: Sequence[str],
+    points: torch.Tensor,
+    model: str = "PINHOLE",
+    parameters: Sequence[float] | None = None,
+) -> None:
+    """Write a sparse model as COLMAP's text files: one lens, all points in all images.
+
+    ``parameters`` are those of ``model``; None: a pinhole with the first camera's numbers.
+    """
+    folder.mkdir(parents=True)
+    given = parameters or [*cameras.focal[0].tolist(), *cameras.center[0].tolist()]
+    numbers = " ".join(map(repr, given))
+    (folder / "cameras.txt").write_text(f"1 {model} {cameras.width} {cameras.height} {numbers}\n")
+    lines = []
+    for k, pose in enumerate(cameras.camera_to_world.double()):
+        turn = (pose[:, :3] * pose.new_tensor([1, -1, -1])).T
+        x, y, z = cv2.Rodrigues(turn.numpy())[0][:, 0].tolist()
+        angle = math.sqrt(x * x + y * y + z * z)
+        share = math.sin(angle / 2) / angle if angle else 0.5
+        quaternion = (math.cos(angle / 2), x * share, y * share, z * share)
+        moved = (-turn @ pose[:, 3]).tolist()
+        lines.append(" ".join(map(repr, (k + 1, *quaternion, *moved, 1))) + f" {names[k]}")
+        lines.append(" ".join(f"0.5 0.5 {number}" for number in range(len(points))))
+    (folder / "images.txt").write_text("\n".join(lines) + "\n")
+    rows = [f"{n} {x!r} {y!r} {z!r} 9 9 9 0.5" for n, (x, y, z) in enumerate(points.tolist())]
+    (folder / "points3D.txt").write_text("\n".join(rows) + "\n")
+
+
+@pytest.fixture(scope="session")
+def write_sparse() -> Callable[..., None]:
+    """The function :func:`sparse_model`."""
+    return sparse_model
+
+
+def rig_of_videos(
+    root: Path, films: Mapping[str, Iterable[np.ndarray]], cameras: Cameras, near: float, far: float
+) -> None:
+    """Write a video for each of the fixed cameras, and ``poses_bounds.npy``, as Neural 3D Video.
+
+    A row of it is [down, right, back, position, (H, W, f)] as 3 × 5, then two depths.
+    """
+    root.mkdir(parents=True)
+    for name, pictures in films.items():
+        write_pictures(root / name, iter(pictures), 10)
+    right, up, back, position = cameras.camera_to_world.double().unbind(dim=2)
+    size = [cameras.height, cameras.width, float(cameras.focal[0, 0])]
+    column = torch.tensor(size, dtype=torch.float64).expand(len(cameras), 3)
+    rows = torch.stack([-up, right, back, position, column], dim=2).reshape(-1, 15)
+    depths = torch.tensor([[near, far]], dtype=torch.float64).expand(len(cameras), 2)
+    np.save(root / "poses_bounds.npy", torch.cat([rows, depths], dim=1).numpy())
+
+
+@pytest.fixture(scope="session")
+def write_rig() -> Callable[..., None]:
+    """The function :func:`rig_of_videos`."""
+    return rig_of_videos
 
 
 class GivenScene(SceneDataModule):

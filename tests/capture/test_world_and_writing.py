@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from devrf.capture.normalisation import normalised
 from devrf.capture.writing import Shot, write_scene
 from devrf.data.recognised import recognised_datamodule
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.colmap_entries import ModelCamera, ModelImage
 from devrf.scenes.colmap_model import SparseModel
+from devrf.scenes.normalisation import normalised
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 

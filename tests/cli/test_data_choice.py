@@ -13,13 +13,17 @@ from omegaconf import OmegaConf
 from devrf.cli.config import config_folder
 from devrf.cli.data_choice import with_data_choice
 from devrf.scenes.blender import BlenderReader
+from devrf.scenes.colmap import ColmapReader
+from devrf.scenes.dycheck import DycheckReader
 from devrf.scenes.export import export
 from devrf.scenes.llff import LlffReader
 from devrf.scenes.nerfies import NerfiesReader
 from devrf.scenes.nerfstudio import NerfstudioReader
+from devrf.scenes.neural_3d_video import Neural3DVideoReader
 from devrf.scenes.procedural import ProceduralScene
 
 READERS = (BlenderReader, LlffReader, NerfiesReader, NerfstudioReader)
+READERS += (ColmapReader, Neural3DVideoReader, DycheckReader)
 
 
 @pytest.mark.parametrize(
@@ -110,7 +114,7 @@ def balls_root(tmp_path, moving) -> Path:
         (["data.downscael=2"], "data.downscael: no such key; did you mean data.downscale?"),
         (["data.downscale=0"], "data.downscale: expected a whole number of at least 1, or up_to_"),
         (["data.frames=1"], "data.frames: should be greater than or equal to 2"),
-        (["data.root=empty"], "{here}/empty: no known layout (Nerfies: no dataset.json"),
+        (["data.root=empty"], "{here}/empty: no known layout (DyCheck: no splits/train.json"),
         (["data.root=nowhere"], "{here}/nowhere: no such folder"),
         (["stage=prepare"], "stage=prepare: writes an embedded scene"),
     ],

@@ -26,7 +26,8 @@ KEY = re.compile(rf"([a-z_]+(?:\.[a-z_]+)+)=|^((?:{GROUPS})(?:\.[a-z_]+)+)$")
 ROOTS = ("src/", "conf/", "tests/", "docs/", "notebooks/", "benchmarks/")
 PACKAGE = REPOSITORY / "src" / "devrf"
 CHOICES = [f"data={name}" for name in ("procedural", "procedural_forward", "inward", "forward")]
-CHOICES += ["data=nerfstudio", "data=nerfies", "logger=wandb", "method=nerfies"]
+CHOICES += ["data=nerfstudio", "data=nerfies", "data=neural_3d_video"]
+CHOICES += ["logger=wandb", "method=nerfies"]
 
 
 # Of the commands without a placeholder that a reader has to fill in.

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +43,8 @@ TINY = [
     "trainer=cpu",
 ]
 FORWARD = ["field=forward", "loss=forward", "field.planes=8", "schedule.canonical.carve=false"]
+# Layouts of what does not move.
+AT_REST = ["colmap"]
 # The embedded scenes in sizes that take no time.
 EMBEDDED = {
     "procedural": ["data.static_views=8", "data.static_test_views=2"],
@@ -127,18 +131,68 @@ def write_nerfies(scene: Scene, root: Path) -> None:
         (root / f"{file}.json").write_text(json.dumps(content))
 
 
-def write_scene(target: str, root: Path, inward: Scene, forward: Scene) -> None:
-    """A tiny scene in the layout that the datamodule ``target`` reads."""
-    if target.endswith("NerfstudioDataModule"):
-        write_nerfstudio(inward, root)
-    elif target.endswith("NerfiesDataModule"):
-        write_nerfies(inward, root)
-    else:
-        export(forward if target.endswith("ForwardFacingDataModule") else inward, root)
+def write_dycheck(scene: Scene, root: Path) -> None:
+    """The scene as DyCheck lists it: the dynamic images alone, made smaller by two."""
+    write_nerfies(scene, root)
+    metadata = json.loads((root / "metadata.json").read_text())
+    (root / "rgb/4x").rename(root / "rgb/2x")
+    (root / "splits").mkdir()
+    for split, part in (("train", "dynamic"), ("val", "held")):
+        names = [name for name in metadata if name.startswith(part)]
+        content = {"frame_names": names, "time_ids": [metadata[name]["warp_id"] for name in names]}
+        (root / f"splits/{split}.json").write_text(json.dumps(content))
+
+
+def write_colmap(scene: Scene, root: Path, write_sparse: Callable[..., None]) -> None:
+    """The static images as COLMAP poses them, with points in the middle of the scene."""
+    (root / "images").mkdir(parents=True)
+    views = scene.static.train
+    names = [f"{k:03d}.png" for k in range(len(views))]
+    for name, pixels in zip(names, views.pixels, strict=True):
+        iio.imwrite(root / "images" / name, pixels.numpy())
+    points = torch.rand(20, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+    write_sparse(root / "sparse/0", views.cameras, names, points)
+
+
+def write_videos(scene: Scene, root: Path, write_rig: Callable[..., None]) -> None:
+    """The dynamic images as a video of each fixed camera; the held-out one is the first."""
+    train, test = scene.dynamic.train, scene.dynamic.test
+    shots = {"cam00.mp4": test.pixels[test.view == 0]}
+    shots |= {f"cam{v + 1:02d}.mp4": train.pixels[train.view == v] for v in range(3)}
+    films = {name: list(pixels[..., :3].numpy()) for name, pixels in shots.items()}
+    poses = [test.cameras.camera_to_world[:1], train.cameras.camera_to_world[:3]]
+    cameras = replace(train.cameras[[0] * 4], camera_to_world=torch.cat(poses))
+    write_rig(root, films, cameras, 1.5, 12.0)
+
+
+@pytest.fixture
+def write_scene(
+    tiny_scene: Scene,
+    forward_scene: Scene,
+    write_sparse: Callable[..., None],
+    write_rig: Callable[..., None],
+) -> Callable[[str, Path], None]:
+    """A function that writes a tiny scene in the layout that a datamodule reads."""
+    writers: dict[str, Callable[[Path], None]] = {
+        "NerfstudioDataModule": partial(write_nerfstudio, tiny_scene),
+        "NerfiesDataModule": partial(write_nerfies, tiny_scene),
+        "DycheckDataModule": partial(write_dycheck, tiny_scene),
+        "ColmapDataModule": partial(write_colmap, tiny_scene, write_sparse=write_sparse),
+        "Neural3DVideoDataModule": partial(write_videos, forward_scene, write_rig=write_rig),
+        "ForwardFacingDataModule": partial(export, forward_scene),
+    }
+
+    def write(target: str, root: Path) -> None:
+        writers.get(target.rpartition(".")[2], partial(export, tiny_scene))(root)
+
+    return write
 
 
 def scene_config(
-    composed: Callable[..., Any], name: str, tmp_path: Path, inward: Scene, forward: Scene
+    composed: Callable[..., Any],
+    name: str,
+    tmp_path: Path,
+    write_scene: Callable[[str, Path], None],
 ) -> Any:
     """The whole config of ``data=<name>`` with a tiny scene and tiny fields."""
     choice = [f"data={name}"]
@@ -153,9 +207,10 @@ def scene_config(
             "data.supersample=1",
         ]
     else:
-        write_scene(target, tmp_path / "scene", inward, forward)
+        write_scene(target, tmp_path / "scene")
         choice.append(f"data.root={tmp_path}/scene")
-    return composed(*choice, *(FORWARD if "Forward" in target else ()), *TINY)
+    facing = "Forward" in target or "Video" in target
+    return composed(*choice, *(FORWARD if facing else ()), *TINY)
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -164,16 +219,18 @@ def test_two_steps_of_both_stages(
     composed: Callable[..., Any],
     trainer: Callable[..., Any],
     tmp_path: Path,
-    tiny_scene: Scene,
-    forward_scene: Scene,
+    write_scene: Callable[[str, Path], None],
 ) -> None:
-    config = scene_config(composed, name, tmp_path, tiny_scene, forward_scene)
+    config = scene_config(composed, name, tmp_path, write_scene)
     module = instantiate(config.data)
     assert isinstance(module, SceneDataModule)
     canonical = instantiate(config.canonical, _convert_="all")
     trainer(max_steps=2).fit(canonical, datamodule=module)
     assert canonical.iteration == 2
     assert canonical.scene_model.canonical.color.values.abs().max() > 0
+    assert module.scene.moves is (name not in AT_REST)
+    if name in AT_REST:
+        return
     build = instantiate(config.deformation, _partial_=True, _convert_="all")
     deformation: DeformationStage = build(canonical.result())
     trainer(max_steps=2).fit(deformation, datamodule=module)
@@ -195,13 +252,16 @@ def test_a_published_scene_leaves_only_its_folder_to_give(
 
 
 def test_the_layouts_say_the_same(
-    composed: Callable[..., Any], tmp_path: Path, tiny_scene: Scene, forward_scene: Scene
+    composed: Callable[..., Any],
+    tmp_path: Path,
+    tiny_scene: Scene,
+    write_scene: Callable[[str, Path], None],
 ) -> None:
-    """One scene through three layouts: the same rays, times and pixels."""
+    """One scene through four layouts: the same rays, times and pixels."""
     scenes = {}
-    for name in ("inward", "nerfstudio", "nerfies"):
+    for name in ("inward", "nerfstudio", "nerfies", "dycheck"):
         folder = tmp_path / name
-        config = scene_config(composed, name, folder, tiny_scene, forward_scene)
+        config = scene_config(composed, name, folder, write_scene)
         scenes[name] = instantiate(config.data).scene
     given = tiny_scene.dynamic.train
     for name, scene in scenes.items():

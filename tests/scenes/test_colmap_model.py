@@ -94,6 +94,8 @@ def test_a_file_that_breaks_off_is_named(tmp_path):
         ("cameras.txt", "7 PINHOLE wide 48 50 50 32 24", "is not one of COLMAP's"),
         ("images.txt", "1 1 0 0 0 0 0 0 7\n", "is not one of COLMAP's"),
         ("images.txt", "# nothing\n", "lists no image"),
+        ("cameras.txt", f"7 PINHOLE {10**40} 48 50 50 32 24", "a camera has size"),
+        ("points3D.txt", f"{2**63} 0 0 0 9 9 9 0.5", "is not one of COLMAP's"),
     ],
 )
 def test_wrong_text_is_named(tmp_path, file, text, expected):

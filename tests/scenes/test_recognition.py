@@ -17,6 +17,13 @@ LAYOUTS = {
     "nerfstudio": ("nerfstudio", ["transforms.json"]),
     "two captures of nerfstudio": ("nerfstudio", ["static/transforms.json"]),
     "Nerfies": ("nerfies", ["dataset.json", "metadata.json", "scene.json"]),
+    "DyCheck": ("dycheck", ["splits/train.json", "splits/val.json", "dataset.json", "scene.json"]),
+    "Neural 3D Video": ("neural_3d_video", ["poses_bounds.npy", "cam00.mp4", "cam01.mp4"]),
+    "COLMAP": ("colmap", ["sparse/0/cameras.bin", "sparse/0/images.bin", "images/0.jpg"]),
+    "COLMAP, one folder less": ("colmap", ["sparse/cameras.txt", "sparse/images.txt"]),
+    # mip-NeRF 360 has both; a video says its times, a model of COLMAP does not.
+    "COLMAP beside LLFF": ("colmap", ["poses_bounds.npy", "sparse/0/cameras.bin"]),
+    "NR-NeRF": ("forward", ["poses_bounds.npy", "precomputed.json", "sparse/0/cameras.bin"]),
     # nerfstudio's converters leave COLMAP's other files beside their own.
     "nerfstudio beside LLFF": ("nerfstudio", ["transforms.json", "poses_bounds.npy"]),
 }
@@ -46,10 +53,12 @@ def test_what_each_layout_lacks_is_said_in_one_line(tmp_path: Path) -> None:
         "DeVRF: no static/transforms_train.json",
         "D-NeRF, NeRF-synthetic: no transforms_train.json",
         "instant-ngp: no transforms.json",
+        "COLMAP: no sparse/**/cameras.*",
         "LLFF: no poses_bounds.npy",
         "set data.root to the scene's folder",
     ):
         assert part in line
+    assert "mp4" not in line  # what lacks more than another is left out
 
 
 def test_a_folder_of_scenes_is_told_from_a_scene(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@
        │
     writing     ``transforms.json`` with a ``time`` on each frame, and the lists of held-out images
 
+``footage`` and ``normalisation`` are in :mod:`devrf.scenes`, whose readers use them, too.
 ``scene_from_footage`` in :mod:`devrf.capture.pipeline` leads through them. Optical flow is
 estimated when the scene is read, as of any other scene (:mod:`devrf.scenes.optical_flow`).
 

@@ -10,9 +10,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from devrf.capture.footage import Picture, chosen
 from devrf.capture.mattes import Matte, chosen_mattes
 from devrf.errors import DevrfError
+from devrf.scenes.footage import Picture, chosen
 
 Size = tuple[int, int]
 
@@ -68,7 +68,7 @@ def write_frames(folder: Path, footage: Chosen, size: Size, filmed: Size) -> Ite
         filmed: of the frames.
 
     Raises:
-        DevrfError: what :func:`devrf.capture.footage.chosen` and
+        DevrfError: what :func:`devrf.scenes.footage.chosen` and
             :func:`devrf.capture.mattes.chosen_mattes` raise, or an image cannot be written.
     """
     (folder / footage.label).mkdir(parents=True, exist_ok=True)

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from devrf.capture.footage import chosen, is_folder
 from devrf.errors import DevrfError
+from devrf.scenes.footage import chosen, is_folder
 from devrf.scenes.image_folders import listed_images
 from devrf.scenes.masks import read_mask
 
@@ -79,7 +79,6 @@ def chosen_mattes(
         for position in positions:
             yield position, read_mask(files[position], size, None, footage)
         return
-    last = -1
     for position, picture in chosen(mattes, positions):
         height, width = picture.shape[:2]
         if (width, height) != size:
@@ -87,14 +86,8 @@ def chosen_mattes(
                 f"{mattes}: {width}x{height} px, but {footage} has {size[0]}x{size[1]} px; give "
                 "mattes of its size"
             )
-        last = position
         # Grey as it is, whatever compression has made of its colours.
         yield position, picture.mean(axis=2).round().astype(np.uint8)
-    if last < max(positions):
-        raise DevrfError(
-            f"{mattes}: ends before frame {max(positions) + 1} of {footage}; give a matte for each "
-            "frame"
-        )
 
 
 def _of_photograph(mattes: Path, photograph: Path) -> Path:

@@ -10,11 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from devrf.capture.alignment import Timeline, timeline
-from devrf.capture.footage import frame_count, is_folder, pictures
 from devrf.capture.frames import Chosen, common_size, write_frames
 from devrf.capture.kept import digest, kept, stamp
 from devrf.capture.mattes import mattes_of
-from devrf.capture.normalisation import AROUND, World, normalised
 from devrf.capture.picking import check_sharp, sharpest
 from devrf.capture.settings import CaptureSettings
 from devrf.capture.structure import check_library, checked_model, reconstruct
@@ -24,8 +22,10 @@ from devrf.capture.writing import IMAGES, Shot, write_scene
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.scenes.colmap_model import SparseModel
+from devrf.scenes.footage import frame_count, is_folder, pictures
 from devrf.scenes.holdout import every_nth
 from devrf.scenes.nerfstudio import FILE
+from devrf.scenes.normalisation import AROUND, World, normalised
 from devrf.system.progress import followed
 
 log = logging.getLogger(__name__)
@@ -74,12 +74,15 @@ def scene_from_footage(settings: CaptureSettings) -> Path:
     filmed = {path: one.size for path, one in surveys.items()}
     _written(into, work, [moving, *fixed], size, filmed)
     model = _model(into, work, moving, fixed, settings)
-    world = normalised(model, settings.facing, cut_out=bool(mattes))
+    world = normalised(model, settings.facing)
+    if settings.facing == "auto":
+        facing = "forward" if world.space == "ndc" else "inward"
+        log.info("cameras look %s-facing; capture.facing says otherwise", facing)
     if settings.subtracts:
         world = _around_motion(world, model, into / IMAGES, fixed)
     taken = surveys[still].times if settings.monocular else None
     shots = _shots(model, world, moving, fixed, clock, settings, taken)
-    path = write_scene(into, shots, world, settings.camera)
+    path = write_scene(into, shots, world, settings.camera, cut_out=bool(mattes))
     log.info("%d images written to %s", len(shots), path)
     return into
 
@@ -101,6 +104,8 @@ def _path(given: str | Path) -> Path:
 
 
 def _surveyed(path: Path, work: Path) -> Survey:
+    if not path.exists():
+        raise DevrfError(f"{path}: no such video; correct capture.static or capture.views")
     # Before a folder is made: a first frame that cannot be read ends here.
     next(pictures(path))
     try:
@@ -191,7 +196,7 @@ def _around_motion(
     poses = world.poses[first]
     around = Box.of([-AROUND] * 3, [AROUND] * 3)
     box = box_of_motion(images, [one.names for one in fixed], poses, lenses, around)
-    return replace(world, box=(list(box.low), list(box.high)))
+    return replace(world, box=(box.low, box.high))
 
 
 def _shots(

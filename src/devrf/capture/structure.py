@@ -13,11 +13,11 @@ from typing import Any
 
 import torch
 
-from devrf.capture.footage import is_folder
 from devrf.capture.frames import Chosen
 from devrf.capture.settings import CaptureSettings
 from devrf.errors import DevrfError
 from devrf.scenes.colmap_model import SparseModel, read_model
+from devrf.scenes.footage import is_folder
 
 log = logging.getLogger(__name__)
 

@@ -12,10 +12,10 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from devrf.capture.footage import Picture
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
+from devrf.scenes.footage import Picture
 from devrf.scenes.scene import Views
 from devrf.scenes.silhouettes import motion_box
 

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from devrf.capture.footage import Picture, pictures
 from devrf.errors import DevrfError
+from devrf.scenes.footage import Picture, pictures
 
 # Frames are looked at with so many pixels of the longer side: much smaller ones hide blur, larger
 # ones show the sensor's noise.
@@ -66,7 +66,7 @@ def survey(path: Path, followed: Iterable[tuple[float, Picture]] | None = None) 
         followed: its frames, if the caller watches the progress; None: they are read here.
 
     Raises:
-        DevrfError: what :func:`devrf.capture.footage.pictures` raises, or the frames have
+        DevrfError: what :func:`devrf.scenes.footage.pictures` raises, or the frames have
             several sizes.
     """
     size: tuple[int, int] | None = None

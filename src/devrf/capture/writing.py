@@ -9,8 +9,8 @@ from typing import Any
 
 from torch import Tensor
 
-from devrf.capture.normalisation import World
 from devrf.scenes.nerfstudio import FILE
+from devrf.scenes.normalisation import World
 from devrf.system.files import write_json
 
 # Below the scene's folder.
@@ -36,7 +36,9 @@ class Shot:
     held_out: bool
 
 
-def write_scene(folder: Path, shots: Sequence[Shot], world: World, model: str) -> Path:
+def write_scene(
+    folder: Path, shots: Sequence[Shot], world: World, model: str, *, cut_out: bool = False
+) -> Path:
     """Write ``transforms.json``; the images are there already.
 
     Args:
@@ -44,14 +46,18 @@ def write_scene(folder: Path, shots: Sequence[Shot], world: World, model: str) -
         shots: all images.
         world: where the scene is.
         model: the lenses' camera model.
+        cut_out: whether the images have mattes: there is nothing around what they cut out, and
+            the reader finds its box.
 
     Returns:
         The file.
     """
     path = folder / FILE
-    known = {"near": world.near, "far": world.far, "box": world.box}
-    bounds: dict[str, Any] = {"space": world.space}
-    bounds |= {key: value for key, value in known.items() if value is not None}
+    bounds: dict[str, Any] = {"space": world.space, "near": world.near, "far": world.far}
+    if world.box is not None:
+        bounds["box"] = world.box
+    if cut_out and world.space == "contracted":
+        bounds = {"space": "world"}
     write_json(
         path,
         {

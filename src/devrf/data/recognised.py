@@ -5,10 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from devrf.data.colmap import ColmapDataModule
+from devrf.data.dycheck import DycheckDataModule
 from devrf.data.forward import ForwardFacingDataModule
 from devrf.data.inward import InwardFacingDataModule
 from devrf.data.nerfies import NerfiesDataModule
 from devrf.data.nerfstudio import NerfstudioDataModule
+from devrf.data.neural_3d_video import Neural3DVideoDataModule
 from devrf.data.recorded import RecordedDataModule
 from devrf.scenes.recognition import recognise
 
@@ -17,6 +20,9 @@ DATAMODULES: dict[str, Any] = {
     "forward": ForwardFacingDataModule,
     "nerfies": NerfiesDataModule,
     "nerfstudio": NerfstudioDataModule,
+    "colmap": ColmapDataModule,
+    "neural_3d_video": Neural3DVideoDataModule,
+    "dycheck": DycheckDataModule,
 }
 
 

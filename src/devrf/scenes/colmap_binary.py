@@ -105,7 +105,7 @@ def read_points(file: Path) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float
     source = _Bytes(file)
     numbers, places = [], []
     for _ in range(source.count()):
-        number, x, y, z = source.take("<Q3d")
+        number, x, y, z = source.take("<q3d")
         source.skip(3 + 8)  # colour, error
         source.skip(8 * source.count())  # its track
         numbers.append(int(number))

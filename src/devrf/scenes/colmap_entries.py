@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from devrf.geometry.distortion import Distortion
 from devrf.scenes.intrinsics import Intrinsics
-from devrf.scenes.validation import scene_error
+from devrf.scenes.validation import LARGEST, scene_error
 
 # Parameters of each camera model that can be read, in the order of the file.
 PARAMETERS = {
@@ -101,7 +101,12 @@ def checked_camera(
             f"a camera of model {name} has {len(parameters)} parameters, expected "
             f"{len(PARAMETERS[name])}; write it again",
         )
-    if min(size) < 1 or not np.isfinite(parameters).all() or parameters[0] <= 0:
+    if (
+        min(size) < 1
+        or max(size) >= LARGEST
+        or not np.isfinite(parameters).all()
+        or parameters[0] <= 0
+    ):
         raise scene_error(
             file, f"a camera has size {size} and parameters {parameters}; write it again"
         )

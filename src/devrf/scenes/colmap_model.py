@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +36,7 @@ class SparseModel:
     points: npt.NDArray[np.float64]
     numbers: npt.NDArray[np.int64]
 
-    @property
+    @cached_property
     def poses(self) -> Tensor:
         """(N, 3, 4) float64 camera-to-world, OpenGL axes, world units.
 

@@ -53,7 +53,7 @@ def read_points(file: Path) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float
     for line in filter(None, _lines(file)):
         with _understood(file, line):
             number, x, y, z = line.split(maxsplit=4)[:4]
-            numbers.append(int(number))
+            numbers.append(np.int64(number))
             places.append((float(x), float(y), float(z)))
     return np.array(numbers, np.int64), np.array(places, np.float64).reshape(-1, 3)
 

@@ -6,7 +6,7 @@ import codecs
 from pathlib import Path
 from typing import Annotated, TypeVar
 
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
 
 from devrf.scenes.paths import existing_file
 from devrf.scenes.validation import LARGEST, first_error, scene_error
@@ -24,6 +24,15 @@ Vector2 = tuple[Number, Number]
 Vector3 = tuple[Number, Number, Number]
 Vector4 = tuple[Number, Number, Number, Number]
 Name = Annotated[str, Field(min_length=1)]
+
+
+def _distinct(ids: list[str]) -> list[str]:
+    if len(set(ids)) < len(ids):
+        raise ValueError("expected a list of distinct ids; correct it")
+    return ids
+
+
+Ids = Annotated[list[Name], Field(fail_fast=True), AfterValidator(_distinct)]
 
 Content = TypeVar("Content")
 

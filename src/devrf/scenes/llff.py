@@ -16,6 +16,7 @@ from torch import Tensor
 from devrf.scenes.capture_folders import chosen_dynamic, dynamic_folders
 from devrf.scenes.downscale import Downscale, folder_factor
 from devrf.scenes.flow_files import FlowDirection, stacked_flow
+from devrf.scenes.holdout import first_of_every
 from devrf.scenes.image_files import Size, image_size
 from devrf.scenes.image_folders import image_folder, listed_images
 from devrf.scenes.images import load_images
@@ -28,7 +29,7 @@ from devrf.scenes.paths import existing_folder, scene_folder
 from devrf.scenes.reader import Count, Holdout, SceneReader, Time
 from devrf.scenes.scene import Capture, OpticalFlow, Scene, Views
 from devrf.scenes.validation import scene_error
-from devrf.scenes.view_folders import ViewFolder, flow_files, view_folders
+from devrf.scenes.view_folders import ViewFolder, chosen_views, flow_files, view_folders
 
 log = logging.getLogger(__name__)
 
@@ -82,7 +83,7 @@ class LlffReader(SceneReader):
         folders = view_folders(moving, folder_factor(static_folder(folder), self.downscale))
         if self.frames is not None and self.frames < len(folders[0].images):
             return None
-        _, train = _chosen_views(moving, len(folders), self.test_view, self.train_views)
+        _, train = chosen_views(moving, len(folders), self.test_view, self.train_views)
         sizes = read_dynamic_poses(moving).last(len(folders)).sizes
         return _flow(views, [folders[v] for v in train], sizes[train[0]], "fwd")
 
@@ -152,8 +153,7 @@ def _posed_images(folder: Path, root: Path, downscale: int) -> Views:
 
 def _held_out(views: Views, holdout: int) -> Capture:
     """A static capture of which one image in ``holdout`` is held out, the first included."""
-    order = torch.arange(len(views))
-    train, test = views[order[order % holdout != 0]], views[order[order % holdout == 0]]
+    train, test = (views[torch.tensor(part)] for part in first_of_every(len(views), holdout))
     return Capture(_numbered(train), _numbered(test))
 
 
@@ -172,7 +172,7 @@ def _dynamic(options: LlffReader, folder: Path, root: Path, downscale: int) -> C
             f"view{len(views)}; the last rows are those of the fixed cameras",
         )
     posed = posed.last(len(views))
-    test, train = _chosen_views(folder, len(views), options.test_view, options.train_views)
+    test, train = chosen_views(folder, len(views), options.test_view, options.train_views)
     total, frames = len(views[0].images), options.frames
     kept = torch.arange(total)
     if frames is not None and frames < total:
@@ -186,29 +186,6 @@ def _dynamic(options: LlffReader, folder: Path, root: Path, downscale: int) -> C
         flow = _flow(train_set, [views[v] for v in train], posed.sizes[train[0]], "bwd")
         train_set = replace(train_set, flow=flow)
     return Capture(train_set, test_set)
-
-
-def _chosen_views(
-    folder: Path, count: int, test_view: int, train_views: int | None
-) -> tuple[int, list[int]]:
-    """Positions of the held-out view and of the views to learn from."""
-    if test_view == 0 or not -count <= test_view <= count:
-        raise scene_error(
-            "data.test_view",
-            f"{test_view} is none of the {count} views in {folder}, view1 … view{count}; give 1 … "
-            f"{count}, or -1 for the last one",
-        )
-    test = test_view - 1 if test_view > 0 else count + test_view
-    train = [v for v in range(count) if v != test]
-    if not train:
-        raise scene_error(folder, "has one view, expected at least one more to learn from")
-    if train_views is not None and train_views > len(train):
-        raise scene_error(
-            folder,
-            f"data.train_views={train_views}, but there are {len(train)} views to learn "
-            "from next to the held-out one; ask for fewer",
-        )
-    return test, train[:train_views]
 
 
 def _moving(

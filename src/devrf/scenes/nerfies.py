@@ -3,62 +3,28 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import KW_ONLY, replace
+from collections.abc import Sequence
+from dataclasses import KW_ONLY
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import torch
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    Field,
-    TypeAdapter,
-    ValidationError,
-)
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
-from devrf.scenes.absent_images import present_images
-from devrf.scenes.bounds import FALLBACK_BOUND_SCALE, axes_do_meet, box_of_frusta
-from devrf.scenes.downscale import Downscale, folder_factor
+from devrf.scenes.downscale import Downscale
 from devrf.scenes.holdout import every_nth
-from devrf.scenes.image_folders import image_folder
-from devrf.scenes.json_files import Name, Number, Positive, Vector3, read_json
-from devrf.scenes.layout import Layout, fewer, load_layout, static_alone, without_static_set
-from devrf.scenes.nerfies_camera import read_camera
+from devrf.scenes.json_files import Ids, Number, read_json
+from devrf.scenes.layout import fewer, load_layout
+from devrf.scenes.nerfies_images import images_at, list_items, motion_layout, posed_items
+from devrf.scenes.nerfies_world import placed, read_world
 from devrf.scenes.paths import scene_folder
-from devrf.scenes.poses import FARTHEST
 from devrf.scenes.reader import EstimatedFlow, Holdout, InwardReader, Time
 from devrf.scenes.scene import Scene
-from devrf.scenes.splits import in_motion, one_moment
-from devrf.scenes.transforms import Transforms
 from devrf.scenes.validation import abbreviated, first_error, scene_error
 
 log = logging.getLogger(__name__)
 
-DATASET, METADATA, SCENE = "dataset.json", "metadata.json", "scene.json"
-
-
-def _distinct(ids: list[str]) -> list[str]:
-    if len(set(ids)) < len(ids):
-        raise ValueError("expected a list of distinct ids; correct it")
-    return ids
-
-
-Ids = Annotated[list[Name], Field(fail_fast=True), AfterValidator(_distinct)]
-Length = Annotated[Positive, Field(le=FARTHEST)]
-
-
-class _World(BaseModel):
-    """``scene.json``: the frame of reference, (position − center) · scale.
-
-    ``near`` and ``far`` are in world units, scaled already.
-    """
-
-    center: Vector3
-    scale: Length
-    near: Length
-    far: Length
+DATASET, METADATA = "dataset.json", "metadata.json"
 
 
 class _Dataset(BaseModel):
@@ -79,7 +45,7 @@ class _Moment(BaseModel):
     warp_id: Number | None = None
 
 
-_WORLD, _DATASET = TypeAdapter(_World), TypeAdapter(_Dataset)
+_DATASET = TypeAdapter(_Dataset)
 _ENTRIES: TypeAdapter[dict[str, Any]] = TypeAdapter(dict[str, Any])
 
 
@@ -108,43 +74,16 @@ class NerfiesReader(InwardReader):
     def read(self) -> Scene:
         """See :meth:`devrf.scenes.reader.SceneReader.read`."""
         folder = scene_folder(self.root)
-        world = read_json(
-            folder / SCENE, _WORLD, "it says where the scene is; set data.root to its folder"
-        )
+        world = read_world(folder)
         items, train, test = _items(folder / DATASET, self.holdout)
-        names = {"full": "1x", "reduced": "{}x"}
-        factor = folder_factor(folder / "rgb", self.downscale, **names)
-        images = image_folder(folder / "rgb", factor, **names)
-        listed = [f"rgb/{images.path.name}/{item}" for item in items]
-        present = present_images(listed, folder / DATASET, folder, self.missing)
-        transforms = _transforms(folder, items, present, world)
-        train, test = (_present(part, present, folder / DATASET) for part in (train, test))
-        layout = _layout(transforms, train, test, self.static_until)
+        images = images_at(folder, self.downscale)
+        listed = list_items(folder, folder / DATASET, items, images, self.missing)
+        times = _times(folder / METADATA, listed.items)
+        transforms = posed_items(folder, listed, world, times)
+        train, test = listed.positions(train), listed.positions(test)
+        layout = motion_layout(transforms, train, test, METADATA, self.static_until)
         layout, _ = fewer(layout, None, self.frames)
-        static, dynamic = load_layout(layout, folder, images.downscale)
-        near = world.near if self.near is None else self.near
-        far = world.far if self.far is None else self.far
-        reader, cameras = replace(self, near=near, far=far), static.train.cameras
-        wide = self.box is None and not static.train.cut_out and 0 <= near < far
-        if not wide or (self.space != "world" and axes_do_meet(cameras)):
-            return reader.scene(folder, static, dynamic)
-        # Without mattes the backdrop is to be learned too.
-        seen = box_of_frusta(cameras, near, far)
-        scale = FALLBACK_BOUND_SCALE if self.bound_scale == "auto" else self.bound_scale
-        box = [seen.low, seen.high]
-        reader = replace(reader, box=box, space="world", bound_scale=scale)
-        scene = reader.scene(folder, static, dynamic)
-        why = "data.space=world" if self.space == "world" else "the cameras look in one direction"
-        bounds = replace(scene.bounds, reason=why, box_source="all that the cameras see up to far")
-        return replace(scene, bounds=bounds)
-
-
-def _layout(transforms: Transforms, train: list[int], test: list[int], until: float) -> Layout:
-    if not one_moment(transforms):
-        both = in_motion(transforms[train]), in_motion(transforms[test])
-        return without_static_set(*both, until)
-    why = f"all images have one time in {METADATA}"
-    return static_alone(transforms[train], transforms[test], why)
+        return placed(self, folder, world, *load_layout(layout, folder, images.downscale))
 
 
 def _items(file: Path, holdout: int) -> tuple[list[str], list[int], list[int]]:
@@ -182,34 +121,8 @@ def _items(file: Path, holdout: int) -> tuple[list[str], list[int], list[int]]:
     return items, learned, [position[item] for item in val]
 
 
-def _present(wanted: list[int], present: dict[int, Path], file: Path) -> list[int]:
-    """Positions among the images that are present."""
-    place = {position: k for k, position in enumerate(present)}
-    kept = [place[position] for position in wanted if position in place]
-    if not kept:
-        raise scene_error(
-            file, "all images to learn from, or all that are held out, are absent; add them"
-        )
-    return kept
-
-
-def _transforms(
-    folder: Path, items: list[str], images: dict[int, Path], world: _World
-) -> Transforms:
-    """The images, by their positions among the items, with cameras and times."""
-    names = [items[position] for position in images]
-    cameras = [read_camera(folder, name, world.center, world.scale) for name in names]
-    return Transforms(
-        folder / DATASET,
-        tuple(intrinsics for _, intrinsics in cameras),
-        tuple(images.values()),
-        torch.stack([pose for pose, _ in cameras]),
-        _times(folder / METADATA, names),
-    )
-
-
-def _times(file: Path, items: list[str]) -> tuple[float, ...]:
-    """When each image was taken, from 0 (the first of all) to 1 (the last)."""
+def _times(file: Path, items: Sequence[str]) -> tuple[float, ...]:
+    """When each image was taken, on the scale of the file."""
     content = read_json(
         file,
         _ENTRIES,
@@ -230,5 +143,4 @@ def _times(file: Path, items: list[str]) -> tuple[float, ...]:
         if value is None:
             raise scene_error(file, f"image {abbreviated(item)} has no {key}; add it")
         ids.append(value)
-    first, last = min(ids), max(ids)
-    return tuple((value - first) / ((last - first) or 1.0) for value in ids)
+    return tuple(ids)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import logging
 import os
-from dataclasses import KW_ONLY, replace
+from dataclasses import KW_ONLY
 from pathlib import Path
-from typing import Literal
 
 import torch
 from pydantic.dataclasses import dataclass
@@ -14,12 +13,11 @@ from torch import Tensor
 
 from devrf.scenes.holdout import every_nth
 from devrf.scenes.image_files import find_image, image_at
-from devrf.scenes.inward_space import SpaceChoice
 from devrf.scenes.layout import Layout, fewer, load_layout, static_alone, without_static_set
 from devrf.scenes.masks import Masks
-from devrf.scenes.one_sided import centred, one_sided_scene
 from devrf.scenes.paths import inside, scene_folder
-from devrf.scenes.reader import Count, EstimatedFlow, Holdout, InwardReader, Time
+from devrf.scenes.posed_reader import PosedReader
+from devrf.scenes.reader import Count, EstimatedFlow, Holdout, Time
 from devrf.scenes.scene import Scene
 from devrf.scenes.splits import (
     at_rest,
@@ -28,7 +26,7 @@ from devrf.scenes.splits import (
     one_moment,
     one_moment_in_words,
 )
-from devrf.scenes.transforms import SceneBounds, Transforms, posed_images, read_listing
+from devrf.scenes.transforms import Transforms, posed_images, read_listing
 from devrf.scenes.validation import abbreviated, scene_error
 
 log = logging.getLogger(__name__)
@@ -40,7 +38,7 @@ _AT_REST = 1e-6
 
 
 @dataclass(frozen=True)
-class NerfstudioReader(InwardReader):
+class NerfstudioReader(PosedReader):
     """Reads ``transforms.json`` and images.
 
     The file may lie in ``root``, with a ``time`` in [0, 1] on every frame, or in
@@ -61,11 +59,8 @@ class NerfstudioReader(InwardReader):
         static_until: in one file, the latest time of an image that counts as static; None: 0
             where several images are of time 0, else 1.
         masks: what the masks of the frames are taken for; ``none`` leaves them alone.
-        space: as of :class:`~devrf.scenes.reader.InwardReader`, or ``ndc`` for cameras that face
-            the scene from one side: then the world is that of their average pose, ``near`` is
-            the near plane, and the scene is a forward-facing one. A file of ``stage=capture``
-            says itself (``scene_bounds``) what ``auto`` is, and ``near``, ``far`` and ``box``
-            where they are None.
+        space: as of :class:`~devrf.scenes.posed_reader.PosedReader`; a file of ``stage=capture``
+            says itself (``scene_bounds``) what ``auto`` is.
     """
 
     _: KW_ONLY
@@ -74,38 +69,15 @@ class NerfstudioReader(InwardReader):
     holdout: Holdout = 8
     static_until: Time | None = None
     masks: Masks = "ignore"
-    space: SpaceChoice | Literal["ndc"] = "auto"  # type: ignore[assignment]
 
     def read(self) -> Scene:
         """See :meth:`devrf.scenes.reader.SceneReader.read`."""
         folder = scene_folder(self.root)
         layout = _layout(folder, self)
         layout, _ = fewer(layout, self.train_views, self.frames)
-        captures = load_layout(layout, folder, self.downscale, self.masks)
-        reader = _with_bounds(self, layout.static_train.transforms.bounds)
-        if reader.space != "ndc":
-            return reader.scene(folder, *captures)
-        if reader.near is None or reader.near <= 0:
-            raise scene_error(
-                "data.near",
-                "data.space=ndc needs the distance of the near plane, above 0; give it in world "
-                "units, a little less than the depth of what is nearest",
-            )
-        name = self.name_of(folder)
-        return one_sided_scene(name, *centred(*captures), reader.near, self.background)
-
-
-def _with_bounds(options: NerfstudioReader, stated: SceneBounds | None) -> NerfstudioReader:
-    """The options, with what the file states where they leave it open."""
-    if stated is None:
-        return options
-    space = stated.space if options.space == "auto" else options.space
-    if (space == "ndc") != (stated.space == "ndc"):  # in another world, or of other meaning
-        return replace(options, space=space)
-    box = stated.box if options.box is None and options.space == "auto" else options.box
-    near = stated.near if options.near is None else options.near
-    far = stated.far if options.far is None else options.far
-    return replace(options, space=space, near=near, far=far, box=box)
+        static, dynamic = load_layout(layout, folder, self.downscale, self.masks)
+        bounds = layout.static_train.transforms.bounds
+        return self.placed(folder, static, dynamic, bounds, f"scene_bounds in {FILE}")
 
 
 def _layout(root: Path, options: NerfstudioReader) -> Layout:

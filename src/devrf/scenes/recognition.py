@@ -20,7 +20,7 @@ class KnownLayout:
     Attributes:
         choice: the option of ``data=`` whose reader reads it.
         name: whose layout it is.
-        files: what has to be there, relative to the scene's folder.
+        files: what has to be there, relative to the scene's folder; ``*`` stands for any text.
     """
 
     choice: str
@@ -29,18 +29,28 @@ class KnownLayout:
 
     def missing(self, root: Path) -> list[str]:
         """Those of ``files`` that are not in ``root``."""
-        return [name for name in self.files if not os.path.isfile(root / name)]
+        return [name for name in self.files if not _is_there(root, name)]
+
+
+def _is_there(root: Path, name: str) -> bool:
+    if "*" not in name:
+        return os.path.isfile(root / name)
+    return any(os.path.isfile(path) for path in root.glob(name))
 
 
 # Folders that hold files of several layouts have that of the first: of two captures before one,
 # of what says more about its images before what says less.
 LAYOUTS = (
+    KnownLayout("dycheck", "DyCheck", ("splits/train.json", "scene.json")),
     KnownLayout("nerfies", "Nerfies", ("dataset.json", "scene.json")),
     KnownLayout("inward", "DeVRF", ("static/transforms_train.json",)),
     KnownLayout("forward", "DeVRF forward", ("static/poses_bounds.npy",)),
     KnownLayout("nerfstudio", "nerfstudio", ("static/transforms.json",)),
     KnownLayout("inward", "D-NeRF, NeRF-synthetic", ("transforms_train.json",)),
     KnownLayout("nerfstudio", "nerfstudio, instant-ngp", ("transforms.json",)),
+    KnownLayout("neural_3d_video", "Neural 3D Video", ("poses_bounds.npy", "cam*.mp4")),
+    KnownLayout("forward", "NR-NeRF", ("poses_bounds.npy", "precomputed.json")),
+    KnownLayout("colmap", "COLMAP", ("sparse/**/cameras.*",)),
     KnownLayout("forward", "LLFF", ("poses_bounds.npy",)),
 )
 
@@ -63,7 +73,10 @@ def recognise(root: str | Path) -> KnownLayout:
 
 
 def _lacks(folder: Path) -> str:
-    return "; ".join(f"{one.name}: no {', '.join(one.missing(folder))}" for one in LAYOUTS)
+    """What each layout lacks; of layouts that begin alike, the one that lacks the least."""
+    missing = {one.name: set(one.missing(folder)) for one in LAYOUTS}
+    least = [one for one in LAYOUTS if not any(m < missing[one.name] for m in missing.values())]
+    return "; ".join(f"{one.name}: no {', '.join(one.missing(folder))}" for one in least)
 
 
 def _advice(folder: Path) -> str:

@@ -83,6 +83,39 @@ def view_folders(folder: Path, downscale: int) -> list[ViewFolder]:
     return views
 
 
+def chosen_views(
+    folder: Path, count: int, test_view: int, train_views: int | None
+) -> tuple[int, list[int]]:
+    """Positions of the held-out view and of the views to learn from.
+
+    Args:
+        folder: where the views are, for messages.
+        count: how many there are.
+        test_view: the number of the one to hold out, from 1 on; −1 is the last one.
+        train_views: learn from the first so many of the others; None: all.
+
+    Raises:
+        DevrfError: there is no such view, or there are too few.
+    """
+    if test_view == 0 or not -count <= test_view <= count:
+        raise scene_error(
+            "data.test_view",
+            f"{test_view} is none of the {count} views in {folder}, view1 … view{count}; give 1 … "
+            f"{count}, or -1 for the last one",
+        )
+    test = test_view - 1 if test_view > 0 else count + test_view
+    train = [v for v in range(count) if v != test]
+    if not train:
+        raise scene_error(folder, "has one view, expected at least one more to learn from")
+    if train_views is not None and train_views > len(train):
+        raise scene_error(
+            folder,
+            f"data.train_views={train_views}, but there are {len(train)} views to learn "
+            "from next to the held-out one; ask for fewer",
+        )
+    return test, train[:train_views]
+
+
 def flow_files(
     views: list[ViewFolder], direction: FlowDirection = "bwd"
 ) -> dict[tuple[int, int], Path]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -225,6 +226,10 @@ def windmill(scene: Scene) -> Writer:
         bounds = {"near": scene.bounds.near, "far": scene.bounds.far}
         write_json(root / "scene.json", {"scale": 1.0, "center": [0.0, 0.0, 0.0], **bounds})
         extra = {"bbox": [[-1, -1, -1], [1, 1, 1]], "factor": 1, "fps": 60}
+        covisible = np.full((test.height, test.width), 255, dtype=np.uint8)
+        covisible[:, :3] = 0
+        for item in ids["val"]:
+            write_image(root / "covisible/1x/val" / f"{item}.png", covisible)
         write_json(root / "extra.json", {**extra, "lookat": [0, 0, 0], "up": [0, 0, 1]})
 
     return write
@@ -247,10 +252,50 @@ def nerfies_camera(cameras: Cameras, image: int) -> dict[str, Any]:
     }
 
 
+def garden(scene: Scene, write_sparse: Callable[..., None]) -> Writer:
+    """COLMAP: photographs at full size and smaller by two, cameras and points in ``sparse/0``."""
+
+    def write(root: Path) -> None:
+        views = scene.static.train
+        names = [f"DSC{k + 7956:05d}.JPG" for k in range(len(views))]
+        for k, name in enumerate(names):
+            image = photograph(views, k)
+            write_image(root / "images" / name, image)
+            small = image.reshape(views.height // 2, 2, views.width // 2, 2, 3).mean(axis=(1, 3))
+            write_image(root / "images_2" / name, small.astype(np.uint8))
+        points = torch.rand(60, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+        write_sparse(root / "sparse/0", views.cameras, names, points)
+        np.save(root / "poses_bounds.npy", poses_bounds(views.cameras, 1.5, 12.0))
+
+    return write
+
+
+def salmon(scene: Scene, write_rig: Callable[..., None]) -> Writer:
+    """Neural 3D Video: the held-out view is ``cam00.mp4``; ``cam01.mp4`` is left out."""
+
+    def write(root: Path) -> None:
+        films, poses = {}, []
+        train, test = scene.dynamic.train, scene.dynamic.test
+        for name, views, view in (("00", test, 0), ("02", train, 0), ("03", train, 1)):
+            shots = (views.view == view).nonzero()[:, 0].tolist()
+            films[f"cam{name}.mp4"] = [photograph(views, k) for k in shots]
+            poses.append(views.cameras.camera_to_world[shots[0]])
+        cameras = replace(train.cameras[[0, 0, 0]], camera_to_world=torch.stack(poses))
+        write_rig(root, films, cameras, 1.5, 12.0)
+
+    return write
+
+
 @pytest.fixture(scope="session")
-def captures(inward: Scene, forward: Scene) -> dict[str, Writer]:
+def captures(
+    inward: Scene,
+    forward: Scene,
+    write_sparse: Callable[..., None],
+    write_rig: Callable[..., None],
+) -> dict[str, Writer]:
     """A function that writes each capture into a folder, by its name."""
     return {
+        **{"garden": garden(inward, write_sparse), "salmon": salmon(forward, write_rig)},
         **{"lego": lego(inward), "fern": fern(forward), "fox": fox(inward)},
         **{"phone": phone(inward), "hand": hand(forward), "windmill": windmill(inward)},
     }

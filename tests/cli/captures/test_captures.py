@@ -1,4 +1,4 @@
-"""Six captures of the kinds that strangers bring: inspected, learned and reported by their path."""
+"""Eight captures of the kinds that strangers bring: inspected, learned, reported by their path."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ FOUND = {
     "fox": ("nerfstudio", False),
     "phone": ("nerfstudio", False),
     "hand": ("forward", True),
-    "windmill": ("nerfies", True),
+    "windmill": ("dycheck", True),
+    "garden": ("colmap", False),
+    "salmon": ("neural_3d_video", True),
 }
 
 
@@ -24,7 +26,7 @@ FOUND = {
 def place(
     tmp_path_factory: pytest.TempPathFactory, captures: dict[str, Callable[[Path], None]]
 ) -> Path:
-    """A working folder with the six captures in it."""
+    """A working folder with the eight captures in it."""
     folder = tmp_path_factory.mktemp("strangers")
     for name, write in captures.items():
         write(folder / name)
@@ -68,6 +70,22 @@ def test_a_capture_needs_no_flag_beside_its_folder(
     assert metrics["scene"] == name and metrics["run"]["choices"]["data"] == reader
     assert ("dynamic" in metrics) is moves and metrics["static"]["psnr"] > 0
     assert (place / "outputs" / name / "quickstart/videos/held_out.mp4").stat().st_size > 0
+
+
+def test_the_stage_at_rest_alone_is_scored_alike(
+    place: Path,
+    learned: dict[str, tuple[Any, Any]],
+    devrf_in: Callable[..., Any],
+    short: tuple[str, ...],
+) -> None:
+    """What COLMAP has posed: stage=canonical and evaluate, or the pipeline."""
+    quick = (*short, "schedule.canonical.carve=false", "hydra.run.dir=alone")
+    for stage in ("canonical", "evaluate"):
+        done = devrf_in(place, "data.root=garden", *quick, f"stage={stage}")
+        assert (done.status, done.err) == (0, "")
+    alone = json.loads((place / "alone/metrics.json").read_text())
+    for score in ("psnr", "ssim"):
+        assert alone["static"][score] == metrics_of(place, "garden")["static"][score]
 
 
 def test_they_are_in_one_report(

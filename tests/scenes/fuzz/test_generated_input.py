@@ -10,6 +10,7 @@ import json
 import os
 import resource
 import shutil
+import struct
 import sys
 import zipfile
 from collections.abc import Callable
@@ -18,15 +19,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.strategies import DrawFn, SearchStrategy
 from PIL import ExifTags, Image
 
+from devrf.data.colmap import ColmapDataModule
+from devrf.data.dycheck import DycheckDataModule
 from devrf.data.forward import ForwardFacingDataModule
 from devrf.data.inward import InwardFacingDataModule
 from devrf.data.nerfies import NerfiesDataModule
 from devrf.data.nerfstudio import NerfstudioDataModule
+from devrf.data.neural_3d_video import Neural3DVideoDataModule
+from devrf.scenes.colmap_model import read_model
 from devrf.scenes.flow_cache import load_flow
 from devrf.scenes.flow_files import read_flow_file
 from devrf.scenes.images import load_images
@@ -300,6 +306,100 @@ def read_nerfies(root: Path) -> Any:
     return NerfiesDataModule(root, downscale=1, flow="none", bound_scale=1.5).load()
 
 
+# --- COLMAP, DyCheck, Neural 3D Video
+
+
+def colmap_folder(fixture: Fixture) -> Path:
+    """Six posed images of one folder."""
+    source, ring = fixture("single_folder"), fixture("ring_cameras")
+    root: Path = fixture("tmp_path") / "colmap"
+    shutil.copytree(source / "train", root / "images")
+    cameras = ring(6, width=WIDTH, height=HEIGHT, angle=0.8)
+    points = torch.rand(20, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+    names = [f"r_{k:03d}.png" for k in range(6)]
+    fixture("write_sparse")(root / "sparse/0", cameras, names, points)
+    return root
+
+
+def read_colmap(root: Path) -> Any:
+    return ColmapDataModule(root, downscale=1, flow="none").load()
+
+
+def colmap_text(fixture: Fixture) -> Prepared:
+    root = colmap_folder(fixture)
+    return one_of_files(fixture, root / "sparse/0", lambda: read_colmap(root))
+
+
+def colmap_binary(fixture: Fixture) -> Prepared:
+    """The same model, as COLMAP writes it in binary."""
+    root = colmap_folder(fixture)
+    place = root / "sparse/0"
+    model = read_model(place)
+    (number, camera), *_ = model.cameras.items()
+    cameras = struct.pack("<QiiQQ4d", 1, number, 1, *camera.size, *camera.parameters)
+    images = struct.pack("<Q", len(model.images))
+    for k, one in enumerate(model.images):
+        images += struct.pack("<i7di", k, *one.quaternion, *one.translation, number)
+        images += one.name.encode() + b"\0" + struct.pack("<Q", len(one.points))
+        images += b"".join(struct.pack("<ddq", 0.5, 0.5, p) for p in one.points.tolist())
+    points = struct.pack("<Q", len(model.points))
+    for k, place_of in zip(model.numbers.tolist(), model.points.tolist(), strict=True):
+        points += struct.pack("<Q3d3BdQ", k, *place_of, 9, 9, 9, 0.5, 0)
+    for name, data in (("cameras", cameras), ("images", images), ("points3D", points)):
+        (place / f"{name}.txt").unlink()
+        (place / f"{name}.bin").write_bytes(data)
+    return one_of_files(fixture, place, lambda: read_colmap(root))
+
+
+def one_of_files(fixture: Fixture, folder: Path, read: Callable[[], Any]) -> Prepared:
+    """What is read while one file of a folder is damaged."""
+    whole = {path: path.read_bytes() for path in sorted(folder.iterdir()) if path.is_file()}
+    inputs = [
+        st.tuples(st.just(path), fixture("damage").bytes(data)) for path, data in whole.items()
+    ]
+
+    def read_damaged(drawn: tuple[Path, bytes]) -> Any:
+        for path, data in whole.items():
+            written(path, drawn[1] if path == drawn[0] else data)
+        return read()
+
+    return st.one_of(inputs), read_damaged
+
+
+def dycheck_folder(fixture: Fixture) -> Path:
+    """The scene in Nerfies' layout, with split lists."""
+    root = nerfies_folder(fixture)
+    ids = [f"{i:06d}" for i in range(6)]
+    (root / "splits").mkdir()
+    for split, part in (("train", ids[:4]), ("val", ids[4:])):
+        content = {"frame_names": part, "time_ids": [int(one) for one in part]}
+        (root / f"splits/{split}.json").write_text(json.dumps(content))
+    return root
+
+
+def dycheck_splits(fixture: Fixture) -> Prepared:
+    root = dycheck_folder(fixture)
+    file = root / "splits/train.json"
+    content = json.loads(file.read_text())
+
+    def read(text: str) -> Any:
+        written(file, text)
+        return DycheckDataModule(root, downscale=1, flow="none", bound_scale=1.5).load()
+
+    return fixture("damage").json(content), read
+
+
+def videos(fixture: Fixture) -> Prepared:
+    root, ring = fixture("tmp_path") / "videos", fixture("ring_cameras")
+    film = [np.full((HEIGHT, WIDTH, 3), 40 * t, np.uint8) for t in range(3)]
+    cameras = ring(60, width=WIDTH, height=HEIGHT, angle=0.8)[torch.arange(2)]
+    fixture("write_rig")(root, {"cam00.mp4": film, "cam01.mp4": film}, cameras, 2.0, 9.0)
+    file = root / "cam01.mp4"
+    return fixture("damage").bytes(file.read_bytes()), lambda data: Neural3DVideoDataModule(
+        written(file, data).parent, downscale=1, flow="none"
+    ).load()
+
+
 # --- whole scenes
 
 
@@ -428,12 +528,12 @@ def inward_files(root: Path) -> Any:
 
 # What is read, how large a part of all inputs it gets (in 1,000), and how they are made.
 PARSERS: dict[str, tuple[int, Callable[[Fixture], Prepared]]] = {
-    "values of transforms.json": (190, transforms_values),
-    "text of transforms.json": (90, transforms_bytes),
+    "values of transforms.json": (160, transforms_values),
+    "text of transforms.json": (80, transforms_bytes),
     "poses_bounds.npy": (110, static_poses),
     "hwf_cxcy.npy": (40, shared_intrinsics),
     "poses.npy and bds.npy": (80, moving_poses),
-    "optical flow": (110, flow),
+    "optical flow": (90, flow),
     "cached optical flow": (50, cached_flow),
     "png": (70, images("PNG RGBA", "PNG P", "PNG RGB")),
     "jpeg and webp": (50, images("JPEG RGB", "WEBP RGBA", "JPEG CMYK")),
@@ -442,6 +542,10 @@ PARSERS: dict[str, tuple[int, Callable[[Fixture], Prepared]]] = {
     "camera of nerfies": (50, nerfies_camera),
     "lists of nerfies": (30, nerfies_lists),
     "nerfstudio": (30, nerfstudio),
+    "COLMAP's text files": (15, colmap_text),
+    "COLMAP's binary files": (20, colmap_binary),
+    "splits of DyCheck": (10, dycheck_splits),
+    "videos": (5, videos),
     "files of an inward-facing scene": (12, scene_files(with_flow, inward_files)),
     "files of D-NeRF's layout": (
         12,
@@ -453,6 +557,7 @@ PARSERS: dict[str, tuple[int, Callable[[Fixture], Prepared]]] = {
     ),
     "files of nerfstudio": (12, scene_files(nerfstudio_folder, read_nerfstudio)),
     "files of nerfies": (12, scene_files(nerfies_folder, read_nerfies)),
+    "files of COLMAP": (10, scene_files(colmap_folder, read_colmap)),
 }
 
 

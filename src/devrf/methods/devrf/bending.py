@@ -7,7 +7,7 @@ from torch.nn.functional import max_pool3d
 
 from devrf.geometry.box import Box
 
-# c of docs/method.md#bending: the change beyond which matter counts as torn or jointed, not as bent.
+# c of docs/method.md#bending: the change beyond which matter counts as torn or jointed, not bent.
 TEARING = 0.1
 # ℓ, over which J's change is looked at, as a share of the box's longest edge.
 REACH = 1 / 20

@@ -102,8 +102,9 @@ class MotionSettings:
             several processes keeps them on its device.
         store_half: whether they are kept in half precision; ``auto``: on a GPU. Active frames
             never are.
-        moments: ``fresh`` begins each visit with a fresh Adam; ``carried`` goes on, above the coarsest
-            level, with the moments of the visit before (docs/method.md#motion-learning-rate).
+        moments: ``fresh`` begins each visit with a fresh Adam; ``carried`` goes on, above the
+            coarsest level, with the moments of the visit before
+            (docs/method.md#motion-learning-rate).
         min_rel_improvement: a visit ends early when two Lightning steps have taken less than
             this share off its loss; None goes through the whole schedule.
     """

@@ -1,26 +1,28 @@
-"""The world of a captured scene: its origin, axes and unit, and where in it the scene is."""
+"""The world of a sparse model: its origin, axes and unit, and where in it the scene is."""
 
 from __future__ import annotations
 
-import logging
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from devrf.errors import DevrfError
 from devrf.geometry.average_pose import average_pose, relative_to
 from devrf.scenes.colmap_model import SparseModel
+from devrf.scenes.poses import FARTHEST, in_reach
+from devrf.scenes.validation import scene_error
 
-log = logging.getLogger(__name__)
-
+Corner = tuple[float, float, float]
 Facing = Literal["auto", "forward", "inward"]
 
 # Cameras that all look within so many degrees of one direction face the scene from one side.
 ONE_SIDE = 45.0
+# From fewer points, each counted in every image that shows it, nothing is said.
+LEAST_POINTS = 50
 # Of the points so many per cent on either side may be wrong.
 OUTLIERS = 1.0
 # In the forward-facing world, the unit that makes the nearest point's distance 1/0.75: LLFF's.
@@ -36,48 +38,52 @@ class World:
     Attributes:
         poses: (N, 3, 4) float64 camera-to-world, OpenGL axes, world units.
         points: (P, 3) float64.
-        space: ``ndc``, ``contracted``, or ``world`` for cameras around what mattes cut out.
-        near: distance before which nothing is, world units; None of ``world``, as ``far``.
+        space: ``ndc`` or ``contracted``.
+        near: distance before which nothing is, world units.
         far: distance behind which no sparse point is, world units.
-        box: low and high corner of what is looked at; None of ``ndc``, and where the reader finds
-            it: with mattes, or where the cameras' axes meet.
+        box: low and high corner of what is looked at; None of ``ndc``, and where the cameras' axes
+            meet: what all cameras see is then the better guess.
     """
 
     poses: Tensor
     points: Tensor
-    space: Literal["ndc", "contracted", "world"]
-    near: float | None
-    far: float | None
-    box: tuple[list[float], list[float]] | None
+    space: Literal["ndc", "contracted"]
+    near: float
+    far: float
+    box: tuple[Corner, Corner] | None
 
 
-def normalised(model: SparseModel, facing: Facing = "auto", *, cut_out: bool = False) -> World:
+def normalised(model: SparseModel, facing: Facing = "auto") -> World:
     """The scene of a model in a world of its own origin, axes and unit.
 
     Args:
         model: cameras and points, in any world.
         facing: from where the cameras look.
-        cut_out: whether the images have mattes.
 
     Raises:
-        DevrfError: there are no points to say where the scene is.
+        DevrfError: the points or the cameras do not say where the scene is.
     """
     poses, points = model.poses, torch.from_numpy(model.points)
     depths = torch.cat([model.depths(k) for k in range(len(model.images))])
     depths = depths[depths > 0]
-    if len(depths) < 50:
-        raise DevrfError(
-            f"{model.folder}: {len(depths)} sparse points, too few to say where the scene is; "
-            "film it with more texture in sight"
+    if len(depths) < LEAST_POINTS:
+        raise scene_error(
+            model.folder,
+            f"its images show {len(depths)} sparse points, expected {LEAST_POINTS} or more to say "
+            "where the scene is; take it with more texture in sight, or write points3D again",
         )
     near, far = (float(np.percentile(depths.numpy(), p)) for p in (OUTLIERS, 100 - OUTLIERS))
     if facing == "auto":
         facing = "forward" if widest_angle(poses) <= ONE_SIDE else "inward"
-        log.info("cameras look %s-facing; capture.facing says otherwise", facing)
-    if facing == "forward":
-        return _forward(poses, points, near, far)
-    world = _inward(poses, points, near, far)
-    return replace(world, space="world", near=None, far=None, box=None) if cut_out else world
+    world = (_forward if facing == "forward" else _inward)(poses, points, near, far)
+    here = bool(in_reach(world.poses[:, :, 3]).all())
+    if not here or not 0 < world.near < world.far <= FARTHEST:  # NaN compares false
+        raise scene_error(
+            model.folder,
+            f"its cameras and points are no scene that cameras look {facing} at (all at one place, "
+            "or far apart); run COLMAP's mapper again",
+        )
+    return world
 
 
 def widest_angle(poses: Tensor) -> float:
@@ -104,8 +110,8 @@ def _inward(poses: Tensor, points: Tensor, near: float, far: float) -> World:
     poses, points = _moved(poses, points, frame, scale)
     near, far = 0.5 * near * scale, far * scale
     if met is not None:
-        # The reader takes what all cameras see. Sparse points are on floor and walls, too: in their
-        # box the thing would have a fraction of the voxels.
+        # Sparse points are on floor and walls, too: in their box the thing would have a fraction of
+        # the voxels.
         return World(poses, points, "contracted", near, far, None)
     # What the sparse points around the middle span, and no more than the cameras go round.
     around = points[points.norm(dim=1) < AROUND]
@@ -116,8 +122,13 @@ def _inward(poses: Tensor, points: Tensor, near: float, far: float) -> World:
         for p in (2 * OUTLIERS, 100 - 2 * OUTLIERS)
     )
     margin = 0.1 * np.maximum(high - low, 0.1 * AROUND)
-    box = (low - margin).tolist(), (high + margin).tolist()
+    box = _corner(low - margin), _corner(high + margin)
     return World(poses, points, "contracted", near, far, box)
+
+
+def _corner(values: npt.NDArray[np.float64]) -> Corner:
+    x, y, z = values.tolist()
+    return x, y, z
 
 
 def _axes_meet(poses: Tensor) -> Tensor | None:

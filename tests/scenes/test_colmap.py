@@ -1,0 +1,212 @@
+"""COLMAP's sparse models and their images as a scene at rest."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+
+from devrf.geometry.distortion import Distortion
+from devrf.scenes.colmap import ColmapReader
+from devrf.scenes.colmap_model import read_model
+from devrf.scenes.lens import Lens
+from devrf.scenes.normalisation import normalised
+
+# Not square, the principal point off the middle.
+WIDTH, HEIGHT, COUNT = 80, 60, 17
+LENS = Lens((88.0, 84.0), (42.0, 28.0), Distortion((-0.3, 0.1, 0.0, 0.0), (0.006, -0.008)))
+OPENCV = (88.0, 84.0, 42.0, 28.0, -0.3, 0.1, 0.006, -0.008)
+# In the order of their names, which is not that of the ring; names may hold spaces and folders.
+NAMES = [f"round/img {(5 * k) % COUNT:02d}.png" for k in range(COUNT)]
+# The middles of the balls that the pictures show, and others around them.
+BALLS = torch.tensor([[1.2, 0.1, 0.45], [-0.6, 1.0, 0.0], [0.1, -1.1, -0.45]])
+POINTS = torch.cat([BALLS, 2 * torch.rand(40, 3, generator=torch.Generator().manual_seed(0)) - 1])
+
+
+@pytest.fixture
+def message_of(refusal) -> Callable[..., str]:
+    return partial(refusal, ColmapReader, downscale=1)
+
+
+@pytest.fixture
+def folder(tmp_path, ring_cameras, picture, write_sparse) -> Path:
+    """A ring of pictures of the balls, taken through a lens with distortion."""
+    root = tmp_path / "balls"
+    ring = ring_cameras(COUNT, width=WIDTH, height=HEIGHT, angle=0.9)
+    (root / "images/round").mkdir(parents=True)
+    for name, pose in zip(NAMES, ring.camera_to_world, strict=True):
+        iio.imwrite(root / "images" / name, picture(pose, LENS, WIDTH, HEIGHT))
+    write_sparse(root / "sparse/0", ring, NAMES, POINTS, "OPENCV", OPENCV)
+    return root
+
+
+def test_points_fall_on_the_pixels_that_show_them(folder):
+    scene = ColmapReader(folder, downscale=1).read()
+    balls = normalised(read_model(folder / "sparse/0")).points[:3].float()
+    for views in (scene.static.train, scene.static.test):
+        for k, pixels in enumerate(views.pixels):
+            weight = pixels[..., :3].float() * pixels[..., 3:]
+            place = torch.stack(
+                torch.meshgrid(torch.arange(WIDTH), torch.arange(HEIGHT), indexing="xy"), dim=-1
+            )
+            middles = torch.einsum("hwb,hwc->bc", weight, place + 0.5)
+            expected, depth = views.cameras.project_into(k, balls)
+            assert (depth > 0).all()
+            found = middles / weight.sum(dim=(0, 1))[:, None]
+            torch.testing.assert_close(found, expected, atol=0.15, rtol=0)
+
+
+def test_every_eighth_image_is_held_out_and_nothing_moves(folder, message_of):
+    scene = ColmapReader(folder, downscale=1).read()
+    assert [name[-6:-4] for name in scene.static.test.names] == ["00", "08", "16"]
+    assert len(scene.static.train) == 14 and scene.name == "balls"
+    assert not scene.moves and scene.dynamic.train is scene.static.train
+    assert len(ColmapReader(folder, downscale=1, holdout=3).read().static.test) == 6
+    assert "data.frames: 2 was asked for" in message_of(folder, frames=2)
+
+
+def test_the_world_is_upright_around_what_is_looked_at(folder):
+    """The ring is level, at a distance of 4 already: turned about z at most."""
+    scene = ColmapReader(folder, downscale=1).read()
+    assert scene.kind == "inward" and scene.space.straight  # balls that are cut out: mattes
+    cameras = scene.static.train.cameras
+    torch.testing.assert_close(cameras.positions.norm(dim=1), torch.full((14,), 4.0))
+    torch.testing.assert_close(cameras.positions[:, 2], torch.full((14,), 1.2), atol=1e-4, rtol=0)
+    low, high = np.array(scene.bounds.box.low), np.array(scene.bounds.box.high)
+    assert (low < -0.9).all() and (high > 0.9).all() and (high - low < 3.2).all()
+
+
+def without_mattes(folder: Path) -> None:
+    for path in (folder / "images/round").iterdir():
+        iio.imwrite(path, iio.imread(path)[..., :3])
+
+
+def test_photographs_are_of_a_scene_without_end(folder):
+    without_mattes(folder)
+    scene = ColmapReader(folder, downscale=1).read()
+    assert not scene.space.straight
+    assert scene.bounds.reason == scene.bounds.box_source == "the sparse model"
+    # Half the depth of the nearest points, which lie on this side of the middle.
+    assert 1.0 < scene.bounds.near < 2.0
+    given = ColmapReader(folder, downscale=1, near=0.7, box=[[-1, -1, -1], [1, 1, 1]]).read()
+    assert given.bounds.near == 0.7 and given.space.low == (-1, -1, -1)
+    assert given.bounds.box_source == "data.box is given"
+
+
+def test_cameras_on_one_side_make_a_forward_facing_scene(tmp_path, ring_cameras, write_sparse):
+    ring = ring_cameras(60, width=WIDTH, height=HEIGHT, angle=0.9)[torch.arange(6)]
+    (tmp_path / "images").mkdir()
+    names = [f"{k}.jpg" for k in range(6)]
+    for name in names:
+        iio.imwrite(tmp_path / "images" / name, np.full((HEIGHT, WIDTH, 3), 99, np.uint8))
+    write_sparse(tmp_path / "sparse", ring, names, POINTS)  # not sparse/0
+    scene = ColmapReader(tmp_path, downscale=1).read()
+    assert scene.kind == "forward" and (len(scene.static.train), len(scene.static.test)) == (5, 1)
+    # The nearest point is at 1/0.75 of the near plane.
+    depths = (-normalised(read_model(tmp_path / "sparse")).points[:, 2]).numpy()
+    assert depths.min() == pytest.approx(4 / 3, rel=0.1)
+    around = ColmapReader(tmp_path, downscale=1, space="contracted").read()
+    assert around.kind == "inward"
+
+
+def test_smaller_images_are_used_where_they_are(folder):
+    averaged = ColmapReader(folder, downscale=2).read().static.train
+    shutil.copytree(folder / "images", folder / "images_2")
+    for path in (folder / "images_2/round").iterdir():
+        whole = iio.imread(path).astype(float)
+        small = whole.reshape(HEIGHT // 2, 2, WIDTH // 2, 2, 4).mean(axis=(1, 3))
+        iio.imwrite(path, small.astype(np.uint8))
+    reduced = ColmapReader(folder, downscale=2).read().static.train
+    assert reduced.names[0].startswith("images_2/") and reduced.width == WIDTH // 2
+    torch.testing.assert_close(reduced.cameras.focal, averaged.cameras.focal)
+    # Of other names, as LLFF's tools write them.
+    for k, path in enumerate(sorted((folder / "images_2/round").iterdir())):
+        path.rename(folder / f"images_2/image{k:03d}.png")
+    assert torch.equal(
+        ColmapReader(folder, downscale=2).read().static.train.pixels, averaged.pixels
+    )
+
+
+def test_absent_images_are_counted_or_left_out(folder, message_of):
+    (folder / "images/round/img 03.png").unlink()
+    assert "1 of the 17 images in images.txt are absent" in message_of(folder)
+    scene = ColmapReader(folder, downscale=1, missing="skip").read()
+    assert len(scene.static.train) + len(scene.static.test) == 16
+
+
+@pytest.fixture
+def moving(folder) -> Path:
+    """Three fixed cameras of three frames stand where 00, 02 and 04 were taken."""
+    for view in range(3):
+        name = f"img {2 * view:02d}"
+        (folder / f"images/round/{name}.png").rename(folder / f"images/round/view{view + 1}.png")
+        rewrite(folder, "images", name, f"view{view + 1}")
+        images = folder / f"dynamic_3views/view{view + 1}/images"
+        images.mkdir(parents=True)
+        for t in range(3):
+            shade = np.full((HEIGHT, WIDTH, 4), 255, np.uint8)
+            shade[..., 0] = 10 * view + t
+            iio.imwrite(images / f"{t}.png", shade)
+    return folder
+
+
+def test_fixed_views_are_posed_by_an_image_of_each(moving, message_of):
+    scene = ColmapReader(moving, downscale=1).read()
+    train, test = scene.dynamic.train, scene.dynamic.test
+    assert train.pixels[:, 0, 0, 0].tolist() == [0, 10, 1, 11, 2, 12]
+    assert train.times.tolist() == [0, 0, 0.5, 0.5, 1, 1] and train.view.tolist() == [0, 1] * 3
+    assert test.pixels[:, 0, 0, 0].tolist() == [20, 21, 22]
+    at_rest = dict(zip(scene.static.train.names, scene.static.train.cameras.positions, strict=True))
+    torch.testing.assert_close(at_rest["images/round/view2.png"], train.cameras.positions[1])
+    # What stands where the held-out camera does is not learned from.
+    assert "images/round/view3.png" in scene.static.test.names
+    few = ColmapReader(moving, downscale=1, test_view=1, train_views=1, frames=2).read()
+    assert few.dynamic.train.pixels[:, 0, 0, 0].tolist() == [10, 12]
+    (moving / "dynamic_3views").rename(moving / "dynamic_4views")
+    shutil.copytree(moving / "dynamic_4views/view1", moving / "dynamic_4views/view4")
+    assert "sparse/0: poses no image view4.png, nor one in a folder view4" in message_of(moving)
+    assert "data.dynamic" in message_of(moving, dynamic="dynamic_5views")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda root: shutil.rmtree(root / "sparse"), "balls: no COLMAP model (looked for cameras"),
+        (lambda root: shutil.rmtree(root / "images"), "balls: no folder images (found: none)"),
+        (lambda root: shutil.rmtree(root / "images/round"), "17 of the 17 images in images.txt"),
+        (
+            lambda root: (root / "sparse/0/points3D.txt").unlink(),
+            "sparse/0: its images show 0 sparse points, expected 50 or more",
+        ),
+        (
+            lambda root: rewrite(root, "cameras", "OPENCV", "OPENCV_FISHEYE"),
+            "cameras.txt: camera model OPENCV_FISHEYE is not supported, only SIMPLE_PINHOLE",
+        ),
+        (
+            lambda root: rewrite(root, "cameras", f" {WIDTH} {HEIGHT} ", f" {HEIGHT} {WIDTH} "),
+            "80x60 px, but its camera is one for 60x80 px",
+        ),
+        (
+            lambda root: rewrite(root, "images", "round/", "../../"),
+            "ds outside the scene's folder",
+        ),
+        (
+            lambda root: rewrite(root, "points3D", " 9 9 9", "e300 9 9 9"),
+            "sparse/0: its cameras and points are no scene that cameras look inward at",
+        ),
+    ],
+)
+def test_what_is_wrong_is_one_line(folder, message_of, change, said):
+    change(folder)
+    assert said in message_of(folder)
+
+
+def rewrite(root: Path, part: str, old: str, new: str) -> None:
+    file = root / f"sparse/0/{part}.txt"
+    file.write_text(file.read_text().replace(old, new))

@@ -1,0 +1,168 @@
+"""DyCheck's layout: splits, times, and what is scored."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+
+from devrf.scenes.dycheck import DycheckReader
+from devrf.scenes.lens import Lens
+
+# Not square. Camera 0 goes half around, cameras 1 and 2 stand and take every third moment.
+WIDTH, HEIGHT, MOMENTS = 40, 32, 9
+LENS = Lens((44.0, 44.0), (21.0, 15.0))
+HELD_OUT = [(camera, time) for camera in (1, 2) for time in (0, 3, 6)]
+
+
+@pytest.fixture
+def message_of(refusal) -> Callable[..., str]:
+    return partial(refusal, DycheckReader, downscale=1)
+
+
+def put(file: Path, content: Any) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(json.dumps(content))
+
+
+def split(shots: list[tuple[int, int]]) -> dict[str, Any]:
+    return {
+        "frame_names": [f"{camera}_{time:05d}" for camera, time in shots],
+        "camera_ids": [camera for camera, _ in shots],
+        "time_ids": [time for _, time in shots],
+    }
+
+
+@pytest.fixture
+def folder(tmp_path, ring_cameras, picture) -> Path:
+    """The balls from 18 places: nine of a moving camera, two of cameras that stand."""
+    root = tmp_path / "windmill"
+    ring = ring_cameras(2 * MOMENTS, width=WIDTH, height=HEIGHT, angle=0.9)
+    learned = [(0, time) for time in range(MOMENTS)]
+    for camera, time in learned + HELD_OUT:
+        item = f"{camera}_{time:05d}"
+        pose = ring.camera_to_world[time if camera == 0 else MOMENTS + 3 * camera]
+        (root / "rgb/1x").mkdir(parents=True, exist_ok=True)
+        iio.imwrite(root / f"rgb/1x/{item}.png", picture(pose, LENS, WIDTH, HEIGHT))
+        axes = pose[:, :3] * torch.tensor([1.0, -1.0, -1.0])
+        content = {"orientation": axes.T.tolist(), "position": (2 * pose[:, 3] + 1).tolist()}
+        content |= {"focal_length": 44.0, "principal_point": [21.0, 15.0]}
+        put(root / f"camera/{item}.json", {**content, "image_size": [WIDTH, HEIGHT]})
+    put(root / "splits/train.json", split(learned))
+    put(root / "splits/val.json", split(HELD_OUT))
+    put(root / "scene.json", {"center": [1, 1, 1], "scale": 0.5, "near": 0.5, "far": 9.0})
+    return root
+
+
+def test_one_camera_is_learned_from_and_the_others_are_held_out(
+    folder, balls_are_where_they_project
+):
+    scene = DycheckReader(folder, downscale=1).read()
+    train, test = scene.dynamic.train, scene.dynamic.test
+    for views in (train, test):
+        balls_are_where_they_project(views)
+    torch.testing.assert_close(train.times, torch.arange(9) / 8)
+    torch.testing.assert_close(test.times, torch.tensor([0, 3, 6] * 2) / 8)
+    assert train.view.tolist() == list(range(9)) and test.view.tolist() == [0] * 3 + [1] * 3
+    assert [Path(name).stem for name in test.names[:2]] == ["1_00000", "1_00003"]
+    # scene.json: (position − center) · scale; the ring's own distance.
+    torch.testing.assert_close(train.cameras.positions.norm(dim=1), torch.full((9,), 4.0))
+    assert (scene.bounds.near, scene.bounds.far, scene.name) == (0.5, 9.0, "windmill")
+    assert scene.static.train is train and test.valid_mask is None
+
+
+def test_fewer_moments_and_a_stand_in_for_the_static_set(folder):
+    scene = DycheckReader(folder, downscale=1, frames=3, static_until=0.25).read()
+    assert scene.dynamic.train.times.tolist() == [0.0, 0.5, 1.0]
+    assert scene.static.train.times.tolist() == [0.0, 0.125, 0.25]
+
+
+@pytest.mark.parametrize(("size", "white"), [("1x", 255), ("2x", 1)])
+def test_what_training_has_hardly_seen_is_not_scored(folder, size, white):
+    factor = int(size[0])
+    if factor == 2:
+        (folder / "rgb/2x").mkdir()
+        for path in sorted((folder / "rgb/1x").iterdir()):
+            iio.imwrite(folder / "rgb/2x" / path.name, iio.imread(path)[::2, ::2])
+    mask = np.full((HEIGHT // factor, WIDTH // factor), white, np.uint8)
+    mask[:, : WIDTH // factor // 4] = 0
+    place = folder / f"covisible/{size}/val"
+    place.mkdir(parents=True)
+    iio.imwrite(place / "1_00003.png", mask)
+    scene = DycheckReader(folder, downscale=2).read()
+    assert scene.dynamic.train.valid_mask is None
+    valid = scene.dynamic.test.valid_mask
+    assert valid is not None and valid.shape == (6, HEIGHT // 2, WIDTH // 2)
+    assert valid[[0, 2, 3, 4, 5]].all()
+    assert not valid[1, :, : WIDTH // 8].any() and valid[1, :, WIDTH // 8 :].all()
+    whole = DycheckReader(folder, downscale=2, masks="none").read()
+    assert whole.dynamic.test.valid_mask is None
+
+
+def test_a_capture_by_one_camera_holds_out_every_nth(folder, caplog):
+    put(folder / "splits/val.json", split([]))
+    with caplog.at_level(logging.INFO):
+        scene = DycheckReader(folder, downscale=1, holdout=4).read()
+    assert "val.json lists no image: one of 4 training images is held out" in caplog.text
+    assert [Path(name).stem for name in scene.dynamic.test.names] == ["0_00003", "0_00007"]
+
+
+def test_one_time_is_a_scene_at_rest(folder):
+    for name, shots in (("train", [(0, t) for t in range(MOMENTS)]), ("val", HELD_OUT)):
+        put(folder / f"splits/{name}.json", {**split(shots), "time_ids": [5] * len(shots)})
+    assert not DycheckReader(folder, downscale=1).read().moves
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda root: (root / "splits/val.json").unlink(), "splits/val.json: no such file; it"),
+        (lambda root: (root / "scene.json").unlink(), "scene.json: no such file"),
+        (lambda root: (root / "camera/1_00003.json").unlink(), "1_00003.json: no such file"),
+        (
+            lambda root: (root / "rgb/1x/2_00006.png").unlink(),
+            "2_00006: no such image (looked for .png, .jpg, .jpeg, .webp); 1 of the 15 images",
+        ),
+        (
+            lambda root: put(root / "splits/val.json", split([(0, 4)])),
+            "val.json: lists '0_00004', as splits/train.json does; list it in one of them",
+        ),
+        (
+            lambda root: put(
+                root / "splits/train.json", {**split([(0, 1), (0, 2)]), "time_ids": [1]}
+            ),
+            "train.json: 2 frame_names, but 1 time_ids",
+        ),
+        (
+            lambda root: put(root / "splits/train.json", split([])),
+            "train.json: lists 0 images, expected at least 1",
+        ),
+        (
+            lambda root: put(root / "splits/train.json", {"frame_names": ["a"], "time_ids": ["b"]}),
+            "train.json: time_ids[0]: should be a valid number",
+        ),
+        (
+            lambda root: put(
+                root / "splits/train.json", {"frame_names": ["../../../a"], "time_ids": [0]}
+            ),
+            "leads outside the scene's folder",
+        ),
+    ],
+)
+def test_what_is_wrong_is_one_line(folder, message_of, change, said):
+    change(folder)
+    assert said in message_of(folder)
+
+
+def test_absent_images_may_be_left_out(folder):
+    (folder / "rgb/1x/2_00006.png").unlink()
+    scene = DycheckReader(folder, downscale=1, missing="skip").read()
+    assert (len(scene.dynamic.train), len(scene.dynamic.test)) == (9, 5)

@@ -1,0 +1,171 @@
+"""Synchronised videos and their poses as a scene that moves before fixed cameras."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from devrf.artifacts.video_file import write_pictures
+from devrf.geometry.cameras import Cameras
+from devrf.scenes.neural_3d_video import Neural3DVideoReader
+
+# Not square. The numbers of the videos leave some out.
+WIDTH, HEIGHT, FRAMES = 32, 24, 7
+NAMES = ["cam00.mp4", "cam02.mp4", "cam03.mp4", "cam10.mp4"]
+
+
+@pytest.fixture
+def message_of(refusal) -> Callable[..., str]:
+    return partial(refusal, Neural3DVideoReader, downscale=1)
+
+
+def film(camera: int, frames: int = FRAMES, width: int = WIDTH) -> Iterator[np.ndarray]:
+    """Frame t of camera k is of one colour: red 30 k, green 30 t."""
+    for t in range(frames):
+        yield np.full((HEIGHT, width, 3), (30 * camera, 30 * t, 128), dtype=np.uint8)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory, write_rig) -> Path:
+    """Four cameras 1 apart, 6 before what is nearest."""
+    root = tmp_path_factory.mktemp("rig") / "coffee"
+    where = torch.tensor([[k - 1.5, 0.0, 0.0] for k in range(4)])
+    ahead = where + torch.tensor([0.0, 0.0, -1.0])
+    cameras = Cameras.looking_at(
+        where, ahead, focal=40.0, width=WIDTH, height=HEIGHT, up=torch.tensor([0.0, 1.0, 0.0])
+    )
+    films = {name: film(k) for k, name in enumerate(NAMES)}
+    write_rig(root, films, cameras, 6.0, 60.0)
+    return root
+
+
+@pytest.fixture
+def folder(tmp_path, written) -> Path:
+    """The same, to be changed."""
+    return Path(shutil.copytree(written, tmp_path / "coffee"))
+
+
+def colours(views) -> list[tuple[int, int]]:
+    """Camera and frame of each image, by its colour."""
+    middle = views.pixels[:, views.height // 2, views.width // 2, :2].float() / 30
+    return [tuple(one) for one in middle.round().int().tolist()]
+
+
+def test_frames_belong_to_the_cameras_of_their_rows(folder):
+    scene = Neural3DVideoReader(folder, downscale=1, frames=None).read()
+    assert scene.kind == "forward" and scene.moves and scene.name == "coffee"
+    train, test = scene.dynamic.train, scene.dynamic.test
+    # All cameras at the first moment, then all at the next; cam00 is held out.
+    assert colours(train) == [(k, t) for t in range(FRAMES) for k in (1, 2, 3)]
+    assert colours(test) == [(0, t) for t in range(FRAMES)]
+    assert train.view.tolist() == [0, 1, 2] * FRAMES
+    torch.testing.assert_close(test.times, torch.arange(7) / 6)
+    # The unit is 0.75 of the least depth, 6; the rig's middle is the origin.
+    places = torch.tensor([-0.5, 0.5, 1.5]) / 4.5
+    torch.testing.assert_close(train.cameras.positions[:3, 0], places)
+    torch.testing.assert_close(train.cameras.focal[0], torch.tensor([40.0, 40.0]))
+    assert (train.names[4], test.names[6]) == ("cam03.mp4 frame 1", "cam00.mp4 frame 6")
+
+
+def test_the_first_frame_of_every_camera_is_the_static_set(folder):
+    scene = Neural3DVideoReader(folder, downscale=1).read()
+    assert colours(scene.static.train) == [(1, 0), (2, 0), (3, 0)]
+    assert colours(scene.static.test) == [(0, 0)]
+    assert scene.static.train.times.tolist() == [0.0] * 3
+
+
+def test_some_frames_some_cameras_another_held_out(folder):
+    scene = Neural3DVideoReader(
+        folder, downscale=1, frames=3, length=5, test_view=10, train_views=2
+    ).read()
+    assert colours(scene.dynamic.train) == [(k, t) for t in (0, 2, 4) for k in (0, 1)]
+    assert scene.dynamic.train.times.unique().tolist() == [0.0, 0.5, 1.0]
+    assert colours(scene.dynamic.test) == [(3, t) for t in (0, 2, 4)]
+
+
+def test_smaller_frames(folder):
+    views = Neural3DVideoReader(folder, downscale=2, frames=2).read().dynamic.train
+    assert (views.width, views.height) == (WIDTH // 2, HEIGHT // 2)
+    assert colours(views) == [(k, t) for t in (0, FRAMES - 1) for k in (1, 2, 3)]
+    torch.testing.assert_close(views.cameras.focal[0], torch.tensor([20.0, 20.0]))
+
+
+def poses(folder: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
+    np.save(folder / "poses_bounds.npy", change(np.load(folder / "poses_bounds.npy")))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            lambda root: write_pictures(root / "cam03.mp4", film(2, 5), 10),
+            "cam03.mp4: 5 frames of 32x24 px, but cam00.mp4 has 7 frames of 32x24 px; all videos",
+        ),
+        (
+            lambda root: write_pictures(root / "cam03.mp4", film(2, width=40), 10),
+            "cam03.mp4: 7 frames of 40x24 px, but cam00.mp4 has 7 frames of 32x24 px",
+        ),
+        (
+            lambda root: (root / "cam03.mp4").unlink(),
+            "poses_bounds.npy: has 4 cameras, but there are 3 videos cam00.mp4 … cam10.mp4; remove",
+        ),
+        (
+            lambda root: poses(root, lambda rows: rows[:3]),
+            "poses_bounds.npy: has 3 cameras, but there are 4 videos cam00.mp4 … cam10.mp4",
+        ),
+        (lambda root: (root / "poses_bounds.npy").unlink(), "poses_bounds.npy: no such file"),
+        (
+            lambda root: [path.unlink() for path in root.glob("cam*")],
+            "coffee: 0 videos cam00.mp4, cam01.mp4, …, expected at least 2",
+        ),
+        (
+            lambda root: (root / "cam02.mp4").write_bytes(b"not a video" * 50),
+            "cam02.mp4: not a readable video; convert it",
+        ),
+        (
+            lambda root: cut(root / "cam02.mp4"),
+            "cam02.mp4: not a readable video; convert it",
+        ),
+        (
+            lambda root: poses(root, lambda rows: rows * np.where(np.arange(17) == 4, 2, 1)),
+            "the poses are for images of 32x48 px (width x height), but these have 32x24 px",
+        ),
+    ],
+)
+def test_what_is_wrong_is_one_line(folder, message_of, change, said):
+    change(folder)
+    assert said in message_of(folder)
+
+
+def cut(file: Path) -> None:
+    """Leave the first half of a file."""
+    data = file.read_bytes()
+    file.write_bytes(data[: len(data) // 2])
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"test_view": 1}, "data.test_view: 1 is the number of none of the videos (cam00.mp4, cam"),
+        ({"train_views": 4}, "data.train_views: 4 were asked for, but there are 3 videos next to"),
+        ({"length": 9}, "data.length: 9 is more than the 7 frames of each video"),
+        ({"test_view": -1}, "data.test_view: should be greater than or equal to 0"),
+        ({"frames": 1}, "data.frames: should be greater than or equal to 2"),
+    ],
+)
+def test_options_that_do_not_fit(folder, message_of, options, said):
+    assert said in message_of(folder, **options)
+
+
+def test_a_video_that_has_fewer_frames_than_it_says(folder, message_of, monkeypatch):
+    from devrf.scenes import footage
+
+    says = footage.FilmHeader((WIDTH, HEIGHT), FRAMES + 1)
+    monkeypatch.setattr("devrf.scenes.camera_videos.film_header", lambda path: says)
+    assert "mp4: ends after 7 frames, expected 8 or more; convert it again" in message_of(folder)
