@@ -213,7 +213,7 @@ def test_flow_initialises_only_frames_whose_predecessor_was_learned(
     followed: list[int] = []
     monkeypatch.setattr(
         "devrf.methods.devrf.deformation_stage.start_from_tracks",
-        lambda field, number, *rest: followed.append(number),
+        lambda field, number, *rest, **options: followed.append(number),
     )
     stage = DeformationStage(rest, TOGETHER, MotionSettings(start="flow"))
     trainer(max_epochs=1).fit(stage, datamodule=four_frames)

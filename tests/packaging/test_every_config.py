@@ -178,7 +178,15 @@ def test_every_ablation_is_in_a_table_of_both_embedded_scenes(composed):
     assert sorted(rows) == sorted(path.stem for path in (config_folder() / "ablation").glob("*"))
 
 
-STEPS = ("published", "along_flow", "changing_colors", "elastic", "more_sweeps", "refinement")
+STEPS = (
+    "published",
+    "along_flow",
+    "changing_colors",
+    "elastic",
+    "more_sweeps",
+    "finishing",
+    "refinement",
+)
 
 
 @pytest.mark.parametrize(
@@ -188,8 +196,9 @@ STEPS = ("published", "along_flow", "changing_colors", "elastic", "more_sweeps",
         (STEPS[1], STEPS[2], {"appearance"}),
         (STEPS[2], STEPS[3], {"deformation", "loss"}),
         (STEPS[3], STEPS[4], {"deformation"}),
-        (STEPS[4], STEPS[5], {"refinement"}),
-        (STEPS[5], "best", {"canonical", "sampling"}),
+        (STEPS[4], STEPS[5], {"deformation", "motion"}),
+        (STEPS[5], STEPS[6], {"refinement"}),
+        (STEPS[6], "best", {"canonical", "sampling"}),
     ],
 )
 def test_each_row_of_the_quality_table_adds_one_thing(composed, before, after, changed):

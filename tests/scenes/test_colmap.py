@@ -91,7 +91,8 @@ def test_photographs_are_of_a_scene_without_end(folder):
     without_mattes(folder)
     scene = ColmapReader(folder, downscale=1).read()
     assert not scene.space.straight
-    assert scene.bounds.reason == scene.bounds.box_source == "the sparse model"
+    assert scene.bounds.reason == "the sparse model"
+    assert scene.bounds.box_source == "what the static cameras all see"
     # Half the depth of the nearest points, which lie on this side of the middle.
     assert 1.0 < scene.bounds.near < 2.0
     given = ColmapReader(folder, downscale=1, near=0.7, box=[[-1, -1, -1], [1, 1, 1]]).read()

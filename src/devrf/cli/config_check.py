@@ -33,6 +33,7 @@ ROOT: dict[str, Any] = {
 # Keys of earlier versions and their new names; then values, by key.
 RENAMED = {
     "schedule.deformation.frames_at_once": "schedule.deformation.parallel_frames",
+    "schedule.deformation.stiffness": "schedule.deformation.factors.elastic",
     "schedule.motion.least_gain": "schedule.motion.min_rel_improvement",
 }
 RENAMED_VALUES = {"schedule.motion.pixels": {"useful": "occupied"}}

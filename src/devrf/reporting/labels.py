@@ -37,6 +37,7 @@ ABLATIONS = {
     "changing_colors": "+ changing colours",
     "elastic": "+ elastic motion",
     "more_sweeps": "+ two more sweeps",
+    "finishing": "+ a finishing level",
     "refinement": "+ refinement",
     "best": "+ finer field at rest",
 }

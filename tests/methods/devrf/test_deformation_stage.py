@@ -112,23 +112,47 @@ def test_total_variation_alone_smooths_both_directions(
     torch.testing.assert_close(peak.mean, expected)
 
 
-class Weights(Callback):
-    """Notes the weight of the elastic term at each side of the motion grid."""
+class Seen(Callback):
+    """Notes weights, total variation and rate after each step, level by level."""
 
     def __init__(self) -> None:
-        self.seen: dict[int, float] = {}
+        self.elastic: dict[int, float] = {}
+        self.smoothing: dict[int, float] = {}
+        self.rates: dict[int, list[float]] = {}
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, *args: Any) -> None:
-        self.seen[pl_module.phase.level] = pl_module.losses.weights["elastic"]
+        level, group = pl_module.phase.level, pl_module.optimizer.param_groups[0]
+        self.elastic[level] = pl_module.losses.weights["elastic"]
+        self.smoothing[level] = group["smoothing"]
+        self.rates.setdefault(level, []).append(group["lr"])
 
 
-def test_each_level_has_its_stiffness(
+def test_each_level_has_its_weights_and_rates(
     rest: LoadedCheckpoint, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
 ) -> None:
-    schedule = DeformationSchedule((4, 6), (2, 2), rays=16, stiffness=(0.0, 3.0))
-    stage, weights = DeformationStage(rest, schedule, loss={"render": 1, "elastic": 0.2}), Weights()
-    trainer(weights, max_epochs=1).fit(stage, datamodule=datamodule)
-    assert weights.seen == {0: 0.0, 1: pytest.approx(0.6)}
+    schedule = DeformationSchedule(
+        (4, 6), (2, 2), rays=16, rates=(1, 0.5), fall=(1, 0.01),
+        factors={"elastic": (0, 3), "tv": (1, 0)},
+    )  # fmt: skip
+    loss = {"render": 1, "elastic": 0.2, "tv": 1}
+    motion = MotionSettings(learning_rate=0.01)
+    stage = DeformationStage(rest, schedule, motion, loss=loss, iterations_per_step=1)
+    seen = Seen()
+    trainer(seen, max_epochs=1).fit(stage, datamodule=datamodule)
+    assert seen.elastic == {0: 0.0, 1: pytest.approx(0.6)}
+    assert seen.smoothing[0] > 0 and seen.smoothing[1] == 0
+    assert set(seen.rates[0]) == {0.01}
+    # Frame 1 has four iterations, frame 2 two; within each the rate falls towards a hundredth.
+    falls = [0.005 * 0.01**share for share in (0, 1 / 4, 1 / 2, 3 / 4, 0, 1 / 2)]
+    assert seen.rates[1] == pytest.approx(falls)
+
+
+def test_factors_are_those_of_terms(rest: LoadedCheckpoint) -> None:
+    schedule = DeformationSchedule((4,), (2,), factors={"elastik": (1,)})
+    with pytest.raises(
+        DevrfError, match="factors: elastik is no term of loss.deformation; the ter"
+    ):
+        DeformationStage(rest, schedule)
 
 
 class Look(Callback):

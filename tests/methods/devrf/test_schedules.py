@@ -287,11 +287,27 @@ def test_a_wrong_canonical_schedule_is_an_error(wrong: dict[str, Any]) -> None:
         {"order": ("forward", "backward")},
         {"order": ("forward", "forward", "forward", "forward", "sideways")},
         {"order": ("backward", "forward", "forward", "forward", "forward")},
-        {"stiffness": (0.0, 1.0)},
-        {"stiffness": (0.0, 1.0, 1.0, 1.0, -1.0)},
+        {"rates": (1.0, 1.0)},
+        {"rates": (1.0, 1.0, 1.0, 1.0, 0.0)},
+        {"fall": (1.0, 1.0, 1.0, 1.0, -0.1)},
+        {"factors": {"elastic": (0.0, 1.0)}},
+        {"factors": {"elastic": (0.0, 1.0, 1.0, 1.0, -1.0)}},
     ],
     ids=str,
 )
 def test_a_wrong_deformation_schedule_is_an_error(wrong: dict[str, Any]) -> None:
     with pytest.raises(DevrfError, match="schedule.deformation"):
         DeformationSchedule(**wrong)
+
+
+def test_a_level_may_have_a_rate_and_weights_of_its_own() -> None:
+    schedule = DeformationSchedule(
+        (4, 8, 8), (2, 2, 2), rates=(1, 0.5, 0.3), fall=(1, 1, 0.1), factors={"tv": (1, 1, 0)}
+    )
+    phases = [schedule.phase(i, frames=2) for i in (0, 4, 8)]
+    assert [(p.learning_rate_factor, p.fall) for p in phases] == [(1, 1), (0.5, 1), (0.3, 0.1)]
+    assert [schedule.weight_factor("tv", level) for level in range(3)] == [1, 1, 0]
+    assert schedule.weight_factor("flow", 2) == 1
+    finest = replace(schedule, coarse_to_fine=False)
+    assert finest.phase(0, frames=2).learning_rate_factor == 1  # the base rate
+    assert finest.phase(0, frames=2).fall == 0.1 and finest.weight_factor("tv", 0) == 0

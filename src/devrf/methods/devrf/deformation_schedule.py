@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import accumulate, pairwise
 from typing import Literal
 
@@ -24,7 +24,8 @@ class DeformationPhase:
         start: first iteration.
         stop: one past the last iteration.
         side: side of the motion grid: it has about side³ voxels.
-        learning_rate_factor: what the learning rate is multiplied by.
+        learning_rate_factor: what the learning rate is multiplied by at the visit's start.
+        fall: what it has been multiplied by further at the visit's end.
         init_from_previous: whether the frame starts from the result of the frame before it.
         has_previous: whether the frames before these have been learned at this level, or are at
             rest.
@@ -36,6 +37,7 @@ class DeformationPhase:
     stop: int
     side: int
     learning_rate_factor: float
+    fall: float
     init_from_previous: bool
     has_previous: bool
 
@@ -78,7 +80,12 @@ class DeformationSchedule:
             before it; None: 1 throughout.
         order: of the frames of each level, ``forward`` in time at the coarsest; None: ``forward``
             throughout.
-        stiffness: factor of ``loss.deformation.elastic`` at each level; None: 1 throughout.
+        rates: factor of the learning rate at each level; None: ``decay`` to the power of how often
+            the side has changed.
+        fall: what the learning rate falls to in the course of a visit, exponentially, as a factor,
+            at each level; None: 1 throughout.
+        factors: of the weights of ``loss.deformation`` at each level, by the term's name; 1
+            throughout of terms that are not named.
     """
 
     sides: Sequence[int] = (10, 20, 40, 80, 160)
@@ -88,7 +95,9 @@ class DeformationSchedule:
     rays: int = 8192
     parallel_frames: Sequence[int] | None = None
     order: Sequence[Order] | None = None
-    stiffness: Sequence[float] | None = None
+    rates: Sequence[float] | None = None
+    fall: Sequence[float] | None = None
+    factors: Mapping[str, Sequence[float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if len(self.sides) != len(self.iterations_per_frame) or not self.sides:
@@ -120,14 +129,16 @@ class DeformationSchedule:
                 f"frame starts from the one before it, not {at_once[0]}"
             )
         self._check_order()
-        self._check_stiffness()
+        self._check_factors()
         if not self.coarse_to_fine:
             object.__setattr__(self, "sides", (self.sides[-1],))
             object.__setattr__(self, "iterations_per_frame", (sum(self.iterations_per_frame),))
             object.__setattr__(self, "parallel_frames", (at_once[-1],))
             object.__setattr__(self, "order", None)
-            if self.stiffness is not None:
-                object.__setattr__(self, "stiffness", (self.stiffness[-1],))
+            object.__setattr__(self, "rates", None)
+            object.__setattr__(self, "fall", None if self.fall is None else (self.fall[-1],))
+            last = {name: (factors[-1],) for name, factors in self.factors.items()}
+            object.__setattr__(self, "factors", last)
 
     def _check_order(self) -> None:
         order = self.order
@@ -144,15 +155,30 @@ class DeformationSchedule:
                 f"starts from the one before it, not {order[0]}"
             )
 
-    def _check_stiffness(self) -> None:
-        stiffness = self.stiffness
-        if stiffness is None:
-            return
-        if len(stiffness) != len(self.sides) or min(stiffness) < 0:
-            raise DevrfError(
-                "schedule.deformation.stiffness: expected a number, at least 0, for each of "
-                f".sides, or null, not {list(stiffness)}"
-            )
+    def _check_factors(self) -> None:
+        given = {"rates": self.rates, "fall": self.fall}
+        of_terms = {f"factors.{name}": factors for name, factors in self.factors.items()}
+        for name, factors in {**given, **of_terms}.items():
+            if factors is None:
+                continue
+            # A weight may be 0, a rate may not.
+            too_low = min(factors, default=0) < 0 or (name in given and 0 in factors)
+            if len(factors) != len(self.sides) or too_low:
+                least = "above 0" if name in given else "at least 0"
+                raise DevrfError(
+                    f"schedule.deformation.{name}: expected a number, {least}, for each of .sides, "
+                    f"not {list(factors)}"
+                )
+
+    def learning_rate_factor(self, level: int) -> float:
+        """Factor of the learning rate when a visit of ``level`` begins."""
+        if self.rates is not None:
+            return self.rates[level]
+        return self.decay ** sum(a != b for a, b in pairwise(self.sides[: level + 1]))
+
+    def weight_factor(self, term: str, level: int) -> float:
+        """Factor of the weight of a loss term at ``level``."""
+        return self.factors[term][level] if term in self.factors else 1.0
 
     def visits(self, level: int, frames: int) -> int:
         """L of T = ``frames`` frames: visits of a level, and the distance of parallel frames."""
@@ -181,7 +207,7 @@ class DeformationSchedule:
         begins = [0, *self.growths(frames)]
         level = bisect_right(begins, iteration) - 1
         begin, apart = begins[level], self.visits(level, frames)
-        share, sides = self.iterations_per_frame[level], self.sides[: level + 1]
+        share = self.iterations_per_frame[level]
         first = 1 if apart == frames else 0  # frame 0 alone
         visit = min(max((iteration - begin) // share, first), apart - 1)
         backward = self.order is not None and self.order[level] == "backward"
@@ -193,7 +219,8 @@ class DeformationSchedule:
             start=begin + (0 if visit == first else visit * share),
             stop=begin + (visit + 1) * share,
             side=self.sides[level],
-            learning_rate_factor=self.decay ** sum(a != b for a, b in pairwise(sides)),
+            learning_rate_factor=self.learning_rate_factor(level),
+            fall=1.0 if self.fall is None else self.fall[level],
             init_from_previous=self.coarse_to_fine and level == 0 and visit > 1,
             has_previous=visit > 0 and not backward,
         )

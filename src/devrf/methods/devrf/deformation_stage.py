@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -113,7 +114,9 @@ class DeformationStage(VoxelStage):
         self.appearance = AppearanceLearning(chosen, self.schedule, appearance_loss)
         weights.update(self.appearance.weights)
         self.losses = WeightedLoss(MOTION_TERMS | {"flow": FLOW_TERMS[flow_mean]}, weights)
-        self._elastic = weights.get("elastic", 0.0)
+        # What the schedule's factors are factors of.
+        self._weights = dict(self.losses.weights)
+        self._check_factors()
         still = rest.model
         fields = still.canonical, still.occupancy
         self.refinement = Refinement(self, refinement or RefinementSettings(), refinement_loss)
@@ -163,11 +166,12 @@ class DeformationStage(VoxelStage):
         return self.schedule.phase(iteration, frames)
 
     def learning_rate_factor(self, iteration: int) -> float:
-        """The decay of the iteration's level (docs/method.md#motion-learning-rate)."""
+        """Of the iteration's level, and of its visit (docs/method.md#motion-learning-rate)."""
         phase = self.phase_at(iteration)
         if isinstance(phase, RefinementPhase):
             return phase.learning_rate_factor(iteration)
-        return phase.learning_rate_factor
+        share = (iteration - phase.start) / (phase.stop - phase.start)
+        return phase.learning_rate_factor * math.pow(phase.fall, share)
 
     def setup(self, stage: str) -> None:
         """Build the field at rest, at the coarsest resolution.
@@ -257,12 +261,13 @@ class DeformationStage(VoxelStage):
         for group in range(len(self._optimizer.param_groups)):
             self._optimizer.replace(group, [])
         self.active.allocate(count, *fields)
-        self._stiffen(self.phase.level)
+        self._weigh(self.phase.level)
         self._matter = None
         if count and any(self.losses.weights.get(name) for name in PRIORS):
             occupancy = self.scene_model.occupancy
             self._matter = occupied_cells(occupancy, self.field.box, self.field.shape)
-        smoothing = total_variation_weight(self.tv, max(self.field.shape), self.schedule.rays)
+        tv = self.tv * self.schedule.weight_factor("tv", self.phase.level)
+        smoothing = total_variation_weight(tv, max(self.field.shape), self.schedule.rays)
         learned = [tensor for frame in self.active for tensor in frame.slices]
         self._optimizer.replace(0, learned, smoothing=smoothing)
         residuals = [frame.residual for frame in self.active if frame.residual is not None]
@@ -272,12 +277,20 @@ class DeformationStage(VoxelStage):
             parameters = [frame.learned for frame in self.active]
             self.bind(self.schedule.rays, parameters, static_shape=static_shape)
 
-    def _stiffen(self, level: int) -> None:
-        """Give the elastic term its weight at ``level``."""
-        stiffness = self.schedule.stiffness
-        if stiffness is not None:
-            weights = {**self.losses.weights, "elastic": stiffness[level] * self._elastic}
-            self.losses = replace(self.losses, weights=weights)
+    def _weigh(self, level: int) -> None:
+        """Give each term its weight at ``level``."""
+        factor = self.schedule.weight_factor
+        weights = {name: weight * factor(name, level) for name, weight in self._weights.items()}
+        self.losses = replace(self.losses, weights=weights)
+
+    def _check_factors(self) -> None:
+        known = {*MOTION_TERMS, "tv"}
+        for name in self.schedule.factors:
+            if name not in known:
+                raise DevrfError(
+                    f"schedule.deformation.factors: {name} is no term of loss.deformation; the "
+                    f"terms are {', '.join(sorted(known))}"
+                )
 
     def _initialise(self, phase: DeformationPhase) -> None:
         """Start each frame from the one before it; along the observed flow, if asked to."""
