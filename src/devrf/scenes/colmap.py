@@ -39,8 +39,8 @@ class ColmapReader(PosedReader):
     The world is that of :func:`devrf.scenes.normalisation.normalised`, as ``stage=capture`` has it:
     of cameras around a scene z points up and the middle of what they look at is the origin; cameras
     that all look within 45° of one direction make a forward-facing scene. The sparse points say
-    near and far, and the box where the cameras' axes do not meet. Lenses are undistorted. Images come from ``images_<downscale>`` where it is
-    there; else larger ones are made smaller.
+    near and far, and the box where the cameras' axes do not meet. Lenses are undistorted. Images
+    come from ``images_<downscale>`` where it is there; else larger ones are made smaller.
 
     Attributes:
         dynamic: which ``dynamic_*views`` folder, where there are several.
