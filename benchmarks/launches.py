@@ -99,7 +99,7 @@ class Count:
 
 
 class Tracing(TorchDispatchMode):  # type: ignore[no-untyped-call]
-    """Counts the operations inside the context, and the launches told by :meth:`launch`."""
+    """Counts the operations inside the context, and the launches told by :meth:`run`."""
 
     def __init__(self) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
@@ -126,8 +126,8 @@ class Tracing(TorchDispatchMode):  # type: ignore[no-untyped-call]
         weakref.finalize(storage, self._living.pop, key, None)
         self.count.taken = max(self.count.taken, sum(self._living.values()))
 
-    def launch(self, kernel: Any, programs: int, on: Tensor, *args: Any, **constants: Any) -> None:
-        """Stands in for ``devrf.ops.kernels.launch.launch``."""
+    def run(self, kernel: Any, programs: int, *args: Any, **constants: Any) -> None:
+        """Stands in for ``devrf.ops.kernels.launch.run``."""
         name = kernel.fn.__name__
         self.count.triton[name] += 1
         tensors = {id(value): value for value in args if isinstance(value, Tensor)}
@@ -176,31 +176,15 @@ def _tensors(values: Any) -> Iterator[Tensor]:
 @contextmanager
 def tracing() -> Iterator[Tracing]:
     """Count launches; Triton's kernels do not run."""
-    from devrf.ops.kernels import (
-        adam,
-        color_network,
-        compositing,
-        motion,
-        photometric,
-        pixel_rays,
-        search,
-        trilinear,
-        warped_depth,
-    )
+    from devrf.ops.kernels import launch
 
-    modules: tuple[Any, ...] = (
-        *(adam, color_network, compositing, motion, photometric),
-        *(pixel_rays, search, trilinear, warped_depth),
-    )
-    trace, usual = Tracing(), [module.launch for module in modules]
-    for module in modules:
-        module.launch = trace.launch
+    trace, usual = Tracing(), launch.run
+    launch.run = trace.run
     try:
         with trace:
             yield trace
     finally:
-        for module, launch in zip(modules, usual, strict=True):
-            module.launch = launch
+        launch.run = usual
 
 
 def views(count: int, frames: int, *, flow: bool) -> Views:
@@ -289,7 +273,7 @@ def _attach(stage: ScheduledStage, images: Views) -> None:
     data = SimpleNamespace(
         scene=SimpleNamespace(background="white"), training_views=lambda capture, device: images
     )
-    strategy = SimpleNamespace(backward=lambda loss, _: loss.backward())
+    strategy = SimpleNamespace(backward=lambda loss, _, gradient: loss.backward(gradient))
     stage._trainer = cast(Trainer, SimpleNamespace(datamodule=data, strategy=strategy))
 
 

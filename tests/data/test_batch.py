@@ -132,9 +132,7 @@ def test_all_pixels_of_some_images():
 
 
 def test_draws_come_from_the_pool_and_reach_all_of_it(rng):
-    pool = PixelPool(
-        torch.tensor([0, 1, 1], dtype=torch.int32), torch.tensor([7, 2, 5], dtype=torch.int32)
-    )
+    pool = PixelPool(torch.tensor([[0, 1, 1], [7, 2, 5]], dtype=torch.int32))
     image, flat = pool.draw(200, rng)
     assert image.dtype == flat.dtype == torch.int64
     drawn = set(zip(image.tolist(), flat.tolist(), strict=True))
@@ -143,7 +141,7 @@ def test_draws_come_from_the_pool_and_reach_all_of_it(rng):
 
 def test_a_pool_is_told_by_its_mask():
     whole = all_pixels(views(), torch.arange(2))
-    some = PixelPool(whole.image[1::3], whole.flat[1::3])
+    some = PixelPool(whole.pixels[:, 1::3])
     of_second = some.of_images(torch.tensor([1]))
     for pool, images in ((some, torch.arange(2)), (of_second, torch.tensor([1]))):
         mask = pool.mask(images, WIDTH * HEIGHT)

@@ -31,17 +31,7 @@ from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.settings import MotionSettings
 from devrf.ops.dispatch import Kind, using
-from devrf.ops.kernels import (
-    adam,
-    color_network,
-    compositing,
-    motion,
-    photometric,
-    pixel_rays,
-    search,
-    trilinear,
-    warped_depth,
-)
+from devrf.ops.kernels import launch
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.sample_capacity import SampleCapacity
 
@@ -94,11 +84,6 @@ def short_work(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(SampleCapacity, "GRAIN", 64)
     monkeypatch.setattr(GraphedStep, "WARM_UP", 1)
 
-
-KERNELS = (
-    *(adam, color_network, compositing, motion, photometric),
-    *(pixel_rays, search, trilinear, warped_depth),
-)
 
 # Operations that wait for the device, or whose results have a shape that depends on data.
 WAITING = {
@@ -158,16 +143,15 @@ class Watch(TorchDispatchMode):
 @contextmanager
 def watching() -> Iterator[Watch]:
     """Record torch's operations and kernel launches, but not the interpreter's operations."""
-    usual, watch = adam.launch, Watch()
+    usual, watch = launch.run, Watch()
 
-    def launch(kernel: Any, programs: int, on: Tensor, *args: Any, **constants: Any) -> None:
+    def run(kernel: Any, programs: int, *args: Any, **constants: Any) -> None:
         watch.note(str(kernel), [programs, *args, *constants.values()], constants)
         with torch.utils._python_dispatch._disable_current_modes():
-            usual(kernel, programs, on, *args, **constants)
+            usual(kernel, programs, *args, **constants)
 
     with pytest.MonkeyPatch.context() as patch, watch:
-        for module in KERNELS:
-            patch.setattr(module, "launch", launch)
+        patch.setattr(launch, "run", run)
         yield watch
 
 

@@ -17,15 +17,27 @@ class PixelPool:
     """P pixels of some images.
 
     Attributes:
-        image: (P,) int32, the image of each pixel.
-        flat: (P,) int32, its row-major number in the image.
+        pixels: (2, P) int32, the image of each pixel and its row-major number in the image.
     """
 
-    image: Tensor
-    flat: Tensor
+    pixels: Tensor
 
     def __len__(self) -> int:
-        return self.image.shape[0]
+        return self.pixels.shape[1]
+
+    @property
+    def image(self) -> Tensor:
+        """(P,) int32, the image of each pixel."""
+        return self.pixels[0]
+
+    @property
+    def flat(self) -> Tensor:
+        """(P,) int32, its row-major number in the image."""
+        return self.pixels[1]
+
+    def __getitem__(self, index: Tensor) -> PixelPool:
+        """Some of the pixels."""
+        return PixelPool(self.pixels[:, index])
 
     def draw(self, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """``count`` pixels with replacement: image (count,) and number (count,), int64.
@@ -34,18 +46,18 @@ class PixelPool:
             count: how many.
             generator: of the random choice, on the pool's device.
         """
-        pick = torch.randint(len(self), (count,), device=self.image.device, generator=generator)
-        return self.image[pick].long(), self.flat[pick].long()
+        pick = torch.randint(len(self), (count,), device=self.pixels.device, generator=generator)
+        image, flat = self.pixels.index_select(1, pick).long().unbind()
+        return image, flat
 
     def of_images(self, images: Tensor) -> PixelPool:
         """The pixels that belong to ``images`` (K,)."""
-        kept = torch.isin(self.image, images.to(self.image.dtype))
-        return PixelPool(self.image[kept], self.flat[kept])
+        return self[torch.isin(self.image, images.to(torch.int32))]
 
     def mask(self, images: Tensor, area: int) -> Tensor:
         """Which pixels of ``images`` (K,), ascending, are here: (K, ``area``) bool."""
-        mask = torch.zeros(len(images), area, dtype=torch.bool, device=self.image.device)
-        row = torch.searchsorted(images.to(self.image.dtype), self.image.contiguous())
+        mask = torch.zeros(len(images), area, dtype=torch.bool, device=self.pixels.device)
+        row = torch.searchsorted(images.to(torch.int32), self.image.contiguous())
         mask[row, self.flat.long()] = True
         return mask
 
@@ -53,7 +65,7 @@ class PixelPool:
     def of_mask(images: Tensor, mask: Tensor) -> PixelPool:
         """The pool that :meth:`mask` describes, its pixels in ascending order."""
         row, flat = mask.nonzero().unbind(1)
-        return PixelPool(images[row].to(torch.int32), flat.to(torch.int32))
+        return PixelPool(torch.stack([images.to(torch.int32)[row], flat.to(torch.int32)]))
 
 
 def all_pixels(views: Views, images: Tensor) -> PixelPool:
@@ -62,8 +74,10 @@ def all_pixels(views: Views, images: Tensor) -> PixelPool:
     if views.valid_mask is not None:
         everything = torch.ones(len(images), area, dtype=torch.bool, device=images.device)
         return wanted_pixels(views, images, everything)
-    flat = torch.arange(area, dtype=torch.int32, device=images.device)
-    return PixelPool(images.to(torch.int32).repeat_interleave(area), flat.repeat(len(images)))
+    pixels = torch.empty(2, len(images), area, dtype=torch.int32, device=images.device)
+    pixels[0] = images[:, None]
+    pixels[1] = torch.arange(area, device=images.device)
+    return PixelPool(pixels.flatten(1))
 
 
 def wanted_pixels(views: Views, images: Tensor, wanted: Tensor) -> PixelPool:
@@ -93,8 +107,7 @@ class Pixels:
 
     def take(self, others: Pixels) -> None:
         """Become as many others, in the same memory."""
-        self.image.copy_(others.image)
-        self.flat.copy_(others.flat)
+        torch._foreach_copy_((self.image, self.flat), (others.image, others.flat))
         if self.background is not others.background:
             self.background.copy_(others.background)
 

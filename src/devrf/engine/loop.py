@@ -52,6 +52,8 @@ class Loop:
         self.num_captures = self.num_short_lists = 0
         self._rays = 0
         self._device = torch.device("cpu")
+        # What losses are scaled by in the backward pass, which would fill one each time.
+        self._one = torch.ones(())
         self._streams = StreamParallel()
         self._graphed: GraphedStep | None = None
         self._capture: CudaGraphCapture | None = None
@@ -79,6 +81,7 @@ class Loop:
         """
         self.release()
         self._rays, self._device = rays, parameters[0][0].device
+        self._one = self._one.to(self._device)
         self.batches = [ParallelBatch(k, learned) for k, learned in enumerate(parameters)]
         if static_shape:
             self._make_capacities()
@@ -149,7 +152,7 @@ class Loop:
 
         def backward(total: Tensor) -> None:
             with span("backward"):
-                stage.manual_backward(total)
+                stage.manual_backward(total, gradient=self._one)
 
         total, terms = self.micro_batching.gradients(
             lambda pixels: stage.loss(batch, views, pixels),

@@ -20,12 +20,11 @@ class MetricAccumulator:
     def add(self, found: Sequence[Mapping[str, Tensor]]) -> None:
         """Add the values () of an iteration, by name for each batch; all have the same names."""
         self._names = tuple(found[0])
-        values = torch.stack([terms[name] for terms in found for name in self._names])
-        values = values.view(len(found), len(self._names))
+        values = [terms[name] for terms in found for name in self._names]
         if self._values is None:
-            self._values = values
+            self._values = torch.stack(values).view(len(found), len(self._names))
         else:
-            self._values += values
+            torch._foreach_add_(self._values.view(-1).unbind(), values)
 
     def take(self, iterations: int) -> tuple[dict[str, Tensor], Tensor]:
         """The means over ``iterations`` and all processes; the sums are set to zero.

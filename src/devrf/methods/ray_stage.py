@@ -308,7 +308,7 @@ class FramePool:
         order = frame.argsort(stable=True)
         _, counts = torch.unique(frame, return_counts=True)
         return FramePool(
-            PixelPool(everything.image[order], everything.flat[order]),
+            everything[order],
             tuple(counts.cumsum(0).tolist()),
             len(views),
         )
@@ -329,7 +329,7 @@ class FramePool:
             generator: of the random choice, on the pool's device.
             moments: so many frames alone, as many pixels of each, frame after frame; None: all.
         """
-        pool, device = self.pool, self.pool.image.device
+        pool, device = self.pool, self.pool.pixels.device
         if moments is None or moments >= frames:
             last = self.ends[frames - 1]
             pick = torch.randint(last, (count,), device=device, generator=generator)

@@ -6,12 +6,13 @@ Imports go down this list, never up:
 |---|---|
 | ``selfcheck`` | ``check_kernels``, ``compare``: both implementations, compared on a device |
 | ``adam`` | ``GridAdam``: the optimiser made of ``adam_step``'s steps |
+| ``selection`` | ``select_listed``: those whose colour is needed, in a list of their own |
 | ``search`` | ``find_samples``: visible samples of rays; ``select``: a subset of them |
 | ``adam_step`` | ``adam_step``, ``smooth_adam_step``: one step on one tensor |
 | ``color_network`` | ``listed_colors``, ``decode``: features and directions → RGB |
 | ``motion`` | ``motion_sum``: the cycle and the flow term |
 | ``photometric`` | ``photometric_sum``: the terms that compare rays with images |
-| ``pixel_rays`` | ``gather_pixels``: rays and truth of pixels; ``steps_in_box`` |
+| ``pixel_rays`` | ``gather_pixels``: rays and truth; ``steps_in_box``, ``steps_between`` |
 | ``warped_depth`` | ``warped_depth``: points of a moment → canonical positions, optical depths |
 | ``trilinear`` | ``interpolate``: values of a grid between its points |
 | ``compositing`` | ``composite``, ``composite_segments``: weights; ``sum_segments``: sums |

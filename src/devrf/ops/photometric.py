@@ -26,10 +26,14 @@ class PhotometricSum(NamedTuple):
     Attributes:
         total: () Σ weight · term; differentiable once.
         terms: (4,) the terms in the order of :data:`TERMS`; not differentiable.
+        opacity: () mean 1 − T_end; not differentiable.
+        coverage: () mean A, or None.
     """
 
     total: Tensor
     terms: Tensor
+    opacity: Tensor
+    coverage: Tensor | None
 
 
 def photometric_sum(
@@ -60,10 +64,10 @@ def photometric_sum(
     if triton_runs(image, transmittance, sample_weight, sample_color, truth):
         from devrf.ops.kernels.photometric import PhotometricInOnePass
 
-        total, terms = PhotometricInOnePass.apply(  # type: ignore[no-untyped-call]
+        total, terms, seen = PhotometricInOnePass.apply(  # type: ignore[no-untyped-call]
             image, transmittance, sample_color, sample_weight.detach(), first, truth, alpha, weights
         )
-        return PhotometricSum(total, terms)
+        return PhotometricSum(total, terms, seen[0], None if alpha is None else seen[1])
     rays = len(image)
     place = torch.arange(len(sample_weight), device=first.device)
     ray = torch.searchsorted(first[1:].contiguous(), place, right=True).clamp(max=rays - 1)
@@ -80,4 +84,5 @@ def photometric_sum(
     )
     total = sum(weight * term for weight, term in zip(weights, terms.unbind(), strict=True))
     assert isinstance(total, Tensor)
-    return PhotometricSum(total, terms.detach())
+    covered = None if alpha is None else alpha.mean()
+    return PhotometricSum(total, terms.detach(), 1 - transmittance.detach().mean(), covered)

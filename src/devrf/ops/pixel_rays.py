@@ -123,6 +123,12 @@ def steps_in_box(
     to_low, to_high = (low - origins) / d, (high - origins) / d
     entry = torch.minimum(to_low, to_high).amax(dim=-1).clamp(min=near)
     leave = torch.maximum(to_low, to_high).amin(dim=-1).clamp(max=far)
-    # Including a sample exactly at the exit.
-    count = torch.where(leave >= entry, ((leave - entry) / step + 1e-3).floor() + 1, 0.0)
-    return entry, count.long()
+    return entry, steps_between(entry, leave, step)
+
+
+def steps_between(entry: Tensor, leave: Tensor, step: float) -> Tensor:
+    """Number (R,) int64 of samples every ``step`` from ``entry`` (R,) up to ``leave`` (R,).
+
+    A sample exactly at the exit counts: in NDC it is the last plane, behind the whole scene.
+    """
+    return torch.where(leave >= entry, ((leave - entry) / step + 1e-3).floor() + 1, 0.0).long()

@@ -85,23 +85,6 @@ class SampleSubset:
         return self.total > len(self.index)
 
 
-@dataclass(frozen=True)
-class ListedSubset(SampleSubset):
-    """Some of the samples of a list with what the list says of them.
-
-    Attributes:
-        ray: (K,) int64, the ray of each; in the padding any ray, spread over all.
-        distance: (K,) along the ray.
-        points: (K, 3) positions.
-        present: (K,) bool, which places hold a sample.
-    """
-
-    ray: Tensor
-    distance: Tensor
-    points: Tensor
-    present: Tensor
-
-
 @torch.no_grad()
 def find_samples(
     origins: Tensor,
@@ -222,29 +205,3 @@ def select(flags: Tensor, first: Tensor, capacity: int) -> SampleSubset:
     target = torch.where(flags, running[:-1], capacity).clamp_(max=capacity)
     index = torch.arange(capacity + 1, device=flags.device).scatter_(0, target, place)
     return SampleSubset(index[:capacity], running[first].clamp_(max=capacity), total)
-
-
-@torch.no_grad()
-def select_listed(found: PackedSamples, capacity: int) -> ListedSubset:
-    """The significant samples of a list, as :func:`select` selects them, in a list of their own."""
-    rays = len(found.first) - 1
-    if capacity <= len(found.ray) and triton_runs(found.distance, found.points):
-        from devrf.ops.kernels.search import select_on_device
-
-        listed = found.ray, found.distance, found.points
-        return ListedSubset(
-            *select_on_device(found.significant, found.first, *listed, rays, capacity)
-        )
-    chosen = select(found.significant, found.first, capacity)
-    place = torch.arange(capacity, device=chosen.index.device)
-    present = place < chosen.first[-1]
-    ray = torch.where(present, found.ray.index_select(0, chosen.index), place % max(rays, 1))
-    return ListedSubset(
-        chosen.index,
-        chosen.first,
-        chosen.total,
-        ray,
-        found.distance.index_select(0, chosen.index),
-        found.points.index_select(0, chosen.index),
-        present,
-    )

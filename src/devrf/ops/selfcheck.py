@@ -21,7 +21,8 @@ from devrf.ops.dispatch import Kind, using
 from devrf.ops.motion import ListedSamples, SeenEarlier, motion_sum
 from devrf.ops.photometric import photometric_sum
 from devrf.ops.pixel_rays import gather_pixels, steps_in_box
-from devrf.ops.search import Thresholds, find_samples, select_listed
+from devrf.ops.search import Thresholds, find_samples
+from devrf.ops.selection import select_listed
 from devrf.ops.total_variation import add_total_variation_gradient
 from devrf.ops.trilinear import interpolate
 from devrf.ops.warped_depth import warped_depth
@@ -191,8 +192,10 @@ def sample_search(draw: Draw, frames: Sequence[int] = (1, 2)) -> Results:
             found.total,
             found.overflow,
         ]
-        chosen = select_listed(found, 12)
-        results += [value for value in vars(chosen).values() if isinstance(value, Tensor)]
+        leaves = draw.leaf(40, 3), draw.leaf(40)
+        chosen = select_listed(found, *leaves, 12)
+        loss = (chosen.canonical * draw(12, 3)).sum() + (chosen.weight * draw(12)).sum()
+        results += [*chosen, *torch.autograd.grad(loss, leaves)]
     return tuple(results)
 
 
@@ -218,7 +221,7 @@ def compositing_colors(draw: Draw) -> Results:
         found = photometric_sum(
             image, left, weights, colors, first, draw(6, 3), alpha, (1.0, 0.1, 0.01, 0.2)
         )
-        results += [image, depth, *found]
+        results += [image, depth, *(tensor for tensor in found if tensor is not None)]
         results += torch.autograd.grad(3 * found.total, (weights, colors, left))
     return tuple(results)
 

@@ -44,7 +44,7 @@ class SampleCapacity:
 
     def note(self, visible: Tensor, significant: Tensor) -> None:
         """Record on the device how many samples () a batch had."""
-        torch.maximum(self._needed, torch.stack([visible, significant]), out=self._needed)
+        torch._foreach_maximum_(self._needed.unbind(), [visible, significant])
 
     def measure(self) -> bool:
         """Wait for the recorded numbers and adapt the lengths; True if they have changed."""

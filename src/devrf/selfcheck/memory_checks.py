@@ -8,8 +8,9 @@ from __future__ import annotations
 import logging
 import math
 import tempfile
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -45,10 +46,29 @@ def at_most(device: torch.device, more: int) -> Iterator[None]:
         torch.cuda.set_per_process_memory_fraction(1.0, device)
 
 
-class MeasureBatch(CudaGraphCapture):
-    """Captures, and measures what the second warm-up takes beside all else.
+class SecondWarmUp(CudaGraphCapture, ABC):
+    """Captures, and does something about the second warm-up.
 
-    The first one makes gradients and moments, which stay.
+    The first one makes gradients and moments, which stay: the second takes a batch alone.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        super().__init__(device)
+        self._calls = 0
+
+    def warm_up(self, work: Work) -> None:
+        """Run ``work``, the second time within :meth:`around`."""
+        self._calls += 1
+        with self.around() if self._calls == 2 else nullcontext():
+            super().warm_up(work)
+
+    @abstractmethod
+    def around(self) -> AbstractContextManager[None]:
+        """What the second warm-up is run in."""
+
+
+class MeasureBatch(SecondWarmUp):
+    """Measures what the second warm-up takes beside all else.
 
     Attributes:
         taken: bytes at the peak, beyond what was held before.
@@ -57,37 +77,27 @@ class MeasureBatch(CudaGraphCapture):
     def __init__(self, device: torch.device) -> None:
         super().__init__(device)
         self.taken = 0
-        self._calls = 0
 
-    def warm_up(self, work: Work) -> None:
-        """Run ``work``, and measure it the second time."""
-        self._calls += 1
-        if self._calls != 2:
-            super().warm_up(work)
-            return
+    @contextmanager
+    def around(self) -> Iterator[None]:
+        """Measure the block."""
         free_cache(self.device)
         before = torch.cuda.memory_reserved(self.device)
         torch.cuda.reset_peak_memory_stats(self.device)
-        super().warm_up(work)
+        yield
         self.taken = max(1, torch.cuda.max_memory_reserved(self.device) - before)
 
 
-class ScarceWarmUp(CudaGraphCapture):
-    """Captures; the second warm-up may take ``more`` bytes, also when it is done in parts."""
+class ScarceWarmUp(SecondWarmUp):
+    """The second warm-up may take ``more`` bytes, also when it is done in parts."""
 
     def __init__(self, device: torch.device, more: int) -> None:
         super().__init__(device)
         self._more = more
-        self._calls = 0
 
-    def warm_up(self, work: Work) -> None:
-        """Run ``work``, the second time with little memory."""
-        self._calls += 1
-        if self._calls != 2:
-            super().warm_up(work)
-            return
-        with at_most(self.device, self._more):
-            super().warm_up(work)
+    def around(self) -> AbstractContextManager[None]:
+        """Little memory for the block."""
+        return at_most(self.device, self._more)
 
 
 class ScarceCapture(CudaGraphCapture):

@@ -15,6 +15,7 @@ from devrf.errors import DevrfError
 from devrf.geometry.rays import Rays
 from devrf.methods.devrf.losses import (
     PHOTOMETRIC_TERMS,
+    VISIBILITY,
     Prediction,
     background_entropy,
     color_error,
@@ -106,6 +107,19 @@ def test_composer_weighs_what_counts_and_reports_it_unweighted() -> None:
     total, terms = loss(torch.ones(4, requires_grad=True))
     assert total.item() == 8 and total.requires_grad
     assert terms == {"cheap": torch.tensor(4.0)} and not terms["cheap"].requires_grad
+
+
+def test_composer_reports_what_is_logged_where_there_is_such_a_thing(
+    prediction: Prediction,
+) -> None:
+    loss = WeightedLoss(PHOTOMETRIC_TERMS, {"matte": 2.0}, VISIBILITY)
+    total, values = loss(prediction)
+    assert list(values) == ["matte", "opacity", "coverage"] and total == 2 * values["matte"]
+    # 1 − (0.25 + 1 + 0.2) / 3, and (1 + 0 + 0.5) / 3.
+    assert values["opacity"].item() == pytest.approx(1.55 / 3)
+    assert values["coverage"].item() == pytest.approx(0.5)
+    without = replace(prediction, batch=replace(prediction.batch, alpha=None))
+    assert loss(without)[1].keys() == {"matte", "opacity"}
 
 
 def test_composer_names_an_unknown_term_and_the_known_ones() -> None:

@@ -56,6 +56,9 @@ def test_terms_by_hand(device: torch.device, kernels: str, matte: bool) -> None:
         [0.25 / 6, 0.5 * 2 / 2, (ln2 + quarter) / 2, bare], rel=1e-5
     )
     assert found.total.item() == pytest.approx(0.25 / 6 + 2 * 0.5 + 4 * bare, rel=1e-5)
+    assert found.opacity.item() == pytest.approx(1 - 0.375)
+    assert (found.coverage is not None) == matte
+    assert found.coverage is None or found.coverage.item() == 1
     assert on_device[1].grad is not None and on_device[3].grad is not None
     # 4 · 2 (T − 0) / R.
     assert on_device[1].grad.tolist() == pytest.approx([2.0, 1.0] if matte else [0.0, 0.0])

@@ -6,9 +6,8 @@ from torch import Tensor
 from torch.nn.functional import max_pool3d
 
 from devrf.geometry.box import Box
+from devrf.methods.devrf.robust_mean import robust_mean
 
-# c of docs/method.md#bending: the change beyond which matter counts as torn or jointed, not bent.
-TEARING = 0.1
 # ℓ, over which J's change is looked at, as a share of the box's longest edge.
 REACH = 1 / 20
 
@@ -35,9 +34,7 @@ def bending_energy(displacement: Tensor, box: Box, occupied: Tensor) -> Tensor:
             curved = _second_difference(displacement, i, j) / (spacing[i] * spacing[j])
             total = total + (1 if i == j else 2) * curved.square().sum(dim=-1)
     energy = (max(box.size) * REACH) ** 2 * total
-    robust = energy * TEARING / (energy + TEARING)
-    near = max_pool3d(occupied[None], kernel_size=2, stride=1)[0]
-    return (near * robust).sum() / near.sum().clamp(min=1)
+    return robust_mean(energy, max_pool3d(occupied[None], kernel_size=2, stride=1)[0])
 
 
 def _second_difference(values: Tensor, i: int, j: int) -> Tensor:

@@ -25,9 +25,9 @@ from devrf.methods.devrf.free_space import possible_matter, view_count_weight
 from devrf.methods.devrf.grid_resolution import fitted_to
 from devrf.methods.devrf.losses import (
     PHOTOMETRIC_TERMS,
+    VISIBILITY,
     Prediction,
     total_variation_weight,
-    visibility,
 )
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.pixel_selection import canonical_pool
@@ -99,7 +99,7 @@ class CanonicalStage(VoxelStage):
         for kind, given in (("search", search_loss), ("fine", fine_loss)):
             weights = dict(given)
             self.tv[kind] = weights.pop("tv", 0.0)
-            self.losses[kind] = WeightedLoss(PHOTOMETRIC_TERMS, weights)
+            self.losses[kind] = WeightedLoss(PHOTOMETRIC_TERMS, weights, VISIBILITY)
         self.pool: PixelPool | None = None
         self._optimizer: GridAdam | None = None
 
@@ -307,8 +307,7 @@ class CanonicalStage(VoxelStage):
         occupancy = self.scene_model.occupancy
         prediction = Prediction(*self.render_pixels(views, pixels, occupancy, batch.capacity))
         with span("losses"):
-            total, terms = self.losses[self.phase.kind](prediction)
-            return total, {**terms, **visibility(prediction)}
+            return self.losses[self.phase.kind](prediction)
 
     @torch.no_grad()
     def on_train_end(self) -> None:

@@ -6,10 +6,8 @@ import torch
 from torch import Tensor
 
 from devrf.geometry.box import Box
+from devrf.methods.devrf.robust_mean import robust_mean
 from devrf.rendering.occupancy import Occupancy
-
-# c of docs/method.md#elastic: the strain beyond which a cell counts as torn, not as stretched.
-TEARING = 0.1
 
 
 def elastic_energy(displacement: Tensor, box: Box, occupied: Tensor) -> Tensor:
@@ -29,8 +27,7 @@ def elastic_energy(displacement: Tensor, box: Box, occupied: Tensor) -> Tensor:
         energy = energy + ((columns[i] * columns[i]).sum(dim=-1) - 1).square()
         for j in range(i):
             energy = energy + 2 * (columns[i] * columns[j]).sum(dim=-1).square()
-    robust = energy * TEARING / (energy + TEARING)
-    return (occupied * robust).sum() / occupied.sum().clamp(min=1)
+    return robust_mean(energy, occupied)
 
 
 @torch.no_grad()

@@ -60,12 +60,15 @@ def matte(prediction: Prediction) -> Tensor:
     return (prediction.output.transmittance - (1 - alpha)).square().mean()
 
 
-@torch.no_grad()
-def visibility(prediction: Prediction) -> dict[str, Tensor]:
-    """Means over rays, for the log: ``opacity`` 1 − T_end, and ``coverage`` A if there is one."""
-    seen = {"opacity": 1 - prediction.output.transmittance.mean()}
+def opacity(prediction: Prediction) -> Tensor:
+    """Mean 1 − T_end: how much the rays hit."""
+    return 1 - prediction.output.transmittance.mean()
+
+
+def coverage(prediction: Prediction) -> Tensor | None:
+    """Mean A of the images' alpha channel: how much they should hit; None without one."""
     alpha = prediction.batch.alpha
-    return seen if alpha is None else {**seen, "coverage": alpha.mean()}
+    return None if alpha is None else alpha.mean()
 
 
 PHOTOMETRIC_TERMS = {
@@ -73,6 +76,11 @@ PHOTOMETRIC_TERMS = {
     "per_sample_color": per_sample_color,
     "entropy": background_entropy,
     "matte": matte,
+}
+# Logged beside the terms.
+VISIBILITY: dict[str, Callable[[Prediction], Tensor | None]] = {
+    "opacity": opacity,
+    "coverage": coverage,
 }
 
 
@@ -153,20 +161,22 @@ FLOW_TERMS: dict[FlowMean, Callable[[MotionPrediction], Tensor]] = {
 }
 
 
-def elastic(prediction: MotionPrediction) -> Tensor:
-    """L_elastic: how much the forward slice stretches matter (docs/method.md#elastic)."""
+def of_grid(
+    energy: Callable[[Tensor, Box, Tensor], Tensor], prediction: MotionPrediction
+) -> Tensor:
+    """An energy () of the forward slice itself, where there is matter; 0 where no grid counts."""
     grid = prediction.grid
     if grid is None:
         return prediction.output.color.new_zeros(())
-    return elastic_energy(grid.displacement, grid.box, grid.occupied)
+    return energy(grid.displacement, grid.box, grid.occupied)
 
 
-def bending(prediction: MotionPrediction) -> Tensor:
-    """L_bending: how much the forward slice bends matter (docs/method.md#bending)."""
-    grid = prediction.grid
-    if grid is None:
-        return prediction.output.color.new_zeros(())
-    return bending_energy(grid.displacement, grid.box, grid.occupied)
+# The terms that look at the forward slice itself: how much it stretches matter
+# (docs/method.md#elastic), and how much it bends it (docs/method.md#bending).
+PRIORS = {
+    "elastic": partial(of_grid, elastic_energy),
+    "bending": partial(of_grid, bending_energy),
+}
 
 
 def induced_flow(
@@ -217,9 +227,6 @@ MOTION_TERMS: dict[str, Callable[[MotionPrediction], Tensor]] = {
     **{("render" if name == "color" else name): term for name, term in PHOTOMETRIC_TERMS.items()},
     "cycle": cycle,
     "flow": flow,
-    "elastic": elastic,
-    "bending": bending,
+    **PRIORS,
     "residual": residual,
 }
-# The terms that look at the forward slice itself, where there is matter.
-PRIORS = ("elastic", "bending")

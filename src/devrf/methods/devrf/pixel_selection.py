@@ -95,8 +95,7 @@ def frame_pools(
         pools = [all_pixels(views, image[None]) for image in images]
     if not join_views:
         return pools
-    image, flat = ([getattr(pool, name) for pool in pools] for name in ("image", "flat"))
-    return [PixelPool(torch.cat(image), torch.cat(flat))]
+    return [PixelPool(torch.cat([pool.pixels for pool in pools], dim=1))]
 
 
 def images_of(views: Views, frame: int) -> Tensor:

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from devrf.data.batch import PixelPool, Pixels
 from devrf.errors import DevrfError
-from devrf.methods.devrf.losses import PHOTOMETRIC_TERMS, Prediction, visibility
+from devrf.methods.devrf.losses import PHOTOMETRIC_TERMS, VISIBILITY, Prediction
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.pixel_selection import canonical_pool, frame_pools
 from devrf.methods.devrf.settings import FINE_LOSS, CanonicalRates
@@ -101,7 +101,7 @@ class Refinement:
             loss: weights of the photometric loss terms.
         """
         self.settings = settings
-        self._losses = WeightedLoss(PHOTOMETRIC_TERMS, dict(loss))
+        self._losses = WeightedLoss(PHOTOMETRIC_TERMS, dict(loss), VISIBILITY)
         # Not an attribute: a stage would hold itself.
         self._stage = stage
         self._still: PixelPool | None = None
@@ -200,10 +200,10 @@ class Refinement:
                 occupancy = self._occupancies[frame - 1]
             seen = self._stage.render_pixels(views, part, occupancy, None, warp, appearance)
             with span("losses"):
-                loss, terms = self._losses(prediction := Prediction(*seen))
+                loss, terms = self._losses(Prediction(*seen))
                 share = (stop - start) / len(pixels)
                 total = total + share * loss
-                for name, value in {**terms, **visibility(prediction)}.items():
+                for name, value in terms.items():
                     means[name] = means.get(name, 0.0) + share * value
         return total, means
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Generic, TypeGuard, TypeVar
 
+import torch
 from torch import Tensor
 
 from devrf.errors import DevrfError
@@ -17,7 +18,9 @@ from devrf.methods.devrf.losses import (
     PHOTOMETRIC_TERMS,
     MotionPrediction,
     Prediction,
+    coverage,
     cycle,
+    opacity,
 )
 from devrf.methods.devrf.volume_rendering import Warp
 from devrf.ops.dispatch import triton_runs
@@ -27,7 +30,7 @@ from devrf.ops.photometric import TERMS, photometric_sum
 Predicted = TypeVar("Predicted")
 # Weights of the terms that count, by their function.
 Counted = Mapping[object, float]
-# A weighted sum, and the unweighted values of its terms by their function.
+# A weighted sum, and unweighted values by their function: of its terms, and of what is logged.
 Fused = tuple[Tensor, dict[object, Tensor]]
 
 
@@ -38,10 +41,13 @@ class WeightedLoss(Generic[Predicted]):
     Attributes:
         terms: what can be computed, by name: prediction → unweighted scalar.
         weights: how much each counts.
+        logged: what is reported beside them, without gradients: prediction → scalar, or None where
+            there is no such thing.
     """
 
     terms: Mapping[str, Callable[[Predicted], Tensor]]
     weights: Mapping[str, float]
+    logged: Mapping[str, Callable[[Predicted], Tensor | None]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         unknown = sorted(set(self.weights) - set(self.terms))
@@ -50,28 +56,34 @@ class WeightedLoss(Generic[Predicted]):
             raise DevrfError(f"loss: unknown term {unknown[0]!r}; the terms are {known}")
 
     def __call__(self, prediction: Predicted) -> tuple[Tensor, dict[str, Tensor]]:
-        """The weighted sum, and each term's unweighted value by name, detached."""
+        """The weighted sum; each term's unweighted value, and what is logged, by name, detached."""
         counted = {name: weight for name, weight in self.weights.items() if weight}
         names: dict[object, str] = {self.terms[name]: name for name in counted}
         by_term = {term: counted[name] for term, name in names.items()}
         total: Tensor | float = 0.0
-        values: dict[str, Tensor] = {}
+        known: dict[object, Tensor] = {}
         for fuse in (photometric_terms, motion_terms):
             fused = fuse(prediction, by_term) if isinstance(prediction, Prediction) else None
             if fused is not None:
-                total = fused[0] + total if values else fused[0]
-                values |= {names[term]: value for term, value in fused[1].items()}
+                total = fused[0] + total if known else fused[0]
+                known |= fused[1]
+        values = {name: known[term] for term, name in names.items() if term in known}
         apart = {name: self.terms[name](prediction) for name in counted if name not in values}
         for name, value in apart.items():
             total = total + counted[name] * value
             values[name] = value.detach()
         if not isinstance(total, Tensor):
             raise DevrfError("loss: every weight is zero; at least one term must count")
+        with torch.no_grad():
+            for name, measure in self.logged.items():
+                measured = known[measure] if measure in known else measure(prediction)
+                if measured is not None:
+                    values[name] = measured
         return total, values
 
 
 def photometric_terms(prediction: Prediction, counted: Counted) -> Fused | None:
-    """The photometric terms, where one kernel computes them all."""
+    """The photometric terms and the rays' visibility, where one kernel computes them all."""
     output, batch = prediction.output, prediction.batch
     if output.first is None or not triton_runs(output.color, output.sample_color):
         return None
@@ -87,7 +99,11 @@ def photometric_terms(prediction: Prediction, counted: Counted) -> Fused | None:
         [counted.get(term, 0.0) for term in functions],
     )
     each = zip(functions, found.terms.unbind(), strict=True)
-    return found.total, {term: value for term, value in each if term in counted}
+    values: dict[object, Tensor] = {term: value for term, value in each if term in counted}
+    values[opacity] = found.opacity
+    if found.coverage is not None:
+        values[coverage] = found.coverage
+    return found.total, values
 
 
 def motion_terms(prediction: Prediction, counted: Counted) -> Fused | None:

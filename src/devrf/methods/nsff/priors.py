@@ -53,13 +53,11 @@ class ImagePriors:
                 self.neighbour[earlier + offset, 0] = image + offset
                 self.neighbour[image + offset, 1] = earlier + offset
             if (pool := _moving(one)) is not None:
-                pools.append(PixelPool(pool.image + offset, pool.flat))
+                pools.append(PixelPool(torch.stack([pool.image + offset, pool.flat])))
         self.neighbour = self.neighbour.to(views[0].times.device)
         self.moving = None
         if pools:
-            self.moving = PixelPool(
-                torch.cat([pool.image for pool in pools]), torch.cat([pool.flat for pool in pools])
-            )
+            self.moving = PixelPool(torch.cat([pool.pixels for pool in pools], dim=1))
 
     @property
     def has_flow(self) -> tuple[bool, bool]:

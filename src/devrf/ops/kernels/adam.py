@@ -205,6 +205,23 @@ def total_variation_kernel(
     tl.store(gradient + at, before + weight * slope, mask=here)
 
 
+@triton.jit
+def moved(g, mean, square, rate, step, at, here, share1, share2, decay1, decay2, eps):
+    """How far Adam moves the numbers at ``at`` against their gradients; updates their moments.
+
+    share = 1 − β, decay = −log β, so that 1 − βᵗ = opacity(t·decay).
+    """
+    m = tl.load(mean + at, mask=here, other=0.0)
+    s = tl.load(square + at, mask=here, other=0.0)
+    m += share1 * (g - m)
+    s += share2 * (g * g - s)
+    tl.store(mean + at, m, mask=here)
+    tl.store(square + at, s, mask=here)
+    time = tl.load(step).to(tl.float32)
+    size = tl.load(rate).to(tl.float32) / opacity(time * decay1)
+    return size * m / (tl.sqrt(s / opacity(time * decay2)) + eps)
+
+
 @triton.jit(do_not_specialize=["x", "y"])
 def adam_kernel(
     values,
@@ -233,7 +250,7 @@ def adam_kernel(
     WIDE: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """One step; share = 1 − β, decay = −log β, so that 1 − βᵗ = opacity(t·decay)."""
+    """One step; the numbers of its rule as for :func:`moved`."""
     row, number = piece(length, WIDE, BLOCK)
     here = number < length
     at = row * length + number
@@ -250,15 +267,7 @@ def adam_kernel(
         g += smoothing * slope_of_variation(
             values, at, own, smoothed, row, number, length, x, y, CHANNELS
         )
-    m = tl.load(mean + at, mask=active, other=0.0)
-    s = tl.load(square + at, mask=active, other=0.0)
-    m += share1 * (g - m)
-    s += share2 * (g * g - s)
-    tl.store(mean + at, m, mask=active)
-    tl.store(square + at, s, mask=active)
-    time = tl.load(step).to(tl.float32)
-    size = tl.load(rate).to(tl.float32) / opacity(time * decay1)
-    move = size * m / (tl.sqrt(s / opacity(time * decay2)) + eps)
+    move = moved(g, mean, square, rate, step, at, active, share1, share2, decay1, decay2, eps)
     if PER_VOXEL_LR:
         move *= tl.load(per_voxel_lr + at // CHANNELS, mask=active, other=0.0)
     tl.store(into + at, tl.where(active, own - move, own), mask=written)
@@ -289,14 +298,6 @@ def adam_several_kernel(
     step = tl.load(own + 4).to(tl.pointer_type(tl.float64))
     g = tl.load(gradient + at, mask=here, other=0.0)
     tl.store(gradient + at, tl.zeros((BLOCK,), dtype=tl.float32), mask=here & (g != 0.0))
-    m = tl.load(mean + at, mask=here, other=0.0)
-    s = tl.load(square + at, mask=here, other=0.0)
-    m += share1 * (g - m)
-    s += share2 * (g * g - s)
-    tl.store(mean + at, m, mask=here)
-    tl.store(square + at, s, mask=here)
-    time = tl.load(step).to(tl.float32)
-    size = tl.load(rate).to(tl.float32) / opacity(time * decay1)
-    move = size * m / (tl.sqrt(s / opacity(time * decay2)) + eps)
+    move = moved(g, mean, square, rate, step, at, here, share1, share2, decay1, decay2, eps)
     before = tl.load(values + at, mask=here, other=0.0)
     tl.store(values + at, before - move, mask=here)

@@ -48,6 +48,18 @@ def corner_weight(fx, fy, fz, CORNER: tl.constexpr):
 
 
 @triton.jit
+def corner_slopes(value, fx, fy, fz, CORNER: tl.constexpr):
+    """What the value at a cell's corner adds to the slopes per grid unit along x, y, z."""
+    wx = share(fx, CORNER & 4)
+    wy = share(fy, CORNER & 2)
+    wz = share(fz, CORNER & 1)
+    along_x = wy * wz * (value if CORNER & 4 else -value)
+    along_y = wx * wz * (value if CORNER & 2 else -value)
+    along_z = wx * wy * (value if CORNER & 1 else -value)
+    return along_x, along_y, along_z
+
+
+@triton.jit
 def load_vectors(vectors, at, here):
     """The components x, y, z of vectors that begin at places ``at``; 0 where not ``here``."""
     x = tl.load(vectors + at, mask=here, other=0.0)
@@ -85,11 +97,9 @@ def scalar_slope(grid, i, j, k, fx, fy, fz, y, z, here):
     for corner in tl.static_range(8):
         row = corner_row(i, j, k, y, z, corner)
         at = tl.load(grid + row, mask=here, other=0.0)
-        wx = share(fx, corner & 4)
-        wy = share(fy, corner & 2)
-        wz = share(fz, corner & 1)
-        value += wx * wy * wz * at
-        along_x += wy * wz * (at if corner & 4 else -at)
-        along_y += wx * wz * (at if corner & 2 else -at)
-        along_z += wx * wy * (at if corner & 1 else -at)
+        value += corner_weight(fx, fy, fz, corner) * at
+        slope_x, slope_y, slope_z = corner_slopes(at, fx, fy, fz, corner)
+        along_x += slope_x
+        along_y += slope_y
+        along_z += slope_z
     return value, along_x, along_y, along_z

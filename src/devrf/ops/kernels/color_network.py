@@ -118,14 +118,14 @@ class ListedColors(torch.autograd.Function):
             # Any pointer where no gradient is needed.
             into.append(buffer if buffer is not None else tensor if own is None else own)
         rays, blocks = len(given[2]) - 1, int(triton.cdiv(len(points), BLOCK))
-        moved = torch.zeros_like(points) if asked[0] else None
+        moved = torch.empty_like(points) if asked[0] else None
         if needs[0] or moved is not None:
             launch(
                 color_samples_backward_kernel,
                 blocks,
                 points,
                 *(*known, points, grid, points if moved is None else moved, into[0]),
-                *(rays, *ctx.numbers),
+                *(len(points), rays, *ctx.numbers),
                 NEEDS_POINTS=moved is not None,
                 NEEDS_GRID=needs[0],
                 **ctx.sizes,
@@ -150,6 +150,14 @@ def _processors(device: torch.device) -> int:
     if device.type != "cuda":
         return 2
     return int(torch.cuda.get_device_properties(device).multi_processor_count)
+
+
+@triton.jit
+def load_features(features, place, channel, here, CHANNELS: tl.constexpr):
+    """The kept features of samples, a tile (BLOCK, PADDED); 0 behind the channels."""
+    wanted = here[:, None] & (channel < CHANNELS)[None, :]
+    row = features + place[:, None] * CHANNELS + channel[None, :]
+    return tl.load(row, mask=wanted, other=0.0)
 
 
 @triton.jit
@@ -197,7 +205,11 @@ def encoded_directions(
 @triton.jit
 def lower_units(
     features,
-    encoded,
+    viewdirs,
+    octaves,
+    ray,
+    place,
+    here,
     feature_weight,
     feature_bias,
     direction_weight,
@@ -205,18 +217,21 @@ def lower_units(
     PADDED: tl.constexpr,
     DIRECTIONS: tl.constexpr,
     ENCODED: tl.constexpr,
+    ANGLES: tl.constexpr,
     WIDTH: tl.constexpr,
     UNITS: tl.constexpr,
     PRECISION: tl.constexpr,
 ):
-    """What the first layer gives, (BLOCK, UNITS) in ``PRECISION``."""
+    """What the first layer gives, (BLOCK, UNITS) in ``PRECISION``; and the encoded directions."""
+    own = tl.load(ray + place, mask=here, other=0)
+    encoded = encoded_directions(viewdirs, octaves, own, here, DIRECTIONS, ENCODED, ANGLES)
     unit = tl.arange(0, UNITS)
     weight = matrix(feature_weight, unit, tl.arange(0, PADDED), WIDTH, CHANNELS)
     x = product(features, tl.trans(weight), PRECISION)
     weight = matrix(direction_weight, unit, tl.arange(0, ENCODED), WIDTH, DIRECTIONS)
     x += product(encoded, tl.trans(weight), PRECISION)
     x += tl.load(feature_bias + unit, mask=unit < WIDTH, other=0.0)[None, :]
-    return tl.maximum(x, 0.0).to(PRECISION)
+    return tl.maximum(x, 0.0).to(PRECISION), encoded
 
 
 @triton.jit
@@ -237,14 +252,22 @@ def upper_units(
 
 
 @triton.jit
+def output_weights(output_weight, unit, WIDTH: tl.constexpr):
+    """The weights of units of the second layer for red, green and blue, (1, SHARE) each."""
+    known = unit < WIDTH
+    red = tl.load(output_weight + unit, mask=known, other=0.0)
+    green = tl.load(output_weight + WIDTH + unit, mask=known, other=0.0)
+    blue = tl.load(output_weight + 2 * WIDTH + unit, mask=known, other=0.0)
+    return red[None, :], green[None, :], blue[None, :]
+
+
+@triton.jit
 def to_upper(red, green, blue, upper, output_weight, unit, WIDTH: tl.constexpr):
     """From gradients of logits to those of units of the second layer, (BLOCK, SHARE)."""
-    known = unit < WIDTH
-    change = red[:, None] * tl.load(output_weight + unit, mask=known, other=0.0)[None, :]
-    weight = tl.load(output_weight + WIDTH + unit, mask=known, other=0.0)
-    change += green[:, None] * weight[None, :]
-    weight = tl.load(output_weight + 2 * WIDTH + unit, mask=known, other=0.0)
-    change += blue[:, None] * weight[None, :]
+    of_red, of_green, of_blue = output_weights(output_weight, unit, WIDTH)
+    change = red[:, None] * of_red
+    change += green[:, None] * of_green
+    change += blue[:, None] * of_blue
     return tl.where(upper > 0.0, change, 0.0)
 
 
@@ -324,11 +347,13 @@ def color_network_kernel(
         channel = tl.arange(0, PADDED)
         wanted = here[:, None] & (channel < CHANNELS)[None, :]
         tl.store(features + place[:, None] * CHANNELS + channel[None, :], found, mask=wanted)
-        own = tl.load(ray + place, mask=here, other=0)
-        encoded = encoded_directions(viewdirs, octaves, own, here, DIRECTIONS, ENCODED, ANGLES)
-        lower = lower_units(
+        lower, _ = lower_units(
             found,
-            encoded,
+            viewdirs,
+            octaves,
+            ray,
+            place,
+            here,
             feature_weight,
             feature_bias,
             direction_weight,
@@ -336,6 +361,7 @@ def color_network_kernel(
             PADDED,
             DIRECTIONS,
             ENCODED,
+            ANGLES,
             WIDTH,
             UNITS,
             PRECISION,
@@ -344,20 +370,17 @@ def color_network_kernel(
             unit = start + tl.arange(0, SHARE)
             upper, _ = upper_units(lower, hidden_weight, hidden_bias, unit, WIDTH, UNITS, PRECISION)
             upper = upper.to(tl.float32)
-            known = unit < WIDTH
-            weight = tl.load(output_weight + unit, mask=known, other=0.0)
-            red += tl.sum(upper * weight[None, :], axis=1)
-            weight = tl.load(output_weight + WIDTH + unit, mask=known, other=0.0)
-            green += tl.sum(upper * weight[None, :], axis=1)
-            weight = tl.load(output_weight + 2 * WIDTH + unit, mask=known, other=0.0)
-            blue += tl.sum(upper * weight[None, :], axis=1)
+            of_red, of_green, of_blue = output_weights(output_weight, unit, WIDTH)
+            red += tl.sum(upper * of_red, axis=1)
+            green += tl.sum(upper * of_green, axis=1)
+            blue += tl.sum(upper * of_blue, axis=1)
         red = tl.where(here, sigmoid(red + tl.load(output_bias)), 0.0)
         green = tl.where(here, sigmoid(green + tl.load(output_bias + 1)), 0.0)
         blue = tl.where(here, sigmoid(blue + tl.load(output_bias + 2)), 0.0)
     store_vectors(colors, at, red, green, blue, place < places)
 
 
-@triton.jit(do_not_specialize=["rays", "x", "y", "z"])
+@triton.jit(do_not_specialize=["places", "rays", "x", "y", "z"])
 def color_samples_backward_kernel(
     viewdirs,
     ray,
@@ -377,6 +400,7 @@ def color_samples_backward_kernel(
     grid,
     into_points,
     into_grid,
+    places,
     rays,
     low_x,
     low_y,
@@ -400,22 +424,22 @@ def color_samples_backward_kernel(
     PRECISION: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Gradients of a block's features, scattered to the grid, and of its points."""
+    """Gradients of a block's features, scattered to the grid, and of its points; 0 in padding."""
     begin = tl.program_id(0) * BLOCK
+    place = begin + tl.arange(0, BLOCK)
+    at = place.to(tl.int64) * 3
     listed = tl.load(first + rays)
     if begin < listed:
-        place = begin + tl.arange(0, BLOCK)
         here = place < listed
-        at = place.to(tl.int64) * 3
         channel = tl.arange(0, PADDED)
-        wanted = here[:, None] & (channel < CHANNELS)[None, :]
-        row = features + place[:, None] * CHANNELS + channel[None, :]
-        found = tl.load(row, mask=wanted, other=0.0)
-        own = tl.load(ray + place, mask=here, other=0)
-        encoded = encoded_directions(viewdirs, octaves, own, here, DIRECTIONS, ENCODED, ANGLES)
-        lower = lower_units(
+        found = load_features(features, place, channel, here, CHANNELS)
+        lower, _ = lower_units(
             found,
-            encoded,
+            viewdirs,
+            octaves,
+            ray,
+            place,
+            here,
             feature_weight,
             feature_bias,
             direction_weight,
@@ -423,6 +447,7 @@ def color_samples_backward_kernel(
             PADDED,
             DIRECTIONS,
             ENCODED,
+            ANGLES,
             WIDTH,
             UNITS,
             PRECISION,
@@ -459,7 +484,11 @@ def color_samples_backward_kernel(
             along_x *= scale_x
             along_y *= scale_y
             along_z *= scale_z
-            store_vectors(into_points, at, along_x, along_y, along_z, here)
+            store_vectors(into_points, at, along_x, along_y, along_z, place < places)
+    else:
+        if NEEDS_POINTS:
+            nothing = tl.zeros((BLOCK,), dtype=tl.float32)
+            store_vectors(into_points, at, nothing, nothing, nothing, place < places)
 
 
 @triton.jit(do_not_specialize=["rays", "programs"])
@@ -524,14 +553,14 @@ def color_weights_backward_kernel(
     while begin < listed:
         place = begin + tl.arange(0, BLOCK)
         here = place < listed
-        wanted = here[:, None] & (channel < CHANNELS)[None, :]
-        row = features + place[:, None] * CHANNELS + channel[None, :]
-        found = tl.load(row, mask=wanted, other=0.0)
-        own = tl.load(ray + place, mask=here, other=0)
-        encoded = encoded_directions(viewdirs, octaves, own, here, DIRECTIONS, ENCODED, ANGLES)
-        lower = lower_units(
+        found = load_features(features, place, channel, here, CHANNELS)
+        lower, encoded = lower_units(
             found,
-            encoded,
+            viewdirs,
+            octaves,
+            ray,
+            place,
+            here,
             feature_weight,
             feature_bias,
             direction_weight,
@@ -539,6 +568,7 @@ def color_weights_backward_kernel(
             PADDED,
             DIRECTIONS,
             ENCODED,
+            ANGLES,
             WIDTH,
             UNITS,
             PRECISION,

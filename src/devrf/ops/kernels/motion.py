@@ -15,9 +15,9 @@ from devrf.ops.corners import Corners, Triple, scales, shape_of
 from devrf.ops.kernels.cells import (
     cell,
     corner_row,
+    corner_slopes,
     inside,
     load_vectors,
-    share,
     store_vectors,
 )
 from devrf.ops.kernels.launch import launch
@@ -190,12 +190,10 @@ def pulled(grid, cx, cy, cz, gx, gy, gz, x, y, z, here):
     for corner in tl.static_range(8):
         dx, dy, dz = load_vectors(grid, corner_row(i, j, k, y, z, corner) * 3, here)
         agreed = dx * gx + dy * gy + dz * gz
-        wx = share(fx, corner & 4)
-        wy = share(fy, corner & 2)
-        wz = share(fz, corner & 1)
-        along_x += wy * wz * (agreed if corner & 4 else -agreed)
-        along_y += wx * wz * (agreed if corner & 2 else -agreed)
-        along_z += wx * wy * (agreed if corner & 1 else -agreed)
+        slope_x, slope_y, slope_z = corner_slopes(agreed, fx, fy, fz, corner)
+        along_x += slope_x
+        along_y += slope_y
+        along_z += slope_z
     return along_x * inside(cx, x), along_y * inside(cy, y), along_z * inside(cz, z)
 
 

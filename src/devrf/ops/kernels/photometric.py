@@ -34,29 +34,29 @@ class PhotometricInOnePass(torch.autograd.Function):
         truth: Tensor,
         alpha: Tensor | None,
         weights: Sequence[float],
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor, Tensor]:
         rays = len(image)
         known = tuple(
             tensor.contiguous()
             # The transmittance stands in for a missing matte, which is not read.
             for tensor in (image, transmittance, sample_color, sample_weight, first, truth)
         ) + ((transmittance if alpha is None else alpha).contiguous(),)
-        parts = image.new_empty(rays, 5)
+        parts = image.new_empty(rays, 7)
         has_alpha = alpha is not None
         launch(
             photometric_kernel, rays, image, *known, parts, *weights, rays, ALPHA=has_alpha, **WARP
         )
         sums = parts.sum(dim=0)
-        total, terms = sums[4], sums[:4]
+        total, terms, seen = sums[4], sums[:4], sums[5:]
         ctx.save_for_backward(*known)
         ctx.weights, ctx.has_alpha = weights, has_alpha
         ctx.set_materialize_grads(False)
-        ctx.mark_non_differentiable(terms)
-        return total, terms
+        ctx.mark_non_differentiable(terms, seen)
+        return total, terms, seen
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, upstream: Tensor, _: None) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, upstream: Tensor, *_: None) -> tuple[Tensor | None, ...]:
         image, transmittance, sample_color, *_ = known = ctx.saved_tensors
         into = torch.empty_like(image), torch.empty_like(transmittance)
         colors = torch.empty_like(sample_color)
@@ -98,7 +98,7 @@ def photometric_kernel(
     ALPHA: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """A ray's share of each term, and of their weighted sum."""
+    """A ray's share of each term, of their weighted sum, and of mean opacity and matte."""
     ray = tl.program_id(0).to(tl.int64)
     red = tl.load(truth + ray * 3)
     green = tl.load(truth + ray * 3 + 1)
@@ -126,15 +126,20 @@ def photometric_kernel(
     left = tl.load(transmittance + ray)
     unsure = share * entropy(tl.minimum(tl.maximum(left, NEAREST), 1.0 - NEAREST))
     bare = 0.0
+    covered = 0.0
     if ALPHA:
-        bare = left - (1.0 - tl.load(alpha + ray))
+        covered = tl.load(alpha + ray)
+        bare = left - (1.0 - covered)
     matte = share * bare * bare
-    tl.store(parts + ray * 5, color)
-    tl.store(parts + ray * 5 + 1, missed)
-    tl.store(parts + ray * 5 + 2, unsure)
-    tl.store(parts + ray * 5 + 3, matte)
+    part = parts + ray * 7
+    tl.store(part, color)
+    tl.store(part + 1, missed)
+    tl.store(part + 2, unsure)
+    tl.store(part + 3, matte)
     total = of_color * color + of_samples * missed + of_entropy * unsure + of_matte * matte
-    tl.store(parts + ray * 5 + 4, total)
+    tl.store(part + 4, total)
+    tl.store(part + 5, share * (1.0 - left))
+    tl.store(part + 6, share * covered)
 
 
 @triton.jit(do_not_specialize=["rays", "places"])

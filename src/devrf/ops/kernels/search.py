@@ -2,7 +2,7 @@
 
 The first kernel tests a ray's samples, 32 at a time, until the ray ends or its transmittance falls
 below the threshold. It writes a byte for each sample and a count for each ray. The counts' running
-sum is where each ray's samples begin; the second kernel writes them there, the third the padding.
+sum is where each ray's samples end; the second kernel writes them there, and the padding.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ import triton.language as tl
 from torch import Tensor
 
 from devrf.ops.corners import Corners, scales, shape_of
-from devrf.ops.kernels.cells import cell, load_vectors, scalar_at, store_vectors
+from devrf.ops.kernels.cells import cell, scalar_at, store_vectors
 from devrf.ops.kernels.launch import launch
 from devrf.ops.kernels.numbers import opacity, softplus
+from devrf.ops.kernels.padding import PADDING, padding_places, padding_programs
 from devrf.ops.kernels.warped_depth import displaced
 
 # A program is one warp, which tests one sample for each of its threads at a time.
 LANES = 32
 WARP = {"LANES": LANES, "num_warps": 1}
-PADDING_BLOCK = 1024
 
 
 def find_samples_on_device(
@@ -55,12 +55,14 @@ def find_samples_on_device(
     before, after = (frame.contiguous() for frame in ([*slices, density, density])[:2])
     stride = triton.cdiv(longest, LANES) * LANES
     marks = torch.empty(rays, stride, dtype=torch.uint8, device=device)
-    kept, reached = torch.empty(2, rays, dtype=torch.int32, device=device)
+    # As wide as their running sum: no cast before it.
+    kept = torch.empty(rays, dtype=torch.int64, device=device)
+    reached = torch.empty(rays, dtype=torch.int32, device=device)
     ray = torch.empty(capacity, dtype=torch.int64, device=device)
     distance = torch.empty(capacity, dtype=torch.float32, device=device)
     points = torch.empty(capacity, 3, dtype=torch.float32, device=device)
     significant = torch.empty(capacity, dtype=torch.uint8, device=device)
-    ends = torch.zeros(rays + 1, dtype=torch.int64, device=device)
+    first, total = (torch.empty(n, dtype=torch.int64, device=device) for n in (rays + 1, ()))
     along = (origins, directions, entry)
     shapes = (shape_of(mask), shape_of(before), shape_of(density))
     launch(
@@ -77,41 +79,17 @@ def find_samples_on_device(
         SLICES=len(slices),
         **WARP,
     )
-    torch.cumsum(kept, 0, out=ends[1:])
-    first = ends.clamp(max=capacity)
-    found = (ray, distance, points, significant)
-    counts = (marks, reached, first)
-    launch(list_kernel, rays, origins, *along, *counts, *found, stride, capacity, step, **WARP)
-    programs = triton.cdiv(capacity, PADDING_BLOCK)
-    launch(pad_kernel, programs, origins, first, *found, rays, capacity, BLOCK=PADDING_BLOCK)
-    return ray, distance, points, significant.view(torch.bool), first, ends[-1]
-
-
-def select_on_device(
-    flags: Tensor,
-    first: Tensor,
-    ray: Tensor,
-    distance: Tensor,
-    points: Tensor,
-    rays: int,
-    capacity: int,
-) -> tuple[Tensor, ...]:
-    """The tensors of devrf.ops.search.ListedSubset."""
-    places, running = len(flags), flags.cumsum(0)
-    index, owner = (ray.new_empty(capacity) for _ in range(2))
-    reached, begin = distance.new_empty(capacity), torch.empty_like(first)
-    where, present = points.new_empty(capacity, 3), torch.empty_like(flags[:capacity])
+    found = (ray, distance, points, significant, first, total)
     launch(
-        select_kernel,
-        triton.cdiv(max(places, rays + 1), PADDING_BLOCK),
-        distance,
-        *(flags.contiguous().view(torch.uint8), running, first.contiguous()),
-        *(ray.contiguous(), distance.contiguous(), points.contiguous()),
-        *(index, begin, owner, reached, where, present.view(torch.uint8)),
-        *(places, rays, capacity),
-        BLOCK=PADDING_BLOCK,
+        list_kernel,
+        # One at least behind the rays, for the total.
+        rays + max(1, padding_programs(capacity)),
+        origins,
+        *(*along, marks, reached, kept.cumsum(0), *found, rays, stride, capacity, step),
+        PADDING=PADDING,
+        **WARP,
     )
-    return index, begin, running[-1], owner, reached, where, present
+    return ray, distance, points, significant.view(torch.bool), first, total
 
 
 @triton.jit
@@ -264,105 +242,63 @@ def march_kernel(
     tl.store(reached + ray, tested)
 
 
-@triton.jit(do_not_specialize=["stride", "capacity"])
+@triton.jit(do_not_specialize=["count", "stride", "capacity"])
 def list_kernel(
     origins,
     directions,
     entry,
     marks,
     reached,
-    first,
+    ends,
     rays,
     distances,
     points,
     significant,
+    first,
+    total,
+    count,
     stride,
     capacity,
     step,
     LANES: tl.constexpr,
+    PADDING: tl.constexpr,
 ):
-    """Writes a ray's kept samples one after another, from ``first`` on."""
-    ray = tl.program_id(0)
-    ox, oy, oz = vector(origins, ray)
-    dx, dy, dz = vector(directions, ray)
-    begin = tl.load(entry + ray)
-    end = tl.load(reached + ray)
-    free = tl.load(first + ray)
-    from_ = marks + ray.to(tl.int64) * stride
-    lane = tl.arange(0, LANES)
-    tested = 0
-    while (tested < end) & (free < capacity):
-        sample = tested + lane
-        mark = tl.load(from_ + sample).to(tl.int32)
-        kept = (mark > 0).to(tl.int32)
-        place = free + tl.cumsum(kept, 0) - kept
-        fits = (kept > 0) & (place < capacity)
-        at = begin + step * sample.to(tl.float32)
-        tl.store(rays + place, (lane * 0 + ray).to(tl.int64), mask=fits)
-        tl.store(distances + place, at, mask=fits)
-        store_vectors(points, place * 3, ox + dx * at, oy + dy * at, oz + dz * at, fits)
-        tl.store(significant + place, (mark > 1).to(tl.uint8), mask=fits)
-        free += tl.sum(kept, 0)
-        tested += LANES
+    """Writes the kept samples of the ``count`` rays one after another, the padding behind them.
 
-
-@triton.jit(do_not_specialize=["count", "capacity"])
-def pad_kernel(first, rays, distances, points, significant, count, capacity, BLOCK: tl.constexpr):
-    """Fills the places behind the samples of the ``count`` rays."""
-    place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    empty = (place >= tl.load(first + count)) & (place < capacity)
-    nothing = tl.zeros((BLOCK,), dtype=tl.float32)
-    at = place.to(tl.int64) * 3
-    tl.store(rays + place, (place * 0 + count).to(tl.int64), mask=empty)
-    tl.store(distances + place, nothing, mask=empty)
-    store_vectors(points, at, nothing, nothing, nothing, empty)
-    tl.store(significant + place, nothing.to(tl.uint8), mask=empty)
-
-
-@triton.jit(do_not_specialize=["places", "count", "capacity"])
-def select_kernel(
-    flags,
-    running,
-    first,
-    rays,
-    distances,
-    points,
-    index,
-    begin,
-    owner,
-    reached,
-    where,
-    present,
-    places,
-    count,
-    capacity,
-    BLOCK: tl.constexpr,
-):
-    """Copies flagged samples to the places that the flags' ``running`` sum gives; the padding.
-
-    A place of the padding copies the sample of the same number, which differ: atomic additions of
-    gradients to them do not collide. ``begin`` is where each of the ``count`` rays begins.
+    ``ends`` is the running sum of the rays' numbers of samples.
     """
-    place = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = place < places
-    flag = tl.load(flags + place, mask=here, other=0) != 0
-    rank = tl.load(running + place, mask=here, other=0) - 1
-    kept = here & flag & (rank < capacity)
-    empty = (place >= tl.load(running + places - 1)) & (place < capacity)
-    ray = tl.load(rays + place, mask=here, other=0)
-    distance = tl.load(distances + place, mask=here, other=0.0)
-    x, y, z = load_vectors(points, place * 3, here)
-    tl.store(index + rank, place, mask=kept)
-    tl.store(owner + rank, ray, mask=kept)
-    tl.store(reached + rank, distance, mask=kept)
-    store_vectors(where, rank * 3, x, y, z, kept)
-    tl.store(present + rank, (rank >= 0).to(tl.uint8), mask=kept)
-    tl.store(index + place, place, mask=empty)
-    tl.store(owner + place, place % count, mask=empty)
-    tl.store(reached + place, distance, mask=empty)
-    store_vectors(where, place * 3, x, y, z, empty)
-    tl.store(present + place, (place < 0).to(tl.uint8), mask=empty)
-    bounds = place <= count
-    start = tl.load(first + place, mask=bounds, other=0)
-    before = tl.load(running + start - 1, mask=bounds & (start > 0), other=0)
-    tl.store(begin + place, tl.minimum(before, capacity), mask=bounds)
+    ray = tl.program_id(0)
+    if ray < count:
+        ox, oy, oz = vector(origins, ray)
+        dx, dy, dz = vector(directions, ray)
+        begin = tl.load(entry + ray)
+        end = tl.load(reached + ray)
+        free = tl.load(ends + ray - 1, mask=ray > 0, other=0)
+        tl.store(first + ray, tl.minimum(free, capacity))
+        from_ = marks + ray.to(tl.int64) * stride
+        lane = tl.arange(0, LANES)
+        tested = 0
+        while (tested < end) & (free < capacity):
+            sample = tested + lane
+            mark = tl.load(from_ + sample).to(tl.int32)
+            kept = (mark > 0).to(tl.int32)
+            place = free + tl.cumsum(kept, 0) - kept
+            fits = (kept > 0) & (place < capacity)
+            at = begin + step * sample.to(tl.float32)
+            tl.store(rays + place, (lane * 0 + ray).to(tl.int64), mask=fits)
+            tl.store(distances + place, at, mask=fits)
+            store_vectors(points, place * 3, ox + dx * at, oy + dy * at, oz + dz * at, fits)
+            tl.store(significant + place, (mark > 1).to(tl.uint8), mask=fits)
+            free += tl.sum(kept, 0)
+            tested += LANES
+    else:
+        used = tl.load(ends + count - 1, mask=count > 0, other=0)
+        if ray == count:
+            tl.store(total, used)
+            tl.store(first + count, tl.minimum(used, capacity))
+        place, empty = padding_places(ray - count, used, capacity, PADDING)
+        nothing = tl.zeros((PADDING,), dtype=tl.float32)
+        tl.store(rays + place, (place * 0 + count).to(tl.int64), mask=empty)
+        tl.store(distances + place, nothing, mask=empty)
+        store_vectors(points, place * 3, nothing, nothing, nothing, empty)
+        tl.store(significant + place, nothing.to(tl.uint8), mask=empty)

@@ -18,10 +18,10 @@ from torch.autograd.function import once_differentiable
 from devrf.ops.kernels.cells import (
     cell,
     corner_row,
+    corner_slopes,
     corner_weight,
     inside,
     load_vectors,
-    share,
     store_vectors,
 )
 from devrf.ops.kernels.launch import launch
@@ -136,20 +136,19 @@ def spread_rows(
     along_z = fx * 0.0
     for corner in tl.static_range(8):
         row = corner_row(i, j, k, y, z, corner)
-        wx = share(fx, corner & 4)
-        wy = share(fy, corner & 2)
-        wz = share(fz, corner & 1)
+        weight = corner_weight(fx, fy, fz, corner)
         place = row[:, None] * CHANNELS + channel[None, :]
         if NEEDS_GRID:
             tl.atomic_add(
-                grid_gradient + place, (wx * wy * wz)[:, None] * change, mask=changed, sem="relaxed"
+                grid_gradient + place, weight[:, None] * change, mask=changed, sem="relaxed"
             )
         if NEEDS_COORDS:
             value = tl.load(grid + place, mask=wanted, other=0.0)
             agreed = tl.sum(value * change, axis=1)
-            along_x += wy * wz * (agreed if corner & 4 else -agreed)
-            along_y += wx * wz * (agreed if corner & 2 else -agreed)
-            along_z += wx * wy * (agreed if corner & 1 else -agreed)
+            slope_x, slope_y, slope_z = corner_slopes(agreed, fx, fy, fz, corner)
+            along_x += slope_x
+            along_y += slope_y
+            along_z += slope_z
     return along_x * inside(cx, x), along_y * inside(cy, y), along_z * inside(cz, z)
 
 

@@ -17,7 +17,7 @@ from devrf.methods.devrf.settings import RenderSettings
 from devrf.methods.devrf.static_shape.sample_search import search
 from devrf.methods.devrf.volume_rendering import VoxelOutput
 from devrf.ops.compositing import composite_colors, composite_segments
-from devrf.ops.search import select_listed
+from devrf.ops.selection import select_listed
 from devrf.ops.trilinear import kept_gradient
 from devrf.ops.warped_depth import warped_depth
 from devrf.rendering.occupancy import Occupancy
@@ -77,13 +77,12 @@ def render_static(
     with span("compositing"):
         weight, transmittance = composite_segments(tau, found.first)
     with span("sampling"):
-        chosen = select_listed(found, capacity.significant)
+        chosen = select_listed(found, canonical, weight, capacity.significant)
         capacity.note(found.total, chosen.total)
         samples = Samples(
             chosen.ray, chosen.distance, chosen.points, len(rays), present=chosen.present
         )
-        canonical = canonical.index_select(0, chosen.index)
-        weight = weight.index_select(0, chosen.index) * chosen.present
+        canonical, weight = chosen.canonical, chosen.weight
     with span("decoder"):
         residual = None if appearance is None else appearance(canonical)
         color = field.rgb(canonical, rays.viewdirs, samples.ray, precision, residual, chosen.first)
