@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
 
+from devrf.checkpoints.stored_shape import StoredShape
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
@@ -64,7 +65,7 @@ class ColorResidual:
         return look_up(self.grid, points, self.box)
 
 
-class AppearanceField(FrameField):
+class AppearanceField(FrameField, StoredShape):
     """Residuals A_t (T, X, Y, Z, 3) over a box: c = sigmoid(decoder(f(q), d) + A_t(q)).
 
     Frame 0 is zero and never trained: the scene at rest looks as the canonical field says.
@@ -76,6 +77,7 @@ class AppearanceField(FrameField):
         clock: the times of the T frames.
     """
 
+    resizable = ("values",)
     values: Tensor
 
     def __init__(self, box: Box, clock: FrameClock, *, voxels: int) -> None:
@@ -104,12 +106,3 @@ class AppearanceField(FrameField):
         """Initialise ``frames``, from 1 on, from the frames before them."""
         for frame in frames:
             self.values[frame] = self.values[frame - 1]
-
-    def _load_from_state_dict(
-        self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
-    ) -> None:
-        """Take the shape of the stored grids."""
-        stored = state_dict.get(prefix + "values")
-        if stored is not None and stored.shape != self.values.shape:
-            self.values = self.values.new_empty(stored.shape)
-        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)

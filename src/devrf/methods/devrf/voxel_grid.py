@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor, nn
 
+from devrf.checkpoints.stored_shape import StoredShape
 from devrf.geometry.box import Box
 from devrf.ops.corners import shape_of, to_grid
 from devrf.ops.resampling import resample
@@ -23,13 +22,14 @@ def look_up(grid: Tensor, points: Tensor, box: Box) -> Tensor:
     return interpolate(grid, coords, gradient=kept_gradient(grid))
 
 
-class VoxelGrid(nn.Module):
+class VoxelGrid(StoredShape):
     """Values at the points of a grid whose outer points lie on a box.
 
     Attributes:
         values: (X, Y, Z, C), channels last so that a grid point is one row of memory.
     """
 
+    resizable = ("values",)  # a run may have ended at any resolution
     values: nn.Parameter
 
     def __init__(self, shape: tuple[int, int, int], channels: int, fill: float = 0.0) -> None:
@@ -50,12 +50,3 @@ class VoxelGrid(nn.Module):
     def resize(self, shape: tuple[int, int, int]) -> None:
         """Resample to another grid over the same box, trilinearly; a new parameter results."""
         self.values = nn.Parameter(resample(self.values, shape))
-
-    def _load_from_state_dict(
-        self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
-    ) -> None:
-        """Take the shape of the stored grid: a run may have ended at any resolution."""
-        stored = state_dict.get(prefix + "values")
-        if stored is not None and stored.shape != self.values.shape:
-            self.values = nn.Parameter(self.values.new_empty(stored.shape))
-        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
