@@ -51,6 +51,11 @@ class Box:
         return max(self.size)
 
     @property
+    def diagonal(self) -> float:
+        """From corner to corner."""
+        return math.hypot(*self.size)
+
+    @property
     def volume(self) -> float:
         """Product of the edge lengths."""
         x, y, z = self.size

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
+from devrf.ops.pixel_rays import steps_between
 from devrf.rendering.occupancy import Occupancy
 
 
@@ -53,15 +54,12 @@ def steps_through(
     Arguments as for :func:`march`.
     """
     entry, leave = box.crossing(rays, near, far)
-    # Including a sample exactly at the exit: in NDC it is the last plane, behind the whole scene.
-    count = torch.where(leave >= entry, ((leave - entry) / step + 1e-3).floor() + 1, 0.0)
-    return entry, count.long()
+    return entry, steps_between(entry, leave, step)
 
 
 def most_steps(box: Box, *, step: float, near: float, far: float) -> int:
     """Upper bound of the samples of a ray whose direction has length 1 or more."""
-    diagonal = sum(edge**2 for edge in box.size) ** 0.5
-    return int(min(far - near, diagonal) / step) + 2
+    return int(min(far - near, box.diagonal) / step) + 2
 
 
 @torch.no_grad()

@@ -160,6 +160,13 @@ def test_a_killed_run_goes_on_to_the_same_weights(
 ) -> None:
     assert_goes_on_exactly(stage)
 
+    def without_hulls() -> RayStage:
+        one = stage()
+        one.scene_model = DNeRF(replace(TINY, hull=False, empty_from=0.0))
+        return one
+
+    assert_goes_on_exactly(without_hulls)
+
 
 def test_an_unknown_term_and_an_unknown_part_are_named(
     trainer: Trainers, datamodule: SceneDataModule

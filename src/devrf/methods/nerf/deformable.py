@@ -99,7 +99,7 @@ class DeformableField(DynamicModel):
         self.set_times(scene.clock.times)
         if s.sampling == "occupancy":
             self.occupancy = OccupancyFrames.of(
-                scene, box, s.occupancy_side, self.device, hull=s.hull
+                scene, box, s.occupancy_side, self.device, hull=s.hull, empty_from=s.empty_from
             )
 
     def config(self) -> dict[str, Any]:
@@ -216,6 +216,19 @@ class DeformableField(DynamicModel):
         return self.occupancy.march(
             rays, (before, after), self.box, self.depth_limits, step, jitter=jitter
         )
+
+    def on_iteration(self, step: int, total: int) -> None:
+        """Look where the field is empty."""
+        share = self.settings.empty_from
+        self.occupancy.learned.follow(step, total, share, self.box, self._opacity)
+
+    def _opacity(self, points: Tensor, time: Tensor) -> Tensor:
+        """Opacity (S,) of a step at points (S, 3) of the fields' space and times (S,)."""
+        points = self.placement.normalised(points)
+        step = self.box.diagonal / self.settings.steps / self.placement.half_edge
+        with self._reduced():
+            density = self.canonical.sigma(*self.deform(points, time))
+        return -torch.expm1(-density.float() * step)
 
     def _reduced(self) -> AbstractContextManager[None]:
         """Where T learns in bfloat16, if it is to."""

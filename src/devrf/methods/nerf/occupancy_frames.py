@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from devrf.checkpoints.stored_shape import StoredShape
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
+from devrf.methods.nerf.learned_occupancy import LearnedOccupancy
 from devrf.methods.nerf.ray_samples import RaySamples
 from devrf.rendering.occupancy import dilate
 from devrf.rendering.sampling import steps_through
@@ -18,41 +18,55 @@ from devrf.scenes.visual_hull import visual_hull
 
 def diagonal_step(box: Box, rays: Rays, steps: int) -> float:
     """One of ``steps`` even steps along the box's diagonal, in units of the longest direction."""
-    diagonal: float = sum(edge**2 for edge in box.size) ** 0.5
     unit = float(rays.directions.norm(dim=1).amax()) if len(rays) else 1.0
-    return diagonal / (steps * unit)
+    return box.diagonal / (steps * unit)
 
 
-class OccupancyFrames(nn.Module):
+class OccupancyFrames(StoredShape):
     """Masks (T, X, Y, Z) of T frames over a box.
 
     Attributes:
         mask: (T, X, Y, Z) bool, True where something may be.
+        learned: what the field leaves empty at all times, where mattes do not tell.
     """
 
+    resizable = ("mask",)
     mask: Tensor
 
     def __init__(self, frames: int, shape: tuple[int, int, int]) -> None:
         """Exclude nothing."""
         super().__init__()
         self.register_buffer("mask", torch.ones(frames, *shape, dtype=torch.bool))
+        self.learned = LearnedOccupancy()
 
     @classmethod
     def of(
-        cls, scene: Scene, box: Box, side: int, device: torch.device, *, hull: bool
+        cls,
+        scene: Scene,
+        box: Box,
+        side: int,
+        device: torch.device,
+        *,
+        hull: bool,
+        empty_from: float | None = None,
     ) -> OccupancyFrames:
         """Masks of each of the scene's frames over ``box``, of about ``side``³ cells.
 
         Args:
-            scene: seen from all around its mattes carve the masks; else nothing is excluded.
+            scene: seen from all around its mattes carve the masks; else the field itself has to
+                tell what is empty.
             box: in the fields' space.
             side: cells along an edge of a cube of the box's size.
             device: where the masks are.
             hull: whether to carve at all.
+            empty_from: share of a stage after which the field is asked; None: never.
         """
         masks = cls(len(scene.clock), box.grid_shape(side**3)).to(device)
         if hull and scene.kind == "inward" and scene.space.straight:
             masks.carve(scene, box)
+        if empty_from is not None and bool(masks.mask.all()):
+            _, x, y, z = masks.mask.shape
+            masks.learned = LearnedOccupancy((x, y, z)).to(device)
         return masks
 
     @torch.no_grad()
@@ -105,6 +119,10 @@ class OccupancyFrames(nn.Module):
         met = torch.zeros_like(ray, dtype=torch.bool)
         for frame in frames:
             met |= flat.view(-1)[frame[ray] * cells + cell]
+        occupied = self.learned.occupied(cell)
+        if occupied is not None:
+            # The last sample of a ray stays: it may stand for all that is behind it.
+            met &= occupied | (number == count[ray] - 1)
         kept = met.nonzero()[:, 0]
         return RaySamples.at(rays, ray[kept], distance[kept], step)
 
@@ -113,11 +131,3 @@ class OccupancyFrames(nn.Module):
         _, x, y, z = self.mask.shape
         place = box.to_grid(box.nearest(points), (x, y, z)).round().long()
         return (place[:, 0] * y + place[:, 1]) * z + place[:, 2]
-
-    def _load_from_state_dict(
-        self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
-    ) -> None:
-        stored = state_dict.get(prefix + "mask")
-        if stored is not None and stored.shape != self.mask.shape:
-            self.mask = torch.ones_like(stored, device=self.mask.device)
-        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)

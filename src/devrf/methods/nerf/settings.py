@@ -12,6 +12,16 @@ from devrf.methods.nerf.radiance_field import RadianceField
 Sampling = Literal["hierarchical", "occupancy"]
 
 
+def check_empty_from(key: str, share: float | None) -> None:
+    """Refuse what is no share of a stage.
+
+    Raises:
+        DevrfError: it is not in [0, 1].
+    """
+    if share is not None and not 0 <= share <= 1:
+        raise DevrfError(f"{key}.empty_from: expected 0 to 1, or null, not {share}")
+
+
 @dataclass(frozen=True)
 class FieldSettings:
     """What D-NeRF, Nerfies and HyperNeRF have in common.
@@ -35,7 +45,9 @@ class FieldSettings:
         steps: samples along the box's diagonal (occupancy).
         occupancy_side: the masks have about side³ cells (occupancy).
         hull: whether these are the visual hulls of each frame's mattes, where there are any, which
-            the published methods never had; else nothing is left out (occupancy).
+            the published methods never had (occupancy).
+        empty_from: where there are no such hulls, space that the fields leave empty at all times
+            is left out after this share of a stage; None: never (occupancy).
     """
 
     key: ClassVar[str] = "ray_stage.model.settings"
@@ -55,6 +67,7 @@ class FieldSettings:
     steps: int = 128
     occupancy_side: int = 48
     hull: bool = True
+    empty_from: float | None = 0.25
 
     def __post_init__(self) -> None:
         for name in ("width", "depth", "coarse", "fine", "steps", "occupancy_side"):
@@ -62,6 +75,7 @@ class FieldSettings:
                 raise DevrfError(
                     f"{self.key}.{name}: expected at least 2, not {getattr(self, name)}"
                 )
+        check_empty_from(self.key, self.empty_from)
         if self.separate_coarse and self.sampling == "occupancy":
             raise DevrfError(
                 f"{self.key}.separate_coarse: sampling=occupancy has no coarse samples; write false"

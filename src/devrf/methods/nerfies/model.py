@@ -110,7 +110,8 @@ class Nerfies(DeformableField):
         self.rest_is_canonical |= step.capture == "static"
 
     def on_iteration(self, step: int, total: int) -> None:
-        """Open the warp's octaves: α grows evenly from 0."""
+        """Open the warp's octaves: α grows evenly from 0. Look where the field is empty."""
+        super().on_iteration(step, total)
         share = self.settings.window * total
         opened = min(step / share, 1.0) if share else 1.0
         self.warp.opened.fill_(opened * self.settings.warp_bands)

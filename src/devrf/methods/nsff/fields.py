@@ -97,6 +97,11 @@ class HeadedField(nn.Module):
             color = self.color(x)
         return raw.float(), torch.sigmoid(color.float()), further.float()
 
+    def density_alone(self, values: Tensor) -> Tensor:
+        """Density before its activation (S,) at ``values`` (S, inputs)."""
+        raw: Tensor = self.density(self.trunk(self.encode(values)))
+        return raw[:, 0]
+
 
 class StaticField(HeadedField):
     """S(γ(x), γ(d)) → σ_s, c_s, v (docs/methods/nsff.md#model)."""

@@ -90,7 +90,7 @@ class NSFF(DynamicModel):
         self._place(box, scene.space, limits, times, cut_out=cut_out)
         if s.sampling == "occupancy":
             self.occupancy = OccupancyFrames.of(
-                scene, box, s.occupancy_side, self.device, hull=s.hull
+                scene, box, s.occupancy_side, self.device, hull=s.hull, empty_from=s.empty_from
             )
 
     def config(self) -> dict[str, Any]:
@@ -124,8 +124,21 @@ class NSFF(DynamicModel):
         return {"static": fields.static.parameters(), "dynamic": fields.dynamic.parameters()}
 
     def on_iteration(self, step: int, total: int) -> None:
-        """Remember the iteration: weights change every N₀."""
+        """Remember the iteration: weights change every N₀. Look where the fields are empty."""
         self._step = step
+        share = self.settings.empty_from
+        self.occupancy.learned.follow(step, total, share, self.box, self._opacity)
+
+    def _opacity(self, points: Tensor, time: Tensor) -> Tensor:
+        """Opacity (S,) of a step at points (S, 3) and times (S,), of the denser field."""
+        points, step = self.placement.normalised(points), self.box.diagonal / self.settings.steps
+        still = self.fields.static.density_alone(points)
+        moving = self.fields.dynamic.density_alone(
+            torch.cat([points, 2 * time[:, None] - 1], dim=-1)
+        )
+        length = points.new_full((), step / self.placement.half_edge)
+        depth = self.fields.optical_depth(torch.maximum(still, moving), length, 0.0)
+        return -torch.expm1(-depth)
 
     @property
     def _first(self) -> int:

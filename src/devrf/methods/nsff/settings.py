@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from devrf.errors import DevrfError
+from devrf.methods.nerf.settings import check_empty_from
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,9 @@ class NSFFSettings:
         steps: samples along the box's diagonal (occupancy).
         occupancy_side: the masks have about side³ cells (occupancy).
         hull: whether these are the visual hulls of each frame's mattes, where there are any, which
-            the published method never had; else nothing is left out (occupancy).
+            the published method never had (occupancy).
+        empty_from: where there are no such hulls, space that the fields leave empty at all times
+            is left out after this share of a stage; None: never (occupancy).
         neighbours: whether a ray is rendered from ``both`` neighbouring frames in each iteration,
             or from ``one`` at random.
         hard_rays: rays within the motion masks that a batch has beside the others in the first N₀
@@ -95,6 +98,7 @@ class NSFFSettings:
     steps: int = 128
     occupancy_side: int = 128
     hull: bool = True
+    empty_from: float | None = 0.25
     neighbours: Literal["both", "one"] = "both"
     hard_rays: int = 512
     precision: Literal["auto", "float32", "bfloat16"] = "float32"
@@ -108,6 +112,7 @@ class NSFFSettings:
         for name in ("hard_rays", "density_noise"):
             if getattr(self, name) < 0:
                 raise DevrfError(f"{key}.{name}: expected 0 or more, not {getattr(self, name)}")
+        check_empty_from(key, self.empty_from)
         if self.flow_reach is not None and self.flow_reach <= 0:
             raise DevrfError(f"{key}.flow_reach: expected more than 0, not {self.flow_reach}")
 
