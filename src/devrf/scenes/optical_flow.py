@@ -99,8 +99,7 @@ def frame_pairs(views: Views) -> list[tuple[int, int]]:
     if float(views.times.max()) == 0:
         return []
     frame = FrameClock.from_times(views.times).frames_of(views.times)
-    moving = len(set(views.view.tolist())) == len(views)
-    view = torch.zeros_like(views.view) if moving else views.view
+    view = torch.zeros_like(views.view) if views.by_moving_camera else views.view
     at = {(v, f): i for i, (v, f) in enumerate(zip(view.tolist(), frame.tolist(), strict=True))}
     return sorted((i, at[v, f - 1]) for (v, f), i in at.items() if (v, f - 1) in at)
 

@@ -93,6 +93,11 @@ class Views:
         """Whether something is left out by the mattes: an opaque one says nothing."""
         return self.has_alpha and bool((self.pixels[..., 3] < 255).any())
 
+    @property
+    def by_moving_camera(self) -> bool:
+        """Whether no two images are of one place: a camera moved between all of them."""
+        return len(set(self.view.tolist())) == len(self)
+
     def __getitem__(self, index: Tensor) -> Views:
         """The views at positions ``index`` (K,) int64."""
         return replace(

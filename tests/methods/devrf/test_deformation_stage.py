@@ -46,14 +46,14 @@ def test_two_steps_move_the_first_frame_only(
 def test_a_scene_at_rest_has_no_motion_to_learn(
     rest: LoadedCheckpoint, tiny_scene: Scene, trainer: Callable[..., Trainer]
 ) -> None:
-    module = Static()
+    module = Given()
     module.given = replace(tiny_scene, dynamic=tiny_scene.static)
     with pytest.raises(DevrfError, match="is at rest, so there is no motion to learn"):
         trainer(max_steps=1).fit(DeformationStage(rest, SHORT), datamodule=module)
 
 
-class Static(SceneDataModule):
-    """Serves a scene at rest."""
+class Given(SceneDataModule):
+    """Serves the scene that it is given."""
 
     given: Scene
 
@@ -153,6 +153,30 @@ def test_factors_are_those_of_terms(rest: LoadedCheckpoint) -> None:
         DevrfError, match="factors: elastik is no term of loss.deformation; the ter"
     ):
         DeformationStage(rest, schedule)
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_the_flow_of_a_moving_camera_neither_starts_nor_teaches_a_frame(
+    rest: LoadedCheckpoint,
+    tiny_scene: Scene,
+    trainer: Callable[..., Trainer],
+    caplog: pytest.LogCaptureFixture,
+    moving: bool,
+) -> None:
+    train = tiny_scene.dynamic.train
+    train = train[(train.view == 0).nonzero()[:, 0]]
+    assert train.flow is not None and train.flow.valid.any()
+    if moving:
+        train = replace(train, view=torch.arange(len(train)))
+    module = Given()
+    module.given = replace(tiny_scene, dynamic=replace(tiny_scene.dynamic, train=train))
+    motion = MotionSettings(learning_rate=1e-9, start="flow")
+    stage = DeformationStage(rest, SHORT, motion, iterations_per_step=1)
+    with caplog.at_level("INFO"):
+        trainer(max_steps=1).fit(stage, datamodule=module)
+    assert (stage.field.to_time[1].abs().amax() > 1e-3) is not moving
+    assert (stage.losses.weights["flow"] > 0) is not moving
+    assert sum("the camera moves" in line for line in caplog.messages) == moving
 
 
 class Look(Callback):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import logging
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -34,11 +35,11 @@ from devrf.methods.devrf.losses import (
     FLOW_TERMS,
     MOTION_TERMS,
     PRIORS,
+    VISIBILITY,
     FlowMean,
     MotionGrid,
     MotionPrediction,
     total_variation_weight,
-    visibility,
 )
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.pixel_selection import frame_pools, images_of
@@ -55,6 +56,8 @@ from devrf.methods.devrf.weighted_loss import WeightedLoss
 from devrf.ops.adam import GridAdam
 from devrf.scenes.scene import CaptureName, Views
 from devrf.system.profiling import span
+
+log = logging.getLogger(__name__)
 
 
 class DeformationStage(VoxelStage):
@@ -113,7 +116,8 @@ class DeformationStage(VoxelStage):
         chosen = appearance or AppearanceSettings()
         self.appearance = AppearanceLearning(chosen, self.schedule, appearance_loss)
         weights.update(self.appearance.weights)
-        self.losses = WeightedLoss(MOTION_TERMS | {"flow": FLOW_TERMS[flow_mean]}, weights)
+        terms = MOTION_TERMS | {"flow": FLOW_TERMS[flow_mean]}
+        self.losses = WeightedLoss(terms, weights, VISIBILITY)
         # What the schedule's factors are factors of.
         self._weights = dict(self.losses.weights)
         self._check_factors()
@@ -141,6 +145,12 @@ class DeformationStage(VoxelStage):
         """The deformation field; the active frames' part of it may not be written back yet."""
         assert self.scene_model.deformation is not None, "the stage has not been set up"
         return self.scene_model.deformation
+
+    @property
+    def _follows_flow(self) -> bool:
+        """Whether there is flow that tells how the scene moves, not the camera."""
+        recorded = self.scene.dynamic.train
+        return recorded.flow is not None and not recorded.by_moving_camera
 
     @property
     def total_iterations(self) -> int:
@@ -188,6 +198,7 @@ class DeformationStage(VoxelStage):
                 f"{self.scene.name}: is at rest, so there is no motion to learn; the canonical "
                 "stage is all that it takes"
             )
+        self._leave_out_camera_flow()
         model, motion = self.scene_model, self.motion
         if model.deformation is None:
             voxels = self.schedule.sides[0] ** 3
@@ -207,6 +218,17 @@ class DeformationStage(VoxelStage):
                 self.refinement.add_groups()
         scale = self.field.box.longest if motion.unit == "box" else 1.0
         self._optimizer.param_groups[0]["base_lr"] = motion.learning_rate * scale
+
+    def _leave_out_camera_flow(self) -> None:
+        """No loss for a moving camera's flow (docs/method.md#flow-of-a-moving-camera)."""
+        if self.scene.dynamic.train.flow is None or self._follows_flow:
+            return
+        if self.motion.start == "flow" or self._weights.get("flow"):
+            log.info(
+                "the camera moves, and so does all that it sees: frames start where the ones "
+                "before them ended, and the flow loss is left out"
+            )
+        self._weights["flow"] = 0.0
 
     def enter(self, phase: Phase) -> None:
         """Go to the phase's frames: grow the grids if a level begins, fresh Adam if asked for."""
@@ -308,7 +330,7 @@ class DeformationStage(VoxelStage):
                 broadcast([self.field.to_canonical[number], self.field.to_time[number]])
 
     def _starts_along_flow(self, phase: DeformationPhase) -> bool:
-        asked = self.motion.start == "flow" and self.views.flow is not None
+        asked = self.motion.start == "flow" and self._follows_flow
         return asked and phase.level == 0 and phase.has_previous
 
     def _prefetch_after(self, phase: DeformationPhase) -> None:
@@ -395,8 +417,7 @@ class DeformationStage(VoxelStage):
             grid,
         )
         with span("losses"):
-            total, terms = self.losses(prediction)
-            return total, {**terms, **visibility(prediction)}
+            return self.losses(prediction)
 
     def converged(self, losses: Tensor) -> bool:
         """Whether each active frame's loss has stopped falling, if the schedule asks for that."""

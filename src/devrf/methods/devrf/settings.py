@@ -96,7 +96,7 @@ class MotionSettings:
         occupancy_every: iterations between updates of the frame's occupancy.
         start: where a frame starts from at the coarsest level: ``previous`` is the result of
             the frame before it; ``flow`` moves that along the observed optical flow, if there is
-            any (docs/method.md#flow-initialisation).
+            any and no camera has moved (docs/method.md#flow-initialisation).
         store: where the displacements of all frames are kept while one is learned: ``device``,
             ``host``, or ``auto``: on the device if they fit there beside all else. Each of
             several processes keeps them on its device.
