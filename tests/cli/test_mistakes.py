@@ -142,6 +142,23 @@ def test_a_file_where_the_run_folder_should_be(devrf, tmp_path, tiny):
     assert (outcome.status, outcome.err) == (2, f"devrf: {Path('taken/run')}: Not a directory\n")
 
 
+@pytest.mark.parametrize("folder", ["/proc/run", "x" * 300])
+@pytest.mark.parametrize("stage", ["canonical", "prepare", "report", "export"])
+def test_a_folder_that_cannot_be_made(devrf, tmp_path, tiny, trained, stage, folder):
+    run, checkpoint = trained[0], trained[0] / "checkpoints" / "deformation.ckpt"
+    points = ["export.content=points", "export.format=ply", "export.points=9"]
+    command = {
+        "canonical": [*tiny, f"hydra.run.dir={folder}"],
+        "prepare": [*tiny, f"data.export={folder}"],
+        "report": [f"report.runs={run}", f"report.into={folder}"],
+        "export": [f"ckpt={checkpoint}", "hydra.run.dir=run", *points, f"export.into={folder}"],
+    }
+    outcome = devrf(f"stage={stage}", *command[stage])
+    assert outcome.status == 2
+    assert outcome.err.count("\n") == 1
+    assert outcome.err.startswith("devrf: ") and folder in outcome.err
+
+
 def test_results_of_an_earlier_run_survive_a_mistake(devrf, tmp_path, tiny):
     assert devrf(*tiny, "stage=canonical", "hydra.run.dir=run").status == 0
     before = (tmp_path / "run" / "checkpoints" / "canonical.ckpt").read_bytes()

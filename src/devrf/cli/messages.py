@@ -23,10 +23,12 @@ from devrf.errors import DevrfError, did_you_mean
 # Read at import: the entry point sets the variable, so that Hydra raises its errors.
 FULL_ERRORS = os.environ.get("HYDRA_FULL_ERROR", "0") != "0"
 
-# Errors of a disk or its permissions. A missing file may be a fault of the program instead.
+# Errors of a disk, its permissions, or a path that was given. A missing file may be a fault of the
+# program instead.
 REFUSED = {
     *(errno.EACCES, errno.EPERM, errno.EROFS),
-    *(errno.ENOSPC, errno.EDQUOT, errno.ENOTDIR, errno.EEXIST),
+    *(errno.ENOSPC, errno.EDQUOT, errno.EIO),
+    *(errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG, errno.ELOOP),
 }
 
 # Options that Hydra's plugins for sweeps add to its groups.

@@ -24,7 +24,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from devrf.cli.messages import REFUSED, report_user_errors
 from devrf.errors import DevrfError
-from devrf.system.files import atomic_write
+from devrf.system.files import atomic_write, make_folder
 
 log = logging.getLogger(__name__)
 
@@ -55,8 +55,9 @@ class RunDirLock(Callback):
             return  # Hydra will report what is wrong with the config
         finally:
             hydra.cfg = before
-        if _locks(config):
-            with report_user_errors():
+        with report_user_errors():
+            make_folder(folder)  # as Hydra does next, with a traceback where it cannot
+            if _locks(config):
                 _lock(folder, "hydra.run.dir")
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
@@ -108,7 +109,7 @@ def _lock(folder: Path, key: str) -> bool:
     if folder.resolve() in _held:
         return True
     place = folder / PLACE
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     place.mkdir(exist_ok=True)
     lock, owner = FileLock(place / LOCK), place / OWNER
     try:

@@ -1,13 +1,28 @@
-"""Files that are written whole or not at all."""
+"""Files that are written whole or not at all, and the folders that they are in."""
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
+
+
+def make_folder(folder: Path) -> None:
+    """Make ``folder``, and those above it, where they are not there.
+
+    Raises:
+        OSError: naming the first folder that cannot be made. Where the system holds no folders of
+            users, as ``/proc``, it says that a file is missing; here it is a PermissionError, so
+            that a missing file stays a fault of the program.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except FileNotFoundError as error:
+        raise PermissionError(errno.EACCES, "no folder can be made there", error.filename) from None
 
 
 @contextmanager
@@ -20,7 +35,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
     Raises:
         OSError: naming ``path``: it cannot be written.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     # The suffix stays last: writers choose the format by it.
     partial = path.with_name(f".partial-{path.name}")
     try:

@@ -18,7 +18,7 @@ from devrf.errors import DevrfError
 from devrf.scenes.fetch.archive import unpack_scene
 from devrf.scenes.fetch.catalogue import PublishedScene
 from devrf.system.download import download, remote_size
-from devrf.system.files import write_json
+from devrf.system.files import make_folder, write_json
 from devrf.system.machine import free_disk
 
 # Beside the data: where they are from, when, and their checksums.
@@ -119,7 +119,7 @@ def fetch_scene(
 @contextmanager
 def _working_folder(work: Path) -> Iterator[Path]:
     """A folder that one process at a time works in; it stays where the work is interrupted."""
-    work.mkdir(parents=True, exist_ok=True)
+    make_folder(work)
     try:
         with FileLock(work / "lock", timeout=0):
             yield work
