@@ -15,11 +15,16 @@ from pathlib import Path
 
 import imageio.v3 as iio
 import pytest
+import torch
+import trimesh
 
 import devrf as package
 from devrf.artifacts.keyframes import CameraPath, Keyframe
 from devrf.artifacts.path_files import write_path
 from devrf.checkpoints.checkpoint import load_checkpoint
+from devrf.rendering.renderer import Renderer
+from devrf.viewer.drawing import Drawing, Shot
+from devrf.viewer.poses import Pose
 
 
 @pytest.fixture
@@ -136,8 +141,6 @@ def test_a_run_learns_the_same_with_the_viewer_beside(devrf, tmp_path, tiny, vis
 
 
 def a_path(folder: Path) -> Path:
-    import torch
-
     pose = torch.tensor([[1.0, 0, 0, 0], [0, 0, -1, -3], [0, 1, 0, 0]])
     further = pose + torch.tensor([[0, 0, 0, 1.0], [0, 0, 0, 0], [0, 0, 0, 0]])
     keyframes = (Keyframe(pose, 40.0, 0.0, 0.0), Keyframe(further, 40.0, 1.0, 1.0))
@@ -192,3 +195,54 @@ def test_a_scene_that_cannot_be_read_is_shown_without_pictures(
     assert outcome.status == 0
     assert "its training cameras are shown without pictures" in outcome.out + outcome.err
     assert logging.getLogger("websockets").level == logging.WARNING
+
+
+SIZES = "ray_stage.model.settings"
+RAYS = (f"{SIZES}.width=8", f"{SIZES}.steps=16")
+PEERS = {
+    "dnerf": (*RAYS, f"{SIZES}.deformation_width=8"),
+    "nerfies": (*RAYS, f"{SIZES}.warp_width=8"),
+    "hypernerf": (*RAYS, f"{SIZES}.warp_width=8"),
+    "nsff": (*RAYS, f"{SIZES}.depth=2", f"{SIZES}.samples=8"),
+    "neural_volumes": (
+        f"{SIZES}.code=4",
+        f"{SIZES}.encoder_views=2",
+        f"{SIZES}.encoder_size=[16,16]",
+        f"{SIZES}.encoder_channels=[4,4]",
+        f"{SIZES}.encoder_width=8",
+        f"{SIZES}.template_channels=[8,8,8]",
+        f"{SIZES}.warp_side=4",
+        f"{SIZES}.warp_width=4",
+        f"{SIZES}.step=0.2",
+    ),
+}
+
+
+@pytest.mark.parametrize("method", PEERS)
+def test_another_method_is_looked_at_and_exported(devrf, tmp_path, tiny_data, port, viser, method):
+    learned = devrf(
+        f"method={method}",
+        *("experiment=peer_small", "protocol=joint", "stage=joint"),
+        *(*PEERS[method], f"{SIZES}.occupancy_side=8", *tiny_data),
+        *("ray_stage.schedule.iterations=2", "ray_stage.schedule.rays=32"),
+        *("hydra.run.dir=run", "trainer=cpu"),
+    )
+    assert learned.status == 0, learned.err
+    sender = ended_by(signal.SIGTERM, port)
+    shown = devrf("stage=view", "hydra.run.dir=run", f"viewer.port={port}", "trainer=cpu")
+    sender.join()
+    assert (shown.status, shown.err) == (0, "") and "the viewer has ended" in shown.out
+    file = tmp_path / "run" / "checkpoints" / "joint.ckpt"
+    drawing = Drawing(Renderer(load_checkpoint(file).model.to_view(torch.device("cpu"))), 1.0)
+    pose = Pose.of_cameras(load_checkpoint(file).viewpoints.held_out, 0)
+    for channel in drawing.channels:
+        *_, picture = drawing.draw(Shot(pose, 0.4, channel, with_depth=True), 12)
+        assert picture.pixels.shape[0] == 12 and picture.depth.isfinite().all()
+    command = ("stage=export", "export.format=ply", "export.points=20", "hydra.run.dir=run")
+    done = devrf(*command, "trainer=cpu")
+    assert done.status == 0
+    clouds = sorted((tmp_path / "run" / "export" / "points").glob("frame_*.ply"))
+    most = max(len(trimesh.load(cloud).vertices) for cloud in clouds)
+    assert len(clouds) == 3 and f"{most} coloured points at most at 3 times" in done.out
+    # A few iterations may make nothing that hides what is behind it.
+    assert ("the files are empty" in done.err + done.out) == (most == 0)

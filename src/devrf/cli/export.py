@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
 from pathlib import Path
 
 import torch
@@ -11,7 +12,7 @@ from hydra.utils import instantiate
 from devrf.artifacts.export.frame import UpFrame
 from devrf.artifacts.export.gltf import write_gltf
 from devrf.artifacts.export.moving_mesh import ForwardMap, MovingMesh, carried
-from devrf.artifacts.export.points import seen_points
+from devrf.artifacts.export.points import PointCloud, seen_points
 from devrf.artifacts.export.sequence import mesh_files, point_files, write_sequence
 from devrf.artifacts.export.settings import ExportSettings
 from devrf.artifacts.export.surface import canonical_surface
@@ -47,12 +48,10 @@ def export(run: RunContext) -> None:
         )
     else:
         path = folder / "points"
-        renderer, behind = Renderer(model, times=1), background_value(scene.background)
-        cameras, count = scene.static.train.cameras, settings.points
-        clouds = (seen_points(renderer, cameras, time, behind, count) for time in times)
-        drawn = followed(point_files(clouds), len(times), "points")
-        write_sequence(path, "ply", times, drawn, "points", settings.seconds)
-        log.info("coloured points at %d times written to %s", len(times), path)
+        most = _write_points(path, model, scene, settings, times)
+        log.info("%d coloured points at most at %d times written to %s", most, len(times), path)
+        if most == 0:
+            log.warning("the files are empty: nothing that the cameras see hides what is behind it")
 
 
 def _takes_surface(model: DynamicModel, settings: ExportSettings) -> bool:
@@ -106,6 +105,29 @@ def _write_mesh(folder: Path, mesh: MovingMesh, scene: Scene, settings: ExportSe
     write = write_gltf if settings.format == "gltf" else write_usd
     write(path, mesh, _named_cameras(scene), frame, settings.seconds)
     return path
+
+
+def _write_points(
+    folder: Path,
+    model: DynamicModel,
+    scene: Scene,
+    settings: ExportSettings,
+    times: tuple[float, ...],
+) -> int:
+    """Write what the static cameras see at each time; the points of the time with the most."""
+    renderer, behind = Renderer(model, times=1), background_value(scene.background)
+    cameras, most = scene.static.train.cameras, 0
+
+    def clouds() -> Iterator[PointCloud]:
+        nonlocal most
+        for time in times:
+            cloud = seen_points(renderer, cameras, time, behind, settings.points)
+            most = max(most, len(cloud.points))
+            yield cloud
+
+    drawn = followed(point_files(clouds()), len(times), "points")
+    write_sequence(folder, "ply", times, drawn, "points", settings.seconds)
+    return most
 
 
 def _named_cameras(scene: Scene) -> dict[str, Cameras]:
