@@ -27,6 +27,7 @@ from devrf.artifacts.grid import image_grid, scaled
 from devrf.artifacts.still import still
 from devrf.checkpoints.checkpoint import load_checkpoint
 from devrf.geometry.cameras import Cameras
+from devrf.methods.base import DynamicModel
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.procedural.filming import Filming
 from devrf.scenes.procedural.truth import extent
@@ -37,11 +38,16 @@ HEIGHT, TILE, MARGIN, TEXT = 400, 210, 8, 19
 ROWS = [["truth"], ["rendered"], ["depth"]]
 
 
+def opened(run: Path) -> tuple[Any, DynamicModel]:
+    """The data of a run, and what its deformation stage learned from them."""
+    data = instantiate(OmegaConf.load(run / "checkpoints" / "config.yaml").data)
+    return data, load_checkpoint(run / "checkpoints" / "deformation.ckpt", data.scene).model
+
+
 def scene_columns(run: Path) -> tuple[list[list[Tensor]], list[str]]:
     """Truth, rendering and depth of a run's scene in four columns, cut to what can be seen."""
-    data = instantiate(OmegaConf.load(run / "checkpoints" / "config.yaml").data)
+    data, model = opened(run)
     scene, recipe = data.scene, data.recipe
-    model = load_checkpoint(run / "checkpoints" / "deformation.ckpt", scene).model
     shape, film = recipe.model(), FilmSettings(frames=8, height=HEIGHT)
     camera = film.sized(scene.dynamic.test.cameras[[0]])
     around = orbit(film.sized(scene.static.train.cameras), model.box, film)
