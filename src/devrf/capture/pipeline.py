@@ -70,8 +70,8 @@ def scene_from_footage(settings: CaptureSettings) -> Path:
         Chosen(path, f"view{k}", positions, mattes.get(path))
         for k, (path, positions) in enumerate(zip(views, clock.positions, strict=True), 1)
     ]
-    size = common_size({path: one.size for path, one in surveys.items()}, settings.size)
     filmed = {path: one.size for path, one in surveys.items()}
+    size = common_size(filmed, settings.size)
     _written(into, work, [moving, *fixed], size, filmed)
     model = _model(into, work, moving, fixed, settings)
     world = normalised(model, settings.facing)

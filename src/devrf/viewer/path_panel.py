@@ -96,7 +96,7 @@ class PathPanel:
         if event.client is None:
             return
         camera = event.client.camera
-        pose = Pose(tuple(camera.wxyz), tuple(camera.position), camera.fov, camera.aspect)
+        pose = Pose.of_browser(camera)
         angle = float(np.degrees(camera.fov))
         self.editor.add(pose.camera_to_world.float(), angle, self.time(), float(self._gap.value))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from kornia.geometry.conversions import (
@@ -14,6 +15,9 @@ from kornia.geometry.conversions import (
 from torch import Tensor
 
 from devrf.geometry.cameras import Cameras
+
+if TYPE_CHECKING:
+    from viser import CameraHandle
 
 # From OpenGL's camera axes (y up, z backwards) to OpenCV's (y down, z forwards), and back.
 FLIP = (1.0, -1.0, -1.0)
@@ -42,6 +46,11 @@ class Pose:
         turned = pose[:, :3] * pose.new_tensor(FLIP)
         wxyz = rotation_matrix_to_quaternion(turned[None])[0]
         return Pose(tuple(wxyz.tolist()), tuple(pose[:, 3].tolist()), fov, aspect)
+
+    @staticmethod
+    def of_browser(camera: CameraHandle) -> Pose:
+        """The pose that a page is looked at from."""
+        return Pose(tuple(camera.wxyz), tuple(camera.position), camera.fov, camera.aspect)
 
     @staticmethod
     def of_cameras(cameras: Cameras, index: int) -> Pose:

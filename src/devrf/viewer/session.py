@@ -129,7 +129,7 @@ class Session:
         camera = client.camera
         if self.scheduler is None or not camera.image_height:
             return
-        pose = Pose(tuple(camera.wxyz), tuple(camera.position), camera.fov, camera.aspect)
+        pose = Pose.of_browser(camera)
         box = self._model.space.inner(self._model.box)
         shot = self.controls.shot(pose, box, with_depth=self._films.drawn)
         self.scheduler.ask(client.client_id, shot)
