@@ -49,6 +49,7 @@ def test_a_protocol_trains_scores_and_films(devrf, tmp_path, tiny_data, protocol
         (["data.surroundings=room"], "robot_room has no end; give images with alpha masks"),
         (["ray_stage.model.settings.warp=rigid"], "expected one of conv, affine"),
         (["ray_stage.schedule.moments=0"], "ray_stage.schedule.moments: expected at least 1"),
+        (["ray_stage.schedule.rays_without_hull=0"], "rays_without_hull: expected at least 1"),
         (["ray_stage.model.settings.warp_side=5"], "warp_side: expected a power of two, not 5"),
     ],
 )

@@ -68,7 +68,8 @@ def requirements(run: RunContext) -> Budget:
 def _of_rays(run: RunContext) -> Budget:
     """The budget of a method of ray stages: each trains the whole model."""
     model = instantiate(run.config.ray_stage.model, _convert_="all")
-    rays, scene = run.config.ray_stage.schedule.rays, run.scene
+    schedule, scene = run.config.ray_stage.schedule, run.scene
+    rays = max(schedule.rays, schedule.get("rays_without_hull") or 0)
     stages = {
         step.name: module_needs(
             model,

@@ -202,6 +202,11 @@ class DynamicModel(nn.Module, ABC):
         return True
 
     @property
+    def has_hull(self) -> bool:
+        """Whether the scene's mattes tell which space rays need not be sampled in."""
+        return False
+
+    @property
     def size(self) -> int:
         """How many numbers are learned."""
         return sum(parameter.numel() for parameter in self.parameters())

@@ -55,6 +55,8 @@ class RaySchedule:
     Attributes:
         iterations: of the whole protocol; each of its stages takes a share.
         rays: of a batch.
+        rays_without_hull: of a batch where no mattes tell which space is empty, so that a ray has
+            more samples; None: as many.
         learning_rate: of Adam at the first iteration of a stage.
         final_learning_rate: at its last; exponential in between.
         betas: of Adam.
@@ -73,6 +75,7 @@ class RaySchedule:
     eps: float = 1e-8
     curriculum: float = 0.0
     moments: int | None = None
+    rays_without_hull: int | None = None
     iterations_per_step: int = 10
 
     def __post_init__(self) -> None:
@@ -81,10 +84,11 @@ class RaySchedule:
                 raise DevrfError(
                     f"ray_stage.schedule.{name}: expected at least 1, not {getattr(self, name)}"
                 )
-        if self.moments is not None and self.moments < 1:
-            raise DevrfError(
-                f"ray_stage.schedule.moments: expected at least 1, or null, not {self.moments}"
-            )
+        for name in ("moments", "rays_without_hull"):
+            if (given := getattr(self, name)) is not None and given < 1:
+                raise DevrfError(
+                    f"ray_stage.schedule.{name}: expected at least 1, or null, not {given}"
+                )
         if not 0 <= self.curriculum < 1:
             raise DevrfError(
                 f"ray_stage.schedule.curriculum: expected 0 or more, below 1, not {self.curriculum}"
@@ -139,6 +143,7 @@ class RayStage(ScheduledStage):
         if not self.weights:
             raise DevrfError("ray_stage.loss: every weight is zero; at least one term must count")
         self.pools: list[FramePool] = []
+        self._rays = schedule.rays
         self._optimizer: GridAdam | None = None
 
     @property
@@ -196,7 +201,9 @@ class RayStage(ScheduledStage):
         self.pools = [FramePool.of(one) for one in views]
         self.scene_model.learn_from(views, self.weights)
         groups = self.optimizer.param_groups
-        self.bind(self.schedule.rays, [[p for group in groups for p in group["params"]]])
+        fewer = self.schedule.rays_without_hull
+        self._rays = self.schedule.rays if fewer is None or self.scene_model.has_hull else fewer
+        self.bind(self._rays, [[p for group in groups for p in group["params"]]])
 
     @property
     def _captures(self) -> tuple[CaptureName, ...]:
@@ -218,7 +225,7 @@ class RayStage(ScheduledStage):
         Images are numbered through, the static ones first. Last are those the model asks for.
         """
         with span("batch"):
-            rays = rays_per_rank(self.schedule.rays)
+            rays = rays_per_rank(self._rays)
             counts = [rays]
             if len(self.pools) > 1:
                 counts = [round(rays * self.static_share), rays - round(rays * self.static_share)]

@@ -17,6 +17,7 @@ from devrf.checkpoints.checkpoint import (
 )
 from devrf.data.datamodule import SceneDataModule
 from devrf.data.rendered import RenderedDataModule
+from devrf.engine.parallel_batch import ParallelBatch
 from devrf.errors import DevrfError
 from devrf.methods.dnerf.model import DNeRF, DNeRFSettings
 from devrf.methods.protocol import ProtocolStage
@@ -166,6 +167,19 @@ def test_a_killed_run_goes_on_to_the_same_weights(
         return one
 
     assert_goes_on_exactly(without_hulls)
+
+
+def test_a_batch_may_have_fewer_rays_where_no_mattes_tell_what_is_empty(
+    trainer: Trainers, datamodule: SceneDataModule
+) -> None:
+    sizes = []
+    for hull in (True, False):
+        one = stage()
+        one.schedule = replace(QUICK, rays_without_hull=7)
+        one.scene_model = DNeRF(replace(TINY, hull=hull))
+        fit(one, trainer, datamodule)
+        sizes.append(len(one.draw(ParallelBatch(0, [])).image))
+    assert sizes == [QUICK.rays, 7]
 
 
 def test_an_unknown_term_and_an_unknown_part_are_named(

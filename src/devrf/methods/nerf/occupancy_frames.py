@@ -39,6 +39,11 @@ class OccupancyFrames(StoredShape):
         self.register_buffer("mask", torch.ones(frames, *shape, dtype=torch.bool))
         self.learned = LearnedOccupancy()
 
+    @property
+    def has_hull(self) -> bool:
+        """Whether mattes leave anything out."""
+        return not bool(self.mask.all())
+
     @classmethod
     def of(
         cls,
@@ -64,7 +69,7 @@ class OccupancyFrames(StoredShape):
         masks = cls(len(scene.clock), box.grid_shape(side**3)).to(device)
         if hull and scene.kind == "inward" and scene.space.straight:
             masks.carve(scene, box)
-        if empty_from is not None and bool(masks.mask.all()):
+        if empty_from is not None and not masks.has_hull:
             _, x, y, z = masks.mask.shape
             masks.learned = LearnedOccupancy((x, y, z)).to(device)
         return masks

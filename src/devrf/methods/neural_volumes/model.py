@@ -95,6 +95,11 @@ class NeuralVolumes(DynamicModel):
                 scene, box, s.occupancy_side, self.device, hull=True
             )
 
+    @property
+    def has_hull(self) -> bool:
+        """Whether the occupancy was carved from mattes."""
+        return self.occupancy.has_hull
+
     def config(self) -> dict[str, Any]:
         """Settings, and where and when the scene is."""
         return {

@@ -93,6 +93,11 @@ class NSFF(DynamicModel):
                 scene, box, s.occupancy_side, self.device, hull=s.hull, empty_from=s.empty_from
             )
 
+    @property
+    def has_hull(self) -> bool:
+        """Whether the occupancy was carved from mattes."""
+        return self.occupancy.has_hull
+
     def config(self) -> dict[str, Any]:
         """Settings, and where and when the scene is."""
         return {
