@@ -88,6 +88,7 @@ def test_loss_weights(paper):
         "entropy": 0.01,
         "elastic": 0.0,
         "bending": 0.0,
+        "matte": 0.0,
     }
 
 
@@ -114,7 +115,7 @@ def test_the_code_defaults_to_the_paper(paper):
 )
 def test_the_rows_of_the_ablation_tables(composed, ablation, off, coarse_to_fine):
     config = composed("experiment=paper_inward", ROOT, f"ablation={ablation}")
-    never = {"elastic", "bending"}
+    never = {"elastic", "bending", "matte"}
     without = {name for name, weight in config.loss.deformation.items() if not weight}
     assert without == off | never
     assert config.schedule.deformation.coarse_to_fine is coarse_to_fine

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from lightning import Trainer
+from lightning import Callback, Trainer
 from torch import Tensor
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint, load_checkpoint, save_checkpoint
@@ -47,11 +47,13 @@ def test_the_residual_is_blended_between_frames_and_absent_at_rest(field: Appear
         torch.testing.assert_close(residual(point), torch.tensor([[red, 0.0, 0.0]]))
 
 
-def test_a_frame_starts_from_the_one_before_it(field: AppearanceField) -> None:
-    field.copy_previous([2])
+def test_a_frame_starts_from_the_one_before_it_or_after_it(field: AppearanceField) -> None:
+    field.copy_neighbours([2])
     assert torch.equal(field.values[2], field.values[1])
-    field.copy_previous([1])
+    field.copy_neighbours([1])
     assert not field.values[1].any() and field.values[2].any()
+    field.copy_neighbours([1, 2], after=True)
+    assert torch.equal(field.values[1], field.values[2]) and field.values[2].any()
 
 
 def test_the_residual_is_interpolated_in_space(cube: Box) -> None:
@@ -113,20 +115,90 @@ def test_what_grows_darker_is_learned_by_the_residual_alone(
     assert not values[0].any() and values[1:].mean() < 0
 
 
-@pytest.mark.parametrize(("drift", "wanted"), [(0.01, False), (0.1, True), (None, False)])
-def test_auto_learns_colours_that_drift(
+@pytest.mark.parametrize(
+    ("drift", "if_steady", "first"),
+    [
+        (0.01, None, None),
+        (0.1, None, 0),
+        (None, None, None),
+        (0.01, 1, 1),
+        (0.1, 1, 0),
+        (None, 1, 1),
+    ],
+)
+def test_auto_learns_colours_that_drift_early_and_others_late(
     rest: LoadedCheckpoint,
     tiny_scene: Scene,
     monkeypatch: pytest.MonkeyPatch,
     drift: float | None,
-    wanted: bool,
+    if_steady: int | None,
+    first: int | None,
 ) -> None:
     monkeypatch.setattr("devrf.methods.devrf.appearance_learning.color_drift", lambda views: drift)
-    stage = DeformationStage(rest, SHORT, FAST, appearance=replace(LEARNED, learn="auto"))
-    given = stage.scene_model, tiny_scene.clock, stage.optimizer, tiny_scene.dynamic.train
-    stage.appearance.setup(*given)
-    assert (stage.scene_model.appearance is not None) == wanted
-    assert [group["name"] for group in stage.optimizer.param_groups][1:] == ["appearance"] * wanted
+    chosen = replace(LEARNED, learn="auto", first_level_if_steady=if_steady)
+    stage = DeformationStage(rest, SHORT, FAST, appearance=chosen)
+    model, groups = stage.scene_model, stage.optimizer.param_groups
+    stage.appearance.setup(model, tiny_scene.clock, stage.optimizer, tiny_scene.dynamic.train)
+    assert (model.appearance is not None) == (first is not None)
+    assert [group["name"] for group in groups][1:] == ["appearance"] * (first is not None)
+    learning = [stage.appearance.at_level(model, level) is not None for level in (0, 1)]
+    assert learning == [first is not None and level >= first for level in (0, 1)]
+
+
+@pytest.mark.parametrize(("drift", "last"), [(0.1, 0.5), (0.01, 2.0)])
+def test_terms_count_less_at_levels_that_learn_colours_that_drift(
+    rest: LoadedCheckpoint,
+    datamodule: SceneDataModule,
+    trainer: Callable[..., Trainer],
+    monkeypatch: pytest.MonkeyPatch,
+    drift: float,
+    last: float,
+) -> None:
+    monkeypatch.setattr("devrf.methods.devrf.appearance_learning.color_drift", lambda views: drift)
+    chosen = AppearanceSettings(
+        learn="auto", side=6, first_level_if_steady=1, factors_if_drifting={"cycle": 0.25}
+    )
+    schedule = replace(SHORT, factors={"cycle": (1.0, 2.0)})
+    stage = DeformationStage(
+        rest,
+        schedule,
+        FAST,
+        {"render": 1.0, "cycle": 1.0},
+        iterations_per_step=1,
+        appearance=chosen,
+    )
+    seen = []
+
+    class Weights(Callback):
+        def on_train_batch_end(self, trainer: Trainer, *of_batch: object) -> None:
+            seen.append(stage.losses.weights["cycle"])
+
+    trainer(Weights(), max_epochs=1).fit(stage, datamodule=datamodule)
+    assert (seen[0], seen[-1]) == (1.0, last)
+
+
+def test_a_factor_of_no_term_is_told(rest: LoadedCheckpoint) -> None:
+    chosen = AppearanceSettings(factors_if_drifting={"flaw": 0.1})
+    with pytest.raises(DevrfError, match="factors_if_drifting: flaw is no term of loss.deformatio"):
+        DeformationStage(rest, SHORT, FAST, appearance=chosen)
+
+
+def test_its_rate_is_its_own_at_every_level(
+    rest: LoadedCheckpoint, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
+) -> None:
+    seen = []
+
+    class Rates(Callback):
+        def on_train_batch_end(self, trainer: Trainer, *of_batch: object) -> None:
+            groups = trainer.optimizers[0].param_groups
+            seen.append([float(group["lr"]) for group in groups])
+
+    slower = replace(SHORT, rates=(1.0, 0.25), fall=(1.0, 1.0))
+    stage = DeformationStage(rest, slower, FAST, iterations_per_step=1, appearance=LEARNED)
+    trainer(Rates(), max_epochs=1).fit(stage, datamodule=datamodule)
+    first, *_, last = seen
+    assert last[0] == pytest.approx(0.25 * first[0])
+    assert first[1] == last[1] == pytest.approx(0.1)
 
 
 def test_a_level_before_the_first_leaves_colours_alone(
@@ -166,10 +238,12 @@ def test_a_checkpoint_keeps_the_colours(
     [
         ({"side": 1}, "schedule.appearance.side: expected at least 2, not 1"),
         ({"first_level": -1}, "schedule.appearance.first_level: expected at least 0"),
+        ({"factors_if_drifting": {"flow": -1.0}}, "factors_if_drifting.flow: expected at least 0"),
+        ({"first_level_if_steady": -1}, "first_level_if_steady: expected at least 0, not -1"),
         ({"learning_rate": 0.0}, "schedule.appearance.learning_rate: expected more than 0"),
     ],
 )
-def test_wrong_settings_are_told(wrong: dict[str, float], told: str) -> None:
+def test_wrong_settings_are_told(wrong: dict[str, object], told: str) -> None:
     with pytest.raises(DevrfError, match=told):
         AppearanceSettings(**wrong)  # type: ignore[arg-type]
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
@@ -28,24 +28,35 @@ class AppearanceSettings:
         learning_rate: logits a step: how far a value moves at most.
         first_level: the first level that learns it, from 0; the last one where there are fewer.
             The levels before find the motion alone.
+        first_level_if_steady: the same where ``auto`` finds that colours do not drift, so that
+            shading alone changes; None: no level.
+        factors_if_drifting: of the weights of ``loss.deformation``, by the term's name, at the
+            levels that learn it where it is not steady: 1 for terms that are not named.
     """
 
     learn: Literal["never", "always", "auto"] = "never"
     side: int = 64
     learning_rate: float = 0.1
     first_level: int = 1
+    first_level_if_steady: int | None = None
+    factors_if_drifting: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name, least in (("side", 2), ("first_level", 0)):
-            if getattr(self, name) < least:
+        for name, least in (("side", 2), ("first_level", 0), ("first_level_if_steady", 0)):
+            if (given := getattr(self, name)) is not None and given < least:
                 raise DevrfError(
-                    f"schedule.appearance.{name}: expected at least {least}, "
-                    f"not {getattr(self, name)}"
+                    f"schedule.appearance.{name}: expected at least {least}, not {given}"
                 )
         if not self.learning_rate > 0:
             raise DevrfError(
                 f"schedule.appearance.learning_rate: expected more than 0, not {self.learning_rate}"
             )
+        for name, factor in self.factors_if_drifting.items():
+            if factor < 0:
+                raise DevrfError(
+                    f"schedule.appearance.factors_if_drifting.{name}: expected at least 0, "
+                    f"not {factor}"
+                )
 
 
 @dataclass(frozen=True)
@@ -102,7 +113,9 @@ class AppearanceField(FrameField, StoredShape):
         return ColorResidual(grid, self.box)
 
     @torch.no_grad()
-    def copy_previous(self, frames: Sequence[int]) -> None:
-        """Initialise ``frames``, from 1 on, from the frames before them."""
+    def copy_neighbours(self, frames: Sequence[int], *, after: bool = False) -> None:
+        """Initialise ``frames``, from 1 on, from the frames before them, or ``after`` them."""
         for frame in frames:
-            self.values[frame] = self.values[frame - 1]
+            neighbour = frame + (1 if after else -1)
+            if neighbour < len(self.values):
+                self.values[frame] = self.values[neighbour]

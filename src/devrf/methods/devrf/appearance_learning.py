@@ -60,8 +60,8 @@ class AppearanceLearning:
         self._schedule = schedule
         self._smoothing = loss.get("tv", 0.0)
         self._residual = loss.get("residual", 0.0)
-        # The ablation without levels has one.
-        self._first = min(settings.first_level, len(schedule.sides) - 1)
+        self._first = settings.first_level
+        self._drifting = True
 
     @property
     def weights(self) -> dict[str, float]:
@@ -79,36 +79,54 @@ class AppearanceLearning:
             optimizer: gets the group.
             views: the dynamic training views, on the host.
         """
-        if not self._wanted(views):
+        first = self._first_level(views)
+        if first is None:
             return
+        # The ablation without levels has one.
+        self._first = min(first, len(self._schedule.sides) - 1)
         voxels, rate = self.settings.side**3, self.settings.learning_rate
         model.appearance = AppearanceField(model.box, clock, voxels=voxels)
         group = {"params": [], "lr": rate, "base_lr": rate, "name": GROUP}
         optimizer.add_param_group(group)
 
-    def _wanted(self, views: Views) -> bool:
-        """Whether residuals are learned from ``views``."""
-        if self.settings.learn != "auto":
-            return self.settings.learn == "always"
+    def _first_level(self, views: Views) -> int | None:
+        """The level from which residuals are learned from ``views``; None: they are not."""
+        s = self.settings
+        if s.learn != "auto":
+            return s.first_level if s.learn == "always" else None
         drift = color_drift(views)
-        changing = drift is not None and drift >= CHANGING
+        self._drifting = drift is not None and drift >= CHANGING
+        first = s.first_level if self._drifting else s.first_level_if_steady
         said = "cannot be followed" if drift is None else f"drift by {100 * drift:.1f} %"
-        log.info("colours %s: their change is %s", said, "learned" if changing else "not learned")
-        return changing
+        learned = "not learned" if first is None else f"learned from level {first} on"
+        log.info("colours %s: their change is %s", said, learned)
+        return first
 
     def at_level(self, model: DeVRFModel, level: int) -> AppearanceField | None:
         """The residuals, if ``level`` learns them."""
         return model.appearance if level >= self._first else None
 
-    def initialise(self, model: DeVRFModel, phase: DeformationPhase) -> None:
-        """At the first level that learns it, start a frame's from that of the frame before it."""
-        if model.appearance is not None and phase.level == self._first:
-            model.appearance.copy_previous(phase.frames)
+    def weight_factor(self, term: str, level: int) -> float:
+        """Factor of the weight of a loss term at ``level``, of a stage that has been set up."""
+        learning = self.settings.learn != "never" and level >= self._first
+        factors = self.settings.factors_if_drifting if learning and self._drifting else {}
+        return factors.get(term, 1.0)
 
-    def give_parameters(self, optimizer: GridAdam, residuals: Sequence[Tensor]) -> None:
-        """Let the optimiser learn the active frames' ``residuals``, (X, Y, Z, 3) each."""
+    def initialise(self, model: DeVRFModel, phase: DeformationPhase) -> None:
+        """At the first level that learns it, start a frame from the one visited before it."""
+        if model.appearance is not None and phase.level == self._first:
+            model.appearance.copy_neighbours(phase.frames, after=phase.backward)
+
+    def give_parameters(self, optimizer: GridAdam, residuals: Sequence[Tensor], level: int) -> None:
+        """Let the optimiser learn the active frames' ``residuals``, (X, Y, Z, 3) each.
+
+        Within a visit their rate falls as that of the displacements does; from level to level it
+        does not.
+        """
         for number, group in enumerate(optimizer.param_groups):
             if group["name"] == GROUP:
+                factor = self._schedule.learning_rate_factor(level)
+                group["base_lr"] = self.settings.learning_rate / factor
                 longest = max([2, *(max(one.shape) for one in residuals)])
                 weight = total_variation_weight(self._smoothing, longest, self._schedule.rays)
                 optimizer.replace(number, residuals, smoothing=weight)

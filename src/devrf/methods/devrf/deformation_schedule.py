@@ -29,6 +29,7 @@ class DeformationPhase:
         init_from_previous: whether the frame starts from the result of the frame before it.
         has_previous: whether the frames before these have been learned at this level, or are at
             rest.
+        backward: whether the frames after these are visited before them.
     """
 
     level: int
@@ -40,6 +41,7 @@ class DeformationPhase:
     fall: float
     init_from_previous: bool
     has_previous: bool
+    backward: bool = False
 
     @property
     def kind(self) -> str:
@@ -223,4 +225,5 @@ class DeformationSchedule:
             fall=1.0 if self.fall is None else self.fall[level],
             init_from_previous=self.coarse_to_fine and level == 0 and visit > 1,
             has_previous=visit > 0 and not backward,
+            backward=backward,
         )

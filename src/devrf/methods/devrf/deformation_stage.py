@@ -293,7 +293,7 @@ class DeformationStage(VoxelStage):
         learned = [tensor for frame in self.active for tensor in frame.slices]
         self._optimizer.replace(0, learned, smoothing=smoothing)
         residuals = [frame.residual for frame in self.active if frame.residual is not None]
-        self.appearance.give_parameters(self._optimizer, residuals)
+        self.appearance.give_parameters(self._optimizer, residuals, self.phase.level)
         if len(self.active):
             static_shape = self.static_shape(self.scene_model.canonical.density.values)
             parameters = [frame.learned for frame in self.active]
@@ -301,18 +301,28 @@ class DeformationStage(VoxelStage):
 
     def _weigh(self, level: int) -> None:
         """Give each term its weight at ``level``."""
-        factor = self.schedule.weight_factor
-        weights = {name: weight * factor(name, level) for name, weight in self._weights.items()}
+        by = self.schedule.weight_factor, self.appearance.weight_factor
+        weights = {
+            name: weight * math.prod(factor(name, level) for factor in by)
+            for name, weight in self._weights.items()
+        }
         self.losses = replace(self.losses, weights=weights)
 
     def _check_factors(self) -> None:
-        known = {*MOTION_TERMS, "tv"}
-        for name in self.schedule.factors:
-            if name not in known:
-                raise DevrfError(
-                    f"schedule.deformation.factors: {name} is no term of loss.deformation; the "
-                    f"terms are {', '.join(sorted(known))}"
-                )
+        given = {
+            "deformation.factors": (self.schedule.factors, {*MOTION_TERMS, "tv"}),
+            "appearance.factors_if_drifting": (
+                self.appearance.settings.factors_if_drifting,
+                set(MOTION_TERMS),
+            ),
+        }
+        for key, (factors, known) in given.items():
+            for name in factors:
+                if name not in known:
+                    raise DevrfError(
+                        f"schedule.{key}: {name} is no term of loss.deformation; the "
+                        f"terms are {', '.join(sorted(known))}"
+                    )
 
     def _initialise(self, phase: DeformationPhase) -> None:
         """Start each frame from the one before it; along the observed flow, if asked to."""

@@ -23,6 +23,7 @@ DEFORMATION_LOSS = {
     "entropy": 0.01,
     "elastic": 0.0,
     "bending": 0.0,
+    "matte": 0.0,
 }
 APPEARANCE_LOSS = {"residual": 1e-3, "tv": 0.002}
 
