@@ -39,6 +39,7 @@ ABLATIONS = {
     "more_sweeps": "+ two more sweeps",
     "finishing": "+ a finishing level",
     "refinement": "+ refinement",
+    "shading": "+ shading",
     "best": "+ finer field at rest",
 }
 # Config groups and keys that decide what is logged, not what is learned.
