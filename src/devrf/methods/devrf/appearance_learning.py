@@ -61,7 +61,8 @@ class AppearanceLearning:
         self._smoothing = loss.get("tv", 0.0)
         self._residual = loss.get("residual", 0.0)
         self._first = settings.first_level
-        self._drifting = True
+        # Of the weights of loss.deformation, from that level on.
+        self._factors: Mapping[str, float] = {}
 
     @property
     def weights(self) -> dict[str, float]:
@@ -79,9 +80,11 @@ class AppearanceLearning:
             optimizer: gets the group.
             views: the dynamic training views, on the host.
         """
-        first = self._first_level(views)
+        first, drifting = self._decide(views)
         if first is None:
             return
+        if drifting:
+            self._factors = self.settings.factors_if_drifting
         # The ablation without levels has one.
         self._first = min(first, len(self._schedule.sides) - 1)
         voxels, rate = self.settings.side**3, self.settings.learning_rate
@@ -89,18 +92,18 @@ class AppearanceLearning:
         group = {"params": [], "lr": rate, "base_lr": rate, "name": GROUP}
         optimizer.add_param_group(group)
 
-    def _first_level(self, views: Views) -> int | None:
-        """The level from which residuals are learned from ``views``; None: they are not."""
+    def _decide(self, views: Views) -> tuple[int | None, bool]:
+        """From which level residuals are learned, None: never; whether colours are to drift."""
         s = self.settings
         if s.learn != "auto":
-            return s.first_level if s.learn == "always" else None
+            return (s.first_level if s.learn == "always" else None), True
         drift = color_drift(views)
-        self._drifting = drift is not None and drift >= CHANGING
-        first = s.first_level if self._drifting else s.first_level_if_steady
+        drifting = drift is not None and drift >= CHANGING
+        first = s.first_level if drifting else s.first_level_if_steady
         said = "cannot be followed" if drift is None else f"drift by {100 * drift:.1f} %"
         learned = "not learned" if first is None else f"learned from level {first} on"
         log.info("colours %s: their change is %s", said, learned)
-        return first
+        return first, drifting
 
     def at_level(self, model: DeVRFModel, level: int) -> AppearanceField | None:
         """The residuals, if ``level`` learns them."""
@@ -108,9 +111,7 @@ class AppearanceLearning:
 
     def weight_factor(self, term: str, level: int) -> float:
         """Factor of the weight of a loss term at ``level``, of a stage that has been set up."""
-        learning = self.settings.learn != "never" and level >= self._first
-        factors = self.settings.factors_if_drifting if learning and self._drifting else {}
-        return factors.get(term, 1.0)
+        return self._factors.get(term, 1.0) if level >= self._first else 1.0
 
     def initialise(self, model: DeVRFModel, phase: DeformationPhase) -> None:
         """At the first level that learns it, start a frame from the one visited before it."""
