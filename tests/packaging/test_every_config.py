@@ -187,6 +187,7 @@ STEPS = (
     "finishing",
     "refinement",
     "shading",
+    "tracks",
 )
 
 
@@ -200,7 +201,8 @@ STEPS = (
         (STEPS[4], STEPS[5], {"deformation", "motion"}),
         (STEPS[5], STEPS[6], {"refinement"}),
         (STEPS[6], STEPS[7], {"appearance"}),
-        (STEPS[7], "best", {"canonical", "sampling"}),
+        (STEPS[7], STEPS[8], {"deformation", "motion"}),
+        (STEPS[8], "best", {"canonical", "sampling"}),
     ],
 )
 def test_each_row_of_the_quality_table_adds_one_thing(composed, before, after, changed):

@@ -6,7 +6,7 @@
    ``canonical_stage``.
 4. Deformation field: ``deformation_field``, ``grid_warp``, ``deformed_occupancy``.
 5. Deformation stage: ``deformation_schedule``, ``deformation_stage``; beyond the paper
-   ``flow_initialisation`` and ``convergence``.
+   ``flow_tracks``, ``flow_initialisation`` and ``convergence``.
 
 ``settings`` has the defaults of both stages and ``voxel_stage`` what they share; ``model`` and
 ``view`` are the learned scene. Memory and files: ``active_frame``, ``frame_memory``,

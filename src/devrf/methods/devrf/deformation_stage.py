@@ -29,7 +29,8 @@ from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule
 from devrf.methods.devrf.deformed_occupancy import deformed_occupancy
 from devrf.methods.devrf.elastic import occupied_cells
-from devrf.methods.devrf.flow_initialisation import follow, start_from_tracks
+from devrf.methods.devrf.flow_initialisation import start_from_tracks
+from devrf.methods.devrf.flow_tracks import FlowTracks
 from devrf.methods.devrf.frame_memory import rest_on_host
 from devrf.methods.devrf.losses import (
     FLOW_TERMS,
@@ -137,6 +138,7 @@ class DeformationStage(VoxelStage):
         self.active = ActiveFrames(self)
         self._late = LateReading()
         self._previous_images: Tensor | None = None
+        self._tracks: FlowTracks | None = None
         # The cells of the motion grid that hold matter at rest; None where no loss asks.
         self._matter: Tensor | None = None
 
@@ -223,7 +225,7 @@ class DeformationStage(VoxelStage):
         """No loss for a moving camera's flow (docs/method.md#flow-of-a-moving-camera)."""
         if self.scene.dynamic.train.flow is None or self._follows_flow:
             return
-        if self.motion.start == "flow" or self._weights.get("flow"):
+        if self.motion.start != "previous" or self._weights.get("flow"):
             log.info(
                 "the camera moves, and so does all that it sees: frames start where the ones "
                 "before them ended, and the flow loss is left out"
@@ -241,6 +243,7 @@ class DeformationStage(VoxelStage):
             return
         if isinstance(previous, DeformationPhase) and previous.level != phase.level:
             self._allocate(0)
+            self._tracks = None
             self.field.resize(phase.side**3)
         self._initialise(phase)
         carried = self.motion.moments == "carried" and phase.level > 0
@@ -331,16 +334,16 @@ class DeformationStage(VoxelStage):
             if phase.init_from_previous:
                 self.field.frames.copy_previous(number)
             if self._starts_along_flow(phase):
-                views, model, clock = self.views, self.scene_model, self.field.clock
-                pool, before = all_pixels(views, images_of(views, number)), clock.times[number - 1]
-                tracks = follow(model, views, pool, self.previous_images, before, self.generator)
+                views, model = self.views, self.scene_model
+                pool, learned = all_pixels(views, images_of(views, number)), phase.frames[0]
+                tracks = self.tracks.follow(number, pool, self.generator, learned=learned)
                 seen = tracks, views.cameras, model.space
                 start_from_tracks(self.field, number, *seen, capturer=self.loop.capturer())
                 # Each process has followed pixels of its own.
                 broadcast([self.field.to_canonical[number], self.field.to_time[number]])
 
     def _starts_along_flow(self, phase: DeformationPhase) -> bool:
-        asked = self.motion.start == "flow" and self._follows_flow
+        asked = self.motion.start != "previous" and self._follows_flow
         return asked and phase.level == 0 and phase.has_previous
 
     def _prefetch_after(self, phase: DeformationPhase) -> None:
@@ -370,6 +373,14 @@ class DeformationStage(VoxelStage):
             self.capture, self.device
         )
         return views
+
+    @property
+    def tracks(self) -> FlowTracks:
+        """Follows the training views' pixels back, at the coarsest level."""
+        if self._tracks is None:
+            seen = self.scene_model, self.views, self.previous_images
+            self._tracks = FlowTracks(*seen, by_color=self.motion.start == "tracks")
+        return self._tracks
 
     @property
     def previous_images(self) -> Tensor:

@@ -1,94 +1,21 @@
-"""Starts a frame from the frame before it, moved along the observed optical flow.
+"""Starts a frame from the frame before it, moved to where its tracks lead.
 
-See docs/method.md#flow-initialisation: :func:`follow` is its step 1, :func:`start_from_tracks` are
-steps 2 and 3.
+Steps 2 and 3 of docs/method.md#flow-initialisation; step 1 is ``flow_tracks``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from devrf.data.batch import PixelPool
-from devrf.engine.gathering import gather_batch
 from devrf.engine.graphs import CudaGraphCapture, GraphedStep
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.space import WORLD, Space
 from devrf.methods.devrf.deformation_field import DeformationField
-from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.volume_rendering import render
-from devrf.ops.compositing import sum_by_ray
+from devrf.methods.devrf.flow_tracks import Tracks
 from devrf.ops.trilinear import interpolate
-from devrf.scenes.scene import Views
-
-
-@dataclass(frozen=True)
-class Tracks:
-    """N canonical points that were seen one frame earlier, and where they are seen now.
-
-    Attributes:
-        canonical: (N, 3) the points q.
-        camera: (N,) int64, the camera that sees each point now.
-        pixel: (N, 2) x, y of the point in its image, in pixels.
-    """
-
-    canonical: Tensor
-    camera: Tensor
-    pixel: Tensor
-
-    def __len__(self) -> int:
-        return self.canonical.shape[0]
-
-    def __getitem__(self, mask: Tensor) -> Tracks:
-        """The tracks where ``mask`` (N,) is True."""
-        return Tracks(self.canonical[mask], self.camera[mask], self.pixel[mask])
-
-
-@torch.no_grad()
-def follow(
-    model: DeVRFModel,
-    views: Views,
-    pool: PixelPool,
-    previous: Tensor,
-    time_before: float,
-    generator: torch.Generator,
-    most: int = 4096,
-) -> Tracks:
-    """Tracks Σ w_i q_i / Σ w_i from the frame before to the present one.
-
-    Args:
-        model: the scene, with the frame before learned.
-        views: the dynamic training views; their flow must be known.
-        pool: pixels of the present frame's images.
-        previous: (N,) int64, for each image the one that its flow leads to.
-        time_before: the time of the frame before.
-        generator: of the random choice, on the pool's device.
-        most: tracks at most, chosen at random.
-    """
-    assert views.flow is not None
-    area = views.height * views.width
-    valid = views.flow.valid.flatten()[pool.image.long() * area + pool.flat.long()]
-    kept = valid.nonzero()[:, 0]
-    kept = kept[torch.randperm(len(kept), device=kept.device, generator=generator)[:most]]
-    image, flat = pool.image[kept].long(), pool.flat[kept].long()
-    now = gather_batch(views, image, flat, torch.ones(3, device=image.device))
-    assert now.flow is not None
-    rays = model.space.rays(views.cameras.rays(previous[image], now.pixel + now.flow))
-    seen = render(
-        rays,
-        model.canonical,
-        model.occupancy_at(time_before),
-        model.settings,
-        torch.ones(3, device=image.device),
-        model.warp(time_before),
-    )
-    point = sum_by_ray(seen.weight[:, None] * seen.canonical, seen.samples.ray, len(rays))
-    mass = sum_by_ray(seen.weight, seen.samples.ray, len(rays))
-    met = (mass > 0.5).nonzero()[:, 0]
-    return Tracks(point[met] / mass[met, None], image[met], now.pixel[met])
 
 
 def start_from_tracks(

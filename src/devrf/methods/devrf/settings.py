@@ -97,7 +97,8 @@ class MotionSettings:
         occupancy_every: iterations between updates of the frame's occupancy.
         start: where a frame starts from at the coarsest level: ``previous`` is the result of
             the frame before it; ``flow`` moves that along the observed optical flow, if there is
-            any and no camera has moved (docs/method.md#flow-initialisation).
+            any and no camera has moved; ``tracks`` follows the flow back to a frame in which the
+            model shows each pixel's colour (docs/method.md#flow-initialisation).
         store: where the displacements of all frames are kept while one is learned: ``device``,
             ``host``, or ``auto``: on the device if they fit there beside all else. Each of
             several processes keeps them on its device.
@@ -115,7 +116,7 @@ class MotionSettings:
     views: Literal["one", "all"] = "one"
     pixels: Literal["all", "occupied"] = "all"
     occupancy_every: int = 25
-    start: Literal["previous", "flow"] = "previous"
+    start: Literal["previous", "flow", "tracks"] = "previous"
     moments: Literal["fresh", "carried"] = "fresh"
     store: Literal["auto", "device", "host"] = "auto"
     store_half: bool | Literal["auto"] = "auto"
