@@ -49,9 +49,14 @@ SEARCHING = CanonicalSchedule(
 )
 # Three frames. Level 0: frame 1 in 0–11, frame 2 in 12–17; level 1: 18–25 and 26–29.
 MOVING = DeformationSchedule(sides=(4, 6), iterations_per_frame=(6, 4), rays=64)
-# The occupancy is looked up anew in iterations 3, 6, 9 of a visit; frames start along the flow.
-ALONG_FLOW = MotionSettings(
-    learning_rate=2e-3, unit="box", views="all", pixels="occupied", occupancy_every=3, start="flow"
+# The occupancy is looked up anew in iterations 3, 6, 9 of a visit; frames start along tracks.
+ALONG_TRACKS = MotionSettings(
+    learning_rate=2e-3,
+    unit="box",
+    views="all",
+    pixels="occupied",
+    occupancy_every=3,
+    start="tracks",
 )
 # Four frames. Level 0 in 0–15; level 1: frame 2 in 16–21, frames 1 and 3 in 22–27.
 TOGETHER = DeformationSchedule(
@@ -157,7 +162,7 @@ def test_the_canonical_stage_goes_on_exactly(learn) -> None:
 
 
 @pytest.mark.parametrize(
-    "motion", [ALONG_FLOW, BY_TURNS, ROUNDED], ids=["all views", "by turns", "in half precision"]
+    "motion", [ALONG_TRACKS, BY_TURNS, ROUNDED], ids=["all views", "by turns", "in half precision"]
 )
 def test_the_deformation_stage_goes_on_exactly(
     learn, rest: LoadedCheckpoint, motion: MotionSettings
@@ -174,7 +179,7 @@ def test_the_deformation_stage_goes_on_exactly(
     ("motion", "leaves"),
     [
         # Around each visit of level 1, and mid-visit.
-        (ALONG_FLOW, (15, 16, 17, 21, 22, 23, 24, 26, 27)),
+        (ALONG_TRACKS, (15, 16, 17, 21, 22, 23, 24, 26, 27)),
         # A visit ends after three steps, as their losses tell.
         (replace(ROUNDED, min_rel_improvement=1.0), (14, 16, 17, 18, 22, 23, 24)),
     ],
@@ -217,7 +222,7 @@ def test_the_refinement_goes_on_exactly(learn, rest: LoadedCheckpoint) -> None:
         return DeformationStage(
             copy.deepcopy(rest),
             MOVING,
-            ALONG_FLOW,
+            ALONG_TRACKS,
             iterations_per_step=1,
             appearance=AppearanceSettings(learn="always", side=5),
             refinement=RefinementSettings(iterations=6),
@@ -244,7 +249,7 @@ def test_a_second_sweep_with_the_elastic_prior_goes_on_exactly(
 
 def test_a_step_of_many_iterations_goes_on_exactly(learn, rest: LoadedCheckpoint) -> None:
     def build() -> ScheduledStage:
-        return DeformationStage(copy.deepcopy(rest), MOVING, ALONG_FLOW, iterations_per_step=4)
+        return DeformationStage(copy.deepcopy(rest), MOVING, ALONG_TRACKS, iterations_per_step=4)
 
     assert_same(learn(build, 4, 12, 16, 22, 26), learn(build))
 

@@ -109,6 +109,8 @@ class FlowTracks:
             right = (mass > 0.5) & (unlike < self.likeness)
             found.append((waiting[right], point[right]))
             waiting, here, place = waiting[~right], here[~right], place[~right]
+            if len(waiting) == 0:
+                break
         index, points = (torch.cat(column) for column in zip(*found, strict=True))
         return Tracks(points, now.image[index], now.pixel[index])
 
