@@ -202,14 +202,15 @@ STEPS = (
         (STEPS[5], STEPS[6], {"refinement"}),
         (STEPS[6], STEPS[7], {"appearance"}),
         (STEPS[7], STEPS[8], {"deformation", "motion"}),
-        (STEPS[8], "best", {"canonical", "sampling"}),
+        (STEPS[8], "best", {"canonical", "sampling", "field"}),
     ],
 )
 def test_each_row_of_the_quality_table_adds_one_thing(composed, before, after, changed):
     found = {}
     for row in (before, after):
         config = composed("experiment=quickstart", f"ablation={row}")
-        found[row] = {**config.schedule, "loss": config.loss, "sampling": config.sampling}
+        beside = {part: config[part] for part in ("loss", "sampling", "field")}
+        found[row] = {**config.schedule, **beside}
     assert {key for key in found[before] if found[before][key] != found[after][key]} == changed
 
 
