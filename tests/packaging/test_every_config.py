@@ -202,7 +202,11 @@ STEPS = (
         (STEPS[5], STEPS[6], {"refinement"}),
         (STEPS[6], STEPS[7], {"appearance"}),
         (STEPS[7], STEPS[8], {"deformation", "motion"}),
-        (STEPS[8], "best", {"canonical", "rates", "loss", "sampling", "field"}),
+        (
+            STEPS[8],
+            "best",
+            {"canonical", "rates", "deformation", "refinement", "loss", "sampling", "field"},
+        ),
     ],
 )
 def test_each_row_of_the_quality_table_adds_one_thing(composed, before, after, changed):
