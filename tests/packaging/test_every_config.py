@@ -19,6 +19,7 @@ from devrf.errors import DevrfError
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
+from devrf.reporting.labels import ABLATIONS
 from devrf.scenes.fetch.catalogue import catalogue
 
 GROUPS = sorted({path.name for path in config_folder().iterdir() if path.is_dir()} - {"hydra"})
@@ -176,6 +177,7 @@ def test_every_ablation_is_in_a_table_of_both_embedded_scenes(composed):
         assert scenes in hydra.sweeper.params.items()
         rows += hydra.sweeper.params["ablation"].split(",")
     assert sorted(rows) == sorted(path.stem for path in (config_folder() / "ablation").glob("*"))
+    assert rows == list(ABLATIONS)  # a report has a name for each, in this order
 
 
 STEPS = (

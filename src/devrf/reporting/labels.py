@@ -40,6 +40,7 @@ ABLATIONS = {
     "finishing": "+ a finishing level",
     "refinement": "+ refinement",
     "shading": "+ shading",
+    "tracks": "+ start along tracks",
     "best": "+ finer field at rest",
 }
 # Config groups and keys that decide what is logged, not what is learned.

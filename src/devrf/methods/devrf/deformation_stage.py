@@ -335,7 +335,9 @@ class DeformationStage(VoxelStage):
                 self.field.frames.copy_previous(number)
             if self._starts_along_flow(phase):
                 views, model = self.views, self.scene_model
-                pool, learned = all_pixels(views, images_of(views, number)), phase.frames[0]
+                pool = all_pixels(views, images_of(views, number))
+                # A visit's first frame has its number: the visits before have learned as many.
+                learned = phase.frames[0]
                 tracks = self.tracks.follow(number, pool, self.generator, learned=learned)
                 seen = tracks, views.cameras, model.space
                 start_from_tracks(self.field, number, *seen, capturer=self.loop.capturer())

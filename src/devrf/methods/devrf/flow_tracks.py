@@ -27,7 +27,7 @@ FARTHEST = 16
 
 @dataclass(frozen=True)
 class Tracks:
-    """N canonical points that were seen one frame earlier, and where they are seen now.
+    """N canonical points that were seen in an earlier frame, and where they are seen now.
 
     Attributes:
         canonical: (N, 3) the points q.
