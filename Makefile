@@ -1,6 +1,7 @@
 # make quickstart   install into .venv and learn the embedded scene: nothing else to set up
 # make test         install with the development tools, then lint, types, architecture, tests
 # make docs         build the documentation into site/; needs no network once installed
+# make house        lines and files of each folder, the longest files, circles of imports
 # make gpu-check    install into .venv and check what this machine's GPU does, in minutes
 # make fuzz         what is too long for make test: the readers' fuzz tests with 100 000 inputs
 #                   (make test has 1000), every launch of the kernels compiled for two GPUs
@@ -19,7 +20,7 @@ INSTALL := $(BIN)/python -m pip install --disable-pip-version-check \
 PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist worksteal \
 	--durations 15
 
-.PHONY: quickstart test docs gpu-check fuzz format shell clean
+.PHONY: quickstart test docs house gpu-check fuzz format shell clean
 
 quickstart: $(VENV)/.installed
 	$(BIN)/python -m devrf experiment=quickstart
@@ -39,6 +40,9 @@ test: $(VENV)/.installed-dev
 docs: $(VENV)/.installed-dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 	@echo "The documentation: site/index.html"
+
+house: $(VENV)/.installed-dev
+	$(BIN)/python benchmarks/house.py
 
 gpu-check: $(VENV)/.installed
 	$(BIN)/python -m devrf stage=selfcheck
