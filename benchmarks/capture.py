@@ -26,7 +26,7 @@ import torch
 from filming import SCENES, Filmed
 from torch import Tensor
 
-from devrf.capture.pipeline import scene_from_footage
+from devrf.apps.capture.pipeline import scene_from_footage
 from devrf.cli.steps import run_stage
 from devrf.system.files import write_json
 

@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from devrf.artifacts.video_file import write_pictures
-from devrf.capture.settings import CaptureSettings
+from devrf.apps.capture.settings import CaptureSettings
+from devrf.apps.video_file import write_pictures
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.procedural.builder import ProceduralScene
 from devrf.scenes.procedural.filming import Filming

@@ -37,7 +37,7 @@ from hydra.plugins.config_source import ConfigResult, ConfigSource
 from hypothesis import settings
 from lightning import Callback, Trainer
 
-from devrf.artifacts.video_file import write_pictures
+from devrf.apps.video_file import write_pictures
 from devrf.callbacks import GridUpscaling, LearningRateDecay
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.cli.config import config_folder

@@ -6,10 +6,10 @@ import time
 
 import pytest
 
+from devrf.apps.viewer.drawing import Drawing
+from devrf.apps.viewer.poses import Pose
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
-from devrf.viewer.drawing import Drawing
-from devrf.viewer.poses import Pose
 
 pytest.importorskip("viser", reason="the viewer's extra is not installed")
 
@@ -28,7 +28,7 @@ class Page:
         pass
 
     def step(self, timeout: float) -> bool:
-        from devrf.viewer.drawing import Shot
+        from devrf.apps.viewer.drawing import Shot
 
         *_, picture = self.drawing.draw(Shot(self.pose, 0.0), 12)
         self.pictures.append(picture.pixels.float().std().item())

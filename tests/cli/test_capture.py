@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 def test_a_mistake_is_one_line_and_leaves_nothing(devrf, tmp_path, monkeypatch):
-    monkeypatch.setattr("devrf.capture.pipeline.check_library", lambda: None)
+    monkeypatch.setattr("devrf.apps.capture.pipeline.check_library", lambda: None)
     outcome = devrf("stage=capture", "capture.static=my walk (1).mp4", "capture.into=scene")
     expected = "devrf: my walk (1).mp4: no such video; correct capture.static or capture.views\n"
     assert (outcome.status, outcome.err) == (2, expected)

@@ -19,12 +19,12 @@ import torch
 import trimesh
 
 import devrf as package
-from devrf.artifacts.keyframes import CameraPath, Keyframe
-from devrf.artifacts.path_files import write_path
+from devrf.apps.keyframes import CameraPath, Keyframe
+from devrf.apps.path_files import write_path
+from devrf.apps.viewer.drawing import Drawing, Shot
+from devrf.apps.viewer.poses import Pose
 from devrf.checkpoints.checkpoint import load_checkpoint
 from devrf.rendering.renderer import Renderer
-from devrf.viewer.drawing import Drawing, Shot
-from devrf.viewer.poses import Pose
 
 
 @pytest.fixture
@@ -124,8 +124,8 @@ def test_the_viewer_is_not_loaded_without_being_asked_for():
             if module not in seen and file.is_file():
                 waiting += imported(file)
         seen.add(module)
-    assert "devrf.viewer.settings" in seen and "devrf.cli.view" in seen
-    assert "viser" not in seen and "devrf.viewer.session" not in seen
+    assert "devrf.apps.viewer.settings" in seen and "devrf.cli.view" in seen
+    assert "viser" not in seen and "devrf.apps.viewer.session" not in seen
 
 
 def test_a_run_learns_the_same_with_the_viewer_beside(devrf, tmp_path, tiny, viser, port):

@@ -10,6 +10,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.utils import get_class, instantiate
 from omegaconf import OmegaConf
 
+from devrf.apps.report.labels import ABLATIONS
 from devrf.cli.config import config_folder
 from devrf.cli.config_check import check_config
 from devrf.cli.context import RunContext
@@ -19,7 +20,6 @@ from devrf.errors import DevrfError
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
-from devrf.reporting.labels import ABLATIONS
 from devrf.scenes.fetch.catalogue import catalogue
 
 GROUPS = sorted({path.name for path in config_folder().iterdir() if path.is_dir()} - {"hydra"})

@@ -84,7 +84,7 @@ def test_the_wheel_has_code_configs_plugin_and_licence(wheel):
     configs = {p.relative_to(config_folder()) for p in config_folder().rglob("*.yaml")}
     assert {f"devrf/conf/{path.as_posix()}" for path in configs} <= names
     assert "devrf/__main__.py" in names and "devrf/py.typed" in names
-    assert "devrf/reporting/published.toml" in names
+    assert "devrf/apps/report/published.toml" in names
     assert "hydra_plugins/devrf_searchpath/__init__.py" in names
     # Other packages share the namespace.
     assert "hydra_plugins/__init__.py" not in names

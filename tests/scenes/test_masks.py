@@ -14,9 +14,9 @@ import pytest
 import torch
 from PIL import Image
 
-from devrf.artifacts.inspection.image_advice import image_advice
-from devrf.artifacts.inspection.picture import shown
-from devrf.artifacts.inspection.report import inspect_scene
+from devrf.apps.inspection.image_advice import image_advice
+from devrf.apps.inspection.picture import shown
+from devrf.apps.inspection.report import inspect_scene
 from devrf.data.batch import all_pixels
 from devrf.data.flow_source import with_flow
 from devrf.data.nerfstudio import NerfstudioDataModule

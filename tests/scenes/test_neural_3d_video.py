@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from devrf.artifacts.video_file import write_pictures
+from devrf.apps.video_file import write_pictures
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.neural_3d_video import Neural3DVideoReader
 

@@ -10,7 +10,7 @@ from types import ModuleType
 
 import pytest
 
-from devrf.artifacts.records import peak_host_memory
+from devrf.apps.records import peak_host_memory
 from devrf.system.process import forget_peak_memory, importing, tune_for_cpu
 
 

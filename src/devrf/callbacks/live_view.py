@@ -8,11 +8,11 @@ from typing import Any
 
 from lightning import Callback, LightningModule, Trainer
 
+from devrf.apps.viewer.drawing import Drawing
+from devrf.apps.viewer.session import Session
 from devrf.engine.stage import ScheduledStage
 from devrf.evaluation.held_out import background_value
 from devrf.rendering.renderer import Renderer
-from devrf.viewer.drawing import Drawing
-from devrf.viewer.session import Session
 
 log = logging.getLogger(__name__)
 

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from lightning import Callback, LightningModule, Trainer
 
-from devrf.artifacts.records import peak_host_memory
+from devrf.apps.records import peak_host_memory
 from devrf.callbacks.training_curve import batch_psnr
 from devrf.engine.stage import ScheduledStage
 

@@ -7,8 +7,8 @@ from typing import Any
 
 from lightning import Callback, LightningModule, Trainer
 
-from devrf.artifacts.preview import preview
-from devrf.artifacts.tracking import trackers
+from devrf.apps.preview import preview
+from devrf.apps.tracking import trackers
 from devrf.engine.stage import ScheduledStage
 
 

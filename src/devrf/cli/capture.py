@@ -8,8 +8,8 @@ import shlex
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from devrf.capture.pipeline import scene_from_footage
-from devrf.capture.settings import CaptureSettings
+from devrf.apps.capture.pipeline import scene_from_footage
+from devrf.apps.capture.settings import CaptureSettings
 from devrf.cli.config import config_folder
 from devrf.cli.context import RunContext
 from devrf.cli.inspect_scene import inspect

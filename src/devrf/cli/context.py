@@ -15,7 +15,7 @@ from lightning import Trainer
 from lightning.pytorch.strategies import Strategy
 from omegaconf import DictConfig, OmegaConf
 
-from devrf.artifacts.tracking import Tracker, trackers
+from devrf.apps.tracking import Tracker, trackers
 from devrf.checkpoints.checkpoint import LoadedCheckpoint, load_checkpoint
 from devrf.checkpoints.checkpoint_file import digest_of
 from devrf.checkpoints.viewpoints import Viewpoints
@@ -28,7 +28,7 @@ from devrf.methods.protocol import Protocol
 from devrf.scenes.scene import Scene
 
 if TYPE_CHECKING:
-    from devrf.viewer.session import Session
+    from devrf.apps.viewer.session import Session
 
 log = logging.getLogger(__name__)
 
@@ -137,7 +137,7 @@ class RunContext:
     @cached_property
     def page(self) -> Session:
         """The page that shows the scene while it is learned; opened when first used."""
-        from devrf.viewer.session import Session  # an extra
+        from devrf.apps.viewer.session import Session  # an extra
 
         settings = instantiate(self.config.viewer)
         session = Session(settings, Viewpoints.of(self.scene), self.scene, self.folder)

@@ -6,8 +6,8 @@ import logging
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from devrf.artifacts.contact_sheet import write_contact_sheet
-from devrf.artifacts.records import (
+from devrf.apps.contact_sheet import write_contact_sheet
+from devrf.apps.records import (
     dynamic_scores,
     frame_rows,
     in_words,

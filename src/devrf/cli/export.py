@@ -9,14 +9,14 @@ from pathlib import Path
 import torch
 from hydra.utils import instantiate
 
-from devrf.artifacts.export.frame import UpFrame
-from devrf.artifacts.export.gltf import write_gltf
-from devrf.artifacts.export.moving_mesh import ForwardMap, MovingMesh, carried
-from devrf.artifacts.export.points import PointCloud, seen_points
-from devrf.artifacts.export.sequence import mesh_files, point_files, write_sequence
-from devrf.artifacts.export.settings import ExportSettings
-from devrf.artifacts.export.surface import canonical_surface
-from devrf.artifacts.export.usd import write_usd
+from devrf.apps.export.frame import UpFrame
+from devrf.apps.export.gltf import write_gltf
+from devrf.apps.export.moving_mesh import ForwardMap, MovingMesh, carried
+from devrf.apps.export.points import PointCloud, seen_points
+from devrf.apps.export.sequence import mesh_files, point_files, write_sequence
+from devrf.apps.export.settings import ExportSettings
+from devrf.apps.export.surface import canonical_surface
+from devrf.apps.export.usd import write_usd
 from devrf.cli.context import RunContext
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value

@@ -7,8 +7,8 @@ import logging
 from rich.console import Console
 from rich.filesize import decimal
 
-from devrf.artifacts.inspection.report import inspect_scene
-from devrf.artifacts.inspection.text import as_text, inspection_text
+from devrf.apps.inspection.report import inspect_scene
+from devrf.apps.inspection.text import as_text, inspection_text
 from devrf.cli.context import RunContext
 from devrf.cli.preflight import requirements
 from devrf.errors import DevrfError
@@ -34,7 +34,7 @@ def prepare(run: RunContext) -> None:
 def inspect(run: RunContext) -> None:
     """Report and draw what the scene holds and what may be wrong with it."""
     # Only this step draws with matplotlib.
-    from devrf.artifacts.inspection.picture import write_inspection_picture
+    from devrf.apps.inspection.picture import write_inspection_picture
 
     needs = [(name, decimal(size)) for name, size in requirements(run).rows()]
     report = inspection_text(inspect_scene(run.scene), needs)

@@ -11,7 +11,7 @@ from pathlib import Path
 from hydra.utils import instantiate
 from torch import Tensor
 
-from devrf.artifacts.camera_paths import (
+from devrf.apps.camera_paths import (
     bullet_time,
     focus_distance,
     held_out_images,
@@ -19,10 +19,10 @@ from devrf.artifacts.camera_paths import (
     spiral,
     time_freeze,
 )
-from devrf.artifacts.film import FilmSettings, held_out_pictures, orbit_pictures, write_video
-from devrf.artifacts.keyframes import cameras_of
-from devrf.artifacts.path_files import read_path
-from devrf.artifacts.still import still
+from devrf.apps.film import FilmSettings, held_out_pictures, orbit_pictures, write_video
+from devrf.apps.keyframes import cameras_of
+from devrf.apps.path_files import read_path
+from devrf.apps.still import still
 from devrf.cli.context import RunContext
 from devrf.evaluation.held_out import background_value
 from devrf.geometry.cameras import Cameras

@@ -14,7 +14,7 @@ log = logging.getLogger(__name__)
 def report(run: RunContext) -> None:
     """Write tables and plots of the runs below ``report.runs``; needs no scene."""
     # Slow to import: pandas and matplotlib.
-    from devrf.reporting.write import write_report
+    from devrf.apps.report.write import write_report
 
     written = write_report(instantiate(run.config.report))
     log.info("%s", written.text)

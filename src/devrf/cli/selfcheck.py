@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from hydra.utils import instantiate
 
-from devrf.artifacts.records import provenance
+from devrf.apps.records import provenance
 from devrf.cli import job
 from devrf.cli.context import RunContext
 from devrf.engine.ddp import ManualDDP

@@ -16,6 +16,7 @@ from hydra.utils import instantiate
 from lightning import seed_everything
 from omegaconf import DictConfig
 
+from devrf.apps.viewer.settings import ViewerSettings
 from devrf.cli import job
 from devrf.cli.capture import capture
 from devrf.cli.closing import say_what_next
@@ -43,7 +44,6 @@ from devrf.methods.devrf.appearance_learning import check_weights
 from devrf.methods.devrf.losses import MOTION_TERMS, PHOTOMETRIC_TERMS
 from devrf.methods.devrf.weighted_loss import WeightedLoss
 from devrf.ops.dispatch import using
-from devrf.viewer.settings import ViewerSettings
 
 log = logging.getLogger(__name__)
 

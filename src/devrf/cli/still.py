@@ -8,8 +8,8 @@ from pathlib import Path
 
 from hydra.utils import instantiate
 
-from devrf.artifacts.images import write_image
-from devrf.artifacts.still import StillSettings, still
+from devrf.apps.images import write_image
+from devrf.apps.still import StillSettings, still
 from devrf.checkpoints.checkpoint import CheckpointMetadata
 from devrf.checkpoints.viewpoints import Viewpoints
 from devrf.cli.context import RunContext

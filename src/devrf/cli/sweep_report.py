@@ -17,7 +17,7 @@ class SweepReport(Callback):
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Write the report into the sweep's folder and print it; nothing if no job was scored."""
         # Hydra imports this module with every command; pandas and matplotlib are slow to import.
-        from devrf.reporting.write import write_report
+        from devrf.apps.report.write import write_report
 
         try:
             written = write_report(instantiate(config.report, runs=config.hydra.sweep.dir))

@@ -10,7 +10,7 @@ from hydra.utils import instantiate
 from lightning import Trainer
 from omegaconf import OmegaConf
 
-from devrf.artifacts.records import in_words
+from devrf.apps.records import in_words
 from devrf.callbacks import PeriodicCheckpoint, StopOnSignal, TrainingRecord
 from devrf.callbacks.csv_logger import ResumableCSVLogger
 from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, save_checkpoint

@@ -8,6 +8,7 @@ from threading import Event
 
 from hydra.utils import instantiate
 
+from devrf.apps.viewer.settings import ViewerSettings
 from devrf.checkpoints.checkpoint import check_scene
 from devrf.checkpoints.viewpoints import Viewpoints
 from devrf.cli.context import RunContext
@@ -16,7 +17,6 @@ from devrf.evaluation.held_out import background_value
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene
 from devrf.system.signals import handle_signals
-from devrf.viewer.settings import ViewerSettings
 
 log = logging.getLogger(__name__)
 
@@ -26,8 +26,8 @@ CACHED = 6
 
 def view(run: RunContext) -> None:
     """Show the run's checkpoint on a page until a signal arrives."""
-    from devrf.viewer.drawing import Drawing
-    from devrf.viewer.session import Session  # an extra
+    from devrf.apps.viewer.drawing import Drawing
+    from devrf.apps.viewer.session import Session  # an extra
 
     settings: ViewerSettings = instantiate(run.config.viewer)
     stored = run.load(unread=True)

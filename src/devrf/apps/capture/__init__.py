@@ -1,0 +1,28 @@
+"""Raw footage becomes a scene: what ``stage=capture`` does, one step a module.
+
+    footage     a video, or a folder of photographs, frame by frame with times in seconds
+       │
+    survey      how sharp each frame is, and how much moves from one frame to the next
+       ├──────────────► picking     the sharpest frame of each stretch of the static video
+       └──────────────► alignment   what the fixed videos' clocks differ by; the moments, and
+       │                            each video's frame that is nearest to each moment
+    frames      these frames as image files of one size
+       │
+    structure   structure from motion over the picked frames and the first frame of each fixed
+       │        video (the scene is at rest in all of them): cameras, lenses, sparse points
+    normalisation   origin, axes and unit; from which side the cameras look; near, far and box
+       │
+    writing     ``transforms.json`` with a ``time`` on each frame, and the lists of held-out images
+
+``footage`` and ``normalisation`` are in :mod:`devrf.scenes`, whose readers use them, too.
+``scene_from_footage`` in :mod:`devrf.apps.capture.pipeline` leads through them. Optical flow is
+estimated when the scene is read, as of any other scene (:mod:`devrf.scenes.optical_flow`).
+
+What a step has found is kept in ``<into>/capture`` together with what it was found from
+(:mod:`devrf.apps.capture.kept`): the same command again goes on behind the last step that
+still holds. ``transforms.json`` is written last: a folder with it is whole.
+
+World: OpenGL axes. Cameras that face the scene from one side get the world of their average pose
+(x right, y up, −z ahead), in which the nearest point is at 1/0.75; cameras around the scene one in
+which z points up, the middle of what they look at is the origin, and their median distance is 4.
+"""

@@ -1,0 +1,185 @@
+"""Videos aligned in time: what their clocks differ by, and which frames show one moment."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from devrf.apps.capture.survey import Survey
+from devrf.errors import DevrfError
+
+log = logging.getLogger(__name__)
+
+# Signals are compared in steps of a quarter of a frame, in windows of at least half the shorter.
+STEPS_A_FRAME = 4
+LEAST_OVERLAP = 0.5
+# Correlation of two views of one motion is above this; of unrelated motion it is rarely.
+SURE = 0.5
+
+_BY_HAND = (
+    "give capture.offsets=[0, seconds that each further video began after the first, ...], or "
+    "clap once in sight of all cameras"
+)
+
+Signal = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """Moments that all fixed views show.
+
+    Attributes:
+        offsets: V seconds that each video began after the first.
+        times: T times in [0, 1], ascending, the first 0 and the last 1.
+        positions: V tuples of T positions, the frame of each video nearest to each moment.
+    """
+
+    offsets: tuple[float, ...]
+    times: tuple[float, ...]
+    positions: tuple[tuple[int, ...], ...]
+
+    def plain(self) -> dict[str, Any]:
+        """As JSON can hold it."""
+        return asdict(self)
+
+    @staticmethod
+    def of(plain: dict[str, Any]) -> Timeline:
+        """What :meth:`plain` made."""
+        positions = tuple(map(tuple, plain["positions"]))
+        return Timeline(tuple(plain["offsets"]), tuple(plain["times"]), positions)
+
+
+def timeline(
+    paths: Sequence[Path],
+    surveys: Sequence[Survey],
+    moments: int,
+    offsets: Sequence[float] | None = None,
+) -> Timeline:
+    """Align the videos of the fixed views.
+
+    The moments are frames of the video with the lowest rate, every n-th where that has more of
+    them than ``moments``; of the others the nearest frames are taken.
+
+    Args:
+        paths: V videos, for messages.
+        surveys: what they show.
+        moments: at most so many.
+        offsets: V seconds that each began after the first; None: found from the motion.
+
+    Raises:
+        DevrfError: the offsets cannot be found, or the videos have too little time in common.
+    """
+    begun = list(map(float, offsets)) if offsets is not None else offsets_found(paths, surveys)
+    shown = [
+        (begin + one.times[0], begin + one.times[-1])
+        for begin, one in zip(begun, surveys, strict=True)
+    ]
+    start, end = max(first for first, _ in shown), min(last for _, last in shown)
+    shortest = min(last - first for first, last in shown)
+    longest = max(last - first for first, last in shown)
+    if end - start < LEAST_OVERLAP * shortest:
+        late = paths[int(np.argmax([first for first, _ in shown]))]
+        raise DevrfError(
+            f"{late}: all {len(paths)} videos together show {max(end - start, 0):.2f} s, of "
+            f"{shortest:.2f} to {longest:.2f} s each; cut them to the same part, or correct "
+            "capture.offsets"
+        )
+    if end - start < 0.95 * longest:
+        log.info(
+            "videos of different lengths: %.2f to %.2f s; the %.2f s that all show are used",
+            *(shortest, longest, end - start),
+        )
+    slowest = int(np.argmin([one.rate for one in surveys]))
+    slack = 0.5 / surveys[slowest].rate
+    clock = np.array(surveys[slowest].times) + begun[slowest]
+    usable = np.flatnonzero((clock >= start - slack) & (clock <= end + slack))
+    usable = usable[:: -(-len(usable) // moments)]
+    if len(usable) < 2:
+        raise DevrfError(
+            f"{paths[slowest]}: {len(usable)} frames in the time that all videos show, expected "
+            "at least 2; give longer videos"
+        )
+    instants = clock[usable]
+    positions = tuple(
+        _nearest(np.array(one.times) + begin, instants)
+        for begin, one in zip(begun, surveys, strict=True)
+    )
+    scaled = (instants - instants[0]) / (instants[-1] - instants[0])
+    return Timeline(tuple(begun), tuple(scaled.tolist()), positions)
+
+
+def offsets_found(paths: Sequence[Path], surveys: Sequence[Survey]) -> list[float]:
+    """Seconds that each video began after the first, from what moves in them.
+
+    Raises:
+        DevrfError: nothing moves in a video, or it moves unlike in the first.
+    """
+    for path, one in zip(paths, surveys, strict=True):
+        if max(one.motion) == 0:
+            raise DevrfError(f"{path}: nothing moves in it; {_BY_HAND}")
+    found = [0.0]
+    for path, one in zip(paths[1:], surveys[1:], strict=True):
+        offset, correlation = offset_between(surveys[0], one)
+        log.info(
+            "%s: began %+.3f s after %s (correlation %.2f)", path, offset, paths[0], correlation
+        )
+        if correlation < SURE:
+            raise DevrfError(
+                f"{path}: what moves in it does not tell when it began (correlation with "
+                f"{paths[0]} {correlation:.2f}, expected {SURE} or more); {_BY_HAND}"
+            )
+        found.append(offset)
+    return found
+
+
+def offset_between(first: Survey, second: Survey) -> tuple[float, float]:
+    """Seconds that the second video began after the first, and the correlation there.
+
+    The amounts of motion a second, sampled on one clock, are correlated at every lag at which
+    they overlap by half of the shorter; the peak is refined by a parabola. A square root keeps a
+    part that is large in one view from deciding alone.
+    """
+    step = 1 / (STEPS_A_FRAME * max(first.rate, second.rate))
+    (a, a_start), (b, b_start) = _sampled(first, step), _sampled(second, step)
+    least = max(2, int(LEAST_OVERLAP * min(len(a), len(b))))
+    lags = np.arange(least - len(b), len(a) - least + 1)
+    values = np.array([_correlation(a, b, int(lag)) for lag in lags])
+    best = int(values.argmax())
+    lag = float(lags[best])
+    if 0 < best < len(values) - 1:
+        left, middle, right = values[best - 1 : best + 2]
+        bend = left - 2 * middle + right
+        lag += 0.5 * (left - right) / bend if bend < 0 else 0.0
+    return lag * step + a_start - b_start, float(values[best])
+
+
+def _sampled(one: Survey, step: float) -> tuple[Signal, float]:
+    """Motion a second, square root, every ``step`` seconds, and the time of its first sample."""
+    times = np.array(one.times)
+    middles = (times[1:] + times[:-1]) / 2
+    speed = np.sqrt(np.array(one.motion[1:]) / np.diff(times))
+    count = max(2, int((middles[-1] - middles[0]) / step) + 1)
+    clock = middles[0] + step * np.arange(count)
+    return np.interp(clock, middles, speed), float(middles[0])
+
+
+def _correlation(a: Signal, b: Signal, lag: int) -> float:
+    """Of the parts of two signals that overlap when the second is moved by ``lag`` samples."""
+    low, high = max(0, lag), min(len(a), len(b) + lag)
+    one, other = a[low:high], b[low - lag : high - lag]
+    one, other = one - one.mean(), other - other.mean()
+    norm = float(np.sqrt((one**2).sum() * (other**2).sum()))
+    return float((one * other).sum()) / norm if norm > 0 else -1.0
+
+
+def _nearest(clock: Signal, instants: Signal) -> tuple[int, ...]:
+    after = np.searchsorted(clock, instants).clip(1, len(clock) - 1)
+    before = after - 1
+    nearer = instants - clock[before] < clock[after] - instants
+    return tuple(np.where(nearer, before, after).tolist())

@@ -1,0 +1,189 @@
+"""Structure from motion: cameras, lenses and sparse points of chosen images, by COLMAP."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import shutil
+from collections.abc import Callable, Sequence
+from importlib.util import find_spec
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from devrf.apps.capture.frames import Chosen
+from devrf.apps.capture.settings import CaptureSettings
+from devrf.errors import DevrfError
+from devrf.scenes.colmap_model import SparseModel, read_model
+from devrf.scenes.footage import is_folder
+
+log = logging.getLogger(__name__)
+
+# Of a video, an image is compared with so many that follow it, and then at doubling distances.
+NEIGHBOURS = 10
+# Neighbouring frames of one video do not turn by more degrees than this, and so many times as much
+# as those in the middle: what looks alike has been taken for the same.
+MOST_TURN = 45.0
+MOST_TURNS = 5.0
+# A model of a smaller share of a moving camera's images is not the scene.
+LEAST_SHARE = 0.5
+
+_FILM = (
+    "film more slowly, with more overlap (neighbouring frames share more than half of what they "
+    "show), and with more texture in sight"
+)
+
+
+def check_library() -> None:
+    """Check that COLMAP's Python package is there.
+
+    Raises:
+        DevrfError: it is not installed.
+    """
+    if find_spec("pycolmap") is None:
+        raise DevrfError(
+            'stage=capture: pycolmap is not installed; run pip install "devrf[capture]"'
+        )
+
+
+def pairs(moving: Sequence[str], fixed: Sequence[str], matching: str) -> list[tuple[str, str]]:
+    """Which images are compared.
+
+    Args:
+        moving: images of a moving camera, in their order.
+        fixed: an image of each fixed view.
+        matching: ``exhaustive``: all with all; ``sequential``: of the moving camera those that
+            are near in its order, the fixed views with all.
+    """
+    if matching == "exhaustive":
+        return list(combinations([*moving, *fixed], 2))
+    steps = [*range(1, NEIGHBOURS + 1)]
+    while steps[-1] < len(moving):
+        steps.append(2 * steps[-1])
+    near = [(a, moving[k + n]) for k, a in enumerate(moving) for n in steps if k + n < len(moving)]
+    return near + [(a, b) for a in moving for b in fixed] + list(combinations(fixed, 2))
+
+
+def reconstruct(
+    images: Path,
+    work: Path,
+    moving: Chosen,
+    fixed: Sequence[str],
+    settings: CaptureSettings,
+    advance: Callable[[str], None],
+) -> Path:
+    """Run structure from motion and write the model.
+
+    Args:
+        images: the folder of images.
+        work: where the data base and the model go; what is there of them is replaced.
+        moving: the moving camera's images.
+        fixed: one image of each fixed view, all of the scene at rest.
+        settings: the lens model, whether lenses are shared, and what is compared.
+        advance: is told what is done next.
+
+    Returns:
+        The folder of the largest model.
+
+    Raises:
+        DevrfError: nothing could be matched.
+    """
+    library: Any = importlib.import_module("pycolmap")
+    library.logging.minloglevel = 3
+    library.set_random_seed(0)
+    base, models, listed = work / "matches.db", work / "models", work / "pairs.txt"
+    base.unlink(missing_ok=True)
+    shutil.rmtree(models, ignore_errors=True)
+    models.mkdir(parents=True)
+    names = [*dict.fromkeys([*moving.names, *fixed])]
+    advance(f"features of {len(names)} images")
+    modes = library.CameraMode
+    reading = library.ImageReaderOptions()
+    reading.camera_model = settings.camera
+    extraction = library.FeatureExtractionOptions()
+    extraction.use_gpu = False
+    library.extract_features(
+        base,
+        images,
+        names,
+        camera_mode=modes.SINGLE if settings.intrinsics == "shared" else modes.PER_FOLDER,
+        reader_options=reading,
+        extraction_options=extraction,
+        device=library.Device.cpu,
+    )
+    compared = pairs(moving.names, [n for n in fixed if n not in moving.names], settings.matching)
+    listed.write_text("".join(f"{a} {b}\n" for a, b in compared))
+    advance(f"matches of {len(compared)} pairs")
+    matching = library.FeatureMatchingOptions()
+    matching.use_gpu = False
+    wanted = library.ImportedPairingOptions()
+    wanted.match_list_path = str(listed)
+    verification = library.TwoViewGeometryOptions()
+    verification.ransac.random_seed = 0
+    library.match_image_pairs(base, matching, wanted, verification, device=library.Device.cpu)
+    advance("cameras and points")
+    mapping = library.IncrementalPipelineOptions()
+    mapping.random_seed = 0
+    mapping.min_model_size = 3
+    found = library.incremental_mapping(base, images, models, mapping)
+    if not found:
+        raise DevrfError(
+            f"{moving.path}: too few matches between its frames to find any camera; {_FILM}"
+        )
+    best = max(found, key=lambda number: found[number].num_reg_images())
+    return models / str(best)
+
+
+def checked_model(folder: Path, moving: Chosen, fixed: dict[str, Path]) -> SparseModel:
+    """The model, if it holds the scene.
+
+    Args:
+        folder: the model's.
+        moving: the moving camera's images.
+        fixed: the video of each fixed view by its image.
+
+    Raises:
+        DevrfError: too few of the moving camera's images are in it, or a fixed view is not; or
+            its cameras jump from frame to frame of a video.
+    """
+    model = read_model(folder)
+    placed = {one.name for one in model.images}
+    known = [name for name in moving.names if name in placed]
+    if len(known) < max(3, LEAST_SHARE * len(moving.names)):
+        raise DevrfError(
+            f"{moving.path}: cameras were found for {len(known)} of {len(moving.names)} frames "
+            f"only, the others have too few matches with them; {_FILM}"
+        )
+    if len(known) < len(moving.names):
+        log.warning(
+            "%s: %d of %d frames could not be placed, and are left out",
+            *(moving.path, len(moving.names) - len(known), len(moving.names)),
+        )
+    if not is_folder(moving.path):
+        _check_turns(model, moving, known)
+    for name, path in fixed.items():
+        if name not in placed:
+            raise DevrfError(
+                f"{path}: its camera could not be placed among the static frames; let the static "
+                "video pass by where that camera stands and look the same way, or leave the view "
+                "out of capture.views"
+            )
+    return model
+
+
+def _check_turns(model: SparseModel, moving: Chosen, known: Sequence[str]) -> None:
+    place = {one.name: k for k, one in enumerate(model.images)}
+    turns = model.poses[[place[name] for name in known], :, :3]
+    trace = (turns[1:] * turns[:-1]).sum(dim=(1, 2))
+    degrees = torch.rad2deg(((trace - 1) / 2).clamp(-1, 1).acos())
+    worst = int(degrees.argmax())
+    most = float(degrees[worst])
+    if most > max(MOST_TURN, MOST_TURNS * float(degrees.median())):
+        raise DevrfError(
+            f"{moving.path}: between {Path(known[worst]).stem} and {Path(known[worst + 1]).stem}, "
+            f"frames that follow one another, its camera seems to turn by {most:.0f} degrees: "
+            "different places look alike; give more frames with capture.frames, or "
+            "capture.matching=sequential, or film where there is more texture"
+        )

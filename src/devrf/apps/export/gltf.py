@@ -1,0 +1,194 @@
+"""glTF 2.0: a mesh that moves by morph targets, and the cameras that saw it, in one .glb file.
+
+Libraries that write meshes leave out morph targets and their animation; the container is small.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+import devrf
+from devrf.apps.export.frame import UpFrame
+from devrf.apps.export.moving_mesh import MovingMesh
+from devrf.geometry.cameras import Cameras
+from devrf.system.files import atomic_write
+
+# Component types and buffer targets of the standard.
+FLOAT, UNSIGNED_INT, UNSIGNED_SHORT = 5126, 5125, 5123
+TYPES = {np.dtype("f4"): FLOAT, np.dtype("u4"): UNSIGNED_INT, np.dtype("u2"): UNSIGNED_SHORT}
+VERTICES, INDICES = 34962, 34963
+KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+# Chunks of the container, and its name.
+JSON, BIN, MAGIC = 0x4E4F534A, 0x004E4942, 0x46546C67
+# What a camera shows begins at this share of the scene's size.
+NEAREST = 1e-3
+
+Array = npt.NDArray[Any]
+
+
+def write_gltf(
+    path: Path,
+    mesh: MovingMesh,
+    cameras: dict[str, Cameras],
+    frame: UpFrame,
+    seconds: float,
+) -> None:
+    """Write a .glb file.
+
+    The mesh is as it is at the first time; for each other time there is a morph target that leads
+    there, and the animation goes from one to the next: linearly, as displacements are between
+    frames. Its colours are light that the cameras saw, so its material is unlit.
+
+    Args:
+        path: the file.
+        mesh: in the capture's world.
+        cameras: one each, by name, in that world; principal points are taken to be the centres.
+        frame: of the file.
+        seconds: how long time 0 to 1 takes.
+    """
+    content = _Content()
+    vertices = frame.points(mesh.vertices)
+    size = float((vertices.amax(dim=(0, 1)) - vertices.amin(dim=(0, 1))).norm())
+    names = [f"t={time:.4g}" for time in mesh.times[1:]]
+    primitive: dict[str, Any] = {
+        "attributes": {
+            "POSITION": content.array(vertices[0].numpy(), VERTICES, limits=True),
+            "COLOR_0": content.array(_linear16(mesh.colors), VERTICES, normalized=True),
+        },
+        "indices": content.array(mesh.faces.reshape(-1).numpy().astype("u4"), INDICES),
+        "material": 0,
+    }
+    if names:
+        moves = (vertices[1:] - vertices[0]).numpy()
+        primitive["targets"] = [
+            {"POSITION": content.array(move, VERTICES, limits=True)} for move in moves
+        ]
+    shown: dict[str, Any] = {"name": "scene", "primitives": [primitive]}
+    nodes: list[dict[str, Any]] = [{"name": "scene", "mesh": 0}]
+    whole: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": f"devrf {devrf.__version__}"},
+        "scene": 0,
+        "materials": [
+            {
+                "name": "radiance",
+                "doubleSided": True,
+                "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
+                "extensions": {"KHR_materials_unlit": {}},
+            }
+        ],
+        "extensionsUsed": ["KHR_materials_unlit"],
+        "meshes": [shown],
+        "nodes": nodes,
+    }
+    if names:
+        shown |= {"weights": [0.0] * len(names), "extras": {"targetNames": names}}
+        whole["animations"] = [_animation(content, mesh.times, seconds)]
+    if cameras:
+        whole["cameras"] = [
+            {"name": name, "type": "perspective", "perspective": _lens(one, NEAREST * size)}
+            for name, one in cameras.items()
+        ]
+        for index, (name, one) in enumerate(cameras.items()):
+            pose = torch.eye(4, dtype=torch.float64)
+            pose[:3] = frame.cameras(one).camera_to_world[0]
+            # The standard has columns one after another.
+            matrix = pose.T.reshape(-1).tolist()
+            nodes.append({"name": name, "camera": index, "matrix": matrix})
+    whole["scenes"] = [
+        {
+            "name": "scene",
+            "nodes": list(range(len(nodes))),
+            "extras": {"frame": f"y up ({frame.up} of the capture's world), metres"},
+        }
+    ]
+    content.write(path, whole)
+
+
+def _animation(content: _Content, times: tuple[float, ...], seconds: float) -> dict[str, Any]:
+    """Each target's weight is 1 at its own time and 0 at the others'."""
+    keys = np.array(times, "f4") * np.float32(seconds)
+    weights = np.eye(len(times), dtype="f4")[:, 1:].reshape(-1)
+    sampler = {
+        "input": content.array(keys, None, limits=True),
+        "output": content.array(weights, None),
+        "interpolation": "LINEAR",
+    }
+    channel = {"sampler": 0, "target": {"node": 0, "path": "weights"}}
+    return {"name": "motion", "samplers": [sampler], "channels": [channel]}
+
+
+def _lens(camera: Cameras, nearest: float) -> dict[str, float]:
+    fx, fy = camera.focal[0].tolist()
+    return {
+        "yfov": 2 * math.atan(camera.height / (2 * fy)),
+        "aspectRatio": (camera.width / fx) / (camera.height / fy),
+        "znear": nearest,
+    }
+
+
+def linear(colors: Tensor) -> Tensor:
+    """Linear light (..., 3) of sRGB colours (..., 3), both in [0, 1] (IEC 61966-2-1)."""
+    dark = colors / 12.92
+    return torch.where(colors <= 0.04045, dark, ((colors + 0.055) / 1.055) ** 2.4)
+
+
+def _linear16(colors: Tensor) -> Array:
+    """Linear RGBA (V, 4) in 16 bits: the standard's vertex colours are linear."""
+    values = torch.cat([linear(colors), torch.ones(len(colors), 1)], dim=1)
+    return (values * 65535).round().numpy().astype("u2")
+
+
+class _Content:
+    """The binary part of a file, and what describes it."""
+
+    def __init__(self) -> None:
+        self._bytes = bytearray()
+        self._views: list[dict[str, int]] = []
+        self._accessors: list[dict[str, Any]] = []
+
+    def array(
+        self, values: Array, target: int | None, *, limits: bool = False, normalized: bool = False
+    ) -> int:
+        """Put an array (N,) or (N, K) in; the number of its accessor."""
+        values = np.ascontiguousarray(values)
+        view = {"buffer": 0, "byteOffset": len(self._bytes), "byteLength": values.nbytes}
+        self._views.append(view if target is None else {**view, "target": target})
+        self._bytes += values.tobytes() + b"\0" * (-values.nbytes % 4)
+        rows = values.reshape(len(values), -1)
+        accessor: dict[str, Any] = {
+            "bufferView": len(self._views) - 1,
+            "componentType": TYPES[values.dtype],
+            "count": len(rows),
+            "type": KINDS[rows.shape[1]],
+        }
+        if limits:
+            accessor |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
+        if normalized:
+            accessor["normalized"] = True
+        self._accessors.append(accessor)
+        return len(self._accessors) - 1
+
+    def write(self, path: Path, whole: dict[str, Any]) -> None:
+        """Write the file: a header, the description, the arrays."""
+        described = {
+            **whole,
+            "buffers": [{"byteLength": len(self._bytes)}],
+            "bufferViews": self._views,
+            "accessors": self._accessors,
+        }
+        text = json.dumps(described, separators=(",", ":")).encode()
+        text += b" " * (-len(text) % 4)
+        length = 12 + 8 + len(text) + 8 + len(self._bytes)
+        with atomic_write(path) as partial, partial.open("wb") as file:
+            file.write(struct.pack("<3I", MAGIC, 2, length))
+            file.write(struct.pack("<2I", len(text), JSON) + text)
+            file.write(struct.pack("<2I", len(self._bytes), BIN) + self._bytes)

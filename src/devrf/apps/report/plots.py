@@ -1,0 +1,222 @@
+"""Plots of finished runs."""
+
+from __future__ import annotations
+
+import re
+from typing import Any, NamedTuple
+
+import matplotlib as mpl
+import pandas as pd
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
+
+from devrf.apps.report.runs import metric_over_time
+from devrf.apps.report.table import LPIPS, PSNR, SSIM, TIME, Block, Table
+
+# The palette of Okabe and Ito, distinguishable with colour-blindness; then each time the colour
+# furthest in CIELAB from those before, from white and from grey. Other dashes every eight colours.
+COLORS = (
+    "#0072B2 #D55E00 #009E73 #CC79A7 #E69F00 #56B4E9 #000000 #8C6D31 "
+    "#4B0096 #96D21E #FF0069 #69001E #D200A5 #A587FF #0F3C00 #4B1E5A "
+    "#00E178 #FFB496 #B4C369 #1E870F #D25A5A #006969 #5AD2D2 #D2001E"
+).split()
+DASHES, ALIKE = ("-", "--", ":", "-."), 8
+POINTS = "osD^"
+# Inches of a line of the legend: the figure grows by it, so that curves keep their room.
+LEGEND_LINE, MOST_COLUMNS = 0.19, 8
+PUBLISHED, GREY = ", published", "#9a9a9a"
+STYLE: dict[Any, Any] = {
+    "figure.dpi": 160,
+    "font.size": 9,
+    "axes.titlesize": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.formatter.useoffset": False,
+    "grid.color": "#e6e6e6",
+    "axes.axisbelow": True,
+    "legend.frameon": False,
+    "legend.fontsize": 8,
+    "legend.handlelength": 2.6,  # of two dashes
+    "lines.linewidth": 1.6,
+    "lines.markersize": 4,
+}
+# Markers of the paper's methods, and how the names of their variants end.
+MARKERS = {
+    "DeVRF": "s",
+    "D-NeRF": "^",
+    "Nerfies": "v",
+    "HyperNeRF": "D",
+    "NSFF": "P",
+    "Neural Volumes": "X",
+}
+VARIANT = r"-2 ?stage$|-dynamic$| \(base\)$| w/ .*$"
+# Seconds to label on an axis, where times span more than a factor of fifty and where less.
+FEW_TICKS = (0.1, 1, 10, 60, 600, 3600, 36000, 360000)
+TICKS = (
+    *(0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 30),
+    *(60 * minutes for minutes in (1, 2, 5, 10, 20, 30)),
+    *(3600 * hours for hours in (1, 2, 5, 10, 24)),
+)
+
+
+class Plot(NamedTuple):
+    """A plot, the name of its files, and what it shows in words."""
+
+    name: str
+    shows: str
+    figure: Figure
+
+
+def plots(table: Table) -> list[Plot]:
+    """Every plot that has data."""
+    found = [
+        ("psnr_against_seconds", "PSNR against training time", psnr_against_seconds(table)),
+        ("metrics_against_views", "Metrics against dynamic training views", against_views(table)),
+    ]
+    for scene in table.runs["scene"].unique():
+        name = file_name(f"psnr_over_time_{scene}")
+        found.append((name, f"{scene}: PSNR over time", psnr_over_time(table, scene)))
+    return [Plot(name, shows, figure) for name, shows, figure in found if figure is not None]
+
+
+def file_name(text: str) -> str:
+    """Text as the name of a file, without what a file system or a link may refuse."""
+    return re.sub(r"[^\w.-]+", "_", text)
+
+
+@mpl.rc_context(STYLE)
+def psnr_over_time(table: Table, scene: str) -> Figure | None:
+    """PSNR of the held-out images of one scene over time, a curve a row; the mean over runs.
+
+    None where no run has frames.
+    """
+    figure = Figure(figsize=(6.4, 3.6), layout="constrained")
+    axes = figure.subplots()
+    for label, runs in table.runs[table.runs["scene"] == scene].groupby("label", sort=False):
+        of_runs = [metric_over_time(path, "psnr") for path in runs["path"]]
+        curve = pd.concat(of_runs, axis=1, join="inner").mean(axis=1)
+        if len(curve):
+            color, dashes = _look(table, label)
+            marker = "o" if len(curve) < 30 else ""
+            axes.plot(curve.index, curve, dashes, color=color, marker=marker, label=label)
+    if not axes.has_data():
+        return None
+    axes.set(title=scene, xlabel="time", ylabel=f"{PSNR.title} (dB)")
+    _legend(figure)
+    return figure
+
+
+@mpl.rc_context(STYLE)
+def psnr_against_seconds(table: Table) -> Figure | None:
+    """PSNR against training time, a panel a scene, the paper's rows as hollow marks.
+
+    None where no run has both.
+    """
+    both = table.rows[(table.rows[TIME.title] > 0) & table.rows[PSNR.title].notna()]
+    scenes = both.index.get_level_values("scene")
+    blocks = [block for block in table.blocks if block.title in scenes]
+    if not blocks:
+        return None
+    across = min(3, len(blocks))
+    down = -(-len(blocks) // across)
+    figure = Figure(figsize=(1.2 + 3.2 * across, 0.9 + 2.9 * down), layout="constrained")
+    panels = list(figure.subplots(down, across, squeeze=False).flat)
+    for axes, block in zip(panels, blocks, strict=False):
+        _points(axes, table, block)
+    for axes in panels[len(blocks) :]:
+        axes.remove()
+    _legend(figure)
+    return figure
+
+
+@mpl.rc_context(STYLE)
+def against_views(table: Table) -> Figure | None:
+    """PSNR, and LPIPS or else SSIM, against the number of dynamic training views.
+
+    A line for each scene and configuration. None unless one was run with several numbers.
+    """
+    rows = table.rows.dropna(subset="views").sort_values("views")
+    lines = rows.groupby(["scene", "line"], sort=False).filter(lambda g: g["views"].nunique() > 1)
+    if lines.empty:
+        return None
+    one_line = lines["line"].nunique() == 1
+    second = LPIPS if lines[LPIPS.title].notna().any() else SSIM
+    figure = Figure(figsize=(7.4, 3.4), layout="constrained")
+    for axes, column in zip(figure.subplots(1, 2), (PSNR, second), strict=True):
+        for k, ((scene, line), group) in enumerate(lines.groupby(["scene", "line"], sort=False)):
+            color, dashes = _style(k)
+            known = group.dropna(subset=column.title)
+            label = scene if one_line else f"{scene}: {line}"
+            points = known["views"], known[column.title]
+            axes.plot(*points, dashes, color=color, marker="o", label=label)
+        axes.set(xlabel="dynamic training views", ylabel=column.heading)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    _legend(figure)
+    return figure
+
+
+def _points(axes: Axes, table: Table, block: Block) -> None:
+    """One scene's panel."""
+    for label, seconds, psnr in _seconds_and_psnr(block.measured):
+        color, dashes = _look(table, label)
+        mark = POINTS[DASHES.index(dashes)]
+        axes.plot(seconds, psnr, mark, color=color, markersize=6, label=label)
+    for label, seconds, psnr in _seconds_and_psnr(block.published):
+        method = re.sub(VARIANT, "", label)
+        look: dict[str, Any] = {"color": GREY, "markerfacecolor": "none"}
+        axes.plot(seconds, psnr, MARKERS[method], label=f"{method}{PUBLISHED}", **look)
+    axes.set(title=block.title, xscale="log", xlabel="training time", ylabel=f"{PSNR.title} (dB)")
+    low, high = axes.get_xlim()
+    axes.set_xlim(low / 1.5, high * 1.5)
+    axes.xaxis.set_major_locator(FixedLocator(FEW_TICKS if high > 50 * low else TICKS))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_major_formatter(_time)
+
+
+def _seconds_and_psnr(rows: pd.DataFrame) -> list[tuple[str, float, float]]:
+    """(label, seconds, PSNR) where both are known and a logarithm can show the time."""
+    known = rows["value"][[TIME.title, PSNR.title]].dropna()
+    return list(known[known[TIME.title] > 0].itertuples(name=None))
+
+
+def _time(seconds: float, position: float) -> str:
+    """The label of a tick."""
+    for unit, size in (("h", 3600), ("min", 60)):
+        if seconds >= size:
+            return f"{seconds / size:g} {unit}"
+    return f"{seconds:g} s"
+
+
+def _look(table: Table, label: str) -> tuple[str, str]:
+    """Colour and dashes of a row, the same in all plots of a report."""
+    return _style(list(table.runs["label"].unique()).index(label))
+
+
+def _style(k: int) -> tuple[str, str]:
+    return COLORS[k % len(COLORS)], DASHES[k // ALIKE % len(DASHES)]
+
+
+def _legend(figure: Figure) -> None:
+    """One legend below the figure for all its panels: each label once, ours first.
+
+    The figure grows, so that the legend takes no room from the panels and is nowhere cut off.
+    """
+    handles: dict[str, Artist] = {}
+    for axes in figure.axes:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            handles.setdefault(label, handle)
+    handles = dict(sorted(handles.items(), key=lambda entry: entry[0].endswith(PUBLISHED)))
+    for columns in range(min(len(handles), MOST_COLUMNS), 0, -1):
+        legend = figure.legend(
+            list(handles.values()), list(handles), loc="outside lower center", ncols=columns
+        )
+        needed = legend.get_window_extent().width / figure.dpi
+        if needed <= figure.get_figwidth() or columns == 1:
+            figure.set_figwidth(max(needed, figure.get_figwidth()))
+            lines = -(-len(handles) // columns)
+            figure.set_figheight(figure.get_figheight() + (lines - 1) * LEGEND_LINE)
+            return
+        legend.remove()

@@ -1,0 +1,304 @@
+"""The tables of a report: runs averaged and ranked by scene, beside the paper's rows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import pandas as pd
+
+from devrf.apps.report.labels import labelled
+from devrf.apps.report.published import published
+from devrf.apps.report.runs import Collection, number
+from devrf.apps.report.settings import PublishedScenes
+
+UNKNOWN = "–"
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of the paper's tables.
+
+    Attributes:
+        title: its heading.
+        key: the column of a collection that holds its value; times are in seconds.
+        higher_is_better: else lower is.
+        digits: after the point; None: a time in the unit that reads best.
+        of_hardware: whether values of different devices cannot be compared.
+        why_missing: the explanation where no run has a value.
+    """
+
+    title: str
+    key: str
+    higher_is_better: bool
+    digits: int | None
+    of_hardware: bool = False
+    why_missing: str = "it was not recorded"
+
+    @property
+    def heading(self) -> str:
+        """The title with the direction in which it is better."""
+        return f"{self.title} {'↑' if self.higher_is_better else '↓'}"
+
+
+NO_WEIGHTS = (
+    "it was not asked for, or the weights that it needs were not available "
+    "(evaluation.lpips_weights, evaluation.download)"
+)
+PSNR = Column("PSNR", "dynamic.psnr", True, 2)
+SSIM = Column("SSIM", "dynamic.ssim", True, 3)
+LPIPS = Column("LPIPS", "dynamic.lpips", False, 4, False, NO_WEIGHTS)
+GPU = Column("GPU (GB)", "peak_gpu_gb", False, 1, True, "no run is known to have used a GPU")
+TIME = Column("Time", "train_seconds", False, None, True)
+COLUMNS = (PSNR, SSIM, LPIPS, GPU, TIME)
+TITLES = [column.title for column in COLUMNS]
+# Shown where a run was scored at times that no training view has; the paper has no such columns.
+OF_TIMES = (
+    Column("PSNR at training times", "dynamic.training_times.psnr", True, 2),
+    Column("PSNR at novel times", "dynamic.novel_times.psnr", True, 2),
+)
+# How a time below so many seconds is written: the unit's seconds, digits, the unit.
+TIMES = (
+    (9.95, 1, 1, " s"),
+    (99.5, 1, 0, " s"),
+    (99.5 * 60, 60, 1, " min"),
+    (math.inf, 3600, 1, " h"),
+)
+
+
+@dataclass(frozen=True)
+class Block:
+    """The rows of one scene, or of an average over scenes.
+
+    Both frames are indexed by label. Their columns have two levels: ``head`` has ``name``,
+    ``protocol`` and ``counts`` (a set of numbers of runs averaged); ``value`` (NaN where unknown),
+    ``text`` and ``rank`` (1, 2, 3 for the best, else 0) have the title of each column.
+
+    Attributes:
+        title: the scene's name, or what was averaged.
+        measured: rows of runs, ranked among themselves.
+        published: rows of the paper, not ranked.
+    """
+
+    title: str
+    measured: pd.DataFrame
+    published: pd.DataFrame
+
+
+@dataclass(frozen=True)
+class Table:
+    """The contents of a report.
+
+    Attributes:
+        found: the runs and failures that it is about.
+        columns: those of its rows.
+        runs: the runs whose dynamic capture was scored, or of a scene at rest the static one;
+            labelled.
+        rows: means over runs, indexed by scene and label: ``name``, ``protocol``, ``line``,
+            ``views``, ``count`` and each column's title; NaN unless all runs of the row have the
+            value.
+        blocks: one for each scene, then the average if there is more than one.
+        notes: remarks on columns and rows, a sentence each.
+    """
+
+    found: Collection
+    columns: tuple[Column, ...]
+    runs: pd.DataFrame
+    rows: pd.DataFrame
+    blocks: tuple[Block, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def shows_published(self) -> bool:
+        """Whether any row is the paper's."""
+        return any(len(block.published) for block in self.blocks)
+
+
+def tabulate(found: Collection, published_scenes: PublishedScenes = "matching") -> Table:
+    """Make the tables of a collection.
+
+    Args:
+        found: finished runs and failures.
+        published_scenes: which of the paper's rows to show: of the scenes that were run, all, or
+            none.
+    """
+    scored = _values(found.runs, PSNR).notna()
+    again = _scored_again(found.runs[scored])
+    runs = labelled(found.runs[scored].drop(index=again.index))
+    columns = _columns(runs)
+    titles = [column.title for column in columns]
+    for column in columns:
+        runs[column.title] = _values(runs, column)
+    groups = runs.groupby(["scene", "label"], sort=False)
+    heads = groups[["name", "protocol", "line", "views"]].first().assign(count=groups.size())
+    complete = groups[titles].count().eq(heads["count"], axis=0)
+    rows = heads.join(groups[titles].mean().where(complete))
+    spread = groups[titles].std().where(complete)
+
+    ours, known = list(runs["scene"].unique()), list(published().tables)
+    beside = {"none": [], "all": known, "matching": [scene for scene in ours if scene in known]}
+    theirs = beside[published_scenes]
+    blocks: list[Block] = []
+    for scene in dict.fromkeys([*ours, *theirs]):
+        measured = _cells(
+            _of(rows, [scene]).assign(counts=lambda found: found["count"].map(lambda n: {n})),
+            _of(spread, [scene]),
+            columns,
+            runs.loc[runs["scene"] == scene, "run.device"],
+        )
+        blocks.append(Block(scene, measured, _published([scene], theirs, columns)))
+    if len(ours) > 1:
+        title = f"average over {len(ours)} scenes"
+        average = Block(
+            title, _average(runs, rows, ours, columns), _published(ours, theirs, columns)
+        )
+        blocks += [average] if len(average.measured) else []
+    notes = _notes(runs, found.runs.loc[~scored, "folder"], again)
+    return Table(found, columns, runs, rows, tuple(blocks), tuple(notes))
+
+
+def _columns(runs: pd.DataFrame) -> tuple[Column, ...]:
+    """The paper's columns, and those of training and novel times that a run has."""
+    known = [one for one in OF_TIMES if one.key in runs and _values(runs, one).notna().any()]
+    return (*COLUMNS[:1], *known, *COLUMNS[1:])
+
+
+def _values(runs: pd.DataFrame, column: Column) -> pd.Series:
+    """The values of a column, NaN where unknown; those of scenes at rest are of the static set."""
+    values = runs[column.key].map(number).astype(float)
+    section, _, name = column.key.partition(".")
+    at_rest, key = runs["at_rest"].eq(True), f"static.{name}"
+    if section == "dynamic" and key in runs:
+        values = values.where(~at_rest, runs[key].map(number).astype(float))
+    return values
+
+
+def shown(value: float, column: Column, spread: float = math.nan) -> str:
+    """A value with the digits of its column: ``29.42``, ``29.42 ± 0.11``, ``9.2 min``, ``–``."""
+    if math.isnan(value):
+        return UNKNOWN
+    size, digits, unit = 1, column.digits, ""
+    if digits is None:
+        _, size, digits, unit = next(row for row in TIMES if value < row[0])
+    text = f"{value / size:.{digits}f}"
+    if not math.isnan(spread):
+        text += f" ± {spread / size:.{digits}f}"
+    return text + unit
+
+
+def ranked(values: pd.Series, column: Column) -> pd.Series:
+    """1, 2, 3 for the best values, else 0; values with the same text share a rank.
+
+    No value is ranked where all have the same text.
+    """
+    texts = values.map(lambda value: shown(value, column)).where(values.notna())
+    ranks = values.groupby(texts).transform("min")
+    ranks = ranks.rank(method="dense", ascending=not column.higher_is_better)
+    return ranks.where((ranks <= 3) & (texts.nunique() > 1), 0).astype(int)
+
+
+def _of(frame: pd.DataFrame, scenes: list[str]) -> pd.DataFrame:
+    """The rows of some scenes, by label."""
+    return frame[frame.index.get_level_values("scene").isin(scenes)].droplevel("scene")
+
+
+def _cells(
+    rows: pd.DataFrame,
+    spread: pd.DataFrame,
+    columns: Sequence[Column],
+    devices: pd.Series | None,
+) -> pd.DataFrame:
+    """Rows as a block holds them, with their standard deviations (or NaN).
+
+    Memory and time are ranked only if all ``devices`` agree; nothing is without devices.
+    """
+    titles = [column.title for column in columns]
+    texts, ranks = rows[titles].astype(object), pd.DataFrame(0, rows.index, titles)
+    for column in columns:
+        both = zip(rows[column.title], spread[column.title], strict=True)
+        texts[column.title] = [shown(value, column, deviation) for value, deviation in both]
+        if devices is not None and (devices.nunique(dropna=False) == 1 or not column.of_hardware):
+            ranks[column.title] = ranked(rows[column.title], column)
+    heads = rows[["name", "protocol", "counts"]]
+    parts = {"head": heads, "value": rows[titles], "text": texts, "rank": ranks}
+    return pd.concat(parts, axis=1)
+
+
+def _average(
+    runs: pd.DataFrame, rows: pd.DataFrame, scenes: list[str], columns: Sequence[Column]
+) -> pd.DataFrame:
+    """Means over all scenes of the configurations that were run on all of them.
+
+    Without a spread: the difference between scenes is no uncertainty of a measurement.
+    """
+    groups, titles = rows.groupby("label", sort=False), [column.title for column in columns]
+    means = _over_scenes(rows[titles], scenes).join(groups[["name", "protocol"]].first())
+    means = means.assign(counts=groups["count"].agg(set))[groups.size() == len(scenes)]
+    devices = runs.loc[runs["label"].isin(means.index), "run.device"]
+    return _cells(means, means[titles] * math.nan, columns, devices)
+
+
+def _published(scenes: list[str], theirs: list[str], columns: Sequence[Column]) -> pd.DataFrame:
+    """The paper's rows of a scene, or their means over several; none unless it has them all."""
+    asked = scenes if set(scenes) <= set(theirs) else []
+    values = _over_scenes(_of(published().values, asked), scenes).dropna()
+    values = values.reindex(columns=[column.title for column in columns])
+    rows = values.assign(name=values.index, protocol="", counts=[{1} for _ in values.index])
+    cells = _cells(rows, values * math.nan, columns, devices=None)
+    if len(scenes) == 1:
+        cells["text"] = _of(published().texts[TITLES], asked).reindex(
+            columns=values.columns, fill_value=UNKNOWN
+        )
+    return cells
+
+
+def _over_scenes(values: pd.DataFrame, scenes: list[str]) -> pd.DataFrame:
+    """Means by label; NaN unless every scene has the value."""
+    groups = values.groupby("label", sort=False)
+    return groups.mean().where(groups.count() == len(scenes))
+
+
+def _scored_again(runs: pd.DataFrame) -> pd.Series:
+    """Folders of runs whose checkpoint was scored again later, in another folder."""
+    known = runs[runs["run.checkpoint"].notna()].sort_values(
+        "run.date", kind="stable", na_position="first"
+    )
+    again = known.loc[known.duplicated("run.checkpoint", keep="last"), "folder"]
+    return again.sort_index()
+
+
+def _sampled(runs: pd.DataFrame) -> list[str]:
+    """How the methods that choose their samples took them, a sentence for each way."""
+    absent = pd.Series(None, runs.index, dtype=object)
+    kind, hull = (
+        runs.get(f"run.settings.ray_stage.model.settings.{key}", absent)
+        for key in ("sampling", "hull")
+    )
+    # A hull of mattes only counts where samples are taken by occupancy; Neural Volumes' always are.
+    carved = hull.eq(True) & kind.fillna("occupancy").eq("occupancy")
+    way = kind.where(kind.notna() | hull.isna(), "even steps")
+    way = way.where(~carved, way.astype(str) + " within hulls of mattes")
+    names = runs["name"].groupby(way, sort=False).unique()
+    return [f"Samples by {one}: {', '.join(found)}." for one, found in names.items()]
+
+
+def _notes(runs: pd.DataFrame, at_rest: pd.Series, again: pd.Series) -> list[str]:
+    notes = [
+        f"No run has {column.title}: {column.why_missing}."
+        for column in COLUMNS
+        if len(runs) and runs[column.title].isna().all()
+    ]
+    if runs["run.device"].nunique(dropna=False) > 1:
+        notes.append("Memory and time are marked only among rows of one device.")
+    notes += _sampled(runs)
+    still = runs.loc[runs["at_rest"].eq(True), "scene"].unique()
+    if len(still):
+        notes.append(f"At rest, scored on held-out images of the static set: {', '.join(still)}.")
+    if len(at_rest):
+        names = ", ".join(at_rest)
+        notes.append(f"Scored at rest only, and therefore not in the tables: {names}.")
+    if len(again):
+        names = ", ".join(again)
+        notes.append(f"Counted once, as last scored elsewhere with the same checkpoint: {names}.")
+    return notes

@@ -1,0 +1,112 @@
+"""Weights & Biases: the only place that knows it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+from lightning.pytorch.loggers import WandbLogger
+from torch import Tensor
+
+from devrf.apps.colors import to_bytes
+from devrf.apps.tracking import Row, columns
+from devrf.errors import DevrfError
+
+if TYPE_CHECKING:
+    from wandb.sdk.wandb_run import Run
+
+# The longest name that wandb takes.
+LONGEST_NAME = 128
+
+
+class WandbTracker(WandbLogger):
+    """One wandb run for all stages of a devrf run, found again by the id kept in its folder.
+
+    Offline, nothing leaves the machine: neither the run nor wandb's own telemetry.
+    """
+
+    def __init__(
+        self,
+        save_dir: str | Path,
+        project: str = "devrf",
+        name: str | None = None,
+        group: str | None = None,
+        tags: Sequence[str] = (),
+        entity: str | None = None,
+        offline: bool = True,
+    ) -> None:
+        """Name the run; it begins when something is logged first.
+
+        Args:
+            save_dir: the run's folder; wandb works in ``wandb/`` below it.
+            project: what the run belongs to.
+            name: the run's name.
+            group: the sweep that it is a job of.
+            tags: to find it by.
+            entity: the account or team; None is the one that is logged in.
+            offline: whether to keep the run on this machine (``wandb sync`` sends it later).
+        """
+        if offline:
+            # Read when wandb is first imported. It reports on itself even when offline.
+            os.environ.setdefault("WANDB_ERROR_REPORTING", "false")
+        super().__init__(
+            name=name and name[:LONGEST_NAME],
+            save_dir=save_dir,
+            project=project,
+            group=group,
+            tags=list(tags),
+            entity=entity,
+            offline=offline,
+        )
+        # wandb ignores it and warns where it is given.
+        self._wandb_init.pop("anonymous", None)
+        self._id_file = Path(save_dir) / "wandb" / "run_id"
+        if self._id_file.is_file():
+            self._id = self._wandb_init["id"] = self._id_file.read_text().strip()
+
+    @property
+    def experiment(self) -> Run:
+        """The wandb run, begun at the first use.
+
+        Raises:
+            DevrfError: wandb could not begin it.
+        """
+        import wandb
+
+        begun = self._experiment is not None
+        try:
+            run = cast("Run", super().experiment)
+        except wandb.errors.Error as error:
+            raise DevrfError(
+                f"logger: wandb cannot begin a run ({error}); leave logger.offline=true, or log "
+                "in with `wandb login`"
+            ) from None
+        if not begun and self._experiment is not None:
+            self._id_file.parent.mkdir(exist_ok=True)
+            self._id_file.write_text(f"{run.id}\n")
+        return run
+
+    def show_image(self, name: str, image: Tensor, step: int | None = None) -> None:
+        """Log an image (H, W, 3) in [0, 1]."""
+        self.log_image(name, [to_bytes(image).cpu().numpy()], step)
+
+    def show_video(self, name: str, path: Path) -> None:
+        """Log a video file as it is."""
+        self.log_video(name, [str(path)], format=[path.suffix[1:]])
+
+    def show_table(self, name: str, rows: Sequence[Row]) -> None:
+        """Log a table."""
+        names = columns(rows)
+        self.log_table(name, names, [[row.get(key) for key in names] for row in rows])
+
+    def conclude(self, values: Mapping[str, float]) -> None:
+        """Put numbers into the run's summary."""
+        self.experiment.summary.update(dict(values))
+
+    def close(self, *, failed: bool) -> None:
+        """Finish the run, so that the next job of a sweep begins its own."""
+        if self._experiment is not None:
+            self.experiment.finish(exit_code=int(failed))
+            self._experiment = None

@@ -1,0 +1,264 @@
+"""What other programs read: a mesh that goes where the forward field leads, in every format."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from pxr import Gf, Usd, UsdGeom
+from scipy.spatial import KDTree
+
+from devrf.apps.export.frame import UpFrame
+from devrf.apps.export.gltf import write_gltf
+from devrf.apps.export.moving_mesh import MovingMesh, carried
+from devrf.apps.export.sequence import mesh_files, write_sequence
+from devrf.apps.export.settings import ExportSettings
+from devrf.apps.export.surface import canonical_surface
+from devrf.apps.export.usd import write_usd
+from devrf.geometry.cameras import Cameras
+from devrf.methods.devrf.deformation_field import DeformationField
+from devrf.methods.devrf.model import DeVRFModel
+from devrf.scenes.procedural import ProceduralScene
+from devrf.scenes.scene import Scene
+
+TIMES = (0.0, 0.25, 0.5, 1.0)
+SECONDS = 2.0
+CPU = torch.device("cpu")
+
+
+def moved_mesh(
+    model: DeVRFModel, cameras: Cameras, times: tuple[float, ...], **settings: Any
+) -> MovingMesh:
+    surface = canonical_surface(
+        model.surface(), model.space, model.depth_limits, cameras, ExportSettings(**settings), CPU
+    )
+    return carried(surface, model.forward_map, model.space, times, CPU)
+
+
+@pytest.fixture
+def mesh(moving_ball: DeVRFModel, around: Cameras) -> MovingMesh:
+    return moved_mesh(moving_ball, around, TIMES, faces=800)
+
+
+@pytest.fixture
+def frame(around: Cameras) -> UpFrame:
+    return UpFrame.of(around, "auto", 2.0)
+
+
+def test_the_ball_moves_and_grows(mesh: MovingMesh) -> None:
+    assert mesh.times == TIMES and mesh.vertices.shape[0] == 4
+    for time, vertices in zip(TIMES, mesh.vertices, strict=True):
+        away = (vertices - torch.tensor([0.4 * time, 0.0, 0.0])).norm(dim=1)
+        assert (away.mean() - 0.5 * (1 + 0.2 * time)).abs() < 0.01
+
+
+@pytest.mark.parametrize(
+    ("up", "expected"),
+    [
+        ("y", (1.0, 2.0, 3.0)),
+        ("z", (1.0, 3.0, -2.0)),
+        ("-z", (1.0, -3.0, 2.0)),
+        ("x", (2.0, 1.0, -3.0)),
+        ("-y", (1.0, -2.0, -3.0)),
+    ],
+)
+def test_the_frame_by_hand(around: Cameras, up: Any, expected: tuple[float, ...]) -> None:
+    frame = UpFrame.of(around, up, 0.5)
+    found = frame.points(torch.tensor([1.0, 2.0, 3.0]))
+    assert found.tolist() == [0.5 * value for value in expected]
+    assert torch.linalg.det(frame.rotation) == 1
+
+
+def test_up_is_the_axis_nearest_to_the_cameras_own(around: Cameras) -> None:
+    assert UpFrame.of(around, "auto", 1.0).up == "z"
+    head = Cameras.looking_at(
+        around.positions,
+        torch.zeros(6, 3),
+        focal=9,
+        width=9,
+        height=9,
+        up=torch.tensor([0, -1.0, 0]),
+    )
+    assert UpFrame.of(head, "auto", 1.0).up == "-y"
+
+
+def glb(path: Path) -> tuple[dict[str, Any], Callable[[int], np.ndarray]]:
+    """The description of a .glb file, and its arrays by the number of their accessor."""
+    content = path.read_bytes()
+    magic, version, length, size, kind = struct.unpack("<4sIII4s", content[:20])
+    assert (magic, version, length, kind) == (b"glTF", 2, len(content), b"JSON")
+    whole = json.loads(content[20 : 20 + size])
+    binary = content[28 + size :]
+    assert len(binary) == whole["buffers"][0]["byteLength"]
+
+    def array(number: int) -> np.ndarray:
+        one = whole["accessors"][number]
+        view = whole["bufferViews"][one["bufferView"]]
+        own = {5126: "<f4", 5125: "<u4", 5123: "<u2"}[one["componentType"]]
+        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[one["type"]]
+        found = np.frombuffer(binary, own, one["count"] * width, view["byteOffset"])
+        found = found.reshape(-1, width)
+        if "min" in one:
+            assert (found.min(0) == one["min"]).all() and (found.max(0) == one["max"]).all()
+        return found
+
+    return whole, array
+
+
+def morphed(
+    whole: dict[str, Any], array: Callable[[int], np.ndarray], seconds: float
+) -> np.ndarray:
+    """The mesh's vertices so many seconds into the animation, as the standard says."""
+    primitive = whole["meshes"][0]["primitives"][0]
+    sampler = whole["animations"][0]["samplers"][0]
+    keys = array(sampler["input"])[:, 0]
+    weights = array(sampler["output"]).reshape(len(keys), -1)
+    vertices = array(primitive["attributes"]["POSITION"]).astype(float)
+    for target, of_target in zip(primitive["targets"], weights.T, strict=True):
+        vertices = vertices + np.interp(seconds, keys, of_target) * array(target["POSITION"])
+    return vertices
+
+
+def test_gltf_goes_where_the_forward_field_leads(
+    tmp_path: Path, moving_ball: DeVRFModel, mesh: MovingMesh, frame: UpFrame
+) -> None:
+    path = tmp_path / "ball.glb"
+    write_gltf(path, mesh, {}, frame, SECONDS)
+    whole, array = glb(path)
+    at_rest = mesh.vertices[0]
+    # 0.8 lies between two exported times, and the forward field goes evenly from one to the other.
+    for time in (*TIMES, 0.8):
+        expected = frame.points(moving_ball.forward_map(time)(at_rest)).numpy()
+        np.testing.assert_allclose(morphed(whole, array, SECONDS * time), expected, atol=1e-5)
+
+
+def test_gltf_as_trimesh_reads_it(tmp_path: Path, mesh: MovingMesh, frame: UpFrame) -> None:
+    path = tmp_path / "ball.glb"
+    write_gltf(path, mesh, {}, frame, SECONDS)
+    (read,) = trimesh.load_scene(path, process=False).geometry.values()
+    np.testing.assert_allclose(read.vertices, frame.points(mesh.vertices[0]), atol=1e-6)
+    assert (read.faces == mesh.faces.numpy()).all()
+    # y up and twice as large: a ball of radius 1.
+    assert read.volume == pytest.approx(4 / 3 * math.pi, rel=0.05)
+
+
+def test_gltf_colours_are_linear_light(tmp_path: Path, mesh: MovingMesh, frame: UpFrame) -> None:
+    grey = MovingMesh(mesh.times, mesh.vertices, mesh.faces, torch.full_like(mesh.colors, 0.5))
+    write_gltf(tmp_path / "grey.glb", grey, {}, frame, SECONDS)
+    whole, array = glb(tmp_path / "grey.glb")
+    colors = array(whole["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]) / 65535
+    # sRGB 0.5 is 21.4 % of the light.
+    np.testing.assert_allclose(colors[:, :3], 0.21404, atol=1e-4)
+    assert (colors[:, 3] == 1).all()
+
+
+def test_gltf_cameras_see_the_ball_where_the_captures_do(
+    tmp_path: Path, mesh: MovingMesh, frame: UpFrame, around: Cameras
+) -> None:
+    named = {f"static_{k}": around[[k]] for k in range(6)}
+    write_gltf(tmp_path / "ball.glb", mesh, named, frame, SECONDS)
+    whole, array = glb(tmp_path / "ball.glb")
+    vertices = array(0).astype(float)
+    assert [one["name"] for one in whole["cameras"]] == list(named)
+    for index, node in enumerate(whole["nodes"][1:]):
+        pose = np.array(node["matrix"]).reshape(4, 4).T
+        local = (np.c_[vertices, np.ones(len(vertices))] @ np.linalg.inv(pose).T)[:, :3]
+        lens = whole["cameras"][node["camera"]]["perspective"]
+        y = local[:, 1] / -local[:, 2] / math.tan(lens["yfov"] / 2)
+        x = local[:, 0] / -local[:, 2] / math.tan(lens["yfov"] / 2) / lens["aspectRatio"]
+        seen, _ = around.project_into(index, mesh.vertices[0])
+        # Of the image's −1 to 1 its pixels: x to the right, y down from the top.
+        pixels = np.stack([(x + 1) * 48 / 2, (1 - y) * 36 / 2], axis=1)
+        np.testing.assert_allclose(pixels, seen.numpy(), atol=1e-3)
+
+
+def test_a_scene_at_rest_is_a_gltf_without_animation(
+    tmp_path: Path, moving_ball: DeVRFModel, around: Cameras, frame: UpFrame
+) -> None:
+    moving_ball.deformation = None
+    write_gltf(tmp_path / "rest.glb", moved_mesh(moving_ball, around, (0.0,)), {}, frame, 1.0)
+    whole, _ = glb(tmp_path / "rest.glb")
+    assert "animations" not in whole and "targets" not in whole["meshes"][0]["primitives"][0]
+
+
+def test_usd_has_a_sample_for_each_time(
+    tmp_path: Path, mesh: MovingMesh, frame: UpFrame, around: Cameras
+) -> None:
+    path = tmp_path / "ball.usdc"
+    write_usd(path, mesh, {"static_1": around[[1]]}, frame, SECONDS)
+    stage = Usd.Stage.Open(str(path))
+    assert UsdGeom.GetStageUpAxis(stage) == "Y" and UsdGeom.GetStageMetersPerUnit(stage) == 1
+    shape = UsdGeom.Mesh(stage.GetPrimAtPath("/scene/mesh"))
+    rate = stage.GetTimeCodesPerSecond()
+    assert shape.GetPointsAttr().GetTimeSamples() == [t * SECONDS * rate for t in TIMES]
+    for time, vertices in zip(TIMES, mesh.vertices, strict=True):
+        found = np.array(shape.GetPointsAttr().Get(time * SECONDS * rate))
+        np.testing.assert_allclose(found, frame.points(vertices), atol=1e-6)
+    assert len(shape.GetDisplayColorPrimvar().Get()) == mesh.vertices.shape[1]
+    camera = UsdGeom.Camera(stage.GetPrimAtPath("/scene/cameras/static_1")).GetCamera(0)
+    eye = camera.frustum.position
+    np.testing.assert_allclose(eye, frame.points(around.positions[1]), atol=1e-5)
+    # What the camera sees of the ball's middle is what the capture's does.
+    shown = camera.frustum.ComputeViewMatrix() * camera.frustum.ComputeProjectionMatrix()
+    x, y, _ = shown.Transform(Gf.Vec3d(*frame.points(mesh.vertices[0, 7]).tolist()))
+    seen, _ = around.project_into(1, mesh.vertices[0, 7:8])
+    assert [(x + 1) * 24, (1 - y) * 18] == pytest.approx(seen[0].tolist(), abs=1e-2)
+
+
+@pytest.mark.parametrize("format", ["ply", "obj"])
+def test_a_file_a_time_and_an_index(tmp_path: Path, mesh: MovingMesh, format: Any) -> None:
+    for name in ("frame_0009.ply", "frame_0009.obj", "frame_notes.txt"):
+        (tmp_path / name).touch()
+    write_sequence(tmp_path, format, TIMES, mesh_files(mesh), "surface", SECONDS)
+    index = json.loads((tmp_path / "index.json").read_text())
+    assert [(one["time"], one["seconds"]) for one in index["frames"]] == [
+        (time, 2 * time) for time in TIMES
+    ]
+    for one, vertices in zip(index["frames"], mesh.vertices, strict=True):
+        read = trimesh.load_mesh(tmp_path / one["file"], process=False)
+        np.testing.assert_allclose(read.vertices, vertices, atol=1e-5)
+        assert (read.faces == mesh.faces.numpy()).all()
+        assert (read.visual.vertex_colors[:, 0] > 250).all()
+        assert (read.visual.vertex_colors[:, 1] < 5).all()
+    # What an earlier, longer sequence left is gone; what is not its own stays.
+    assert not (tmp_path / f"frame_0009.{format}").exists()
+    assert (tmp_path / "frame_notes.txt").exists()
+
+
+def test_the_embedded_robot_is_within_a_hundredth_of_its_box(
+    tmp_path: Path,
+    of_distance: Callable[..., DeVRFModel],
+    tiny_recipe: ProceduralScene,
+    tiny_scene: Scene,
+) -> None:
+    robot, box, clock = tiny_recipe.model(), tiny_scene.bounds.whole, tiny_scene.clock
+    model = of_distance(lambda points: robot.distance(points, 0.0), box, 56)
+    motion = DeformationField(box, clock, voxels=24**3)
+    points = box.grid_points(motion.shape, torch.empty(0)).view(-1, 3)
+    material = robot.material(points, 0.0)
+    for frame, time in enumerate(clock.times):
+        moves = robot.forward(material, time) - points
+        motion.to_time[frame] = moves.view(*motion.shape, 3)
+    model.deformation = motion
+    mesh = moved_mesh(model, tiny_scene.static.train.cameras, clock.times)
+    write_sequence(tmp_path, "ply", mesh.times, mesh_files(mesh), "surface", SECONDS)
+    views, hundredth = tiny_scene.dynamic.test, 0.01 * math.hypot(*box.size)
+    for number, time in enumerate(clock.times):
+        read = trimesh.load_mesh(tmp_path / f"frame_{number:04d}.ply")
+        away = robot.distance(torch.tensor(read.vertices).float(), time).abs()
+        assert float(away.mean()) < hundredth
+        # And nothing is missing: what a camera sees is near the mesh.
+        image = int((views.times - time).abs().argmin())
+        depth = views.depth[image].view(-1)
+        met = depth.isfinite().nonzero()[:, 0]
+        seen = views.cameras[[image]].image_rays(0).at(met, depth[met])
+        missing, _ = KDTree(read.vertices).query(seen.numpy())
+        assert len(seen) > 30 and missing.mean() < hundredth

@@ -1,0 +1,161 @@
+"""The surface of a field at rest: where it is, which way it faces, how it is coloured."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+import trimesh
+
+from devrf.apps.export.settings import ExportSettings
+from devrf.apps.export.surface import Surface, canonical_surface
+from devrf.errors import DevrfError
+from devrf.geometry.box import Box
+from devrf.geometry.cameras import Cameras
+from devrf.geometry.contraction import ContractedSpace
+from devrf.geometry.ndc import NormalizedDevice
+from devrf.methods.devrf.model import DeVRFModel
+
+Build = Callable[..., DeVRFModel]
+
+
+def surface_of(model: DeVRFModel, cameras: Cameras, **settings: object) -> Surface:
+    return canonical_surface(
+        model.surface(),
+        model.space,
+        model.depth_limits,
+        cameras,
+        ExportSettings(**settings),
+        torch.device("cpu"),
+    )
+
+
+def mesh_of(surface: Surface) -> trimesh.Trimesh:
+    return trimesh.Trimesh(surface.points.numpy(), surface.faces.numpy(), process=False)
+
+
+def test_a_ball_is_where_it_is_closed_and_faces_outward(
+    moving_ball: DeVRFModel, around: Cameras
+) -> None:
+    surface = surface_of(moving_ball, around)
+    # Within a tenth of a voxel of 1/12: distances are not quite linear along an edge.
+    assert (surface.points.norm(dim=1) - 0.5).abs().max() < 0.1 / 12
+    mesh = mesh_of(surface)
+    assert mesh.is_watertight
+    assert mesh.volume == pytest.approx(4 / 3 * torch.pi * 0.125, rel=0.03)
+
+
+def test_what_no_camera_can_reach_is_solid(of_distance: Build, cube: Box, around: Cameras) -> None:
+    hollow = of_distance(lambda points: (points.norm(dim=1) - 0.4).abs() - 0.15, cube, 25)
+    mesh = mesh_of(surface_of(hollow, around))
+    assert mesh.body_count == 1
+    assert mesh.volume == pytest.approx(4 / 3 * torch.pi * 0.55**3, rel=0.03)
+
+
+def test_a_room_is_seen_from_within(of_distance: Build, cube: Box) -> None:
+    room = of_distance(lambda points: 0.7 - points.norm(dim=1), cube, 25)
+    inside = Cameras.looking_at(
+        torch.zeros(1, 3), torch.tensor([[1.0, 0, 0]]), focal=20.0, width=40, height=40
+    )
+    surface = surface_of(room, inside)
+    # Its normals point into the room: the volume that they enclose is negative.
+    assert mesh_of(surface).volume == pytest.approx(-4 / 3 * torch.pi * 0.343, rel=0.03)
+
+
+def test_small_pieces_are_left_out(of_distance: Build, cube: Box, around: Cameras) -> None:
+    def two(points: torch.Tensor) -> torch.Tensor:
+        small = (points - torch.tensor([0.8, 0.0, 0.0])).norm(dim=1) - 0.12
+        return torch.minimum(points.norm(dim=1) - 0.5, small)
+
+    model = of_distance(two, cube, 25)
+    assert mesh_of(surface_of(model, around, pieces=0.0)).body_count == 2
+    assert mesh_of(surface_of(model, around, pieces=0.2)).body_count == 1
+
+
+def test_it_has_as_many_faces_as_wanted(moving_ball: DeVRFModel, around: Cameras) -> None:
+    surface = surface_of(moving_ball, around, faces=300)
+    assert 200 < len(surface.faces) <= 300
+    assert (surface.points.norm(dim=1) - 0.5).abs().mean() < 0.02
+
+
+@pytest.mark.parametrize("colors", ["mean", "normal"])
+def test_it_has_the_colour_of_the_field(
+    of_distance: Build, cube: Box, around: Cameras, colors: str
+) -> None:
+    model = of_distance(lambda points: points.norm(dim=1) - 0.5, cube, 21, (0.2, 0.4, 0.9))
+    found = surface_of(model, around, colors=colors).colors
+    torch.testing.assert_close(
+        found, torch.tensor([0.2, 0.4, 0.9]).expand_as(found), atol=1e-3, rtol=0
+    )
+
+
+def test_a_forward_facing_surface_is_in_the_world_and_faces_the_camera(of_distance: Build) -> None:
+    space = NormalizedDevice(40, 30, (40.0, 40.0), near=2.0)
+    box = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+    # Everything further than 4 units, z' = 0, is matter.
+    wall = of_distance(lambda points: -points[:, 2], box, 21, space=space)
+    eye = Cameras(
+        torch.eye(4)[None, :3], torch.full((1, 2), 40.0), torch.tensor([[20.0, 15.0]]), 40, 30
+    )
+    surface = surface_of(wall, eye)
+    world = space.to_world(surface.points)
+    torch.testing.assert_close(world[:, 2], torch.full_like(world[:, 2], -4.0))
+    mesh = trimesh.Trimesh(world.numpy(), surface.faces.numpy(), process=False)
+    assert (mesh.face_normals[:, 2] > 0.99).all()
+    assert mesh.area == pytest.approx(4.0 * 3.0, rel=0.01)
+
+
+def test_of_an_endless_scene_what_is_far_is_left_out(of_distance: Build) -> None:
+    space = ContractedSpace((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+
+    def two_balls(points: torch.Tensor) -> torch.Tensor:
+        # In the shell, x = −1.4 is the world's −1 / (2 − 1.4), and 1.8 its 5.
+        near = (points - torch.tensor([-1.25, 0, 0])).norm(dim=1) - 0.15
+        return torch.minimum(near, (points - torch.tensor([1.9, 0, 0])).norm(dim=1) - 0.1)
+
+    model = of_distance(two_balls, space.box, 61, space=space)
+    middle = Cameras.looking_at(
+        torch.zeros(1, 3), torch.tensor([[-1.0, 0, 0]]), focal=20.0, width=40, height=40
+    )
+    both, near = (
+        space.to_world(surface_of(model, middle, pieces=0.0, reach=reach).points)
+        for reach in (1e9, 2.0)
+    )
+    assert both[:, 0].max() > 20
+    assert near[:, 0].min() == pytest.approx(-1 / 0.6, abs=0.02)
+    assert near[:, 0].max() < 0
+
+
+@pytest.mark.parametrize(
+    ("threshold", "expected"),
+    [
+        (0.999, "export.threshold: the field is empty: no voxel has the opacity 0.999"),
+        (1e-9, "export.threshold: all of the field has the opacity 1e-09"),
+    ],
+)
+def test_a_threshold_that_nothing_crosses_is_refused(
+    of_distance: Build, cube: Box, around: Cameras, threshold: float, expected: str
+) -> None:
+    flat = of_distance(lambda points: 0.01 * points[:, 0], cube, 9)
+    with pytest.raises(DevrfError, match=expected) as error:
+        surface_of(flat, around, threshold=threshold)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ({"threshold": 1.0}, "export.threshold: expected between 0 and 1, not 1.0"),
+        ({"side": 1}, "export.side: expected 2 to 1024, not 1"),
+        ({"faces": 0}, "export.faces: expected at least 4"),
+        ({"pieces": 2.0}, "export.pieces: expected 0 to 1, not 2.0"),
+        ({"metres": 0.0}, "export.metres: expected more than 0, not 0.0"),
+        ({"times": [0.5, 0.2]}, "export.times: expected ascending times"),
+        ({"times": [0.5, 1.2]}, "export.times: expected times from 0 to 1"),
+        ({"times": [0.5], "fps": 3.0}, "give one of them"),
+    ],
+)
+def test_settings_that_make_no_sense(settings: dict[str, object], expected: str) -> None:
+    with pytest.raises(DevrfError, match=expected):
+        ExportSettings(**settings)

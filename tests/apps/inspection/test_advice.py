@@ -1,0 +1,150 @@
+"""Each problem is found on a scene that was made to have it, and none on a healthy one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from devrf.apps.inspection.advice import listed
+from devrf.apps.inspection.report import inspect_scene
+from devrf.geometry.box import Box
+from devrf.scenes.bounds import box_from_cameras
+from devrf.scenes.procedural import ProceduralScene
+from devrf.scenes.scene import OpticalFlow, Scene, Views
+
+Spoil = Callable[[Scene], Scene]
+
+
+@pytest.fixture(scope="module")
+def healthy(tiny_recipe: ProceduralScene) -> Scene:
+    """A robot in 24×18 pixels: 16 static views all around, 2 moving views of 3 frames."""
+    return replace(tiny_recipe, static_views=16)()
+
+
+def changed(name: str, change: Callable[[Views], Views]) -> Spoil:
+    """A scene with one of its sets of images changed: ``static.train``."""
+    capture, part = name.split(".")
+
+    def spoil(scene: Scene) -> Scene:
+        sets = getattr(scene, capture)
+        return replace(scene, **{capture: replace(sets, **{part: change(getattr(sets, part))})})
+
+    return spoil
+
+
+def ambiguous(views: Views) -> Views:
+    return replace(views, ambiguous_orientation=torch.arange(len(views)) == 7)
+
+
+def late(views: Views) -> Views:
+    return replace(views, times=0.1 + 0.9 * views.times)
+
+
+def rgb(views: Views) -> Views:
+    return replace(views, pixels=views.pixels[..., :3])
+
+
+def turned(degrees: float) -> Callable[[Views], Views]:
+    """The fourth camera turned about its own up axis."""
+
+    def change(views: Views) -> Views:
+        poses = views.cameras.camera_to_world.clone()
+        c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+        poses[3, :, :3] @= torch.tensor([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+        return replace(views, cameras=replace(views.cameras, camera_to_world=poses))
+
+    return change
+
+
+def painted(image: int | slice, channels: slice, value: list[int]) -> Callable[[Views], Views]:
+    def change(views: Views) -> Views:
+        pixels = views.pixels.clone()
+        pixels[image, ..., channels] = torch.tensor(value, dtype=torch.uint8)
+        return replace(views, pixels=pixels)
+
+    return change
+
+
+def where(test: Callable[[Views], Tensor]) -> Callable[[Views], Views]:
+    return lambda views: views[test(views).nonzero()[:, 0]]
+
+
+def flowing(change: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]) -> Spoil:
+    def flowed(views: Views) -> Views:
+        assert views.flow is not None
+        return replace(views, flow=OpticalFlow(*change(views.flow.vectors, views.flow.valid)))
+
+    return changed("dynamic.train", flowed)
+
+
+def without_alpha(scene: Scene, box: Box | None = None) -> Scene:
+    for name in SETS:
+        scene = changed(name, rgb)(scene)
+    bounds = replace(scene.bounds, box=box or scene.bounds.box.scaled(0.9))
+    return replace(scene, bounds=bounds)
+
+
+def one_colour(scene: Scene) -> Scene:
+    return changed(MOVING, painted(2, slice(3), [90, 90, 91]))(without_alpha(scene))
+
+
+SETS = REST, REST_TEST, MOVING, _ = "static.train", "static.test", "dynamic.train", "dynamic.test"
+PROBLEMS: list[tuple[Spoil, str, str]] = [
+    (changed(REST_TEST, where(lambda v: v.times < 0)), "static test", "no view"),
+    (changed(REST, turned(180)), "static train 003", "looks away"),
+    (changed(REST, turned(75)), "static train 003", "in the picture"),
+    (changed(REST, where(lambda v: v.cameras.positions[:, 0] > 0)), "static training", "sector of"),
+    (one_colour, "frame 001 view 0", "one colour"),
+    (changed(REST, painted(5, slice(4), [90, 0, 91, 0])), "static train 005", "mask is empty"),
+    (changed(REST, ambiguous), "static train 007", "EXIF orientation"),
+    (changed(REST_TEST, rgb), "static test", "without alpha masks"),
+    (changed(REST_TEST, painted(slice(None), slice(3, 4), [255])), "static test", "opaque"),
+    (changed(MOVING, late), "dynamic training", "begins at time 0.1"),
+    (
+        changed(MOVING, where(lambda v: (v.times != 0.5) | (v.view != 1))),
+        "dynamic training",
+        "time 0.5 without view 1",
+    ),
+    (flowing(lambda vectors, valid: (vectors, valid & False)), "optical flow", "on 0.0 %"),
+    (flowing(lambda vectors, valid: (vectors + 25, valid)), "flow of", "the image (24 px)"),
+    (flowing(lambda vectors, valid: (vectors * math.nan, valid)), "flow of", "not a number"),
+]
+
+
+@pytest.mark.parametrize(("spoil", "where", "what"), PROBLEMS)
+def test_a_problem(healthy: Scene, spoil: Spoil, where: str, what: str) -> None:
+    (found,) = inspect_scene(spoil(healthy)).advice
+    assert where in found.where and what in found.what
+    assert str(found) == f"{found.where}: {found.what}; {found.remedy}"
+
+
+def test_no_problem(healthy: Scene) -> None:
+    assert inspect_scene(healthy).advice == ()
+
+
+def test_held_out_views_that_are_learned_from(healthy: Scene) -> None:
+    train = healthy.dynamic.train
+    spoil = changed("dynamic.test", lambda _: train[torch.tensor([0, 4])])
+    (found,) = inspect_scene(spoil(healthy)).advice
+    assert found.where == "dynamic test set"
+    assert train.names[0] in found.what and train.names[4] in found.what
+    # The same camera at another time may be held out.
+    test = replace(train[torch.tensor([0])], times=torch.tensor([0.25]))
+    assert inspect_scene(changed("dynamic.test", lambda _: test)(healthy)).advice == ()
+
+
+def test_a_box_that_is_only_guessed(healthy: Scene) -> None:
+    guess = box_from_cameras(healthy.static.train.cameras)
+    (found,) = inspect_scene(without_alpha(healthy, guess)).advice
+    assert "data.box=" in found.remedy
+    assert inspect_scene(without_alpha(healthy, guess.scaled(0.9))).advice == ()
+
+
+def test_long_lists_are_cut_short() -> None:
+    assert listed(["a", "b"]) == "a, b"
+    assert listed([str(k) for k in range(9)]) == "0, 1, 2 and 6 more"

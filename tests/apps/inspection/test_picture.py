@@ -1,0 +1,154 @@
+"""The page of an inspection: its panels and labels, and what they show."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import imageio.v3 as iio
+import pytest
+import torch
+from matplotlib.figure import Figure
+
+from devrf.apps.inspection.camera_plot import box_edges, compass, frusta, scene_lines
+from devrf.apps.inspection.picture import (
+    flow_scale,
+    inspection_figure,
+    sample_images,
+    shown,
+    write_inspection_picture,
+)
+from devrf.geometry.box import Box
+from devrf.geometry.cameras import Cameras
+from devrf.geometry.ndc import NormalizedDevice
+from devrf.scenes.scene import Capture, OpticalFlow, Scene, Views
+
+
+@pytest.fixture(scope="module")
+def forward_scene(tiny_scene: Scene) -> Scene:
+    """The tiny scene as if it lived in NDC, its cameras side by side."""
+
+    def facing(views: Views) -> Views:
+        pose = torch.eye(3, 4).repeat(len(views), 1, 1)
+        pose[:, 0, 3] = 0.1 * torch.arange(len(views))
+        return replace(views, cameras=replace(views.cameras, camera_to_world=pose))
+
+    box = Box((-1.2, -1.1, -1.0), (1.2, 1.1, 1.0))
+    return replace(
+        tiny_scene,
+        kind="forward",
+        space=NormalizedDevice(24, 18, (24.0, 24.0)),
+        bounds=replace(tiny_scene.bounds, box=box, motion=None),
+        static=Capture(*map(facing, (tiny_scene.static.train, tiny_scene.static.test))),
+        dynamic=Capture(*map(facing, (tiny_scene.dynamic.train, tiny_scene.dynamic.test))),
+    )
+
+
+def captions(figure: Figure) -> list[str]:
+    """Labels below the images of a page."""
+    return [label for axes in figure.axes[2:] if (label := axes.get_xlabel())]
+
+
+def headings(figure: Figure) -> str:
+    return "\n".join(part.get_suptitle() for part in figure.subfigs)
+
+
+def test_the_page_of_a_scene(tiny_scene: Scene) -> None:
+    figure = inspection_figure(tiny_scene)
+    for part in ("robot, inward-facing", "set: 8 images", "2 fixed views, 3 times", "Optical flow"):
+        assert part in headings(figure)
+    (legend,) = figure.subfigs[0].legends
+    labels = [text.get_text() for text in legend.get_texts()]
+    assert {"box", "room for motion", "static views (8)", "dynamic views (2)"} <= set(labels)
+    plan = {text.get_text() for text in figure.axes[1].texts}
+    assert plan == {"view 0", "view 1", "test 0"}
+    rows = [f"view {view}, time {time}" for view in (0, 1) for time in ("0.00", "0.50", "1.00")]
+    found = captions(figure)
+    assert found[:1] == ["static train 000"] and found[6:12] == rows
+    # Of each view's first image there is no flow; the first place shows the wheel instead.
+    assert found[12].startswith("rim: ") and found[13:] == rows[1:3] + rows[4:]
+
+
+def test_the_page_of_a_moving_camera_without_flow(forward_scene: Scene) -> None:
+    train = forward_scene.dynamic.train
+    train = replace(train, view=torch.arange(6), times=torch.linspace(0, 1, 6), flow=None)
+    figure = inspection_figure(replace(forward_scene, dynamic=Capture(train, train)))
+    assert "a moving camera, 6 times" in headings(figure)
+    assert "Optical flow" not in headings(figure)
+    assert [label.split(",")[0] for label in captions(figure)[6:]] == [
+        f"view {k}" for k in range(6)
+    ]
+
+
+def test_the_file(tiny_scene: Scene, tmp_path: Path) -> None:
+    path = tmp_path / "images" / "inspect.png"
+    # A name may hold what matplotlib takes for a formula.
+    write_inspection_picture(path, replace(tiny_scene, name=r"$\broken$"))
+    assert iio.imread(path).shape[1] == 1600
+    assert [p.name for p in path.parent.iterdir()] == ["inspect.png"]
+
+
+def test_edges_of_a_box(tiny_scene: Scene, cube: Box) -> None:
+    edges = box_edges(tiny_scene, cube)
+    assert edges.shape == (12, 2, 3)
+    torch.testing.assert_close((edges[:, 1] - edges[:, 0]).norm(dim=1), torch.full((12,), 2.0))
+    assert len({tuple(sorted(map(tuple, edge))) for edge in edges.tolist()}) == 12
+
+
+def test_a_camera_is_a_pyramid_that_opens_where_it_looks() -> None:
+    cameras = Cameras(
+        torch.eye(3, 4)[None], torch.tensor([[10.0, 10.0]]), torch.tensor([[10.0, 5.0]]), 20, 10
+    )
+    lines = frusta(cameras, depth=2.0)
+    assert lines.shape == (10, 2, 3)
+    # The image's top left corner: 10 left and 5 up at focal length 10, 2 away along -z.
+    torch.testing.assert_close(lines[0], torch.tensor([[0.0, 0, 0], [-2.0, 1.0, -2.0]]))
+    # The tick above it shows which way is up.
+    torch.testing.assert_close(lines[8, 1], torch.tensor([0.0, 1.4, -2.0]))
+
+
+def test_fixed_cameras_are_drawn_once(tiny_scene: Scene) -> None:
+    counts = {group.label: len(group.ends) for group in scene_lines(tiny_scene)}
+    assert counts["dynamic views (2)"] == 20 and counts["held-out dynamic (1)"] == 10
+
+
+def test_forward_facing_cameras_look_north(forward_scene: Scene) -> None:
+    east_north_up = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    torch.testing.assert_close(compass(forward_scene), east_north_up, atol=1e-5, rtol=0)
+
+
+def test_the_longest_hundredth_of_the_flow_does_not_count() -> None:
+    vectors, valid = torch.zeros(6, 18, 24, 2), torch.ones(6, 18, 24, dtype=torch.bool)
+    vectors[..., 0] = 2.0
+    vectors[0, 0, 0] = torch.tensor([500.0, float("nan")])
+    vectors[1, 0, 0] = 500.0
+    assert flow_scale(OpticalFlow(vectors, valid)) == pytest.approx(2.0)
+    assert flow_scale(OpticalFlow(vectors, valid & False)) == 1.0
+
+
+def test_what_alpha_or_masks_leave_out_is_chequered(tiny_scene: Scene) -> None:
+    views = tiny_scene.static.train[torch.tensor([0])]
+    pixels = torch.tensor([255, 0, 0, 255], dtype=torch.uint8).expand(1, 18, 24, 4).clone()
+    left = (torch.arange(24) < 12).expand(1, 18, 24)
+    cut_out = pixels * torch.stack([torch.ones_like(left)] * 3 + [left], dim=-1)
+    for changed in (
+        replace(views, pixels=cut_out),
+        replace(views, pixels=pixels, valid_mask=left),
+        replace(views, pixels=pixels[..., :3], valid_mask=left),
+    ):
+        image = shown(changed, 0)
+        assert (image[:, :12] == [255, 0, 0]).all()
+        assert set(image[:, 12:].reshape(-1).tolist()) == {232, 255}
+
+
+def test_few_views_at_few_times_are_shown(tiny_scene: Scene) -> None:
+    train = tiny_scene.dynamic.train
+    many = train[torch.arange(6).repeat(60)]
+    views = replace(many, view=torch.arange(6).repeat_interleave(60), times=torch.rand(360))
+    rows = sample_images(views)
+    assert [int(views.view[row[0]]) for row in rows] == [0, 2, 3, 5]
+    for row in rows:
+        times = views.times[row]
+        assert len(row) == 6 and bool((times.diff() > 0).all())
+        own = views.times[views.view == views.view[row[0]]]
+        assert (times[0], times[-1]) == (own.min(), own.max())

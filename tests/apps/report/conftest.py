@@ -1,0 +1,98 @@
+"""Folders as runs leave them, without running anything."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import pytest
+
+from devrf.apps.report.runs import collect
+from devrf.apps.report.table import tabulate
+
+
+@pytest.fixture
+def runs(tmp_path):
+    """The folder that the runs of a test lie in."""
+    folder = tmp_path / "runs"
+    folder.mkdir()
+    return folder
+
+
+@pytest.fixture
+def ran(runs):
+    """``ran(name, …)``: leaves a finished run in ``runs/name`` and returns its folder."""
+
+    def write(
+        name,
+        scene="robot",
+        *,
+        method=None,
+        protocol=None,
+        scores=None,
+        seconds=(10.0, 20.0),
+        gpu=(None, None),
+        ablation="full",
+        choices=None,
+        overrides=(),
+        seed=0,
+        frames=(),
+        **of_run,
+    ):
+        # Without a method: as earlier versions wrote it.
+        new = {"method": method, "protocol": protocol} if method else {}
+        static, dynamic = ("static", "dynamic") if method else ("canonical", "deformation")
+        scored = {"psnr": 29.0, "ssim": 0.95, "lpips": None, **(scores or {})}
+        record = {
+            "scene": scene,
+            **new,
+            static: {"psnr": 33.0, "seconds": seconds[0], "peak_gpu_gb": gpu[0]},
+            dynamic: {**scored, "seconds": seconds[1], "peak_gpu_gb": gpu[1]},
+            "run": {
+                "device": "a processor",
+                "git": "0123456789abcdef",
+                "choices": {"ablation": ablation, "logger": "csv", **new, **(choices or {})},
+                "overrides": list(overrides),
+                "seed": seed,
+                **of_run,
+            },
+        }
+        folder = runs / name
+        folder.mkdir(parents=True)
+        (folder / "metrics.json").write_text(json.dumps(record))
+        if frames:
+            with (folder / "frames.csv").open("w", newline="") as file:
+                table = csv.writer(file)
+                table.writerow(["capture", "name", "time", "psnr", "ssim"])
+                table.writerow(["static", "at rest", 0, 40, 0.9])
+                table.writerows(["dynamic", f"m{t}", t, psnr, ""] for t, psnr in frames)
+        return folder
+
+    return write
+
+
+@pytest.fixture
+def failed(runs):
+    """``failed(name, error, …)``: leaves the record of a failed job in ``runs/name``."""
+
+    def write(name, error, **further):
+        record = {
+            "scene": "robot",
+            "choices": {"ablation": "base"},
+            "overrides": ["ablation=base"],
+            "seed": 0,
+            "error": error,
+            "mistake": True,
+            "date": "2026-01-01T00:00:00+00:00",
+        }
+        folder = runs / name
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "failure.json").write_text(json.dumps({**record, **further}))
+
+    return write
+
+
+@pytest.fixture
+def table(runs):
+    """``table(…)``: the table of what lies in the folder."""
+    return lambda *published: tabulate(collect(runs), *published)

@@ -1,0 +1,160 @@
+"""The same table as Markdown, plain text and LaTeX, read back."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from devrf.apps.report import latex as latex_form
+from devrf.apps.report import markdown as markdown_form
+from devrf.apps.report.latex import latex
+from devrf.apps.report.markdown import markdown, plain
+
+FULL = "Ours w/ c2f, tv, cycle, flow"
+METRICS = ["PSNR ↑", "SSIM ↑", "LPIPS ↓", "GPU (GB) ↓", "Time ↓"]
+
+
+@pytest.fixture
+def pig_and_robot(table, ran):
+    """Pig toy by three ablations, one of them with two seeds; and a run of the robot."""
+    for k, (ablation, psnr, seed) in enumerate(
+        [("base", 20.0, 0), ("c2f", 24.0, 0), ("full", 29.0, 0), ("full", 31.0, 1)]
+    ):
+        scores = {"psnr": psnr, "ssim": psnr / 40}
+        ran(f"{k}_pig", "pig_toy", ablation=ablation, seed=seed, seconds=(k, 20), scores=scores)
+    ran("robot", ablation="c2f", scores={"psnr": 25.0, "ssim": 0.9})
+    return table
+
+
+def rows_below(text, heading):
+    """Cells of the Markdown table below a heading, without its rule."""
+    section = text.split(f"## {heading}\n")[1].split("\n## ")[0]
+    lines = [line for line in section.splitlines() if line.startswith("|")]
+    return [[cell.strip() for cell in line[1:-1].split(" | ")] for line in lines[:1] + lines[2:]]
+
+
+def test_markdown_tables_read_back(pig_and_robot):
+    text = markdown(pig_and_robot(), {})
+    head, *rows = rows_below(text, "pig_toy")
+    assert head == ["", *METRICS]
+    assert rows[:3] == [
+        ["Ours (base)", "*20.00*", "*0.500*", "–", "–", "**20 s**"],
+        ["Ours w/ c2f", "<ins>24.00</ins>", "<ins>0.600</ins>", "–", "–", "<ins>21 s</ins>"],
+        [f"{FULL} (n = 2)", "**30.00 ± 1.41**", "**0.750 ± 0.035**", "–", "–", "*22 ± 1 s*"],
+    ]
+    assert rows[3] == ["*† published, on an NVIDIA GeForce RTX 3090*", *[""] * 5]
+    assert rows[4] == ["† D-NeRF", "31.23", "0.974", "0.0381", "12.4", "22.1hrs"]
+    assert len(rows) == 3 + 1 + 9 and all(len(row) == 6 for row in rows)
+    assert "# Runs compared\n\n5 finished runs below `" in text
+    assert "NeurIPS 2022" in text and "not marked" in text
+    assert "- No run has LPIPS: " in text
+
+
+def test_methods_and_protocols_have_columns_where_they_differ(table, ran):
+    ran("a", "lego", method="dnerf", protocol="joint")
+    ran("b", "lego", method="dnerf", protocol="dynamic")
+    head, *rows = rows_below(markdown(table(), {}), "lego")
+    assert head == ["", "Protocol", *METRICS]
+    assert [row[:3] for row in rows[:2]] == [["D-NeRF", p, "29.00"] for p in ("dynamic", "joint")]
+    assert rows[3][:2] == ["† Neural Volumes", ""]
+    assert re.search("^D-NeRF +dynamic +29.00", plain(table()), flags=re.MULTILINE)
+    assert "D-NeRF & dynamic & 29.00" in latex(table())
+    ran("c", "lego", method="devrf", protocol="joint", scores={"psnr": 31.0})
+    head, *rows = rows_below(markdown(table(), {}), "lego")
+    assert head == ["Method", "Protocol", *METRICS]
+    assert rows[0][:3] == [FULL, "joint", "**31.00**"]
+
+
+def test_nothing_is_credited_that_is_not_shown(table, ran):
+    ran("a")
+    text = markdown(table(), {"PSNR over time": "figures/a b.png"})
+    assert "NeurIPS" not in text and "†" not in text and "± " not in text
+    assert "![PSNR over time](<figures/a b.png>)" in text
+
+
+def test_failures_are_listed_with_their_reason(pig_and_robot, failed, runs):
+    shared = "data.width=24"
+    failed("7_robot", "data.frames: expected 2", overrides=[shared, "data.frames=1"])
+    failed("8_robot", "ZeroDivisionError: by zero", mistake=False, overrides=[shared])
+    (runs / "9_robot").mkdir()
+    (runs / "9_robot" / "metrics.json").write_text("{")
+    found = pig_and_robot()
+    first = f"7_robot (robot {shared} data.frames=1): data.frames: expected 2"
+    second = (
+        f"8_robot (robot {shared}): ZeroDivisionError: by zero "
+        "(a fault of the program: see its run.log)"
+    )
+    text = markdown(found, {})
+    assert f"## Failed\n\n- {first}\n- {second}\n" in text
+    assert "5 finished runs" in text and ", 2 failed." in text
+    assert f"## Skipped\n\n- {runs}/9_robot/metrics.json: skipped; damaged" in text
+    said = plain(found)
+    assert f"failed: {first}\nfailed: {second}\n" in said
+    assert said.count("metrics.json: skipped") == 1
+    assert f"% failed: {first}\n% failed: {second}\n" in latex(found)
+
+
+def test_overrides_that_all_runs_share_are_left_out(table, ran, failed):
+    failed("1", "lost", overrides=["data.width=24", "seed=1"])
+    ran("0", overrides=["data.width=24", "seed=0"])
+    assert "- 1 (robot seed=1): lost\n" in markdown(table(), {})
+
+
+def test_plain_text_is_aligned_and_marked(pig_and_robot):
+    lines = plain(pig_and_robot()).splitlines()
+    assert lines[0].split() == ["pig_toy", *" ".join(METRICS).split()]
+    assert lines[1].startswith("Ours (base) ") and "20.00³" in lines[1] and "20 s¹" in lines[1]
+    assert len({line.index("–") for line in lines[1:4]}) == 1
+
+
+@pytest.mark.parametrize(
+    ("escaped", "text", "expected"),
+    [
+        (markdown_form.escaped, "pig_toy _a_ a|b 2*3*4", r"pig_toy \_a\_ a\|b 2\*3\*4"),
+        (markdown_form.escaped, "<b> `x` [y] a\\b", r"\<b\> \`x\` \[y\] a\\b"),
+        (latex_form.escaped, "pig_toy 100 % & more", r"pig\_toy 100 \% \& more"),
+        (latex_form.escaped, "$x^2$ #{1}", r"\$x\textasciicircum{}2\$ \#\{1\}"),
+        (latex_form.escaped, "C:\\x~", r"C:\textbackslash{}x\textasciitilde{}"),
+        (latex_form.escaped, "29 ± 1 ↑ ↓", r"29 $\pm$ 1 $\uparrow$ $\downarrow$"),
+        (latex_form.escaped, "– † <|>", r"-- $\dagger$ \textless{}\textbar{}\textgreater{}"),
+    ],
+)
+def test_nothing_in_a_text_is_taken_for_markup(escaped, text, expected):
+    assert escaped(text) == expected
+
+
+def test_latex_has_the_scenes_side_by_side(pig_and_robot):
+    text = latex(pig_and_robot())
+    assert text.isascii()
+    assert r"\begin{tabular}{l|ccccc|ccccc|ccccc}" in text
+    body = text.split(r"\begin{tabular}")[1].split(r"\end{tabular}")[0]
+    lines = [line for line in body.splitlines() if "&" in line]
+    assert lines[0] == (
+        r" & \multicolumn{5}{c|}{pig\_toy} & \multicolumn{5}{c|}{robot} & "
+        r"\multicolumn{5}{c}{average over 2 scenes} \\"
+    )
+    # Every other row has a label and five cells a scene.
+    assert {len(re.split(r"(?<!\\)&", line)) for line in lines[1:]} == {16}
+    c2f = next(line for line in lines if line.startswith("Ours w/ c2f &"))
+    assert c2f == (
+        r"Ours w/ c2f & \devrfsecond{24.00} & \devrfsecond{0.600} & -- & -- & \devrfsecond{21 s} & "
+        r"25.00 & 0.900 & -- & -- & 30 s & 24.50 & 0.750 & -- & -- & 26 s \\"
+    )
+    full = next(line for line in lines if line.startswith(f"{FULL} (n = 2)"))
+    assert r"\devrfbest{30.00 $\pm$ 1.41}" in full
+    # What a scene does not have stays empty.
+    assert re.search(r"(&  ){9}&  \\\\$", full)
+    heading = r"\textit{$\dagger$ published, on an NVIDIA GeForce RTX 3090}"
+    assert f"\\hline\n\\multicolumn{{16}}{{l}}{{{heading}}} \\\\\n" in body
+    assert r"\providecommand{\devrfbest}[1]{\textbf{#1}}" in text
+
+
+def test_latex_begins_a_new_table_after_three_scenes(table, ran):
+    for k in range(4):
+        ran(str(k), f"scene_{k}")
+    text = latex(table())
+    assert text.count(r"\begin{table*}") == text.count(r"\end{table*}") == 2
+    assert text.count("{") == text.count("}")
+    assert r"\begin{tabular}{l|ccccc|ccccc|ccccc}" in text
+    assert r"\begin{tabular}{l|ccccc|ccccc}" in text  # the fourth, and the average

@@ -1,0 +1,182 @@
+"""Which runs share a row, and what rows are called."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from devrf.apps.report.labels import labelled
+from devrf.apps.report.runs import collect
+
+FULL = "Ours w/ c2f, tv, cycle, flow"
+
+
+@pytest.fixture
+def rows(runs):
+    """``rows()``: (scene, label, folders) of each row of what lies in the folder."""
+
+    def read():
+        groups = labelled(collect(runs).runs).groupby(["scene", "label"], sort=False)
+        return [(*key, list(folders)) for key, folders in groups["folder"]]
+
+    return read
+
+
+@pytest.fixture
+def labels(rows):
+    return lambda: [label for _, label, _ in rows()]
+
+
+def test_ablations_are_called_and_ordered_as_in_the_paper(labels, ran):
+    for k, ablation in enumerate(("full", "c2f_tv", "base", "c2f_tv_cycle", "c2f", "no_tv", None)):
+        ran(str(k), ablation=ablation)
+    assert labels() == [
+        "Ours (base)",
+        "Ours w/ c2f",
+        "Ours w/ c2f, tv",
+        "Ours w/ c2f, tv, cycle",
+        FULL,
+        "Ours",
+        "Ours (no_tv)",
+    ]
+
+
+def test_runs_equal_in_all_that_was_typed_but_seed_and_folder_share_a_row(rows, ran):
+    for k, seed in enumerate((0, 1, 2, 2, None)):
+        ran(f"{k}/run", seed=seed, overrides=[f"seed={seed}", f"hydra.run.dir={k}", "logger=wandb"])
+    ran("5", choices={"logger": "wandb"}, overrides=["video.frames=3"])
+    assert rows() == [("robot", FULL, ["0/run", "1/run", "2/run", "3/run", "4/run", "5"])]
+
+
+def test_what_is_the_same_for_all_runs_of_a_scene_is_not_said(rows, ran):
+    for k, shape in enumerate(("robot", "flower")):
+        typed = [f"data.shape={shape}", "field.width=16"]
+        ran(str(k), shape, choices={"schedule": "quick"}, train_views=4 - k, overrides=typed)
+    assert rows() == [("robot", FULL, ["0"]), ("flower", FULL, ["1"])]
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "endings"),
+    [
+        ({"choices": {"field": "a"}}, {"choices": {"field": "b"}}, ["; field=a", "; field=b"]),
+        (
+            {"choices": {"experiment": "x"}},
+            {"choices": {"experiment": None}},
+            ["", "; experiment=x"],
+        ),
+        ({"train_views": 1}, {"train_views": 2}, ["; 1 view", "; 2 views"]),
+        ({"overrides": ["+loss.deformation.tv=0.5"]}, {}, ["", "; loss.deformation.tv=0.5"]),
+        ({"test_frames": 3}, {"test_frames": 14}, ["; 14 held-out images", "; 3 held-out images"]),
+        ({"device": "GPU"}, {"device": "CPU"}, ["; on CPU", "; on GPU"]),
+        (
+            {"git": "ab" * 20},
+            {"git": "ab" * 20 + "-dirty"},
+            ["; at ababababa", "; at ababababa-dirty"],
+        ),
+        ({"devrf": "1.0"}, {"devrf": "2.0"}, ["; devrf 1.0", "; devrf 2.0"]),
+        ({"method": "devrf", "protocol": "joint"}, {}, ["; joint", "; two_stage"]),
+        ({"choices": {"method": "devrf_big"}}, {}, ["", "; method=devrf_big"]),
+    ],
+)
+def test_two_different_runs_never_share_a_row(labels, ran, one, other, endings):
+    ran("a", seed=0, **one)
+    ran("b", seed=1, **other)
+    assert labels() == [FULL + ending for ending in endings]
+
+
+def test_methods_have_rows_of_their_own_after_ours(labels, ran):
+    ran("a", method="nsff", protocol="dynamic")
+    ran("b", method="dnerf", protocol="joint", overrides=["method=dnerf", "protocol=joint"])
+    ran("c", method="dnerf", protocol="dynamic")
+    ran("d", method="mine", protocol="joint", ablation="small")
+    ran("e")  # by an earlier version, which knew one method
+    ran("f", method="devrf", protocol="two_stage", seed=1)
+    assert labels() == [
+        f"{FULL}; two_stage",
+        "D-NeRF; dynamic",
+        "D-NeRF; joint",
+        "NSFF; dynamic",
+        "mine (small); joint",
+    ]
+
+
+def test_the_most_telling_difference_is_said_and_what_follows_from_it_is_not(labels, ran):
+    for name, schedule in (("quickstart", "quick"), ("paper_inward", "paper_inward")):
+        choices = {"experiment": name, "schedule": schedule, "field": schedule}
+        ran(name, choices=choices, overrides=[f"experiment={name}"])
+    assert labels() == [f"{FULL}; experiment=paper_inward", f"{FULL}; experiment=quickstart"]
+
+
+def test_a_run_that_does_not_say_how_it_was_configured_goes_by_its_folder(rows, ran):
+    ran("known")
+    for name, scene in (("old/a", "robot"), ("old/b", "robot"), ("old/c", "flower")):
+        path = ran(name, scene) / "metrics.json"
+        record = json.loads(path.read_text())
+        del record["run"]["choices"]
+        path.write_text(json.dumps(record))
+    assert rows() == [
+        ("robot", FULL, ["known"]),
+        ("robot", "Ours; old/a", ["old/a"]),
+        ("robot", "Ours; old/b", ["old/b"]),
+        ("flower", "Ours; old/c", ["old/c"]),
+    ]
+
+
+def test_a_row_knows_its_views_and_its_label_without_them(ran, runs):
+    for views in (1, 3):
+        ran(str(views), train_views=views, overrides=[f"data.train_views={views}"])
+    found = labelled(collect(runs).runs)
+    assert list(found["views"]) == [1, 3] and set(found["line"]) == {FULL}
+
+
+SETTINGS = {"data.frames": 14, "data.width": 96, "data.near": None, "seed": 0}
+
+
+@pytest.fixture
+def learned(ran):
+    """``learned(name, settings, …)``: leaves a run that records its settings."""
+
+    def write(name, settings=(), seed=0, **how):
+        own = {**SETTINGS, **dict(settings), "seed": seed}
+        ran(name, method="devrf", protocol="two_stage", seed=seed, settings=own, **how)
+
+    return write
+
+
+def test_equal_runs_share_a_row_whatever_was_typed(rows, learned):
+    learned("a")
+    learned("b", seed=1, choices={"experiment": "quickstart"}, overrides=["data.width=96"])
+    learned("b/previous-1", overrides=["resume=false", "ckpt=x"], choices={"field": "small"})
+    learned("c", ablation="base", overrides=["seed=3", "data.frames=14"], seed=3)
+    assert rows() == [("robot", "Ours (base)", ["a", "b", "b/previous-1", "c"])]
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "endings"),
+    [
+        ({"data.width": 48}, {}, ["; data.width=48", "; data.width=96"]),
+        ({"data.frames": 8, "data.width": 48}, {}, ["; data.frames=14", "; data.frames=8"]),
+        ({"data.near": 0.5}, {}, ["; data.near=0.5", "; data.near=null"]),
+        ({"data.sides": [4, 8]}, {}, ["", "; data.sides=[4, 8]"]),
+    ],
+)
+def test_unequal_runs_say_what_differs(labels, learned, one, other, endings):
+    # Not what was typed, and not the name of an experiment that has the defaults.
+    learned("a", one, choices={"experiment": "quickstart"})
+    learned("b", other, choices={"experiment": None}, seed=1)
+    assert labels() == [FULL + ending for ending in endings]
+
+
+def test_a_name_for_the_settings_is_said_where_all_equal_runs_have_it(labels, learned):
+    for k, schedule in enumerate(("quick", "paper")):
+        for seed in (0, 1):
+            width = {"schedule.side": k, "data.width": 96 + k}
+            learned(f"{k}{seed}", width, seed=seed, choices={"schedule": schedule})
+    assert labels() == [f"{FULL}; schedule=paper", f"{FULL}; schedule=quick"]
+
+
+def test_captures_of_one_name_are_not_taken_for_one(labels, learned):
+    for k in "ab":
+        learned(k, fingerprint=f"{k}bcdefgh")
+    assert labels() == [f"{FULL}; capture abcdef", f"{FULL}; capture bbcdef"]

@@ -1,0 +1,114 @@
+"""Plots show what was measured, and only that."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from matplotlib.colors import to_rgb
+
+from devrf.apps.report.plots import (
+    COLORS,
+    GREY,
+    against_views,
+    plots,
+    psnr_against_seconds,
+    psnr_over_time,
+)
+
+
+def curves(axes):
+    """The points of each labelled curve."""
+    return {
+        line.get_label(): list(zip(line.get_xdata(), line.get_ydata(), strict=True))
+        for line in axes.get_lines()
+    }
+
+
+def test_psnr_over_time_is_the_mean_over_seeds(table, ran):
+    ran("a", seed=0, frames=[(0.0, 30.0), (1.0, 20.0)])
+    ran("b", seed=1, frames=[(0.0, 32.0), (1.0, 22.0)])
+    ran("c", ablation="base", frames=[(0.0, 15.0), (1.0, 14.0)])
+    ran("d", "flower", frames=[(0.0, 1.0)])
+    (axes,) = psnr_over_time(table(), "robot").axes
+    assert curves(axes) == {
+        "Ours (base)": [(0, 15), (1, 14)],
+        "Ours w/ c2f, tv, cycle, flow": [(0, 31), (1, 21)],
+    }
+    assert axes.get_title() == "robot"
+
+
+def test_psnr_against_seconds_has_a_panel_a_scene_and_the_published_rows(table, ran):
+    ran("a", "lego", scores={"psnr": 30.0}, seconds=(100, 200))
+    ran("b", "robot", scores={"psnr": 25.0}, seconds=(10, 20))
+    ran("c", "flower", seconds=(None, 20))
+    lego, robot = psnr_against_seconds(table()).axes
+    assert [axes.get_title() for axes in (lego, robot)] == ["lego", "robot"]
+    assert curves(robot) == {"Ours w/ c2f, tv, cycle, flow": [(30, 25)]}
+    points = [(x, y) for line in lego.get_lines() for x, y in zip(*line.get_data(), strict=True)]
+    assert len(points) == 1 + 17
+    assert points[0] == (300, 30) and (540, 29.25) in points
+    assert {line.get_label() for line in lego.get_lines()[1:]} == {
+        f"{name}, published"
+        for name in ("Neural Volumes", "D-NeRF", "Nerfies", "HyperNeRF", "NSFF", "DeVRF")
+    }
+    assert lego.get_xscale() == "log"
+
+
+def test_metrics_against_views_need_several_numbers_of_them(table, ran):
+    ran("1", train_views=1, scores={"psnr": 20.0, "ssim": 0.8})
+    ran("base", ablation="base", train_views=1)
+    assert against_views(table()) is None
+    ran("3", train_views=3, scores={"psnr": 26.0, "ssim": 0.9})
+    psnr, ssim = against_views(table()).axes
+    assert curves(psnr) == {"robot": [(1, 20), (3, 26)]}
+    assert curves(ssim) == {"robot": [(1, 0.8), (3, 0.9)]}
+    ran("lpips", train_views=2, scores={"lpips": 0.1})
+    _, lpips = against_views(table()).axes
+    assert lpips.get_ylabel() == "LPIPS ↓" and curves(lpips) == {"robot": [(2, 0.1)]}
+
+
+def test_no_plot_of_what_is_not_there(table, ran):
+    ran("a", seconds=(None, None))
+    assert plots(table()) == []
+    ran("b", "a scene/of mine", frames=[(0.0, 20.0)], seconds=(1, 2))
+    assert [plot.name for plot in plots(table())] == [
+        "psnr_against_seconds",
+        "psnr_over_time_a_scene_of_mine",
+    ]
+
+
+def test_a_row_has_one_colour_in_all_plots(table, ran):
+    for name, ablation in (("a", "base"), ("b", "full")):
+        ran(name, ablation=ablation, frames=[(0.0, 20.0)])
+    found = table()
+    looks = [
+        {line.get_label(): line.get_color() for line in figure.axes[0].get_lines()}
+        for figure in (psnr_over_time(found, "robot"), psnr_against_seconds(found))
+    ]
+    assert looks[0] == looks[1] and len(set(looks[0].values())) == 2
+
+
+def test_many_curves_have_looks_of_their_own(table, ran):
+    # CIELAB of the palette, of published rows and of the page.
+    colors = np.float32([[to_rgb(color) for color in (*COLORS, GREY, "white")]])
+    lab = cv2.cvtColor(colors, cv2.COLOR_RGB2Lab)[0]
+    apart = np.linalg.norm(lab[:, None] - lab, axis=-1) + 1e3 * np.eye(len(lab))
+    assert len(COLORS) >= 20 and apart.min() > 20  # 2.3 is just noticeable
+    for k in range(30):
+        ran(f"{k}", method=f"m{k}", protocol="two_stage", frames=[(0.0, 20.0 + k)])
+    (axes,) = psnr_over_time(table(), "robot").axes
+    looks = {(line.get_color(), line.get_linestyle()) for line in axes.get_lines()}
+    assert len(axes.get_lines()) == len(looks) == 30
+
+
+@pytest.mark.parametrize("name", ["m", "a method with a name that is longer than a plot is wide: "])
+def test_a_legend_covers_no_curve_and_is_not_cut_off(table, ran, name):
+    for k in range(20):
+        ran(f"{k}", method=f"{name}{k}" * 2, protocol="two_stage", frames=[(0.0, 20.0 + k)])
+    figure = psnr_over_time(table(), "robot")
+    figure.draw_without_rendering()
+    legend, (axes,) = figure.legends[0].get_window_extent(), figure.axes
+    assert legend.y1 <= axes.get_tightbbox().y0 and legend.y0 >= 0
+    assert legend.x0 >= -1 and legend.x1 <= figure.bbox.width + 1
+    assert axes.bbox.height / figure.dpi > 2.5

@@ -1,0 +1,114 @@
+"""What is found below a folder, and what is not."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+
+from devrf.apps.report.runs import collect, metric_over_time, number
+
+
+def one(folder):
+    (run,) = collect(folder).runs.to_dict("records")
+    return run
+
+
+def test_finished_runs_are_found_at_any_depth_in_the_order_of_their_jobs(runs, ran):
+    for name in ("10_robot", "2_robot", "lego/paper/x", "sweeps/monday/0_robot", ".cache"):
+        ran(name)
+    (runs / "under_way").mkdir()
+    (runs / "under_way" / ".partial-metrics.json").write_text("{")
+    found = collect(runs)
+    names = ["2_robot", "10_robot", "lego/paper/x", "sweeps/monday/0_robot"]
+    assert list(found.runs["folder"]) == names and not found.skipped
+
+
+def test_a_record_is_read_back(ran):
+    typed = {"overrides": ["ablation=full", "seed=3"], "seed": 3, "wall_seconds": {"evaluate": 7}}
+    folder = ran("a", scores={"psnr": 30.5}, seconds=(17.5, 38.0), gpu=(2.0, 3.25), **typed)
+    run = one(folder)
+    assert (run["folder"], run["path"], run["scene"]) == ("a", folder, "robot")
+    assert run["dynamic.psnr"] == run["deformation.psnr"] == 30.5 and run["dynamic.lpips"] is None
+    assert (run["train_seconds"], run["peak_gpu_gb"]) == (55.5, 3.25)
+    assert run["run.wall_seconds.evaluate"] == 7 and run["run.device"] == "a processor"
+    assert run["run.overrides"] == ["ablation=full", "seed=3"] and run["run.seed"] == 3
+    assert run["run.choices.ablation"] == "full"
+
+
+def test_records_of_earlier_versions_are_devrf_in_two_stages(runs):
+    deformation = {"psnr": 29.0, "seconds": 38.0, "back_offs": 1}
+    record = {"scene": "x", "canonical": {"psnr": 31}, "deformation": deformation}
+    (runs / "metrics.json").write_text(json.dumps(record))
+    run = one(runs)
+    assert (run["method"], run["protocol"]) == ("devrf", "two_stage")
+    assert (run["static.psnr"], run["dynamic.psnr"]) == (31, 29.0)
+    assert run["dynamic.num_rollbacks"] == run["deformation.num_rollbacks"] == 1
+    # Both stages make the time: that of one alone is not the run's.
+    assert math.isnan(run["train_seconds"]) and math.isnan(run["peak_gpu_gb"])
+
+
+@pytest.mark.parametrize(
+    ("protocol", "static", "seconds"),
+    [("two_stage", 10, 48), ("two_stage", None, math.nan), ("joint", None, 38), ("dynamic", 1, 39)],
+)
+def test_the_time_is_that_of_the_stages_of_the_protocol(ran, protocol, static, seconds):
+    run = one(ran("new", method="dnerf", protocol=protocol, seconds=(static, 38.0)))
+    assert (run["method"], run["protocol"]) == ("dnerf", protocol)
+    assert run["train_seconds"] == pytest.approx(seconds, nan_ok=True)
+
+
+def test_only_finite_numbers_are_values():
+    assert number(3) == 3.0
+    assert all(math.isnan(number(value)) for value in (None, True, "3", math.inf, math.nan))
+
+
+def test_a_failure_is_told_in_one_line(runs, failed):
+    failed("0_robot", "data.frames: expected\n2 or more")
+    (failure,) = collect(runs).failures.to_dict("records")
+    assert (failure["folder"], failure["scene"]) == ("0_robot", "robot")
+    assert failure["error"] == "data.frames: expected 2 or more" and failure["mistake"] is True
+    assert failure["run.overrides"] == ["ablation=base"]
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (b"", "damaged"),
+        (b"{", "damaged"),
+        (b"\xff\xfe", "damaged"),
+        (b"[" * 100_000, "damaged"),
+        (b"[1, 2]", "the file"),
+        (b"{}", "scene|error"),
+        (b'{"scene": 3}', "scene|error"),
+        (b'{"scene": "robot", "error": 3, "run": []}', "run|error"),
+        (b'{"scene": "robot", "deformation": 30}', "deformation|error"),
+        (b'{"scene": "robot", "run": {"choices": ["full"]}}', "run.choices|error"),
+        (b'{"scene": "robot", "run": {"overrides": [1]}}', "run.overrides.0|error"),
+        (b'{"scene": "robot", "run": {"seed": "one"}}', "run.seed|error"),
+        (b'{"scene": "robot", "run": {"device": 3}}', "run.device|error"),
+    ],
+)
+def test_damaged_records_are_skipped_with_a_line_that_says_where(runs, ran, content, reason):
+    ran("good")
+    for name in ("failure", "metrics"):
+        (runs / name).mkdir()
+        (runs / name / f"{name}.json").write_bytes(content)
+    found = collect(runs)
+    assert list(found.runs["folder"]) == ["good"] and found.failures.empty
+    assert len(found.skipped) == 2
+    for line, name in zip(found.skipped, ("failure", "metrics"), strict=True):
+        assert line.startswith(f"{runs / name / name}.json: skipped; ") and "\n" not in line
+        assert any(part in line for part in reason.split("|"))
+
+
+def test_curves_are_over_the_dynamic_images_views_of_a_time_averaged(ran):
+    folder = ran("a", frames=[(1.0, 20.0), (0.0, 30.0), (0.0, 32.0)])
+    assert metric_over_time(folder, "psnr").to_dict() == {0.0: 31.0, 1.0: 20.0}
+    assert metric_over_time(folder, "ssim").empty and metric_over_time(folder, "nothing").empty
+    assert metric_over_time(ran("b"), "psnr").empty
+    no_number = b"capture,time,psnr\ndynamic,x,3\n"
+    for content in (b"", b"\xff", b"psnr,time\n3,0\n", b"a\0b", no_number):
+        (folder / "frames.csv").write_bytes(content)
+        assert metric_over_time(folder, "psnr").empty

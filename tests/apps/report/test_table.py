@@ -1,0 +1,218 @@
+"""Cells, means, marks and averages, by hand."""
+
+from __future__ import annotations
+
+import pandas as pd
+import pytest
+
+from devrf.apps.report.latex import latex
+from devrf.apps.report.markdown import markdown, plain
+from devrf.apps.report.published import published
+from devrf.apps.report.table import GPU, LPIPS, PSNR, SSIM, TIME, TITLES, ranked, shown
+
+FULL = "Ours w/ c2f, tv, cycle, flow"
+
+
+def texts(rows):
+    """The cells of each row, by label."""
+    return {label: list(cells) for label, cells in rows["text"].T.items()}
+
+
+def ranks(rows, column):
+    return list(rows["rank", column.title])
+
+
+@pytest.mark.parametrize(
+    ("value", "column", "text"),
+    [
+        (29.4249, PSNR, "29.42"),
+        (0.9765, SSIM, "0.977"),
+        (0.00744, LPIPS, "0.0074"),
+        (3.25, GPU, "3.2"),
+        (0.31, TIME, "0.3 s"),
+        (9.94, TIME, "9.9 s"),
+        (9.96, TIME, "10 s"),
+        (55.4, TIME, "55 s"),
+        (99.6, TIME, "1.7 min"),
+        (540, TIME, "9.0 min"),
+        (22.4 * 3600, TIME, "22.4 h"),
+    ],
+)
+def test_digits_are_the_papers_and_times_are_in_the_unit_that_reads_best(value, column, text):
+    assert shown(value, column) == text
+
+
+def test_seeds_are_averaged_with_their_spread_where_all_have_a_value(table, ran):
+    # 29, 30, 31: mean 30, sample standard deviation 1. 240, 360 and 300 s: 5 ± 1 min.
+    rows = [(29, 100, 0.1), (30, 220, 0.1), (31, 160, None)]
+    for seed, (psnr, seconds, lpips) in enumerate(rows):
+        scores = {"psnr": psnr, "lpips": lpips}
+        ran(str(seed), scores=scores, seconds=(140, seconds), seed=seed)
+    ((cells),) = texts(table().blocks[0].measured).values()
+    assert cells == ["30.00 ± 1.00", "0.950 ± 0.000", "–", "–", "5.0 ± 1.0 min"]
+
+
+def test_novel_times_have_a_column_where_a_run_has_them(table, ran):
+    ran("one", scene="lego", scores={"novel_times": {"psnr": 25.5}})
+    ran("other", scene="lego", ablation="base")
+    found = table()
+    titles = [column.title for column in found.columns]
+    assert titles == ["PSNR", "PSNR at novel times", "SSIM", "LPIPS", "GPU (GB)", "Time"]
+    (block,) = found.blocks
+    assert texts(block.measured)[FULL][1] == "25.50"
+    assert [cells[1] for label, cells in texts(block.measured).items() if label != FULL] == ["–"]
+    # The paper has no such column.
+    assert {cells[1] for cells in texts(block.published).values()} == {"–"}
+    label = block.published.index[0]
+    printed = published().texts.loc[("lego", label), "PSNR"]
+    assert block.published["text"].loc[label, "PSNR"] == printed
+    for text in (markdown(found, {}), plain(found), latex(found)):
+        assert "PSNR at novel times" in text and "25.50" in text
+
+
+def test_runs_without_novel_times_have_the_papers_columns(table, ran):
+    ran("one")
+    assert [column.title for column in table().columns] == TITLES
+
+
+@pytest.mark.parametrize(
+    ("values", "column", "expected"),
+    [
+        ([20, 24, 22, 21], PSNR, [0, 1, 2, 3]),
+        ([0.3, 0.1, 0.2, 0.4], LPIPS, [3, 1, 2, 0]),
+        # Kuka's LPIPS in the paper: three methods share the best value.
+        ([0.105, 0.0147, 0.0176, 0.0147, 0.0147], LPIPS, [3, 1, 2, 1, 1]),
+        # What looks the same is the same.
+        ([29.421, 29.419, 28], PSNR, [1, 1, 2]),
+        ([None, 22, 21], PSNR, [0, 1, 2]),
+        ([22], PSNR, [0]),
+        ([22, 22], PSNR, [0, 0]),
+        ([None, None], PSNR, [0, 0]),
+        ([None, 22], PSNR, [0, 0]),
+    ],
+)
+def test_the_best_three_values_are_marked(values, column, expected):
+    assert list(ranked(pd.Series(values, dtype=float), column)) == expected
+
+
+def test_a_block_by_hand(table, ran):
+    ran("0", ablation="base", scores={"psnr": 20.068, "ssim": 0.834, "lpips": 0.2}, gpu=(1.0, 2.0))
+    ran("1", ablation="c2f", scores={"psnr": 23.98, "ssim": 0.932}, seconds=(17, 60), gpu=(2.5, 2))
+    ran("2", ablation="full", scores={"psnr": 29.42, "ssim": 0.977, "lpips": 0.1}, gpu=(1.0, 2.0))
+    (block,) = table().blocks
+    assert block.title == "robot" and block.published.empty
+    assert texts(block.measured) == {
+        "Ours (base)": ["20.07", "0.834", "0.2000", "2.0", "30 s"],
+        "Ours w/ c2f": ["23.98", "0.932", "–", "2.5", "77 s"],
+        FULL: ["29.42", "0.977", "0.1000", "2.0", "30 s"],
+    }
+    assert ranks(block.measured, PSNR) == [3, 2, 1]
+    assert ranks(block.measured, LPIPS) == [2, 0, 1]
+    assert ranks(block.measured, GPU) == [1, 2, 1]
+    assert ranks(block.measured, TIME) == [1, 2, 1]
+
+
+def test_times_of_different_devices_are_not_ranked(table, ran):
+    ran("0", ablation="base", seconds=(1, 1))
+    ran("1", seconds=(9, 9), device="another processor", scores={"psnr": 31})
+    found = table()
+    (block,) = found.blocks
+    assert ranks(block.measured, TIME) == [0, 0]
+    assert ranks(block.measured, PSNR) == [2, 1]
+    assert "Memory and time are marked only among rows of one device." in found.notes
+
+
+def test_it_says_which_methods_took_their_samples_how(table, ran):
+    def sampled(**settings):
+        return {f"ray_stage.model.settings.{key}": value for key, value in settings.items()}
+
+    ran("a", method="devrf", protocol="two_stage", settings={"schedule.motion.unit": "box"})
+    for name, own in (
+        ("dnerf", sampled(sampling="occupancy", hull=True)),
+        ("nerfies", sampled(sampling="occupancy", hull=False)),
+        ("hypernerf", sampled(sampling="hierarchical", hull=True)),
+        ("neural_volumes", sampled(hull=True)),
+    ):
+        ran(name, method=name, protocol="joint", settings=own)
+    assert [note for note in table().notes if "Samples" in note] == [
+        "Samples by occupancy within hulls of mattes: D-NeRF.",
+        "Samples by occupancy: Nerfies.",
+        "Samples by hierarchical: HyperNeRF.",
+        "Samples by even steps within hulls of mattes: Neural Volumes.",
+    ]
+
+
+def test_the_average_is_over_scenes_that_a_configuration_was_run_on(table, ran):
+    for scene, psnr in (("robot", 30.0), ("flower", 33.0)):
+        ran(f"{scene}_full", scene, scores={"psnr": psnr})
+        ran(f"{scene}_base_0", scene, ablation="base", scores={"psnr": psnr - 10}, seed=0)
+    ran("robot_base_1", ablation="base", scores={"psnr": 22.0}, seed=1)
+    ran("robot_c2f", ablation="c2f")
+    *scenes, average = table().blocks
+    assert [block.title for block in scenes] == ["flower", "robot"]
+    assert average.title == "average over 2 scenes" and average.published.empty
+    # Base: (23 + (20 + 22) / 2) / 2 = 22. c2f was run on the robot alone.
+    assert {label: cells[0] for label, cells in texts(average.measured).items()} == {
+        "Ours (base)": "22.00",
+        FULL: "31.50",
+    }
+    assert list(average.measured["head", "counts"]) == [{1, 2}, {1}]
+    assert ranks(average.measured, PSNR) == [2, 1]
+
+
+def test_nothing_is_averaged_that_one_scene_lacks(table, ran):
+    ran("a", "robot", ablation="base", scores={"lpips": 0.1})
+    ran("b", "flower", ablation="full")
+    assert [block.title for block in table().blocks] == ["robot", "flower"]
+    ran("c", "flower", ablation="base")
+    assert table().blocks[-1].measured.loc["Ours (base)", ("text", "LPIPS")] == "–"
+
+
+def test_published_rows_are_those_of_the_scenes_that_were_run(table, ran):
+    ran("a", "lego")
+    ran("b", "robot")
+    lego, robot = table().blocks[:2]
+    assert len(lego.published) == 17 and robot.published.empty
+    first = ["5.958", "0.369", "0.8314", "19.4", "22.4hrs"]
+    assert texts(lego.published)["Neural Volumes"] == first
+    assert not lego.published["rank"].any(axis=None)
+    assert all(block.published.empty for block in table("none").blocks)
+    everything = table("all").blocks
+    others = ["floating_robot", "daisy", "glove", "kuka", "pig_toy"]
+    assert [b.title for b in everything] == ["lego", "robot", *others, "average over 2 scenes"]
+    assert everything[2].measured.empty and len(everything[6].published) == 9
+
+
+def test_published_rows_are_averaged_over_the_same_scenes(table, ran):
+    for scene in ("lego", "pig_toy"):
+        ran(scene, scene)
+    rows = texts(table().blocks[-1].published)
+    # (29.25 + 30.85) / 2; (9 + 10) / 2 minutes.
+    full = rows["DeVRF w/ c2f, tv, cycle, flow"]
+    assert (full[0], full[-1]) == ("30.05", "9.5 min")
+    assert "Neural Volumes" not in rows  # not in the table of pig toy
+
+
+def test_a_column_without_values_is_explained(table, ran):
+    ran("a")
+    (lpips, gpu) = table().notes
+    assert lpips.startswith("No run has LPIPS: ") and "evaluation.lpips_weights" in lpips
+    assert gpu.startswith("No run has GPU (GB): ")
+
+
+def test_runs_scored_at_rest_only_are_named_and_not_tabulated(table, ran):
+    ran("a")
+    ran("b", scores={"psnr": None})
+    ran("c", scores={"psnr": float("nan")})
+    found = table()
+    assert len(found.rows) == 1
+    assert "Scored at rest only, and therefore not in the tables: b, c." in found.notes
+
+
+def test_a_checkpoint_that_was_scored_twice_counts_once(table, ran):
+    for k, psnr in enumerate((20.0, 21.0, 30.0)):
+        date = f"2026-01-0{k + 1}T00:00:00+00:00"
+        ran(str(k), scores={"psnr": psnr}, checkpoint="ab"[k == 2], date=date)
+    found = table()
+    assert list(found.rows["count"]) == [2] and list(found.rows["PSNR"]) == [25.5]
+    assert any("same checkpoint: 0." in note for note in found.notes)

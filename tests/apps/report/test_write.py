@@ -1,0 +1,81 @@
+"""The report's folder."""
+
+from __future__ import annotations
+
+import csv
+import subprocess
+import sys
+
+import pytest
+
+from devrf.apps.report.runs import collect
+from devrf.apps.report.settings import ReportSettings
+from devrf.apps.report.write import write_report
+from devrf.errors import DevrfError
+
+
+def files(folder):
+    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_report_is_written_beside_the_runs_and_not_taken_for_one(runs, ran):
+    ran("a", frames=[(0.0, 20.0), (1.0, 21.0)])
+    written = write_report(ReportSettings(runs))
+    assert written.path == runs / "report" / "report.md"
+    plots = {"figures/psnr_against_seconds", "figures/psnr_over_time_robot"}
+    assert files(runs / "report") == {
+        "report.md",
+        "report.csv",
+        "report.tex",
+        *(f"{p}.png" for p in plots),
+        *(f"{p}.pdf" for p in plots),
+    }
+    for plot in plots:
+        assert f"(<{plot}.png>)" in written.path.read_text(encoding="utf-8")
+    again = write_report(ReportSettings(runs)).table.found
+    assert len(again.runs) == len(collect(runs).runs) == 1 and not again.skipped
+
+
+def test_csv_has_a_row_for_each_run_and_failure_and_every_number(runs, ran, failed):
+    ran("a", scores={"psnr": 31.0}, seconds=(3, 20), seed=1, overrides=["seed=1"])
+    ran("at_rest", scores={"psnr": None})
+    failed("7_robot", "data.frames: expected 2, or more", overrides=["data.frames=1", "seed=0"])
+    write_report(ReportSettings(runs))
+    with (runs / "report" / "report.csv").open(newline="", encoding="utf-8") as file:
+        rows = {row["folder"]: row for row in csv.DictReader(file)}
+    assert set(rows) == {"a", "at_rest", "7_robot"}
+    assert rows["at_rest"]["row"] == ""
+    expected = {"status": "finished", "scene": "robot", "method": "devrf", "protocol": "two_stage"}
+    expected |= {"row": "Ours w/ c2f, tv, cycle, flow", "run.seed": "1", "run.overrides": "seed=1"}
+    expected |= {"deformation.psnr": "31.0", "deformation.lpips": "", "peak_gpu_gb": ""}
+    expected |= {"canonical.seconds": "3", "deformation.seconds": "20", "train_seconds": "23.0"}
+    expected |= {"run.choices.ablation": "full", "run.git": "0123456789abcdef"}
+    assert rows["a"].items() >= expected.items()
+    expected = {"status": "failed", "error": "data.frames: expected 2, or more", "mistake": "true"}
+    expected |= {"run.overrides": "data.frames=1 seed=0", "run.choices.ablation": "base"}
+    assert rows["7_robot"].items() >= {**expected, "deformation.psnr": ""}.items()
+
+
+def test_failures_alone_are_a_report(runs, failed):
+    failed("a", "out of luck")
+    text = write_report(ReportSettings(runs)).path.read_text(encoding="utf-8")
+    assert "0 finished runs" in text and "out of luck" in text
+    failed("b", "too early to know", scene=None, overrides=None, mistake=None)
+    assert "- b (unknown scene): too early to know" in write_report(
+        ReportSettings(runs, published="all")
+    ).path.read_text(encoding="utf-8")
+
+
+def test_damaged_runs_alone_are_an_error_and_nothing_is_written(runs):
+    (runs / "metrics.json").write_text("{")
+    with pytest.raises(DevrfError, match="report.runs: no finished run below .*damaged"):
+        write_report(ReportSettings(runs))
+    assert not (runs / "report").exists()
+
+
+def test_a_sweep_imports_nothing_heavy_before_its_report():
+    modules = "devrf.cli.config, devrf.cli.sweep_report"
+    heavy = {"torch", "pandas", "matplotlib"}
+    script = f"import sys, {modules}; assert not {heavy} & set(sys.modules)"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

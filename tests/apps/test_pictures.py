@@ -1,0 +1,290 @@
+"""Colour maps, contact sheets and films, read back from the files."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from devrf.apps.camera_paths import held_out_images, orbit
+from devrf.apps.colors import (
+    UNKNOWN,
+    depth_colors,
+    error_colors,
+    flow_colors,
+    flow_wheel,
+    to_bytes,
+)
+from devrf.apps.contact_sheet import write_contact_sheet
+from devrf.apps.film import (
+    FilmSettings,
+    film_bytes,
+    held_out_pictures,
+    orbit_pictures,
+    write_video,
+)
+from devrf.apps.grid import image_grid, scaled
+from devrf.apps.images import evenly, short_name
+from devrf.evaluation.held_out import HeldOutView, truth_image
+from devrf.geometry.box import Box
+from devrf.geometry.cameras import Cameras
+from devrf.rendering.renderer import Renderer
+
+
+def flat(height: int, width: int, color: tuple[float, float, float]) -> Tensor:
+    return torch.tensor(color).expand(height, width, 3)
+
+
+def test_bytes_are_rounded_and_clamped() -> None:
+    values = torch.tensor([-1.0, 0.0, 0.5, 1.0, 7.0, 0.9985])
+    assert to_bytes(values).tolist() == [0, 0, 128, 255, 255, 255]
+
+
+def test_depth_is_bright_near_dark_far_and_white_where_nothing_is() -> None:
+    depth = torch.tensor([[1.0, 1.5, 2.0, 3.0, 0.0]])
+    opacity = torch.tensor([[1.0, 1.0, 1.0, 1.0, 0.0]])
+    light = depth_colors(depth, opacity, near=1.0, far=2.0)[0].mean(dim=1)
+    assert light[4] == 1 > light[0] > light[1] > light[2] == light[3]
+
+
+def test_errors_are_black_to_white_up_to_a_quarter() -> None:
+    prediction = torch.tensor([0.0, 0.1, 0.25, 0.9])[None, :, None].expand(1, 4, 3)
+    light = error_colors(prediction, torch.zeros(1, 4, 3)).mean(dim=-1)[0]
+    assert light[0] < 0.05 < light[1] < 0.95 < light[2] == light[3]
+
+
+def test_flow_as_colours() -> None:
+    vectors = torch.tensor([[[2.0, 0.0], [0.0, -2.0], [-9.0, 0.0], [0.0, 0.0], [7.0, 7.0]]])
+    valid = torch.tensor([[True, True, True, True, False]])
+    expected = torch.tensor(
+        [
+            [0.9, 0.0, 0.0],  # to the right: red
+            [0.45, 0.9, 0.0],  # up: a quarter turn further
+            [0.0, 0.9, 0.9],  # to the left, as saturated as it gets
+            [1.0, 1.0, 1.0],  # nowhere
+            [UNKNOWN] * 3,
+        ]
+    )
+    colors = flow_colors(vectors, valid, full=2.0)
+    torch.testing.assert_close(colors[0], expected, atol=1e-5, rtol=0)
+
+
+def test_the_wheel_shows_the_directions_that_it_explains() -> None:
+    wheel = flow_wheel(101)
+    assert torch.equal(wheel[0, 0], torch.ones(3))
+    red, cyan = wheel[50, 99], wheel[50, 1]
+    assert red[0] > 0.85 > 0.1 > red[1] and cyan[0] < 0.1 < 0.85 < cyan[1]
+    torch.testing.assert_close(wheel[50, 50], torch.ones(3), atol=0.02, rtol=0)
+
+
+def view(number: int, height: int = 90, width: int = 120) -> HeldOutView:
+    truth = flat(height, width, (0.0, 0.0, 1.0))
+    prediction = flat(height, width, (number / 255, 0.0, 0.0))
+    return HeldOutView(
+        f"frame {number}",
+        0.25,
+        truth,
+        prediction,
+        10.0,
+        0.5,
+        9.0,
+        compared=prediction,
+        depth=torch.full((height, width), 2.0 + number),
+        opacity=torch.ones(height, width),
+    )
+
+
+@pytest.mark.parametrize(("count", "shades"), [(11, [0, 50, 100]), (2, [0, 10]), (1, [0])])
+def test_a_contact_sheet_shows_truth_rendering_error_and_depth_of_spread_views(
+    tmp_path: Path, count: int, shades: list[int]
+) -> None:
+    path = tmp_path / "images" / "static.png"
+    shown = write_contact_sheet(path, [view(10 * k) for k in range(count)], rows=3)
+    sheet = iio.imread(path)
+    assert torch.equal(torch.from_numpy(sheet), to_bytes(shown))
+    # Images are enlarged to 300 x 400 pixels, text is 15 pixels high, and 6 are between images.
+    left = sheet.shape[1] - 4 * 400 - 3 * 6
+    assert sheet.shape[0] == 30 + len(shades) * (300 + 6) - 6 and left > 80
+    depths = []
+    for row, shade in enumerate(shades):
+        top = 30 + row * 306
+        truth, rendered, error, depth = (
+            sheet[top : top + 300, left + k * 406 : left + k * 406 + 400] for k in range(4)
+        )
+        assert (truth == [0, 0, 255]).all() and (rendered == [shade, 0, 0]).all()
+        assert (error == error[0, 0]).all() and error.max() == 255
+        depths.append(int(depth[0, 0].sum()))
+        assert dark(sheet[top : top + 300, :left])
+    # The nearest is the brightest.
+    assert depths == sorted(depths, reverse=True) and len(set(depths)) == len(depths)
+    for column in range(4):
+        assert dark(sheet[:30, left + column * 406 : left + column * 406 + 400])
+
+
+def dark(area: np.ndarray) -> bool:
+    """Whether there is text, with a margin of white all around."""
+    ink = area.max(axis=-1) < 128
+    return bool(ink.any()) and not (ink[0].any() or ink[-1].any() or ink[:, [0, -1]].any())
+
+
+def test_a_grid_fits_its_text_to_its_places() -> None:
+    image = flat(40, 30, (0.5, 0.5, 0.5))
+    long = "a heading far longer than its column is wide"
+    grid = to_bytes(image_grid([[image, image]] * 2, [long, "b"], [["x"], [long]])).numpy()
+    top, left = 18, grid.shape[1] - 2 * 30 - 4
+    assert grid.shape[0] == top + 2 * 40 + 4
+    assert (grid[top : top + 40, left : left + 30] == 128).all()
+    assert (grid[top + 44 :, left + 34 :] == 128).all()
+    # Labels have the room that they need; headings are made smaller.
+    assert left > 5 * len(long) * 0.8
+    assert (grid[:top, left : left + 30].min(axis=-1) < 200).any()
+    assert (grid[:top, left + 30 : left + 34] == 255).all() and (grid[:, 0] == 255)[:56].all()
+
+
+def test_images_are_scaled_smoothly() -> None:
+    steps = torch.tensor([0.0, 1.0])[None, :, None].expand(2, 2, 3)
+    larger = scaled(steps, 40)
+    assert larger.shape == (40, 40, 3) and scaled(steps, 4, 6).shape == (4, 6, 3)
+    assert len(larger[20, :, 0].unique()) > 5 and (larger[20].diff(dim=0) > -0.05).all()
+    assert scaled(steps, 2) is steps
+
+
+def test_names_and_positions() -> None:
+    assert evenly(3, 6) == [0, 1, 2]
+    assert evenly(50, 6) == [0, 10, 20, 29, 39, 49]
+    assert short_name("folder/r_000.png") == "r_000.png"
+    assert short_name(30 * "a" + "_000.png") == "…" + 21 * "a" + "_000.png"
+
+
+@pytest.mark.parametrize(("height", "width"), [(48, 96), (241, 33), (17, 75)])
+def test_a_video_has_even_sides_and_all_its_pictures(
+    tmp_path: Path, height: int, width: int
+) -> None:
+    path = tmp_path / "videos" / "orbit.mp4"
+    shades = (0.0, 0.5, 1.0, 0.25)
+    write_video(path, iter([flat(height, width, (s, s, s)) for s in shades]), fps=7.5)
+    frames = iio.imread(path, plugin="FFMPEG")
+    assert frames.shape == (4, height + height % 2, width + width % 2, 3)
+    for frame, shade in zip(frames, shades, strict=True):
+        assert abs(float(frame.mean()) - 255 * shade) < 4
+    assert iio.immeta(path, plugin="FFMPEG")["fps"] == 7.5
+    assert [p.name for p in path.parent.iterdir()] == ["orbit.mp4"]
+
+
+def test_a_film_that_fails_leaves_nothing_behind(tmp_path: Path) -> None:
+    def broken() -> Iterator[Tensor]:
+        yield flat(240, 240, (0, 0, 0))
+        raise RuntimeError("out of memory")
+
+    with pytest.raises(RuntimeError, match="out of memory"):
+        write_video(tmp_path / "film.mp4", broken(), fps=10)
+    assert list(tmp_path.iterdir()) == []
+
+
+def ring(count: int) -> Cameras:
+    angle = torch.arange(count) * (2 * math.pi / count)
+    positions = torch.stack([3 * angle.cos(), 3 * angle.sin(), 0 * angle + 1], dim=1)
+    return Cameras.looking_at(positions, torch.zeros(count, 3), focal=20.0, width=15, height=10)
+
+
+def test_an_orbit_circles_the_box_at_the_cameras_distance(cube: Box) -> None:
+    settings = FilmSettings(frames=8, orbit_turns=2.0, orbit_elevation=30.0)
+    cameras = orbit(ring(6), cube, settings)
+    assert len(cameras) == 8 and (cameras.width, cameras.height) == (15, 10)
+    torch.testing.assert_close(cameras.positions.norm(dim=1), torch.full((8,), math.sqrt(10)))
+    torch.testing.assert_close(cameras.positions[:, 2], torch.full((8,), math.sqrt(10) / 2))
+    # Two turns in eight pictures: a quarter turn each.
+    steps = cameras.positions[:-1, :2] * cameras.positions[1:, :2]
+    torch.testing.assert_close(steps.sum(dim=1), torch.zeros(7), atol=1e-5, rtol=0)
+    toward = torch.nn.functional.normalize(-cameras.positions, dim=1)
+    torch.testing.assert_close(cameras.forwards, toward)
+
+
+def test_an_orbit_shows_colour_beside_depth_while_time_runs(moving, reference) -> None:
+    camera = ring(1)
+    shown = list(orbit_pictures(Renderer(moving), camera[[0, 0, 0]], 1.0))
+    # Images 10 x 15, a line of text 18 pixels high above them.
+    assert [tuple(image.shape) for image in shown] == [(28, 34, 3)] * 3
+    for image, time in zip(shown, (0.0, 0.5, 1.0), strict=True):
+        seen = reference(moving, camera.image_rays(0), time, torch.ones(3))
+        colors = image[18:, :15].reshape(-1, 3)
+        torch.testing.assert_close(colors, seen.color, atol=0.51 / 255, rtol=0)
+
+
+def test_held_out_pictures_are_rendered_in_the_films_size_beside_the_truth(
+    moving, reference, tiny_scene
+) -> None:
+    views, film = tiny_scene.dynamic.test, FilmSettings(height=36)
+    images = held_out_images(views, 3)
+    shown = list(held_out_pictures(Renderer(moving), views, images, film, "white"))
+    large = views.cameras.of_height(36)
+    assert [tuple(image.shape) for image in shown] == [(18 + 36, 3 * 48 + 8, 3)] * 3
+    for image, index, time in zip(shown, images, (0.0, 0.5, 1.0), strict=True):
+        truth, rendered = image[18:, :48], image[18:, 52:100]
+        assert torch.equal(
+            to_bytes(truth), to_bytes(scaled(truth_image(views, index, "white"), 36))
+        )
+        seen = reference(moving, large.image_rays(index), time, torch.ones(3))
+        torch.testing.assert_close(rendered.reshape(-1, 3), seen.color, atol=0.51 / 255, rtol=0)
+
+
+def test_held_out_images_are_the_nearest_in_time(tiny_scene) -> None:
+    views = tiny_scene.dynamic.test
+    assert len(set(views.view.tolist())) == 1
+    times = views.times[held_out_images(views, 7)]
+    wanted = torch.linspace(0, 1, 7)
+    apart = (times[:, None] - views.times).abs().amin(dim=1)
+    assert not apart.any() and ((times - wanted).abs() <= 0.51 * views.times.diff().max()).all()
+    # Of several fixed cameras the first; a camera that moves; images at rest one after another.
+    two = replace(views, view=torch.arange(len(views)) % 2)
+    assert {int(two.view[k]) for k in held_out_images(two, 7)} == {0}
+    moved = replace(views, view=torch.arange(len(views)))
+    assert held_out_images(moved, 7) == held_out_images(views, 7)
+    rest = replace(moved, times=torch.zeros(len(views)))
+    assert held_out_images(rest, len(views)) == list(range(len(views)))
+
+
+def test_small_captures_are_filmed_400_pixels_high(tiny_scene) -> None:
+    cameras = tiny_scene.dynamic.test.cameras
+    sized = FilmSettings().sized(cameras)
+    assert (sized.height, sized.width) == (400, round(400 * cameras.width / cameras.height))
+    # Magnified intrinsics: the corners of the image see the same.
+    small, large = cameras.image_rays(0), sized.image_rays(0)
+    middle = small.directions.mean(dim=0), large.directions.mean(dim=0)
+    torch.testing.assert_close(*middle, atol=1e-3, rtol=0)
+    tall = cameras.of_height(500)
+    assert FilmSettings().sized(tall).height == 500
+    assert FilmSettings(height=40).sized(tall).height == 40
+
+
+def test_rendering_keeps_to_its_seconds() -> None:
+    film = FilmSettings(frames=60, fps=20, max_seconds=12)
+    assert film.within_limit(0.2) == film
+    fewer = film.within_limit(0.4)
+    assert (fewer.frames, fewer.fps) == (30, 10)
+    assert film.within_limit(100.0).frames == 8
+    assert FilmSettings(frames=4, max_seconds=1).within_limit(9.0).frames == 4
+    assert FilmSettings(frames=60).within_limit(100.0).frames == 60
+
+
+def test_videos_are_no_larger_than_was_said(rest, tiny_scene, tmp_path):
+    cameras, views = tiny_scene.static.train.cameras, tiny_scene.dynamic.test
+    renderer = Renderer(rest.model)
+    film = FilmSettings(frames=8, height=60)
+    turned = orbit(film.sized(cameras), rest.model.canonical.box, film)
+    images = held_out_images(views, 8)
+    shown = (
+        orbit_pictures(renderer, turned, 1.0),
+        held_out_pictures(renderer, views, images, film, "white"),
+    )
+    for k, pictures in enumerate(shown):
+        write_video(tmp_path / f"{k}.mp4", pictures, film.fps)
+    written = sum(path.stat().st_size for path in tmp_path.iterdir())
+    assert 0.02 * film_bytes(film, cameras) < written < film_bytes(film, cameras)

@@ -1,0 +1,123 @@
+"""Mean scores, rows and provenance, read back."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+import torch
+
+import devrf
+from devrf.apps.records import (
+    dynamic_scores,
+    git_revision,
+    in_words,
+    mean_scores,
+    provenance,
+    write_frames,
+)
+from devrf.evaluation.held_out import HeldOutView
+from devrf.geometry.clock import FrameClock
+
+METRICS = ["psnr", "ssim", "rest_pose_psnr", "depth_error", "flow_error"]
+
+
+def view(name: str, time: float, psnr: float, **further: float | None) -> HeldOutView:
+    image = torch.zeros(2, 2, 3)
+    planes = {"depth": image[..., 0], "opacity": image[..., 0]}
+    return HeldOutView(name, time, image, image, psnr, 0.5, 9.0, further, compared=image, **planes)
+
+
+def test_means_are_over_what_is_known() -> None:
+    views = [
+        view("a", 0.0, 20.0, depth_error=0.5, flow_error=None, lpips=None),
+        view("b", 1.0, 31.0, depth_error=0.25, flow_error=3.0, lpips=None),
+    ]
+    assert mean_scores(views) == {
+        "psnr": 25.5,
+        "ssim": 0.5,
+        "depth_error": 0.375,
+        "flow_error": 3.0,
+        "lpips": None,
+    }
+
+
+def test_times_that_no_training_view_has_are_scored_apart() -> None:
+    views = [
+        view("a", 0.0, 20.0),
+        view("b", 0.25, 30.0),
+        view("c", 0.5, 22.0),
+        view("d", 1.0, 40.0),
+    ]
+    found = dynamic_scores(views, FrameClock((0.0, 0.5)))
+    assert (found["psnr"], found["rest_pose_psnr"]) == (28.0, 9.0)
+    assert (found["training_times"]["psnr"], found["training_times"]["images"]) == (21.0, 2)
+    # Between two frames, and beyond the last.
+    expected = {"psnr": 35.0, "ssim": 0.5, "rest_pose_psnr": 9.0, "images": 2}
+    assert found["novel_times"] == expected
+    usual = dynamic_scores(views, FrameClock((0.0, 0.25, 0.5, 1.0)))
+    assert not {"novel_times", "training_times"} & usual.keys()
+    # Where all times are novel that section is of all images.
+    alone = dynamic_scores(views[1:2], FrameClock((0.0, 0.5)))
+    assert alone["psnr"] == alone["novel_times"]["psnr"] == 30.0
+    assert "training_times" not in alone
+
+
+def test_numbers_are_rounded_for_people() -> None:
+    values = {
+        "psnr": 33.42981,
+        "ssim": 0.99137,
+        "lpips": None,
+        "iterations": 123456,
+        "seconds": 12345.678,
+        "error": 0.000123456,
+        "missing": float("nan"),
+    }
+    assert in_words(values) == (
+        "psnr 33.43, ssim 0.9914, iterations 123456, seconds 12346, error 0.0001235, missing nan"
+    )
+
+
+def test_frames_read_back(tmp_path: Path) -> None:
+    path = tmp_path / "run" / "frames.csv"
+    rest = [view("r, 0", 0.0, 20.0, depth_error=0.5, flow_error=None)]
+    moving = [view("m", 0.5, 21.0, depth_error=None, flow_error=1.5)]
+    write_frames(path, {"static": rest, "dynamic": moving})
+    with path.open(newline="") as file:
+        assert list(csv.reader(file)) == [
+            ["capture", "name", "time", *METRICS],
+            ["static", "r, 0", "0", "20", "0.5", "9", "0.5", ""],
+            ["dynamic", "m", "0.5", "21", "0.5", "9", "", "1.5"],
+        ]
+
+
+def test_provenance_is_plain_data() -> None:
+    found = provenance(12, torch.device("cpu"))
+    assert json.loads(json.dumps(found)) == found
+    assert {"lightning", "python", "git", "peak_host_gb"} < set(found)
+    assert found["devrf"] == devrf.__version__ and found["torch"] == torch.__version__
+    assert found["device"] and found["parameters"] == 12
+    assert found["date"].endswith("+00:00")
+
+
+@pytest.mark.skipif(shutil.which("git") is None, reason="git is not installed")
+def test_the_revision_is_that_of_a_checkout(tmp_path: Path) -> None:
+    def git(*arguments: str) -> str:
+        command = ["git", "-c", "user.name=a", "-c", "user.email=a@b.c", *arguments]
+        return subprocess.check_output(command, cwd=tmp_path, text=True).strip()
+
+    assert git_revision(tmp_path) is None
+    git("init")
+    assert git_revision(tmp_path) is None  # nothing committed yet
+    (tmp_path / "file").write_text("one")
+    git("add", "file")
+    git("-c", "commit.gpgsign=false", "commit", "-m", "one")
+    git("tag", "v1")
+    head = git("rev-parse", "HEAD")
+    assert git_revision(tmp_path) == head
+    (tmp_path / "file").write_text("two")
+    assert git_revision(tmp_path) == f"{head}-dirty"
