@@ -39,9 +39,10 @@ from lightning import Callback, Trainer
 
 from devrf.apps.video_file import write_pictures
 from devrf.callbacks import GridUpscaling, LearningRateDecay
-from devrf.checkpoints.checkpoint import LoadedCheckpoint
+from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, LoadedCheckpoint
 from devrf.cli.config import config_folder
 from devrf.data.datamodule import SceneDataModule
+from devrf.engine.stage import ScheduledStage
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
@@ -52,6 +53,7 @@ from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.model import DeVRFModel
+from devrf.methods.devrf.settings import CanonicalRates
 from devrf.methods.devrf.volume_rendering import render
 from devrf.rendering.rendered_image import RenderedImage
 from devrf.scenes.procedural import ProceduralScene
@@ -265,15 +267,30 @@ def write_rig() -> Callable[..., None]:
 
 
 class GivenScene(SceneDataModule):
-    """Serves a scene that is there already."""
+    """Serves a scene that is there already, and counts how often it was asked for."""
 
     def __init__(self, scene: Scene) -> None:
         super().__init__()
-        self.given = scene
+        self.given, self.loads = scene, 0
 
     def load(self) -> Scene:
         """The scene."""
+        self.loads += 1
         return self.given
+
+
+@pytest.fixture(scope="session")
+def serve() -> Callable[[Scene], SceneDataModule]:
+    """``serve(scene)``: a datamodule of a scene that is there already."""
+    return GivenScene
+
+
+@pytest.fixture(scope="session")
+def dark_scene(tiny_scene: Scene) -> Scene:
+    """The tiny scene with black static training images and no depth: nothing to learn from."""
+    train = tiny_scene.static.train
+    dark = replace(train, pixels=torch.zeros_like(train.pixels), depth=None)
+    return replace(tiny_scene, static=replace(tiny_scene.static, train=dark))
 
 
 @pytest.fixture
@@ -313,6 +330,54 @@ def quiet_trainer(*callbacks: Callback, **options: Any) -> Trainer:
 def trainer() -> Callable[..., Trainer]:
     """The function :func:`quiet_trainer`."""
     return quiet_trainer
+
+
+@pytest.fixture
+def fit(
+    datamodule: SceneDataModule, trainer: Callable[..., Trainer]
+) -> Callable[..., ScheduledStage]:
+    """``fit(stage, *callbacks)``: the stage, fitted; no row of the curves is due before the end."""
+
+    def learn(
+        stage: ScheduledStage,
+        *callbacks: Callback,
+        data: SceneDataModule = datamodule,
+        ckpt_path: Path | None = None,
+        every: int = 1000,
+    ) -> ScheduledStage:
+        fitted = trainer(*callbacks, max_epochs=1, log_every_n_steps=every)
+        fitted.strategy.checkpoint_io = ChecksummedCheckpointIO()
+        fitted.fit(stage, datamodule=data, ckpt_path=ckpt_path and str(ckpt_path))
+        return stage
+
+    return learn
+
+
+@pytest.fixture
+def canonical() -> Callable[..., CanonicalStage]:
+    """``canonical(**changes)``: a stage of 12 iterations; changes of its schedule and field."""
+    schedule = CanonicalSchedule(
+        search_iterations=0,
+        search_side=12,
+        carve=True,
+        iterations=12,
+        side=12,
+        doublings=(3, 7),
+        decay_iterations=6,
+        rays=64,
+    )
+
+    def build(
+        alpha_init: float = 0.01,
+        rates: CanonicalRates | None = None,
+        iterations_per_step: int = 1,
+        **changes: Any,
+    ) -> CanonicalStage:
+        field = Architecture(channels=4, width=8, frequencies=1, alpha_init=alpha_init)
+        changed = replace(schedule, **changes)
+        return CanonicalStage(changed, field, rates, iterations_per_step=iterations_per_step)
+
+    return build
 
 
 SMALL = Architecture(channels=4, width=16, frequencies=2)

@@ -50,7 +50,7 @@ def moving(rest: LoadedCheckpoint) -> Callable[..., DeformationStage]:
 
 
 @pytest.fixture
-def without_masks(tiny_scene: Scene, datamodule: SceneDataModule) -> SceneDataModule:
+def without_masks(tiny_scene: Scene, serve: Callable[[Scene], SceneDataModule]) -> SceneDataModule:
     """Serves the tiny scene without alpha masks."""
 
     def bare(capture: Any) -> Any:
@@ -58,7 +58,7 @@ def without_masks(tiny_scene: Scene, datamodule: SceneDataModule) -> SceneDataMo
         return replace(capture, train=replace(capture.train, pixels=pixels))
 
     scene = replace(tiny_scene, static=bare(tiny_scene.static), dynamic=bare(tiny_scene.dynamic))
-    return type(datamodule)(scene)  # type: ignore[call-arg]
+    return serve(scene)
 
 
 class Spoil(Callback):

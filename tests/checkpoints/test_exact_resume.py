@@ -292,10 +292,13 @@ def test_another_schedule_is_refused(
 
 
 def test_another_scene_is_refused(
-    left: Path, datamodule: SceneDataModule, trainer: Callable[..., Trainer], tiny_scene: Scene
+    left: Path,
+    trainer: Callable[..., Trainer],
+    tiny_scene: Scene,
+    serve: Callable[[Scene], SceneDataModule],
 ) -> None:
     fewer = replace(tiny_scene.static, train=tiny_scene.static.train[torch.arange(7)])
-    other = type(datamodule)(replace(tiny_scene, static=fewer))  # type: ignore[call-arg]
+    other = serve(replace(tiny_scene, static=fewer))
     assert "another scene" in refused(trainer(max_epochs=1), canonical(), other, left)
 
 

@@ -10,7 +10,6 @@ from typing import Any, get_type_hints
 import pytest
 import torch
 
-from devrf.data.datamodule import SceneDataModule
 from devrf.data.forward import ForwardFacingDataModule
 from devrf.data.inward import InwardFacingDataModule
 from devrf.data.nerfies import NerfiesDataModule
@@ -22,28 +21,16 @@ from devrf.scenes.export_blender import export_blender
 from devrf.scenes.scene import Scene
 
 
-class Given(SceneDataModule):
-    """Serves a scene that is there already, and counts how often it was asked for."""
-
-    def __init__(self, scene: Scene) -> None:
-        super().__init__()
-        self.given, self.loads = scene, 0
-
-    def load(self) -> Scene:
-        self.loads += 1
-        return self.given
-
-
-def test_the_scene_is_loaded_once_and_only_when_needed(tiny_scene):
-    module = Given(tiny_scene)
+def test_the_scene_is_loaded_once_and_only_when_needed(tiny_scene, serve):
+    module = serve(tiny_scene)
     assert module.loads == 0
     module.setup("fit")
     module.setup("test")
     assert module.scene is tiny_scene and module.loads == 1
 
 
-def test_training_views_move_to_the_device_once_for_each_capture(tiny_scene):
-    module, cpu = Given(tiny_scene), torch.device("cpu")
+def test_training_views_move_to_the_device_once_for_each_capture(tiny_scene, serve):
+    module, cpu = serve(tiny_scene), torch.device("cpu")
     static = module.training_views("static", cpu)
     assert module.training_views("static", cpu) is static
     assert torch.equal(static.pixels, tiny_scene.static.train.pixels)
@@ -56,9 +43,9 @@ def test_training_views_move_to_the_device_once_for_each_capture(tiny_scene):
     ("capture", "images", "held_out"), [("static", (8,), 2), ("both", (8, 6), 3)]
 )
 def test_a_stage_is_served_what_it_learns_from(
-    tiny_scene: Scene, capture: str, images: tuple[int, ...], held_out: int
+    tiny_scene: Scene, serve: Any, capture: str, images: tuple[int, ...], held_out: int
 ) -> None:
-    module, cpu = Given(tiny_scene), torch.device("cpu")
+    module, cpu = serve(tiny_scene), torch.device("cpu")
     learner: Any = SimpleNamespace(lightning_module=SimpleNamespace(capture=capture))
     module.trainer = learner
     served = module.transfer_batch_to_device(None, cpu, 0)
@@ -69,8 +56,8 @@ def test_a_stage_is_served_what_it_learns_from(
     assert module.transfer_batch_to_device(1, cpu, 0) == 1
 
 
-def test_the_training_loader_never_ends(tiny_scene: Scene) -> None:
-    loader = Given(tiny_scene).train_dataloader()
+def test_the_training_loader_never_ends(tiny_scene: Scene, serve: Any) -> None:
+    loader = serve(tiny_scene).train_dataloader()
     assert list(itertools.islice(loader, 50)) == [None] * 50
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,22 +12,9 @@ from lightning import Callback, Trainer
 from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, save_checkpoint
 from devrf.data.datamodule import SceneDataModule
 from devrf.methods.ray_stage import RayStage
-from devrf.scenes.scene import Capture, Scene
+from devrf.scenes.scene import Scene
 
 MakeStage = Callable[[], RayStage]
-
-
-@pytest.fixture
-def poisoned(tiny_scene: Scene) -> SceneDataModule:
-    """Serves the tiny scene, its static training images being black."""
-
-    class Poisoned(SceneDataModule):
-        def load(self) -> Scene:
-            train = tiny_scene.static.train
-            dark = replace(train, pixels=torch.zeros_like(train.pixels))
-            return replace(tiny_scene, static=Capture(dark, tiny_scene.static.test))
-
-    return Poisoned()
 
 
 def assert_same_weights(one: RayStage, other: RayStage) -> None:
@@ -67,15 +53,18 @@ def assert_goes_on_exactly(
 
 @pytest.fixture
 def assert_never_reads_the_static_set(
-    trainer: Callable[..., Trainer], datamodule: SceneDataModule, poisoned: SceneDataModule
+    trainer: Callable[..., Trainer],
+    serve: Callable[[Scene], SceneDataModule],
+    tiny_scene: Scene,
+    dark_scene: Scene,
 ) -> Callable[[MakeStage], None]:
     """Fails unless a stage learns the same, in the same box, where static images are black."""
 
     def check(stage: MakeStage) -> None:
         clean, dark = stage(), stage()
-        for one, scene in ((clean, datamodule), (dark, poisoned)):
+        for one, scene in ((clean, tiny_scene), (dark, dark_scene)):
             torch.manual_seed(0)
-            trainer(max_epochs=1).fit(one, datamodule=scene)
+            trainer(max_epochs=1).fit(one, datamodule=serve(scene))
         assert_same_weights(clean, dark)
         assert clean.scene_model.box == dark.scene_model.box
 

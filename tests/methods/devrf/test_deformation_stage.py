@@ -44,21 +44,14 @@ def test_two_steps_move_the_first_frame_only(
 
 
 def test_a_scene_at_rest_has_no_motion_to_learn(
-    rest: LoadedCheckpoint, tiny_scene: Scene, trainer: Callable[..., Trainer]
+    rest: LoadedCheckpoint,
+    tiny_scene: Scene,
+    serve: Callable[[Scene], SceneDataModule],
+    trainer: Callable[..., Trainer],
 ) -> None:
-    module = Given()
-    module.given = replace(tiny_scene, dynamic=tiny_scene.static)
+    module = serve(replace(tiny_scene, dynamic=tiny_scene.static))
     with pytest.raises(DevrfError, match="is at rest, so there is no motion to learn"):
         trainer(max_steps=1).fit(DeformationStage(rest, SHORT), datamodule=module)
-
-
-class Given(SceneDataModule):
-    """Serves the scene that it is given."""
-
-    given: Scene
-
-    def load(self) -> Scene:
-        return self.given
 
 
 def test_a_whole_schedule_sees_the_motion_better_than_the_rest_pose(
@@ -159,6 +152,7 @@ def test_factors_are_those_of_terms(rest: LoadedCheckpoint) -> None:
 def test_the_flow_of_a_moving_camera_neither_starts_nor_teaches_a_frame(
     rest: LoadedCheckpoint,
     tiny_scene: Scene,
+    serve: Callable[[Scene], SceneDataModule],
     trainer: Callable[..., Trainer],
     caplog: pytest.LogCaptureFixture,
     moving: bool,
@@ -168,8 +162,7 @@ def test_the_flow_of_a_moving_camera_neither_starts_nor_teaches_a_frame(
     assert train.flow is not None and train.flow.valid.any()
     if moving:
         train = replace(train, view=torch.arange(len(train)))
-    module = Given()
-    module.given = replace(tiny_scene, dynamic=replace(tiny_scene.dynamic, train=train))
+    module = serve(replace(tiny_scene, dynamic=replace(tiny_scene.dynamic, train=train)))
     motion = MotionSettings(learning_rate=1e-9, start="flow")
     stage = DeformationStage(rest, SHORT, motion, iterations_per_step=1)
     with caplog.at_level("INFO"):

@@ -79,18 +79,12 @@ def test_batches_have_further_rays_where_something_moves(
 
 
 def test_dynamic_never_reads_the_static_set(
-    stage: MakeStage, fit: Fit, datamodule: SceneDataModule, tiny_scene: Scene
+    stage: MakeStage, fit: Fit, serve: Callable[[Scene], SceneDataModule], dark_scene: Scene
 ) -> None:
-    class Poisoned(SceneDataModule):
-        def load(self) -> Scene:
-            train = tiny_scene.static.train
-            dark = replace(train, pixels=torch.zeros_like(train.pixels), depth=None)
-            return replace(tiny_scene, static=Capture(dark, tiny_scene.static.test))
-
     clean = stage(DYNAMIC)
     fit(clean)
     poisoned = stage(DYNAMIC)
-    fit(poisoned, data=Poisoned())
+    fit(poisoned, data=serve(dark_scene))
     for name, value in clean.state_dict().items():
         if isinstance(value, torch.Tensor):
             assert torch.equal(value, poisoned.state_dict()[name])
