@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 from omegaconf import OmegaConf
@@ -15,11 +17,12 @@ from devrf.cli.data_choice import with_data_choice
 
 REPOSITORY = Path(__file__).parents[2]
 PAGES = [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md"]
-PAGES += sorted((REPOSITORY / "docs").glob("*.md"))
+PAGES += sorted((REPOSITORY / "docs").rglob("*.md"))
 
 SPAN = re.compile(r"`([^`\n]+)`")
 TEST = re.compile(r"(tests/[\w/]+\.py)(?:::(\w+))?")
 LINK = re.compile(r"\]\((?!https?:)([^)#\s]+)")
+EQUATION = re.compile(r"\\\((.+?)\\\)|\\\[(.+?)\\\]", re.S)
 COMMAND = re.compile(r"python -m devrf ((?:-m )?[\w./]+=[^\s`]+(?: [\w./]+=[^\s`]+)*)")
 GROUPS = "callbacks|data|evaluation|export|field|sampling|schedule|still|video|viewer"
 KEY = re.compile(rf"([a-z_]+(?:\.[a-z_]+)+)=|^((?:{GROUPS})(?:\.[a-z_]+)+)$")
@@ -27,7 +30,8 @@ ROOTS = ("src/", "conf/", "tests/", "docs/", "notebooks/", "benchmarks/")
 PACKAGE = REPOSITORY / "src" / "devrf"
 CHOICES = [f"data={name}" for name in ("procedural", "procedural_forward", "inward", "forward")]
 CHOICES += ["data=nerfstudio", "data=nerfies", "data=neural_3d_video"]
-CHOICES += ["logger=wandb", "method=nerfies"]
+CHOICES += ["logger=wandb", "method=nerfies", "method=nsff", "method=hypernerf"]
+CHOICES += ["method=dnerf", "method=neural_volumes"]
 
 
 # Of the commands without a placeholder that a reader has to fill in.
@@ -36,7 +40,7 @@ COMMANDS = sorted(
         command
         for page in PAGES
         for command in COMMAND.findall(page.read_text())
-        if not re.search("NAME|CHOICE|hparams_search", command)
+        if not re.search("NAME|CHOICE|PROTOCOL|hparams_search", command)
     }
 )
 
@@ -98,3 +102,30 @@ def dotted(value: object, prefix: str = "") -> Iterator[str]:
     if isinstance(value, dict):
         for key, inner in value.items():
             yield from dotted(inner, f"{prefix}{key}.")
+
+
+def test_generated_tables_hold_every_choice():
+    hook = load_hook("configuration")
+    page = hook.reference()
+    for path in sorted(hook.CONF.glob("*/**/*.yaml")):
+        if str(path.parent.relative_to(hook.CONF)) not in hook.INTERNAL:
+            assert hook.header(path), f"{path} does not begin with a comment that says what it is"
+            assert f"`{path.stem}`" in page
+    assert "| `seed` | `0` |" in page
+
+
+def test_equations_become_mathml():
+    hook = load_hook("equations")
+    for page in sorted((REPOSITORY / "docs").rglob("*.md")):
+        for line, display in EQUATION.findall(page.read_text()):
+            # What the converter does not know stays a backslash with its name.
+            mathml = hook.convert(line or display)
+            assert mathml.startswith("<math") and "\\" not in mathml, line or display
+
+
+def load_hook(name: str) -> ModuleType:
+    path = REPOSITORY / "docs" / "hooks" / f"{name}.py"
+    spec = importlib.util.spec_from_file_location(f"docs_hook_{name}", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
