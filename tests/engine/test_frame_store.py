@@ -165,3 +165,23 @@ def test_frames_are_fetched_on_one_stream_for_good(
         store.prefetch(frames)
         assert sorted(store._fetched) == frames
     assert len(made) == 1
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.parametrize("half", [False, True])
+def test_frames_on_the_host_are_page_locked_and_come_back_as_they_were(half: bool) -> None:
+    device = torch.device("cuda", 0)
+    store = FrameStore(3, (4, 5, 6)).to(device)
+    store.offload(on_host=True, half=half)
+    assert store.to_time.is_pinned() and store.to_canonical.is_pinned()
+    written = tuple(torch.rand(4, 5, 6, 3, device=device) for _ in range(2))
+    store.write(1, written)  # type: ignore[arg-type]
+    store.synchronize()
+    store.prefetch([1])
+    found = torch.empty(4, 5, 6, 3, device=device), torch.empty(4, 5, 6, 3, device=device)
+    store.read(1, found)
+    for ours, theirs in zip(found, written, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1 / 2048 if half else 0, atol=1e-7)
+    store.resize((6, 6, 6))
+    assert store.to_time.shape == (3, 6, 6, 6, 3) and store.to_time.is_pinned()
