@@ -15,7 +15,7 @@ from devrf.data.batch import (
     pixel_positions,
     wanted_pixels,
 )
-from devrf.engine.gathering import gather_batch
+from devrf.engine.batches import gather_batch
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.scene import OpticalFlow, Views
 

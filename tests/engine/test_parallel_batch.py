@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from devrf.data.batch import Pixels
-from devrf.engine.metric_accumulator import MetricAccumulator
-from devrf.engine.parallel_batch import ParallelBatch
+from devrf.engine.loop import MetricAccumulator, ParallelBatch
 from devrf.rendering.sample_capacity import SampleCapacity
 
 

@@ -16,7 +16,7 @@ from torch.profiler import ProfilerActivity, profile
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import Pixels
 from devrf.data.datamodule import SceneDataModule
-from devrf.engine.parallel_batch import ParallelBatch
+from devrf.engine.loop import ParallelBatch
 from devrf.engine.streams import StreamParallel
 from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage

@@ -10,8 +10,7 @@ from statistics import median
 import torch
 from torch import Tensor
 
-from devrf.engine.phase import Phase
-from devrf.engine.stage import ScheduledStage
+from devrf.engine.stage import Phase, ScheduledStage
 
 # An expected opacity (or transparency) below this is too small to judge by.
 FAINT = 0.02

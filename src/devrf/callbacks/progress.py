@@ -14,8 +14,7 @@ from rich.progress import Progress as Bar
 from torch import Tensor
 
 from devrf.callbacks.training_curve import batch_psnr
-from devrf.engine.phase import in_words
-from devrf.engine.stage import ScheduledStage
+from devrf.engine.stage import ScheduledStage, in_words
 from devrf.system.progress import time_left
 
 log = logging.getLogger(__name__)

@@ -1,7 +1,7 @@
 """Progress files, and the random state in them.
 
 A progress file holds all that a stage needs to go on exactly where it was left
-(:mod:`devrf.engine.resume`).
+(:mod:`devrf.engine.stage`).
 """
 
 from __future__ import annotations

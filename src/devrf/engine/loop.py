@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import torch
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
 
-from devrf.engine.ddp import average_gradients, rays_per_rank, world_size
+from devrf.data.batch import Pixels
+from devrf.engine.ddp import average, average_gradients, rays_per_rank, world_size
 from devrf.engine.graphs import CudaGraphCapture, GraphedStep, Graphs
-from devrf.engine.metric_accumulator import MetricAccumulator
 from devrf.engine.micro_batching import MicroBatching
-from devrf.engine.parallel_batch import ParallelBatch
 from devrf.engine.streams import StreamParallel
 from devrf.ops.adam import GridAdam
 from devrf.rendering.sample_capacity import SampleCapacity
@@ -22,8 +22,90 @@ from devrf.system.out_of_memory import OutOfMemoryError
 from devrf.system.profiling import measured, span
 from devrf.system.speed import wait
 
-if TYPE_CHECKING:
-    from devrf.engine.stage import ScheduledStage
+
+@dataclass
+class ParallelBatch:
+    """One of the batches that an iteration learns from, independent of the others.
+
+    Attributes:
+        number: its index in the iteration, from 0.
+        parameters: what is learned from it, and from no other batch.
+        capacity: the length of its sample lists; None where their length depends on data.
+        pixels: the pixels of the present iteration; None before the first.
+    """
+
+    number: int
+    parameters: Sequence[Tensor]
+    capacity: SampleCapacity | None = None
+    pixels: Pixels | None = None
+
+    def take(self, drawn: Pixels) -> None:
+        """Set the pixels to ``drawn``; with a capacity, copy them into the same memory."""
+        if self.capacity is None:
+            self.pixels = drawn
+        elif self.pixels is None:
+            self.pixels = drawn.clone()
+        else:
+            self.pixels.take(drawn)
+
+
+class MetricAccumulator:
+    """Sums by name for each parallel batch, in the same memory from the first :meth:`add` on."""
+
+    def __init__(self) -> None:
+        self._names: tuple[str, ...] = ()
+        self._values: Tensor | None = None  # (batches, names)
+
+    def add(self, found: Sequence[Mapping[str, Tensor]]) -> None:
+        """Add the values () of an iteration, by name for each batch; all have the same names."""
+        self._names = tuple(found[0])
+        values = [terms[name] for terms in found for name in self._names]
+        if self._values is None:
+            self._values = torch.stack(values).view(len(found), len(self._names))
+        else:
+            torch._foreach_add_(self._values.view(-1).unbind(), values)
+
+    def take(self, iterations: int) -> tuple[dict[str, Tensor], Tensor]:
+        """The means over ``iterations`` and all processes; the sums are set to zero.
+
+        Returns:
+            For each name the mean over the batches, (); for each batch its ``loss``, (batches,).
+        """
+        assert self._values is not None
+        means = average(self._values) / iterations
+        self._values.zero_()
+        over_batches = means.mean(dim=0).unbind()
+        return dict(zip(self._names, over_batches, strict=True)), means[
+            :, self._names.index("loss")
+        ]
+
+
+class Learner(Protocol):
+    """What the loop asks of a stage."""
+
+    @property
+    def optimizer(self) -> GridAdam:
+        """Steps over everything that is learned."""
+        ...
+
+    @property
+    def view_cycle(self) -> int:
+        """In how many iterations a batch has come from every training view."""
+        ...
+
+    def draw(self, batch: ParallelBatch) -> Pixels:
+        """The pixels of a batch's next iteration."""
+        ...
+
+    def loss(
+        self, batch: ParallelBatch, views: Any, pixels: Pixels
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """The weighted loss () of a batch's pixels of ``views``, and its terms () by name."""
+        ...
+
+    def manual_backward(self, loss: Tensor, *args: Any, **kwargs: Any) -> None:
+        """Add the gradients of a loss."""
+        ...
 
 
 class Loop:
@@ -95,7 +177,7 @@ class Loop:
         """Capture the next iteration anew: a setting that the graph contains has changed."""
         self._graphed = None
 
-    def step(self, stage: ScheduledStage, views: Any, optimizer: LightningOptimizer) -> None:
+    def step(self, stage: Learner, views: Any, optimizer: LightningOptimizer) -> None:
         """Run one iteration.
 
         Args:
@@ -133,7 +215,7 @@ class Loop:
         for batch in self.batches:
             batch.capacity = SampleCapacity(rays, self._device)
 
-    def _accumulate(self, stage: ScheduledStage, views: Any) -> None:
+    def _accumulate(self, stage: Learner, views: Any) -> None:
         """Compute the gradients of all batches; add losses and terms to the metrics."""
         if len(self.batches) == 1:
             found = [self._gradients(self.batches[0], stage, views)]
@@ -144,9 +226,7 @@ class Loop:
         average_gradients(p for group in groups for p in group["params"])
         self.metrics.add(found)
 
-    def _gradients(
-        self, batch: ParallelBatch, stage: ScheduledStage, views: Any
-    ) -> dict[str, Tensor]:
+    def _gradients(self, batch: ParallelBatch, stage: Learner, views: Any) -> dict[str, Tensor]:
         """Compute the gradients of one batch; its loss and terms by name."""
         assert batch.pixels is not None
 
@@ -170,9 +250,7 @@ class Loop:
             self._make_capacities()
             self._graphed = None
 
-    def _static_step(
-        self, stage: ScheduledStage, views: Any, optimizer: LightningOptimizer
-    ) -> None:
+    def _static_step(self, stage: Learner, views: Any, optimizer: LightningOptimizer) -> None:
         """An iteration with static shapes: the same work on the same tensors, with other pixels."""
 
         def work() -> None:

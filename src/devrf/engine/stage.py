@@ -3,7 +3,7 @@
 A schedule is a list of phases. Within a phase the same tensors are learned; between two phases
 grids grow or other frames become active. A subclass of :class:`ScheduledStage` says what is learned
 in each phase, which pixels an iteration draws, and what their loss is. How an iteration is carried
-out is in :mod:`devrf.engine.loop`, how a stopped run continues in :mod:`devrf.engine.resume`.
+out is in :mod:`devrf.engine.loop`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
 import torch
@@ -19,22 +19,68 @@ from lightning import LightningModule
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
 
-from devrf.checkpoints.checkpoint import CheckpointMetadata, TrainingFigures
-from devrf.checkpoints.progress import set_rng_state
-from devrf.data.batch import Pixels
-from devrf.engine import resume
+from devrf.checkpoints.checkpoint import (
+    MODEL,
+    CheckpointMetadata,
+    TrainingFigures,
+    check_scene,
+    metadata_in,
+)
+from devrf.checkpoints.progress import rng_state, set_rng_state
+from devrf.checkpoints.viewpoints import Viewpoints
+from devrf.data.batch import Pixels, background_color
 from devrf.engine.ddp import assert_replicas_equal, broadcast, check_strategy, rank
 from devrf.engine.graphs import Graphs
-from devrf.engine.loop import Loop
-from devrf.engine.parallel_batch import ParallelBatch
-from devrf.engine.phase import Phase, in_words
-from devrf.engine.resume import LearnedModel
+from devrf.engine.loop import Loop, ParallelBatch
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import score
 from devrf.ops.adam import GridAdam
 from devrf.rendering.renderer import Renderer
-from devrf.scenes.scene import CaptureName, Scene
+from devrf.rendering.view import Viewable
+from devrf.scenes.scene import CaptureName, Scene, Views
 from devrf.system.out_of_memory import OutOfMemoryError
+
+
+class Phase(Protocol):
+    """A range of iterations in which the same tensors are learned."""
+
+    @property
+    def start(self) -> int:
+        """First iteration."""
+        ...
+
+    @property
+    def stop(self) -> int:
+        """One past the last iteration."""
+        ...
+
+    @property
+    def kind(self) -> str:
+        """What is learned, in a word or two: ``search``, ``fine``, ``level 2``."""
+        ...
+
+    @property
+    def frames(self) -> tuple[int, ...]:
+        """The frames that are learned, ascending; empty where all times are learned at once."""
+        ...
+
+
+def in_words(frames: tuple[int, ...]) -> str:
+    """``frame 3``, or ``frames 3, 10``."""
+    noun = "frame" if len(frames) == 1 else "frames"
+    return f"{noun} {', '.join(str(frame) for frame in frames)}"
+
+
+class LearnedModel(Viewable, Protocol):
+    """What a stage learns: a :class:`~devrf.methods.base.DynamicModel`."""
+
+    def config(self) -> dict[str, Any]:
+        """Plain data to build it from."""
+        ...
+
+    def stored_state(self) -> dict[str, Any]:
+        """The state for a finished checkpoint."""
+        ...
 
 
 class ScheduledStage(LightningModule, ABC):
@@ -96,6 +142,7 @@ class ScheduledStage(LightningModule, ABC):
         self.lr_scale = 1.0
         self.abort_reason: str | None = None
         self.logged: dict[str, Tensor] = {}
+        self._plain: Tensor | None = None
         self._progress: dict[str, Any] | None = None
         self._finished: dict[str, Any] | None = None
 
@@ -179,6 +226,25 @@ class ScheduledStage(LightningModule, ABC):
         scene: Scene = self.trainer.datamodule.scene  # type: ignore[attr-defined]
         return scene
 
+    def training_views(self, capture: CaptureName) -> Views:
+        """The training views of a capture, on the stage's device."""
+        views: Views = self.trainer.datamodule.training_views(  # type: ignore[attr-defined]
+            capture, self.device
+        )
+        return views
+
+    def background(self, image: Tensor) -> Tensor:
+        """What is behind the pixels of ``image`` (R,): (3,), always the same tensor, if plain.
+
+        Else (R, 3), drawn with ``generator``.
+        """
+        name = self.scene.background
+        if name == "random":
+            return background_color(name, len(image), self.generator)
+        if self._plain is None or self._plain.device != image.device:
+            self._plain = background_color(name, 0, self.generator).to(image.device)
+        return self._plain
+
     @property
     def scored_capture(self) -> CaptureName:
         """The capture whose held-out views measure what was learned."""
@@ -192,7 +258,20 @@ class ScheduledStage(LightningModule, ABC):
 
     def metadata(self) -> CheckpointMetadata:
         """The metadata of a checkpoint of this stage."""
-        return resume.metadata(self)
+        model = self.scene_model
+        target = f"{type(model).__module__}.{type(model).__qualname__}"
+        return CheckpointMetadata(
+            scene=self.scene.name,
+            fingerprint=self.scene.fingerprint,
+            stage=self.name,
+            model={"_target_": target, **model.config()},
+            protocol=self.protocol,
+            records={**self.earlier_records, self.name: self.record},
+            training_config=self.training_config,
+            earlier_configs=self.earlier_configs,
+            command=self.command,
+            complete=self.iteration >= self.total_iterations,
+        )
 
     def describe(self, iteration: int) -> str:
         """An iteration of the present phase, with its frames and resolution, for messages."""
@@ -244,8 +323,30 @@ class ScheduledStage(LightningModule, ABC):
         self.generator = torch.Generator(self.trainer.strategy.root_device)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Restore the position in the schedule and the tensors' shapes; tensors are loaded next."""
-        self._progress = resume.load(self, checkpoint, Path(str(self.trainer.ckpt_path)))
+        """Restore the position in the schedule and the tensors' shapes; tensors are loaded next.
+
+        What else a progress file holds is restored once they are: ``phase_state`` when the
+        optimiser is configured, ``random`` when training starts.
+
+        Raises:
+            DevrfError: the checkpoint is of another scene, stage or schedule.
+        """
+        path = Path(str(self.trainer.ckpt_path))
+        check_scene(path, metadata_in(path, checkpoint), self.scene)
+        self.resize_to(checkpoint["state_dict"])
+        self._progress = kept = checkpoint.get("progress")
+        if kept is None:
+            return
+        course, ours = (kept["stage"], kept["total"]), (self.name, self.total_iterations)
+        if course != ours:
+            raise DevrfError(
+                f"{path}: left by the {course[0]} stage on a schedule of {course[1]} iterations, "
+                f"this is the {ours[0]} stage on one of {ours[1]}; give it its own schedule"
+            )
+        self.iteration, self.skipped, self.seed = kept["iteration"], kept["skipped"], kept["seed"]
+        self.loop.micro_batching.count = kept["micro_batches"]
+        self.num_rollbacks, self.lr_scale = kept["num_rollbacks"], kept["lr_scale"]
+        self.phase = None if kept["phase"] is None else self.phase_at(kept["phase"])
 
     def configure_optimizers(self) -> GridAdam:
         """The optimiser; in a resumed run with the parameters of the phase that was left."""
@@ -345,8 +446,30 @@ class ScheduledStage(LightningModule, ABC):
         return self._finished or self.current_model().stored_state()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add the state that is not in tensors."""
-        resume.save(self, checkpoint)
+        """Add the state that is not in tensors.
+
+        Without the optimiser's state a checkpoint is for rendering, not for resuming.
+        """
+        checkpoint["devrf"] = self.metadata().as_data()
+        checkpoint["viewpoints"] = Viewpoints.of(self.scene).as_data()
+        if "optimizer_states" not in checkpoint:
+            if self.iteration >= self.total_iterations:
+                compact = self.finished_state()
+                checkpoint["state_dict"] = {f"{MODEL}{k}": v for k, v in compact.items()}
+            return
+        checkpoint["progress"] = {
+            "stage": self.name,
+            "iteration": self.iteration,
+            "skipped": self.skipped,
+            "total": self.total_iterations,
+            "phase": None if self.phase is None else self.phase.start,
+            "phase_state": {} if self.phase is None else self.phase_state(),
+            "seed": self.seed,
+            "random": rng_state(self.device),
+            "micro_batches": self.loop.micro_batching.count,
+            "num_rollbacks": self.num_rollbacks,
+            "lr_scale": self.lr_scale,
+        }
 
     def on_fit_end(self) -> None:
         """Check the result.

@@ -11,18 +11,14 @@ from torch import Tensor
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import (
-    PixelPool,
     Pixels,
     RayBatch,
-    all_pixels,
-    background_color,
     concatenated,
 )
+from devrf.engine.batches import FramePool, gather_batch
 from devrf.engine.ddp import rays_per_rank
-from devrf.engine.gathering import gather_batch
-from devrf.engine.parallel_batch import ParallelBatch
-from devrf.engine.phase import Phase
-from devrf.engine.stage import ScheduledStage
+from devrf.engine.loop import ParallelBatch
+from devrf.engine.stage import Phase, ScheduledStage
 from devrf.errors import DevrfError
 from devrf.methods.base import DynamicModel
 from devrf.methods.protocol import ProtocolStage
@@ -197,7 +193,7 @@ class RayStage(ScheduledStage):
     def enter(self, phase: Phase) -> None:
         """Gather the pixels to draw from."""
         self.phase = phase
-        views = [self._training_views(name) for name in self._captures]
+        views = [self.training_views(name) for name in self._captures]
         self.pools = [FramePool.of(one) for one in views]
         self.scene_model.learn_from(views, self.weights)
         groups = self.optimizer.param_groups
@@ -208,12 +204,6 @@ class RayStage(ScheduledStage):
     @property
     def _captures(self) -> tuple[CaptureName, ...]:
         return ("static", "dynamic") if self.capture == "both" else (self.capture,)
-
-    def _training_views(self, capture: CaptureName) -> Views:
-        views: Views = self.trainer.datamodule.training_views(  # type: ignore[attr-defined]
-            capture, self.device
-        )
-        return views
 
     def prepare(self) -> None:
         """Let the model follow the schedule."""
@@ -243,7 +233,7 @@ class RayStage(ScheduledStage):
                 images.append(further[0])
                 flats.append(further[1])
             image = torch.cat(images)
-            background = background_color(self.scene.background, len(image), self.generator)
+            background = self.background(image)
             return Pixels(image, torch.cat(flats), background)
 
     def _shown_frames(self, pool: FramePool) -> int:
@@ -290,64 +280,6 @@ class RayStage(ScheduledStage):
     def restore(self, phase: Phase, kept: dict[str, Any]) -> None:
         """Go on with ``phase``, the model being loaded."""
         self.enter(phase)
-
-
-@dataclass(frozen=True)
-class FramePool:
-    """The valid pixels of some images, in the order of their frames.
-
-    Attributes:
-        pool: the pixels.
-        ends: how many pixels the first k + 1 frames have, for each k.
-        images: how many images there are.
-    """
-
-    pool: PixelPool
-    ends: tuple[int, ...]
-    images: int
-
-    @staticmethod
-    def of(views: Views) -> FramePool:
-        """All valid pixels of some views."""
-        assert views.frames is not None
-        everything = all_pixels(views, torch.arange(len(views), device=views.frames.device))
-        frame = views.frames[everything.image.long()]
-        order = frame.argsort(stable=True)
-        _, counts = torch.unique(frame, return_counts=True)
-        return FramePool(
-            everything[order],
-            tuple(counts.cumsum(0).tolist()),
-            len(views),
-        )
-
-    @property
-    def frames(self) -> int:
-        """How many frames there are."""
-        return len(self.ends)
-
-    def draw(
-        self, count: int, frames: int, generator: torch.Generator, *, moments: int | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """``count`` pixels with replacement: image and number, (count,) int64 each.
-
-        Args:
-            count: how many.
-            frames: so many of the first frames are drawn from.
-            generator: of the random choice, on the pool's device.
-            moments: so many frames alone, as many pixels of each, frame after frame; None: all.
-        """
-        pool, device = self.pool, self.pool.pixels.device
-        if moments is None or moments >= frames:
-            last = self.ends[frames - 1]
-            pick = torch.randint(last, (count,), device=device, generator=generator)
-        else:
-            ends = torch.tensor((0, *self.ends), device=device)
-            chosen = torch.randperm(frames, device=device, generator=generator)[:moments]
-            frame = chosen[torch.arange(count, device=device) * moments // count]
-            size = ends[frame + 1] - ends[frame]
-            part = torch.rand(count, dtype=torch.float64, device=device, generator=generator)
-            pick = ends[frame] + (part * size).long()
-        return pool.image[pick].long(), pool.flat[pick].long()
 
 
 @torch.no_grad()

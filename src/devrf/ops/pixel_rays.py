@@ -1,6 +1,6 @@
 """From drawn pixels to their rays and what the images show there; and a ray's steps in a box.
 
-Each in one launch where Triton runs. :func:`devrf.engine.gathering.gather_batch` is made of the
+Each in one launch where Triton runs. :func:`devrf.engine.batches.gather_batch` is made of the
 first; the second gives what :func:`devrf.rendering.sampling.steps_through` gives.
 """
 

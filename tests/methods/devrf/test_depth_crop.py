@@ -10,7 +10,7 @@ from lightning import Trainer
 
 from devrf.data.batch import all_pixels
 from devrf.data.datamodule import SceneDataModule
-from devrf.engine.gathering import gather_batch
+from devrf.engine.batches import gather_batch
 from devrf.geometry.box import Box
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.methods.devrf import depth_crop

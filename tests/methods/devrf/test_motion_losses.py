@@ -11,7 +11,7 @@ from torch import Tensor
 
 from devrf.data.batch import RayBatch
 from devrf.data.correspondence import previous_images
-from devrf.engine.gathering import gather_batch
+from devrf.engine.batches import gather_batch
 from devrf.geometry.cameras import Cameras
 from devrf.methods.devrf.losses import (
     MotionPrediction,

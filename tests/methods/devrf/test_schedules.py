@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from devrf.engine.phase import in_words
+from devrf.engine.stage import in_words
 from devrf.errors import DevrfError
 from devrf.methods.devrf.canonical_schedule import CanonicalPhase, CanonicalSchedule
 from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule

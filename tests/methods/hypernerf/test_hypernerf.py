@@ -16,7 +16,7 @@ from devrf.checkpoints.checkpoint import (
     save_checkpoint,
 )
 from devrf.data.datamodule import SceneDataModule
-from devrf.engine.gathering import gather_batch
+from devrf.engine.batches import gather_batch
 from devrf.errors import DevrfError
 from devrf.methods.hypernerf.model import HyperNeRF, HyperNeRFSettings
 from devrf.methods.nerfies.model import Nerfies, NerfiesSettings

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from devrf.data.batch import RayBatch
-from devrf.engine.gathering import gather_batch
+from devrf.engine.batches import gather_batch
 from devrf.methods.hypernerf.model import HyperNeRF, HyperNeRFSettings
 from devrf.scenes.scene import Scene
 

@@ -14,7 +14,7 @@ from lightning import Trainer
 from devrf.checkpoints.checkpoint import load_checkpoint, save_checkpoint
 from devrf.data.batch import RayBatch
 from devrf.data.datamodule import SceneDataModule
-from devrf.engine.gathering import gather_batch
+from devrf.engine.batches import gather_batch
 from devrf.errors import DevrfError
 from devrf.methods.nerfies.model import Nerfies, NerfiesSettings
 from devrf.methods.protocol import ProtocolStage

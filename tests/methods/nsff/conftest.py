@@ -12,7 +12,7 @@ from lightning import Trainer
 
 from devrf.data.batch import RayBatch
 from devrf.data.datamodule import SceneDataModule
-from devrf.engine.gathering import gather_batch
+from devrf.engine.batches import gather_batch
 from devrf.methods.nsff.model import NSFF
 from devrf.methods.nsff.settings import NSFFSettings, Warmup
 from devrf.methods.protocol import ProtocolStage

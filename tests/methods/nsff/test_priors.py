@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from devrf.data.rendered import RenderedDataModule
-from devrf.engine.gathering import gather_batch
+from devrf.engine.batches import gather_batch
 from devrf.methods.nsff.fields import BACKWARD, FORWARD
 from devrf.methods.nsff.model import NSFF
 from devrf.methods.nsff.priors import ImagePriors

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from devrf.data.batch import pixel_positions
-from devrf.engine.gathering import gather_batch
+from devrf.engine.batches import gather_batch
 from devrf.geometry.box import Box
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.rays import Rays

@@ -35,7 +35,6 @@ class ActiveFrame:
         appearance: q → A_t(q) of the frame, its grid a leaf; None where it is not learned.
         number: the frame; 0 before the first.
         pools: the pixels to learn from; batches are drawn from each in turn.
-        losses: mean loss of each Lightning step since the frame was checked out.
     """
 
     backward: Tensor
@@ -47,7 +46,6 @@ class ActiveFrame:
     appearance: ColorResidual | None = None
     number: int = 0
     pools: list[PixelPool] = field(default_factory=list)
-    losses: list[float] = field(default_factory=list)
 
     @staticmethod
     def of(
@@ -107,7 +105,7 @@ class ActiveFrame:
         self, motion: DeformationField, number: int, appearance: AppearanceField | None = None
     ) -> None:
         """Copy a frame out of the fields."""
-        self.number, self.losses = number, []
+        self.number = number
         motion.frames.read(number, self.slices)
         motion.frames.read_forward(number - 1, self.before)
         if self.residual is not None and appearance is not None:

@@ -13,9 +13,10 @@ from torch import Tensor
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.checkpoints.packing import pack_bits, unpack_bits
 from devrf.data.batch import PixelPool, Pixels
+from devrf.engine.batches import static_pool
 from devrf.engine.graphs import Graphs
-from devrf.engine.parallel_batch import ParallelBatch
-from devrf.engine.phase import Phase
+from devrf.engine.loop import ParallelBatch
+from devrf.engine.stage import Phase
 from devrf.errors import DevrfError
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField
@@ -30,7 +31,6 @@ from devrf.methods.devrf.losses import (
     total_variation_weight,
 )
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.pixel_selection import canonical_pool
 from devrf.methods.devrf.settings import (
     FINE_LOSS,
     SEARCH_LOSS,
@@ -182,7 +182,7 @@ class CanonicalStage(VoxelStage):
             self._begin_fine(phase)
         elif previous is not None:
             self._grow(phase)
-        self.pool = canonical_pool(views, model, everywhere=phase.kind == "search")
+        self.pool = static_pool(views, model, None if phase.kind == "search" else model.occupancy)
         if not len(self.pool):
             raise DevrfError(
                 f"the field has become empty by iteration {self.iteration}: check data.background, "

@@ -15,13 +15,13 @@ from torch import Tensor
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import Pixels, all_pixels
 from devrf.data.correspondence import previous_images
+from devrf.engine.batches import frame_pools, images_of
+from devrf.engine.convergence import Convergence
 from devrf.engine.ddp import broadcast
 from devrf.engine.graphs import Graphs
-from devrf.engine.late_reading import LateReading
-from devrf.engine.parallel_batch import ParallelBatch
-from devrf.engine.phase import Phase
+from devrf.engine.loop import ParallelBatch
+from devrf.engine.stage import Phase
 from devrf.errors import DevrfError
-from devrf.methods.devrf import convergence
 from devrf.methods.devrf.active_frame import ActiveFrames
 from devrf.methods.devrf.appearance import AppearanceSettings
 from devrf.methods.devrf.appearance_learning import AppearanceLearning
@@ -43,7 +43,6 @@ from devrf.methods.devrf.losses import (
     total_variation_weight,
 )
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.pixel_selection import frame_pools, images_of
 from devrf.methods.devrf.refinement import Refinement, RefinementPhase, RefinementSettings
 from devrf.methods.devrf.settings import (
     APPEARANCE_LOSS,
@@ -136,7 +135,7 @@ class DeformationStage(VoxelStage):
             [{"params": [placeholder], "lr": self.motion.learning_rate, "name": "motion"}]
         )
         self.active = ActiveFrames(self)
-        self._late = LateReading()
+        self._convergence = Convergence()
         self._previous_images: Tensor | None = None
         self._tracks: FlowTracks | None = None
         # The cells of the motion grid that hold matter at rest; None where no loss asks.
@@ -273,7 +272,7 @@ class DeformationStage(VoxelStage):
         if len(self.active) != len(phase.frames):
             self._allocate(len(phase.frames))
         self.active.check_out(phase.frames)
-        self._late.reset()
+        self._convergence.reset()
 
     def _allocate(self, count: int) -> None:
         """Make memory for ``count`` active frames at the field's present resolution."""
@@ -371,10 +370,7 @@ class DeformationStage(VoxelStage):
     @property
     def views(self) -> Views:
         """The dynamic training views, on the stage's device."""
-        views: Views = self.trainer.datamodule.training_views(  # type: ignore[attr-defined]
-            self.capture, self.device
-        )
-        return views
+        return self.training_views(self.capture)
 
     @property
     def tracks(self) -> FlowTracks:
@@ -447,20 +443,12 @@ class DeformationStage(VoxelStage):
         least = self.motion.min_rel_improvement
         if least is None or isinstance(self.phase, RefinementPhase):
             return False
-        # On a GPU one step late: it then always has the next step's work.
-        known = self._late.exchange(losses) if losses.is_cuda else losses.tolist()
-        if known is None:
-            return False
-        for frame, loss in zip(self.active, known, strict=True):
-            frame.losses.append(loss)
-        return all(convergence.converged(frame.losses, least) for frame in self.active)
+        return self._convergence.converged(losses, least)
 
     def rollback(self, iteration: int, lr_scale: float) -> None:
         """Go on from an earlier iteration of the present frames, with an occupancy found anew."""
         super().rollback(iteration, lr_scale)
-        self._late.reset()
-        for frame in self.active:
-            frame.losses = []
+        self._convergence.reset()
         self.update_occupancy()
 
     @property
@@ -478,8 +466,7 @@ class DeformationStage(VoxelStage):
                 frame.state(images_of(self.views, frame.number), area, exact=exact)
                 for frame in self.active
             ],
-            "losses": [list(frame.losses) for frame in self.active],
-            "late": self._late.waiting,
+            "convergence": self._convergence.state(),
         }
 
     def restore(self, phase: Phase, kept: dict[str, Any]) -> None:
@@ -490,9 +477,6 @@ class DeformationStage(VoxelStage):
         assert isinstance(phase, DeformationPhase)
         self.activate(phase)
         views = self.views
-        states = zip(self.active, kept["frames"], kept["losses"], strict=True)
-        for frame, state, losses in states:
+        for frame, state in zip(self.active, kept["frames"], strict=True):
             frame.load_state(state, images_of(views, frame.number), views.height * views.width)
-            frame.losses = list(losses)
-        # Progress files of earlier revisions have none.
-        self._late.reset(kept.get("late"))
+        self._convergence.load_state(kept["convergence"])

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from devrf.data.batch import PixelPool
-from devrf.engine.gathering import gather_batch
+from devrf.engine.batches import gather_batch
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.volume_rendering import render
 from devrf.ops.compositing import sum_by_ray

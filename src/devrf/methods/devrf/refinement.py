@@ -9,10 +9,10 @@ import torch
 from torch import Tensor, nn
 
 from devrf.data.batch import PixelPool, Pixels
+from devrf.engine.batches import frame_pools, static_pool
 from devrf.errors import DevrfError
 from devrf.methods.devrf.losses import PHOTOMETRIC_TERMS, VISIBILITY, Prediction
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.pixel_selection import canonical_pool, frame_pools
 from devrf.methods.devrf.settings import FINE_LOSS, CanonicalRates
 from devrf.methods.devrf.voxel_stage import VoxelStage
 from devrf.methods.devrf.weighted_loss import WeightedLoss
@@ -135,7 +135,7 @@ class Refinement:
         stage, model = self._stage, self._stage.scene_model
         assert model.deformation is not None
         times = model.deformation.clock.times
-        self._still = canonical_pool(self._static_views, model, everywhere=False)
+        self._still = static_pool(self._static_views, model, model.occupancy)
         self._occupancies, self._pools = [], []
         for frame in range(1, len(times)):
             occupancy = model.occupancy_at(times[frame])
@@ -160,11 +160,7 @@ class Refinement:
 
     @property
     def _static_views(self) -> Views:
-        stage = self._stage
-        views: Views = stage.trainer.datamodule.training_views(  # type: ignore[attr-defined]
-            "static", stage.device
-        )
-        return views
+        return self._stage.training_views("static")
 
     def draw(self) -> Pixels:
         """Random pixels: of static images first, then of one frame's dynamic images.

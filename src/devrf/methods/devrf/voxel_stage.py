@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from devrf.data.batch import PixelPool, Pixels, RayBatch, background_color
+from devrf.data.batch import PixelPool, Pixels, RayBatch
+from devrf.engine.batches import gather_batch
 from devrf.engine.ddp import rays_per_rank
-from devrf.engine.gathering import gather_batch
 from devrf.engine.graphs import Graphs
 from devrf.engine.stage import ScheduledStage
 from devrf.methods.devrf.appearance import ColorResidual
@@ -46,7 +46,6 @@ class VoxelStage(ScheduledStage):
     ) -> None:
         super().__init__(iterations_per_step, graphs)
         self.decoder_precision = decoder_precision
-        self._plain: Tensor | None = None
 
     def current_model(self) -> DeVRFModel:
         """The model, everything that has been learned so far written back."""
@@ -56,16 +55,7 @@ class VoxelStage(ScheduledStage):
         """A batch of random pixels of a pool."""
         with span("batch"):
             image, flat = pool.draw(rays_per_rank(self.schedule.rays), self.generator)
-            return Pixels(image, flat, self._background(image))
-
-    def _background(self, image: Tensor) -> Tensor:
-        """What is behind the pixels of ``image`` (R,); always the same tensor if it is plain."""
-        name = self.scene.background
-        if name == "random":
-            return background_color(name, len(image), self.generator)
-        if self._plain is None or self._plain.device != image.device:
-            self._plain = background_color(name, 0, self.generator).to(image.device)
-        return self._plain
+            return Pixels(image, flat, self.background(image))
 
     def render_pixels(
         self,

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
+import torch
 from lightning import Trainer
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
+from devrf.engine.convergence import LateReading, converged
 from devrf.errors import DevrfError
-from devrf.methods.devrf.convergence import converged
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.settings import MotionSettings
@@ -52,3 +53,21 @@ def test_a_frame_that_has_converged_is_left_if_asked(
 def test_a_gain_is_a_share() -> None:
     with pytest.raises(DevrfError, match="schedule.motion.min_rel_improvement: expected above 0"):
         MotionSettings(min_rel_improvement=0.0)
+
+
+def test_each_call_hands_over_what_the_one_before_was_given() -> None:
+    late, values = LateReading(), torch.tensor([1.0, 2.0])
+    assert late.exchange(values) is None
+    values.fill_(3.0)  # what was given has been copied
+    assert late.waiting == [1.0, 2.0]
+    assert late.exchange(values) == [1.0, 2.0]
+    assert late.exchange(values) == [3.0, 3.0]
+
+
+def test_what_waits_can_be_kept_and_forgotten() -> None:
+    late, again = LateReading(), LateReading()
+    late.exchange(torch.tensor([0.25]))
+    again.reset(late.waiting)
+    assert again.exchange(torch.tensor([9.0])) == [0.25]
+    again.reset()
+    assert again.exchange(torch.tensor([1.0])) is None

@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 
+from devrf.engine.batches import rays_hit_occupied
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.pixel_selection import rays_hit_occupied
 from devrf.methods.devrf.settings import RenderSettings
 from devrf.rendering.occupancy import Occupancy, dilate
 from devrf.rendering.sampling import march
