@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from devrf.apps.capture.settings import CaptureSettings
+from devrf.apps.settings import CaptureSettings
 from devrf.apps.video_file import write_pictures
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.procedural.builder import ProceduralScene

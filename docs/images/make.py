@@ -20,11 +20,9 @@ from omegaconf import OmegaConf
 from PIL import Image
 from torch import Tensor
 
-from devrf.apps.camera_paths import orbit
-from devrf.apps.colors import to_bytes
-from devrf.apps.film import FilmSettings
-from devrf.apps.grid import image_grid, scaled
+from devrf.apps.images import image_grid, scaled, to_bytes
 from devrf.apps.still import still
+from devrf.apps.video import FilmSettings, orbit
 from devrf.checkpoints.checkpoint import load_checkpoint
 from devrf.geometry.cameras import Cameras
 from devrf.methods.base import DynamicModel

@@ -16,8 +16,7 @@ from pathlib import Path
 from make import HERE, opened, write_small
 from torch import Tensor
 
-from devrf.apps.colors import error_colors
-from devrf.apps.grid import image_grid, scaled
+from devrf.apps.images import error_colors, image_grid, scaled
 from devrf.evaluation.held_out import HeldOutView, score
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from devrf.apps.camera_paths import bullet_time, orbit, time_freeze
-from devrf.apps.film import FilmSettings
+from devrf.apps.video import FilmSettings, bullet_time, orbit, time_freeze
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras

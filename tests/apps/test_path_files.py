@@ -7,8 +7,7 @@ import json
 import pytest
 import torch
 
-from devrf.apps.keyframes import CameraPath, Keyframe
-from devrf.apps.path_files import check_name, path_from, read_path, write_path
+from devrf.apps.keyframes import CameraPath, Keyframe, check_name, path_from, read_path, write_path
 from devrf.errors import DevrfError
 
 # Looks along −x from (1, 2, 3), row by row.

@@ -13,25 +13,28 @@ import pytest
 import torch
 from torch import Tensor
 
-from devrf.apps.camera_paths import held_out_images, orbit
-from devrf.apps.colors import (
+from devrf.apps.images import (
     UNKNOWN,
     depth_colors,
     error_colors,
+    evenly,
     flow_colors,
     flow_wheel,
+    image_grid,
+    scaled,
+    short_name,
     to_bytes,
 )
-from devrf.apps.contact_sheet import write_contact_sheet
-from devrf.apps.film import (
+from devrf.apps.still import write_contact_sheet
+from devrf.apps.video import (
     FilmSettings,
     film_bytes,
+    held_out_images,
     held_out_pictures,
+    orbit,
     orbit_pictures,
     write_video,
 )
-from devrf.apps.grid import image_grid, scaled
-from devrf.apps.images import evenly, short_name
 from devrf.evaluation.held_out import HeldOutView, truth_image
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras

@@ -9,8 +9,8 @@ import pytest
 import torch
 from lightning import Trainer
 
-from devrf.apps.film import FilmSettings
 from devrf.apps.still import StillSettings, still
+from devrf.apps.video import FilmSettings
 from devrf.checkpoints.viewpoints import Viewpoints
 from devrf.errors import DevrfError
 from devrf.methods.devrf.canonical_stage import CanonicalStage

@@ -6,8 +6,8 @@ import time
 
 import pytest
 
+from devrf.apps.viewer.cameras import Pose
 from devrf.apps.viewer.drawing import Drawing
-from devrf.apps.viewer.poses import Pose
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 

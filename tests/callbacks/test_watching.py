@@ -16,7 +16,7 @@ from lightning import Callback, Trainer
 from lightning.pytorch.loggers import CSVLogger, Logger
 from torch import Tensor
 
-from devrf.apps.tracking import Row
+from devrf.apps.trackers import Row
 from devrf.callbacks import Meter, Previews, TrainingCurve, TrainingRecord
 from devrf.data.datamodule import SceneDataModule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
@@ -98,7 +98,7 @@ def test_the_curve_of_a_stage_has_every_step(
     learn, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drawn: list[Any] = []
-    module = "devrf.apps.training_curve"
+    module = "devrf.apps.report.plots"
     original = importlib.import_module(module).training_curve
     monkeypatch.setattr(f"{module}.training_curve", lambda *a: drawn.append(a) or original(*a))
     album = Album()

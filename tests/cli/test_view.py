@@ -19,10 +19,9 @@ import torch
 import trimesh
 
 import devrf as package
-from devrf.apps.keyframes import CameraPath, Keyframe
-from devrf.apps.path_files import write_path
+from devrf.apps.keyframes import CameraPath, Keyframe, write_path
+from devrf.apps.viewer.cameras import Pose
 from devrf.apps.viewer.drawing import Drawing, Shot
-from devrf.apps.viewer.poses import Pose
 from devrf.checkpoints.checkpoint import load_checkpoint
 from devrf.rendering.renderer import Renderer
 
@@ -124,7 +123,7 @@ def test_the_viewer_is_not_loaded_without_being_asked_for():
             if module not in seen and file.is_file():
                 waiting += imported(file)
         seen.add(module)
-    assert "devrf.apps.viewer.settings" in seen and "devrf.cli.view" in seen
+    assert "devrf.apps.settings" in seen and "devrf.cli.view" in seen
     assert "viser" not in seen and "devrf.apps.viewer.session" not in seen
 
 

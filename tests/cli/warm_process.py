@@ -33,7 +33,7 @@ from typing import Any
 import torch
 from hydra.core.plugins import Plugins
 
-import devrf.apps.film
+import devrf.apps.video
 import devrf.callbacks
 import devrf.cli.steps
 from devrf.__main__ import entry

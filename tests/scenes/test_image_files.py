@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import ExifTags, Image, ImageOps
 
-from devrf.apps.inspection.image_advice import image_advice
+from devrf.apps.inspection.advice import image_advice
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.image_files import decode, image_size, read_header

@@ -14,7 +14,7 @@ import pytest
 import torch
 from PIL import Image
 
-from devrf.apps.inspection.image_advice import image_advice
+from devrf.apps.inspection.advice import image_advice
 from devrf.apps.inspection.picture import shown
 from devrf.apps.inspection.report import inspect_scene
 from devrf.data.batch import all_pixels

@@ -1,17 +1,81 @@
-"""Images as files and side by side; and their names as labels."""
+"""Images: depth, errors and flow as colours; grids; files."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
 import torch
+from kornia.color import ColorMap, apply_colormap, hsv_to_rgb
+from PIL import Image, ImageDraw
 from torch import Tensor
 
-from devrf.apps.colors import to_bytes
+from devrf.apps.video_file import fitted_font, font
 from devrf.system.files import atomic_write
+
+# Grey level of invalid flow; valid flow is white or coloured.
+UNKNOWN = 0.85
+
+
+def depth_colors(depth: Tensor, opacity: Tensor, near: float, far: float) -> Tensor:
+    """Depth as RGB (H, W, 3) in [0, 1]: ``near`` bright, ``far`` dark, empty space white.
+
+    Args:
+        depth: (H, W) distances, in the unit of ``near`` and ``far``.
+        opacity: (H, W) in [0, 1].
+        near: the distance shown brightest.
+        far: the distance shown darkest.
+    """
+    closeness = 1 - ((depth - near) / (far - near)).clamp(0, 1)
+    colors = _mapped(closeness, "viridis")
+    return 1 + opacity[..., None] * (colors - 1)
+
+
+def error_colors(prediction: Tensor, truth: Tensor) -> Tensor:
+    """The mean absolute difference of (H, W, 3) images as RGB: 0 is black, 0.25 or more white."""
+    return _mapped((4 * (prediction - truth).abs().mean(dim=-1)).clamp(0, 1), "hot")
+
+
+def flow_colors(vectors: Tensor, valid: Tensor, full: float) -> Tensor:
+    """Optical flow as colours: hue is direction, saturation length, white is no motion.
+
+    Args:
+        vectors: (H, W, 2) pixels, x to the right, then y down.
+        valid: (H, W) bool; elsewhere the picture is grey.
+        full: the length in pixels from which on colours are saturated.
+
+    Returns:
+        (H, W, 3) RGB in [0, 1].
+    """
+    x, y = torch.where(valid[..., None], vectors, 0.0).float().unbind(-1)
+    hue = torch.atan2(-y, x) % (2 * math.pi)  # counted upwards, as angles are drawn
+    saturation = (torch.hypot(x, y) / max(full, 1e-6)).clamp(0, 1)
+    hsv = torch.stack([hue, saturation, 1 - 0.1 * saturation])
+    colors: Tensor = hsv_to_rgb(hsv[None])[0].permute(1, 2, 0)
+    return torch.where(valid[..., None], colors, UNKNOWN)
+
+
+def flow_wheel(side: int) -> Tensor:
+    """The key to :func:`flow_colors` (side, side, 3): a disc of all directions, white outside."""
+    at = (torch.arange(side) + 0.5) / side * 2 - 1
+    y, x = torch.meshgrid(at, at, indexing="ij")
+    vectors = torch.stack([x, y], dim=-1)
+    inside = torch.hypot(x, y) <= 1
+    return torch.where(inside[..., None], flow_colors(vectors, inside, 1.0), 1.0)
+
+
+def to_bytes(image: Tensor) -> Tensor:
+    """An image in [0, 1] as uint8, rounded."""
+    return (image.clamp(0, 1) * 255).round().to(torch.uint8)
+
+
+def _mapped(values: Tensor, name: str) -> Tensor:
+    table = ColorMap(base=name, num_colors=256)
+    return apply_colormap(values[None, None].cpu().float(), table)[0].permute(1, 2, 0)
+
 
 GAP = 4
 # Longest name that fits below a small image, in characters.
@@ -39,3 +103,73 @@ def short_name(name: str) -> str:
 def evenly(count: int, most: int) -> list[int]:
     """At most ``most`` of the positions 0 … count − 1, evenly spread, both ends among them."""
     return [round(k) for k in np.linspace(0, count - 1, min(count, most))]
+
+
+# Grey levels of text, and of the lines around images, most of which have a white background.
+INK, LINE = "#262626", "#c8c8c8"
+# Text is so high for each pixel of an image's height, and between these heights, in pixels.
+TEXT, SMALLEST_TEXT, LARGEST_TEXT = 0.05, 9, 26
+
+
+def image_grid(
+    rows: Sequence[Sequence[Tensor]],
+    headings: Sequence[str] = (),
+    labels: Sequence[Sequence[str]] = (),
+    text: int | None = None,
+) -> Tensor:
+    """A picture of all images, with text that is fitted to its place, never cut off.
+
+    Args:
+        rows: images (H, W, 3) in [0, 1], all of one size, as many in each row.
+        headings: text above each column; none: no line of them.
+        labels: lines of text left of each row; none: no room for them.
+        text: its height in pixels; None: a twentieth of that of the images, within limits.
+
+    Returns:
+        (H', W', 3) in [0, 1].
+    """
+    height, width = rows[0][0].shape[:2]
+    size = text or min(max(round(TEXT * height), SMALLEST_TEXT), LARGEST_TEXT)
+    gap = size // 3 + 1
+    widths = (font(size).getlength(line) for label in labels for line in label)
+    left = round(max(widths, default=-3 * gap)) + 3 * gap
+    top = 2 * size if headings else 0
+    page = Image.new(
+        "RGB",
+        (left + len(rows[0]) * (width + gap) - gap, top + len(rows) * (height + gap) - gap),
+        "white",
+    )
+    pen = ImageDraw.Draw(page)
+    columns = [left + k * (width + gap) for k in range(len(rows[0]))]
+    for x, heading in zip(columns, headings, strict=False):
+        pen.text((x + width / 2, top / 2), heading, INK, fitted_font(heading, size, width), "mm")
+    for number, row in enumerate(rows):
+        y = top + number * (height + gap)
+        for x, image in zip(columns, row, strict=True):
+            page.paste(Image.fromarray(to_bytes(image).cpu().numpy()), (x, y))
+            if x != columns[0]:
+                pen.line((x - gap // 2 - 1, y, x - gap // 2 - 1, y + height - 1), LINE)
+        if number:
+            pen.line((0, y - gap // 2 - 1, page.width, y - gap // 2 - 1), LINE)
+        if labels:
+            lines = "\n".join(labels[number])
+            middle = (left / 2, y + height / 2)
+            pen.multiline_text(middle, lines, INK, font(size), "mm", spacing=gap, align="center")
+    return torch.from_numpy(np.array(page)).float() / 255
+
+
+def scaled(image: Tensor, height: int, width: int | None = None) -> Tensor:
+    """An image (H, W, 3) in [0, 1] of another size, smoothly interpolated.
+
+    Args:
+        image: the image.
+        height: the new height in pixels.
+        width: the new width; None: in proportion.
+    """
+    if width is None:
+        width = max(1, round(image.shape[1] * height / image.shape[0]))
+    if tuple(image.shape[:2]) == (height, width):
+        return image
+    source = Image.fromarray(to_bytes(image).cpu().numpy())
+    resized = source.resize((width, height), Image.Resampling.LANCZOS)
+    return torch.from_numpy(np.array(resized)).float() / 255

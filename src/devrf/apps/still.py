@@ -1,18 +1,34 @@
-"""What one camera sees of a learned scene: colour, and depth as colours."""
+"""What one camera sees of a learned scene: pictures, previews, contact sheets."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from pathlib import Path
+from typing import Literal, NamedTuple
 
+import torch
 from torch import Tensor
 
-from devrf.apps.colors import depth_colors
+from devrf.apps.images import (
+    depth_colors,
+    error_colors,
+    evenly,
+    image_grid,
+    scaled,
+    short_name,
+    side_by_side,
+    write_image,
+)
 from devrf.checkpoints.viewpoints import Viewpoints
 from devrf.errors import DevrfError
+from devrf.evaluation.held_out import HeldOutView, background_value, compare, truth_image
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
+from devrf.metrics.image import psnr
 from devrf.rendering.renderer import Renderer
+from devrf.rendering.view import Viewable
+from devrf.scenes.scene import Background, Views
 
 # Pictures of small images are rendered at this height, in pixels, unless another is asked for.
 READABLE = 400
@@ -91,3 +107,90 @@ def still(
     depth, opacity = image.depth.view(shape).cpu(), image.opacity.view(shape).cpu()
     color = image.color.view(*shape, 3).clamp(0, 1).cpu()
     return color, depth_colors(depth, opacity, near, far)
+
+
+class Preview(NamedTuple):
+    """A held-out view as rendered so far.
+
+    Attributes:
+        images: (H, W', 3) in [0, 1] by name: ``view`` is the rendered image beside the truth and
+            the error, ``depth`` its depth.
+        psnr: dB, of the whole image, pixels that are not valid taken as right.
+    """
+
+    images: dict[str, Tensor]
+    psnr: float
+
+
+def preview(model: Viewable, views: Views, index: int, background: Background) -> Preview:
+    """Render a held-out view and compare it with the truth.
+
+    Args:
+        model: what has been learned so far.
+        views: the held-out views, on the host.
+        index: which of them.
+        background: what is behind the alpha mask.
+    """
+    time, behind = float(views.times[index]), background_value(background)
+    prediction, depth = still(Renderer(model, times=1), views.cameras, time, behind, index)
+    truth = truth_image(views, index, background).cpu()
+    compared = compare(prediction, truth, views.valid_mask_of(index))
+    shown = side_by_side([prediction, truth, error_colors(compared, truth)])
+    return Preview({"view": shown, "depth": depth}, psnr(compared, truth))
+
+
+# Lower images are enlarged to this height, higher ones reduced to the other, in pixels.
+LEAST_HEIGHT, MOST_HEIGHT = 300, 640
+HEADINGS = ("truth", "rendered", "error: 0 to 0.25 or more", "depth: near is bright")
+
+
+def write_contact_sheet(path: Path, views: Sequence[HeldOutView], rows: int = 6) -> Tensor:
+    """Write a PNG with ``rows`` of the views, evenly spread, each with name, time and scores.
+
+    Returns:
+        The sheet (H, W, 3) in [0, 1].
+    """
+    shown = [views[k] for k in evenly(len(views), rows)]
+    near, far = _depth_range(shown)
+    tiles = [
+        (
+            view.truth,
+            view.prediction,
+            error_colors(view.compared, view.truth),
+            depth_colors(view.depth, view.opacity, near, far),
+        )
+        for view in shown
+    ]
+    height = min(max(shown[0].truth.shape[0], LEAST_HEIGHT), MOST_HEIGHT)
+    sheet = image_grid(
+        [[scaled(tile, height) for tile in row] for row in tiles],
+        HEADINGS,
+        [_label(view) for view in shown],
+    )
+    write_image(path, sheet)
+    return sheet
+
+
+def _label(view: HeldOutView) -> tuple[str, ...]:
+    scores = (f"PSNR {view.psnr:.2f} dB", f"SSIM {view.ssim:.3f}")
+    return (*_broken(short_name(view.name)), f"time {view.time:.2f}", *scores)
+
+
+def _broken(name: str) -> list[str]:
+    """A name in lines of about 16 characters, broken at its spaces."""
+    lines = [""]
+    for word in name.split():
+        fits = len(lines[-1]) + len(word) < 16
+        lines = [*lines[:-1], f"{lines[-1]} {word}".strip()] if fits else [*lines, word]
+    return [line for line in lines if line]
+
+
+def _depth_range(views: Sequence[HeldOutView]) -> tuple[float, float]:
+    """The nearest and furthest depth of what is solid in the views, but for a hundredth each."""
+    depth = torch.cat([view.depth[view.opacity > 0.5] for view in views])
+    if len(depth) == 0:
+        return 0.0, 1.0
+    order = depth.sort().values
+    last = len(order) - 1
+    near, far = float(order[last // 100]), float(order[last - last // 100])
+    return near, max(far, near + 1e-6)

@@ -1,15 +1,30 @@
-"""Pictures as a video file."""
+"""Text in pictures, and pictures as a video file; needs no torch."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import closing
+from functools import cache
 from pathlib import Path
 
 import imageio
+import matplotlib
 import numpy as np
+from PIL import ImageFont
 
 from devrf.system.files import atomic_write
+
+
+@cache
+def font(size: int) -> ImageFont.FreeTypeFont:
+    """matplotlib's own font, which has more letters than Pillow's, ``size`` pixels high."""
+    return ImageFont.truetype(Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans.ttf", size)
+
+
+def fitted_font(text: str, size: int, width: int) -> ImageFont.FreeTypeFont:
+    """The largest font up to ``size`` in which the text is no wider than ``width`` pixels."""
+    needed = font(size).getlength(text)
+    return font(max(1, int(size * min(1.0, 0.98 * width / max(needed, 1.0)))))
 
 
 def write_pictures(path: Path, pictures: Iterator[np.ndarray], fps: float) -> None:

@@ -7,8 +7,8 @@ from typing import Any
 
 from lightning import Callback, LightningModule, Trainer
 
-from devrf.apps.preview import preview
-from devrf.apps.tracking import trackers
+from devrf.apps.still import preview
+from devrf.apps.trackers import trackers
 from devrf.engine.stage import ScheduledStage
 
 

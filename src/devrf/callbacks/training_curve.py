@@ -94,7 +94,7 @@ class TrainingCurve(Callback):
         if not self._points:
             return
         # Only this hook draws with matplotlib.
-        from devrf.apps.training_curve import write_training_curve
+        from devrf.apps.report.plots import write_training_curve
 
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
         previews = [point for one in callbacks if isinstance(one, Previews) for point in one.psnr]

@@ -9,7 +9,7 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from devrf.apps.capture.pipeline import scene_from_footage
-from devrf.apps.capture.settings import CaptureSettings
+from devrf.apps.settings import CaptureSettings
 from devrf.cli.config import config_folder
 from devrf.cli.context import RunContext
 from devrf.cli.inspect_scene import inspect

@@ -8,7 +8,7 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from devrf.apps.report.settings import ReportSettings
+from devrf.apps.settings import ReportSettings
 
 
 def config_folder() -> Path:

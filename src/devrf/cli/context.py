@@ -15,7 +15,7 @@ from lightning import Trainer
 from lightning.pytorch.strategies import Strategy
 from omegaconf import DictConfig, OmegaConf
 
-from devrf.apps.tracking import Tracker, trackers
+from devrf.apps.trackers import Tracker, trackers
 from devrf.checkpoints.checkpoint import LoadedCheckpoint, load_checkpoint
 from devrf.checkpoints.checkpoint_file import digest_of
 from devrf.checkpoints.viewpoints import Viewpoints

@@ -6,7 +6,6 @@ import logging
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from devrf.apps.contact_sheet import write_contact_sheet
 from devrf.apps.records import (
     dynamic_scores,
     frame_rows,
@@ -15,6 +14,7 @@ from devrf.apps.records import (
     provenance,
     write_frames,
 )
+from devrf.apps.still import write_contact_sheet
 from devrf.checkpoints.checkpoint import CheckpointMetadata, TrainingFigures
 from devrf.checkpoints.checkpoint_file import digest_of
 from devrf.cli import job

@@ -9,12 +9,17 @@ from pathlib import Path
 import torch
 from hydra.utils import instantiate
 
-from devrf.apps.export.frame import UpFrame
+from devrf.apps.export.geometry import (
+    ExportSettings,
+    ForwardMap,
+    MovingMesh,
+    PointCloud,
+    UpFrame,
+    carried,
+    seen_points,
+)
 from devrf.apps.export.gltf import write_gltf
-from devrf.apps.export.moving_mesh import ForwardMap, MovingMesh, carried
-from devrf.apps.export.points import PointCloud, seen_points
 from devrf.apps.export.sequence import mesh_files, point_files, write_sequence
-from devrf.apps.export.settings import ExportSettings
 from devrf.apps.export.surface import canonical_surface
 from devrf.apps.export.usd import write_usd
 from devrf.cli.context import RunContext

@@ -7,8 +7,7 @@ import logging
 from rich.console import Console
 from rich.filesize import decimal
 
-from devrf.apps.inspection.report import inspect_scene
-from devrf.apps.inspection.text import as_text, inspection_text
+from devrf.apps.inspection.report import as_text, inspect_scene, inspection_text
 from devrf.cli.context import RunContext
 from devrf.cli.preflight import requirements
 from devrf.errors import DevrfError

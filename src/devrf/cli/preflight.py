@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from devrf.apps.film import film_bytes
+from devrf.apps.video import film_bytes
 from devrf.callbacks import PeriodicCheckpoint
 from devrf.cli.context import RunContext
 from devrf.cli.memory import IMAGES, Budget, Parts, estimate, module_needs, tensor_bytes

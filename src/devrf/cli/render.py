@@ -11,18 +11,20 @@ from pathlib import Path
 from hydra.utils import instantiate
 from torch import Tensor
 
-from devrf.apps.camera_paths import (
+from devrf.apps.keyframes import cameras_of, read_path
+from devrf.apps.still import still
+from devrf.apps.video import (
+    FilmSettings,
     bullet_time,
     focus_distance,
     held_out_images,
+    held_out_pictures,
     orbit,
+    orbit_pictures,
     spiral,
     time_freeze,
+    write_video,
 )
-from devrf.apps.film import FilmSettings, held_out_pictures, orbit_pictures, write_video
-from devrf.apps.keyframes import cameras_of
-from devrf.apps.path_files import read_path
-from devrf.apps.still import still
 from devrf.cli.context import RunContext
 from devrf.evaluation.held_out import background_value
 from devrf.geometry.cameras import Cameras

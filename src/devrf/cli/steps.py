@@ -16,7 +16,7 @@ from hydra.utils import instantiate
 from lightning import seed_everything
 from omegaconf import DictConfig
 
-from devrf.apps.viewer.settings import ViewerSettings
+from devrf.apps.settings import ViewerSettings
 from devrf.cli import job
 from devrf.cli.capture import capture
 from devrf.cli.closing import say_what_next

@@ -8,7 +8,7 @@ from threading import Event
 
 from hydra.utils import instantiate
 
-from devrf.apps.viewer.settings import ViewerSettings
+from devrf.apps.settings import ViewerSettings
 from devrf.checkpoints.checkpoint import check_scene
 from devrf.checkpoints.viewpoints import Viewpoints
 from devrf.cli.context import RunContext

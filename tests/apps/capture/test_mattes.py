@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from devrf.apps.capture.frames import Chosen, write_frames
-from devrf.apps.capture.mattes import mattes_of
-from devrf.apps.capture.settings import CaptureSettings
-from devrf.apps.capture.subtraction import box_of_motion, silhouettes
+from devrf.apps.capture.images import Chosen, box_of_motion, mattes_of, silhouettes, write_frames
+from devrf.apps.settings import CaptureSettings
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from devrf.apps.capture.frames import Chosen, common_size, fitted
+from devrf.apps.capture.images import Chosen, common_size, fitted
 from devrf.apps.capture.structure import checked_model, pairs
 from devrf.errors import DevrfError
 

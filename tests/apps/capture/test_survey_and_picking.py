@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from devrf.apps.capture.picking import BLURRED, check_sharp, sharpest
-from devrf.apps.capture.survey import moved, sharpness, survey
+from devrf.apps.capture.survey import BLURRED, check_sharp, moved, sharpest, sharpness, survey
 from devrf.errors import DevrfError
 
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from devrf.apps.capture.pipeline import scene_from_footage
-from devrf.apps.capture.settings import CaptureSettings
+from devrf.apps.settings import CaptureSettings
 from devrf.data.recognised import recognised_datamodule
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from devrf.apps.capture.writing import Shot, write_scene
+from devrf.apps.capture.pipeline import Shot, write_scene
 from devrf.data.recognised import recognised_datamodule
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.colmap_entries import ModelCamera, ModelImage

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from devrf.apps.capture.pipeline import scene_from_footage
-from devrf.apps.capture.settings import CaptureSettings
+from devrf.apps.settings import CaptureSettings
 from devrf.errors import DevrfError
 
 

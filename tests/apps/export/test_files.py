@@ -16,11 +16,9 @@ import trimesh
 from pxr import Gf, Usd, UsdGeom
 from scipy.spatial import KDTree
 
-from devrf.apps.export.frame import UpFrame
+from devrf.apps.export.geometry import ExportSettings, MovingMesh, UpFrame, carried
 from devrf.apps.export.gltf import write_gltf
-from devrf.apps.export.moving_mesh import MovingMesh, carried
 from devrf.apps.export.sequence import mesh_files, write_sequence
-from devrf.apps.export.settings import ExportSettings
 from devrf.apps.export.surface import canonical_surface
 from devrf.apps.export.usd import write_usd
 from devrf.geometry.cameras import Cameras

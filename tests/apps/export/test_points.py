@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from devrf.apps.export.points import seen_points
+from devrf.apps.export.geometry import seen_points
 from devrf.geometry.cameras import Cameras
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.rendering.renderer import Renderer

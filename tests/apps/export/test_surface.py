@@ -8,7 +8,7 @@ import pytest
 import torch
 import trimesh
 
-from devrf.apps.export.settings import ExportSettings
+from devrf.apps.export.geometry import ExportSettings
 from devrf.apps.export.surface import Surface, canonical_surface
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box

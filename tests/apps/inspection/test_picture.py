@@ -10,11 +10,14 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
-from devrf.apps.inspection.camera_plot import box_edges, compass, frusta, scene_lines
 from devrf.apps.inspection.picture import (
+    box_edges,
+    compass,
     flow_scale,
+    frusta,
     inspection_figure,
     sample_images,
+    scene_lines,
     shown,
     write_inspection_picture,
 )

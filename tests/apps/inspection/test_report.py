@@ -10,8 +10,7 @@ import torch
 from rich.console import Console
 
 from devrf.apps.inspection.advice import Advice
-from devrf.apps.inspection.report import FlowFacts, inspect_scene
-from devrf.apps.inspection.text import as_text, inspection_text
+from devrf.apps.inspection.report import FlowFacts, as_text, inspect_scene, inspection_text
 from devrf.geometry.box import Box
 from devrf.scenes.scene import OpticalFlow, Scene
 

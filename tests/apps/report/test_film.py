@@ -5,8 +5,8 @@ from __future__ import annotations
 import imageio.v3 as iio
 import numpy as np
 
-from devrf.apps.report.settings import ReportSettings
 from devrf.apps.report.write import write_report
+from devrf.apps.settings import ReportSettings
 
 TRUTH, DEPTH = (40, 40, 40), (200, 200, 200)
 

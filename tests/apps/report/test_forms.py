@@ -6,10 +6,7 @@ import re
 
 import pytest
 
-from devrf.apps.report import latex as latex_form
-from devrf.apps.report import markdown as markdown_form
-from devrf.apps.report.latex import latex
-from devrf.apps.report.markdown import markdown, plain
+from devrf.apps.report.text import latex, latex_escaped, markdown, markdown_escaped, plain
 
 FULL = "Ours w/ c2f, tv, cycle, flow"
 METRICS = ["PSNR ↑", "SSIM ↑", "LPIPS ↓", "GPU (GB) ↓", "Time ↓"]
@@ -111,13 +108,13 @@ def test_plain_text_is_aligned_and_marked(pig_and_robot):
 @pytest.mark.parametrize(
     ("escaped", "text", "expected"),
     [
-        (markdown_form.escaped, "pig_toy _a_ a|b 2*3*4", r"pig_toy \_a\_ a\|b 2\*3\*4"),
-        (markdown_form.escaped, "<b> `x` [y] a\\b", r"\<b\> \`x\` \[y\] a\\b"),
-        (latex_form.escaped, "pig_toy 100 % & more", r"pig\_toy 100 \% \& more"),
-        (latex_form.escaped, "$x^2$ #{1}", r"\$x\textasciicircum{}2\$ \#\{1\}"),
-        (latex_form.escaped, "C:\\x~", r"C:\textbackslash{}x\textasciitilde{}"),
-        (latex_form.escaped, "29 ± 1 ↑ ↓", r"29 $\pm$ 1 $\uparrow$ $\downarrow$"),
-        (latex_form.escaped, "– † <|>", r"-- $\dagger$ \textless{}\textbar{}\textgreater{}"),
+        (markdown_escaped, "pig_toy _a_ a|b 2*3*4", r"pig_toy \_a\_ a\|b 2\*3\*4"),
+        (markdown_escaped, "<b> `x` [y] a\\b", r"\<b\> \`x\` \[y\] a\\b"),
+        (latex_escaped, "pig_toy 100 % & more", r"pig\_toy 100 \% \& more"),
+        (latex_escaped, "$x^2$ #{1}", r"\$x\textasciicircum{}2\$ \#\{1\}"),
+        (latex_escaped, "C:\\x~", r"C:\textbackslash{}x\textasciitilde{}"),
+        (latex_escaped, "29 ± 1 ↑ ↓", r"29 $\pm$ 1 $\uparrow$ $\downarrow$"),
+        (latex_escaped, "– † <|>", r"-- $\dagger$ \textless{}\textbar{}\textgreater{}"),
     ],
 )
 def test_nothing_in_a_text_is_taken_for_markup(escaped, text, expected):

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from devrf.apps.report.published import published
-from devrf.apps.report.table import TITLES
+from devrf.apps.report.table import TITLES, published
 from devrf.cli.config import config_folder
 
 SCENES = {"lego": 1, "floating_robot": 1, "daisy": 1, "glove": 2, "kuka": 2, "pig_toy": 3}

@@ -5,10 +5,8 @@ from __future__ import annotations
 import pandas as pd
 import pytest
 
-from devrf.apps.report.latex import latex
-from devrf.apps.report.markdown import markdown, plain
-from devrf.apps.report.published import published
-from devrf.apps.report.table import GPU, LPIPS, PSNR, SSIM, TIME, TITLES, ranked, shown
+from devrf.apps.report.table import GPU, LPIPS, PSNR, SSIM, TIME, TITLES, published, ranked, shown
+from devrf.apps.report.text import latex, markdown, plain
 
 FULL = "Ours w/ c2f, tv, cycle, flow"
 

@@ -9,8 +9,8 @@ import sys
 import pytest
 
 from devrf.apps.report.runs import collect
-from devrf.apps.report.settings import ReportSettings
 from devrf.apps.report.write import write_report
+from devrf.apps.settings import ReportSettings
 from devrf.errors import DevrfError
 
 

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from devrf.apps.settings import ViewerSettings
 from devrf.apps.viewer.drawing import Drawing
-from devrf.apps.viewer.settings import ViewerSettings
 from devrf.checkpoints.viewpoints import Viewpoints
 from devrf.rendering.renderer import Renderer
 

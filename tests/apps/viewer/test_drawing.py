@@ -7,10 +7,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from devrf.apps.colors import to_bytes
+from devrf.apps.images import to_bytes
+from devrf.apps.viewer.cameras import Pose, bare_frusta, moving_frusta, resting_frusta
 from devrf.apps.viewer.drawing import Drawing, Picture, Shot
-from devrf.apps.viewer.frusta import bare_frusta, moving_frusta, resting_frusta
-from devrf.apps.viewer.poses import Pose
 from devrf.methods.nerf.ray_view import RayView
 from devrf.rendering.renderer import Renderer
 

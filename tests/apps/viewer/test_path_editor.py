@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from devrf.apps.keyframes import Keyframe
-from devrf.apps.viewer.path_editor import PathEditor
+from devrf.apps.viewer.paths import PathEditor
 from devrf.errors import DevrfError
 
 POSE = torch.eye(3, 4)

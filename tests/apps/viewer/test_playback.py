@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from devrf.apps.viewer.playback import Playback
+from devrf.apps.viewer.controls import Playback
 
 
 def test_time_stands_until_it_is_played():

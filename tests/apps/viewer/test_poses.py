@@ -7,8 +7,8 @@ import math
 import pytest
 import torch
 
-from devrf.apps.viewer.poses import Pose
-from devrf.apps.viewer.presets import distance_ahead
+from devrf.apps.viewer.cameras import Pose
+from devrf.apps.viewer.paths import distance_ahead
 from devrf.geometry.cameras import Cameras
 
 

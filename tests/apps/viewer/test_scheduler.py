@@ -8,9 +8,8 @@ from collections.abc import Callable, Iterator
 import pytest
 import torch
 
-from devrf.apps.viewer.drawing import Picture, Shot
-from devrf.apps.viewer.poses import Pose
-from devrf.apps.viewer.scheduler import RenderScheduler
+from devrf.apps.viewer.cameras import Pose
+from devrf.apps.viewer.drawing import Picture, RenderScheduler, Shot
 
 POSE = Pose((1.0, 0, 0, 0), (0.0, 0, 0), 1.0, 1.0)
 FIRST, SECOND = Shot(POSE, 0.1), Shot(POSE, 0.2)

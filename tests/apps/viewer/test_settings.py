@@ -6,7 +6,7 @@ import socket
 
 import pytest
 
-from devrf.apps.viewer.settings import ViewerSettings
+from devrf.apps.settings import ViewerSettings
 from devrf.errors import DevrfError
 
 

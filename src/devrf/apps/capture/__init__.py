@@ -19,7 +19,7 @@
 estimated when the scene is read, as of any other scene (:mod:`devrf.scenes.optical_flow`).
 
 What a step has found is kept in ``<into>/capture`` together with what it was found from
-(:mod:`devrf.apps.capture.kept`): the same command again goes on behind the last step that
+(:mod:`devrf.apps.capture.pipeline`): the same command again goes on behind the last step that
 still holds. ``transforms.json`` is written last: a folder with it is whole.
 
 World: OpenGL axes. Cameras that face the scene from one side get the world of their average pose

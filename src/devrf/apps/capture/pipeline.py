@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import logging
 import shutil
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
+
 from devrf.apps.capture.alignment import Timeline, timeline
-from devrf.apps.capture.frames import Chosen, common_size, write_frames
-from devrf.apps.capture.kept import digest, kept, stamp
-from devrf.apps.capture.mattes import mattes_of
-from devrf.apps.capture.picking import check_sharp, sharpest
-from devrf.apps.capture.settings import CaptureSettings
+from devrf.apps.capture.images import Chosen, box_of_motion, common_size, mattes_of, write_frames
 from devrf.apps.capture.structure import check_library, checked_model, reconstruct
-from devrf.apps.capture.subtraction import box_of_motion
-from devrf.apps.capture.survey import Survey, survey
-from devrf.apps.capture.writing import IMAGES, Shot, write_scene
+from devrf.apps.capture.survey import Survey, check_sharp, sharpest, survey
+from devrf.apps.settings import CaptureSettings
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.scenes.colmap_model import SparseModel
@@ -26,9 +25,120 @@ from devrf.scenes.footage import frame_count, is_folder, pictures
 from devrf.scenes.holdout import every_nth
 from devrf.scenes.nerfstudio import FILE
 from devrf.scenes.normalisation import AROUND, World, normalised
+from devrf.system.files import write_json
 from devrf.system.progress import followed
 
 log = logging.getLogger(__name__)
+
+# Part of every key: a change of a step makes what was kept before foreign.
+VERSION = 1
+
+
+def kept(
+    file: Path, source: Any, make: Callable[[], dict[str, Any]], *, files: Path | None = None
+) -> dict[str, Any]:
+    """What ``make`` returns, or what it returned before from the same source.
+
+    Args:
+        file: the JSON file that keeps it.
+        source: all that it depends on, as JSON can hold it.
+        make: finds it anew.
+        files: a folder of files that belong to it; without it, it is found anew.
+    """
+    key = digest(source)
+    if file.is_file() and (files is None or files.is_dir()):
+        try:
+            found = json.loads(file.read_text())
+            if found["key"] == key and isinstance(found["result"], dict):
+                log.info("%s: found before", file.stem)
+                return dict(found["result"])
+        except (ValueError, KeyError, TypeError):
+            log.warning("%s: damaged; it is found again", file)
+    result = make()
+    write_json(file, {"key": key, "result": result})
+    return result
+
+
+def digest(source: Any) -> str:
+    """A short hash of something that JSON can hold."""
+    text = json.dumps([VERSION, source], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def stamp(path: Path) -> list[Any]:
+    """What tells one state of a file, or of a folder of files, from another."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    found = [(file, file.stat()) for file in files if file.is_file()]
+    return [str(path.resolve()), *([f.name, s.st_size, s.st_mtime_ns] for f, s in found)]
+
+
+# Below the scene's folder.
+IMAGES = "images"
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One image of the scene.
+
+    Attributes:
+        name: of its file, relative to the folder of images.
+        pose: (3, 4) camera-to-world, OpenGL axes, world units.
+        lens: ``fl_x``, ``cx``, ``k1`` … in pixels of the image.
+        time: in [0, 1], 0 at rest.
+        held_out: whether it is scored instead of learned from.
+    """
+
+    name: str
+    pose: Tensor
+    lens: dict[str, float]
+    time: float
+    held_out: bool
+
+
+def write_scene(
+    folder: Path, shots: Sequence[Shot], world: World, model: str, *, cut_out: bool = False
+) -> Path:
+    """Write ``transforms.json``; the images are there already.
+
+    Args:
+        folder: the scene's.
+        shots: all images.
+        world: where the scene is.
+        model: the lenses' camera model.
+        cut_out: whether the images have mattes: there is nothing around what they cut out, and
+            the reader finds its box.
+
+    Returns:
+        The file.
+    """
+    path = folder / FILE
+    bounds: dict[str, Any] = {"space": world.space, "near": world.near, "far": world.far}
+    if world.box is not None:
+        bounds["box"] = world.box
+    if cut_out and world.space == "contracted":
+        bounds = {"space": "world"}
+    write_json(
+        path,
+        {
+            "camera_model": model,
+            "scene_bounds": bounds,
+            "frames": [_frame(shot) for shot in shots],
+            "train_filenames": [f"{IMAGES}/{one.name}" for one in shots if not one.held_out],
+            "test_filenames": [f"{IMAGES}/{one.name}" for one in shots if one.held_out],
+        },
+    )
+    return path
+
+
+def _frame(shot: Shot) -> dict[str, Any]:
+    matrix = [*shot.pose.tolist(), [0.0, 0.0, 0.0, 1.0]]
+    return {
+        "file_path": f"{IMAGES}/{shot.name}",
+        "time": shot.time,
+        **shot.lens,
+        "transform_matrix": matrix,
+    }
+
 
 # Below the scene's folder: what the steps have found.
 WORK = "capture"

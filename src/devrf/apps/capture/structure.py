@@ -13,8 +13,8 @@ from typing import Any
 
 import torch
 
-from devrf.apps.capture.frames import Chosen
-from devrf.apps.capture.settings import CaptureSettings
+from devrf.apps.capture.images import Chosen
+from devrf.apps.settings import CaptureSettings
 from devrf.errors import DevrfError
 from devrf.scenes.colmap_model import SparseModel, read_model
 from devrf.scenes.footage import is_folder

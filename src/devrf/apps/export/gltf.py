@@ -17,8 +17,7 @@ import torch
 from torch import Tensor
 
 import devrf
-from devrf.apps.export.frame import UpFrame
-from devrf.apps.export.moving_mesh import MovingMesh
+from devrf.apps.export.geometry import MovingMesh, UpFrame
 from devrf.geometry.cameras import Cameras
 from devrf.system.files import atomic_write
 

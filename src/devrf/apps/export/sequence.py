@@ -10,8 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from torch import Tensor
 
-from devrf.apps.export.moving_mesh import MovingMesh
-from devrf.apps.export.points import PointCloud
+from devrf.apps.export.geometry import MovingMesh, PointCloud
 from devrf.system.files import atomic_write, write_json
 
 INDEX = "index.json"

@@ -2,35 +2,128 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
-from devrf.apps.export.isosurface import Mesh, entries, isosurface
-from devrf.apps.export.settings import ExportSettings
-from devrf.apps.export.vertex_colors import vertex_colors, vertex_normals
+from devrf.apps.export.geometry import ExportSettings, Surface
 from devrf.errors import DevrfError
+from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.space import Space
 from devrf.rendering.surface_field import SurfaceField
 
+# Points at which a field is asked at once.
+CHUNK = 2**18
+# A voxel with less optical depth counts as having so much: the logarithm ends here.
+LEAST = 1e-6
+# Rays of each camera, along each side of its image, that say where empty space begins.
+ENTRIES = 16
 
-@dataclass(frozen=True)
-class Surface:
-    """A mesh at rest.
+Mesh = tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]
 
-    Attributes:
-        points: (V, 3) canonical vertices in the fields' space, on the host.
-        faces: (F, 3) int64, counter-clockwise from outside as the world is seen.
-        colors: (V, 3) RGB in [0, 1], encoded as the images are (sRGB).
+
+def isosurface(field: SurfaceField, outside: Tensor, threshold: float, side: int | None) -> Mesh:
+    """Marching cubes on a field, as if solid wherever no empty way leads from ``outside``.
+
+    Density is learned where images show it: behind a surface it often falls to nothing again. A
+    second surface there would be seen by no camera.
+
+    What is interpolated between grid points is s = log(eᵗ − 1), t the optical depth: of a density
+    softplus(v + b) that is v + b, which DeVRF interpolates, too (docs/method.md#density).
+
+    Args:
+        field: at rest.
+        outside: (K, 3) points of the fields' space that cameras see through.
+        threshold: opacity of one voxel on the surface, in (0, 1).
+        side: grid points along the box's longest edge; None: those of the field.
+
+    Returns:
+        vertices (V, 3) in the fields' space, and faces (F, 3), counter-clockwise from outside if
+        that space is right-handed.
+
+    Raises:
+        DevrfError: no point of the field has that opacity, or all have.
     """
+    from skimage import measure  # an extra
 
-    points: Tensor
-    faces: Tensor
-    colors: Tensor
+    box = field.box
+    shape = field.shape if side is None else _shape(box, side)
+    depth = _sampled(field, shape)
+    level = _logit(torch.tensor(-math.log1p(-threshold))).item()
+    values = _logit(depth).numpy()
+    empty = values < level
+    if empty.all():
+        most = -math.expm1(-float(depth.max()))
+        raise DevrfError(
+            f"export.threshold: the field is empty: no voxel has the opacity {threshold:g}, the "
+            f"most is {most:.2g}; give a lower threshold, or learn for longer"
+        )
+    if not empty.any():
+        raise DevrfError(
+            f"export.threshold: all of the field has the opacity {threshold:g}; give a higher one"
+        )
+    hidden = empty & ~_reached(empty, box, outside)
+    values[hidden] = 2 * abs(level) + values.max()
+    vertices, faces, _, _ = measure.marching_cubes(values, level, gradient_direction="ascent")
+    low, size = np.array(box.low), np.array(box.size)
+    points = low + vertices * (size / (np.array(shape) - 1))
+    return points.astype(np.float32), faces.astype(np.int64)
+
+
+def entries(cameras: Cameras, space: Space, box: Box, limits: tuple[float, float]) -> Tensor:
+    """Points (K, 3) in the fields' space at which rays of the cameras begin to be sampled.
+
+    Args:
+        cameras: in world units, on the host.
+        space: the space of the fields.
+        box: what holds the scene, in it.
+        limits: distances before and behind which nothing is sampled, in it.
+    """
+    cameras = cameras.resized(ENTRIES, ENTRIES)
+    found = []
+    for camera in range(len(cameras)):
+        rays = space.rays(cameras.image_rays(camera))
+        entry, leave = box.crossing(rays, *limits)
+        met = (entry < leave).nonzero()[:, 0]
+        found.append(rays.at(met, entry[met]))
+    return torch.cat(found)
+
+
+def _shape(box: Box, side: int) -> tuple[int, int, int]:
+    x, y, z = (max(2, round(edge / box.longest * (side - 1)) + 1) for edge in box.size)
+    return x, y, z
+
+
+def _sampled(field: SurfaceField, shape: tuple[int, int, int]) -> Tensor:
+    """Optical depth (X, Y, Z) at a grid's points, on the host."""
+    points = field.box.grid_points(shape, torch.empty(0)).view(-1, 3)
+    return torch.cat([field.optical_depth(part).cpu() for part in torch.split(points, CHUNK)]).view(
+        shape
+    )
+
+
+def _logit(depth: Tensor) -> Tensor:
+    depth = depth.clamp(min=LEAST)
+    return depth + torch.log(-torch.expm1(-depth))
+
+
+def _reached(empty: npt.NDArray[np.bool_], box: Box, outside: Tensor) -> npt.NDArray[np.bool_]:
+    """Which of the empty cells are connected, face to face, with a point of ``outside``."""
+    from skimage import measure
+
+    labels = measure.label(empty, connectivity=1)
+    shape = torch.tensor(empty.shape)
+    cells = box.to_grid(outside, empty.shape).round().long()
+    inside = ((cells >= 0) & (cells < shape)).all(dim=1)
+    begun = np.unique(labels[tuple(cells[inside].t().numpy())])
+    found: npt.NDArray[np.bool_] = np.isin(labels, begun[begun > 0])
+    # Where all cameras stand in fog there is nothing to go by.
+    return found if found.any() else empty
 
 
 def canonical_surface(
@@ -126,3 +219,93 @@ def _mirrors(space: Space, field: SurfaceField) -> bool:
     corner, steps = torch.tensor(field.box.middle), torch.diag(torch.tensor(field.box.size) / 100)
     way = space.to_world(corner + steps) - space.to_world(corner)
     return bool(torch.linalg.det(way / way.norm(dim=1, keepdim=True)) < 0)
+
+
+# Vertices whose colour is found at once.
+VERTICES = 2**13
+# Where a ray begins and ends, in voxels behind the vertex, and how far its samples are apart.
+BEFORE, BEHIND, STEP = -1.0, 3.0, 0.25
+# Samples with a smaller share of what is seen are left out.
+SIGNIFICANT = 0.01
+# Directions over which colours are averaged, and the widest, in degrees off the normal.
+DIRECTIONS, WIDEST = 16, 60.0
+
+
+def vertex_colors(
+    field: SurfaceField, points: Tensor, faces: Tensor, normals: Tensor, *, averaged: bool
+) -> Tensor:
+    """RGB (V, 3) in [0, 1] of vertices.
+
+    A vertex lies where matter begins, and there the field's colours are not yet learned: its own
+    is that of a ray that goes straight in, Σ w_i c_i / Σ w_i (docs/method.md#compositing).
+
+    Args:
+        field: at rest, on the host.
+        points: (V, 3) in the fields' space.
+        faces: (F, 3) int64, counter-clockwise from outside in that space.
+        normals: (V, 3) unit normals, outward in the world.
+        averaged: over directions up to 60 degrees off the normal; False: along the normal.
+    """
+    box = field.box
+    low, _ = box.corners(points)
+    voxel = points.new_tensor(box.size) / (points.new_tensor(field.shape) - 1)
+    inward = -voxel * vertex_normals((points - low) / voxel, faces)
+    eyes = _cap(DIRECTIONS, math.radians(WIDEST)) if averaged else torch.eye(3)[2:]
+    found = [
+        _seen(
+            field,
+            points[k : k + VERTICES],
+            inward[k : k + VERTICES],
+            normals[k : k + VERTICES],
+            eyes,
+        )
+        for k in range(0, len(points), VERTICES)
+    ]
+    return torch.cat(found).clamp(0, 1)
+
+
+def _seen(
+    field: SurfaceField, points: Tensor, inward: Tensor, normals: Tensor, toward_eyes: Tensor
+) -> Tensor:
+    """RGB (V, 3), the mean over the directions (K, 3), each weighted by its cosine."""
+    way = torch.arange(BEFORE, BEHIND + STEP / 2, STEP)
+    samples = points[:, None] + way[:, None] * inward[:, None]
+    depth = STEP * field.optical_depth(samples.reshape(-1, 3)).view(samples.shape[:2])
+    weight = torch.exp(depth - depth.cumsum(dim=1)) * -torch.expm1(-depth)
+    weight = weight / weight.sum(dim=1, keepdim=True).clamp(min=1e-9)
+    vertex, sample = (weight > SIGNIFICANT).nonzero(as_tuple=True)
+    share, where = weight[vertex, sample, None], samples[vertex, sample]
+    frames = _frames(normals)
+    seen, total = torch.zeros_like(points), toward_eyes[:, 2].sum()
+    for direction in toward_eyes:
+        viewdirs = -(frames @ direction)
+        color = field.color(where, viewdirs[vertex])
+        seen.index_add_(0, vertex, share * color * (direction[2] / total))
+    kept = torch.zeros(len(points)).index_add_(0, vertex, share[:, 0])
+    return seen / kept.clamp(min=1e-9)[:, None]
+
+
+def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
+    """Unit normals (V, 3): the means over the faces (F, 3) around, weighted by area."""
+    a, b, c = vertices[faces].unbind(dim=1)
+    across, normals = torch.linalg.cross(b - a, c - a), torch.zeros_like(vertices)
+    for corner in range(3):
+        normals.index_add_(0, faces[:, corner], across)
+    return normalize(normals, dim=1)
+
+
+def _cap(count: int, widest: float) -> Tensor:
+    """Unit vectors (K, 3), evenly spread over the cap of ``widest`` radians about +z."""
+    k = torch.arange(count) + 0.5
+    z = 1 - (1 - math.cos(widest)) * k / count
+    around = math.pi * (1 + math.sqrt(5)) * k
+    radius = (1 - z * z).sqrt()
+    return torch.stack([radius * around.cos(), radius * around.sin(), z], dim=1)
+
+
+def _frames(normals: Tensor) -> Tensor:
+    """Rotations (V, 3, 3) that lead +z to the normals."""
+    x, _, z = torch.eye(3)
+    helper = torch.where(normals[:, 2:].abs() < 0.9, z, x)
+    right = normalize(torch.linalg.cross(helper, normals), dim=1)
+    return torch.stack([right, torch.linalg.cross(normals, right), normals], dim=2)

@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from devrf.apps.export.frame import UpFrame
+from devrf.apps.export.geometry import MovingMesh, UpFrame
 from devrf.apps.export.gltf import linear
-from devrf.apps.export.moving_mesh import MovingMesh
 from devrf.geometry.cameras import Cameras
 from devrf.system.files import atomic_write
 

@@ -1,10 +1,18 @@
-"""Advice on a scene, and the names of the images that it is about."""
+"""Problems that lower quality, found in cameras, images, masks, times and optical flow."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
+import torch
+from torch import Tensor
+
+from devrf.apps.inspection.layout import box_middle, box_points, widest_gap
+from devrf.errors import DevrfError
+from devrf.geometry.clock import FrameClock
+from devrf.scenes.bounds import box_from_cameras
+from devrf.scenes.optical_flow import frame_pairs
 from devrf.scenes.scene import Scene, Views
 
 
@@ -54,3 +62,265 @@ def listed(names: Sequence[str], most: int = 3) -> str:
     """The first ``most`` names, and how many more there are."""
     more = len(names) - most
     return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
+
+
+# Largest gap between neighbouring static views, as seen from the box's middle, in degrees.
+WIDEST_GAP = 120.0
+# Two cameras are the same when their axes differ by less than this (radians, about), and their
+# positions by less than this share of the distance to the scene.
+SAME = 1e-4
+
+
+def camera_advice(scene: Scene) -> list[Advice]:
+    """Problems that the cameras alone show."""
+    return [*_held_out(scene), *_looking_away(scene), *_box_unknown(scene), *_one_side(scene)]
+
+
+def _held_out(scene: Scene) -> Iterator[Advice]:
+    for name, capture in scene.captures.items():
+        if len(capture.test) == 0:
+            yield Advice(
+                f"{name} test set",
+                "holds no view, so nothing can be scored",
+                "hold out some images of the capture",
+            )
+        elif twins := _twins(capture.test, capture.train, box_middle(scene)):
+            yield Advice(
+                f"{name} test set",
+                f"{listed(twins)}: the same camera and time as a training view, so the score "
+                "measures memory of that view",
+                "hold out other views",
+            )
+
+
+def _twins(test: Views, train: Views, middle: Tensor) -> list[str]:
+    """Names of the test views that have the camera and the time of a training view."""
+    reach = float((train.cameras.positions - middle).norm(dim=1).mean())
+    poses = train.cameras.camera_to_world
+    names = []
+    for k, pose in enumerate(test.cameras.camera_to_world):
+        turned = (poses[:, :, :3] - pose[:, :3]).abs().amax(dim=(1, 2))
+        moved = (poses[:, :, 3] - pose[:, 3]).norm(dim=1) / max(reach, 1e-9)
+        apart = (train.times - test.times[k]).abs()
+        if bool(((turned < SAME) & (moved < SAME) & (apart <= FrameClock.TOLERANCE)).any()):
+            names.append(test.names[k])
+    return names
+
+
+def _looking_away(scene: Scene) -> Iterator[Advice]:
+    points = box_points(scene, scene.bounds.box, (9, 9, 9))
+
+    def away(views: Views, k: int) -> bool:
+        return float(views.cameras.project_into(k, points[4, 4, 4:5])[1]) <= 0
+
+    def beside(views: Views, k: int) -> bool:
+        pixels, depth = views.cameras.project_into(k, points.reshape(-1, 3))
+        size = pixels.new_tensor([views.width, views.height])
+        seen = (depth > 0) & ((pixels >= 0) & (pixels <= size)).all(dim=1)
+        return not away(views, k) and not bool(seen.any())
+
+    remedy = "check the pose (camera-to-world, x right, y up, looking along -z), or set data.box"
+    if names := images_where(scene, away):
+        yield Advice(listed(names), "looks away from the middle of the box", remedy)
+    if names := images_where(scene, beside):
+        yield Advice(listed(names), "does not have the box in the picture", remedy)
+
+
+def _box_unknown(scene: Scene) -> Iterator[Advice]:
+    views, box = scene.static.train, scene.bounds.box
+    if scene.kind != "inward" or not scene.space.straight or views.has_alpha:
+        return
+    try:
+        guessed = box_from_cameras(views.cameras)
+    except DevrfError:
+        return  # the cameras tell no box: it was given
+    corners, guess = (torch.tensor([*b.low, *b.high]) for b in (box, guessed))
+    if float((corners - guess).abs().max()) <= 1e-4 * guessed.longest:
+        yield Advice(
+            "static training set",
+            "has no alpha masks, and the box is only what the cameras all see",
+            "set data.box=[[x,y,z],[x,y,z]] around the object, or give the images alpha (RGBA)",
+        )
+
+
+def _one_side(scene: Scene) -> Iterator[Advice]:
+    if scene.kind != "inward":
+        return
+    gap = widest_gap(scene.static.train.cameras, box_middle(scene))
+    if gap is not None and gap > WIDEST_GAP:
+        yield Advice(
+            "static training set",
+            f"no view from a sector of {gap:.0f} degrees, seen from above",
+            "expect fog on that side, or add views there "
+            "(data=forward is for scenes from one side)",
+        )
+
+
+# An image whose values all lie within this of one another, of 255, shows nothing.
+FLAT = 2
+# A pixel is in the alpha mask above this, of 255.
+OPAQUE = 127
+# Share of the pixels (in the alpha mask, where there is one) that the flow should cover at least.
+LEAST_FLOW = 0.02
+# Masks of passers-by rarely leave out more than this share of the pixels.
+MUCH_MASKED = 0.5
+
+
+def image_advice(scene: Scene) -> list[Advice]:
+    """Problems that images, masks, times and flow show."""
+    return [
+        *_blank(scene),
+        *_turned(scene),
+        *_alpha(scene),
+        *_masks(scene),
+        *_times(scene),
+        *_flow(scene.dynamic.train),
+    ]
+
+
+def mean_share(masks: Iterable[Tensor]) -> float:
+    """Mean of masks (H, W), one by one: a large scene's at once would be copied."""
+    shares = [float(mask.float().mean()) for mask in masks]
+    return sum(shares) / len(shares)
+
+
+def _blank(scene: Scene) -> Iterator[Advice]:
+    if flat := images_where(scene, _is_flat):
+        remedy = "look at the file, and leave it out if it is lost"
+        yield Advice(listed(flat), "one colour all over", remedy)
+    if empty := images_where(scene, _is_empty):
+        what = "its alpha mask is empty: it shows background only"
+        yield Advice(listed(empty), what, "look at the alpha channel, or leave the image out")
+
+
+def _valid_pixels(views: Views, k: int) -> Tensor:
+    """(M, 3 or 4) uint8."""
+    pixels = views.pixels[k]
+    return pixels.flatten(0, 1) if views.valid_mask is None else pixels[views.valid_mask[k]]
+
+
+def _is_flat(views: Views, k: int) -> bool:
+    # With alpha a subject of one colour still has an outline.
+    if views.has_alpha:
+        return False
+    low, high = _valid_pixels(views, k).int().aminmax(dim=0)
+    return int((high - low).max()) <= FLAT
+
+
+def _is_empty(views: Views, k: int) -> bool:
+    return views.has_alpha and int(_valid_pixels(views, k)[:, 3].max()) <= OPAQUE
+
+
+def _is_ambiguous(views: Views, k: int) -> bool:
+    return views.ambiguous_orientation is not None and bool(views.ambiguous_orientation[k])
+
+
+def _turned(scene: Scene) -> Iterator[Advice]:
+    if names := images_where(scene, _is_ambiguous):
+        yield Advice(
+            listed(names),
+            "its EXIF orientation says that it is to be seen turned; it is read as it is stored, "
+            "since its camera does not tell",
+            "if the cameras were found on turned images, turn the files too "
+            "(mogrify -auto-orient); else take the orientation out (exiftool -Orientation=)",
+        )
+
+
+def _alpha(scene: Scene) -> Iterator[Advice]:
+    sets = image_sets(scene)
+    without = [name for name, views in sets.items() if not views.has_alpha]
+    if 0 < len(without) < len(sets):
+        yield Advice(
+            listed(without, 4),
+            "without alpha masks, while the other images have them",
+            "give alpha to all images or to none: else the background is learned from some only",
+        )
+    for name, views in sets.items():
+        if views.has_alpha and int(views.pixels[..., 3].amin()) > OPAQUE:
+            yield Advice(
+                name,
+                "has an alpha channel that is opaque everywhere, which tells nothing",
+                "give real alpha masks, or write the images without alpha",
+            )
+
+
+def _masks(scene: Scene) -> Iterator[Advice]:
+    masked = {
+        name: mean_share(~mask for mask in views.valid_mask)
+        for name, views in image_sets(scene).items()
+        if views.valid_mask is not None
+    }
+    much = {name: share for name, share in masked.items() if share > MUCH_MASKED}
+    if much:
+        yield Advice(
+            listed(list(much), 4),
+            f"masks leave out up to {100 * max(much.values()):.0f} % of the pixels, of which "
+            "nothing is learned",
+            "if they cut out the subject, set data.masks=matte: "
+            "what they leave out is background then",
+        )
+
+
+def _times(scene: Scene) -> Iterator[Advice]:
+    if not scene.moves:
+        return
+    views, clock = scene.dynamic.train, scene.clock
+    first = float(views.times.min())
+    if first > FrameClock.TOLERANCE:
+        yield Advice(
+            "dynamic training set",
+            f"begins at time {first:g}; the rest state at time 0 is taken from the static set "
+            "alone",
+            "let the first frame show the rest state, at time 0",
+        )
+    numbers = set(views.view.tolist())
+    if len(numbers) == len(views):
+        return  # a moving camera: each image is a view of its own
+    frames = clock.frames_of(views.times)
+    fewer = []
+    for frame in sorted(set(frames.tolist())):
+        missing = sorted(numbers - set(views.view[frames == frame].tolist()))
+        if missing:
+            without = ", ".join(map(str, missing))
+            fewer.append(f"time {clock.times[frame]:.3g} without view {without}")
+    if fewer:
+        yield Advice(
+            "dynamic training set",
+            f"not all views at every time: {listed(fewer)}",
+            "add the images, or leave these times or views out: motion is less certain there",
+        )
+
+
+def _flow(views: Views) -> Iterator[Advice]:
+    flow = views.flow
+    if flow is None:
+        return
+    longest = max(views.width, views.height)
+    long, broken, covered = [], [], []
+    for k, _ in frame_pairs(views):
+        vectors, valid = flow.vectors[k], flow.valid[k]
+        inside = views.pixels[k, ..., 3] > OPAQUE if views.has_alpha else torch.ones_like(valid)
+        covered.append(float((valid & inside).sum()) / max(int(inside.sum()), 1))
+        length = vectors[valid].norm(dim=-1)
+        if not bool(torch.isfinite(length).all()):
+            broken.append(views.names[k])
+        elif len(length) and float(length.max()) > longest:
+            long.append(views.names[k])
+    if long:
+        yield Advice(
+            f"flow of {listed(long)}",
+            f"longer than the image ({longest} px)",
+            "flow is in pixels, x then y, from the frame to the one before it; check its unit, "
+            "or set data.flow=dis or data.flow=none",
+        )
+    if broken:
+        what, remedy = "valid where it is not a number", "mask these pixels, or set data.flow=none"
+        yield Advice(f"flow of {listed(broken)}", what, remedy)
+    share = sum(covered) / max(len(covered), 1)
+    if covered and share < LEAST_FLOW:
+        where = "the alpha masks" if views.has_alpha else "the pixels"
+        yield Advice(
+            "optical flow",
+            f"valid on {100 * share:.1f} % of {where}",
+            "check its masks, or set data.flow=dis to estimate it",
+        )

@@ -1,15 +1,15 @@
-"""Sentences and cells that Markdown, plain text and LaTeX share."""
+"""A report as Markdown, as LaTeX and as plain text."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import pandas as pd
 
-from devrf.apps.report.published import published
 from devrf.apps.report.runs import Collection
-from devrf.apps.report.table import Block, Column, Table
+from devrf.apps.report.table import Block, Column, Table, published
 
 
 @dataclass(frozen=True)
@@ -113,3 +113,141 @@ def reasons(found: Collection) -> list[str]:
         bug = " (a fault of the program: see its run.log)" * (failure["mistake"] is False)
         lines.append(f"{failure['folder']} ({what}): {failure['error']}{bug}")
     return lines
+
+
+def markdown_escaped(text: str) -> str:
+    """Text in which nothing is taken for Markdown."""
+    return re.sub(r"([\\`*<>|\[\]])|((?<!\w)_|_(?!\w))", r"\\\1\2", text)
+
+
+MARKDOWN = Style(markdown_escaped, ("{}", "**{}**", "<ins>{}</ins>", "*{}*"), "*{}*")
+PLAIN = Style(str, ("{} ", "{}¹", "{}²", "{}³"))
+
+
+def markdown(
+    table: Table, figures: Mapping[str, str], films: Mapping[str, str] | None = None
+) -> str:
+    """The whole report, with links to ``figures`` and ``films``, by what they show."""
+    found = table.found
+    failed = f", {len(found.failures)} failed" if len(found.failures) else ""
+    count = len(found.runs)
+    parts = [
+        "# Runs compared",
+        f"{count} finished run{'s' * (count != 1)} below `{found.folder}`{failed}.",
+        f"{markdown_escaped(caption(table))} **Best**, <ins>second</ins>, *third*.",
+    ]
+    if table.shows_published:
+        parts.append(f"† {markdown_escaped(credit())}")
+    for block in table.blocks:
+        parts += [f"## {markdown_escaped(block.title)}", _block(table, block)]
+    for heading, lines in (
+        ("", table.notes),
+        ("## Failed", reasons(found)),
+        ("## Skipped", found.skipped),
+    ):
+        if lines:
+            parts += [heading, "\n".join(f"- {markdown_escaped(line)}" for line in lines)]
+    if figures:
+        parts.append("## Plots")
+        parts += [f"![{markdown_escaped(shows)}](<{link}>)" for shows, link in figures.items()]
+    if films:
+        parts.append("## Videos")
+        parts.append(
+            "\n".join(f"- [{markdown_escaped(show)}](<{link}>)" for show, link in films.items())
+        )
+    return "\n\n".join(filter(None, parts)) + "\n"
+
+
+def plain(table: Table) -> str:
+    """The tables, notes and failures, for a terminal; ¹ ² ³ mark the best."""
+    parts = [_plain_block(table, block) + "\n" for block in table.blocks]
+    failed = [f"failed: {why}" for why in reasons(table.found)]
+    return "\n".join([*parts, *table.notes, *failed, *table.found.skipped]).rstrip()
+
+
+def _block(table: Table, block: Block) -> str:
+    frame = printed(table, [block], MARKDOWN).droplevel(0, axis=1)
+    left = len(frame.columns) - len(table.columns)
+    align = ["left"] * left + ["right"] * len(table.columns)
+    return str(frame.to_markdown(index=False, disable_numparse=True, colalign=align))
+
+
+def _plain_block(table: Table, block: Block) -> str:
+    frame = printed(table, [block], PLAIN).droplevel(0, axis=1)
+    count = len(table.columns)
+    heads, cells = frame.iloc[:, :-count], frame.iloc[:, -count:]
+    heads = heads.apply(lambda column: column.str.ljust(column.str.len().max()))
+    cells.index = heads.agg("  ".join, axis=1)
+    cells.columns = [f"{heading} " for heading in cells.columns]
+    cells.columns.name = block.title
+    return "\n".join(line.rstrip() for line in cells.to_string().splitlines())
+
+
+SIDE_BY_SIDE = 3
+HEAD = r"""% Made by devrf; read it with \input. Needs no package. For marks in colour, define
+%   \newcommand{\devrfbest}[1]{\cellcolor{red!30}#1}   % before it, with \usepackage[table]{xcolor}
+% and \devrfsecond and \devrfthird alike.
+\providecommand{\devrfbest}[1]{\textbf{#1}}
+\providecommand{\devrfsecond}[1]{\underline{#1}}
+\providecommand{\devrfthird}[1]{\textit{#1}}
+"""
+# pandas' own escapes leave the symbols below the first two lines as they are.
+SPECIAL = str.maketrans(
+    {character: rf"\{character}" for character in "&%$#_{}"}
+    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+    | {"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': "''", "–": "--"}
+    | {"±": r"$\pm$", "↑": r"$\uparrow$", "↓": r"$\downarrow$", "†": r"$\dagger$"}
+)
+COMMANDS = {
+    **dict.fromkeys(("toprule", "midrule", "bottomrule"), ":hline"),
+    "scriptsize": ":{}",
+    "setlength": r":{\tabcolsep}{3pt}",
+}
+
+
+def latex_escaped(text: str) -> str:
+    """Text in which nothing is taken for a command."""
+    return text.translate(SPECIAL)
+
+
+STYLE = Style(
+    latex_escaped,
+    ("{}", r"\devrfbest{{{}}}", r"\devrfsecond{{{}}}", r"\devrfthird{{{}}}"),
+    r"\textit{{{}}}",
+)
+
+
+def latex(table: Table) -> str:
+    """The whole report; failures are comments, for a paper does not print them."""
+    words = f"{caption(table)} Best, second and third are marked."
+    words += f" † {credit()}" if table.shows_published else ""
+    parts = [HEAD]
+    for start in range(0, len(table.blocks), SIDE_BY_SIDE):
+        parts.append(
+            _tables(table, table.blocks[start : start + SIDE_BY_SIDE], latex_escaped(words))
+        )
+        words = "Continued."
+    lines = [*table.notes, *(f"failed: {why}" for why in reasons(table.found))]
+    parts.append("".join(f"% {' '.join(line.split())}\n" for line in lines))
+    return "\n".join(filter(None, parts))
+
+
+def _tables(table: Table, blocks: Sequence[Block], words: str) -> str:
+    frame = printed(table, blocks, STYLE)
+    width = len(frame.columns)
+    left = "l" * (width - len(table.columns) * len(blocks))
+    style = frame.style.hide(axis="index").set_table_styles(
+        [{"selector": command, "props": options} for command, options in COMMANDS.items()]
+    )
+    text = style.to_latex(
+        column_format="|".join([left, *["c" * len(table.columns)] * len(blocks)]),
+        multicol_align="c|",
+        environment="table*",
+        position="t",
+        position_float="centering",
+        caption=words,
+    )
+    text = "{c}".join(text.rsplit("{c|}", 1))  # no rule at the right edge
+    # The line above the published rows goes over all columns.
+    above = rf"\\hline\n\\multicolumn{{{width}}}{{l}}{{\1}} \\\\"
+    return re.sub(r"^(\\textit\{[^&]*\})[ &]*\\\\$", above, text, flags=re.MULTILINE)

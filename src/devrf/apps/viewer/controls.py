@@ -4,18 +4,55 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import viser
 
+from devrf.apps.viewer.cameras import Pose
 from devrf.apps.viewer.drawing import Drawing, Shot
-from devrf.apps.viewer.playback import DURATION, Playback
-from devrf.apps.viewer.poses import Pose
-from devrf.apps.viewer.server import set_value
 from devrf.geometry.box import Box
 
+# How long the whole recording takes at speed 1, in seconds.
+DURATION = 5.0
+
+
+@dataclass(frozen=True)
+class Playback:
+    """The state of the time controls.
+
+    Attributes:
+        time: in [0, 1].
+        playing: whether time runs.
+        loop: whether it begins anew at its end; otherwise it stops there.
+        speed: recordings for each :data:`DURATION` seconds.
+    """
+
+    time: float = 0.0
+    playing: bool = False
+    loop: bool = True
+    speed: float = 1.0
+
+    def advanced(self, seconds: float) -> Playback:
+        """The state ``seconds`` later."""
+        if not self.playing:
+            return self
+        time = self.time + seconds * self.speed / DURATION
+        if time <= 1:
+            return replace(self, time=time)
+        return replace(self, time=time % 1) if self.loop else replace(self, time=1.0, playing=False)
+
+    def started(self) -> Playback:
+        """Time runs, from its beginning where it stood at its end."""
+        return replace(self, playing=True, time=0.0 if self.time >= 1 else self.time)
+
+
 SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
+
+
+def set_value(control: Any, value: object) -> None:
+    """Set what a control of the page shows; its type takes it for read-only."""
+    control.value = value
 
 
 class Controls:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import logging
 import math
 import threading
@@ -13,18 +15,49 @@ import torch
 import viser
 
 from devrf.apps.keyframes import CameraPath
+from devrf.apps.settings import ViewerSettings
+from devrf.apps.viewer.cameras import FrustaLayer, Pose
 from devrf.apps.viewer.controls import Controls
-from devrf.apps.viewer.drawing import Drawing, Picture, Shot
-from devrf.apps.viewer.frusta_layer import FrustaLayer
-from devrf.apps.viewer.path_panel import PathPanel
-from devrf.apps.viewer.poses import Pose
-from devrf.apps.viewer.presets import distance_ahead, known_paths
-from devrf.apps.viewer.scheduler import RenderScheduler
-from devrf.apps.viewer.server import open_server, stop_server
-from devrf.apps.viewer.settings import ViewerSettings
+from devrf.apps.viewer.drawing import Drawing, Picture, RenderScheduler, Shot
+from devrf.apps.viewer.paths import PathPanel, distance_ahead, known_paths
 from devrf.checkpoints.viewpoints import Viewpoints
+from devrf.errors import DevrfError
 from devrf.rendering.view import Viewable
 from devrf.scenes.scene import Scene
+
+
+def open_server(settings: ViewerSettings) -> viser.ViserServer:
+    """A server at the address of the settings; the caller stops it.
+
+    Raises:
+        DevrfError: the address is in use, or not this machine's.
+    """
+    settings.check_free()
+    logging.getLogger("websockets").setLevel(logging.WARNING)
+    with quiet():
+        server = viser.ViserServer(settings.host, settings.port, label="devrf", verbose=False)
+    if server.get_port() != settings.port:  # it takes the next one that is free
+        stop_server(server)
+        raise DevrfError(
+            f"viewer.port: {settings.port} on {settings.host} is in use by another program; "
+            "give another"
+        )
+    # Its share button would give the page to a server elsewhere.
+    server.gui.configure_theme(show_logo=False, show_share_button=False)
+    server.gui.main_panel.dock_right()  # beside the picture, not on it
+    return server
+
+
+def stop_server(server: viser.ViserServer) -> None:
+    """Take a server from the network."""
+    with quiet():
+        server.stop()
+
+
+def quiet() -> contextlib.redirect_stdout[io.StringIO]:
+    """A block in which the server prints no banner."""
+    return contextlib.redirect_stdout(io.StringIO())
+
 
 log = logging.getLogger(__name__)
 

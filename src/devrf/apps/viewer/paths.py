@@ -1,22 +1,136 @@
-"""The page's controls of a film: keyframes that are added, saved, loaded, flown through."""
+"""The page's controls of a video: keyframes that are added, saved, loaded, flown through."""
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 import viser
+from torch import Tensor
 
-from devrf.apps.keyframes import CameraPath
-from devrf.apps.path_files import check_name, path_from, write_path
-from devrf.apps.viewer.path_editor import PathEditor
-from devrf.apps.viewer.poses import Pose
-from devrf.apps.viewer.presets import Preset
-from devrf.apps.viewer.server import set_value
+from devrf.apps.keyframes import (
+    CameraPath,
+    Keyframe,
+    check_name,
+    keyframes_of,
+    path_from,
+    write_path,
+)
+from devrf.apps.video import FilmSettings, bullet_time, orbit, spiral, time_freeze
+from devrf.apps.viewer.cameras import Pose
+from devrf.apps.viewer.controls import set_value
 from devrf.errors import DevrfError
+from devrf.geometry.cameras import Cameras
+from devrf.geometry.ndc import NormalizedDevice
+from devrf.rendering.view import Viewable
+
+
+class PathEditor:
+    """A list of keyframes, changed by several threads."""
+
+    def __init__(self) -> None:
+        self._keyframes: tuple[Keyframe, ...] = ()
+        self._lock = threading.Lock()
+
+    @property
+    def keyframes(self) -> tuple[Keyframe, ...]:
+        """All of them, in their order."""
+        return self._keyframes
+
+    def add(self, camera_to_world: Tensor, fov: float, time: float, gap: float) -> None:
+        """Add a keyframe after the others, ``gap`` seconds later.
+
+        Args:
+            camera_to_world: (3, 4), OpenGL axes, world units.
+            fov: the vertical angle of view in degrees.
+            time: the scene's, in [0, 1].
+            gap: seconds, more than 0.
+        """
+        with self._lock:
+            last = self._keyframes[-1:]
+            seconds = last[0].seconds + gap if last else 0.0
+            one = Keyframe(camera_to_world, fov, time, seconds)
+            self._keyframes = (*self._keyframes, one)
+
+    def remove_last(self) -> None:
+        """Remove the newest keyframe, if there is one."""
+        with self._lock:
+            self._keyframes = self._keyframes[:-1]
+
+    def replace(self, keyframes: tuple[Keyframe, ...]) -> None:
+        """Take other keyframes, the first at second 0."""
+        with self._lock:
+            self._keyframes = tuple(
+                replace(one, seconds=one.seconds - keyframes[0].seconds) for one in keyframes
+            )
+
+    def path(self, aspect: float, fps: float) -> CameraPath:
+        """The path through the keyframes.
+
+        Raises:
+            DevrfError: there are fewer than two.
+        """
+        if len(self._keyframes) < 2:
+            raise DevrfError("a path needs two keyframes; add the camera at two places or times")
+        return CameraPath(self._keyframes, aspect, fps)
+
+
+# Keyframes of a path, and the seconds that it takes to go round.
+KEYFRAMES, SECONDS = 13, 8.0
+# From a time in [0, 1], at which the film is to stop.
+Preset = Callable[[float], tuple[Keyframe, ...]]
+
+
+def known_paths(cameras: Cameras, model: Callable[[], Viewable]) -> dict[str, Preset]:
+    """Paths by name: around a scene, or before a forward-facing one.
+
+    Args:
+        cameras: the static captured ones.
+        model: gives the scene, once there is one.
+    """
+    settings = FilmSettings(frames=KEYFRAMES)
+
+    def ring(film: FilmSettings) -> Cameras:
+        """Comes back to where it began."""
+        space, film = model().space, replace(film, frames=film.frames - 1)
+        again = [*range(film.frames), 0]
+        if isinstance(space, NormalizedDevice):
+            return spiral(cameras, distance_ahead(cameras), film)[again]
+        return orbit(cameras, space.inner(model().box), film)[again]
+
+    def orbiting(moment: float) -> tuple[Keyframe, ...]:
+        return keyframes_of(ring(settings), torch.linspace(0, 1, KEYFRAMES).tolist(), SECONDS)
+
+    def bullet(moment: float) -> tuple[Keyframe, ...]:
+        return keyframes_of(*bullet_time(ring, moment, settings), SECONDS)
+
+    def freeze(moment: float) -> tuple[Keyframe, ...]:
+        longer = FilmSettings(frames=3 * KEYFRAMES)
+        return keyframes_of(*time_freeze(ring, moment, longer), 3 * SECONDS)
+
+    return {"orbit": orbiting, "bullet time": bullet, "time freeze": freeze}
+
+
+def distance_ahead(cameras: Cameras) -> float:
+    """How far before N cameras the point is that lies nearest to all their optical axes.
+
+    It solves Σ (1 − d dᵀ)(p − o) = 0 for p. Axes that meet nowhere give the cameras' extent.
+    """
+    origins, forwards = cameras.positions, cameras.forwards
+    across = torch.eye(3) - forwards[:, :, None] * forwards[:, None, :]
+    extent = float((origins - origins.mean(dim=0)).norm(dim=1).max()) or 1.0
+    normal = across.sum(dim=0)
+    if float(torch.linalg.eigvalsh(normal)[0]) < 1e-3 * len(cameras):
+        return extent
+    point = torch.linalg.solve(normal, (across @ origins[:, :, None]).sum(dim=0)[:, 0])
+    distance = float(((point - origins) * forwards).sum(dim=1).mean())
+    return distance if distance > 0 else extent
+
 
 Act = Callable[[viser.GuiEvent[Any]], None]
 # Points of the line that shows a path.

@@ -1,0 +1,301 @@
+"""Chosen frames of all footage as image files of one size, their masks, and what moves in them."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import repeat
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from devrf.errors import DevrfError
+from devrf.geometry.box import Box
+from devrf.geometry.cameras import Cameras
+from devrf.scenes.footage import Picture, chosen, is_folder
+from devrf.scenes.image_folders import listed_images
+from devrf.scenes.masks import read_mask
+from devrf.scenes.scene import Views
+from devrf.scenes.silhouettes import motion_box
+
+Size = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """Which frames of one video become images.
+
+    Attributes:
+        path: the footage.
+        label: the folder of its images: ``static``, ``view1`` …
+        positions: of its frames, ascending where distinct; a frame may be wanted twice.
+        mattes: of all its frames, which become the images' alpha; None: the images have none.
+    """
+
+    path: Path
+    label: str
+    positions: tuple[int, ...]
+    mattes: Path | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The image of each position, relative to the folder of images."""
+        return tuple(f"{self.label}/{position:05d}.png" for position in self.positions)
+
+
+def common_size(sizes: dict[Path, Size], longer: int) -> Size:
+    """Width and height of all images: those of the first footage, made smaller if need be.
+
+    Raises:
+        DevrfError: some footage is upright, other lies on its side.
+    """
+    (first, (width, height)), *others = sizes.items()
+    for path, (w, h) in others:
+        if (w > h) != (width > height):
+            raise DevrfError(
+                f"{path}: {w}x{h} px, but {first} has {width}x{height} px; hold all cameras the "
+                "same way, or turn the video"
+            )
+    factor = min(1.0, longer / max(width, height))
+    return round(width * factor), round(height * factor)
+
+
+def write_frames(folder: Path, footage: Chosen, size: Size, filmed: Size) -> Iterator[Path]:
+    """Write the images of one video, each when it is asked for.
+
+    Frames of other proportions are cropped in the middle; then all are brought to ``size``.
+
+    Args:
+        folder: of images.
+        footage: which of its frames.
+        size: of the images.
+        filmed: of the frames.
+
+    Raises:
+        DevrfError: what :func:`devrf.scenes.footage.chosen` and
+            :func:`devrf.apps.capture.images.chosen_mattes` raise, or an image cannot be written.
+    """
+    (folder / footage.label).mkdir(parents=True, exist_ok=True)
+    places = dict(zip(footage.positions, footage.names, strict=True))
+    wanted = sorted(places)
+    mattes: Iterator[tuple[int, Matte] | None] = repeat(None, len(wanted))
+    if footage.mattes is not None:
+        mattes = chosen_mattes(footage.mattes, footage.path, wanted, filmed)
+    for (position, picture), matte in zip(chosen(footage.path, wanted), mattes, strict=False):
+        path = folder / places[position]
+        image = cv2.cvtColor(fitted(picture, size), cv2.COLOR_RGB2BGR)
+        if matte is not None:
+            image = np.dstack([image, fitted(matte[1], size)])
+        if not cv2.imwrite(str(path), image):
+            raise DevrfError(f"{path}: cannot be written; see that there is room, and permission")
+        yield path
+
+
+def fitted(picture: Picture, size: Size) -> Picture:
+    """A picture cropped in the middle to the proportions of ``size``, and brought to it."""
+    height, width = picture.shape[:2]
+    scale = max(size[0] / width, size[1] / height)
+    w, h = min(width, round(size[0] / scale)), min(height, round(size[1] / scale))
+    left, top = (width - w) // 2, (height - h) // 2
+    part = picture[top : top + h, left : left + w]
+    if (w, h) == size:
+        return part
+    way = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+    return np.asarray(cv2.resize(part, size, interpolation=way), np.uint8)
+
+
+# 8-bit grey, (H, W): white is kept, black is background.
+Matte = npt.NDArray[np.uint8]
+
+VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm")
+
+
+def mattes_of(folder: Path, footage: Path, count: int) -> Path:
+    """The mattes of some footage: ``<folder>/<its name without suffix>``, a folder or a video.
+
+    Of photographs it is a folder with a file of each one's name; of a video one with as many
+    images as it has frames, in the order of their names, or a video of as many frames.
+
+    Args:
+        folder: ``capture.mattes``.
+        footage: the video, or the folder of photographs.
+        count: how many frames it has.
+
+    Raises:
+        DevrfError: there are none, or not of all frames.
+    """
+    if not os.path.isdir(folder):
+        raise DevrfError(
+            f"{folder}: no such folder of mattes; correct capture.mattes, or give subtract"
+        )
+    place = folder / footage.stem
+    video = next((v for v in (folder / f"{footage.stem}{s}" for s in VIDEOS) if v.is_file()), None)
+    if not os.path.isdir(place):
+        if video is None or is_folder(footage):
+            raise DevrfError(
+                f"{place}: no such folder, expected the mattes of {footage}; add it with an image "
+                f"for each {'photograph' if is_folder(footage) else 'frame'}"
+            )
+        return video
+    if is_folder(footage):
+        for photograph in listed_images(footage):
+            _of_photograph(place, photograph)
+    elif len(listed_images(place)) != count:
+        raise DevrfError(
+            f"{place}: {len(listed_images(place))} mattes, but {footage} has {count} frames; give "
+            "an image for each frame, in the order of their names"
+        )
+    return place
+
+
+def chosen_mattes(
+    mattes: Path, footage: Path, positions: Sequence[int], size: tuple[int, int]
+) -> Iterator[tuple[int, Matte]]:
+    """The mattes of the frames at ``positions``, ascending, each with its position.
+
+    Args:
+        mattes: what :func:`mattes_of` returned.
+        footage: what they belong to.
+        positions: of the frames.
+        size: width and height of the frames.
+
+    Raises:
+        DevrfError: one is no grey image, has another size than its frame, or is missing.
+    """
+    if is_folder(mattes):
+        files = listed_images(mattes)
+        if is_folder(footage):
+            files = [_of_photograph(mattes, one) for one in listed_images(footage)]
+        for position in positions:
+            yield position, read_mask(files[position], size, None, footage)
+        return
+    for position, picture in chosen(mattes, positions):
+        height, width = picture.shape[:2]
+        if (width, height) != size:
+            raise DevrfError(
+                f"{mattes}: {width}x{height} px, but {footage} has {size[0]}x{size[1]} px; give "
+                "mattes of its size"
+            )
+        # Grey as it is, whatever compression has made of its colours.
+        yield position, picture.mean(axis=2).round().astype(np.uint8)
+
+
+def _of_photograph(mattes: Path, photograph: Path) -> Path:
+    for one in listed_images(mattes):
+        if one.stem == photograph.stem:
+            return one
+    raise DevrfError(
+        f"{mattes / photograph.stem}.png: no such matte, of {photograph}; give each photograph one "
+        "of its name"
+    )
+
+
+log = logging.getLogger(__name__)
+
+# Silhouettes are found in images of so many pixels of the longer side: a box needs no more.
+LONGER_SIDE = 320
+# Squared distance from the background, in its variances, from which a pixel moves; and the
+# variance that a pixel has at least, in grey levels squared (compression).
+_FAR, _LEAST_VARIANCE = 25.0, 16.0
+# What a pixel shows for this share of the pictures is background; of less, it moves.
+_MOST_OF_THE_TIME = 0.5
+# Connected pixels that are a smaller share of the image are noise.
+_SPECK = 5e-4
+
+Mask = npt.NDArray[np.uint8]
+
+
+def silhouettes(pictures: Sequence[Picture]) -> list[Mask]:
+    """Where each picture of a camera that stands still differs from what stays, (H, W): 0 or 255.
+
+    The background is learned from all pictures (Zivkovic's mixtures of Gaussians, OpenCV's MOG2).
+    What comes to rest for most of the time is background.
+
+    Args:
+        pictures: at least two, of one size.
+    """
+    model = cv2.createBackgroundSubtractorMOG2(len(pictures), _FAR, detectShadows=False)
+    model.setVarMin(_LEAST_VARIANCE)
+    model.setVarInit(_LEAST_VARIANCE)
+    model.setBackgroundRatio(_MOST_OF_THE_TIME)
+    for picture in pictures:
+        # Of equal weight, whatever their order.
+        model.apply(picture, learningRate=1 / len(pictures))
+    return [_cleaned(np.asarray(model.apply(one, learningRate=0), np.uint8)) for one in pictures]
+
+
+def _cleaned(mask: Mask) -> Mask:
+    """The mask without specks."""
+    opened = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(opened)
+    large = stats[:, cv2.CC_STAT_AREA] >= _SPECK * mask.size
+    large[0] = False
+    return np.where(large[labels], 255, 0).astype(np.uint8)
+
+
+def box_of_motion(
+    images: Path,
+    names: Sequence[Sequence[str]],
+    poses: Tensor,
+    lenses: Sequence[dict[str, float]],
+    around: Box,
+) -> Box:
+    """The box of all that moves, carved from the silhouettes of the fixed views.
+
+    Args:
+        images: the folder of images.
+        names: of each of V ≥ 2 views its T images, relative to the folder.
+        poses: (V, 3, 4) camera-to-world, OpenGL axes, world units.
+        lenses: of each view its ``fl_x``, ``cx`` … in pixels; a distortion is left alone, being
+            less than a cell of the carved grid at the middle.
+        around: where it is looked for, half as far again.
+
+    Raises:
+        DevrfError: nothing moves in what two views see.
+    """
+    shown: list[Mask] = []
+    for one in names:
+        shown += silhouettes([_small(images / name) for name in one])
+    count = len(names[0])
+    height, width = shown[0].shape
+    shares = [width / lens["w"] for lens in lenses]
+    focal, center = (
+        torch.tensor(
+            [[lens[x] * s, lens[y] * s] for lens, s in zip(lenses, shares, strict=True)],
+            dtype=torch.float32,
+        )
+        for x, y in (("fl_x", "fl_y"), ("cx", "cy"))
+    )
+    view = torch.arange(len(names)).repeat_interleave(count)
+    alpha = torch.from_numpy(np.stack(shown))[..., None]
+    views = Views(
+        alpha.expand(-1, -1, -1, 4),
+        Cameras(poses.float(), focal, center, width, height)[view],
+        torch.linspace(0, 1, count).repeat(len(names)),
+        view,
+        tuple(name for one in names for name in one),
+    )
+    # Coarsely where it is, then with a finer grid.
+    coarse = motion_box(views, around)
+    found = None if coarse is None else motion_box(views, coarse)
+    if found is None:
+        raise DevrfError(
+            "capture.mattes: subtract needs at least 2 fixed views that see something move at one "
+            "time; leave capture.mattes out"
+        )
+    log.info("what moves is in %s", found)
+    return found
+
+
+def _small(path: Path) -> Picture:
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    assert image is not None  # the step before has written it
+    factor = min(1.0, LONGER_SIDE / max(image.shape[:2]))
+    size = (round(image.shape[1] * factor), round(image.shape[0] * factor))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)

@@ -1,0 +1,272 @@
+"""What is exported: a mesh that moves, or coloured points of each time; and the settings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from devrf.errors import DevrfError
+from devrf.geometry.cameras import Cameras
+from devrf.geometry.clock import FrameClock
+from devrf.geometry.space import Space
+from devrf.rendering.renderer import Renderer
+
+Format = Literal["gltf", "ply", "obj", "usd"]
+Up = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
+
+
+@dataclass(frozen=True)
+class ExportSettings:
+    """The geometry that ``stage=export`` writes.
+
+    Attributes:
+        format: ``gltf`` (one .glb file that plays), ``usd`` (one file with time samples), ``ply``
+            or ``obj`` (a file a time).
+        content: ``surface``, one mesh that moves; ``points``, coloured points of each time;
+            ``auto`` takes the surface of a method that has one and knows where its points go.
+        threshold: opacity of one voxel, in (0, 1): the surface is where the field reaches it.
+        side: points of the sampled grid along the longest edge; None: those of the field.
+        faces: triangles to keep at most.
+        pieces: connected pieces with a smaller share of the largest one's faces are left out.
+        reach: how many times as far from the cameras as half of the surface a vertex may be.
+        colors: of a vertex: seen along its normal (``normal``), or the mean over directions from
+            which it can be seen (``mean``).
+        points: number of points at each time, at most.
+        times: times in [0, 1], ascending; None: the training frames', or as ``fps`` says.
+        fps: evenly spread times, so many a second; None: ``times``.
+        seconds: how long time 0 to 1 takes.
+        up: the axis of the capture's world that points up; ``auto``: the one nearest to the
+            cameras' mean.
+        metres: length of a unit of the capture's world.
+        into: the folder; None: ``export`` in the run's.
+    """
+
+    format: Format = "gltf"
+    content: Literal["auto", "surface", "points"] = "auto"
+    threshold: float = 0.1
+    side: int | None = None
+    faces: int = 20_000
+    pieces: float = 0.01
+    reach: float = 10.0
+    colors: Literal["normal", "mean"] = "mean"
+    points: int = 20_000
+    times: Sequence[float] | None = None
+    fps: float | None = None
+    seconds: float = 3.0
+    up: Up = "auto"
+    metres: float = 1.0
+    into: str | Path | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 < self.threshold < 1:
+            raise DevrfError(f"export.threshold: expected between 0 and 1, not {self.threshold}")
+        if self.side is not None and not 2 <= self.side <= 1024:
+            raise DevrfError(f"export.side: expected 2 to 1024, not {self.side}")
+        for name, least in (("faces", 4), ("points", 1)):
+            if getattr(self, name) < least:
+                raise DevrfError(f"export.{name}: expected at least {least}")
+        if not 0 <= self.pieces <= 1:
+            raise DevrfError(f"export.pieces: expected 0 to 1, not {self.pieces}")
+        for name in ("reach", "fps", "seconds", "metres"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:
+                raise DevrfError(f"export.{name}: expected more than 0, not {value}")
+        self._check_times()
+
+    def _check_times(self) -> None:
+        if self.times is None:
+            return
+        if self.fps is not None:
+            raise DevrfError("export.times: export.fps also says which times; give one of them")
+        pairs = zip(self.times, list(self.times)[1:], strict=False)
+        if not self.times or not all(a < b for a, b in pairs):
+            raise DevrfError("export.times: expected ascending times, such as [0,0.5,1]")
+        if not (0 <= self.times[0] and self.times[-1] <= 1):
+            raise DevrfError(f"export.times: expected times from 0 to 1, not {list(self.times)}")
+
+    def moments(self, clock: FrameClock) -> tuple[float, ...]:
+        """The times to export, of a scene whose training frames have the clock's times."""
+        if self.times is not None:
+            return tuple(self.times)
+        if self.fps is not None:
+            steps = max(1, round(self.seconds * self.fps))
+            return tuple(k / steps for k in range(steps + 1))
+        return clock.times
+
+
+AXES = "xyz"
+
+
+@dataclass(frozen=True)
+class UpFrame:
+    """The way from the capture's world to right-handed axes with y up, in metres.
+
+    Attributes:
+        rotation: (3, 3) axes of the world onto axes of the frame.
+        metres: length of a unit of the world.
+        up: the world's axis that becomes y.
+    """
+
+    rotation: Tensor
+    metres: float
+    up: str
+
+    @classmethod
+    def of(cls, cameras: Cameras, up: Up, metres: float) -> UpFrame:
+        """The frame of a scene.
+
+        Args:
+            cameras: that saw it, for ``up=auto``: the axis nearest to their mean up.
+            up: the world's axis that points up.
+            metres: length of a unit of the world.
+        """
+        if up == "auto":
+            mean = cameras.camera_to_world[:, :, 1].mean(dim=0)
+            axis = int(mean.abs().argmax())
+            sign = -1.0 if mean[axis] < 0 else 1.0
+        else:
+            axis, sign = AXES.index(up[-1]), -1.0 if up.startswith("-") else 1.0
+        y = torch.zeros(3)
+        y[axis] = sign
+        x = torch.zeros(3)
+        x[1 if axis == 0 else 0] = 1.0
+        name = ("-" if sign < 0 else "") + AXES[axis]
+        return cls(torch.stack([x, y, torch.linalg.cross(x, y)]), metres, name)
+
+    def points(self, points: Tensor) -> Tensor:
+        """Points (..., 3) of the world in the frame."""
+        return self.metres * (points @ self.rotation.T)
+
+    def cameras(self, cameras: Cameras) -> Cameras:
+        """Cameras of the world in the frame."""
+        pose = cameras.camera_to_world
+        turned = self.rotation @ pose[:, :, :3]
+        return replace(
+            cameras,
+            camera_to_world=torch.cat([turned, self.points(pose[:, :, 3])[:, :, None]], dim=2),
+        )
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A mesh at rest.
+
+    Attributes:
+        points: (V, 3) canonical vertices in the fields' space, on the host.
+        faces: (F, 3) int64, counter-clockwise from outside as the world is seen.
+        colors: (V, 3) RGB in [0, 1], encoded as the images are (sRGB).
+    """
+
+    points: Tensor
+    faces: Tensor
+    colors: Tensor
+
+
+ForwardMap = Callable[[Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class MovingMesh:
+    """A mesh at T times.
+
+    Attributes:
+        times: T times in [0, 1], ascending.
+        vertices: (T, V, 3) float32, in the capture's world.
+        faces: (F, 3) int64, counter-clockwise from outside.
+        colors: (V, 3) RGB in [0, 1], sRGB.
+    """
+
+    times: tuple[float, ...]
+    vertices: Tensor
+    faces: Tensor
+    colors: Tensor
+
+
+def carried(
+    surface: Surface,
+    forward: Callable[[float], ForwardMap],
+    space: Space,
+    times: Sequence[float],
+    device: torch.device,
+) -> MovingMesh:
+    """A surface at rest, carried through time: each canonical vertex q goes to x(q, t).
+
+    Args:
+        surface: at rest, in the fields' space.
+        forward: time → q → x(q, t), in the fields' space.
+        space: that space.
+        times: in [0, 1], ascending.
+        device: of the fields.
+    """
+    points = surface.points.to(device)
+    moved = [space.to_world(forward(time)(points)).float().cpu() for time in times]
+    return MovingMesh(tuple(times), torch.stack(moved), surface.faces, surface.colors)
+
+
+# Cameras that look at the scene, at most.
+CAMERAS = 24
+# Rows of the images that tell how much of them is filled, and of the largest ones.
+FIRST, LARGEST = 24, 2048
+# So many more pixels than the share that is filled asks for.
+SPARE = 1.3
+# What lets more light through shows no surface.
+SOLID = 0.5
+
+
+@dataclass(frozen=True)
+class PointCloud:
+    """Coloured points.
+
+    Attributes:
+        points: (N, 3) in the capture's world.
+        colors: (N, 3) RGB in [0, 1], sRGB.
+    """
+
+    points: Tensor
+    colors: Tensor
+
+
+def seen_points(
+    renderer: Renderer, cameras: Cameras, time: float, background: float, count: int
+) -> PointCloud:
+    """What the cameras see at ``time``: the points where their rays end, in the mean.
+
+    Args:
+        renderer: of a learned scene.
+        cameras: world units; of many some, evenly chosen.
+        time: in [0, 1].
+        background: grey level.
+        count: of points, at most; of more some, evenly chosen.
+    """
+    some = cameras[_evenly(len(cameras), CAMERAS)].to(renderer.device)
+    filled = len(_seen(renderer, some.of_height(FIRST), time, background).points)
+    rows = FIRST * (SPARE * count / max(filled, 1)) ** 0.5
+    seen = _seen(renderer, some.of_height(min(round(rows), LARGEST)), time, background)
+    kept = _evenly(len(seen.points), count)
+    return PointCloud(seen.points[kept], seen.colors[kept])
+
+
+def _seen(renderer: Renderer, cameras: Cameras, time: float, background: float) -> PointCloud:
+    """The points that all pixels of the cameras show."""
+    space, points, colors = renderer.model.space, [], []
+    for camera in range(len(cameras)):
+        rays = cameras.image_rays(camera)
+        image = renderer.picture(rays, time, background)
+        solid = (image.opacity > SOLID).nonzero()[:, 0]
+        ends = space.rays(rays).at(solid, image.depth[solid])
+        points.append(space.to_world(ends).float().cpu())
+        colors.append(image.color[solid].clamp(0, 1).float().cpu())
+    return PointCloud(torch.cat(points), torch.cat(colors))
+
+
+def _evenly(count: int, most: int) -> Tensor:
+    """Positions of at most ``most`` of ``count`` things, evenly spread."""
+    if count <= most:
+        return torch.arange(count)
+    return torch.arange(most) * count // most
