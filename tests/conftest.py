@@ -55,7 +55,7 @@ from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import CanonicalRates
 from devrf.methods.devrf.volume_rendering import render
-from devrf.rendering.rendered_image import RenderedImage
+from devrf.rendering.output import RenderedImage
 from devrf.scenes.procedural import ProceduralScene
 from devrf.scenes.scene import Scene
 

@@ -11,8 +11,7 @@ from devrf.cli.command_line import as_hydra_takes_it
 from devrf.cli.completion import answer_completion
 from devrf.cli.messages import report_user_errors
 from devrf.cli.sweep import failures_at_the_end
-from devrf.system.process import tune_for_cpu
-from devrf.system.signals import Interrupted, end_at_once, handle_signals
+from devrf.system.process import Interrupted, end_at_once, handle_signals, tune_for_cpu
 
 
 def entry() -> None:

@@ -43,8 +43,8 @@ from devrf.methods.devrf.settings import MotionSettings, Precision, Sampling
 from devrf.ops.dispatch import Kind, using
 from devrf.ops.selfcheck import CASES, Case, compare
 from devrf.rendering.renderer import Renderer
-from devrf.system.out_of_memory import free_cache
-from devrf.system.speed import wait
+from devrf.system.device import wait
+from devrf.system.memory import free_cache
 
 log = logging.getLogger(__name__)
 

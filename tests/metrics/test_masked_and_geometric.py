@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from devrf.metrics.geometric import depth_error, end_point_error
-from devrf.metrics.image import ssim, ssim_map
-from devrf.metrics.masked import psnr_masked, ssim_masked, ssim_within
+from devrf.metrics.image import psnr_masked, ssim, ssim_masked, ssim_within
 
 
 def test_masked_psnr_counts_the_masked_pixels_alone() -> None:
@@ -44,19 +43,6 @@ def test_ssim_within_a_mask_knows_nothing_of_what_is_beyond(rng: torch.Generator
     assert ssim_within(a, b, mask) == pytest.approx(inside, abs=1e-5)
     mask[9, 7] = False  # no window of 11 x 11 is without it
     assert ssim_within(a, b, mask) is None
-
-
-def test_masked_ssim_of_an_image_smaller_than_a_window(rng: torch.Generator) -> None:
-    a, b = torch.rand(2, 8, 9, 3, generator=rng)
-    mask = torch.zeros(8, 9, dtype=torch.bool)
-    mask[2, 3] = True
-    values = ssim_map(a, b)
-    assert ssim_masked(a, b, mask) == pytest.approx(float(values[2, 3].mean()))
-    assert ssim_within(a, b, mask | True) == pytest.approx(ssim(a, b))
-    mask[:], mask[7, 8] = True, False
-    # The windows of rows 0 and 1 and of columns 0 to 2 do not reach (7, 8).
-    expected = torch.cat([values[:2].reshape(-1), values[2:, :3].reshape(-1)]).mean()
-    assert ssim_within(a, b, mask) == pytest.approx(float(expected))
 
 
 def test_depth_error_by_hand() -> None:

@@ -85,18 +85,3 @@ def test_a_stored_mask_of_other_shape_and_box_loads_with_its_vicinity(
     assert torch.equal(fresh.vicinity, stored.vicinity)
     points = torch.rand(200, 3, generator=rng) * 5 - 2.5
     assert torch.equal(fresh.at(points), stored.at(points))
-
-
-def test_replacing_the_mask_keeps_the_box_unless_another_is_given(cube: Box) -> None:
-    occupancy = Occupancy.full((3, 3, 3), cube)
-    occupancy.replace(single((5, 5, 5), (0, 0, 0)))
-    assert occupancy.box == cube and occupancy.share == pytest.approx(1 / 125)
-    assert occupancy.near(torch.tensor([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]])).tolist() == [
-        True,
-        False,
-    ]
-    occupancy.replace(occupancy.mask, Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)))
-    assert occupancy.at(torch.tensor([[0.0, 0.0, 0.0], [-1.0, -1.0, -1.0]])).tolist() == [
-        True,
-        False,
-    ]

@@ -1,36 +1,30 @@
-"""A renderer renders what the model renders, and computes each time's view once."""
+"""A renderer renders what the model renders, in chunks that memory allows, whole or cropped."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
+from devrf.checkpoints.checkpoint import LoadedCheckpoint
+from devrf.geometry.box import Box
+from devrf.geometry.contraction import ContractedSpace
 from devrf.geometry.rays import Rays
+from devrf.geometry.space import WORLD, Space
 from devrf.methods.devrf import view as module
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.rendering.rendered_image import RenderedImage
-from devrf.rendering.renderer import Renderer
+from devrf.rendering.output import RenderedImage
+from devrf.rendering.renderer import MIN_CHUNK, Renderer, in_chunks
 from devrf.scenes.scene import Scene
 
 WHITE = torch.ones(3)
+RED, BLUE = torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 0, 1])
+NEAR, FAR = 0.5, 10.0
 Same = Callable[[RenderedImage, RenderedImage], None]
 Picture = Callable[[DeVRFModel, Rays, float, torch.Tensor], RenderedImage]
-
-
-@pytest.fixture
-def looks(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Has an entry for each time that an occupancy was computed."""
-    found: list[int] = []
-    inner: Callable[..., object] = module.occupancy_through
-
-    def counted(*arguments: object) -> object:
-        found.append(1)
-        return inner(*arguments)
-
-    monkeypatch.setattr(module, "occupancy_through", counted)
-    return found
 
 
 @pytest.mark.parametrize("time", [0.0, 0.4, 0.55, 1.0])
@@ -54,30 +48,20 @@ def test_a_view_has_the_occupancy_and_displacement_of_its_time(moving: DeVRFMode
     assert rest.at_rest and rest.occupancy is moving.occupancy and rest.displacement is None
 
 
-def test_the_views_of_the_last_times_are_cached(moving: DeVRFModel, looks: list[int]) -> None:
+def test_the_views_of_the_last_times_are_cached(
+    moving: DeVRFModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looks: list[float] = []
+    usual = module.occupancy_through
+    monkeypatch.setattr(module, "occupancy_through", lambda *a: looks.append(1) or usual(*a))
     renderer = Renderer(moving, times=2)
     for time in (0.4, 0.7, 0.4, 0.7, 0.4):
         renderer.at(time)
     assert len(looks) == 2
     renderer.at(0.9)
     renderer.at(0.4)
-    assert len(looks) == 3
     renderer.at(0.7)  # replaced by 0.9
     assert len(looks) == 4
-
-
-def test_a_stream_is_rendered_image_by_image(
-    moving: DeVRFModel, tiny_scene: Scene, looks: list[int], same: Same, reference: Picture
-) -> None:
-    cameras, renderer = tiny_scene.dynamic.test.cameras, Renderer(moving)
-    stream = renderer.stream(cameras, [0.4, 0.4, 1.0], 0.0)
-    assert len(looks) == 0
-    first = next(stream)
-    assert len(looks) == 1
-    same(first, reference(moving, cameras.image_rays(0), 0.4, torch.zeros(3)))
-    _, last = stream
-    same(last, renderer.view(cameras, 2, 1.0, torch.zeros(3)))
-    assert len(looks) == 2
 
 
 def test_any_size_and_any_background(moving: DeVRFModel, tiny_scene: Scene) -> None:
@@ -89,6 +73,117 @@ def test_any_size_and_any_background(moving: DeVRFModel, tiny_scene: Scene) -> N
     assert torch.equal(seen.color[empty][0], torch.tensor([0.0, 1.0, 0.0]))
 
 
-def test_no_rays(moving: DeVRFModel, tiny_scene: Scene) -> None:
-    rays = tiny_scene.dynamic.test.cameras.image_rays(0)[:0]
-    assert Renderer(moving).picture(rays, 0.4, 1.0).color.shape == (0, 3)
+@pytest.fixture
+def rays(rng: torch.Generator) -> Rays:
+    origins = torch.rand(1000, 3, generator=rng)
+    return Rays(origins, origins, origins)
+
+
+def test_rays_come_in_order(rays: Rays) -> None:
+    assert [len(part) for part in in_chunks(lambda some: some, rays, 300)] == [300, 300, 300, 100]
+    assert [len(part) for part in in_chunks(lambda some: some, rays[:0], 300)] == [0]
+
+
+@pytest.mark.parametrize(
+    ("error", "sizes"),
+    [
+        (torch.OutOfMemoryError("CUDA out of memory."), [512, MIN_CHUNK]),
+        (RuntimeError("ours"), [512]),
+    ],
+)
+def test_errors_that_smaller_chunks_do_not_prevent(
+    rays: Rays, error: Exception, sizes: list[int]
+) -> None:
+    tried: list[int] = []
+
+    def render(some: Rays) -> None:
+        tried.append(len(some))
+        raise error
+
+    with pytest.raises(type(error), match=str(error)):
+        in_chunks(render, rays, 512)
+    assert tried == sizes
+
+
+def test_an_image_is_the_same_with_less_memory(
+    rest: LoadedCheckpoint,
+    tiny_scene: Scene,
+    same: Same,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    rays = tiny_scene.static.test.cameras.image_rays(0)
+    rays = rays[torch.arange(len(rays)).repeat(2)]
+    whole = Renderer(rest.model).picture(rays, 0.0, 1.0)
+    usual, tried = module.render, []
+
+    def render(some: Rays, *others: Any, **named: Any) -> Any:
+        tried.append(len(some))
+        if len(some) > 450:
+            raise torch.OutOfMemoryError("CUDA out of memory.")
+        return usual(some, *others, **named)
+
+    monkeypatch.setattr(module, "render", render)
+    same(Renderer(rest.model).picture(rays, 0.0, 1.0), whole)
+    assert tried == [864, 432, 432]
+    assert caplog.messages[-1].startswith("out of memory: pictures are rendered 432 rays")
+
+
+class Walls:
+    """A red wall at x = 0.5 and a blue one at x = −0.5, seen along −x from NEAR to FAR."""
+
+    box = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+    depth_limits = NEAR, FAR
+    device = torch.device("cpu")
+    chunk, at_rest = 2, False
+
+    def __init__(self, space: Space = WORLD) -> None:
+        self.space = space
+
+    def at(self, time: float, *, half: bool = False) -> Walls:
+        return self
+
+    def render(self, rays: Rays, background: Tensor) -> RenderedImage:
+        color, depth = background.repeat(len(rays), 1), torch.zeros(len(rays))
+        for wall, paint in ((-0.5, BLUE), (0.5, RED)):
+            distance = (rays.origins[:, 0] - wall) / -rays.directions[:, 0]
+            hit = (distance >= NEAR) & (distance <= FAR)
+            color[hit], depth[hit] = paint, distance[hit]
+        return RenderedImage(color, depth, (depth > 0).float())
+
+
+def along(x: float) -> Rays:
+    """Rays from (x, 0, 0) and (x, 5, 0), which passes the box by, along −x."""
+    ahead = torch.tensor([[-1.0, 0, 0]]).repeat(2, 1)
+    return Rays(torch.tensor([[x, 0.0, 0.0], [x, 5.0, 0.0]]), ahead, ahead)
+
+
+@pytest.mark.parametrize("space", [WORLD, ContractedSpace((-1.0,) * 3, (1.0,) * 3)])
+@pytest.mark.parametrize(
+    ("low", "high", "color", "depth"),
+    [
+        (-1.0, 1.0, RED, 2.5),
+        (-1.0, 0.0, BLUE, 3.5),  # the red wall is cut away before it
+        (0.0, 1.0, RED, 2.5),
+        (-0.3, 0.3, torch.ones(3), 0.0),  # between them; the blue one is behind the box
+    ],
+)
+def test_what_is_outside_a_crop_is_left_out(
+    space: Space, low: float, high: float, color: Tensor, depth: float
+) -> None:
+    crop = Box((low, -1.0, -1.0), (high, 1.0, 1.0))
+    seen = Renderer(Walls(space)).picture(along(3.0), 0.0, 1.0, crop)
+    torch.testing.assert_close(seen.color[0], color)
+    assert float(seen.depth[0]) == pytest.approx(depth)
+    assert float(seen.opacity[0]) == (depth > 0)
+    assert seen.color[1].tolist() == [1, 1, 1] and float(seen.opacity[1]) == 0
+
+
+def test_a_distant_camera_is_cropped_to_the_box() -> None:
+    renderer, rays = Renderer(Walls()), along(30.0)
+    assert float(renderer.picture(rays, 0.0, 1.0).opacity[0]) == 0  # beyond the far limit
+    box = renderer.reach(rays.origins[0])
+    assert box == Walls.box
+    seen = renderer.picture(rays, 0.0, 1.0, box)
+    assert (float(seen.depth[0]), seen.color[0].tolist()) == (29.5, RED.tolist())
+    assert renderer.reach(torch.tensor([3.0, 0, 0])) is None

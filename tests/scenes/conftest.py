@@ -17,8 +17,7 @@ import torch
 
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
-from devrf.geometry.cameras import Cameras
-from devrf.geometry.distortion import Distortion
+from devrf.geometry.cameras import Cameras, Distortion
 from devrf.scenes.lens import Lens
 from devrf.scenes.reader import SceneReader
 from devrf.scenes.resampling import shrink_pixels

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from devrf.geometry.distortion import Distortion
+from devrf.geometry.cameras import Distortion
 from devrf.scenes.colmap import ColmapReader
 from devrf.scenes.colmap_model import read_model
 from devrf.scenes.lens import Lens
@@ -74,7 +74,7 @@ def test_every_eighth_image_is_held_out_and_nothing_moves(folder, message_of):
 def test_the_world_is_upright_around_what_is_looked_at(folder):
     """The ring is level, at a distance of 4 already: turned about z at most."""
     scene = ColmapReader(folder, downscale=1).read()
-    assert scene.kind == "inward" and scene.space.straight  # balls that are cut out: mattes
+    assert scene.kind == "inward" and scene.space.is_linear  # balls that are cut out: mattes
     cameras = scene.static.train.cameras
     torch.testing.assert_close(cameras.positions.norm(dim=1), torch.full((14,), 4.0))
     torch.testing.assert_close(cameras.positions[:, 2], torch.full((14,), 1.2), atol=1e-4, rtol=0)
@@ -90,7 +90,7 @@ def without_mattes(folder: Path) -> None:
 def test_photographs_are_of_a_scene_without_end(folder):
     without_mattes(folder)
     scene = ColmapReader(folder, downscale=1).read()
-    assert not scene.space.straight
+    assert not scene.space.is_linear
     assert scene.bounds.reason == "the sparse model"
     assert scene.bounds.box_source == "what the static cameras all see"
     # Half the depth of the nearest points, which lie on this side of the middle.

@@ -54,7 +54,7 @@ def test_opaque_mattes_say_nothing(ball_views: Callable[..., Views]) -> None:
     views = ball_views(PLACES, 0.4)
     pixels = views.pixels.clone()
     pixels[..., 3] = 255
-    assert not chosen(replace(views, pixels=pixels))[0].straight
+    assert not chosen(replace(views, pixels=pixels))[0].is_linear
 
 
 def test_a_given_box_is_the_inner_box(ball_views: Callable[..., Views]) -> None:
@@ -74,7 +74,7 @@ def test_in_a_room_every_ray_meets_something(tiny_room: Scene) -> None:
         for views in (capture.train, capture.test):
             assert not views.has_alpha
             assert views.depth is not None and bool(views.depth.isfinite().all())
-    assert not tiny_room.space.straight
+    assert not tiny_room.space.is_linear
     # The room stands still while the robot moves.
     flow = tiny_room.dynamic.train.flow
     assert flow is not None and bool(flow.valid[2:].all()) and not bool(flow.valid[:2].any())
@@ -98,7 +98,7 @@ def test_a_room_reads_back_as_it_was_written(tiny_room: Scene, tmp_path: Path) -
 
 
 def test_methods_that_see_the_moving_views_alone_stay_endless(tiny_room: Scene) -> None:
-    assert not dynamic_only(tiny_room).space.straight
+    assert not dynamic_only(tiny_room).space.is_linear
 
 
 def test_surroundings_are_checked(tiny_room_recipe: ProceduralScene) -> None:

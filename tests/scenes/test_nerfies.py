@@ -14,7 +14,7 @@ import imageio.v3 as iio
 import pytest
 import torch
 
-from devrf.geometry.distortion import Distortion
+from devrf.geometry.cameras import Distortion
 from devrf.scenes.lens import Lens
 from devrf.scenes.nerfies import NerfiesReader
 
@@ -154,7 +154,7 @@ def test_without_mattes_the_box_holds_the_backdrop(folder):
         image = iio.imread(folder.root / f"rgb/1x/{item}.png")
         iio.imwrite(folder.root / f"rgb/1x/{item}.png", image[..., :3])
     endless = NerfiesReader(folder.root, downscale=1).read()
-    assert not endless.space.straight and endless.bounds.reason.startswith("the images have no")
+    assert not endless.space.is_linear and endless.bounds.reason.startswith("the images have no")
     scene = NerfiesReader(folder.root, downscale=1, space="world").read()
     cameras, box = scene.static.train.cameras, scene.bounds.box
     for camera in range(len(cameras)):

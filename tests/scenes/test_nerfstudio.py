@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import torch
 
-from devrf.geometry.distortion import Distortion
+from devrf.geometry.cameras import Distortion
 from devrf.scenes.lens import Lens
 from devrf.scenes.nerfstudio import NerfstudioReader
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from devrf.geometry.average_pose import average_pose
+from devrf.geometry.poses import average_pose
 from devrf.geometry.rays import Rays
 from devrf.scenes.procedural import ProceduralForwardScene
 from devrf.scenes.procedural.backdrop import FLOOR

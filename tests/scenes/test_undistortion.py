@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from devrf.errors import DevrfError
-from devrf.geometry.distortion import Distortion
+from devrf.geometry.cameras import Distortion
 from devrf.scenes.lens import Lens
 from devrf.scenes.resampling import look_up_pixels
 from devrf.scenes.undistortion import as_pinhole

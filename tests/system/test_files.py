@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all."""
+"""Files that are written whole or not at all, and the room on their disk."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from devrf.system.files import atomic_write, write_json
+from devrf.system.files import atomic_write, free_disk, write_json
 
 
 def test_a_finished_file_stands_under_its_name_alone(tmp_path: Path) -> None:
@@ -72,3 +72,7 @@ def test_json_takes_the_place_of_what_was_there(tmp_path: Path) -> None:
     path.write_text("{ damaged")
     write_json(path, {"a": 1, "b": {"c": None}})
     assert json.loads(path.read_text()) == {"a": 1, "b": {"c": None}}
+
+
+def test_a_disk_is_that_of_the_first_folder_that_exists(tmp_path: Path) -> None:
+    assert free_disk(tmp_path) == pytest.approx(free_disk(tmp_path / "not" / "yet"), rel=0.05)

@@ -1,17 +1,28 @@
-"""Settings of the C library and the system for a process that trains."""
+"""A process that trains: its settings, and signals, which the innermost block handles."""
 
 from __future__ import annotations
 
 import gc
 import mmap
 import os
+import signal
 import sys
+import threading
+from collections.abc import Iterator
 from types import ModuleType
 
 import pytest
 
 from devrf.apps.records import peak_host_memory
-from devrf.system.process import forget_peak_memory, importing, tune_for_cpu
+from devrf.system.process import (
+    STOP_SIGNALS,
+    Interrupted,
+    end_at_once,
+    forget_peak_memory,
+    handle_signals,
+    importing,
+    tune_for_cpu,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -21,17 +32,14 @@ def own_environment(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.delenv(name)
 
 
-def test_threads_spin_briefly() -> None:
+def test_threads_spin_briefly_unless_the_user_has_set_something(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     tune_for_cpu()
     assert os.environ["GOMP_SPINCOUNT"] == "1000"
-
-
-@pytest.mark.parametrize("name", ["GOMP_SPINCOUNT", "OMP_WAIT_POLICY"])
-def test_what_the_user_has_set_stays(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(name, "ACTIVE")
+    monkeypatch.setenv("GOMP_SPINCOUNT", "ACTIVE")
     tune_for_cpu()
-    assert os.environ[name] == "ACTIVE"
-    assert len({"GOMP_SPINCOUNT", "OMP_WAIT_POLICY"} & set(os.environ)) == 1
+    assert os.environ["GOMP_SPINCOUNT"] == "ACTIVE"
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the system cannot forget")
@@ -71,3 +79,75 @@ def test_new_modules_are_left_alone_by_later_looks(monkeypatch: pytest.MonkeyPat
     with importing():
         monkeypatch.setitem(sys.modules, "new", ModuleType("new"))
     assert kept("new")
+
+
+@pytest.fixture(autouse=True)
+def handlers_as_before() -> Iterator[None]:
+    before = {number: signal.getsignal(number) for number in STOP_SIGNALS}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def send(*numbers: int) -> None:
+    for number in numbers:
+        os.kill(os.getpid(), number)
+
+
+@pytest.mark.parametrize("number", STOP_SIGNALS)
+def test_a_block_handles_signals_and_restores_the_handlers(number: int) -> None:
+    before = signal.getsignal(number)
+    heard: list[int] = []
+    with handle_signals(heard.append):
+        send(number)
+    assert heard == [number]
+    assert signal.getsignal(number) == before
+
+
+def test_the_inner_block_comes_first() -> None:
+    outer: list[int] = []
+    inner: list[int] = []
+    with handle_signals(outer.append):
+        with handle_signals(inner.append):
+            send(signal.SIGTERM)
+        send(signal.SIGINT)
+    assert (outer, inner) == ([signal.SIGINT], [signal.SIGTERM])
+
+
+def test_other_programs_handlers_stay() -> None:
+    theirs: list[int] = []
+    ours: list[int] = []
+    signal.signal(signal.SIGUSR2, lambda number, frame: theirs.append(number))
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with handle_signals(ours.append):
+        send(signal.SIGUSR2, signal.SIGINT, signal.SIGTERM)
+    assert (theirs, ours) == ([signal.SIGUSR2], [signal.SIGTERM])
+
+
+def test_signals_are_taken_back_from_a_library() -> None:
+    heard: list[int] = []
+    with handle_signals(heard.append) as take:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        take()
+        send(signal.SIGTERM)
+    assert heard == [signal.SIGTERM]
+
+
+def test_outside_the_main_thread_nothing_is_taken() -> None:
+    found: list[object] = []
+
+    def work() -> None:
+        with handle_signals(end_at_once):
+            found.append(signal.getsignal(signal.SIGTERM))
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert found == [signal.getsignal(signal.SIGTERM)]
+
+
+def test_ending_at_once_has_the_status_of_a_shell() -> None:
+    with pytest.raises(Interrupted) as caught, handle_signals(end_at_once):
+        send(signal.SIGTERM)
+    assert caught.value.code == 143
+    assert not isinstance(caught.value, Exception)  # no handler of errors catches it

@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from lightning import Callback, LightningModule, Trainer
 
 from devrf.callbacks.periodic_checkpoint import PeriodicCheckpoint
-from devrf.system.signals import Interrupted, handle_signals
+from devrf.system.process import Interrupted, handle_signals
 
 
 class StopOnSignal(Callback):

@@ -11,7 +11,7 @@ from lightning import Callback, LightningModule, Trainer
 from devrf.callbacks.previews import Previews
 from devrf.engine.stage import ScheduledStage
 from devrf.ops.dispatch import triton_runs
-from devrf.system.speed import wait
+from devrf.system.device import wait
 
 
 class TrainingRecord(Callback):

@@ -202,7 +202,7 @@ def estimate(
     canonical, architecture = fitted_to(scene, canonical, architecture)
     voxels, sizes = round(canonical.side**3), (architecture.channels, architecture.width)
     with torch.device("meta"):
-        box = (scene.space.straight and scene.bounds.motion) or scene.bounds.box
+        box = (scene.space.is_linear and scene.bounds.motion) or scene.bounds.box
         field = architecture.radiance_field(box, voxels, voxels)
     occupied = OCCUPIED if field.planes is None else 1.0
 

@@ -17,8 +17,8 @@ from devrf.cli.memory import IMAGES, Budget, Parts, estimate, module_needs, tens
 from devrf.cli.scene_stages import stages_with_images
 from devrf.engine.micro_batching import MicroBatching
 from devrf.errors import DevrfError
-from devrf.system.machine import free_disk, free_host_memory, free_memory, own_memory
-from devrf.system.out_of_memory import gib, is_oom, numbers
+from devrf.system.files import free_disk
+from devrf.system.memory import free_host_memory, free_memory, gib, is_oom, numbers, own_memory
 
 # Keys that lower the need, by the stage that ran out of memory.
 LOWER = {

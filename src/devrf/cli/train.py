@@ -22,7 +22,7 @@ from devrf.cli.resume import ResumePoint, beginning, remove_progress
 from devrf.engine.stage import ScheduledStage
 from devrf.errors import DevrfError
 from devrf.system.files import atomic_write
-from devrf.system.signals import Interrupted
+from devrf.system.process import Interrupted
 
 log = logging.getLogger(__name__)
 

@@ -16,7 +16,7 @@ from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene
-from devrf.system.signals import handle_signals
+from devrf.system.process import handle_signals
 
 log = logging.getLogger(__name__)
 

@@ -26,7 +26,7 @@ class RecordedDataModule(SceneDataModule):
         """Read the scene, and estimate its optical flow if that is asked for."""
         scene = self.reader.read()
         if scene.kind == "inward":
-            bounds, kind = scene.bounds, "world" if scene.space.straight else "contracted"
+            bounds, kind = scene.bounds, "world" if scene.space.is_linear else "contracted"
             log.info(
                 "%s: %s space (%s), box from %s", scene.name, kind, bounds.reason, bounds.box_source
             )

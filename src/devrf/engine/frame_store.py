@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from devrf.ops.resampling import resample
-from devrf.system.page_locked import page_locked
+from devrf.system.memory import page_locked
 
 log = logging.getLogger(__name__)
 

@@ -18,9 +18,9 @@ from devrf.engine.micro_batching import MicroBatching
 from devrf.engine.streams import StreamParallel
 from devrf.ops.adam import GridAdam
 from devrf.rendering.sample_capacity import SampleCapacity
-from devrf.system.out_of_memory import OutOfMemoryError
+from devrf.system.device import wait
+from devrf.system.memory import OutOfMemoryError
 from devrf.system.profiling import measured, span
-from devrf.system.speed import wait
 
 
 @dataclass

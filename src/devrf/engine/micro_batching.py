@@ -11,7 +11,7 @@ from torch import Tensor
 from devrf.data.batch import Pixels
 from devrf.engine.ddp import world_size
 from devrf.errors import DevrfError
-from devrf.system.out_of_memory import OutOfMemoryError, free_cache, is_oom, numbers
+from devrf.system.memory import OutOfMemoryError, free_cache, is_oom, numbers
 
 log = logging.getLogger(__name__)
 

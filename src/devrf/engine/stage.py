@@ -38,7 +38,7 @@ from devrf.ops.adam import GridAdam
 from devrf.rendering.renderer import Renderer
 from devrf.rendering.view import Viewable
 from devrf.scenes.scene import CaptureName, Scene, Views
-from devrf.system.out_of_memory import OutOfMemoryError
+from devrf.system.memory import OutOfMemoryError
 
 
 class Phase(Protocol):

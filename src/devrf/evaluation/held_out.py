@@ -8,9 +8,8 @@ import torch
 from torch import Tensor
 
 from devrf.evaluation.suite import MetricInput, MetricSuite
-from devrf.metrics.image import psnr, ssim
-from devrf.metrics.masked import psnr_masked, ssim_masked, ssim_within
-from devrf.rendering.rendered_image import RenderedImage
+from devrf.metrics.image import psnr, psnr_masked, ssim, ssim_masked, ssim_within
+from devrf.rendering.output import RenderedImage
 from devrf.rendering.renderer import Renderer
 from devrf.rendering.view import Viewable
 from devrf.scenes.scene import Background, Views
@@ -71,7 +70,7 @@ def score(
         renderer: of the learned scene.
         views: the held-out views, on the host.
         index: which of them.
-        background: what is behind the matte.
+        background: what is behind the alpha mask.
         suite: metrics beside PSNR and SSIM.
         time: the time to render, in [0, 1]; None: the image's own.
     """
@@ -87,21 +86,11 @@ def score(
     valid_mask = views.valid_mask_of(index)
     compared, rest = (compare(image, truth, valid_mask) for image in (prediction, rest))
     further: dict[str, float | None] = {}
-    shape = (views.height, views.width)
-    opacity = seen.opacity.cpu().view(shape)
+    opacity = seen.opacity.cpu().view(truth.shape[:2])
     if suite is not None and suite.metrics:
-        distance = _world_distance(renderer.model, views, index, seen)
+        distance = _world_distance(renderer.model, views, index, seen).view(truth.shape[:2])
         further = suite.scores(
-            MetricInput(
-                renderer,
-                views,
-                index,
-                compared,
-                truth,
-                distance.view(shape),
-                opacity,
-                suite.lpips,
-            )
+            MetricInput(renderer, views, index, compared, truth, distance, opacity, suite.lpips)
         )
     return HeldOutView(
         name=views.names[index],
@@ -113,35 +102,32 @@ def score(
         rest_pose_psnr=_psnr(rest, truth, valid_mask),
         further=further,
         compared=compared,
-        depth=seen.depth.cpu().view(shape),
+        depth=seen.depth.cpu().view(truth.shape[:2]),
         opacity=opacity,
     )
 
 
 def compare(prediction: Tensor, truth: Tensor, valid_mask: Tensor | None) -> Tensor:
     """The prediction (H, W, 3) of a held-out image; the truth where pixels are not valid."""
-    return (
-        prediction if valid_mask is None else torch.where(valid_mask[..., None], prediction, truth)
-    )
+    if valid_mask is None:
+        return prediction
+    return torch.where(valid_mask[..., None], prediction, truth)
 
 
 def _psnr(compared: Tensor, truth: Tensor, valid_mask: Tensor | None) -> float:
-    if valid_mask is None:
-        return psnr(compared, truth)
-    inside = psnr_masked(compared, truth, valid_mask)
-    assert inside is not None  # readers refuse a mask that leaves nothing
-    return inside
+    # Readers refuse a mask that leaves nothing.
+    value = None if valid_mask is None else psnr_masked(compared, truth, valid_mask)
+    return psnr(compared, truth) if value is None else value
 
 
 def _ssim(compared: Tensor, truth: Tensor, valid_mask: Tensor | None) -> float:
-    if valid_mask is None:
-        return ssim(compared, truth)
     # Where no window has valid pixels alone, those centred on valid pixels are taken; where these
     # are at the image's rim, all windows.
-    for measure in (ssim_within, ssim_masked):
-        found = measure(compared, truth, valid_mask)
-        if found is not None:
-            return found
+    if valid_mask is not None:
+        for measure in (ssim_within, ssim_masked):
+            value = measure(compared, truth, valid_mask)
+            if value is not None:
+                return value
     return ssim(compared, truth)
 
 

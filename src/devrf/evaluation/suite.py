@@ -9,14 +9,14 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from devrf.data.batch import pixel_positions
+from devrf.data.correspondence import previous_images
 from devrf.errors import DevrfError, did_you_mean
-from devrf.evaluation.held_out_flow import flow_error
-from devrf.metrics.geometric import depth_error
-from devrf.metrics.image import ms_ssim
-from devrf.metrics.masked import psnr_masked, ssim_masked
-from devrf.metrics.perceptual import Lpips
-from devrf.metrics.pretrained import Network, load_lpips
+from devrf.metrics.geometric import SOLID, depth_error, end_point_error
+from devrf.metrics.image import ms_ssim, psnr_masked, ssim_masked
+from devrf.metrics.lpips import Lpips, Network, load_lpips
 from devrf.rendering.renderer import Renderer
+from devrf.rendering.view import MovingView
 from devrf.scenes.scene import Views
 
 
@@ -46,7 +46,7 @@ class MetricInput:
 
     @property
     def mask(self) -> Tensor:
-        """(H, W) bool, inside the matte at valid pixels; nowhere True of images without one."""
+        """(H, W) bool, inside the alpha mask at valid pixels; nowhere True without one."""
         pixels = self.views.pixels[self.index]
         if not self.views.has_alpha:
             return torch.zeros(pixels.shape[:2], dtype=torch.bool)
@@ -155,3 +155,53 @@ class MetricSuite:
     def scores(self, inputs: MetricInput) -> dict[str, float | None]:
         """Each metric by name; None where there is nothing to compare with."""
         return {name: MEASURES[name](inputs) for name in self.metrics}
+
+
+def flow_error(renderer: Renderer, views: Views, index: int) -> float | None:
+    """Mean end-point error in pixels of image ``index``'s backward flow, where that is known.
+
+    None without flow or an earlier frame, or if the method's views have no motion.
+    """
+    if views.flow is None:
+        return None
+    before = int(previous_images(views)[index])
+    flat = views.flow.valid[index].flatten().nonzero()[:, 0]
+    if before == index or len(flat) == 0:
+        return None
+    seen = seen_flow(renderer, views, index, before, flat)
+    if seen is None:
+        return None
+    return end_point_error(seen, views.flow.vectors[index].view(-1, 2)[flat])
+
+
+@torch.no_grad()
+def seen_flow(
+    renderer: Renderer, views: Views, index: int, before: int, flat: Tensor, chunk: int = 16384
+) -> Tensor | None:
+    """The backward flow (P, 2) in pixels at some pixels of an image; 0 where opacity is below 0.5.
+
+    Args:
+        renderer: of the learned scene.
+        views: the views, on the host.
+        index: the image.
+        before: the same view's image one frame earlier.
+        flat: (P,) row-major numbers of the pixels.
+        chunk: rays rendered at once.
+
+    Returns:
+        None if the method's views have no motion.
+    """
+    view = renderer.at(float(views.times[index]))
+    if not isinstance(view, MovingView):
+        return None
+    device, earlier = renderer.device, float(views.times[before])
+    pixels = pixel_positions(flat, views.width)
+    rays = views.cameras.rays(torch.full_like(flat, index), pixels).to(device)
+    rays, pixels = renderer.model.space.rays(rays), pixels.to(device)
+    camera = views.cameras[[before]].to(device)
+    parts = []
+    for k in range(0, len(rays), chunk):
+        some = slice(k, k + chunk)
+        mean, mass = view.induced_flow(rays[some], pixels[some], camera, earlier)
+        parts.append(torch.where(mass[:, None] > SOLID, mean, torch.zeros_like(mean)))
+    return torch.cat(parts).cpu()

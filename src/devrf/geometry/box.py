@@ -106,13 +106,13 @@ class Box:
         They are made once: a tensor made of Python's numbers at every step would make the device
         wait for the host.
         """
-        low, high = (_kept(corner, like.dtype, like.device) for corner in (self.low, self.high))
+        low, high = (constant(corner, like.dtype, like.device) for corner in (self.low, self.high))
         return low, high
 
     def to_grid(self, points: Tensor, shape: tuple[int, int, int]) -> Tensor:
         """Grid coordinates (..., 3): 0 on the low faces, shape − 1 on the high ones."""
         low, high = self.corners(points)
-        extent = _kept(shape, points.dtype, points.device) - 1
+        extent = constant(shape, points.dtype, points.device) - 1
         return (points - low) * (extent / (high - low))
 
     def grid_points(self, shape: tuple[int, int, int], like: Tensor) -> Tensor:
@@ -142,7 +142,8 @@ class Box:
 
 
 @lru_cache(maxsize=256)
-def _kept(numbers: tuple[float, float, float], dtype: torch.dtype, device: torch.device) -> Tensor:
+def constant(numbers: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Numbers (N,) as a tensor that is made once; to be read only."""
     # A tensor made in inference mode could not be used for training later.
     with torch.inference_mode(False):
         return torch.tensor(numbers, dtype=dtype, device=device)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from dataclasses import dataclass
-from functools import lru_cache
 
 import torch
 from torch import Tensor
+
+from devrf.geometry.box import constant
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,7 @@ class FrameClock:
             The frames before and after each time, int64, and the share of the one after, all of
             the shape of ``times``.
         """
-        clock = _kept(self.times, times.dtype, times.device)
+        clock = constant(self.times, times.dtype, times.device)
         after = torch.searchsorted(clock, times.contiguous() - self.TOLERANCE)
         after = after.clamp(max=len(self) - 1)
         on_frame = (clock[after] - times).abs() <= self.TOLERANCE
@@ -93,10 +94,3 @@ class FrameClock:
         gap = clock[after] - clock[before]
         alone = gap <= 0
         return before, after, torch.where(alone, 0, (times - clock[before]) / gap.where(~alone, 1))
-
-
-@lru_cache(maxsize=64)
-def _kept(times: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-    # A tensor made in inference mode could not be used for training later.
-    with torch.inference_mode(False):
-        return torch.tensor(times, dtype=dtype, device=device)

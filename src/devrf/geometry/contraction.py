@@ -39,7 +39,7 @@ class ContractedSpace:
     high: Xyz
     shell: float = 1.0
 
-    straight: ClassVar[bool] = False
+    is_linear: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         inner = Box.of(list(self.low), list(self.high))

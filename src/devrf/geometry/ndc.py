@@ -1,4 +1,4 @@
-"""Normalised device coordinates: an endless frustum becomes a box (forward-facing scenes).
+"""Normalised device coordinates: an unbounded frustum becomes a box (forward-facing scenes).
 
 With a camera at the origin that looks along −z, focal length f, width W, height H and near
 plane n, a point (x, y, z) maps to (−f·x/(W/2·z), −f·y/(H/2·z), 1 + 2n/z), in [−1, 1]³: the
@@ -37,7 +37,7 @@ class NormalizedDevice:
     focal: tuple[float, float]
     near: float = 1.0
 
-    straight: ClassVar[bool] = True
+    is_linear: ClassVar[bool] = True
     side_factor: ClassVar[float] = 1.0
 
     def inner(self, box: Box) -> Box:

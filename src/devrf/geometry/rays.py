@@ -1,4 +1,4 @@
-"""Rays: half-lines through pixels, in whatever space the fields live in."""
+"""Rays: origin, direction and viewing direction, in whatever space the fields live in."""
 
 from __future__ import annotations
 

@@ -1,14 +1,17 @@
-"""The space that fields live in: the world itself, or an endless part of it made into a box."""
+"""The space that fields live in: the world itself, or an unbounded part of it made into a box."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar, Protocol
 
 from torch import Tensor
 
 from devrf.geometry.box import Box
+from devrf.geometry.contraction import ContractedSpace
+from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.rays import Rays
 
 
@@ -17,11 +20,11 @@ class Space(Protocol):
 
     :class:`WorldSpace` for inward-facing scenes,
     :class:`~devrf.geometry.ndc.NormalizedDevice` for forward-facing ones,
-    :class:`~devrf.geometry.contraction.ContractedSpace` for what has no end on any side.
+    :class:`~devrf.geometry.contraction.ContractedSpace` for what is unbounded on every side.
     """
 
     @property
-    def straight(self) -> bool:
+    def is_linear(self) -> bool:
         """Whether world rays are straight lines in it, walked evenly."""
         ...
 
@@ -63,7 +66,7 @@ class Space(Protocol):
 class WorldSpace:
     """Fields that live in world space: nothing is mapped."""
 
-    straight: ClassVar[bool] = True
+    is_linear: ClassVar[bool] = True
     side_factor: ClassVar[float] = 1.0
 
     def inner(self, box: Box) -> Box:
@@ -92,3 +95,25 @@ class WorldSpace:
 
 
 WORLD = WorldSpace()
+# By the name that a checkpoint has for them.
+KINDS: dict[str, type[NormalizedDevice] | type[ContractedSpace]] = {
+    "ndc": NormalizedDevice,
+    "contracted": ContractedSpace,
+}
+
+
+def space_config(space: Space) -> dict[str, Any]:
+    """A space as plain data with its ``kind``; the world is empty."""
+    for kind, known in KINDS.items():
+        if isinstance(space, known):
+            return {"kind": kind, **asdict(space)}
+    return {}
+
+
+def space_from(config: Mapping[str, Any]) -> Space:
+    """The space that :func:`space_config` described."""
+    if not config:
+        return WORLD
+    values = dict(config)
+    space: Space = KINDS[values.pop("kind")](**values)
+    return space

@@ -23,8 +23,7 @@ from devrf.geometry.box import Box
 from devrf.geometry.space import Space
 from devrf.methods.protocol import ProtocolStage
 from devrf.rendering.output import RenderOutput
-from devrf.rendering.surface_field import SurfaceField
-from devrf.rendering.view import View
+from devrf.rendering.view import SurfaceField, View
 from devrf.scenes.scene import Scene, Views
 
 

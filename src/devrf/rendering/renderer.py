@@ -1,9 +1,13 @@
-"""Renders a learned scene: images of any size, from anywhere, at any time."""
+"""Renders a learned scene: images of any size, from anywhere, at any time, whole or cropped."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import logging
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -11,11 +15,17 @@ from torch import Tensor
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.rays import Rays
-from devrf.geometry.space import WorldSpace
-from devrf.rendering.chunks import in_chunks
-from devrf.rendering.crop import CroppedRays
-from devrf.rendering.rendered_image import RenderedImage
+from devrf.geometry.space import Space, WorldSpace
+from devrf.rendering.output import RenderedImage
 from devrf.rendering.view import Viewable
+from devrf.system.memory import free_cache, is_oom
+
+log = logging.getLogger(__name__)
+
+Part = TypeVar("Part")
+
+# Smaller chunks would hardly need less memory.
+MIN_CHUNK = 256
 
 
 class Renderer:
@@ -51,7 +61,7 @@ class Renderer:
             rays: R rays in world space, on any device.
             time: in [0, 1].
             background: grey level, or RGB (3,).
-            crop: what is outside this box is left out (:class:`~devrf.rendering.crop.CroppedRays`).
+            crop: what is outside this box is left out (:class:`CroppedRays`).
         """
         view = self.at(time)
         if not isinstance(background, Tensor):
@@ -89,16 +99,77 @@ class Renderer:
         away = torch.maximum((position - low).abs(), (position - high).abs()).norm()
         return box if float(away) > far else None
 
-    def stream(
-        self, cameras: Cameras, times: Sequence[float], background: float | Tensor
-    ) -> Iterator[RenderedImage]:
-        """One image after another, each rendered when it is asked for.
+
+def in_chunks(render: Callable[[Rays], Part], rays: Rays, chunk: int) -> list[Part]:
+    """``render(rays[k:l])`` for consecutive chunks of R ``rays``, in order; at least one.
+
+    When memory runs out, this and later chunks are halved, down to ``MIN_CHUNK`` rays.
+    """
+    parts: list[Part] = []
+    first, chunk = 0, min(chunk, max(len(rays), 1))
+    while first < len(rays) or not parts:
+        try:
+            parts.append(render(rays[first : first + chunk]))
+            first += chunk
+            continue
+        except (RuntimeError, MemoryError) as error:
+            if chunk // 2 < MIN_CHUNK or not is_oom(error):
+                raise
+        # Outside the handler, where the error's traceback no longer holds tensors.
+        free_cache(rays.origins.device)
+        chunk //= 2
+        log.warning("out of memory: pictures are rendered %d rays at a time", chunk)
+    return parts
+
+
+@dataclass(frozen=True)
+class CroppedRays:
+    """Rays that begin where they enter a box.
+
+    What is before the box is cut off exactly. What is behind it is left out pixel by pixel: where
+    the mean depth lies behind the box, the background is seen.
+
+    Attributes:
+        rays: the K of R rays that meet the box, in the fields' space, from where they enter it.
+        hit: (R,) bool, which they are.
+        skipped: (K,) the distance from the origin of each ray to where it begins now.
+        length: (K,) the distance from there to where it leaves the box.
+    """
+
+    rays: Rays
+    hit: Tensor
+    skipped: Tensor
+    length: Tensor
+
+    @staticmethod
+    def of(rays: Rays, box: Box, space: Space, near: float) -> CroppedRays:
+        """Crop world rays.
 
         Args:
-            cameras: N cameras.
-            times: N times in [0, 1].
-            background: as for :meth:`picture`.
+            rays: R rays in world space.
+            box: in the fields' space; of a contracted scene in its inner box, where that is the
+                world.
+            space: the fields' space.
+            near: the distance before which a view samples nothing.
         """
-        cameras = cameras.to(self.device)
-        for index, time in enumerate(times):
-            yield self.view(cameras, index, time, background)
+        lines = space.rays(rays) if space.is_linear else rays
+        entry, leave = lines.crossing(*box.corners(lines.origins), 0.0, math.inf)
+        hit = entry < leave
+        lines, entry, leave = lines[hit], entry[hit], leave[hit]
+        skipped = (entry - near).clamp(min=0)
+        lines = replace(lines, origins=lines.origins + skipped[:, None] * lines.directions)
+        if not space.is_linear:
+            lines = space.rays(lines)
+        return CroppedRays(lines, hit, skipped, leave - skipped)
+
+    def completed(self, image: RenderedImage, background: Tensor) -> RenderedImage:
+        """The image of all R rays from that of the K, with the background (3,) elsewhere."""
+        inside = image.depth <= self.length
+        seen = self.hit.clone()
+        seen[self.hit] = inside
+        color = background.expand(len(self.hit), 3).clone()
+        color[seen] = image.color[inside]
+        depth, opacity = (torch.zeros_like(self.hit, dtype=color.dtype) for _ in range(2))
+        depth[seen] = (image.depth + self.skipped)[inside]
+        opacity[seen] = image.opacity[inside]
+        return RenderedImage(color, depth, opacity)

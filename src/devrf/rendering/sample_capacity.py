@@ -13,8 +13,8 @@ log = logging.getLogger(__name__)
 class SampleCapacity:
     """The lengths of the lists of a batch's samples, adapted to the numbers that were needed.
 
-    A list that was too short has lost the samples of the batch's last rays. The host learns this a
-    few steps later, without waiting for the device, and lengthens the lists.
+    Where a list was too short, samples of the batch's last rays were dropped. The host learns this
+    a few steps later, without waiting for the device, and lengthens the lists.
 
     Attributes:
         visible: length of the list of visible samples.
@@ -75,8 +75,8 @@ class SampleCapacity:
         if visible > self.visible or significant > self.significant:
             if not self.num_short:
                 log.info(
-                    "a batch had %d samples, %d of them to be coloured, for %d and %d places: its "
-                    "last rays lost theirs, and the lists grow",
+                    "a batch had %d samples, %d of them to be coloured, for %d and %d places: "
+                    "samples of the last rays were dropped, and the lists grow",
                     *(visible, significant, *before),
                 )
             self.num_short += 1

@@ -1,4 +1,4 @@
-"""A scene at one time: what films, stills, evaluation and the viewer need of a method."""
+"""What films, stills, evaluation, the viewer and exports need of a method."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import Space
-from devrf.rendering.rendered_image import RenderedImage
+from devrf.rendering.output import RenderedImage
 
 
 class View(Protocol):
@@ -88,5 +88,35 @@ class Viewable(Protocol):
         Args:
             time: in [0, 1].
             half: run networks in half precision where device and method allow it.
+        """
+        ...
+
+
+class SurfaceField(Protocol):
+    """What is where at rest, as a function of canonical points in the fields' space."""
+
+    @property
+    def box(self) -> Box:
+        """What holds the scene at rest, in the fields' space."""
+        ...
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Points along x, y, z of a grid over the box that is as fine as the field."""
+        ...
+
+    def optical_depth(self, points: Tensor) -> Tensor:
+        """τ (M,) of a way of one voxel at ``points`` (M, 3), so that its opacity is 1 − exp(−τ).
+
+        0 where nothing is rendered.
+        """
+        ...
+
+    def color(self, points: Tensor, viewdirs: Tensor) -> Tensor:
+        """RGB (M, 3) in [0, 1], as in the images, at ``points`` (M, 3).
+
+        Args:
+            points: in the fields' space.
+            viewdirs: (M, 3) unit viewing directions in world space, from the eye to the points.
         """
         ...

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from devrf.geometry.distortion import Distortion
+from devrf.geometry.cameras import Distortion
 from devrf.scenes.intrinsics import Intrinsics
 from devrf.scenes.validation import LARGEST, scene_error
 

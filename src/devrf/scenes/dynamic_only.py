@@ -23,6 +23,6 @@ def dynamic_only(scene: Scene) -> Scene:
     if isinstance(scene.space, NormalizedDevice):
         bounds = forward_bounds([views], scene.space, "all that the dynamic cameras see")
         return replace(scene, static=Capture(*at_rest), bounds=bounds)
-    choice: SpaceChoice = "world" if scene.space.straight else "contracted"
+    choice: SpaceChoice = "world" if scene.space.is_linear else "contracted"
     space, bounds = inward_space(choice, views, views, [views, held_out])
     return replace(scene, static=Capture(*at_rest), bounds=bounds, space=space)

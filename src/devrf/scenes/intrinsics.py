@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel
 
-from devrf.geometry.distortion import Distortion
+from devrf.geometry.cameras import Distortion
 from devrf.scenes.json_files import Number, Positive
 from devrf.scenes.lens import MOST_FOCAL, Lens
 from devrf.scenes.validation import abbreviated, same_shape, scene_error

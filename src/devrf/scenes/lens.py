@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from devrf.geometry.distortion import Distortion
+from devrf.geometry.cameras import Distortion
 
 # Focal lengths as shares of the image's longer side: a view of 0.0006 to 178.9 degrees.
 LEAST_FOCAL = 0.01

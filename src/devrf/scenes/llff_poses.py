@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from devrf.geometry.average_pose import average_pose, relative_to
 from devrf.geometry.cameras import Cameras
+from devrf.geometry.poses import average_pose, relative_to
 from devrf.scenes.array_files import Numbers, read_numbers
 from devrf.scenes.lens import LEAST_FOCAL, MOST_FOCAL, MOST_OFFSET
 from devrf.scenes.poses import FARTHEST, in_reach, is_rotation

@@ -8,7 +8,7 @@ import torch
 from pydantic import AliasChoices, BaseModel, Field, TypeAdapter
 from torch import Tensor
 
-from devrf.geometry.distortion import Distortion
+from devrf.geometry.cameras import Distortion
 from devrf.scenes.intrinsics import Intrinsics
 from devrf.scenes.json_files import Number, Positive, Vector2, Vector3, read_json
 from devrf.scenes.paths import inside

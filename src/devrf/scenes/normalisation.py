@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from devrf.geometry.average_pose import average_pose, relative_to
+from devrf.geometry.poses import average_pose, relative_to
 from devrf.scenes.colmap_model import SparseModel
 from devrf.scenes.poses import FARTHEST, in_reach
 from devrf.scenes.validation import scene_error

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import torch
 
-from devrf.geometry.average_pose import average_pose, relative_to
+from devrf.geometry.poses import average_pose, relative_to
 from devrf.scenes.bounds import STILL
 from devrf.scenes.forward_bounds import forward_bounds, reference_space
 from devrf.scenes.scene import Background, Capture, Scene, Views

@@ -1,10 +1,11 @@
-"""Files that are written whole or not at all, and the folders that they are in."""
+"""Files that are written whole or not at all, their folders, and the room on the disk."""
 
 from __future__ import annotations
 
 import errno
 import json
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -66,3 +67,9 @@ def write_json(path: Path, values: dict[str, Any]) -> None:
     """Write ``values`` as an indented JSON object."""
     with atomic_write(path) as partial:
         partial.write_text(json.dumps(values, indent=2) + "\n")
+
+
+def free_disk(folder: Path) -> int:
+    """Bytes that can be written to ``folder``, which need not exist yet."""
+    there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    return shutil.disk_usage(there).free

@@ -89,7 +89,7 @@ def test_cameras_around_a_thing_share_a_contracted_world(footage, tmp_path):
     settings = {"static": walk, "views": views, "into": into, "offsets": [0, 0, 0]}
     scene_from_footage(CaptureSettings(**settings))
     scene = read(into)
-    assert not scene.space.straight
+    assert not scene.space.is_linear
     assert scene.bounds.reason == "scene_bounds in transforms.json"
     assert scene.bounds.box_source == "what the static cameras all see"
     assert [len(v) for v in (scene.dynamic.train, scene.dynamic.test)] == [12, 6]
@@ -110,7 +110,7 @@ def test_mattes_make_a_world_of_the_thing_and_are_found_again(footage, tmp_path,
     scene_from_footage(CaptureSettings(**settings, mattes=tmp_path / "mattes"))
     scene = read(into)
     assert scene.static.train.cut_out and scene.dynamic.test.cut_out
-    assert scene.space.straight and scene.bounds.motion is not None
+    assert scene.space.is_linear and scene.bounds.motion is not None
     # Found again as long as no matte changes.
     scene_from_footage(CaptureSettings(**settings, mattes=tmp_path / "mattes"))
     assert len(found) == 1
@@ -125,7 +125,7 @@ def test_subtraction_gives_the_box_of_what_moves(footage, tmp_path):
     settings = {"static": walk, "views": views, "into": tmp_path / "scene", "offsets": [0, 0, 0]}
     scene_from_footage(CaptureSettings(**settings, mattes="subtract"))
     scene = read(tmp_path / "scene")
-    assert not scene.static.train.has_alpha and not scene.space.straight
+    assert not scene.static.train.has_alpha and not scene.space.is_linear
     assert scene.bounds.box_source == "scene_bounds in transforms.json"
     # Its box is another than that of all sparse points, 1.2 units wide and their margin.
     box = Box.of(scene.space.low, scene.space.high)

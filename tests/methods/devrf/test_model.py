@@ -19,7 +19,7 @@ from devrf.methods.devrf.deformed_occupancy import deformed_occupancy
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import RenderSettings
 from devrf.rendering.occupancy import Occupancy, dilate
-from devrf.rendering.rendered_image import RenderedImage
+from devrf.rendering.output import RenderedImage
 from devrf.rendering.renderer import Renderer
 
 SIDE = 11

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from devrf.geometry.rigid_motion import rigid_motion
+from devrf.geometry.poses import rigid_motion
 from devrf.methods.nerfies.elastic import drawn, jacobians, robust, strain
 
 

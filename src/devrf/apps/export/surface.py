@@ -15,7 +15,7 @@ from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.space import Space
-from devrf.rendering.surface_field import SurfaceField
+from devrf.rendering.view import SurfaceField
 
 # Points at which a field is asked at once.
 CHUNK = 2**18

@@ -128,7 +128,7 @@ def _looking_away(scene: Scene) -> Iterator[Advice]:
 
 def _box_unknown(scene: Scene) -> Iterator[Advice]:
     views, box = scene.static.train, scene.bounds.box
-    if scene.kind != "inward" or not scene.space.straight or views.has_alpha:
+    if scene.kind != "inward" or not scene.space.is_linear or views.has_alpha:
         return
     try:
         guessed = box_from_cameras(views.cameras)

@@ -239,7 +239,7 @@ def _colors(change: float, drift: float | None) -> str:
 def _space(scene: Scene) -> str:
     """The space that fields live in, and why."""
     name = "normalised device coordinates" if scene.kind == "forward" else "the world"
-    if not scene.space.straight:
+    if not scene.space.is_linear:
         name = "contracted: beyond the box everything to infinity is squeezed into a shell"
     return name + _why(scene.bounds.reason)
 

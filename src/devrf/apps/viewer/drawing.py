@@ -16,9 +16,8 @@ from devrf.apps.viewer.cameras import Pose
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.rays import Rays
-from devrf.rendering.chunks import in_chunks
-from devrf.rendering.rendered_image import RenderedImage
-from devrf.rendering.renderer import Renderer
+from devrf.rendering.output import RenderedImage
+from devrf.rendering.renderer import Renderer, in_chunks
 from devrf.rendering.view import MovingView
 
 # Motion is shown as optical flow over so much time, and saturated at this share of the height.
@@ -40,7 +39,7 @@ class Shot:
         time: in [0, 1].
         channel: ``color``, ``depth``, ``opacity`` or ``motion``.
         beside_rest: whether the rest state is shown beside, on the left.
-        crop: leave out what is outside this box (see :class:`~devrf.rendering.crop.CroppedRays`).
+        crop: leave out what is outside this box (:class:`~devrf.rendering.renderer.CroppedRays`).
         with_depth: whether distances are asked for, to hide what is behind the scene.
     """
 

@@ -48,7 +48,7 @@ class Architecture:
 
     def in_space(self, space: Space, side: float) -> Architecture:
         """The sizes that hold in ``space`` for a grid of ``side`` voxels along an edge."""
-        if space.straight:
+        if space.is_linear:
             return self
         return replace(self, alpha_init=1 - (1 - self.contracted_opacity) ** (1 / side))
 

@@ -144,7 +144,7 @@ class CanonicalSchedule:
 
         Sides are longer by the space's factor; ``doublings`` and ``directions_from`` are filled in.
         """
-        if space.straight:
+        if space.is_linear:
             return self
         side, late = self.side * space.side_factor, self.directions_from
         return replace(

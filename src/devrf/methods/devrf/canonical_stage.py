@@ -224,7 +224,7 @@ class CanonicalStage(VoxelStage):
                 "data.background, or give it more schedule.canonical.search_iterations"
             )
         bounds = self.scene.bounds
-        if not self.scene.space.straight:
+        if not self.scene.space.is_linear:
             box = occupancy.box
         elif bounds.motion is None:
             box = tight.scaled(bounds.scale)

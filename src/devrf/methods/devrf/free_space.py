@@ -39,7 +39,7 @@ def possible_matter(
     if 1 < least_views <= len(positions):
         possible &= view_count(cameras, points) >= least_views
     at_rest = float(views.times.max() - views.times.min()) <= FrameClock.TOLERANCE
-    if carve and space.straight and views.has_alpha and at_rest:
+    if carve and space.is_linear and views.has_alpha and at_rest:
         possible &= visual_hull(views, box, shape, device)
     return possible.cpu()
 

@@ -13,8 +13,7 @@ from torch import Tensor, nn
 from devrf.data.batch import RayBatch
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
-from devrf.geometry.space import WORLD, Space
-from devrf.geometry.space_config import space_config, space_from
+from devrf.geometry.space import WORLD, Space, space_config, space_from
 from devrf.methods.base import DynamicModel
 from devrf.methods.devrf.appearance import AppearanceField, ColorResidual
 from devrf.methods.devrf.architecture import Architecture
@@ -192,7 +191,7 @@ class DeVRFModel(DynamicModel):
     def stored_state(self) -> dict[str, Any]:
         """The state with packed grids (``compact_state``)."""
         fields = self.occupancy, self.canonical, self.deformation, self.occupancy_at
-        endless = not self.space.straight
+        endless = not self.space.is_linear
         return compact_state(self.state_dict(), *fields, self.appearance, endless=endless)
 
     def load_stored_state(self, state: Mapping[str, Any]) -> None:

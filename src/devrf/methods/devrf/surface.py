@@ -11,7 +11,7 @@ from devrf.rendering.occupancy import Occupancy
 
 
 class CanonicalSurface:
-    """The radiance field at rest, as :class:`~devrf.rendering.surface_field.SurfaceField`.
+    """The radiance field at rest, as :class:`~devrf.rendering.view.SurfaceField`.
 
     Opacities are those of a voxel of the full grid (docs/method.md#step-length).
     """

@@ -20,7 +20,7 @@ from devrf.ops.corners import shape_of
 from devrf.ops.dispatch import triton_runs
 from devrf.ops.resampling import resample
 from devrf.rendering.occupancy import Occupancy
-from devrf.rendering.rendered_image import RenderedImage
+from devrf.rendering.output import RenderedImage
 
 # Rays at once: on a CPU what its caches hold, on a GPU what keeps it busy and fits.
 ON_CPU, ON_GPU, IN_LISTS = 8192, 2**15, 2**18
@@ -80,7 +80,7 @@ class DeVRFView:
     @property
     def _in_lists(self) -> bool:
         """Whether lists of fixed length are rendered: their kernels take straight rays."""
-        return self._space.straight and triton_runs(self._canonical.density.values)
+        return self._space.is_linear and triton_runs(self._canonical.density.values)
 
     @property
     def chunk(self) -> int:

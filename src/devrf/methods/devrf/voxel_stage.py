@@ -22,7 +22,7 @@ from devrf.ops.dispatch import triton_runs
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.sample_capacity import SampleCapacity
 from devrf.scenes.scene import Views
-from devrf.system.machine import multiplies_bfloat16
+from devrf.system.device import multiplies_bfloat16
 from devrf.system.profiling import span
 
 
@@ -80,7 +80,7 @@ class VoxelStage(ScheduledStage):
 
         Its kernels take straight rays, which contracted space does not have.
         """
-        return self.scene_model.space.straight and triton_runs(density)
+        return self.scene_model.space.is_linear and triton_runs(density)
 
     @property
     def _precision(self) -> torch.dtype:

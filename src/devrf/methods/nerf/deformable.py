@@ -15,8 +15,7 @@ from devrf.data.batch import RayBatch
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.geometry.rays import Rays
-from devrf.geometry.space import WORLD, Space
-from devrf.geometry.space_config import space_config, space_from
+from devrf.geometry.space import WORLD, Space, space_config, space_from
 from devrf.methods.base import DynamicModel
 from devrf.methods.nerf.hierarchical import flattened, importance, limits, stratified
 from devrf.methods.nerf.occupancy_frames import OccupancyFrames, diagonal_step
@@ -28,7 +27,7 @@ from devrf.methods.nerf.settings import FieldSettings
 from devrf.ops.compositing import composite
 from devrf.rendering.output import RenderOutput
 from devrf.scenes.scene import Scene
-from devrf.system.machine import multiplies_bfloat16
+from devrf.system.device import multiplies_bfloat16
 
 
 class DeformableField(DynamicModel):
@@ -170,7 +169,7 @@ class DeformableField(DynamicModel):
         background: Tensor,
     ) -> RenderOutput:
         """What samples of rays come to in a radiance field."""
-        if not self.space.straight:
+        if not self.space.is_linear:
             samples = samples.endless()
         points, when = self.placement.normalised(samples.points), time.index_select(0, samples.ray)
         canonical, ambient = self.deform(points, when)

@@ -67,7 +67,7 @@ class OccupancyFrames(StoredShape):
             empty_from: share of a stage after which the field is asked; None: never.
         """
         masks = cls(len(scene.clock), box.grid_shape(side**3)).to(device)
-        if hull and scene.kind == "inward" and scene.space.straight:
+        if hull and scene.kind == "inward" and scene.space.is_linear:
             masks.carve(scene, box)
         if empty_from is not None and not masks.has_hull:
             _, x, y, z = masks.mask.shape

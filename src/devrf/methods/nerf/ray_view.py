@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from devrf.geometry.rays import Rays
-from devrf.rendering.output import RenderOutput
-from devrf.rendering.rendered_image import RenderedImage
+from devrf.rendering.output import RenderedImage, RenderOutput
 
 # Rays at once, on a CPU and on a GPU.
 ON_CPU, ON_GPU = 2048, 2**14

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from devrf.geometry.rigid_motion import rigid_motion
+from devrf.geometry.poses import rigid_motion
 from devrf.methods.nerf.encoding import SinusoidalEncoding, octave_window
 from devrf.methods.nerf.mlp import Trunk, initialise
 

@@ -21,7 +21,7 @@ def check_scene(scene: Scene) -> None:
             f"method: neural_volumes needs cameras around a cube, and {scene.name} is seen from "
             "one side; use another method"
         )
-    if not scene.space.straight:
+    if not scene.space.is_linear:
         raise DevrfError(
             f"method: neural_volumes needs a scene in a cube, and {scene.name} has no end; give "
             "images with alpha masks, or use another method"

@@ -12,7 +12,7 @@ from devrf.methods.nerf.encoding import SinusoidalEncoding
 from devrf.methods.nerf.mlp import Trunk
 from devrf.methods.nsff.blending import Blend, blended, closed, shared
 from devrf.methods.nsff.settings import NSFFSettings
-from devrf.system.machine import multiplies_bfloat16
+from devrf.system.device import multiplies_bfloat16
 
 # The flow's weights begin in ±SMALL, so that the first flows are next to zero.
 SMALL = 1e-4

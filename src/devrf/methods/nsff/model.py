@@ -17,8 +17,7 @@ from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.rays import Rays
-from devrf.geometry.space import WORLD, Space
-from devrf.geometry.space_config import space_config, space_from
+from devrf.geometry.space import WORLD, Space, space_config, space_from
 from devrf.methods.base import DynamicModel
 from devrf.methods.nerf.occupancy_frames import OccupancyFrames, diagonal_step
 from devrf.methods.nerf.placement import Placement
@@ -153,7 +152,7 @@ class NSFF(DynamicModel):
     @property
     def _endless(self) -> bool:
         """Whether the last sample of a ray stands for all behind it."""
-        return not (self._cut_out and self.space.straight)
+        return not (self._cut_out and self.space.is_linear)
 
     def learn_from(self, views: Sequence[Views], terms: Collection[str]) -> None:
         """Look for priors; what is missing is said, and its terms are left out."""

@@ -68,7 +68,7 @@ class ImagePriors:
     @property
     def has_depth(self) -> bool:
         """Whether some image has depth that rays of the fields' space can be compared with."""
-        return self._space.straight and any(one.depth is not None for one in self._views)
+        return self._space.is_linear and any(one.depth is not None for one in self._views)
 
     def flow(self, batch: RayBatch, side: int) -> tuple[Tensor, Tensor]:
         """Optical flow (R, 2) in pixels of a batch's rays, and (R,) bool where it is known.

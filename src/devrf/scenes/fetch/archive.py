@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
 from devrf.errors import DevrfError
-from devrf.system.machine import free_disk
+from devrf.system.files import free_disk
 
 # What a Mac adds to archives.
 FOREIGN = "__MACOSX"

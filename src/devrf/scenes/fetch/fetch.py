@@ -18,8 +18,7 @@ from devrf.errors import DevrfError
 from devrf.scenes.fetch.archive import unpack_scene
 from devrf.scenes.fetch.catalogue import PublishedScene
 from devrf.system.download import download, remote_size
-from devrf.system.files import make_folder, write_json
-from devrf.system.machine import free_disk
+from devrf.system.files import free_disk, make_folder, write_json
 
 # Beside the data: where they are from, when, and their checksums.
 RECORD = "fetched.json"

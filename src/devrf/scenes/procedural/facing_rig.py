@@ -8,8 +8,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from devrf.geometry.average_pose import average_pose, relative_to
 from devrf.geometry.cameras import Cameras
+from devrf.geometry.poses import average_pose, relative_to
 
 FIELD_OF_VIEW = 1.05  # radians across the image's longer side
 # Half axes (x, y) of the ellipse of static cameras and of that of the fixed dynamic ones; all

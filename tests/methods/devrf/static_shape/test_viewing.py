@@ -18,7 +18,7 @@ from devrf.methods.devrf.static_shape.viewing import ListRenderer
 from devrf.methods.devrf.volume_rendering import render
 from devrf.ops.dispatch import using
 from devrf.rendering.occupancy import Occupancy
-from devrf.rendering.rendered_image import RenderedImage
+from devrf.rendering.output import RenderedImage
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene
 

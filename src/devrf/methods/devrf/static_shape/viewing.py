@@ -18,7 +18,7 @@ from devrf.ops.compositing import color_and_depth, composite_segments, sum_segme
 from devrf.ops.search import PackedSamples, select
 from devrf.ops.warped_depth import warped_depth
 from devrf.rendering.occupancy import Occupancy
-from devrf.rendering.rendered_image import RenderedImage
+from devrf.rendering.output import RenderedImage
 
 # Lists are made this much longer than the present picture needs.
 SPARE = 1.25

@@ -1,4 +1,4 @@
-"""LPIPS: distance of two images in the features of an image classifier.
+"""LPIPS: distance of two images in the features of an image classifier, and its weights.
 
 Zhang et al. 2018, version 0.1: images in [−1, 1] are shifted and scaled by fixed constants;
 after five of the trunk's layers the features are normalised to unit length over channels; the
@@ -9,12 +9,23 @@ torchvision's layer numbers, built here so that torchvision need not be installe
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, normalize
+
+from devrf.errors import DevrfError
+
+log = logging.getLogger(__name__)
+
+Network = Literal["vgg", "alex"]
+PUBLISHED_AT = "https://download.pytorch.org/models"
 
 SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
@@ -52,16 +63,19 @@ class Trunk:
         return built
 
 
-def _vgg_layers(*blocks: tuple[int, int]) -> Iterable[tuple[int, ...]]:
-    for number, (channels, count) in enumerate(blocks):
-        if number:
-            yield (2, 2)
-        yield from [(channels, 3, 1, 1)] * count
-
-
 TRUNKS = {
     "vgg": Trunk(
-        layers=tuple(_vgg_layers((64, 2), (128, 2), (256, 3), (512, 3), (512, 3))),
+        layers=(
+            *[(64, 3, 1, 1)] * 2,
+            (2, 2),
+            *[(128, 3, 1, 1)] * 2,
+            (2, 2),
+            *[(256, 3, 1, 1)] * 3,
+            (2, 2),
+            *[(512, 3, 1, 1)] * 3,
+            (2, 2),
+            *[(512, 3, 1, 1)] * 3,
+        ),
         taps=(3, 8, 15, 22, 29),
         smallest=16,
         file="vgg16-397923af.pth",
@@ -146,9 +160,81 @@ class Lpips(nn.Module):
     def _features(self, image: Tensor) -> list[Tensor]:
         value = image.to(self.shift).permute(2, 0, 1)
         value = ((2 * value - 1 - self.shift) / self.scale)[None]
-        found = []
+        features = []
         for number, layer in enumerate(self.layers):
             value = layer(value)
             if number in self.trunk.taps:
-                found.append(normalize(value, dim=1, eps=1e-8))
-        return found
+                features.append(normalize(value, dim=1, eps=1e-8))
+        return features
+
+
+def load_lpips(
+    network: Network = "vgg", weights: str | Path | None = None, download: bool = False
+) -> Lpips | None:
+    """The metric, or None where its weights cannot be had; one logged line says why.
+
+    The weights of the trunk are those of torchvision's network trained on ImageNet: from
+    ``weights``, else from torch's cache (``torch.hub.get_dir()/checkpoints``), else downloaded
+    into it. The heads come with torchmetrics.
+
+    Args:
+        network: ``vgg`` (what papers on radiance fields report) or ``alex``.
+        weights: a file with the network's weights, or with those of its ``features`` alone.
+        download: whether they may be downloaded (528 MB for ``vgg``, 233 MB for ``alex``).
+
+    Raises:
+        DevrfError: ``weights`` is no file, or holds something else.
+    """
+    if weights is not None:
+        return read_lpips(network, Path(weights))
+    file = TRUNKS[network].file
+    cached = Path(torch.hub.get_dir()) / "checkpoints" / file
+    if not cached.is_file():
+        if not download:
+            log.info(
+                "LPIPS is null: no weights in %s; give evaluation.lpips_weights=PATH or "
+                "evaluation.download=true",
+                cached,
+            )
+            return None
+        try:
+            torch.hub.load_state_dict_from_url(
+                f"{PUBLISHED_AT}/{file}",
+                map_location="cpu",
+                progress=False,
+                check_hash=True,
+                weights_only=True,
+            )
+        except (OSError, RuntimeError) as error:  # no network; another file than expected
+            log.info("LPIPS is null: %s/%s: %s", PUBLISHED_AT, file, error)
+            return None
+    return read_lpips(network, cached)
+
+
+def read_lpips(network: Network, path: Path) -> Lpips:
+    """The metric with the trunk's weights from a file.
+
+    Raises:
+        DevrfError: it holds something else, or is not there.
+    """
+    heads = _heads(network)
+    try:
+        stored = torch.load(path, map_location="cpu", weights_only=True)
+        features = {
+            name.removeprefix("features."): value
+            for name, value in stored.items()
+            if name.startswith("features.")
+        }
+        return Lpips(TRUNKS[network], features, heads)
+    except Exception:  # a damaged file makes the unpickler raise any exception
+        raise DevrfError(
+            f"{path}: not the weights of {network}; expected torchvision's, with names like "
+            "features.0.weight"
+        ) from None
+
+
+def _heads(network: Network) -> list[Tensor]:
+    shipped = files("torchmetrics.functional.image") / "lpips_models" / f"{network}.pth"
+    with as_file(shipped) as path:
+        stored = torch.load(path, map_location="cpu", weights_only=True)
+    return [stored[f"lin{number}.model.1.weight"] for number in range(5)]

@@ -1,0 +1,19 @@
+"""What a device does: waiting for its queue, and the arithmetic that it is quick at."""
+
+from __future__ import annotations
+
+import torch
+
+
+def wait(device: torch.device) -> None:
+    """Return when the device has done all that is queued."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def multiplies_bfloat16(device: torch.device) -> bool:
+    """Whether ``device`` multiplies bfloat16 faster: NVIDIA's GPUs from Ampere on.
+
+    A CPU does not: oneDNN compiles its products anew for each number of samples.
+    """
+    return device.type == "cuda" and torch.cuda.get_device_capability(device) >= (8, 0)

@@ -1,0 +1,155 @@
+"""Memory: what is free, errors that say it has run out, and memory that a GPU copies quickly."""
+
+from __future__ import annotations
+
+import gc
+import mmap
+import re
+from collections.abc import Iterator
+from contextlib import suppress
+from math import prod
+from pathlib import Path
+
+import psutil
+import torch
+from torch import Tensor
+
+from devrf.errors import DevrfError
+
+# Messages of torch's allocators and libraries (oneDNN's do not mention memory); on a GPU the error
+# has a class of its own.
+MESSAGES = (
+    "out of memory",
+    "can't allocate memory",
+    "bad_alloc",
+    "STATUS_ALLOC_FAILED",
+    "could not create a primitive",
+    "could not create a memory",
+)
+ASKED = re.compile(r"tried to allocate (\d[\d.]*) ?(\w+)", re.IGNORECASE)
+UNITS = {"b": 1, "bytes": 1, "kib": 2**10, "mib": 2**20, "gib": 2**30, "tib": 2**40}
+
+
+class OutOfMemoryError(DevrfError):
+    """Memory has run out, and smaller batches did not help."""
+
+
+def free_memory(device: torch.device) -> int:
+    """Bytes that this process could still take on ``device``."""
+    if device.type != "cuda":
+        return free_host_memory()
+    free, _ = torch.cuda.mem_get_info(device)
+    # What torch has reserved but does not use is free, too.
+    return free + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+
+
+def free_host_memory(root: Path = Path("/")) -> int:
+    """Bytes that this process could still take on the host.
+
+    The least of what the system calls available and what the process's control groups (containers,
+    SLURM) leave it. ``root`` holds ``proc`` and ``sys``.
+    """
+    available: int = psutil.virtual_memory().available
+    return min([available, *_left_by_groups(root)])
+
+
+def own_memory() -> int:
+    """Bytes of memory that this process holds."""
+    return int(psutil.Process().memory_info().rss)
+
+
+def _left_by_groups(root: Path) -> Iterator[int]:
+    """Bytes that the process's control group (version 2) and the groups around it leave it."""
+    try:
+        lines = (root / "proc" / "self" / "cgroup").read_text().splitlines()
+    except OSError:
+        return
+    mount = root / "sys" / "fs" / "cgroup"
+    for own in (line.removeprefix("0::") for line in lines if line.startswith("0::")):
+        # A group is held to the limits of its parents too; a container sees its own as "/".
+        folder = mount / own.strip("/")
+        for group in (folder, *folder.parents):
+            if group.is_relative_to(mount):
+                yield from _left_by_group(group)
+
+
+def _left_by_group(folder: Path) -> Iterator[int]:
+    """Bytes left of a group's limit, if it has one; cached files count as free."""
+    try:
+        most, used = (int((folder / f"memory.{name}").read_text()) for name in ("max", "current"))
+        stat = (folder / "memory.stat").read_text().split()
+    except (OSError, ValueError):  # "max": there is no limit
+        return
+    cached = int(stat[stat.index("inactive_file") + 1]) if "inactive_file" in stat else 0
+    yield max(most - used + cached, 0)
+
+
+def is_oom(error: BaseException) -> bool:
+    """Whether an error says that memory has run out, on a GPU or on the host."""
+    if isinstance(error, MemoryError | torch.OutOfMemoryError):
+        return True
+    return isinstance(error, RuntimeError) and any(words in str(error) for words in MESSAGES)
+
+
+def free_cache(device: torch.device) -> None:
+    """Free what torch keeps without using it.
+
+    What an error's traceback holds stays: call this after the ``except`` block.
+    """
+    gc.collect()
+    if device.type == "cuda":
+        torch.cuda.empty_cache()
+
+
+def numbers(said: str, device: torch.device) -> str:
+    """In words, what was asked for, if the message ``said`` so, and what is free on ``device``."""
+    asked, free = ASKED.search(said), f"{gib(free_memory(device))} GiB free on {device}"
+    if not asked or asked.group(2).lower() not in UNITS:
+        return free
+    return f"{gib(float(asked.group(1)) * UNITS[asked.group(2).lower()])} GiB more asked, {free}"
+
+
+def gib(count: float) -> str:
+    """Bytes as a number of GiB with two significant digits or more: 21.3, 1.2, 0.034."""
+    value = count / 2**30
+    return f"{value:.1f}" if value >= 1 else f"{value:.2g}"
+
+
+def page_locked(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+    """A tensor of zeros on the host that a GPU copies without the processor's help.
+
+    torch's own page-locked memory is rounded up to a power of two and kept when its tensor goes:
+    2.5 GB take 4. This memory is locked where it is, and unlocked with its tensor.
+
+    Raises:
+        RuntimeError: the system does not allow to lock as much.
+    """
+    size = prod(shape) * dtype.itemsize
+    if not size:
+        return torch.empty(shape, dtype=dtype)
+    return torch.frombuffer(_locked(size), dtype=dtype, count=prod(shape)).view(shape)
+
+
+class _LockedMemory(mmap.mmap):
+    """Memory that is unlocked before it is given back to the system."""
+
+    place = 0
+
+    def __del__(self) -> None:
+        if self.place:
+            torch.cuda.synchronize()  # copies from or to it may be under way
+            torch.cuda.cudart().cudaHostUnregister(self.place)  # type: ignore[no-untyped-call]
+
+
+def _locked(size: int) -> _LockedMemory:
+    memory = _LockedMemory(-1, size)
+    place = torch.frombuffer(memory, dtype=torch.uint8).data_ptr()
+    runtime = torch.cuda.cudart()  # type: ignore[no-untyped-call]
+    status = int(runtime.cudaHostRegister(place, size, 0))
+    if status:
+        # The error stays pending, and the next kernel that is launched would raise it.
+        with suppress(Exception):
+            torch.zeros(1, device="cuda")
+        raise RuntimeError(f"CUDA does not lock {size} bytes (error {status})")
+    memory.place = place
+    return memory

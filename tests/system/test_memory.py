@@ -1,0 +1,144 @@
+"""Free memory by the system and its control groups, how a lack shows, page-locked memory."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from types import SimpleNamespace
+
+import psutil
+import pytest
+import torch
+
+from devrf.system.device import multiplies_bfloat16
+from devrf.system.memory import (
+    free_host_memory,
+    free_memory,
+    gib,
+    is_oom,
+    numbers,
+    own_memory,
+    page_locked,
+)
+
+MIB = 2**20
+GPU = "CUDA out of memory. Tried to allocate 20.00 MiB. GPU 0 has a total capacity of 23.68 GiB"
+HOST = "DefaultCPUAllocator: can't allocate memory: you tried to allocate 1073741824 bytes. Error"
+
+
+@pytest.fixture
+def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A machine with 900 MiB available, in no control group."""
+    (tmp_path / "proc" / "self").mkdir(parents=True)
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=900 * MIB))
+    return tmp_path
+
+
+def group(folder: Path, limit: str, used: int, cached: int) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "memory.max").write_text(f"{limit}\n")
+    (folder / "memory.current").write_text(f"{used * MIB}\n")
+    (folder / "memory.stat").write_text(f"anon 5\ninactive_file {cached * MIB}\n")
+
+
+def test_a_control_group_leaves_less_than_the_system(root: Path) -> None:
+    assert free_host_memory(root) == 900 * MIB
+    (root / "proc" / "self" / "cgroup").write_text("0::/jobs/mine\n")
+    mount = root / "sys" / "fs" / "cgroup"
+    group(mount / "jobs" / "mine", "max", 100, 0)
+    assert free_host_memory(root) == 900 * MIB
+    # The limit of the group around it: 500 used, 200 of that only cached.
+    group(mount / "jobs", str(800 * MIB), 500, 200)
+    assert free_host_memory(root) == 500 * MIB
+    group(mount / "jobs" / "mine", str(300 * MIB), 310, 0)
+    assert free_host_memory(root) == 0
+
+
+def test_a_container_sees_its_own_group_as_the_root(root: Path) -> None:
+    (root / "proc" / "self" / "cgroup").write_text("0::/\n")
+    group(root / "sys" / "fs" / "cgroup", str(400 * MIB), 100, 0)
+    assert free_host_memory(root) == 300 * MIB
+
+
+def test_this_machine() -> None:
+    assert free_memory(torch.device("cpu")) > 0
+    assert 50 * MIB < own_memory() < 2**40
+
+
+@pytest.mark.parametrize(
+    ("error", "short"),
+    [
+        (torch.OutOfMemoryError(GPU), True),
+        (MemoryError(), True),
+        (RuntimeError("CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling"), True),
+        (RuntimeError("could not create a primitive"), True),
+        (RuntimeError("mat1 and mat2 shapes cannot be multiplied"), False),
+        (ValueError("out of memory"), False),
+    ],
+)
+def test_what_is_out_of_memory(error: BaseException, short: bool) -> None:
+    assert is_oom(error) is short
+
+
+def test_what_torch_itself_says_is_understood() -> None:
+    with pytest.raises(RuntimeError) as caught:
+        torch.empty(2**60, dtype=torch.uint8)
+    assert is_oom(caught.value)
+    assert numbers(str(caught.value), torch.device("cpu")).startswith("1073741824.0 GiB more asked")
+
+
+@pytest.mark.parametrize(
+    ("said", "asked"), [(GPU, "0.02 GiB more asked, "), (HOST, "1.0 GiB more asked, "), ("", "")]
+)
+def test_the_numbers_of_an_error(said: str, asked: str) -> None:
+    words = numbers(said, torch.device("cpu"))
+    assert re.fullmatch(rf"{asked}[\d.]+ GiB free on cpu", words)
+
+
+def test_bytes_in_gib() -> None:
+    assert [gib(n * 2**30) for n in (21.34, 1.16, 0.0342)] == ["21.3", "1.2", "0.034"]
+
+
+@pytest.mark.parametrize(("capability", "expected"), [((7, 5), False), ((8, 0), True)])
+def test_what_a_gpu_multiplies(
+    capability: tuple[int, int], expected: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: capability)
+    assert multiplies_bfloat16(torch.device("cuda", 0)) is expected
+    assert not multiplies_bfloat16(torch.device("cpu"))
+
+
+class Runtime:
+    """Stands for CUDA's runtime."""
+
+    def __init__(self) -> None:
+        self.status = 0
+        self.locked: dict[int, int] = {}
+
+    def cudaHostRegister(self, place: int, size: int, flags: int) -> int:  # noqa: N802
+        if not self.status:
+            self.locked[place] = size
+        return self.status
+
+    def cudaHostUnregister(self, place: int) -> int:  # noqa: N802
+        del self.locked[place]
+        return 0
+
+
+def test_memory_is_locked_until_the_last_view_goes(monkeypatch: pytest.MonkeyPatch) -> None:
+    runtime = Runtime()
+    monkeypatch.setattr(torch.cuda, "cudart", lambda: runtime)
+    monkeypatch.setattr(torch.cuda, "synchronize", lambda: None)
+    tensor = page_locked((5, 7, 3), torch.float16)
+    assert tensor.shape == (5, 7, 3) and tensor.dtype == torch.float16
+    assert runtime.locked == {tensor.data_ptr(): 210}
+    tensor[2] = 1.5
+    view = tensor[2]
+    del tensor
+    assert len(runtime.locked) == 1 and bool((view == 1.5).all())
+    del view
+    assert runtime.locked == {}
+    runtime.status = 2
+    with pytest.raises(RuntimeError, match="CUDA does not lock 24 bytes \\(error 2\\)"):
+        page_locked((2, 3), torch.float32)
+    assert page_locked((0, 3), torch.float32).shape == (0, 3) and runtime.locked == {}
