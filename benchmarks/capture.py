@@ -30,23 +30,30 @@ from devrf.apps.capture.pipeline import scene_from_footage
 from devrf.cli.steps import run_stage
 from devrf.system.files import write_json
 
+
+def levels(*rows: tuple[int, int]) -> list[str]:
+    """Overrides for levels of (side, iterations of a frame), the third left out."""
+    given = [f"{{side:{side},iterations:{count}}}" for side, count in rows]
+    return [f"schedule.deformation.levels.{k}={row}" for k, row in enumerate([*given, "null"], 1)]
+
+
 # What is learned: half of the images' size, for some hundred iterations.
 LEARNED = {
     "forward": (
         *("experiment=quickstart_forward", "schedule.canonical.doublings=[60,120]"),
         "schedule.canonical.iterations=300",
-        *("schedule.deformation.sides=[8,16]", "schedule.deformation.iterations_per_frame=[16,10]"),
+        *levels((8, 16), (16, 10)),
     ),
     "inward": (
         *("experiment=quickstart", "schedule.canonical.doublings=[50,100,150]"),
         "schedule.canonical.iterations=300",
-        *("schedule.deformation.sides=[8,12]", "schedule.deformation.iterations_per_frame=[12,8]"),
+        *levels((8, 12), (12, 8)),
         "schedule.deformation.rays=768",
     ),
     "monocular": (
         *("experiment=quickstart", "schedule.canonical.doublings=[40,80,120]"),
         *("schedule.canonical.iterations=250", "schedule.canonical.rays=1024"),
-        *("schedule.deformation.sides=[8,12]", "schedule.deformation.iterations_per_frame=[6,3]"),
+        *levels((8, 6), (12, 3)),
         "schedule.deformation.rays=768",
     ),
 }

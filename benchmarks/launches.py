@@ -251,7 +251,10 @@ def deformation() -> ScheduledStage:
     )
     images = views(MOVING, FRAMES, flow=True)
     _attach(stage, images)
-    clock, side = FrameClock(tuple(k / FRAMES for k in range(FRAMES))), stage.schedule.sides[-1]
+    clock, side = (
+        FrameClock(tuple(k / FRAMES for k in range(FRAMES))),
+        stage.schedule.levels[-1].side,
+    )
     with META:
         field = stage.scene_model.deformation = DeformationField(
             stage.scene_model.box, clock, voxels=side**3

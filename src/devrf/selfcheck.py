@@ -36,7 +36,7 @@ from devrf.evaluation.held_out import background_value
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
-from devrf.methods.devrf.deformation_schedule import DeformationSchedule
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import MotionSettings, Precision, Sampling
@@ -151,15 +151,11 @@ class SmallScene:
             )
             return CanonicalStage(schedule, architecture, sampling=sampling, **common)
         # The first frame of the first level takes twice as many; the second level's are parallel.
-        motion = DeformationSchedule(
-            sides=self.sides,
-            iterations_per_frame=(
-                max(1, self.iterations * 3 // 4 // self.frames),
-                max(1, self.iterations // 8),
-            ),
-            rays=self.rays,
-            parallel_frames=(1, (self.frames - 1) // 2),
-        )
+        coarse, fine = self.sides
+        first = Level(coarse, max(1, self.iterations * 3 // 4 // self.frames))
+        parallel = (self.frames - 1) // 2
+        second = Level(fine, max(1, self.iterations // 8), parallel_frames=parallel)
+        motion = DeformationSchedule((first, second), rays=self.rays)
         settings = MotionSettings(2e-3, unit="box", views="one", start="flow", store="host")
         return DeformationStage(copy.deepcopy(self.canonical), motion, settings, **common)
 

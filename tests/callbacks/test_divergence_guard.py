@@ -21,13 +21,13 @@ from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.checkpoints.checkpoint_file import read_checkpoint_file
 from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
-from devrf.methods.devrf.deformation_schedule import DeformationSchedule
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.settings import CanonicalRates
 from devrf.scenes.scene import Scene
 
 # Three frames. Level 0: frame 1 in 0–11, frame 2 in 12–17; level 1: 18–25 and 26–29.
-MOVING = DeformationSchedule(sides=(4, 6), iterations_per_frame=(6, 4), rays=64)
+MOVING = DeformationSchedule(levels=(Level(4, 6), Level(6, 4)), rays=64)
 # A phase of the canonical stage from 0 to 9, one from 10 to 23; and longer ones.
 SHORT: dict[str, Any] = {"iterations": 24, "doublings": (10,), "decay_iterations": 100}
 LONG: dict[str, Any] = {**SHORT, "iterations": 60, "doublings": (20,), "rays": 128}
@@ -168,7 +168,7 @@ def test_a_frame_is_visited_again(fit, moving, caplog, iteration: int) -> None:
 def test_parallel_frames_are_visited_again_together(
     fit, moving, caplog, four_frames: SceneDataModule
 ) -> None:
-    stage = moving(sides=(4, 6), iterations_per_frame=(2, 5), parallel_frames=(1, 2))
+    stage = moving(levels=(Level(4, 2), Level(6, 5, parallel_frames=2)))
     fit(stage, Spoil("nan", 15), DivergenceGuard(), data=four_frames)
     assert "of 18 (frames 1, 3, " in caplog.text and "back to iteration 13," in caplog.text
     assert (stage.iteration, stage.num_rollbacks) == (18, 1) and finite(stage.state_dict())
@@ -222,7 +222,7 @@ def test_a_stage_that_never_saw_anything_warns(fit, canonical, caplog) -> None:
 def test_motion_that_leaves_the_image_without_masks_only_warns(
     fit, moving, without_masks: SceneDataModule, caplog
 ) -> None:
-    stage = moving(sides=(4,), iterations_per_frame=(40,))
+    stage = moving(levels=(Level(4, 40),))
     fit(stage, Spoil("100", 45), DivergenceGuard(every_iterations=20), data=without_masks)
     assert caplog.text.count("everything has become empty by") == 1
     assert stage.num_rollbacks == 0
@@ -240,10 +240,10 @@ def test_a_frame_whose_loss_stands_out_is_named(
 
     monkeypatch.setattr(DeformationStage, "loss", dear)
     guard = DivergenceGuard()
-    seen = {"kind": "level 0", "visited": [0.01, 0.011, 0.012, 0.01]}
+    seen = {"kind": "level 1", "visited": [0.01, 0.011, 0.012, 0.01]}
     guard.load_state_dict({**guard.state_dict(), **seen})
     monkeypatch.setattr(guard, "_reset", lambda: None)
-    fit(moving(sides=(4,), iterations_per_frame=(20,)), guard)
+    fit(moving(levels=(Level(4, 20),)), guard)
     assert "times that of the frames before" in caplog.text and "(frame 2, " in caplog.text
 
 

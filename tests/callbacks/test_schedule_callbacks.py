@@ -16,11 +16,11 @@ from devrf.callbacks import Meter, Progress, TrainingRecord
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
-from devrf.methods.devrf.deformation_schedule import DeformationSchedule
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.settings import MotionSettings
 
-DEFORMATION = DeformationSchedule(sides=(4, 6), iterations_per_frame=(3, 2), rays=64)
+DEFORMATION = DeformationSchedule(levels=(Level(4, 3), Level(6, 2)), rays=64)
 
 
 class Watch(Callback):
@@ -106,7 +106,7 @@ def test_progress_and_curves_name_the_frames_of_a_visit(
     trainer: Callable[..., Trainer],
     lines: Callable[[], list[str]],
 ) -> None:
-    schedule = replace(DEFORMATION, coarse_to_fine=False, parallel_frames=(1, 2))
+    schedule = replace(DEFORMATION, coarse_to_fine=False, levels=(Level(6, 5, parallel_frames=2),))
     stage = DeformationStage(rest, schedule, iterations_per_step=100)
     fitted = trainer(Progress(line_every_seconds=0.0), Meter(), max_epochs=1)
     fitted.fit(stage, datamodule=four_frames)

@@ -17,7 +17,7 @@ from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
-from devrf.methods.devrf.deformation_schedule import DeformationSchedule
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.metrics.image import psnr
@@ -77,7 +77,7 @@ def test_the_deformation_stage_comes_back_and_alone_suffices(
     tmp_path: Path,
     trainer: Callable[..., Trainer],
 ) -> None:
-    schedule = DeformationSchedule(sides=(4, 6), iterations_per_frame=(4, 2), rays=128)
+    schedule = DeformationSchedule(levels=(Level(4, 4), Level(6, 2)), rays=128)
     stage, fit = DeformationStage(rest, schedule), trainer(max_epochs=1)
     fit.fit(stage, datamodule=datamodule)
     save_checkpoint(fit, tmp_path / "deformation.ckpt")
@@ -95,7 +95,7 @@ def test_the_deformation_stage_comes_back_and_alone_suffices(
 def test_a_deformation_can_be_learned_on_a_loaded_checkpoint(
     canonical: Path, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
 ) -> None:
-    schedule = DeformationSchedule(sides=(4,), iterations_per_frame=(2,), rays=64)
+    schedule = DeformationSchedule(levels=(Level(4, 2),), rays=64)
     stage = DeformationStage(load_checkpoint(canonical), schedule)
     trainer(max_epochs=1).fit(stage, datamodule=datamodule)
     assert stage.iteration == 6

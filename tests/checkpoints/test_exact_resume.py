@@ -29,7 +29,7 @@ from devrf.methods.devrf.appearance import AppearanceSettings
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
-from devrf.methods.devrf.deformation_schedule import DeformationSchedule
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.refinement import RefinementSettings
 from devrf.methods.devrf.settings import MotionSettings
@@ -48,7 +48,7 @@ SEARCHING = CanonicalSchedule(
     rays=64,
 )
 # Three frames. Level 0: frame 1 in 0–11, frame 2 in 12–17; level 1: 18–25 and 26–29.
-MOVING = DeformationSchedule(sides=(4, 6), iterations_per_frame=(6, 4), rays=64)
+MOVING = DeformationSchedule(levels=(Level(4, 6), Level(6, 4)), rays=64)
 # The occupancy is looked up anew in iterations 3, 6, 9 of a visit; frames start along tracks.
 ALONG_TRACKS = MotionSettings(
     learning_rate=2e-3,
@@ -59,16 +59,15 @@ ALONG_TRACKS = MotionSettings(
     start="tracks",
 )
 # Four frames. Level 0 in 0–15; level 1: frame 2 in 16–21, frames 1 and 3 in 22–27.
-TOGETHER = DeformationSchedule(
-    sides=(4, 6), iterations_per_frame=(4, 6), rays=64, parallel_frames=(1, 2)
-)
+TOGETHER = DeformationSchedule(levels=(Level(4, 4), Level(6, 6, parallel_frames=2)), rays=64)
 # Then once more, backward: frames 1 and 3 in 28–31, frame 2 in 32–35.
 BACKWARD = replace(
     TOGETHER,
-    sides=(4, 6, 6),
-    iterations_per_frame=(4, 6, 4),
-    parallel_frames=(1, 2, 2),
-    order=("forward", "forward", "backward"),
+    levels=(
+        Level(4, 4),
+        Level(6, 6, parallel_frames=2),
+        Level(6, 4, parallel_frames=2, order="backward"),
+    ),
 )
 PRIORS = {"render": 1.0, "cycle": 100.0, "tv": 1.0, "elastic": 0.1}
 BY_TURNS = MotionSettings(occupancy_every=3)

@@ -92,7 +92,8 @@ def test_no_alarm_where_all_is_well(trained) -> None:
 def test_no_alarm_in_other_scenes(devrf, tiny, arguments) -> None:
     more = (
         "schedule.canonical.iterations=60",
-        "schedule.deformation.iterations_per_frame=[20,4]",
+        "schedule.deformation.levels.1.iterations=20",
+        "schedule.deformation.levels.2.iterations=4",
         "data.frames=6",
         "evaluation.metrics=[]",
         "video.frames=1",

@@ -27,7 +27,7 @@ from devrf.geometry.box import Box
 from devrf.methods.devrf.appearance import AppearanceSettings
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
-from devrf.methods.devrf.deformation_schedule import DeformationSchedule
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.refinement import RefinementSettings
 from devrf.methods.devrf.settings import MotionSettings
 from devrf.scenes.scene import Scene
@@ -36,7 +36,7 @@ SMALL = Architecture(channels=4, width=16, frequencies=2)
 CANONICAL = CanonicalSchedule(
     search_iterations=0, search_side=8, iterations=10, side=10, doublings=(5,), rays=64
 )
-DEFORMATION = DeformationSchedule(sides=(4, 8), iterations_per_frame=(2, 2), rays=64)
+DEFORMATION = DeformationSchedule(levels=(Level(4, 2), Level(8, 2)), rays=64)
 POINTS, GRID_BYTES = 10**3, 10**3 * (1 + 4) * 4
 # 4→16 with bias, direction (3 + 6·2)→16, 16→16 and 16→3 with bias.
 DECODER = 4 * (4 * 16 + 16 + 15 * 16 + 16 * 16 + 16 + 3 * 16 + 3)
@@ -88,7 +88,9 @@ def test_the_deformation_stage_by_hand(cubic: Scene) -> None:
 
 def test_each_parallel_frame_counts(cubic: Scene) -> None:
     one = deformation_needs(cubic)
-    two = deformation_needs(cubic, replace(DEFORMATION, parallel_frames=(1, 2)))
+    two = deformation_needs(
+        cubic, replace(DEFORMATION, levels=(Level(4, 2), Level(8, 2, parallel_frames=2)))
+    )
     assert two.held[FRAMES] == 4 * SLICES and two.held[PARALLEL] == 11 * SLICES
     assert two.held[IMAGES] == 2 * one.held[IMAGES]
     assert (two.batch, two.batches) == (2 * one.batch, 2)
@@ -98,7 +100,7 @@ def test_each_parallel_frame_counts(cubic: Scene) -> None:
 def test_the_level_that_needs_most_counts(cubic: Scene) -> None:
     # Two frames on nearly as many voxels, or one on all; files are of the last level.
     schedule = DeformationSchedule(
-        sides=(4, 22, 24), iterations_per_frame=(1, 1, 1), rays=64, parallel_frames=(1, 2, 1)
+        levels=(Level(4, 1), Level(22, 1, parallel_frames=2), Level(24, 1)), rays=64
     )
     needs = deformation_needs(cubic, schedule)
     assert needs.held[PARALLEL] == 2 * 11 * 22**3 * 12

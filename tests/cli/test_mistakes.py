@@ -18,8 +18,8 @@ MISTAKES = {
         "schedule.motion.least_gain: renamed; write schedule.motion.min_rel_improvement=VALUE",
     ),
     "renamed key, appended": (
-        ["+schedule.deformation.frames_at_once=[1,2]"],
-        "schedule.deformation.frames_at_once: renamed; write schedule.deformation.parallel_frames=",
+        ["+schedule.deformation.sides=[4,8]"],
+        "schedule.deformation.sides: renamed; write schedule.deformation.levels.N.side=VALUE",
     ),
     "renamed value": (
         ["schedule.motion.pixels=useful"],
@@ -72,15 +72,21 @@ MISTAKES = {
         ["schedule.canonical.doublings=[5,3]"],
         "schedule.canonical.doublings",
     ),
-    "levels that do not match": (["schedule.deformation.sides=[4]"], "schedule.deformation.sides"),
-    "words for frames at once": (
-        ["schedule.deformation.parallel_frames=[1,many]"],
-        "schedule.deformation.parallel_frames: expected a list of which each is a whole number or "
-        "null, not",
+    "a level without a side": (
+        ["schedule.deformation.levels.4={iterations:2}", "schedule.deformation.levels.3=null"],
+        "schedule.deformation.levels: expected rows 1 to 3 with side and iterations",
     ),
-    "frames at once where they start from one another": (
-        ["schedule.deformation.parallel_frames=[2,2]"],
-        "schedule.deformation.parallel_frames: expected 1 at the first level",
+    "unknown key of a level": (
+        ["+schedule.deformation.levels.3.sides=4"],
+        "schedule.deformation.levels.3.sides: no such key; did you mean",
+    ),
+    "word for parallel frames": (
+        ["schedule.deformation.levels.2.parallel_frames=many"],
+        "schedule.deformation.levels.2.parallel_frames: expected a whole number",
+    ),
+    "parallel frames where they start from one another": (
+        ["schedule.deformation.levels.1.parallel_frames=2"],
+        "schedule.deformation.levels.1.parallel_frames: expected 1 at the first level",
     ),
     "unknown loss term": (["+loss.deformation.foo=1"], "unknown term 'foo'"),
     "word for a weight": (["loss.fine.color=high"], "loss.fine.color: expected a number"),

@@ -63,7 +63,7 @@ def test_the_budget_is_told_first(trained) -> None:
 @pytest.mark.parametrize(
     ("arguments", "key"),
     [
-        (["schedule.deformation.sides=[4,2000]"], "schedule.deformation.sides"),
+        (["schedule.deformation.levels.2.side=2000"], "schedule.deformation.levels"),
         (["schedule.canonical.side=3000"], "schedule.canonical.side"),
         (["schedule.canonical.rays=1000000000"], "schedule.canonical.rays"),
         (["stage=canonical", "schedule.canonical.side=3000"], "schedule.canonical.side"),
@@ -158,9 +158,9 @@ SIZES = {
         "schedule.canonical.rays=1024",
         "schedule.canonical.iterations=4",
         "schedule.canonical.doublings=[1]",
-        "schedule.deformation.sides=[8,24]",
+        "schedule.deformation.levels.1={side:8,iterations:1}",
+        "schedule.deformation.levels.2={side:24,iterations:1}",
         "schedule.deformation.rays=1024",
-        "schedule.deformation.iterations_per_frame=[1,1]",
     ),
     "large": (
         "data.width=96",
@@ -170,9 +170,9 @@ SIZES = {
         "schedule.canonical.rays=4096",
         "schedule.canonical.iterations=2",
         "schedule.canonical.doublings=[1]",
-        "schedule.deformation.sides=[56]",
+        "schedule.deformation.levels.1={side:56,iterations:1}",
+        "schedule.deformation.levels.2=null",
         "schedule.deformation.rays=4096",
-        "schedule.deformation.iterations_per_frame=[1]",
     ),
 }
 

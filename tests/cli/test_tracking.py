@@ -121,7 +121,7 @@ def test_offline_nothing_is_sent(watched):
 def test_wandb_holds_config_and_name(watched):
     tracked = watched.runs[0]
     assert tracked.config["data"]["shape"] == "robot"
-    assert tracked.config["schedule"]["deformation"]["sides"] == [4, 8]
+    assert tracked.config["schedule"]["deformation"]["levels"]["2"]["side"] == 8
     assert (tracked.run.project, tracked.run.display_name) == ("devrf", "robot")
     assert list(tracked.run.tags) == ["robot", "full"] and tracked.run.run_group == ""
 

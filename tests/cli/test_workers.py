@@ -25,10 +25,10 @@ MEANINGFUL = (
     "schedule.canonical.search_side=24",
     "schedule.canonical.doublings=[20]",
     "schedule.canonical.rays=512",
-    "schedule.deformation.sides=[6,12]",
-    "schedule.deformation.iterations_per_frame=[8,8]",
+    "schedule.deformation.levels.1={side:6,iterations:8}",
+    "schedule.deformation.levels.2={side:12,iterations:8,parallel_frames:2}",
+    "schedule.deformation.levels.3=null",
     "schedule.deformation.rays=512",
-    "schedule.deformation.parallel_frames=[1,2]",
     "video.frames=1",
     "evaluation.metrics=[]",
 )

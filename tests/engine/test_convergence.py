@@ -12,11 +12,11 @@ from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.convergence import LateReading, converged
 from devrf.errors import DevrfError
-from devrf.methods.devrf.deformation_schedule import DeformationSchedule
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.settings import MotionSettings
 
-SCHEDULE = DeformationSchedule(sides=(4, 6), iterations_per_frame=(12, 8), rays=64)
+SCHEDULE = DeformationSchedule(levels=(Level(4, 12), Level(6, 8)), rays=64)
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ from devrf.engine.stage import ScheduledStage
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
-from devrf.methods.devrf.deformation_schedule import DeformationSchedule
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.settings import MotionSettings
 from devrf.ops.dispatch import Kind, using
@@ -51,7 +51,7 @@ SCHEDULE = CanonicalSchedule(
     rays=5,
 )
 LOSS = {"color": 1.0, "per_sample_color": 0.1, "entropy": 0.01}
-MOVING = DeformationSchedule(sides=(3, 4), iterations_per_frame=(2, 1), rays=5)
+MOVING = DeformationSchedule(levels=(Level(3, 2), Level(4, 1)), rays=5)
 MOTION = MotionSettings(learning_rate=2e-3, views="one", occupancy_every=2)
 
 
@@ -244,10 +244,8 @@ def test_one_graph_contains_all_frames_that_are_learned_in_parallel(
         # Frame 2 in three iterations, which are left out, then frames 1 and 3.
         stage.schedule = replace(
             MOVING,
-            sides=(3,),
-            iterations_per_frame=(3,),
+            levels=(Level(3, 3, parallel_frames=2),),
             coarse_to_fine=False,
-            parallel_frames=(2,),
         )
         stage.iteration = 3
         return stage
@@ -290,7 +288,7 @@ def test_before_a_capture_lists_have_been_long_enough_for_every_view(
     monkeypatch.setattr(SampleCapacity, "measure", lambda self: noted.append("measured"))
     stage = moving(rest)
     assert isinstance(stage, DeformationStage)
-    stage.schedule = replace(MOVING, sides=(3,), iterations_per_frame=(2,))
+    stage.schedule = replace(MOVING, levels=(Level(3, 2),))
     stage.loop.capturer = Noting  # type: ignore[assignment,method-assign]
     trainer(max_epochs=1).fit(stage, datamodule=datamodule)
     first = ["view 0", "view 1", "measured", "view 0", "captured"]

@@ -25,7 +25,7 @@ from devrf.methods.devrf import voxel_stage
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
-from devrf.methods.devrf.deformation_schedule import DeformationSchedule
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
 
 SMALL = Architecture(channels=4, width=8, frequencies=1)
@@ -39,9 +39,9 @@ SCHEDULE = CanonicalSchedule(
     decay_iterations=100,
     rays=64,
 )
-MOVING = DeformationSchedule(sides=(4,), iterations_per_frame=(4,), rays=64)
+MOVING = DeformationSchedule(levels=(Level(4, 4),), rays=64)
 # Of four frames number 2 in iterations 0 to 3, then 1 and 3.
-TOGETHER = replace(MOVING, coarse_to_fine=False, parallel_frames=(2,))
+TOGETHER = replace(MOVING, coarse_to_fine=False, levels=(Level(4, 4, parallel_frames=2),))
 # Without the terms that are means over what rays have met.
 BY_RAY = {"render": 1.0, "per_sample_color": 0.1, "entropy": 0.01}
 
@@ -140,9 +140,7 @@ def test_a_frame_that_never_fits_ends_the_stage(
     stage = moving(rest, TOGETHER)
     with pytest.raises(DevrfError, match=r"at iteration 5 of 8 \(frames 1, 3, ") as caught:
         fit(stage, data=four_frames)
-    assert "schedule.deformation.rays or schedule.deformation.parallel_frames, or" in str(
-        caught.value
-    )
+    assert "rays or schedule.deformation.levels.1.parallel_frames, or" in str(caught.value)
     # The gradients of the first frame's batch are dropped with the other's.
     gradients = [p.grad for group in stage.optimizer.param_groups for p in group["params"]]
     assert gradients == [None] * 4 and stage.iteration == 5

@@ -18,7 +18,7 @@ from devrf.data.batch import Pixels
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.loop import ParallelBatch
 from devrf.engine.streams import StreamParallel
-from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule
+from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.settings import MotionSettings
 
@@ -130,9 +130,7 @@ class Alone(DeformationSchedule):
 
 
 # Of four frames number 2 first, then 1 and 3.
-TOGETHER = Alone(
-    sides=(5,), iterations_per_frame=(8,), rays=64, coarse_to_fine=False, parallel_frames=(2,)
-)
+TOGETHER = Alone(levels=(Level(5, 8, parallel_frames=2),), rays=64, coarse_to_fine=False)
 
 
 @pytest.mark.parametrize(
@@ -194,9 +192,7 @@ class Before(Callback):
 def test_each_frame_has_a_copy_of_the_frame_before_it(
     rest: LoadedCheckpoint, four_frames: SceneDataModule, trainer: Callable[..., Trainer]
 ) -> None:
-    schedule = DeformationSchedule(
-        sides=(4, 5), iterations_per_frame=(3, 2), rays=64, parallel_frames=(1, 2)
-    )
+    schedule = DeformationSchedule(levels=(Level(4, 3), Level(5, 2, parallel_frames=2)), rays=64)
     stage, before = DeformationStage(rest, schedule), Before()
     trainer(before, max_epochs=1).fit(stage, datamodule=four_frames)
     # One by one; then in two phases: frame 2 alone, frames 1 and 3 in parallel.

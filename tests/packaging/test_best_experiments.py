@@ -29,7 +29,8 @@ def test_they_take_a_scene_from_disk_and_go_over_its_motion_twice(composed, expe
     check_config(config)
     assert config.loss.deformation.elastic > 0
     moves = instantiate(config.schedule.deformation, _convert_="all")
-    assert "backward" in moves.order[-2:] and moves.sides[-1] == moves.sides[-2]
+    *_, before, last = moves.levels
+    assert "backward" in (before.order, last.order) and last.side == before.side
     assert config.sampling._target_ == "devrf.methods.devrf.settings.Sampling"
 
 

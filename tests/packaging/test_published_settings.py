@@ -11,6 +11,7 @@ from hydra.utils import instantiate
 from devrf.cli.paper_scene import with_paper_experiment
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
+from devrf.methods.devrf.deformation_schedule import PAPER_LEVELS
 from devrf.methods.devrf.settings import (
     DEFORMATION_LOSS,
     FINE_LOSS,
@@ -53,8 +54,10 @@ def test_canonical_schedule(paper):
 
 def test_deformation_schedule(paper):
     schedule = instantiate(paper.schedule.deformation, _convert_="all")
-    assert schedule.sides == [10, 20, 40, 80, 160]
-    assert schedule.iterations_per_frame == [200, 100, 100, 50, 50]
+    assert tuple(schedule.levels) == PAPER_LEVELS
+    assert [(level.side, level.iterations) for level in PAPER_LEVELS] == [
+        (10, 200), (20, 100), (40, 100), (80, 50), (160, 50)
+    ]  # fmt: skip
     assert schedule.rays == 8192
     assert schedule.total(frames=50) == 25_000
     assert schedule.growths(frames=50) == [10_000, 15_000, 20_000, 22_500]
@@ -149,7 +152,7 @@ def test_each_forward_scene_has_its_published_schedule(
 ):
     config = composed(f"experiment=paper_{scene}", ROOT)
     schedule = instantiate(config.schedule.deformation, _convert_="all")
-    assert (config.data.name, schedule.sides) == (scene, sides)
+    assert (config.data.name, [level.side for level in schedule.levels]) == (scene, sides)
     assert (schedule.growths(frames), schedule.total(frames)) == (growths, total)
     assert config.schedule.canonical.dense_tv_iterations == 10_000
     assert config.loss.flow_mean == "samples"

@@ -14,7 +14,7 @@ SMALLER = {
     "side=56": "side=14",
     "doublings=[80, 160, 240]": "doublings=[2]",
     "rays=1024": "rays=64",
-    "sides=[12, 20, 32], iterations_per_frame=[36, 18, 18]": "sides=[4], iterations_per_frame=[2]",
+    "[Level(12, 36), Level(20, 18), Level(32, 18)]": "[Level(4, 2)]",
 }
 
 

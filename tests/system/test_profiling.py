@@ -9,7 +9,7 @@ from torch.profiler import ProfilerActivity, profile
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
-from devrf.methods.devrf.deformation_schedule import DeformationSchedule
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.system.profiling import Part, measured, span
 
@@ -29,7 +29,7 @@ def test_nothing_is_made_where_nothing_is_profiled() -> None:
 def test_training_does_every_part(
     rest: LoadedCheckpoint, datamodule: SceneDataModule, trainer: type[Trainer]
 ) -> None:
-    schedule = DeformationSchedule(sides=(4,), iterations_per_frame=(2,), rays=64)
+    schedule = DeformationSchedule(levels=(Level(4, 2),), rays=64)
     with profile(activities=[ProfilerActivity.CPU]) as profiled:
         trainer(max_steps=2).fit(DeformationStage(rest, schedule), datamodule=datamodule)
     assert set(get_args(Part)) <= {event.name for event in profiled.events()}

@@ -32,8 +32,13 @@ ROOT: dict[str, Any] = {
 }
 # Keys of earlier versions and their new names; then values, by key.
 RENAMED = {
-    "schedule.deformation.frames_at_once": "schedule.deformation.parallel_frames",
-    "schedule.deformation.stiffness": "schedule.deformation.factors.elastic",
+    "schedule.deformation.sides": "schedule.deformation.levels.N.side",
+    "schedule.deformation.iterations_per_frame": "schedule.deformation.levels.N.iterations",
+    "schedule.deformation.parallel_frames": "schedule.deformation.levels.N.parallel_frames",
+    "schedule.deformation.order": "schedule.deformation.levels.N.order",
+    "schedule.deformation.rates": "schedule.deformation.levels.N.lr_factor",
+    "schedule.deformation.fall": "schedule.deformation.levels.N.lr_final_factor",
+    "schedule.deformation.factors": "schedule.deformation.levels.N.weight_factors",
     "schedule.motion.least_gain": "schedule.motion.min_rel_improvement",
 }
 RENAMED_VALUES = {"schedule.motion.pixels": {"useful": "occupied"}}
@@ -124,9 +129,16 @@ def _settings(target: str, path: str) -> dict[str, tuple[Any, Any]]:
 
 
 def _check_value(where: str, value: object, hint: Any) -> None:
+    row = next((kind for kind in (hint, *get_args(hint)) if is_dataclass(kind)), None)
     if isinstance(value, Mapping) and get_origin(hint) in (dict, Mapping):
         for key, one in value.items():
             _check_value(f"{where}.{key}", one, get_args(hint)[1])
+    elif isinstance(value, Mapping) and row is not None:
+        hints = get_type_hints(row)
+        for key, one in value.items():
+            if key not in hints:
+                raise unknown_key(f"{where}.{key}", hints)
+            _check_value(f"{where}.{key}", one, hints[key])
     elif not fits(value, hint):
         now = RENAMED_VALUES.get(where, {}).get(str(value))
         if now:

@@ -28,9 +28,9 @@ Parts = Mapping[tuple[str, ...], int]
 
 IMAGES = ("data.downscale", "data.width", "data.frames")
 GRIDS = ("schedule.canonical.side",)
-FRAMES = ("schedule.deformation.sides", "data.frames")
+FRAMES = ("schedule.deformation.levels", "data.frames")
 APPEARANCE = ("schedule.appearance.side", "data.frames")
-PARALLEL = ("schedule.deformation.parallel_frames", "schedule.deformation.sides")
+PARALLEL = ("schedule.deformation.levels",)
 
 # Python and its libraries on the host, without what the driver of a GPU adds.
 PROGRAM = 600_000_000
@@ -221,7 +221,7 @@ def estimate(
     motion = motion or MotionSettings()
     moving = [
         _level_needs(scene, field, rest, deformation, level, motion, batch)
-        for level in range(len(deformation.sides))
+        for level in range(len(deformation.levels))
     ]
     if appearance is not None and appearance.learn != "never":
         moving = [_with_appearance(one, scene, field, appearance.side) for one in moving]
@@ -285,7 +285,7 @@ def _level_needs(
 ) -> StageNeeds:
     """What the deformation stage needs at a level, on top of the canonical field."""
     views, frames, points = scene.dynamic.train, len(scene.clock), field.density.values.numel()
-    shape, final = (field.box.grid_shape(schedule.sides[k] ** 3) for k in (level, -1))
+    shape, final = (field.box.grid_shape(schedule.levels[k].side ** 3) for k in (level, -1))
     parallel, slices = schedule.max_parallel_frames(level, frames), resident_bytes(1, shape, False)
     pool = views.height * views.width * -(-len(views) // frames) * POOLED
     if motion.store == "host":  # with the next frames, which are being copied

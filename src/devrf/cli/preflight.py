@@ -23,7 +23,7 @@ from devrf.system.memory import free_host_memory, free_memory, gib, is_oom, numb
 # Keys that lower the need, by the stage that ran out of memory.
 LOWER = {
     "canonical": "schedule.canonical.side or schedule.canonical.rays",
-    "deformation": "schedule.deformation.sides, schedule.deformation.rays or data.frames",
+    "deformation": "schedule.deformation.levels, schedule.deformation.rays or data.frames",
 }
 
 

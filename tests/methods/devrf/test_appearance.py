@@ -18,13 +18,13 @@ from devrf.geometry.clock import FrameClock
 from devrf.methods.devrf.appearance import AppearanceField, AppearanceSettings, ColorResidual
 from devrf.methods.devrf.appearance_learning import check_weights
 from devrf.methods.devrf.color_decoder import ColorDecoder, SigmoidColor
-from devrf.methods.devrf.deformation_schedule import DeformationSchedule
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.settings import MotionSettings
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene, Views
 
-SHORT = DeformationSchedule(sides=(4, 6), iterations_per_frame=(6, 6), rays=128)
+SHORT = DeformationSchedule(levels=(Level(4, 6), Level(6, 6)), rays=128)
 FAST = MotionSettings(learning_rate=5e-3, views="all", pixels="occupied")
 LEARNED = AppearanceSettings(learn="always", side=6, first_level=0, learning_rate=0.1)
 CLOCK = FrameClock((0.0, 0.5, 1.0))
@@ -158,7 +158,7 @@ def test_terms_count_less_at_levels_that_learn_colours_that_drift(
     chosen = AppearanceSettings(
         learn="auto", side=6, first_level_if_steady=1, factors_if_drifting={"cycle": 0.25}
     )
-    schedule = replace(SHORT, factors={"cycle": (1.0, 2.0)})
+    schedule = replace(SHORT, levels=(Level(4, 6), Level(6, 6, weight_factors={"cycle": 2.0})))
     stage = DeformationStage(
         rest,
         schedule,
@@ -193,7 +193,7 @@ def test_its_rate_is_its_own_at_every_level(
             groups = trainer.optimizers[0].param_groups
             seen.append([float(group["lr"]) for group in groups])
 
-    slower = replace(SHORT, rates=(1.0, 0.25), fall=(1.0, 1.0))
+    slower = replace(SHORT, levels=(Level(4, 6), Level(6, 6, lr_factor=0.25)))
     stage = DeformationStage(rest, slower, FAST, iterations_per_step=1, appearance=LEARNED)
     trainer(Rates(), max_epochs=1).fit(stage, datamodule=datamodule)
     first, *_, last = seen

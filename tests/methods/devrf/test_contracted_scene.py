@@ -22,7 +22,7 @@ from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.color_decoder import ColorDecoder
 from devrf.methods.devrf.deformation_field import DeformationField
-from devrf.methods.devrf.deformation_schedule import DeformationSchedule
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.flow_initialisation import Tracks, start_from_tracks
 from devrf.methods.devrf.grid_warp import GridWarp
@@ -185,7 +185,7 @@ def test_a_room_is_learned_and_moves_inside_the_inner_box(
     assert float(fitted.callback_metrics["static/color"]) < 0.8 * blank
     moving = DeformationStage(
         stage.result(),
-        DeformationSchedule(sides=(6,), iterations_per_frame=(10,), rays=256),
+        DeformationSchedule(levels=(Level(6, 10),), rays=256),
         MotionSettings(unit="box", views="all", start="flow"),
     )
     trainer(max_epochs=1).fit(moving, datamodule=data)

@@ -16,14 +16,14 @@ from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import score
 from devrf.methods.devrf.compact_state import expanded_state
-from devrf.methods.devrf.deformation_schedule import DeformationSchedule
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.settings import MotionSettings
 from devrf.ops.total_variation import total_variation
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene
 
-SHORT = DeformationSchedule(sides=(4, 8), iterations_per_frame=(20, 10), rays=256)
+SHORT = DeformationSchedule(levels=(Level(4, 20), Level(8, 10)), rays=256)
 FAST = MotionSettings(learning_rate=5e-3, views="all", pixels="occupied")
 
 
@@ -60,7 +60,7 @@ def test_a_whole_schedule_sees_the_motion_better_than_the_rest_pose(
     tiny_scene: Scene,
     trainer: Callable[..., Trainer],
 ) -> None:
-    schedule = DeformationSchedule(sides=(4, 8), iterations_per_frame=(40, 20), rays=256)
+    schedule = DeformationSchedule(levels=(Level(4, 40), Level(8, 20)), rays=256)
     stage = DeformationStage(rest, schedule, FAST)
     fit = trainer(max_epochs=1)
     fit.fit(stage, datamodule=datamodule)
@@ -123,10 +123,10 @@ class Seen(Callback):
 def test_each_level_has_its_weights_and_rates(
     rest: LoadedCheckpoint, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
 ) -> None:
-    schedule = DeformationSchedule(
-        (4, 6), (2, 2), rays=16, rates=(1, 0.5), fall=(1, 0.01),
-        factors={"elastic": (0, 3), "tv": (1, 0)},
-    )  # fmt: skip
+    second = Level(
+        6, 2, lr_factor=0.5, lr_final_factor=0.01, weight_factors={"elastic": 3, "tv": 0}
+    )
+    schedule = DeformationSchedule((Level(4, 2, weight_factors={"elastic": 0}), second), rays=16)
     loss = {"render": 1, "elastic": 0.2, "tv": 1}
     motion = MotionSettings(learning_rate=0.01)
     stage = DeformationStage(rest, schedule, motion, loss=loss, iterations_per_step=1)
@@ -141,9 +141,9 @@ def test_each_level_has_its_weights_and_rates(
 
 
 def test_factors_are_those_of_terms(rest: LoadedCheckpoint) -> None:
-    schedule = DeformationSchedule((4,), (2,), factors={"elastik": (1,)})
+    schedule = DeformationSchedule((Level(4, 2, weight_factors={"elastik": 1}),))
     with pytest.raises(
-        DevrfError, match="factors: elastik is no term of loss.deformation; the ter"
+        DevrfError, match="1.weight_factors: elastik is no term of loss.deformation; the ter"
     ):
         DeformationStage(rest, schedule)
 
@@ -264,7 +264,7 @@ def test_adam_begins_anew_at_each_visit_or_goes_on_above_the_coarsest_level(
     fine: list[int],
 ) -> None:
     # Three frames; frame 1 gets the share of frame 0 as well.
-    schedule = DeformationSchedule(sides=(4, 6), iterations_per_frame=(2, 2), rays=16)
+    schedule = DeformationSchedule(levels=(Level(4, 2), Level(6, 2)), rays=16)
     motion = replace(FAST, moments=moments)
     stage, counts = DeformationStage(rest, schedule, motion, iterations_per_step=1), StepCounts()
     trainer(counts, max_epochs=1).fit(stage, datamodule=datamodule)

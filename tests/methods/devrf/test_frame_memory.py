@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from devrf.methods.devrf.deformation_schedule import DeformationSchedule
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.frame_memory import (
     active_bytes,
     fits_on_device,
@@ -46,7 +46,7 @@ def test_a_quarter_of_the_gpu_is_left(
 
 
 # Of three frames in two directions, at most 20^3 voxels of 12 bytes: 0.58 MB.
-SCHEDULE = DeformationSchedule(sides=(4, 20), iterations_per_frame=(1, 1))
+SCHEDULE = DeformationSchedule(levels=(Level(4, 1), Level(20, 1)))
 
 
 @pytest.fixture

@@ -13,14 +13,14 @@ from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import score
-from devrf.methods.devrf.deformation_schedule import DeformationSchedule
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.refinement import RefinementPhase, RefinementSettings
 from devrf.methods.devrf.settings import CanonicalRates, MotionSettings
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene
 
-SHORT = DeformationSchedule(sides=(4, 6), iterations_per_frame=(8, 4), rays=256)
+SHORT = DeformationSchedule(levels=(Level(4, 8), Level(6, 4)), rays=256)
 FAST = MotionSettings(learning_rate=5e-3, views="all", pixels="occupied")
 # Three frames: 24 + 12 iterations, then these.
 REFINED = RefinementSettings(iterations=30, rates=CanonicalRates(0.05, 0.05, 5e-4), grow=1)

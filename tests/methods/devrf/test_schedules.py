@@ -12,7 +12,19 @@ from hypothesis import strategies as st
 from devrf.engine.stage import in_words
 from devrf.errors import DevrfError
 from devrf.methods.devrf.canonical_schedule import CanonicalPhase, CanonicalSchedule
-from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule
+from devrf.methods.devrf.deformation_schedule import (
+    PAPER_LEVELS,
+    DeformationPhase,
+    DeformationSchedule,
+    Level,
+)
+
+
+def with_level(number: int, **other: Any) -> list[Level]:
+    """The paper's levels, one of them changed."""
+    levels = list(PAPER_LEVELS)
+    levels[number - 1] = replace(levels[number - 1], **other)
+    return levels
 
 
 def canonical_phases(schedule: CanonicalSchedule) -> list[CanonicalPhase]:
@@ -76,7 +88,7 @@ def test_deformation_defaults_are_the_papers_inward() -> None:
 
 
 def test_deformation_forward_facing_is_the_papers() -> None:
-    schedule = DeformationSchedule(iterations_per_frame=(200, 200, 100, 50, 50), rays=4096)
+    schedule = DeformationSchedule(with_level(2, iterations=200), rays=4096)
     assert schedule.total(40) == 24000
     assert schedule.growths(40) == [8000, 16000, 20000, 22000]
 
@@ -96,9 +108,7 @@ def course(schedule: DeformationSchedule, frames: int) -> list[tuple[Any, ...]]:
 
 
 def test_frames_of_two_stretches_are_visited_together() -> None:
-    schedule = DeformationSchedule(
-        sides=(4, 6), iterations_per_frame=(6, 4), parallel_frames=(1, 2)
-    )
+    schedule = DeformationSchedule((Level(4, 6), Level(6, 4, parallel_frames=2)))
     # Frames 0 to 6 and 7 to 13.
     assert course(schedule, 14) == [
         (0, (1,), 0, 12),
@@ -122,10 +132,11 @@ def test_frames_of_two_stretches_are_visited_together() -> None:
 
 def test_a_further_level_goes_backward_through_the_frames() -> None:
     schedule = DeformationSchedule(
-        sides=(4, 6, 6),
-        iterations_per_frame=(6, 4, 2),
-        parallel_frames=(1, 1, 2),
-        order=("forward", "backward", "backward"),
+        (
+            Level(4, 6),
+            Level(6, 4, order="backward"),
+            Level(6, 2, order="backward", parallel_frames=2),
+        )
     )
     assert course(schedule, 5) == [
         (0, (1,), 0, 12),
@@ -161,33 +172,21 @@ def test_a_further_level_goes_backward_through_the_frames() -> None:
     ],
 )
 def test_stretches_of_all_kinds(frames: int, at_once: int, visits: list[tuple[int, ...]]) -> None:
-    schedule = DeformationSchedule(
-        sides=(4, 6), iterations_per_frame=(1, 3), parallel_frames=(1, at_once)
-    )
+    schedule = DeformationSchedule((Level(4, 1), Level(6, 3, parallel_frames=at_once)))
     found = [visit for visit in course(schedule, frames) if visit[0] == 1]
     assert [visited for _, visited, _, _ in found] == visits
     assert schedule.max_parallel_frames(1, frames) == max(len(visit) for visit in visits)
     assert schedule.total(frames) - frames == 3 * max(2, -(-frames // at_once))
 
 
-def test_one_at_once_is_one_after_another() -> None:
-    levels = {"sides": (4, 6), "iterations_per_frame": (6, 4)}
-    by_hand = [(0, (1,), 0, 12), (0, (2,), 12, 18), (1, (1,), 18, 26), (1, (2,), 26, 30)]
-    for at_once in (None, (1, 1)):
-        assert course(DeformationSchedule(**levels, parallel_frames=at_once), 3) == by_hand
-    for schedule in (DeformationSchedule(), DeformationSchedule(coarse_to_fine=False)):
-        ones = replace(schedule, parallel_frames=(1,) * len(schedule.sides))
-        assert deformation_phases(ones, 50) == deformation_phases(schedule, 50)
-
-
 def test_without_coarse_to_fine_the_finest_level_says_how_many() -> None:
     schedule = DeformationSchedule(
-        sides=(4, 6), iterations_per_frame=(2, 1), coarse_to_fine=False, parallel_frames=(1, 2)
+        (Level(4, 2), Level(6, 1, parallel_frames=2)), coarse_to_fine=False
     )
     assert course(schedule, 4) == [(0, (2,), 0, 3), (0, (1, 3), 3, 6)]
     assert not any(phase.init_from_previous for phase in deformation_phases(schedule, 4))
     # From rest, several may begin at once.
-    assert replace(schedule, rays=9).parallel_frames == (2,)
+    assert replace(schedule, rays=9).levels == (Level(6, 3, parallel_frames=2),)
 
 
 @given(
@@ -220,13 +219,9 @@ def test_canonical_phases_tile_every_schedule(search: int, doublings: list[int],
 def test_deformation_phases_tile_every_schedule(
     levels: list[tuple[int, int, int]], frames: int, coarse_to_fine: bool, together: bool
 ) -> None:
-    sides, shares, at_once = zip(*levels, strict=True)
-    schedule = DeformationSchedule(
-        sorted(sides),
-        shares,
-        coarse_to_fine,
-        parallel_frames=(1 if coarse_to_fine else 3, *at_once[1:]) if together else None,
-    )
+    rows = [Level(*level[:2], parallel_frames=level[2] if together else 1) for level in levels]
+    rows[0] = replace(rows[0], parallel_frames=1)
+    schedule = DeformationSchedule(rows, coarse_to_fine)
     phases = deformation_phases(schedule, frames)
     assert phases[0].start == 0 and phases[-1].stop == schedule.total(frames)
     for phase, after in zip(phases, phases[1:], strict=False):
@@ -270,44 +265,49 @@ def test_a_wrong_canonical_schedule_is_an_error(wrong: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    ("wrong", "key"),
     [
-        {"sides": (10, 20)},
-        {"sides": (), "iterations_per_frame": ()},
-        {"iterations_per_frame": (200, 100, 100, 50, 0)},
-        {"iterations_per_frame": (200, 100, -100, 50, 50)},
-        {"sides": (10, 20, 40, 80, 1)},
-        {"decay": 0.0},
-        {"rays": 0},
-        {"parallel_frames": (1, 8, 8, 4)},
-        {"parallel_frames": ()},
-        {"parallel_frames": (1, 8, 8, 4, 0)},
-        {"parallel_frames": (2, 8, 8, 4, 2)},
-        {"parallel_frames": (2, 0, 8, 4, 2), "coarse_to_fine": False},
-        {"order": ("forward", "backward")},
-        {"order": ("forward", "forward", "forward", "forward", "sideways")},
-        {"order": ("backward", "forward", "forward", "forward", "forward")},
-        {"rates": (1.0, 1.0)},
-        {"rates": (1.0, 1.0, 1.0, 1.0, 0.0)},
-        {"fall": (1.0, 1.0, 1.0, 1.0, -0.1)},
-        {"factors": {"elastic": (0.0, 1.0)}},
-        {"factors": {"elastic": (0.0, 1.0, 1.0, 1.0, -1.0)}},
+        ({"levels": ()}, "levels: expected at least one"),
+        ({"decay": 0.0}, "decay"),
+        ({"rays": 0}, "rays"),
+        ({"levels": with_level(5, iterations=0)}, "levels.5.iterations"),
+        ({"levels": with_level(5, side=1)}, "levels.5.side"),
+        ({"levels": with_level(5, parallel_frames=0)}, "levels.5.parallel_frames"),
+        ({"levels": with_level(1, parallel_frames=2)}, "levels.1.parallel_frames"),
+        ({"levels": with_level(1, order="backward")}, "levels.1.order"),
+        ({"levels": with_level(2, order="sideways")}, "levels.2.order"),
+        ({"levels": with_level(5, lr_factor=0.0)}, "levels.5.lr_factor"),
+        ({"levels": with_level(5, lr_final_factor=-0.1)}, "levels.5.lr_final_factor"),
+        ({"levels": with_level(2, weight_factors={"tv": -1})}, "levels.2.weight_factors.tv"),
     ],
     ids=str,
 )
-def test_a_wrong_deformation_schedule_is_an_error(wrong: dict[str, Any]) -> None:
-    with pytest.raises(DevrfError, match="schedule.deformation"):
+def test_a_wrong_deformation_schedule_is_an_error(wrong: dict[str, Any], key: str) -> None:
+    with pytest.raises(DevrfError, match=f"schedule.deformation.{key}"):
         DeformationSchedule(**wrong)
 
 
+def test_rows_of_a_config_are_levels_in_the_order_of_their_numbers() -> None:
+    rows: dict[str, Any] = {
+        "2": {"side": 6, "iterations": 4, "order": "backward"},
+        "1": {"side": 4, "iterations": 6},
+        "3": None,
+    }
+    schedule = DeformationSchedule.from_rows(rows, rays=64)
+    assert schedule == DeformationSchedule([Level(4, 6), Level(6, 4, order="backward")], rays=64)
+    for wrong in ({"1": None}, {"2": {"side": 6}}):
+        with pytest.raises(DevrfError, match="expected rows 1 to"):
+            DeformationSchedule.from_rows({**rows, **wrong})
+
+
 def test_a_level_may_have_a_rate_and_weights_of_its_own() -> None:
-    schedule = DeformationSchedule(
-        (4, 8, 8), (2, 2, 2), rates=(1, 0.5, 0.3), fall=(1, 1, 0.1), factors={"tv": (1, 1, 0)}
-    )
+    last = Level(8, 2, lr_factor=0.3, lr_final_factor=0.1, weight_factors={"tv": 0})
+    schedule = DeformationSchedule((Level(4, 2), Level(8, 2, lr_factor=0.5), last))
     phases = [schedule.phase(i, frames=2) for i in (0, 4, 8)]
-    assert [(p.learning_rate_factor, p.fall) for p in phases] == [(1, 1), (0.5, 1), (0.3, 0.1)]
+    rates = [(p.learning_rate_factor, p.lr_final_factor) for p in phases]
+    assert rates == [(1, 1), (0.5, 1), (0.3, 0.1)]
     assert [schedule.weight_factor("tv", level) for level in range(3)] == [1, 1, 0]
     assert schedule.weight_factor("flow", 2) == 1
     finest = replace(schedule, coarse_to_fine=False)
     assert finest.phase(0, frames=2).learning_rate_factor == 1  # the base rate
-    assert finest.phase(0, frames=2).fall == 0.1 and finest.weight_factor("tv", 0) == 0
+    assert finest.phase(0, frames=2).lr_final_factor == 0.1 and finest.weight_factor("tv", 0) == 0

@@ -86,7 +86,7 @@ class AppearanceLearning:
         if drifting:
             self._factors = self.settings.factors_if_drifting
         # The ablation without levels has one.
-        self._first = min(first, len(self._schedule.sides) - 1)
+        self._first = min(first, len(self._schedule.levels) - 1)
         voxels, rate = self.settings.side**3, self.settings.learning_rate
         model.appearance = AppearanceField(model.box, clock, voxels=voxels)
         group = {"params": [], "lr": rate, "base_lr": rate, "name": GROUP}

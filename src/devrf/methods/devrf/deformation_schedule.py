@@ -4,14 +4,45 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import accumulate, pairwise
-from typing import Literal
+from typing import Any, Literal
 
 from devrf.errors import DevrfError
 
 # In time, from a visit of a level to the next.
 Order = Literal["forward", "backward"]
+
+
+@dataclass(frozen=True)
+class Level:
+    """One resolution of the motion grids, and how the frames are learned at it.
+
+    Attributes:
+        side: the motion grids have about side³ voxels. A level may have the side of the one before
+            it: the same grids are then gone through once more.
+        iterations: share of each frame.
+        lr_factor: of the learning rate; None: the schedule's ``decay`` to the power of how often
+            the side has changed.
+        lr_final_factor: what the learning rate falls to in the course of a visit, exponentially,
+            as a factor.
+        order: of the frames, in time; ``forward`` at the coarsest level.
+        parallel_frames: K, how many frames may be learned in parallel; 1 at the coarsest level,
+            where a frame starts from the one before it.
+        weight_factors: of the weights of ``loss.deformation``, by the term's name; 1 for terms
+            that are not named.
+    """
+
+    side: int
+    iterations: int
+    lr_factor: float | None = None
+    lr_final_factor: float = 1.0
+    order: Order = "forward"
+    parallel_frames: int = 1
+    weight_factors: Mapping[str, float] = field(default_factory=dict)
+
+
+PAPER_LEVELS = (Level(10, 200), Level(20, 100), Level(40, 100), Level(80, 50), Level(160, 50))
 
 
 @dataclass(frozen=True)
@@ -25,7 +56,7 @@ class DeformationPhase:
         stop: one past the last iteration.
         side: side of the motion grid: it has about side³ voxels.
         learning_rate_factor: what the learning rate is multiplied by at the visit's start.
-        fall: what it has been multiplied by further at the visit's end.
+        lr_final_factor: what it has been multiplied by further at the visit's end.
         init_from_previous: whether the frame starts from the result of the frame before it.
         has_previous: whether the frames before these have been learned at this level, or are at
             rest.
@@ -38,15 +69,15 @@ class DeformationPhase:
     stop: int
     side: int
     learning_rate_factor: float
-    fall: float
+    lr_final_factor: float
     init_from_previous: bool
     has_previous: bool
     backward: bool = False
 
     @property
     def kind(self) -> str:
-        """The level, in words."""
-        return f"level {self.level}"
+        """The level, in words, by the number of its row."""
+        return f"level {self.level + 1}"
 
 
 @dataclass(frozen=True)
@@ -68,124 +99,93 @@ class DeformationSchedule:
     frame 1 gets its share as above.
 
     A level whose order is ``backward`` makes the same visits from the last to the first; where
-    frame 0 is alone, its share goes to the last frame. A level may have the side of the one before
-    it: the same grids are then gone through once more, at the same rate.
+    frame 0 is alone, its share goes to the last frame.
 
     Attributes:
-        sides: the motion grids have about side³ voxels at each level, coarse to fine.
-        iterations_per_frame: share of a frame at each level.
+        levels: coarse to fine.
         coarse_to_fine: False spends all shares at the finest resolution, at the base rate, each
             frame starting from rest (``ablation=base``, docs/method.md#ablations).
         decay: factor of the learning rate from a level to the next, if its side is another one.
         rays: of a batch.
-        parallel_frames: K of each level, 1 at the coarsest, where a frame starts from the one
-            before it; None: 1 throughout.
-        order: of the frames of each level, ``forward`` in time at the coarsest; None: ``forward``
-            throughout.
-        rates: factor of the learning rate at each level; None: ``decay`` to the power of how often
-            the side has changed.
-        fall: what the learning rate falls to in the course of a visit, exponentially, as a factor,
-            at each level; None: 1 throughout.
-        factors: of the weights of ``loss.deformation`` at each level, by the term's name; 1
-            throughout of terms that are not named.
     """
 
-    sides: Sequence[int] = (10, 20, 40, 80, 160)
-    iterations_per_frame: Sequence[int] = (200, 100, 100, 50, 50)
+    levels: Sequence[Level] = PAPER_LEVELS
     coarse_to_fine: bool = True
     decay: float = 10 ** (-1 / 4)
     rays: int = 8192
-    parallel_frames: Sequence[int] | None = None
-    order: Sequence[Order] | None = None
-    rates: Sequence[float] | None = None
-    fall: Sequence[float] | None = None
-    factors: Mapping[str, Sequence[float]] = field(default_factory=dict)
+
+    @classmethod
+    def from_rows(
+        cls,
+        levels: Mapping[str, Level | None],
+        coarse_to_fine: bool = True,
+        decay: float = 10 ** (-1 / 4),
+        rays: int = 8192,
+    ) -> DeformationSchedule:
+        """The schedule of a config, whose levels are rows that are named ``1``, ``2`` and so on.
+
+        Args:
+            levels: the values of a :class:`Level` in each row; null leaves a row out, so that a
+                schedule may have fewer levels than the one that it starts from.
+            coarse_to_fine: as of the schedule.
+            decay: likewise.
+            rays: likewise.
+
+        Raises:
+            DevrfError: a row between two others is missing, or lacks its side or iterations.
+        """
+        rows: dict[str, Any] = {str(name): row for name, row in levels.items() if row is not None}
+        numbered = []
+        for number in range(1, len(rows) + 1):
+            row = rows.get(str(number))
+            if row is None or not {"side", "iterations"} <= set(row):
+                raise DevrfError(
+                    f"schedule.deformation.levels: expected rows 1 to {len(rows)} with side and "
+                    f"iterations, which row {number} has not; there are {', '.join(sorted(rows))}"
+                )
+            numbered.append(Level(**row))
+        return cls(numbered, coarse_to_fine, decay, rays)
 
     def __post_init__(self) -> None:
-        if len(self.sides) != len(self.iterations_per_frame) or not self.sides:
-            raise DevrfError(
-                "schedule.deformation.sides and .iterations_per_frame must be of one length, "
-                f"not {len(self.sides)} and {len(self.iterations_per_frame)}"
-            )
-        at_once = (1,) * len(self.sides) if self.parallel_frames is None else self.parallel_frames
-        if len(at_once) != len(self.sides):
-            raise DevrfError(
-                f"schedule.deformation.parallel_frames: expected {len(self.sides)} numbers, one "
-                f"for each of .sides, or null, not {len(at_once)}"
-            )
-        for name, values, bound in (
-            ("sides", self.sides, 2),
-            ("iterations_per_frame", self.iterations_per_frame, 1),
-            ("rays", (self.rays,), 1),
-            ("parallel_frames", at_once, 1),
-        ):
-            if min(values) < bound:
-                raise DevrfError(
-                    f"schedule.deformation.{name}: expected at least {bound}, not {min(values)}"
-                )
+        if not self.levels:
+            raise DevrfError("schedule.deformation.levels: expected at least one")
+        if self.rays < 1:
+            raise DevrfError(f"schedule.deformation.rays: expected at least 1, not {self.rays}")
         if not self.decay > 0:
             raise DevrfError(f"schedule.deformation.decay: expected more than 0, not {self.decay}")
-        if self.coarse_to_fine and at_once[0] > 1:
+        for number, level in enumerate(self.levels, 1):
+            _check_level(f"schedule.deformation.levels.{number}", level)
+        first, last = self.levels[0], self.levels[-1]
+        if self.coarse_to_fine and first.parallel_frames > 1:
             raise DevrfError(
-                "schedule.deformation.parallel_frames: expected 1 at the first level, where a "
-                f"frame starts from the one before it, not {at_once[0]}"
+                "schedule.deformation.levels.1.parallel_frames: expected 1 at the first level, "
+                f"where a frame starts from the one before it, not {first.parallel_frames}"
             )
-        self._check_order()
-        self._check_factors()
+        if first.order != "forward":
+            raise DevrfError(
+                "schedule.deformation.levels.1.order: expected forward at the first level, where a "
+                f"frame starts from the one before it, not {first.order}"
+            )
         if not self.coarse_to_fine:
-            object.__setattr__(self, "sides", (self.sides[-1],))
-            object.__setattr__(self, "iterations_per_frame", (sum(self.iterations_per_frame),))
-            object.__setattr__(self, "parallel_frames", (at_once[-1],))
-            object.__setattr__(self, "order", None)
-            object.__setattr__(self, "rates", None)
-            object.__setattr__(self, "fall", None if self.fall is None else (self.fall[-1],))
-            last = {name: (factors[-1],) for name, factors in self.factors.items()}
-            object.__setattr__(self, "factors", last)
-
-    def _check_order(self) -> None:
-        order = self.order
-        if order is None:
-            return
-        if len(order) != len(self.sides) or not set(order) <= {"forward", "backward"}:
-            raise DevrfError(
-                "schedule.deformation.order: expected forward or backward for each of .sides, or "
-                f"null, not {list(order)}"
-            )
-        if order[0] != "forward":
-            raise DevrfError(
-                "schedule.deformation.order: expected forward at the first level, where a frame "
-                f"starts from the one before it, not {order[0]}"
-            )
-
-    def _check_factors(self) -> None:
-        given = {"rates": self.rates, "fall": self.fall}
-        of_terms = {f"factors.{name}": factors for name, factors in self.factors.items()}
-        for name, factors in {**given, **of_terms}.items():
-            if factors is None:
-                continue
-            # A weight may be 0, a rate may not.
-            too_low = min(factors, default=0) < 0 or (name in given and 0 in factors)
-            if len(factors) != len(self.sides) or too_low:
-                least = "above 0" if name in given else "at least 0"
-                raise DevrfError(
-                    f"schedule.deformation.{name}: expected a number, {least}, for each of .sides, "
-                    f"not {list(factors)}"
-                )
+            iterations = sum(level.iterations for level in self.levels)
+            finest = replace(last, iterations=iterations, lr_factor=None, order="forward")
+            object.__setattr__(self, "levels", (finest,))
 
     def learning_rate_factor(self, level: int) -> float:
         """Factor of the learning rate when a visit of ``level`` begins."""
-        if self.rates is not None:
-            return self.rates[level]
-        return self.decay ** sum(a != b for a, b in pairwise(self.sides[: level + 1]))
+        factor = self.levels[level].lr_factor
+        if factor is not None:
+            return factor
+        sides = [row.side for row in self.levels[: level + 1]]
+        return self.decay ** sum(a != b for a, b in pairwise(sides))
 
     def weight_factor(self, term: str, level: int) -> float:
         """Factor of the weight of a loss term at ``level``."""
-        return self.factors[term][level] if term in self.factors else 1.0
+        return self.levels[level].weight_factors.get(term, 1.0)
 
     def visits(self, level: int, frames: int) -> int:
         """L of T = ``frames`` frames: visits of a level, and the distance of parallel frames."""
-        at_once = 1 if self.parallel_frames is None else self.parallel_frames[level]
-        return max(2, -(-frames // at_once))
+        return max(2, -(-frames // self.levels[level].parallel_frames))
 
     def max_parallel_frames(self, level: int, frames: int) -> int:
         """The most of T = ``frames`` frames that a level learns in parallel."""
@@ -201,29 +201,43 @@ class DeformationSchedule:
 
     def _lengths(self, frames: int) -> list[int]:
         """Iterations of each level."""
-        shares = enumerate(self.iterations_per_frame)
-        return [share * self.visits(level, frames) for level, share in shares]
+        return [row.iterations * self.visits(k, frames) for k, row in enumerate(self.levels)]
 
     def phase(self, iteration: int, frames: int) -> DeformationPhase:
         """The visit that ``iteration`` belongs to; the last one from the end on."""
         begins = [0, *self.growths(frames)]
         level = bisect_right(begins, iteration) - 1
-        begin, apart = begins[level], self.visits(level, frames)
-        share = self.iterations_per_frame[level]
+        begin, apart, row = begins[level], self.visits(level, frames), self.levels[level]
         first = 1 if apart == frames else 0  # frame 0 alone
-        visit = min(max((iteration - begin) // share, first), apart - 1)
-        backward = self.order is not None and self.order[level] == "backward"
+        visit = min(max((iteration - begin) // row.iterations, first), apart - 1)
+        backward = row.order == "backward"
         place = first + apart - 1 - visit if backward else visit
         visited = tuple(range(place or apart, frames, apart))
         return DeformationPhase(
             level=level,
             frames=visited,
-            start=begin + (0 if visit == first else visit * share),
-            stop=begin + (visit + 1) * share,
-            side=self.sides[level],
+            start=begin + (0 if visit == first else visit * row.iterations),
+            stop=begin + (visit + 1) * row.iterations,
+            side=row.side,
             learning_rate_factor=self.learning_rate_factor(level),
-            fall=1.0 if self.fall is None else self.fall[level],
+            lr_final_factor=row.lr_final_factor,
             init_from_previous=self.coarse_to_fine and level == 0 and visit > 1,
             has_previous=visit > 0 and not backward,
             backward=backward,
         )
+
+
+def _check_level(key: str, level: Level) -> None:
+    """Check what holds for every level; ``key`` is that of its row."""
+    for name, bound in (("side", 2), ("iterations", 1), ("parallel_frames", 1)):
+        if getattr(level, name) < bound:
+            raise DevrfError(f"{key}.{name}: expected at least {bound}, not {getattr(level, name)}")
+    for name in ("lr_factor", "lr_final_factor"):
+        factor = getattr(level, name)
+        if factor is not None and not factor > 0:
+            raise DevrfError(f"{key}.{name}: expected more than 0, not {factor}")
+    if level.order not in ("forward", "backward"):
+        raise DevrfError(f"{key}.order: expected forward or backward, not {level.order}")
+    for term, factor in level.weight_factors.items():
+        if factor < 0:
+            raise DevrfError(f"{key}.weight_factors.{term}: expected at least 0, not {factor}")

@@ -182,7 +182,7 @@ class DeformationStage(VoxelStage):
         if isinstance(phase, RefinementPhase):
             return phase.learning_rate_factor(iteration)
         share = (iteration - phase.start) / (phase.stop - phase.start)
-        return phase.learning_rate_factor * math.pow(phase.fall, share)
+        return phase.learning_rate_factor * math.pow(phase.lr_final_factor, share)
 
     def setup(self, stage: str) -> None:
         """Build the field at rest, at the coarsest resolution.
@@ -202,7 +202,7 @@ class DeformationStage(VoxelStage):
         self._leave_out_camera_flow()
         model, motion = self.scene_model, self.motion
         if model.deformation is None:
-            voxels = self.schedule.sides[0] ** 3
+            voxels = self.schedule.levels[0].side ** 3
             box = model.space.inner(model.box)
             model.deformation = DeformationField(
                 box, self.scene.clock, voxels=voxels, still_outside=box != model.box
@@ -212,7 +212,7 @@ class DeformationStage(VoxelStage):
                 half=motion.rests_half(self.trainer.strategy.root_device),
             )
             # Before the clock of training starts.
-            self.field.frames.reserve(box.grid_shape(self.schedule.sides[-1] ** 3))
+            self.field.frames.reserve(box.grid_shape(self.schedule.levels[-1].side ** 3))
             recorded = self.scene.dynamic.train
             self.appearance.setup(model, self.field.clock, self._optimizer, recorded)
             if self.refinement.settings.iterations:
@@ -312,7 +312,13 @@ class DeformationStage(VoxelStage):
 
     def _check_factors(self) -> None:
         given = {
-            "deformation.factors": (self.schedule.factors, {*MOTION_TERMS, "tv"}),
+            **{
+                f"deformation.levels.{number}.weight_factors": (
+                    level.weight_factors,
+                    {*MOTION_TERMS, "tv"},
+                )
+                for number, level in enumerate(self.schedule.levels, 1)
+            },
             "appearance.factors_if_drifting": (
                 self.appearance.settings.factors_if_drifting,
                 set(MOTION_TERMS),
@@ -454,8 +460,11 @@ class DeformationStage(VoxelStage):
     @property
     def memory_keys(self) -> tuple[str, ...]:  # type: ignore[override]
         """Grid sizes and rays; how many frames are learned together, if there are several."""
-        keys = ("schedule.deformation.sides", "schedule.deformation.rays")
-        return (*keys, "schedule.deformation.parallel_frames") if len(self.active) > 1 else keys
+        levels, phase = len(self.schedule.levels), self.phase
+        number = phase.level + 1 if isinstance(phase, DeformationPhase) else levels
+        level = f"schedule.deformation.levels.{number}"
+        keys = (f"{level}.side", "schedule.deformation.rays")
+        return (*keys, f"{level}.parallel_frames") if len(self.active) > 1 else keys
 
     def phase_state(self) -> dict[str, Any]:
         """The state of each active frame, and its losses so far."""

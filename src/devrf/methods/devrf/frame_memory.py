@@ -57,7 +57,7 @@ def rest_on_host(
     assert model.deformation is not None
     free, _ = torch.cuda.mem_get_info(device)
     motion_box, frames = model.deformation.box, len(model.deformation.clock)
-    shape = motion_box.grid_shape(schedule.sides[-1] ** 3)
+    shape = motion_box.grid_shape(schedule.levels[-1].side ** 3)
     parallel = schedule.max_parallel_frames(-1, frames)
     half = motion.rests_half(device)
     fits = fits_on_device(free, frames, shape, half=half, parallel=parallel)
