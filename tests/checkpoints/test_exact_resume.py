@@ -70,7 +70,6 @@ BACKWARD = replace(
     ),
 )
 PRIORS = {"render": 1.0, "cycle": 100.0, "tv": 1.0, "elastic": 0.1}
-BY_TURNS = MotionSettings(occupancy_every=3)
 # The field would not keep exactly what a visit has learned.
 ROUNDED = MotionSettings(occupancy_every=3, store="host", store_half=True)
 
@@ -156,13 +155,11 @@ def learn(
 
 def test_the_canonical_stage_goes_on_exactly(learn) -> None:
     # In the search, before, at and after its end, mid-level, around both doublings, at last.
-    leaves = (1, 7, 8, 9, 11, 12, 13, 16, 19)
+    leaves = (1, 8, 9, 12, 16, 19)
     assert_same(learn(canonical, *leaves), learn(canonical))
 
 
-@pytest.mark.parametrize(
-    "motion", [ALONG_TRACKS, BY_TURNS, ROUNDED], ids=["all views", "by turns", "in half precision"]
-)
+@pytest.mark.parametrize("motion", [ALONG_TRACKS, ROUNDED], ids=["all views", "in half precision"])
 def test_the_deformation_stage_goes_on_exactly(
     learn, rest: LoadedCheckpoint, motion: MotionSettings
 ) -> None:
@@ -170,7 +167,7 @@ def test_the_deformation_stage_goes_on_exactly(
         return DeformationStage(copy.deepcopy(rest), MOVING, motion, iterations_per_step=1)
 
     # Mid-frame, around a look at the occupancy, around a frame's end, around a level's, at last.
-    leaves = (1, 2, 3, 4, 11, 12, 13, 17, 18, 19, 26, 29)
+    leaves = (2, 3, 4, 12, 13, 18, 26, 29)
     assert_same(learn(build, *leaves), learn(build))
 
 
@@ -178,9 +175,9 @@ def test_the_deformation_stage_goes_on_exactly(
     ("motion", "leaves"),
     [
         # Around each visit of level 1, and mid-visit.
-        (ALONG_TRACKS, (15, 16, 17, 21, 22, 23, 24, 26, 27)),
+        (ALONG_TRACKS, (16, 17, 22, 24)),
         # A visit ends after three steps, as their losses tell.
-        (replace(ROUNDED, min_rel_improvement=1.0), (14, 16, 17, 18, 22, 23, 24)),
+        (replace(ROUNDED, min_rel_improvement=1.0), (16, 17, 18, 23)),
     ],
     ids=["all views", "in half precision"],
 )
@@ -199,11 +196,10 @@ def test_frames_that_are_visited_together_go_on_exactly(
     assert len(whole["optimizer"]["param_groups"][0]["params"]) == 4
 
 
-@pytest.mark.parametrize("first_level", [0, 1])
 def test_colours_that_change_go_on_exactly(
-    learn, rest: LoadedCheckpoint, four_frames: SceneDataModule, first_level: int
+    learn, rest: LoadedCheckpoint, four_frames: SceneDataModule
 ) -> None:
-    appearance = AppearanceSettings(learn="always", side=5, first_level=first_level)
+    appearance = AppearanceSettings(learn="always", side=5, first_level=1)
 
     def build() -> ScheduledStage:
         return DeformationStage(
@@ -212,7 +208,7 @@ def test_colours_that_change_go_on_exactly(
 
     # Mid-visit at both levels, around a frame's end, around the level's.
     whole = learn(build, data=four_frames)
-    assert_same(learn(build, 3, 9, 15, 16, 18, 22, 25, data=four_frames), whole)
+    assert_same(learn(build, 3, 16, 18, 25, data=four_frames), whole)
     assert len(whole["optimizer"]["param_groups"][1]["params"]) == 2
 
 
@@ -229,7 +225,7 @@ def test_the_refinement_goes_on_exactly(learn, rest: LoadedCheckpoint) -> None:
 
     # At its beginning, within, before its end.
     whole = learn(build)
-    assert_same(learn(build, 30, 31, 33, 35), whole)
+    assert_same(learn(build, 30, 33), whole)
     assert whole["iteration"] == 36
 
 
@@ -241,7 +237,7 @@ def test_a_second_sweep_with_the_elastic_prior_goes_on_exactly(
         return DeformationStage(stage, BACKWARD, ROUNDED, PRIORS, iterations_per_step=1)
 
     # Mid-visit, around a look at the occupancy, around visits and levels.
-    leaves = (2, 13, 16, 20, 27, 28, 30, 31, 32, 34)
+    leaves = (13, 20, 28, 31, 34)
     whole = learn(build, data=four_frames)
     assert_same(learn(build, *leaves, data=four_frames), whole)
 
@@ -250,7 +246,7 @@ def test_a_step_of_many_iterations_goes_on_exactly(learn, rest: LoadedCheckpoint
     def build() -> ScheduledStage:
         return DeformationStage(copy.deepcopy(rest), MOVING, ALONG_TRACKS, iterations_per_step=4)
 
-    assert_same(learn(build, 4, 12, 16, 22, 26), learn(build))
+    assert_same(learn(build, 4, 16, 26), learn(build))
 
 
 def test_only_what_is_to_be_gone_on_from_holds_the_way_there(

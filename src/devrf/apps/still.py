@@ -20,7 +20,7 @@ from devrf.apps.images import (
     side_by_side,
     write_image,
 )
-from devrf.checkpoints.viewpoints import Viewpoints
+from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import HeldOutView, background_value, compare, truth_image
 from devrf.geometry.box import Box

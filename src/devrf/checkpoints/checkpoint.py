@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from lightning import Trainer
 from lightning.fabric.plugins import CheckpointIO
@@ -19,23 +18,14 @@ from devrf.checkpoints.checkpoint_file import (
     read_description,
     write_checkpoint_file,
 )
-from devrf.checkpoints.viewpoints import Viewpoints, viewpoints_in
 from devrf.errors import DevrfError
-from devrf.scenes.scene import Scene
+from devrf.geometry.cameras import Cameras
+from devrf.scenes.scene import Background, Scene
 
 # The stage's attribute that holds the model: what its entries of a state begin with.
 MODEL = "scene_model."
 # What training took: by name, numbers, and words that say how it ran.
 TrainingFigures = dict[str, float | str | None]
-
-
-class StoredModel(Protocol):
-    """What a model's class offers: a :class:`~devrf.methods.base.DynamicModel`."""
-
-    @classmethod
-    def from_config(cls, config: Mapping[str, Any]) -> Any:
-        """A model that takes the state of the one that was described."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -70,6 +60,30 @@ class CheckpointMetadata:
 
     def as_data(self) -> dict[str, Any]:
         """Plain data, for a checkpoint."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Viewpoints:
+    """The cameras of a scene, without its images.
+
+    Attributes:
+        static: cameras of the static training images.
+        held_out: the camera of the first held-out image of the moving scene: one camera.
+        background: what is behind the alpha mask.
+    """
+
+    static: Cameras
+    held_out: Cameras
+    background: Background
+
+    @classmethod
+    def of(cls, scene: Scene) -> Viewpoints:
+        """The viewpoints of a scene."""
+        return cls(scene.static.train.cameras, scene.dynamic.test.cameras[[0]], scene.background)
+
+    def as_data(self) -> dict[str, Any]:
+        """Plain data and tensors, for a checkpoint."""
         return asdict(self)
 
 
@@ -146,7 +160,7 @@ def load_checkpoint(path: Path, scene: Scene | None = None) -> LoadedCheckpoint:
         check_scene(path, metadata, scene)
     state = data.get("state_dict")
     model = _model(path, metadata, state if isinstance(state, dict) else {})
-    return LoadedCheckpoint(metadata, model, viewpoints_in(path, data))
+    return LoadedCheckpoint(metadata, model, _viewpoints(path, data))
 
 
 def check_scene(path: Path, metadata: CheckpointMetadata, scene: Scene) -> None:
@@ -187,6 +201,18 @@ def metadata_in(path: Path, data: dict[str, Any]) -> CheckpointMetadata:
         ) from None
 
 
+def _viewpoints(path: Path, data: dict[str, Any]) -> Viewpoints | None:
+    """The viewpoints in the content of a checkpoint; None where it has none."""
+    stored = data.get("viewpoints")
+    if stored is None:
+        return None
+    try:
+        static, held_out = Cameras(**stored["static"]), Cameras(**stored["held_out"])
+        return Viewpoints(static, held_out, stored["background"])
+    except (TypeError, LookupError) as error:
+        raise DevrfError(f"{path}: its cameras are not as devrf writes them ({error})") from None
+
+
 def _model(path: Path, metadata: CheckpointMetadata, state: dict[str, Any]) -> nn.Module:
     """The model that the metadata describe, with the stored state."""
     own = {str(k).removeprefix(MODEL): v for k, v in state.items() if str(k).startswith(MODEL)}
@@ -198,16 +224,16 @@ def _model(path: Path, metadata: CheckpointMetadata, state: dict[str, Any]) -> n
     return model
 
 
-def _model_class(path: Path, metadata: CheckpointMetadata) -> type[StoredModel]:
+def _model_class(path: Path, metadata: CheckpointMetadata) -> Any:
     """The model's class; a file may not choose which other code is run."""
     module, _, name = str(metadata.model.get("_target_")).rpartition(".")
-    if module.startswith("devrf.methods.") and not module.count(".") > 4:
+    if module.startswith("devrf.methods."):
         with suppress(ModuleNotFoundError):
             importlib.import_module(module)
-    found = getattr(sys.modules.get(module), name, None)
-    if not (isinstance(found, type) and hasattr(found, "from_config")):
+    model_class = getattr(sys.modules.get(module), name, None)
+    if not (isinstance(model_class, type) and hasattr(model_class, "from_config")):
         raise DevrfError(
             f"{path}: was learned by {module}.{name}, which is not known here; import the "
             "module of its method first"
         )
-    return found
+    return model_class

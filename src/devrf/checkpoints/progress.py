@@ -22,12 +22,12 @@ def progress_file(folder: Path, stage: str, iteration: int) -> Path:
 
 def progress_files(folder: Path, stage: str) -> list[Path]:
     """The progress files of a stage, the furthest first."""
-    found = {
+    files = {
         int(match.group(1)): path
         for path in folder.glob(f"{stage}-progress-*.ckpt")
         if (match := re.fullmatch(rf"{stage}-progress-(\d+)\.ckpt", path.name))
     }
-    return [found[iteration] for iteration in sorted(found, reverse=True)]
+    return [files[iteration] for iteration in sorted(files, reverse=True)]
 
 
 def rng_state(device: torch.device) -> dict[str, Any]:

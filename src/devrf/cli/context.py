@@ -16,9 +16,8 @@ from lightning.pytorch.strategies import Strategy
 from omegaconf import DictConfig, OmegaConf
 
 from devrf.apps.trackers import Tracker, trackers
-from devrf.checkpoints.checkpoint import LoadedCheckpoint, load_checkpoint
+from devrf.checkpoints.checkpoint import LoadedCheckpoint, Viewpoints, load_checkpoint
 from devrf.checkpoints.checkpoint_file import digest_of
-from devrf.checkpoints.viewpoints import Viewpoints
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.ddp import ManualDDP
 from devrf.engine.stage import ScheduledStage

@@ -23,7 +23,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from devrf.checkpoints.checkpoint import CheckpointMetadata, metadata_in
-from devrf.checkpoints.checkpoint_file import OtherFormatError, digest_of, read_checkpoint_file
+from devrf.checkpoints.checkpoint_file import digest_of, read_checkpoint_file
 from devrf.checkpoints.progress import progress_files
 from devrf.cli.config_check import REFERENCE
 from devrf.cli.context import GIVEN_REST, OWN_REST, RunContext
@@ -103,8 +103,6 @@ def beginning(run: RunContext, stage: str) -> ResumePoint:
         try:
             content = read_checkpoint_file(progress)
             metadata, iteration = metadata_in(progress, content), content["progress"]["iteration"]
-        except OtherFormatError:
-            raise
         except DevrfError as error:
             log.warning("%s; the file before it is taken", error)
             progress.unlink()

@@ -10,8 +10,7 @@ from hydra.utils import instantiate
 
 from devrf.apps.images import write_image
 from devrf.apps.still import StillSettings, still
-from devrf.checkpoints.checkpoint import CheckpointMetadata
-from devrf.checkpoints.viewpoints import Viewpoints
+from devrf.checkpoints.checkpoint import CheckpointMetadata, Viewpoints
 from devrf.cli.context import RunContext
 from devrf.cli.overrides import Overrides
 from devrf.cli.resume import deciding_settings

@@ -9,8 +9,7 @@ from threading import Event
 from hydra.utils import instantiate
 
 from devrf.apps.settings import ViewerSettings
-from devrf.checkpoints.checkpoint import check_scene
-from devrf.checkpoints.viewpoints import Viewpoints
+from devrf.checkpoints.checkpoint import Viewpoints, check_scene
 from devrf.cli.context import RunContext
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value

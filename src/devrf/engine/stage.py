@@ -23,11 +23,11 @@ from devrf.checkpoints.checkpoint import (
     MODEL,
     CheckpointMetadata,
     TrainingFigures,
+    Viewpoints,
     check_scene,
     metadata_in,
 )
 from devrf.checkpoints.progress import rng_state, set_rng_state
-from devrf.checkpoints.viewpoints import Viewpoints
 from devrf.data.batch import Pixels, background_color
 from devrf.engine.ddp import assert_replicas_equal, broadcast, check_strategy, rank
 from devrf.engine.graphs import Graphs

@@ -16,7 +16,7 @@ from PIL import Image
 
 from devrf.apps.settings import ViewerSettings
 from devrf.apps.viewer.drawing import Drawing
-from devrf.checkpoints.viewpoints import Viewpoints
+from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.rendering.renderer import Renderer
 
 pytest.importorskip("viser", reason="the viewer's extra is not installed")

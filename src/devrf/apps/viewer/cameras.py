@@ -23,7 +23,7 @@ import threading
 import viser
 
 from devrf.apps.images import evenly, scaled, to_bytes
-from devrf.checkpoints.viewpoints import Viewpoints
+from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.evaluation.held_out import truth_image
 from devrf.scenes.scene import Background, Scene, Views
 

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from devrf.checkpoints.packing import pack_bits, unpack_bits
+from devrf.checkpoints.stored_grids import pack_bits, unpack_bits
 from devrf.data.batch import PixelPool
 from devrf.geometry.box import Box
 from devrf.methods.devrf.appearance import AppearanceField, ColorResidual

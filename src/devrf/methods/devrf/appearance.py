@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from devrf.checkpoints.stored_shape import StoredShape
+from devrf.checkpoints.stored_grids import StoredShape
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock

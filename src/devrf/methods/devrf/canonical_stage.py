@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
-from devrf.checkpoints.packing import pack_bits, unpack_bits
+from devrf.checkpoints.stored_grids import pack_bits, unpack_bits
 from devrf.data.batch import PixelPool, Pixels
 from devrf.engine.batches import static_pool
 from devrf.engine.graphs import Graphs

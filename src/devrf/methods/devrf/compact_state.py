@@ -1,7 +1,7 @@
 """The state of a finished scene as its checkpoint holds it.
 
-Grids are packed (:mod:`devrf.checkpoints.packing`): in half precision, in detail only near what is
-ever occupied. Progress files hold everything as it is.
+Grids are packed (:mod:`devrf.checkpoints.stored_grids`): in half precision, in detail only near
+what is ever occupied. Progress files hold everything as it is.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from devrf.checkpoints.packing import pack, unpack
+from devrf.checkpoints.stored_grids import pack, unpack
 from devrf.geometry.box import Box
 from devrf.methods.devrf.appearance import AppearanceField
 from devrf.methods.devrf.canonical_field import CanonicalField

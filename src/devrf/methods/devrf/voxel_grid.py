@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from devrf.checkpoints.stored_shape import StoredShape
+from devrf.checkpoints.stored_grids import StoredShape
 from devrf.geometry.box import Box
 from devrf.ops.corners import shape_of, to_grid
 from devrf.ops.resampling import resample

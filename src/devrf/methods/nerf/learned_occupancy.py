@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from devrf.checkpoints.stored_shape import StoredShape
+from devrf.checkpoints.stored_grids import StoredShape
 from devrf.geometry.box import Box
 
 # A cell is empty below LEAST of opacity a step: what it is at a random place and time, or DECAY

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from devrf.checkpoints.stored_shape import StoredShape
+from devrf.checkpoints.stored_grids import StoredShape
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
 from devrf.methods.nerf.learned_occupancy import LearnedOccupancy

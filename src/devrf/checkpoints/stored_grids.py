@@ -1,4 +1,4 @@
-"""Grids as a finished checkpoint holds them, and masks as bits.
+"""Grids as checkpoints hold them: packed, as bits, and of the shape they were stored with.
 
 Most of a field's voxels lie in empty space. Their values are not seen, but a deformation field has
 to map empty space to empty space, also between frames. So a smooth grid is kept twice, in half
@@ -9,19 +9,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from devrf.ops.resampling import resample
 
 # Grid points of the detailed grid to one of the thinned-out grid.
 THINNING = 4
-
-# Packing makes grids smaller by this factor at most: a file that claims more is hostile.
-MAX_RATIO = 1000
 
 Packed = dict[str, Any]
 
@@ -56,7 +53,7 @@ def pack(grids: Tensor, keep: Tensor, *, smooth: bool) -> Packed:
             elsewhere.append(mean.half())
     return {
         "shape": list(grids.shape[1:4]),
-        "keep": torch.stack([pack_bits(one) for one in keep]),
+        "keep": torch.stack([pack_bits(mask) for mask in keep]),
         "kept": torch.cat(kept),
         "elsewhere": torch.stack(elsewhere),
     }
@@ -66,25 +63,17 @@ def unpack(packed: Packed) -> Tensor:
     """The grids (N, X, Y, Z, C) in single precision that :func:`pack` stored.
 
     Raises:
-        ValueError: the parts do not fit together.
+        RuntimeError | ValueError: the parts do not fit together.
     """
     x, y, z = (int(points) for points in packed["shape"])
-    shape = (x, y, z)
-    elsewhere, kept = packed["elsewhere"].float(), packed["kept"]
-    stored = sum(packed[name].nbytes for name in ("keep", "kept", "elsewhere"))
-    if 4 * len(elsewhere) * elsewhere.shape[-1] * x * y * z > MAX_RATIO * stored:
-        raise ValueError("the stored grids claim to be larger than they can be")
+    shape, elsewhere = (x, y, z), packed["elsewhere"].float()
     keep = [unpack_bits(bits, shape) for bits in packed["keep"]]
-    counts = [int(one.sum()) for one in keep]
-    if len(keep) == 1:
-        keep, counts = keep * len(elsewhere), counts * len(elsewhere)
-    if len(keep) != len(elsewhere) or sum(counts) != len(kept):
-        raise ValueError("the stored grids are not as long as they should be")
+    keep = keep * len(elsewhere) if len(keep) == 1 else keep
+    details = packed["kept"].split([int(mask.sum()) for mask in keep])
     grids: Tensor = elsewhere.new_empty(len(elsewhere), *shape, elsewhere.shape[-1])
-    values = kept.split(counts)
-    for grid, rest, here, detail in zip(grids, elsewhere, keep, values, strict=True):
+    for grid, rest, mask, detail in zip(grids, elsewhere, keep, details, strict=True):
         grid.copy_(rest if rest.ndim == 1 else resample(rest, shape))
-        grid[here] = detail.float()
+        grid[mask] = detail.float()
     return grids
 
 
@@ -99,13 +88,26 @@ def pack_bits(mask: Tensor) -> Tensor:
 
 
 def unpack_bits(bits: Tensor, shape: Sequence[int], device: torch.device | str = "cpu") -> Tensor:
-    """The mask of ``shape`` that :func:`pack_bits` packed, on ``device``.
+    """The mask of ``shape`` that :func:`pack_bits` packed, on ``device``."""
+    flat = np.unpackbits(bits.cpu().numpy(), count=math.prod(shape), bitorder="little")
+    return torch.from_numpy(flat.astype(bool)).view(*shape).to(device)
 
-    Raises:
-        ValueError: there are too few bits.
+
+class StoredShape(nn.Module):
+    """A module that may be loaded from a state of another resolution.
+
+    Attributes:
+        resizable: names of the parameters and buffers that take the stored shape.
     """
-    cells = math.prod(shape)
-    if 8 * len(bits) < cells:
-        raise ValueError("the stored mask is not as long as it should be")
-    flat = np.unpackbits(bits.cpu().numpy(), count=cells, bitorder="little").astype(bool)
-    return torch.from_numpy(flat).view(*shape).to(device)
+
+    resizable: ClassVar[tuple[str, ...]]
+
+    def _load_from_state_dict(
+        self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
+    ) -> None:
+        for name in self.resizable:
+            stored, own = state_dict.get(prefix + name), getattr(self, name)
+            if stored is not None and stored.shape != own.shape:
+                empty = own.new_empty(stored.shape)
+                setattr(self, name, nn.Parameter(empty) if name in self._parameters else empty)
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
