@@ -16,10 +16,9 @@ from torch import Tensor
 from devrf.apps.settings import CaptureSettings
 from devrf.apps.video_file import write_pictures
 from devrf.geometry.cameras import Cameras
-from devrf.scenes.procedural.builder import ProceduralScene
 from devrf.scenes.procedural.filming import Filming
-from devrf.scenes.procedural.forward import ProceduralForwardScene
-from devrf.scenes.procedural.room import REACH, STEPS
+from devrf.scenes.procedural.recipe import ProceduralForwardScene, ProceduralScene
+from devrf.scenes.procedural.surroundings import REACH, STEPS
 from devrf.scenes.scene import Scene
 
 RATE = 10

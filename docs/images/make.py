@@ -27,8 +27,7 @@ from devrf.checkpoints.checkpoint import load_checkpoint
 from devrf.geometry.cameras import Cameras
 from devrf.methods.base import DynamicModel
 from devrf.rendering.renderer import Renderer
-from devrf.scenes.procedural.filming import Filming
-from devrf.scenes.procedural.truth import extent
+from devrf.scenes.procedural.filming import Filming, extent
 
 HERE = Path(__file__).parent
 # Of the renderings and of the tiles, in pixels; white pixels that stay around what is seen.

@@ -12,14 +12,14 @@ from omegaconf import OmegaConf
 
 from devrf.cli.config import config_folder
 from devrf.cli.data_choice import with_data_choice
-from devrf.scenes.blender import BlenderReader
-from devrf.scenes.colmap import ColmapReader
-from devrf.scenes.dycheck import DycheckReader
 from devrf.scenes.export import export
-from devrf.scenes.llff import LlffReader
-from devrf.scenes.nerfies import NerfiesReader
-from devrf.scenes.nerfstudio import NerfstudioReader
-from devrf.scenes.neural_3d_video import Neural3DVideoReader
+from devrf.scenes.formats.blender import BlenderReader
+from devrf.scenes.formats.colmap import ColmapReader
+from devrf.scenes.formats.dycheck import DycheckReader
+from devrf.scenes.formats.llff import LlffReader
+from devrf.scenes.formats.nerfies import NerfiesReader
+from devrf.scenes.formats.nerfstudio import NerfstudioReader
+from devrf.scenes.formats.neural_3d_video import Neural3DVideoReader
 from devrf.scenes.procedural import ProceduralScene
 
 READERS = (BlenderReader, LlffReader, NerfiesReader, NerfstudioReader)

@@ -17,7 +17,7 @@ from devrf.data.nerfstudio import NerfstudioDataModule
 from devrf.data.procedural import ProceduralDataModule
 from devrf.data.rendered import RenderedDataModule
 from devrf.errors import DevrfError
-from devrf.scenes.export_blender import export_blender
+from devrf.scenes.export import export_blender
 from devrf.scenes.scene import Scene
 
 

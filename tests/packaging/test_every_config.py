@@ -20,7 +20,7 @@ from devrf.errors import DevrfError
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
-from devrf.scenes.fetch.catalogue import catalogue
+from devrf.scenes.fetch import catalogue
 
 GROUPS = sorted({path.name for path in config_folder().iterdir() if path.is_dir()} - {"hydra"})
 NAMES = {g: sorted(p.stem for p in (config_folder() / g).glob("*.yaml")) for g in GROUPS}

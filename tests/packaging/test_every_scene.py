@@ -19,7 +19,7 @@ from devrf.cli.config import config_folder
 from devrf.data.datamodule import SceneDataModule
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.scenes.export import export
-from devrf.scenes.procedural.forward import ProceduralForwardScene
+from devrf.scenes.procedural.recipe import ProceduralForwardScene
 from devrf.scenes.scene import Scene, Views
 
 PUBLISHED_INWARD = ["lego", "floating_robot", "daisy", "glove", "kuka", "flower_360"]

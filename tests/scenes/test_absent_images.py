@@ -7,9 +7,9 @@ import logging
 import pytest
 import torch
 
-from devrf.scenes.blender import BlenderReader
-from devrf.scenes.nerfies import NerfiesReader
-from devrf.scenes.nerfstudio import NerfstudioReader
+from devrf.scenes.formats.blender import BlenderReader
+from devrf.scenes.formats.nerfies import NerfiesReader
+from devrf.scenes.formats.nerfstudio import NerfstudioReader
 
 
 def warnings_in(caplog) -> list[str]:

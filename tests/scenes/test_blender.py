@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from devrf.scenes.blender import BlenderReader
+from devrf.scenes.formats.blender import BlenderReader
 
 SUZANNE = Path(__file__).resolve().parents[2] / ".." / "shared" / "scenes" / "suzanne"
 

@@ -14,7 +14,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from devrf.scenes.blender import BlenderReader
+from devrf.scenes.formats.blender import BlenderReader
 
 NAN = float("nan")
 TRAIN = "static/transforms_train.json"

@@ -1,7 +1,8 @@
-"""COLMAP's sparse models and their images as a scene at rest."""
+"""COLMAP's sparse models and their images as a scene: at rest, or beside fixed views."""
 
 from __future__ import annotations
 
+import importlib
 import shutil
 from collections.abc import Callable
 from functools import partial
@@ -13,17 +14,16 @@ import pytest
 import torch
 
 from devrf.geometry.cameras import Distortion
-from devrf.scenes.colmap import ColmapReader
-from devrf.scenes.colmap_model import read_model
+from devrf.scenes.formats.colmap import ColmapReader
 from devrf.scenes.lens import Lens
-from devrf.scenes.normalisation import normalised
+from devrf.scenes.sparse_model import normalised, read_model
 
 # Not square, the principal point off the middle.
 WIDTH, HEIGHT, COUNT = 80, 60, 17
 LENS = Lens((88.0, 84.0), (42.0, 28.0), Distortion((-0.3, 0.1, 0.0, 0.0), (0.006, -0.008)))
 OPENCV = (88.0, 84.0, 42.0, 28.0, -0.3, 0.1, 0.006, -0.008)
-# In the order of their names, which is not that of the ring; names may hold spaces and folders.
-NAMES = [f"round/img {(5 * k) % COUNT:02d}.png" for k in range(COUNT)]
+# In the order of their names, which is not that of the ring; names may hold folders.
+NAMES = [f"round/img_{(5 * k) % COUNT:02d}.png" for k in range(COUNT)]
 # The middles of the balls that the pictures show, and others around them.
 BALLS = torch.tensor([[1.2, 0.1, 0.45], [-0.6, 1.0, 0.0], [0.1, -1.1, -0.45]])
 POINTS = torch.cat([BALLS, 2 * torch.rand(40, 3, generator=torch.Generator().manual_seed(0)) - 1])
@@ -135,7 +135,7 @@ def test_smaller_images_are_used_where_they_are(folder):
 
 
 def test_absent_images_are_counted_or_left_out(folder, message_of):
-    (folder / "images/round/img 03.png").unlink()
+    (folder / "images/round/img_03.png").unlink()
     assert "1 of the 17 images in images.txt are absent" in message_of(folder)
     scene = ColmapReader(folder, downscale=1, missing="skip").read()
     assert len(scene.static.train) + len(scene.static.test) == 16
@@ -145,7 +145,7 @@ def test_absent_images_are_counted_or_left_out(folder, message_of):
 def moving(folder) -> Path:
     """Three fixed cameras of three frames stand where 00, 02 and 04 were taken."""
     for view in range(3):
-        name = f"img {2 * view:02d}"
+        name = f"img_{2 * view:02d}"
         (folder / f"images/round/{name}.png").rename(folder / f"images/round/view{view + 1}.png")
         rewrite(folder, "images", name, f"view{view + 1}")
         images = folder / f"dynamic_3views/view{view + 1}/images"
@@ -180,14 +180,17 @@ def test_fixed_views_are_posed_by_an_image_of_each(moving, message_of):
     [
         (lambda root: shutil.rmtree(root / "sparse"), "balls: no COLMAP model (looked for cameras"),
         (lambda root: shutil.rmtree(root / "images"), "balls: no folder images (found: none)"),
-        (lambda root: shutil.rmtree(root / "images/round"), "17 of the 17 images in images.txt"),
         (
-            lambda root: (root / "sparse/0/points3D.txt").unlink(),
+            lambda root: (root / "sparse/0/points3D.txt").write_text(""),
             "sparse/0: its images show 0 sparse points, expected 50 or more",
         ),
         (
-            lambda root: rewrite(root, "cameras", "OPENCV", "OPENCV_FISHEYE"),
-            "cameras.txt: camera model OPENCV_FISHEYE is not supported, only SIMPLE_PINHOLE",
+            lambda root: (root / "sparse/0/images.txt").write_text("1 1 0 0 0 0 0 0 7\n"),
+            "sparse/0: not a readable COLMAP model",
+        ),
+        (
+            lambda root: rewrite(root, "cameras", " OPENCV ", " OPENCV_FISHEYE "),
+            "sparse/0: camera model OPENCV_FISHEYE is not supported, only SIMPLE_PINHOLE",
         ),
         (
             lambda root: rewrite(root, "cameras", f" {WIDTH} {HEIGHT} ", f" {HEIGHT} {WIDTH} "),
@@ -195,11 +198,7 @@ def test_fixed_views_are_posed_by_an_image_of_each(moving, message_of):
         ),
         (
             lambda root: rewrite(root, "images", "round/", "../../"),
-            "ds outside the scene's folder",
-        ),
-        (
-            lambda root: rewrite(root, "points3D", " 9 9 9", "e300 9 9 9"),
-            "sparse/0: its cameras and points are no scene that cameras look inward at",
+            "leads outside the scene's folder",
         ),
     ],
 )
@@ -211,3 +210,34 @@ def test_what_is_wrong_is_one_line(folder, message_of, change, said):
 def rewrite(root: Path, part: str, old: str, new: str) -> None:
     file = root / f"sparse/0/{part}.txt"
     file.write_text(file.read_text().replace(old, new))
+
+
+HALF = 0.5**0.5
+
+
+@pytest.mark.parametrize("suffix", [".txt", ".bin"])
+def test_cameras_poses_and_depths_by_hand(tmp_path, suffix):
+    """Camera 7 at (1, 2, 3), turned by 90 degrees about its viewing axis z; two points."""
+    (tmp_path / "cameras.txt").write_text("7 OPENCV 64 48 50 51 32 24 0.1 0.01 0.001 0.002\n")
+    (tmp_path / "images.txt").write_text(
+        f"1 1 0 0 0 0 0 0 7 b.png\n5 6 11 1 1 -1\n"
+        f"2 {HALF} 0 0 {HALF} 2 -1 -3 7 a.png\n5 6 4 7 8 11\n"
+    )
+    (tmp_path / "points3D.txt").write_text("11 1 2 8 9 9 9 0.5 1 0 2 1\n4 0 0 5 9 9 9 0.5 2 0\n")
+    if suffix == ".bin":
+        library = importlib.import_module("pycolmap")
+        library.Reconstruction(tmp_path).write_binary(tmp_path)
+        for path in tmp_path.glob("*.txt"):
+            path.unlink()
+    model = read_model(tmp_path)
+    assert [image.name for image in model.images] == ["a.png", "b.png"]
+    keys = {"fl_x": 50, "fl_y": 51, "cx": 32, "cy": 24, "w": 64, "h": 48}
+    assert model.cameras[7].keys == keys | {"k1": 0.1, "k2": 0.01, "p1": 0.001, "p2": 0.002}
+    turned, straight = model.poses
+    # World to camera (x, y, z) → (−y, x, z) + t, so the camera is at (1, 2, 3); its y is flipped.
+    assert torch.allclose(turned[:, 3], torch.tensor([1.0, 2.0, 3.0]).double())
+    expected = torch.tensor([[0.0, -1, 0], [-1, 0, 0], [0, 0, -1]]).double()
+    assert torch.allclose(turned[:, :3], expected, atol=1e-12)
+    assert torch.allclose(straight[:, :3], torch.diag(torch.tensor([1.0, -1, -1])).double())
+    assert model.depths(0).tolist() == pytest.approx([5 - 3, 8 - 3])
+    assert model.depths(1).tolist() == [8.0]

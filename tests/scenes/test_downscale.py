@@ -6,9 +6,9 @@ import logging
 
 import pytest
 
-from devrf.scenes.blender import BlenderReader
-from devrf.scenes.downscale import whole_factor
-from devrf.scenes.llff import LlffReader
+from devrf.scenes.formats.blender import BlenderReader
+from devrf.scenes.formats.llff import LlffReader
+from devrf.scenes.image_folders import whole_factor
 
 
 @pytest.mark.parametrize(

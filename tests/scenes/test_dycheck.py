@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from devrf.scenes.dycheck import DycheckReader
+from devrf.scenes.formats.dycheck import DycheckReader
 from devrf.scenes.lens import Lens
 
 # Not square. Camera 0 goes half around, cameras 1 and 2 stand and take every third moment.

@@ -13,8 +13,8 @@ import pytest
 import torch
 
 from devrf.errors import DevrfError
-from devrf.scenes.blender import BlenderReader
 from devrf.scenes.export import export, export_blender
+from devrf.scenes.formats.blender import BlenderReader
 from devrf.scenes.procedural import ProceduralScene
 from devrf.scenes.scene import Scene
 

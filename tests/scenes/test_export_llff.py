@@ -12,7 +12,7 @@ import torch
 
 from devrf.errors import DevrfError
 from devrf.scenes.export import export, export_llff
-from devrf.scenes.llff import LlffReader
+from devrf.scenes.formats.llff import LlffReader
 from devrf.scenes.procedural import ProceduralForwardScene
 from devrf.scenes.scene import Capture, Scene, Views
 

@@ -14,9 +14,8 @@ from PIL import ExifTags, Image, ImageOps
 from devrf.apps.inspection.advice import image_advice
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
-from devrf.scenes.image_files import decode, image_size, read_header
-from devrf.scenes.images import load_images
-from devrf.scenes.nerfstudio import NerfstudioReader
+from devrf.scenes.formats.nerfstudio import NerfstudioReader
+from devrf.scenes.images import decode, image_size, load_images, read_header
 
 WIDE, HIGH = (24, 16), (16, 24)
 

@@ -15,12 +15,11 @@ from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.contraction import ContractedSpace
 from devrf.geometry.space import WORLD, Space
-from devrf.scenes.blender import BlenderReader
-from devrf.scenes.dynamic_only import dynamic_only
 from devrf.scenes.export import export
-from devrf.scenes.inward_space import NEAR_SHARE, SHELL, inward_space
+from devrf.scenes.formats.blender import BlenderReader
 from devrf.scenes.procedural import ProceduralScene, moved
 from devrf.scenes.scene import Bounds, Scene, Views
+from devrf.scenes.space import NEAR_SHARE, SHELL, dynamic_only, inward_space
 
 PLACES = torch.tensor([[0.0, 0, 0], [0.3, 0, 0]])
 BOX = Box((-0.5, -0.4, -0.3), (0.6, 0.7, 0.8))

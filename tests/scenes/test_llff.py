@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from devrf.geometry.ndc import NormalizedDevice
-from devrf.scenes.llff import LlffReader
+from devrf.scenes.formats.llff import LlffReader
 from devrf.scenes.scene import Views
 
 

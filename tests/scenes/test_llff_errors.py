@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from devrf.scenes.llff import LlffReader
+from devrf.scenes.formats.llff import LlffReader
 
 STATIC = "static/poses_bounds.npy"
 POSES = "dynamic_3views/poses.npy"

@@ -22,8 +22,8 @@ from devrf.data.flow_source import with_flow
 from devrf.data.nerfstudio import NerfstudioDataModule
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
-from devrf.scenes.nerfstudio import NerfstudioReader
-from devrf.scenes.visual_hull import visual_hull
+from devrf.scenes.formats.nerfstudio import NerfstudioReader
+from devrf.scenes.silhouettes import visual_hull
 
 WIDTH, HEIGHT = 80, 60
 

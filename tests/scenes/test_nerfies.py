@@ -15,8 +15,8 @@ import pytest
 import torch
 
 from devrf.geometry.cameras import Distortion
+from devrf.scenes.formats.nerfies import NerfiesReader
 from devrf.scenes.lens import Lens
-from devrf.scenes.nerfies import NerfiesReader
 
 # Not square, the principal point off the middle, and pixels that are neither.
 WIDTH, HEIGHT, COUNT = 80, 60, 9

@@ -13,8 +13,8 @@ import pytest
 import torch
 
 from devrf.geometry.cameras import Distortion
+from devrf.scenes.formats.nerfstudio import NerfstudioReader
 from devrf.scenes.lens import Lens
-from devrf.scenes.nerfstudio import NerfstudioReader
 
 WIDTH, HEIGHT = 80, 60
 

@@ -13,7 +13,7 @@ import torch
 
 from devrf.apps.video_file import write_pictures
 from devrf.geometry.cameras import Cameras
-from devrf.scenes.neural_3d_video import Neural3DVideoReader
+from devrf.scenes.formats.neural_3d_video import Neural3DVideoReader
 
 # Not square. The numbers of the videos leave some out.
 WIDTH, HEIGHT, FRAMES = 32, 24, 7
@@ -167,5 +167,5 @@ def test_a_video_that_has_fewer_frames_than_it_says(folder, message_of, monkeypa
     from devrf.scenes import footage
 
     says = footage.FilmHeader((WIDTH, HEIGHT), FRAMES + 1)
-    monkeypatch.setattr("devrf.scenes.camera_videos.film_header", lambda path: says)
+    monkeypatch.setattr("devrf.scenes.formats.neural_3d_video.film_header", lambda path: says)
     assert "mp4: ends after 7 frames, expected 8 or more; convert it again" in message_of(folder)

@@ -13,9 +13,9 @@ from torch import Tensor
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.procedural import Flower, ProceduralForwardScene, ProceduralScene, moved
-from devrf.scenes.procedural.cameras import dynamic_rig
 from devrf.scenes.procedural.filming import Filming
 from devrf.scenes.procedural.march import HIT
+from devrf.scenes.procedural.rigs import dynamic_rig
 from devrf.scenes.scene import Scene, Views
 
 # Not square, so that a swap of the axes cannot hide.

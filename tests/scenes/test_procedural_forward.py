@@ -9,9 +9,9 @@ from torch import Tensor
 from devrf.geometry.poses import average_pose
 from devrf.geometry.rays import Rays
 from devrf.scenes.procedural import ProceduralForwardScene
-from devrf.scenes.procedural.backdrop import FLOOR
-from devrf.scenes.procedural.facing_rig import dynamic_rig, static_rig
 from devrf.scenes.procedural.filming import Filming
+from devrf.scenes.procedural.rigs import facing_dynamic_rig, facing_static_rig
+from devrf.scenes.procedural.surroundings import FLOOR
 from devrf.scenes.scene import Scene, Views
 
 
@@ -45,14 +45,14 @@ def test_every_ray_meets_something_beyond_the_bound_of_the_published_layout(scen
 
 
 def test_every_ray_of_the_default_cameras_meets_something() -> None:
-    cameras, _ = dynamic_rig(4, width=96, height=72)
+    cameras, _ = facing_dynamic_rig(4, width=96, height=72)
     film = Filming(ProceduralForwardScene().model(), 9.0, 1, 0.0, steps=400)
     assert bool(film.pictures(cameras, 0.5).depth.isfinite().all())
 
 
 @pytest.mark.parametrize("count", [2, 7, 23])
 def test_the_static_cameras_are_centred_and_face_the_scene(count: int) -> None:
-    cameras = static_rig(count, width=40, height=28)
+    cameras = facing_static_rig(count, width=40, height=28)
     average = average_pose(cameras.camera_to_world.double())
     torch.testing.assert_close(average, torch.eye(3, 4).double(), atol=1e-6, rtol=0)
     assert bool((cameras.forwards[:, 2] < -0.98).all())
@@ -60,7 +60,7 @@ def test_the_static_cameras_are_centred_and_face_the_scene(count: int) -> None:
 
 @pytest.mark.parametrize(("width", "height"), [(40, 28), (28, 40), (32, 32)])
 def test_the_floor_stays_far_enough_in_images_of_any_shape(width: int, height: int) -> None:
-    cameras = static_rig(23, width=width, height=height)
+    cameras = facing_static_rig(23, width=width, height=height)
     down = torch.tensor([[width / 2, float(height)]]).repeat(23, 1)
     rays = cameras.rays(torch.arange(23), down)
     reach = (FLOOR - rays.origins[:, 1]) / rays.directions[:, 1]

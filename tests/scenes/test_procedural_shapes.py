@@ -6,15 +6,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from devrf.scenes.procedural import Flower, Material, Plush, Robot, Shape, facing_rig, moved
-from devrf.scenes.procedural.backdrop import FLOOR, WALL, Backdrop
-from devrf.scenes.procedural.cameras import dynamic_rig
-from devrf.scenes.procedural.filming import Filming
+from devrf.scenes.procedural import Flower, Material, Plush, Robot, Shape, moved
+from devrf.scenes.procedural.filming import Filming, extent
 from devrf.scenes.procedural.march import HIT
-from devrf.scenes.procedural.plush import TABLE
-from devrf.scenes.procedural.plush_parts import BASE, REACH
-from devrf.scenes.procedural.surrounded import Surrounded
-from devrf.scenes.procedural.truth import extent
+from devrf.scenes.procedural.plush import BASE, REACH, TABLE
+from devrf.scenes.procedural.rigs import dynamic_rig, facing_dynamic_rig
+from devrf.scenes.procedural.surroundings import FLOOR, WALL, Backdrop, Surrounded
 
 ALONE = [Robot(), Flower(), Robot(2.0), Flower(2.0)]
 SHAPES = [*ALONE, Surrounded(Plush(), Backdrop()), Surrounded(Plush(2.0), Backdrop())]
@@ -25,7 +22,7 @@ each_shape = pytest.mark.parametrize("shape", SHAPES, ids=repr)
 def surface(shape: Shape, time: float) -> Tensor:
     """World points (S, 3) that three cameras see of the shape at ``time``."""
     if isinstance(shape, Surrounded):
-        cameras, _ = facing_rig.dynamic_rig(3, width=32, height=24)
+        cameras, _ = facing_dynamic_rig(3, width=32, height=24)
         depth = Filming(shape, 9.0, 1, steps=400).pictures(cameras, time).depth
     else:
         cameras, _ = dynamic_rig(3, width=48, height=48, reach=1.4)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from devrf.errors import DevrfError
-from devrf.scenes.recognition import recognise
+from devrf.scenes.formats import recognise
 
 LAYOUTS = {
     "DeVRF": ("inward", ["static/transforms_train.json", "dynamic_4views/transforms_train.json"]),

@@ -13,9 +13,9 @@ import pytest
 import torch
 
 from devrf.data.flow_source import with_flow
-from devrf.scenes.blender import BlenderReader
-from devrf.scenes.llff import LlffReader
-from devrf.scenes.nerfstudio import NerfstudioReader
+from devrf.scenes.formats.blender import BlenderReader
+from devrf.scenes.formats.llff import LlffReader
+from devrf.scenes.formats.nerfstudio import NerfstudioReader
 from devrf.scenes.scene import Scene
 
 

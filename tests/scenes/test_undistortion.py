@@ -9,8 +9,7 @@ import torch
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Distortion
 from devrf.scenes.lens import Lens
-from devrf.scenes.resampling import look_up_pixels
-from devrf.scenes.undistortion import as_pinhole
+from devrf.scenes.resampling import as_pinhole, look_up_pixels
 
 BARREL = Distortion((-0.2, 0.05, 0.0, 0.0), (0.004, -0.006))
 PINCUSHION = Distortion((0.15, 0.02, 0.01, 0.0), (-0.004, 0.003))

@@ -7,7 +7,7 @@ import torch
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.scene import Views
-from devrf.scenes.visual_hull import visual_hull
+from devrf.scenes.silhouettes import visual_hull
 
 BOX = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 CENTER = torch.tensor([0.2, -0.1, 0.15])

@@ -17,9 +17,8 @@ from torch import Tensor
 
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
-from devrf.scenes.json_files import MAX_BYTES, Number, Positive, read_json
-from devrf.scenes.poses import in_reach, is_rotation
-from devrf.scenes.validation import first_error, scene_error
+from devrf.scenes.files import MAX_BYTES, Number, Positive, read_json
+from devrf.scenes.validation import first_error, in_reach, is_rotation, scene_error
 from devrf.system.files import write_json
 
 # More frames than this are a mistake in the file: an hour at 25 a second.

@@ -18,7 +18,7 @@ from devrf.cli.config import config_folder
 from devrf.cli.config_check import ROOT
 from devrf.cli.stages import known_stages
 from devrf.cli.value_types import choices
-from devrf.scenes.fetch.catalogue import catalogue
+from devrf.scenes.fetch import catalogue
 
 # Without `=` among the shell's word breaks the whole of KEY=VALUE is one word. Other commands of
 # Python are left to the shell's own completion of files.

@@ -59,7 +59,7 @@ def with_recognised_data(config: DictConfig) -> DictConfig:
     if OmegaConf.is_missing(data, "root"):
         return config  # the check of the config says so
     # Imported here: --help and a misspelt key are answered before torch has loaded.
-    from devrf.scenes.recognition import recognise
+    from devrf.scenes.formats import recognise
 
     layout = recognise(data.root)
     own = OmegaConf.load(config_folder() / "data" / f"{layout.choice}.yaml")

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import logging
 import shlex
+import sys
 from pathlib import Path
 
 from hydra.utils import instantiate
-from rich.console import Console
-from rich.filesize import decimal
-from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColumn
 
 from devrf.cli.context import RunContext
-from devrf.scenes.fetch.catalogue import PublishedScene, published_scene
-from devrf.scenes.fetch.fetch import RECORD, Fetched, download_size, fetch_scene, fetched_before
-from devrf.scenes.fetch.settings import FetchSettings
+from devrf.scenes.fetch import (
+    RECORD,
+    Fetched,
+    FetchSettings,
+    PublishedScene,
+    fetch_scene,
+    fetched_before,
+    published_scene,
+)
 
 log = logging.getLogger(__name__)
 
@@ -29,20 +33,9 @@ def fetch(run: RunContext) -> None:
 
 
 def _fetch(scene: PublishedScene, into: Path, sha256: str | None) -> Fetched:
-    size = download_size(scene)
-    log.info(
-        "%s: %s; %s from %s; licence: %s",
-        scene.name,
-        scene.about,
-        "size unknown" if size is None else decimal(size),
-        scene.collection.page,
-        scene.collection.licence,
-    )
-    columns = (BarColumn(), DownloadColumn(), TimeRemainingColumn())
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task(scene.name, total=size)
-        return fetch_scene(scene, into, sha256, size, lambda done: bar.update(task, completed=done))
+    source = scene.collection
+    log.info("%s: %s; from %s; licence: %s", scene.name, scene.about, source.page, source.licence)
+    return fetch_scene(scene, into, sha256, progress=sys.stderr.isatty())
 
 
 def _conclude(scene: PublishedScene, done: Fetched) -> None:

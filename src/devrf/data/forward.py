@@ -6,7 +6,7 @@ from typing import Any
 
 from devrf.data.options import takes_options_of
 from devrf.data.recorded import RecordedDataModule
-from devrf.scenes.llff import LlffReader
+from devrf.scenes.formats.llff import LlffReader
 
 
 class ForwardFacingDataModule(RecordedDataModule):

@@ -6,7 +6,7 @@ from typing import Any
 
 from devrf.data.options import takes_options_of
 from devrf.data.recorded import RecordedDataModule
-from devrf.scenes.nerfstudio import NerfstudioReader
+from devrf.scenes.formats.nerfstudio import NerfstudioReader
 
 
 class NerfstudioDataModule(RecordedDataModule):

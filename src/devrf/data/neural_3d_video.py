@@ -6,7 +6,7 @@ from typing import Any
 
 from devrf.data.options import takes_options_of
 from devrf.data.recorded import RecordedDataModule
-from devrf.scenes.neural_3d_video import Neural3DVideoReader
+from devrf.scenes.formats.neural_3d_video import Neural3DVideoReader
 
 
 class Neural3DVideoDataModule(RecordedDataModule):

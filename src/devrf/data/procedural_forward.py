@@ -8,7 +8,7 @@ from typing import Any
 
 from devrf.data.options import takes_options_of
 from devrf.data.rendered import RenderedDataModule
-from devrf.scenes.procedural.forward import ProceduralForwardScene
+from devrf.scenes.procedural.recipe import ProceduralForwardScene
 
 
 @dataclass(frozen=True, kw_only=True)

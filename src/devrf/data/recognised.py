@@ -13,7 +13,7 @@ from devrf.data.nerfies import NerfiesDataModule
 from devrf.data.nerfstudio import NerfstudioDataModule
 from devrf.data.neural_3d_video import Neural3DVideoDataModule
 from devrf.data.recorded import RecordedDataModule
-from devrf.scenes.recognition import recognise
+from devrf.scenes.formats import recognise
 
 DATAMODULES: dict[str, Any] = {
     "inward": InwardFacingDataModule,

@@ -7,8 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from devrf.data.datamodule import SceneDataModule
+from devrf.scenes.procedural.filming import forward_flow
 from devrf.scenes.procedural.recipe import Recipe
-from devrf.scenes.procedural.truth import forward_flow
 from devrf.scenes.scene import Scene
 
 

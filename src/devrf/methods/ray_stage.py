@@ -24,8 +24,8 @@ from devrf.methods.base import DynamicModel
 from devrf.methods.protocol import ProtocolStage
 from devrf.ops.adam import GridAdam
 from devrf.rendering.output import RenderOutput
-from devrf.scenes.dynamic_only import dynamic_only
 from devrf.scenes.scene import CaptureName, Scene, Views
+from devrf.scenes.space import dynamic_only
 from devrf.system.profiling import span
 
 

@@ -1,14 +1,273 @@
-"""A scene written to disk in the published layout of its kind."""
+"""Writing a scene to disk: a folder that is whole or absent, and the order of its images."""
 
 from __future__ import annotations
 
+import json
+import math
+import os
+import shutil
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
-from devrf.scenes.export_blender import export_blender
-from devrf.scenes.export_llff import export_llff
-from devrf.scenes.scene import Scene
+import imageio.v3 as iio
+import numpy as np
+import torch
+from torch import Tensor
 
-__all__ = ["export", "export_blender", "export_llff"]
+from devrf.geometry.cameras import Cameras
+from devrf.scenes.files import Numbers
+from devrf.scenes.flow_files import write_flow
+from devrf.scenes.formats.llff_poses import BOUND_FACTOR
+from devrf.scenes.scene import Capture, Scene, Views
+from devrf.scenes.validation import scene_error
+
+_WRITE_HINT = "give data.export another folder"
+
+
+@contextmanager
+def whole_folder(folder: Path) -> Iterator[Path]:
+    """A folder to write into that becomes ``folder`` at the end, if nothing fails.
+
+    Args:
+        folder: a new or an empty folder; folders above it are made.
+
+    Raises:
+        DevrfError: it is in use, or it cannot be written.
+    """
+    folder = folder.expanduser().absolute()
+    if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
+        raise scene_error(folder, f"is there already and not an empty folder; {_WRITE_HINT}")
+    partial = folder.with_name(f".{folder.name}.partial-{os.getpid()}")
+    try:
+        partial.mkdir(parents=True)
+        yield partial
+        partial.rename(folder)
+    except OSError as error:
+        raise scene_error(folder, f"cannot be written ({error}); {_WRITE_HINT}") from error
+    finally:
+        # After the renaming there is nothing left to remove.
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def time_major(views: Views) -> Views:
+    """The views in order of time; those of one time in order of their cameras."""
+    by_view = torch.argsort(views.view, stable=True)
+    return views[by_view[torch.argsort(views.times[by_view], stable=True)]]
+
+
+# The layout has a validation split, which nothing here learns from: a few test images again.
+_VALIDATION_VIEWS = 4
+
+
+def export_blender(scene: Scene, folder: Path) -> None:
+    """Write ``scene`` as ``folder/static`` and ``folder/dynamic_<V>views``.
+
+    Each holds ``transforms_{train,val,test}.json`` and images, RGBA where they have mattes; dynamic
+    images are ordered time-major, and their flow, where there is one, goes to
+    ``train_flow/<index>_bwd.npz``. Poses, times and images read back exactly.
+
+    Args:
+        scene: an inward-facing scene.
+        folder: a new or an empty folder.
+
+    Raises:
+        DevrfError: the folder is in use or cannot be written, or the layout cannot hold the
+            scene.
+    """
+    if scene.kind != "inward":
+        raise scene_error(scene.name, "only inward-facing scenes fit the Blender layout")
+    dynamic = Capture(time_major(scene.dynamic.train), time_major(scene.dynamic.test))
+    count = len(set(dynamic.train.view.tolist()))
+    with whole_folder(folder) as partial:
+        _write_capture(scene.static, partial / "static")
+        _write_capture(dynamic, partial / f"dynamic_{count}views")
+
+
+def _write_capture(capture: Capture, folder: Path) -> None:
+    few = torch.arange(min(_VALIDATION_VIEWS, len(capture.test)))
+    _write_split(capture.train, "train", folder)
+    _write_split(capture.test[few], "val", folder)
+    _write_split(capture.test, "test", folder)
+    if capture.train.flow is not None:
+        # The first images of the views have no earlier one.
+        later = (capture.train.times > 0).nonzero().flatten().tolist()
+        write_flow(folder / "train_flow", capture.train.flow, later)
+
+
+def _write_split(views: Views, split: str, folder: Path) -> None:
+    (folder / split).mkdir(parents=True)
+    frames: list[dict[str, Any]] = []
+    for k, (pixels, pose, time) in enumerate(
+        zip(views.pixels, views.cameras.camera_to_world, views.times.tolist(), strict=True)
+    ):
+        name = f"r_{k:03d}"
+        iio.imwrite(folder / split / f"{name}.png", pixels.cpu().numpy())
+        frames.append(
+            {
+                "file_path": f"./{split}/{name}",
+                "time": time,
+                # A float32 becomes the float64 of the same value, which JSON keeps digit for digit.
+                "transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]],
+            }
+        )
+    content = {"camera_angle_x": _field_of_view(views.cameras), "frames": frames}
+    text = json.dumps(content, indent=1)
+    (folder / f"transforms_{split}.json").write_text(text + "\n", encoding="utf-8")
+
+
+def _field_of_view(cameras: Cameras) -> float:
+    """``camera_angle_x`` in radians, the only intrinsic that the layout has."""
+    focal, center = cameras.focal.double(), cameras.center.double()
+    middle = center.new_tensor([cameras.width / 2, cameras.height / 2])
+    shared = float(focal[0, 0])
+    if not torch.allclose(focal, focal.new_tensor(shared), rtol=1e-6, atol=0.0):
+        raise scene_error("cameras", "one camera_angle_x cannot hold different focal lengths")
+    if not torch.allclose(center, middle.expand_as(center), rtol=0.0, atol=1e-4):
+        raise scene_error("cameras", "camera_angle_x needs principal points in the images' middle")
+    return 2 * math.atan(cameras.width / 2 / shared)
+
+
+# The published scenes are read at this factor, from folders images_4; larger images need not
+# be there, and are not.
+FACTOR = 4
+# Readers hold out every eighth static image, the first one included.
+HOLDOUT = 8
+# Times are not written, but counted: k / (T − 1).
+_TIME_TOLERANCE = 1e-5
+# The largest depth where none is known, in multiples of the least one.
+_FAR = 100.0
+
+Flags = np.ndarray[Any, np.dtype[np.bool_]]
+
+
+def export_llff(scene: Scene, folder: Path) -> None:
+    """Write ``scene`` as ``folder/static`` and ``folder/dynamic_<V>views``.
+
+    ``static/poses_bounds.npy`` (N, 17) speaks of images four times as large as those in
+    ``static/images_4``, as LLFF's does. The moving capture has V − 1 views to learn from and,
+    the last one, the held-out view; flow goes to ``view<k>/images_4_flow/<frame>_bwd.npz``.
+    Least depths are written as 1/0.75, so a reader scales by one; a scene whose static cameras
+    have the identity as their average pose reads back as it is.
+
+    Args:
+        scene: a forward-facing scene.
+        folder: a new or an empty folder.
+
+    Raises:
+        DevrfError: the folder is in use or cannot be written, or the layout cannot hold the
+            scene.
+    """
+    if scene.kind != "forward":
+        raise scene_error(scene.name, "only forward-facing scenes fit LLFF's layout")
+    held_out = _held_out(scene.static)
+    views = [*_by_camera(scene.dynamic.train), *_by_camera(scene.dynamic.test)]
+    _check_moving(scene.dynamic, views)
+    far = _farthest([scene.static.train, scene.static.test, *views])
+    bounds = np.array([1 / BOUND_FACTOR, far])
+    with whole_folder(folder) as partial:
+        _write_static(scene.static, held_out, bounds, partial / "static")
+        _write_moving(views, bounds, partial / f"dynamic_{len(views)}views")
+
+
+def _held_out(static: Capture) -> Flags:
+    """Which of the N static images readers hold out (N,); DevrfError if they would differ."""
+    count = len(static.train) + len(static.test)
+    held_out: Flags = np.arange(count) % HOLDOUT == 0
+    if held_out.sum() != len(static.test):
+        raise scene_error(
+            "static",
+            f"the layout holds out every {HOLDOUT}th image, {held_out.sum()} of "
+            f"{count}, but {len(static.test)} are held out here",
+        )
+    if static.train.pixels.shape[1:] != static.test.pixels.shape[1:]:
+        raise scene_error("static", "the layout needs static images of one size and channel count")
+    return held_out
+
+
+def _by_camera(views: Views) -> list[Views]:
+    """The views of each fixed camera, in order of time."""
+    ordered = time_major(views)
+    return [
+        ordered[(ordered.view == camera).nonzero().flatten()]
+        for camera in sorted(set(views.view.tolist()))
+    ]
+
+
+def _check_moving(capture: Capture, views: list[Views]) -> None:
+    held_out = len(set(capture.test.view.tolist()))
+    if held_out != 1:
+        raise scene_error(
+            "dynamic", f"the layout holds one held-out view, but there are {held_out}"
+        )
+    frames = len(views[0])
+    expected = torch.arange(frames) / max(frames - 1, 1)
+    for view in views:
+        if len(view) != frames or bool(((view.times - expected).abs() > _TIME_TOLERANCE).any()):
+            raise scene_error(
+                "dynamic",
+                "the layout has no times: each view needs the same frames, evenly "
+                "spread over [0, 1]",
+            )
+        poses = view.cameras.camera_to_world
+        if not torch.equal(poses, poses[:1].expand_as(poses)):
+            raise scene_error("dynamic", "the layout needs cameras that stand still")
+
+
+def _farthest(everyone: list[Views]) -> float:
+    """The largest known distance from a camera, else one that is as good as infinity."""
+    known = [views.depth[views.depth.isfinite()] for views in everyone if views.depth is not None]
+    return max(float(depth.max()) for depth in known) if known else _FAR / BOUND_FACTOR
+
+
+def _intrinsics(views: Views, factor: int) -> Numbers:
+    """[H, W, focal] (N, 3) of images larger by ``factor``; else DevrfError."""
+    cameras = views.cameras
+    middle = cameras.center.new_tensor([cameras.width / 2, cameras.height / 2])
+    if not torch.allclose(cameras.focal[:, 0], cameras.focal[:, 1], rtol=1e-6, atol=0.0):
+        raise scene_error("cameras", "the layout has one focal length for both axes")
+    if not torch.allclose(cameras.center, middle.expand_as(cameras.center), rtol=0.0, atol=1e-4):
+        raise scene_error("cameras", "the layout needs principal points in the images' middle")
+    sides = np.tile([cameras.height, cameras.width], (len(views), 1))
+    focal = cameras.focal[:, :1].double().cpu().numpy()
+    return np.concatenate([sides, focal], axis=1) * factor
+
+
+def _write_static(static: Capture, held_out: Flags, bounds: Numbers, folder: Path) -> None:
+    rows = np.empty((len(held_out), 17))
+    for views, own in ((static.train, ~held_out), (static.test, held_out)):
+        right, up, back, position = _double(views.cameras.camera_to_world).transpose(2, 0, 1)
+        matrix = np.stack([-up, right, back, position, _intrinsics(views, FACTOR)], axis=2)
+        rows[own] = np.hstack([matrix.reshape(-1, 15), np.tile(bounds, (len(views), 1))])
+        _write_images(views, np.flatnonzero(own), folder / f"images_{FACTOR}")
+    np.save(folder / "poses_bounds.npy", rows)
+
+
+def _write_moving(views: list[Views], bounds: Numbers, folder: Path) -> None:
+    matrices = []
+    for number, view in enumerate(views, start=1):
+        images = folder / f"view{number}" / f"images_{FACTOR}"
+        _write_images(view, range(len(view)), images)
+        if view.flow is not None and number < len(views):
+            flow_folder = images.with_name(f"{images.name}_flow")
+            write_flow(flow_folder, view.flow, range(1, len(view)))
+        pose = _double(view.cameras.camera_to_world[0])
+        matrices.append(np.concatenate([pose, _intrinsics(view, 1)[:1].T], axis=1))
+    np.save(folder / "poses.npy", np.stack(matrices))
+    np.save(folder / "bds.npy", np.tile(bounds, (len(views), 1)))
+
+
+def _double(poses: Tensor) -> Numbers:
+    """Poses in double precision: what was exact in single precision stays so."""
+    array: Numbers = poses.double().cpu().numpy()
+    return array
+
+
+def _write_images(views: Views, numbers: Iterable[int], folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for k, pixels in zip(numbers, views.pixels, strict=True):
+        iio.imwrite(folder / f"{k:03d}.png", pixels.cpu().numpy())
 
 
 def export(scene: Scene, folder: Path) -> None:

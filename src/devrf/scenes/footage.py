@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from devrf.scenes.files import existing_file
 from devrf.scenes.image_folders import listed_images
-from devrf.scenes.paths import existing_file
 from devrf.scenes.validation import MAX_PIXELS, scene_error
 
 # 8-bit RGB, (H, W, 3).

@@ -1,4 +1,9 @@
-"""Sets of image files → uint8 tensors: measured before they are decoded, made smaller."""
+"""Single image files: found, measured before they are decoded, turned where they have to be.
+
+A photo may carry an EXIF orientation: viewers turn it, most tools that find cameras do not. The
+camera's own size tells which of the two it was found on, if it tells anything: an image is turned
+where only the turned one has the camera's shape, and is else read as it is stored.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +11,7 @@ import logging
 import math
 import os
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -14,14 +20,178 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import torch
+from PIL import ExifTags, Image
 from torch import Tensor
 
-from devrf.scenes.image_files import Header, Size, decode, read_header
-from devrf.scenes.memory import check_memory
+from devrf.scenes.files import decoding
 from devrf.scenes.resampling import shrink_pixels
-from devrf.scenes.validation import reduced_size, scene_error
+from devrf.scenes.validation import MAX_PIXELS, check_memory, reduced_size, same_shape, scene_error
 
 log = logging.getLogger(__name__)
+
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
+# By content, not by name. Pillow reads many more formats, some by starting other programs.
+FORMATS = ("PNG", "JPEG", "WEBP")
+# 16-bit and float greys have no fixed white; the rest converts to 8 bits without a choice.
+DEEP_MODES = ("I", "F", "I;16", "I;16B", "I;16L", "I;16N")
+# How the stored image becomes the one to be seen, by its EXIF orientation; 1 is as it is.
+TURNS = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+# Of these, width and height change places.
+QUARTER_TURNS = (5, 6, 7, 8)
+
+Size = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Header:
+    """What a file claims to be, nothing decoded.
+
+    Attributes:
+        width: columns of the image as it will be read.
+        height: its rows.
+        has_alpha: whether it has an alpha channel.
+        file_size: bytes of the file.
+        turn: the EXIF orientation by which it has to be turned; 1 is as it is stored.
+        ambiguous_orientation: its EXIF orientation asks for a turn, and its camera neither
+            confirms nor refutes it.
+    """
+
+    width: int
+    height: int
+    has_alpha: bool
+    file_size: int
+    turn: int = 1
+    ambiguous_orientation: bool = False
+
+
+def image_at(path: Path) -> Path | None:
+    """The file at ``path``, or at ``path`` with an image suffix appended; None: there is none."""
+    candidates = [path.with_name(path.name + suffix) for suffix in SUFFIXES]
+    if path.suffix.lower() in SUFFIXES:
+        candidates.insert(0, path)
+    for candidate in candidates:
+        if os.path.isfile(candidate):  # Path.is_file raises on names that are too long
+            return candidate
+    return None
+
+
+def find_image(path: Path) -> Path:
+    """As :func:`image_at`; DevrfError where there is none."""
+    found = image_at(path)
+    if found is None:
+        raise scene_error(
+            path,
+            f"no such image (looked for {', '.join(SUFFIXES)}); correct file_path or add the file",
+        )
+    return found
+
+
+def _open(path: Path) -> Image.Image:
+    """The image at ``path``, its header read and its size accepted, nothing decoded yet."""
+    too_large = f"the image claims more than {MAX_PIXELS // 10**6} megapixels; make it smaller"
+    with decoding(path, "image", "replace the file"):
+        try:
+            image = Image.open(path, formats=FORMATS)
+        except (Image.DecompressionBombError, Image.DecompressionBombWarning):
+            raise scene_error(path, too_large) from None
+    if image.width * image.height > MAX_PIXELS:
+        image.close()
+        raise scene_error(path, too_large)
+    return image
+
+
+def read_header(path: Path, camera: Size | None = None) -> Header:
+    """What an image file claims to be.
+
+    Args:
+        path: the file.
+        camera: (width, height) of the images that its camera is for; None: unknown.
+
+    Raises:
+        DevrfError: it is no image of at most 100 megapixels with 8 bits a channel.
+    """
+    with _open(path) as image:
+        if image.mode in DEEP_MODES:
+            raise scene_error(path, f"expected 8 bits a channel, not mode {image.mode}; convert it")
+        alpha = "A" in image.mode or "a" in image.mode or "transparency" in image.info
+        turn, ambiguous_orientation = _turn(
+            _orientation(image), (image.width, image.height), camera
+        )
+        size = (image.width, image.height)
+        width, height = size[::-1] if turn in QUARTER_TURNS else size
+        return Header(width, height, alpha, os.path.getsize(path), turn, ambiguous_orientation)
+
+
+def _orientation(image: Image.Image) -> int:
+    """The EXIF orientation of an opened image, 1 if it has none that can be read."""
+    stored = image.info.get("exif")
+    if not isinstance(stored, bytes):
+        return 1
+    exif = Image.Exif()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            exif.load(stored)
+            value = exif.get(ExifTags.Base.Orientation)
+        # Any exception, as in decoding(); but damaged EXIF data do not spoil the picture.
+        except Exception:
+            return 1
+    return value if isinstance(value, int) and value in TURNS else 1
+
+
+def _turn(orientation: int, stored: Size, camera: Size | None) -> tuple[int, bool]:
+    """The orientation to turn an image by, and whether it is in doubt."""
+    if orientation == 1:
+        return 1, False
+    if camera is None:
+        return 1, True
+    turned = stored[::-1] if orientation in QUARTER_TURNS else stored
+    as_stored, as_seen = same_shape(stored, camera), same_shape(turned, camera)
+    if as_seen and not as_stored:
+        return orientation, False
+    return 1, as_seen == as_stored
+
+
+def image_size(path: Path, camera: Size | None = None) -> tuple[int, int]:
+    """(width, height) of an image file, from its header; else DevrfError.
+
+    Args:
+        path: the file.
+        camera: as for :func:`read_header`.
+    """
+    header = read_header(path, camera)
+    return header.width, header.height
+
+
+def decode(path: Path, header: Header, mode: str) -> npt.NDArray[np.uint8]:
+    """The pixels (H, W, …) of a file whose header has been read.
+
+    Args:
+        path: the file.
+        header: what it claimed to be.
+        mode: Pillow's name of what to convert to: RGB, RGBA.
+
+    Raises:
+        DevrfError: it is damaged, or not what it claimed to be.
+    """
+    with _open(path) as image, decoding(path, "image", "replace the file"):
+        converted: Image.Image = image.convert(mode)
+        if header.turn in TURNS:
+            converted = converted.transpose(TURNS[header.turn])
+        pixels = np.asarray(converted)
+        if pixels.shape[:2] != (header.height, header.width):
+            raise ValueError("its size is not the one that its header claims")
+    return pixels
+
 
 # What the images that are decoded at one time may take, at 8 bytes a pixel each.
 _IN_FLIGHT = 2**30
@@ -66,7 +236,7 @@ def load_images(
     """Read images of one size, a few at a time.
 
     A file's EXIF orientation turns its image only where its camera asks for that
-    (:mod:`devrf.scenes.image_files`).
+    (:mod:`devrf.scenes.images`).
 
     Args:
         paths: at least one existing file, 8 bits a channel, with or without alpha.

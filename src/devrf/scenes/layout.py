@@ -9,8 +9,8 @@ from pathlib import Path
 
 import torch
 
-from devrf.scenes.downscale import whole_factor
-from devrf.scenes.image_files import image_size
+from devrf.scenes.image_folders import whole_factor
+from devrf.scenes.images import image_size
 from devrf.scenes.masks import Masks
 from devrf.scenes.scene import Capture, Views
 from devrf.scenes.splits import (

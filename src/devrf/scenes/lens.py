@@ -1,10 +1,16 @@
-"""The inner numbers of a camera, as files give them: focal lengths, middle, skew, distortion."""
+"""Lenses of cameras: focal lengths, principal point, skew, distortion, and how files state them."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BaseModel
 
 from devrf.geometry.cameras import Distortion
+from devrf.scenes.files import Number, Positive
+from devrf.scenes.validation import abbreviated, same_shape, scene_error
 
 # Focal lengths as shares of the image's longer side: a view of 0.0006 to 178.9 degrees.
 LEAST_FOCAL = 0.01
@@ -49,3 +55,153 @@ class Lens:
         """The same lens for an image whose sides are ``x`` and ``y`` times as long."""
         (fx, fy), (cx, cy) = self.focal, self.center
         return Lens((fx * x, fy * y), (cx * x, cy * y), self.distortion, self.skew * x)
+
+
+# Models of the one equation that Distortion states; the simpler ones leave coefficients out.
+CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
+_LEAST_ANGLE = 1 / MOST_FOCAL
+_UNDISTORT = "undistort the images and list them as PINHOLE"
+
+
+def _supported(model: object) -> object:
+    if model not in CAMERA_MODELS:
+        raise ValueError(
+            f"{abbreviated(model)} is not supported, only {', '.join(CAMERA_MODELS)}; {_UNDISTORT}"
+        )
+    return model
+
+
+def _no_fisheye(value: object) -> object:
+    if value:
+        raise ValueError(f"a fisheye is not supported; {_UNDISTORT}")
+    return value
+
+
+class CameraKeys(BaseModel):
+    """The keys of a camera, in a transforms file or in one of its frames.
+
+    Attributes:
+        fl_x: focal length in pixels of an image of ``w`` × ``h``; or there is an angle.
+        fl_y: None: as ``fl_x``.
+        cx: principal point in pixels; None: the image's middle.
+        cy: as ``cx``.
+        w: width of the image that pixels are measured in; None: the file's.
+        h: as ``w``.
+        camera_angle_x: horizontal field of view in radians.
+        camera_model: one of :data:`CAMERA_MODELS`.
+        is_fisheye: must be false.
+        k1: with ``k2`` to ``k4``, radial distortion.
+        p1: with ``p2``, tangential distortion.
+    """
+
+    fl_x: Positive | None = None
+    fl_y: Positive | None = None
+    cx: Positive | None = None
+    cy: Positive | None = None
+    w: Positive | None = None
+    h: Positive | None = None
+    camera_angle_x: Number | None = None
+    camera_model: Annotated[Any, AfterValidator(_supported)] = "OPENCV"
+    is_fisheye: Annotated[Any, AfterValidator(_no_fisheye)] = False
+    k1: Number = 0.0
+    k2: Number = 0.0
+    k3: Number = 0.0
+    k4: Number = 0.0
+    p1: Number = 0.0
+    p2: Number = 0.0
+
+
+KEYS = set(CameraKeys.model_fields)
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A camera's inner numbers, for images of any size where an angle gives them.
+
+    Attributes:
+        angle_x: horizontal field of view in radians, or None when ``focal`` is given.
+        focal: (fx, fy) in pixels, or None.
+        center: (cx, cy) in pixels; None means the image's middle.
+        size: (width, height) of the image that pixels are measured in; None: the file's.
+        distortion: of the lens.
+        skew: pixels; 0 where the sensor's axes are square to one another.
+    """
+
+    angle_x: float | None
+    focal: tuple[float, float] | None
+    center: tuple[float | None, float | None]
+    size: tuple[float, float] | None = None
+    distortion: Distortion = Distortion()
+    skew: float = 0.0
+
+    def lens(self, width: int, height: int, where: object) -> Lens:
+        """The lens in pixels of a file of ``width`` × ``height`` pixels.
+
+        Raises:
+            DevrfError: ``where``, the file, has another shape than its camera, or a camera of
+                which it can show nothing.
+        """
+        w, h = (width, height) if self.size is None else self.size
+        if not same_shape((width, height), (w, h)):
+            raise scene_error(
+                where,
+                f"{width}x{height} px, but its camera is one for {w:g}x{h:g} px; crop or "
+                "turn the image back, or correct the camera's size",
+            )
+        if self.focal is not None:
+            focal = self.focal
+        else:
+            assert self.angle_x is not None  # intrinsics_of asks for one of the two
+            square = w / 2 / math.tan(self.angle_x / 2)
+            focal = (square, square)
+        cx, cy = self.center
+        center = (w / 2 if cx is None else cx, h / 2 if cy is None else cy)
+        lens = Lens(focal, center, self.distortion, self.skew).scaled(width / w, height / h)
+        if not lens.fits(width, height):
+            (fx, fy), (x, y) = lens.focal, lens.center
+            raise scene_error(
+                where,
+                f"its camera cannot be one of {width}x{height} px: focal lengths {fx:g} and "
+                f"{fy:g} px, middle {x:g}, {y:g}, skew {lens.skew:g}; correct them",
+            )
+        return lens
+
+
+def intrinsics_of(camera: CameraKeys, where: object) -> Intrinsics:
+    """The intrinsics that the keys of a file, or of one of its frames, state.
+
+    Raises:
+        DevrfError: ``where`` has no focal length, or an angle out of range.
+    """
+    c = camera
+    distortion = Distortion((c.k1, c.k2, c.k3, c.k4), (c.p1, c.p2))
+    size = None if c.w is None or c.h is None else (c.w, c.h)
+    if c.fl_x is not None:
+        focal = (c.fl_x, c.fl_x if c.fl_y is None else c.fl_y)
+        return Intrinsics(None, focal, (c.cx, c.cy), size, distortion)
+    angle = c.camera_angle_x
+    if angle is None:
+        raise scene_error(
+            where, 'has no "camera_angle_x" (radians) and no "fl_x" (pixels); add one'
+        )
+    if not _LEAST_ANGLE <= angle < math.pi:
+        raise scene_error(
+            where, f"camera_angle_x is {angle}, expected radians between 0 and pi; correct it"
+        )
+    return Intrinsics(angle, None, (c.cx, c.cy), size, distortion)
+
+
+def frame_intrinsics(shared: CameraKeys, frame: CameraKeys, where: object) -> Intrinsics | None:
+    """The intrinsics of a frame that brings its own, over the shared ones; None: it brings none.
+
+    Raises:
+        DevrfError: what :func:`intrinsics_of` raises.
+    """
+    own = frame.model_dump(include=KEYS, exclude_unset=True)
+    if not own:
+        return None
+    merged = shared.model_dump(include=KEYS, exclude_unset=True) | own
+    if "camera_angle_x" in own and "fl_x" not in own:
+        # Its angle stands against focal lengths of other images.
+        merged = {key: value for key, value in merged.items() if key not in ("fl_x", "fl_y")}
+    return intrinsics_of(CameraKeys.model_construct(**merged), where)

@@ -17,13 +17,10 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from devrf.scenes.image_files import Header, Size, decode, read_header
-from devrf.scenes.images import Finish, workers
+from devrf.scenes.images import Finish, Header, Size, decode, read_header, workers
 from devrf.scenes.lens import Lens
-from devrf.scenes.memory import check_memory
-from devrf.scenes.resampling import shrink_pixels
-from devrf.scenes.undistortion import as_pinhole
-from devrf.scenes.validation import scene_error
+from devrf.scenes.resampling import as_pinhole, shrink_pixels
+from devrf.scenes.validation import check_memory, scene_error
 
 log = logging.getLogger(__name__)
 

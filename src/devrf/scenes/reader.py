@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import KW_ONLY
+from dataclasses import KW_ONLY, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,12 +12,12 @@ from pydantic import ConfigDict, Field, PlainValidator, ValidationError, model_v
 from pydantic.dataclasses import dataclass
 
 from devrf.geometry.clock import FrameClock
-from devrf.scenes.absent_images import Missing
-from devrf.scenes.downscale import Downscale
-from devrf.scenes.inward_space import SpaceChoice, inward_space
-from devrf.scenes.json_files import Number
+from devrf.scenes.files import Number
+from devrf.scenes.image_folders import Downscale, Missing
 from devrf.scenes.scene import Background, Capture, OpticalFlow, Scene, Views
-from devrf.scenes.validation import LARGEST, checked_box, first_error
+from devrf.scenes.space import SpaceChoice, centred, inward_space, one_sided_scene
+from devrf.scenes.transforms import SceneBounds
+from devrf.scenes.validation import LARGEST, checked_box, first_error, scene_error
 
 FlowSource = Literal["auto", "files", "dis", "raft", "none"]
 # Of layouts that have no place for flow files.
@@ -144,7 +144,7 @@ class InwardReader(SceneReader):
         """The scene of two captures that were read from ``folder``, its bounds found.
 
         Raises:
-            DevrfError: what :func:`devrf.scenes.inward_space.inward_space` raises.
+            DevrfError: what :func:`devrf.scenes.space.inward_space` raises.
         """
         space, bounds = inward_space(
             self.space,
@@ -158,3 +158,68 @@ class InwardReader(SceneReader):
         )
         name = self.name_of(folder)
         return Scene(name, "inward", static, dynamic, bounds, self.background, space)
+
+
+@dataclass(frozen=True)
+class PosedReader(InwardReader):
+    """Options of layouts that may state bounds.
+
+    Attributes:
+        space: as of :class:`~devrf.scenes.reader.InwardReader`, or ``ndc`` for cameras that face
+            the scene from one side: then the world is that of their average pose, ``near`` is
+            the near plane, and the scene is a forward-facing one. Stated bounds say what ``auto``
+            is, and ``near``, ``far`` and ``box`` where they are None.
+    """
+
+    _: KW_ONLY
+    space: SpaceChoice | Literal["ndc"] = "auto"  # type: ignore[assignment]
+
+    def placed(
+        self,
+        folder: Path,
+        static: Capture,
+        dynamic: Capture,
+        stated: SceneBounds | None,
+        source: str,
+    ) -> Scene:
+        """The scene of two captures.
+
+        Args:
+            folder: where they were read from.
+            static: the scene at rest.
+            dynamic: the scene in motion; ``static`` itself where it is always at rest.
+            stated: where the scene is, if that is known.
+            source: what states it, in words.
+
+        Raises:
+            DevrfError: the options, or the cameras, do not say where it is.
+        """
+        reader = _with_bounds(self, stated)
+        if reader.space != "ndc":
+            scene = reader.scene(folder, static, dynamic)
+            reason = scene.bounds.reason if reader.space == self.space else source
+            found = self.box is None and reader.box is not None
+            box_source = source if found else scene.bounds.box_source
+            bounds = replace(scene.bounds, reason=reason, box_source=box_source)
+            return replace(scene, bounds=bounds)
+        if reader.near is None or reader.near <= 0:
+            raise scene_error(
+                "data.near",
+                "data.space=ndc needs the distance of the near plane, above 0; give it in world "
+                "units, a little less than the depth of what is nearest",
+            )
+        name, captures = self.name_of(folder), centred(static, dynamic)
+        return one_sided_scene(name, *captures, reader.near, self.background)
+
+
+def _with_bounds(options: PosedReader, stated: SceneBounds | None) -> PosedReader:
+    """The options, with what is stated where they leave it open."""
+    if stated is None:
+        return options
+    space = stated.space if options.space == "auto" else options.space
+    if (space == "ndc") != (stated.space == "ndc"):  # in another world, or of other meaning
+        return replace(options, space=space)
+    box = stated.box if options.box is None and options.space == "auto" else options.box
+    near = stated.near if options.near is None else options.near
+    far = stated.far if options.far is None else options.far
+    return replace(options, space=space, near=near, far=far, box=box)

@@ -1,4 +1,4 @@
-"""Which camera and which time each image of a split belongs to, found from poses and times."""
+"""Which images of a capture are held out where no list says so."""
 
 from __future__ import annotations
 
@@ -15,12 +15,33 @@ from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
 from devrf.scenes.images import load_images
 from devrf.scenes.masks import Masks, cutting_out, valid_pixels
+from devrf.scenes.resampling import as_pinhole
 from devrf.scenes.scene import Views
 from devrf.scenes.transforms import Transforms
-from devrf.scenes.undistortion import as_pinhole
 from devrf.scenes.validation import scene_error
 
 log = logging.getLogger(__name__)
+
+
+def every_nth(count: int, holdout: int) -> tuple[list[int], list[int]]:
+    """The positions to learn from and those to hold out, of ``count`` ≥ 2 images.
+
+    Every ``holdout``-th (≥ 2) is held out: the last of each such run, since the first image of a
+    sequence shows the scene at rest. Of fewer images the last one is held out.
+    """
+    held_out = list(range(holdout - 1, count, holdout)) or [count - 1]
+    return sorted(set(range(count)) - set(held_out)), held_out
+
+
+def first_of_every(count: int, holdout: int) -> tuple[list[int], list[int]]:
+    """The positions to learn from and those to hold out, of ``count`` ≥ 2 images at rest.
+
+    Every ``holdout``-th (≥ 2) is held out, the first included: so are LLFF's scenes scored, and
+    those of mip-NeRF 360.
+    """
+    held_out = list(range(0, count, holdout))
+    return sorted(set(range(count)) - set(held_out)), held_out
+
 
 # Two poses are one camera when no entry differs by more than this, relative to its distance.
 SAME_POSE = 1e-4
@@ -189,7 +210,7 @@ def load_views(split: Split, root: Path, downscale: int, masks: Masks = "none") 
 
     Raises:
         DevrfError: what :func:`devrf.scenes.images.load_images`,
-            :func:`devrf.scenes.undistortion.as_pinhole` and :mod:`devrf.scenes.masks` raise, or
+            :func:`devrf.scenes.resampling.as_pinhole` and :mod:`devrf.scenes.masks` raise, or
             an image has not the shape that its camera is for.
     """
     used = split.index

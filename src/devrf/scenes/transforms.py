@@ -16,12 +16,10 @@ import torch
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter
 from torch import Tensor
 
-from devrf.scenes.absent_images import Missing, present_images
-from devrf.scenes.intrinsics import CameraKeys, Intrinsics, frame_intrinsics, intrinsics_of
-from devrf.scenes.json_files import Name, Number, Positive, Vector3, Vector4, read_json
-from devrf.scenes.paths import inside
-from devrf.scenes.poses import FARTHEST, in_reach, is_rotation
-from devrf.scenes.validation import scene_error
+from devrf.scenes.files import Name, Number, Positive, Vector3, Vector4, inside, read_json
+from devrf.scenes.image_folders import Missing, present_images
+from devrf.scenes.lens import CameraKeys, Intrinsics, frame_intrinsics, intrinsics_of
+from devrf.scenes.validation import FARTHEST, in_reach, is_rotation, scene_error
 
 TIME_TOLERANCE = 1e-6
 
@@ -159,7 +157,7 @@ def posed_images(
         file: where it is; its image paths are relative to its folder.
         root: the scene's folder, which no image path may leave.
         masked: whether ``mask_path`` is followed, too.
-        missing: as for :func:`devrf.scenes.absent_images.present_images`.
+        missing: as for :func:`devrf.scenes.image_folders.present_images`.
 
     Raises:
         DevrfError: an image is missing, a pose is no rigid transform, or only some frames have

@@ -6,7 +6,10 @@ import math
 import reprlib
 from collections.abc import Iterable
 
+import psutil
+import torch
 from pydantic import ValidationError
+from torch import Tensor
 
 from devrf.errors import DevrfError, did_you_mean
 from devrf.geometry.box import Box
@@ -123,3 +126,44 @@ def checked_box(value: object) -> Box:
         raise scene_error(
             "data.box", f"expected [[x, y, z], [x, y, z]] with low < high, not {value!r}"
         ) from None
+
+
+def check_memory(needed: int, where: object, what: str) -> None:
+    """DevrfError when ``what`` takes more bytes than the machine has.
+
+    Args:
+        needed: bytes.
+        where: the file or folder that asks for them.
+        what: what they are for, in words.
+    """
+    there = psutil.virtual_memory().total
+    if needed > there:
+        raise scene_error(
+            where,
+            f"{what} take {needed / 2**30:.1f} GiB, but this machine has "
+            f"{there / 2**30:.1f} GiB of memory; set data.downscale higher, or data.frames",
+        )
+
+
+# Rotations are written with 5 digits or more; further off they are scaled, sheared or mirrored.
+ROTATION_TOLERANCE = 1e-2
+# World units in which a distance, squared twice, still is a float32.
+FARTHEST = 1e9
+
+
+def is_rotation(matrices: Tensor) -> Tensor:
+    """Which matrices (..., 3, 3) turn without scaling, shearing or mirroring, up to rounding.
+
+    Returns:
+        A mask (...,); false where a matrix holds NaN.
+    """
+    eye = torch.eye(3).to(matrices)
+    off = (matrices.mT @ matrices - eye).abs().amax(dim=(-2, -1))
+    upright: Tensor = (off <= ROTATION_TOLERANCE) & (torch.linalg.det(matrices) > 0)
+    return upright
+
+
+def in_reach(positions: Tensor) -> Tensor:
+    """Which positions (..., 3), world units, can be computed with; false where one holds NaN."""
+    near: Tensor = (positions.abs() <= FARTHEST).all(dim=-1)
+    return near

@@ -1,7 +1,8 @@
-"""The fixed cameras' folders ``view1`` … ``viewV`` of a moving capture, and their flow files."""
+"""Which of a scene's folders holds the capture of the moving scene."""
 
 from __future__ import annotations
 
+import fnmatch
 import logging
 import os
 import re
@@ -9,12 +10,43 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from devrf.scenes.files import entries
 from devrf.scenes.flow_files import FlowDirection
 from devrf.scenes.image_folders import image_folder, listed_images
-from devrf.scenes.paths import entries
 from devrf.scenes.validation import scene_error
 
 log = logging.getLogger(__name__)
+
+
+def dynamic_folders(root: Path) -> list[Path]:
+    """The folders ``dynamic_<V>views`` of ``root``, in order of their names."""
+    return [
+        path
+        for path in entries(root)
+        if fnmatch.fnmatch(path.name, "dynamic_*views") and os.path.isdir(path)
+    ]
+
+
+def chosen_dynamic(root: Path, chosen: str | None) -> Path:
+    """The one of :func:`dynamic_folders` called ``chosen``, or (None) the only one.
+
+    Raises:
+        DevrfError: there is none, none of that name, or several to choose from.
+    """
+    folders = dynamic_folders(root)
+    names = ", ".join(folder.name for folder in folders)
+    if chosen is not None:
+        named = [folder for folder in folders if folder.name == chosen]
+        if not named:
+            found = names or "none"
+            raise scene_error(root, f"no folder {chosen!r} (found: {found}); correct data.dynamic")
+        return named[0]
+    if not folders:
+        raise scene_error(root, "no folder dynamic_<V>views; add the capture of the moving scene")
+    if len(folders) > 1:
+        raise scene_error(root, f"several captures ({names}); choose one with data.dynamic=NAME")
+    return folders[0]
+
 
 _VIEW = re.compile(r"view([1-9]\d{0,5})")
 _FROM_ZERO = re.compile(r"view0\d*")

@@ -13,9 +13,7 @@ import torch
 from devrf.apps.capture.pipeline import Shot, write_scene
 from devrf.data.recognised import recognised_datamodule
 from devrf.geometry.cameras import Cameras
-from devrf.scenes.colmap_entries import ModelCamera, ModelImage
-from devrf.scenes.colmap_model import SparseModel
-from devrf.scenes.normalisation import normalised
+from devrf.scenes.sparse_model import ModelCamera, ModelImage, SparseModel, normalised
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 

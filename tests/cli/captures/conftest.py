@@ -17,7 +17,7 @@ from torch import Tensor
 
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.procedural import ProceduralScene
-from devrf.scenes.procedural.forward import ProceduralForwardScene
+from devrf.scenes.procedural.recipe import ProceduralForwardScene
 from devrf.scenes.scene import Scene, Views
 
 Writer = Callable[[Path], None]

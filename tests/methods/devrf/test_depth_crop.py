@@ -23,7 +23,7 @@ from devrf.methods.devrf.depth_crop import crop_to_visible, visible_depths, with
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import RenderSettings
 from devrf.rendering.occupancy import Occupancy
-from devrf.scenes.forward_bounds import box_between
+from devrf.scenes.bounds import box_between
 from devrf.scenes.procedural import ProceduralForwardScene
 from devrf.scenes.scene import Scene
 

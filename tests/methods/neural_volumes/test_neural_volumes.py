@@ -23,7 +23,7 @@ from devrf.methods.neural_volumes.settings import NeuralVolumesSettings
 from devrf.methods.protocol import ProtocolStage
 from devrf.methods.ray_stage import RaySchedule, RayStage
 from devrf.rendering.renderer import Renderer
-from devrf.scenes.procedural.forward import ProceduralForwardScene
+from devrf.scenes.procedural.recipe import ProceduralForwardScene
 from devrf.scenes.scene import Capture, Scene
 
 TINY = NeuralVolumesSettings(

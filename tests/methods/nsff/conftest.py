@@ -17,7 +17,7 @@ from devrf.methods.nsff.model import NSFF
 from devrf.methods.nsff.settings import NSFFSettings, Warmup
 from devrf.methods.protocol import ProtocolStage
 from devrf.methods.ray_stage import RaySchedule, RayStage
-from devrf.scenes.procedural.forward import ProceduralForwardScene
+from devrf.scenes.procedural.recipe import ProceduralForwardScene
 from devrf.scenes.scene import Scene
 
 TINY = NSFFSettings(

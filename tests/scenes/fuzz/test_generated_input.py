@@ -10,7 +10,6 @@ import json
 import os
 import resource
 import shutil
-import struct
 import sys
 import zipfile
 from collections.abc import Callable
@@ -32,13 +31,11 @@ from devrf.data.inward import InwardFacingDataModule
 from devrf.data.nerfies import NerfiesDataModule
 from devrf.data.nerfstudio import NerfstudioDataModule
 from devrf.data.neural_3d_video import Neural3DVideoDataModule
-from devrf.scenes.colmap_model import read_model
-from devrf.scenes.flow_cache import load_flow
-from devrf.scenes.flow_files import read_flow_file
+from devrf.scenes.flow_files import load_flow, read_flow_file
+from devrf.scenes.formats.llff_poses import read_dynamic_poses, read_static_poses
+from devrf.scenes.formats.nerfies import read_camera
 from devrf.scenes.images import load_images
-from devrf.scenes.llff_poses import read_dynamic_poses, read_static_poses
 from devrf.scenes.masks import read_mask
-from devrf.scenes.nerfies_camera import read_camera
 from devrf.scenes.transforms import read_transforms
 
 WIDTH, HEIGHT = 32, 24
@@ -330,27 +327,6 @@ def colmap_text(fixture: Fixture) -> Prepared:
     return one_of_files(fixture, root / "sparse/0", lambda: read_colmap(root))
 
 
-def colmap_binary(fixture: Fixture) -> Prepared:
-    """The same model, as COLMAP writes it in binary."""
-    root = colmap_folder(fixture)
-    place = root / "sparse/0"
-    model = read_model(place)
-    (number, camera), *_ = model.cameras.items()
-    cameras = struct.pack("<QiiQQ4d", 1, number, 1, *camera.size, *camera.parameters)
-    images = struct.pack("<Q", len(model.images))
-    for k, one in enumerate(model.images):
-        images += struct.pack("<i7di", k, *one.quaternion, *one.translation, number)
-        images += one.name.encode() + b"\0" + struct.pack("<Q", len(one.points))
-        images += b"".join(struct.pack("<ddq", 0.5, 0.5, p) for p in one.points.tolist())
-    points = struct.pack("<Q", len(model.points))
-    for k, place_of in zip(model.numbers.tolist(), model.points.tolist(), strict=True):
-        points += struct.pack("<Q3d3BdQ", k, *place_of, 9, 9, 9, 0.5, 0)
-    for name, data in (("cameras", cameras), ("images", images), ("points3D", points)):
-        (place / f"{name}.txt").unlink()
-        (place / f"{name}.bin").write_bytes(data)
-    return one_of_files(fixture, place, lambda: read_colmap(root))
-
-
 def one_of_files(fixture: Fixture, folder: Path, read: Callable[[], Any]) -> Prepared:
     """What is read while one file of a folder is damaged."""
     whole = {path: path.read_bytes() for path in sorted(folder.iterdir()) if path.is_file()}
@@ -543,7 +519,6 @@ PARSERS: dict[str, tuple[int, Callable[[Fixture], Prepared]]] = {
     "lists of nerfies": (30, nerfies_lists),
     "nerfstudio": (30, nerfstudio),
     "COLMAP's text files": (15, colmap_text),
-    "COLMAP's binary files": (20, colmap_binary),
     "splits of DyCheck": (10, dycheck_splits),
     "videos": (5, videos),
     "files of an inward-facing scene": (12, scene_files(with_flow, inward_files)),

@@ -18,14 +18,12 @@ from PIL import Image
 from pydantic import TypeAdapter
 
 from devrf.errors import DevrfError
-from devrf.scenes.array_files import read_numbers
-from devrf.scenes.blender import BlenderReader
-from devrf.scenes.flow_cache import load_flow
-from devrf.scenes.flow_files import read_flow_file
+from devrf.scenes.files import read_json, read_numbers
+from devrf.scenes.flow_files import load_flow, read_flow_file
+from devrf.scenes.formats.blender import BlenderReader
+from devrf.scenes.formats.llff import LlffReader
+from devrf.scenes.formats.nerfies import NerfiesReader
 from devrf.scenes.images import load_images
-from devrf.scenes.json_files import read_json
-from devrf.scenes.llff import LlffReader
-from devrf.scenes.nerfies import NerfiesReader
 
 TRAIN = "static/transforms_train.json"
 

@@ -20,11 +20,10 @@ from devrf.apps.capture.survey import Survey, check_sharp, sharpest, survey
 from devrf.apps.settings import CaptureSettings
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
-from devrf.scenes.colmap_model import SparseModel
 from devrf.scenes.footage import frame_count, is_folder, pictures
-from devrf.scenes.holdout import every_nth
-from devrf.scenes.nerfstudio import FILE
-from devrf.scenes.normalisation import AROUND, World, normalised
+from devrf.scenes.formats.nerfstudio import FILE
+from devrf.scenes.sparse_model import AROUND, SparseModel, World, normalised
+from devrf.scenes.splits import every_nth
 from devrf.system.files import write_json
 from devrf.system.progress import followed
 

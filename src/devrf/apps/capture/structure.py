@@ -16,8 +16,8 @@ import torch
 from devrf.apps.capture.images import Chosen
 from devrf.apps.settings import CaptureSettings
 from devrf.errors import DevrfError
-from devrf.scenes.colmap_model import SparseModel, read_model
 from devrf.scenes.footage import is_folder
+from devrf.scenes.sparse_model import SparseModel, read_model
 
 log = logging.getLogger(__name__)
 

@@ -13,7 +13,7 @@ from devrf.geometry.box import Box
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.volume_rendering import render
-from devrf.scenes.forward_bounds import box_between
+from devrf.scenes.bounds import box_between
 from devrf.scenes.scene import Scene, Views
 
 log = logging.getLogger(__name__)

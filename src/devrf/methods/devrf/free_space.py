@@ -8,7 +8,7 @@ from torch import Tensor
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
 from devrf.scenes.scene import Scene
-from devrf.scenes.visual_hull import visual_hull
+from devrf.scenes.silhouettes import visual_hull
 
 
 def possible_matter(

@@ -13,7 +13,7 @@ from devrf.methods.nerf.ray_samples import RaySamples
 from devrf.rendering.occupancy import dilate
 from devrf.rendering.sampling import steps_through
 from devrf.scenes.scene import Scene
-from devrf.scenes.visual_hull import visual_hull
+from devrf.scenes.silhouettes import visual_hull
 
 
 def diagonal_step(box: Box, rays: Rays, steps: int) -> float:

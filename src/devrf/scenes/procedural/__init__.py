@@ -1,12 +1,11 @@
 """Scenes computed instead of photographed: every pixel, depth and flow is known exactly."""
 
-from devrf.scenes.procedural.builder import ProceduralScene
+from devrf.scenes.procedural.filming import moved
 from devrf.scenes.procedural.flower import Flower
-from devrf.scenes.procedural.forward import ProceduralForwardScene
 from devrf.scenes.procedural.plush import Plush
+from devrf.scenes.procedural.recipe import ProceduralForwardScene, ProceduralScene
 from devrf.scenes.procedural.robot import Robot
-from devrf.scenes.procedural.shape import Material, Shape
-from devrf.scenes.procedural.truth import moved
+from devrf.scenes.procedural.solids import Material, Shape
 
 __all__ = [
     "Flower",

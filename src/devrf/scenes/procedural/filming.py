@@ -1,4 +1,4 @@
-"""A moving shape filmed: posed images at rest and in motion, with exact depth and flow."""
+"""The colours of a shape's surface: its paint under ambient light and a fixed lamp."""
 
 from __future__ import annotations
 
@@ -8,13 +8,129 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.rays import Rays
 from devrf.scenes.procedural.march import CHUNK, MAX_STEPS, block_starts, trace
-from devrf.scenes.procedural.shading import shaded
-from devrf.scenes.procedural.shape import Shape
-from devrf.scenes.procedural.truth import backward_flow
+from devrf.scenes.procedural.solids import BoundedShape, Shape
 from devrf.scenes.scene import Capture, OpticalFlow, Views
+
+# Towards the lamp, world space: fixed, so that shading changes as the shape turns.
+_LAMP = (0.40, -0.55, 0.73)
+# Half the span over which a normal is measured, world units: well above float32 rounding.
+_NORMAL_STEP = 1e-3
+
+
+def shaded(shape: Shape, points: Tensor, time: float, light: float) -> Tensor:
+    """Colour (M, 3) of surface points: albedo, ambient light, and a wrapped diffuse lamp.
+
+    Args:
+        shape: whose surface it is.
+        points: (M, 3) world units.
+        time: in [0, 1].
+        light: share of the lamp in the lighting, 0 (albedo alone) … 1.
+    """
+    albedo = shape.color(shape.material(points, time))
+    if light == 0:
+        return albedo
+    lamp = torch.nn.functional.normalize(points.new_tensor(_LAMP), dim=0)
+    # Wrapped: the side away from the lamp still varies, and no edge of shadow is drawn.
+    lit = 0.5 + 0.5 * (_normals(shape, points, time) @ lamp)
+    return albedo * (1 - light + light * lit)[:, None]
+
+
+def _normals(shape: Shape, points: Tensor, time: float) -> Tensor:
+    """Unit normals (M, 3): the distance's gradient from its values at a tetrahedron's corners."""
+    corners = points.new_tensor([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+    around = (points + _NORMAL_STEP * corners[:, None]).reshape(-1, 3)
+    values = shape.distance(around, time).view(4, -1)
+    return torch.nn.functional.normalize(values.T @ corners, dim=-1)
+
+
+# Motion is sampled at this many times; the margin covers what happens between them.
+_TIMES = 97
+_MARGIN = 0.04
+
+
+@dataclass(frozen=True)
+class Extent:
+    """Where a shape is.
+
+    Attributes:
+        rest: a cube about the origin that holds the shape at rest.
+        motion: holds the shape at all times in [0, 1].
+        reach: radius of a ball about the origin that does so too, world units.
+    """
+
+    rest: Box
+    motion: Box
+    reach: float
+
+
+def extent(shape: BoundedShape) -> Extent:
+    """Where ``shape`` is, from the paths of the points around its parts."""
+    outline = shape.outline()
+    times = torch.linspace(0, 1, _TIMES).tolist()
+    paths = torch.stack([shape.forward(outline, time) for time in times])
+    half = float(outline.rest.abs().max()) + _MARGIN
+    points = paths.reshape(-1, 3)
+    return Extent(
+        rest=Box.of([-half] * 3, [half] * 3),
+        motion=Box.of(points.amin(dim=0) - _MARGIN, points.amax(dim=0) + _MARGIN),
+        reach=float(points.norm(dim=-1).max()) + _MARGIN,
+    )
+
+
+def moved(shape: Shape, points: Tensor, time: float, to: float) -> Tensor:
+    """Where the material of surface ``points`` (M, 3) at ``time`` is at time ``to``: (M, 3)."""
+    return shape.forward(shape.material(points, time), to)
+
+
+def backward_flow(
+    shape: Shape, cameras: Cameras, depth: Tensor, time: float, earlier: float
+) -> OpticalFlow:
+    """Exact optical flow of N fixed cameras from ``time`` to ``earlier``.
+
+    The point that the ray through a pixel's centre meets is carried to the earlier time and
+    projected; it may be hidden there, or outside of the image.
+
+    Args:
+        shape: what is seen.
+        cameras: N cameras, world units.
+        depth: (N, H, W) distance along the rays through the pixels' centres, +inf on a miss.
+        time: of the images.
+        earlier: of the images before them.
+
+    Returns:
+        flow in pixels, 0 where nothing is seen, and valid wherever something is.
+    """
+    valid = depth.isfinite()
+    camera, row, column = valid.nonzero().unbind(-1)
+    pixels = torch.stack([column, row], dim=-1).to(depth) + 0.5
+    rays = cameras.rays(camera, pixels)
+    points = rays.at(torch.arange(len(rays)), depth[valid])
+    before, _ = cameras.project(camera, moved(shape, points, time, earlier))
+    flow = depth.new_zeros(*depth.shape, 2)
+    flow[valid] = before - pixels
+    return OpticalFlow(flow, valid)
+
+
+def forward_flow(shape: Shape, views: Views) -> OpticalFlow:
+    """Exact forward optical flow of the images of fixed cameras; the last frame's has none.
+
+    Args:
+        shape: what is seen.
+        views: N images of a scene, all cameras at each of its frames, with depth.
+    """
+    assert views.depth is not None
+    times = torch.unique(views.times)
+    vectors = views.depth.new_zeros(*views.depth.shape, 2)
+    valid = torch.zeros_like(views.depth, dtype=torch.bool)
+    for time, later in zip(times, times[1:], strict=False):
+        at = (views.times == time).nonzero()[:, 0]
+        flow = backward_flow(shape, views.cameras[at], views.depth[at], float(time), float(later))
+        vectors[at], valid[at] = flow.vectors, flow.valid
+    return OpticalFlow(vectors, valid)
 
 
 @dataclass(frozen=True)

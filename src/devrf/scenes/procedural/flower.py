@@ -2,35 +2,215 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from devrf.scenes.procedural import flower_parts as parts
-from devrf.scenes.procedural.blades import Leaf, Whorl
-from devrf.scenes.procedural.flower_parts import LEAVES, WHORLS
-from devrf.scenes.procedural.motion import Bending, Swing, length
-from devrf.scenes.procedural.sdf import rounded_box, rounded_cylinder, sphere
-from devrf.scenes.procedural.shape import Material
-from devrf.scenes.procedural.texture import PaintedParts
+from devrf.scenes.procedural.motion import Bending, Swing, length, rotation, stretch, turn
+from devrf.scenes.procedural.solids import (
+    Material,
+    Paint,
+    PaintedParts,
+    Rgb,
+    blade,
+    rounded_box,
+    rounded_cylinder,
+    sphere,
+)
+
+# Share of the opening that a petal turns by at its hinge; the rest builds up towards its tip.
+_AT_HINGE = 0.6
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """A leaf on the stem, at rest; lengths in world units, angles in radians.
+
+    Attributes:
+        height: where it leaves the stem.
+        azimuth: direction in which it points.
+        elevation: angle above the horizon.
+        half_length: half of its length.
+        half_width: half of its width.
+        thickness: its half thickness.
+        paint: its texture.
+    """
+
+    height: float
+    azimuth: float
+    elevation: float
+    half_length: float
+    half_width: float
+    thickness: float
+    paint: Paint
+
+    def frame(self) -> tuple[Tensor, Tensor]:
+        """Axes (3, 3) as columns (along, across, normal) and hinge (3,), float64."""
+        axes = rotation((0, 0, 1), self.azimuth) @ rotation((0, 1, 0), -self.elevation)
+        return axes, torch.tensor([0, 0, self.height], dtype=torch.float64)
+
+    def distance(self, local: Tensor) -> Tensor:
+        """Distance (M,) of points (M, 3) in the leaf's frame."""
+        x, y, z = local.unbind(-1)
+        return blade(x - self.half_length, y, z, self.half_length, self.half_width, self.thickness)
+
+
+@dataclass(frozen=True)
+class Whorl:
+    """A ring of equal petals around the z axis that open and close together.
+
+    A petal curls in the plane of the blossom's axis and its own: each point turns about the
+    hinge by an angle that depends on its distance ρ from the hinge in that plane. Lengths in
+    world units, angles in radians; ``opening`` arguments are 0 at rest and 1 when open.
+
+    Attributes:
+        first_part: part number of petal 0; the others follow.
+        count: number of petals.
+        height: of the blossom's middle.
+        hinge: distance of the hinges from the blossom's axis.
+        elevation: angle above the horizon at which the petals stand at rest.
+        opening: by how much their tips turn downward when open.
+        half_length: half of a petal's length.
+        half_width: half of a petal's width.
+        thickness: its half thickness.
+        paints: textures of the petals with even and with odd numbers.
+    """
+
+    first_part: int
+    count: int
+    height: float
+    hinge: float
+    elevation: float
+    opening: float
+    half_length: float
+    half_width: float
+    thickness: float
+    paints: tuple[Paint, Paint]
+
+    def frame(self, petal: int) -> tuple[Tensor, Tensor]:
+        """Axes (3, 3) as columns (along, across, normal) and hinge (3,) at rest, float64."""
+        around = rotation((0, 0, 1), petal * 2 * math.pi / self.count)
+        hinge = around @ torch.tensor([self.hinge, 0, 0], dtype=torch.float64)
+        hinge = hinge + torch.tensor([0, 0, self.height], dtype=torch.float64)
+        return around @ rotation((0, 1, 0), -self.elevation), hinge
+
+    def nearest(self, points: Tensor) -> Tensor:
+        """Number (M,) of the petal whose sector holds each point (M, 3).
+
+        The petals are equal and each is its own mirror image, so none is nearer.
+        """
+        sector = torch.atan2(points[:, 1], points[:, 0]) * (self.count / (2 * math.pi))
+        return sector.round().long().remainder(self.count)
+
+    def distance(self, points: Tensor, opening: float) -> Tensor:
+        """Lower bound (M,) of the distance of points (M, 3) to the nearest petal."""
+        x, y, z = self._at_hinge(points, self.nearest(points))
+        x, z = self._curl(x, z, -opening)
+        x, z = turn(x, z, -self.elevation)
+        shear = abs(self.opening * opening) * (1 - _AT_HINGE)
+        flat = blade(x - self.half_length, y, z, self.half_length, self.half_width, self.thickness)
+        return flat / stretch(shear)
+
+    def curled(self, rest: Tensor, petal: Tensor, opening: float) -> Tensor:
+        """Rest points (M, 3) of the petals (M,), opened; the opposite opening undoes it."""
+        x, y, z = self._at_hinge(rest, petal)
+        x, z = self._curl(x, z, opening)
+        x, y = turn(x + self.hinge, y, self._azimuth(petal, x))
+        return torch.stack([x, y, z + self.height], dim=-1)
+
+    def _curl(self, x: Tensor, z: Tensor, opening: float) -> tuple[Tensor, Tensor]:
+        """Turn (x, z) about the hinge downward by opening · (share at hinge … 1 at the tip)."""
+        rho = torch.hypot(x, z) / (2 * self.half_length)
+        share = _AT_HINGE + (1 - _AT_HINGE) * rho.clamp_max(1)
+        return turn(x, z, -self.opening * opening * share)
+
+    def _azimuth(self, petal: Tensor, like: Tensor) -> Tensor:
+        return petal.to(like) * (2 * math.pi / self.count)
+
+    def _at_hinge(self, points: Tensor, petal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Coordinates outward, across and up from the petal's hinge."""
+        x, y = turn(points[:, 0], points[:, 1], -self._azimuth(petal, points))
+        return x - self.hinge, y, points[:, 2] - self.height
+
+
+BASE = -0.66  # height at which the stem leaves the soil: the centre of the bending
+HEAD = 0.30  # height of the blossom's middle
+STEM_RADIUS = 0.055
+HEART = 0.14  # radius of the ball in the blossom's middle
+POT_CENTER, POT_RADIUS, POT_HALF_HEIGHT, POT_ROUNDING = -0.83, 0.34, 0.19, 0.06
+
+# Part numbers: pot, stem, heart, then the leaves, then the petals.
+POT, FIRST_LEAF, FIRST_PETAL = 0, 3, 6
+
+MAGENTA: Rgb = (0.84, 0.10, 0.45)
+ROSE: Rgb = (0.98, 0.62, 0.75)
+VIOLET: Rgb = (0.42, 0.22, 0.70)
+LILAC: Rgb = (0.80, 0.70, 0.97)
+GOLD: Rgb = (1.00, 0.80, 0.18)
+AMBER: Rgb = (0.96, 0.50, 0.08)
+CREAM: Rgb = (1.00, 0.94, 0.76)
+BROWN: Rgb = (0.35, 0.17, 0.08)
+LEAF_GREEN: Rgb = (0.12, 0.48, 0.20)
+SPRING: Rgb = (0.62, 0.82, 0.28)
+TERRACOTTA: Rgb = (0.78, 0.36, 0.20)
+BLUE: Rgb = (0.13, 0.35, 0.62)
+
+# A petal's paint starts at its hinge: cos is 1 there, so that the accent glows at the heart.
+OUTER = Whorl(
+    first_part=FIRST_PETAL,
+    count=8,
+    height=HEAD,
+    hinge=0.10,
+    elevation=0.62,
+    opening=0.8,
+    half_length=0.3,
+    half_width=0.145,
+    thickness=0.022,
+    paints=(Paint(MAGENTA, ROSE, (0.3, 0, 0), 0.1, 5), Paint(VIOLET, LILAC, (0.3, 0, 0), 0.1, 5)),
+)
+INNER = Whorl(
+    first_part=FIRST_PETAL + OUTER.count,
+    count=6,
+    height=HEAD,
+    hinge=0.07,
+    elevation=1.05,
+    opening=0.5,
+    half_length=0.19,
+    half_width=0.095,
+    thickness=0.02,
+    paints=(Paint(AMBER, CREAM, (0.34, 0, 0), 0.2, 4), Paint(GOLD, CREAM, (0.34, 0, 0), 0.2, 4)),
+)
+WHORLS = (OUTER, INNER)
+
+LEAVES = (
+    Leaf(-0.50, 0.5, 0.55, 0.27, 0.12, 0.02, Paint(LEAF_GREEN, SPRING, (0.22, 0, 0), 0.2)),
+    Leaf(-0.32, 3.4, 0.60, 0.25, 0.11, 0.02, Paint(SPRING, LEAF_GREEN, (0, 0.2, 0), 0.2)),
+    Leaf(-0.16, 1.9, 0.65, 0.20, 0.10, 0.02, Paint(LEAF_GREEN, SPRING, (0.18, 0, 0), 0.1)),
+)
+
+POT_PAINT = Paint(TERRACOTTA, CREAM, (0, 0, 0.26), 0.3)
+STEM_PAINT = Paint(LEAF_GREEN, SPRING, (0, 0, 0.24), 0.0)
+HEART_PAINT = Paint(BROWN, GOLD, (0.14, 0.14, 0), 0.2, 5)
+
 
 # Where along the distance from the stem's base bending and twisting build up: nothing below,
 # one rigid turn above, which leaves the blossom undistorted.
 _RAMP = (0.05, 0.85)
 _BENDING = Bending(_RAMP, ((0, 1, Swing(0.6, 1.4, -0.4)), (2, 0, Swing(0.66, 1.2, -0.1))))
 _OPENING = Swing(1.0, 1.7, -0.5)
-_BASE = (0.0, 0.0, parts.BASE)
-_STEM_MIDDLE, _STEM_HALF = (parts.HEAD + parts.BASE) / 2, (parts.HEAD - parts.BASE) / 2
+_BASE = (0.0, 0.0, BASE)
+_STEM_MIDDLE, _STEM_HALF = (HEAD + BASE) / 2, (HEAD - BASE) / 2
 
 
 def _painted() -> PaintedParts:
     """The paints of all parts in the order of their numbers."""
     upright = torch.eye(3, dtype=torch.float64)
-    heights = (parts.POT_CENTER, _STEM_MIDDLE, parts.HEAD)
+    heights = (POT_CENTER, _STEM_MIDDLE, HEAD)
     frames = [(upright, torch.tensor([0, 0, h], dtype=torch.float64)) for h in heights]
     frames += [leaf.frame() for leaf in LEAVES]
-    paints = [parts.POT_PAINT, parts.STEM_PAINT, parts.HEART_PAINT]
+    paints = [POT_PAINT, STEM_PAINT, HEART_PAINT]
     paints += [leaf.paint for leaf in LEAVES]
     for whorl in WHORLS:
         frames += [whorl.frame(k) for k in range(whorl.count)]
@@ -44,7 +224,7 @@ _PAINTED = _painted()
 
 @dataclass(frozen=True)
 class Flower:
-    """A non-rigid :class:`~devrf.scenes.procedural.shape.Shape`; parts: pot, stem, … petals.
+    """A non-rigid :class:`~devrf.scenes.procedural.solids.Shape`; parts: pot, stem, … petals.
 
     A petal first curls about its hinge, by an angle that grows with the distance from it; then
     all but the pot turns about the stem's base, by angles that grow with the distance from it.
@@ -65,9 +245,9 @@ class Flower:
         rest = self._unbent(points, time)
         kind = self._distances(points, rest, time).argmin(dim=0)
         part = kind.clone()
-        rest = torch.where((kind == parts.POT)[:, None], points, rest)
+        rest = torch.where((kind == POT)[:, None], points, rest)
         opening = _OPENING(self.speed, time)
-        for own_kind, whorl in enumerate(WHORLS, start=parts.FIRST_PETAL):
+        for own_kind, whorl in enumerate(WHORLS, start=FIRST_PETAL):
             own = kind == own_kind
             petal = whorl.nearest(rest)
             part = torch.where(own, whorl.first_part + petal, part)
@@ -85,7 +265,7 @@ class Flower:
             points = torch.where(own[:, None], curled, points)
         base = points.new_tensor(_BASE)
         moved = _BENDING.bent(points - base, self.speed, time) + base
-        return torch.where((material.part == parts.POT)[:, None], material.rest, moved)
+        return torch.where((material.part == POT)[:, None], material.rest, moved)
 
     def color(self, material: Material) -> Tensor:
         """The parts' paints."""
@@ -94,16 +274,16 @@ class Flower:
     def outline(self) -> Material:
         """A grid of points over the box around each part, in its own frame."""
         half = [
-            (parts.POT_RADIUS, parts.POT_RADIUS, parts.POT_HALF_HEIGHT),
-            (parts.STEM_RADIUS, parts.STEM_RADIUS, _STEM_HALF),
-            (parts.HEART, parts.HEART, parts.HEART),
+            (POT_RADIUS, POT_RADIUS, POT_HALF_HEIGHT),
+            (STEM_RADIUS, STEM_RADIUS, _STEM_HALF),
+            (HEART, HEART, HEART),
         ]
         middle = [(0.0, 0.0, 0.0)] * len(half)
-        blades: list[Leaf | Whorl] = [*LEAVES]
+        flat: list[Leaf | Whorl] = [*LEAVES]
         for whorl in WHORLS:
-            blades += [whorl] * whorl.count
-        for blade in blades:
-            a, b, t = blade.half_length, blade.half_width, blade.thickness
+            flat += [whorl] * whorl.count
+        for each in flat:
+            a, b, t = each.half_length, each.half_width, each.thickness
             half.append((a + t, b + t, t))
             # A blade's frame starts at its hinge.
             middle.append((a, 0.0, 0.0))
@@ -119,17 +299,17 @@ class Flower:
         pot = rounded_cylinder(
             x,
             y,
-            z - parts.POT_CENTER,
-            parts.POT_RADIUS,
-            parts.POT_HALF_HEIGHT,
-            parts.POT_ROUNDING,
+            z - POT_CENTER,
+            POT_RADIUS,
+            POT_HALF_HEIGHT,
+            POT_ROUNDING,
         )
         x, y, z = unbent.unbind(-1)
-        r = parts.STEM_RADIUS
+        r = STEM_RADIUS
         stem = rounded_box(x, y, z - _STEM_MIDDLE, (r, r, _STEM_HALF), r)
-        heart = sphere(x, y, z - parts.HEAD, parts.HEART)
+        heart = sphere(x, y, z - HEAD, HEART)
         leaves = []
-        for number, leaf in enumerate(LEAVES, start=parts.FIRST_LEAF):
+        for number, leaf in enumerate(LEAVES, start=FIRST_LEAF):
             axes, hinge = _PAINTED.rotation[number], _PAINTED.origin[number]
             leaves.append(leaf.distance((unbent - hinge.to(unbent)) @ axes.to(unbent)))
         petals = [whorl.distance(unbent, _OPENING(self.speed, time)) for whorl in WHORLS]

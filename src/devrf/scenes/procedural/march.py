@@ -9,7 +9,7 @@ from torch import Tensor
 
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.rays import Rays
-from devrf.scenes.procedural.shape import Shape
+from devrf.scenes.procedural.solids import Shape
 
 # Nearer than this is on the surface, world units: a hundredth of a pixel at the usual sizes.
 HIT = 3e-4

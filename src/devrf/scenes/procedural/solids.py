@@ -1,16 +1,191 @@
-"""Painted rounded boxes: what the robot and the plush toy are built of."""
+"""What a moving shape can be asked: all of it exact, at any time in [0, 1]."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from devrf.scenes.procedural.sdf import rounded_box
-from devrf.scenes.procedural.shape import Material
-from devrf.scenes.procedural.texture import Paint, PaintedParts
+
+@dataclass(frozen=True)
+class Material:
+    """M material points: the name a point of the object keeps while it moves.
+
+    Attributes:
+        rest: (M, 3) where the points are at t = 0, world units.
+        part: (M,) int64, which part of the object each belongs to.
+    """
+
+    rest: Tensor
+    part: Tensor
+
+
+class Shape(Protocol):
+    """A textured solid that deforms; at t = 0 it is at rest."""
+
+    def distance(self, points: Tensor, time: float) -> Tensor:
+        """Lower bound (M,) of the distance of ``points`` (M, 3) to the surface at ``time``.
+
+        Zero on the surface only, negative inside.
+        """
+        ...
+
+    def material(self, points: Tensor, time: float) -> Material:
+        """Which material is at world ``points`` (M, 3) on (or near) the surface at ``time``.
+
+        ``material(points, time).rest`` is the exact backward warp.
+        """
+        ...
+
+    def forward(self, material: Material, time: float) -> Tensor:
+        """Where the material is at ``time``: (M, 3) world units; ``material.rest`` at t = 0."""
+        ...
+
+    def color(self, material: Material) -> Tensor:
+        """Albedo (M, 3) in [0, 1]: it depends on the material alone, so it moves with it."""
+        ...
+
+
+class BoundedShape(Shape, Protocol):
+    """A shape that ends somewhere."""
+
+    def outline(self) -> Material:
+        """Material points around every part, so that their bounding box holds the object."""
+        ...
+
+
+# Lengths that a caller may give as a number, or as a tensor of one length for each primitive.
+Length = float | Tensor
+
+
+def sphere(x: Tensor, y: Tensor, z: Tensor, radius: Length) -> Tensor:
+    """A ball of ``radius`` about the origin."""
+    return (x * x + y * y + z * z).sqrt() - radius
+
+
+def rounded_box(
+    x: Tensor, y: Tensor, z: Tensor, half: tuple[Length, Length, Length], rounding: Length
+) -> Tensor:
+    """A box with outer half edges ``half``, edges rounded by ``rounding`` ≤ min(half).
+
+    A rounding equal to the two smaller half edges makes a capsule, to all three a ball.
+    """
+    qx, qy, qz = (c.abs() - (h - rounding) for c, h in zip((x, y, z), half, strict=True))
+    px, py, pz = qx.clamp_min(0), qy.clamp_min(0), qz.clamp_min(0)
+    outside = (px * px + py * py + pz * pz).sqrt()
+    inside = torch.maximum(torch.maximum(qx, qy), qz).clamp_max(0)
+    return outside + inside - rounding
+
+
+def rounded_cylinder(
+    x: Tensor, y: Tensor, z: Tensor, radius: float, half_height: float, rounding: float
+) -> Tensor:
+    """An upright cylinder about z with outer ``radius`` and ``half_height``, rims rounded."""
+    across, up = torch.hypot(x, y) - (radius - rounding), z.abs() - (half_height - rounding)
+    outside = torch.hypot(across.clamp_min(0), up.clamp_min(0))
+    return outside + torch.maximum(across, up).clamp_max(0) - rounding
+
+
+def blade(
+    x: Tensor, y: Tensor, z: Tensor, half_length: float, half_width: float, thickness: float
+) -> Tensor:
+    """A leaf: a pointed lens in the x-y plane, inflated by ``thickness``.
+
+    The lens is where two equal discs overlap; its tips are at x = ± half_length, its sides at
+    y = ± half_width.
+    """
+    # A disc with its centre on the y axis that passes the tip (a, 0) and the side (0, b).
+    offset = (half_length**2 - half_width**2) / (2 * half_width)
+    radius = offset + half_width
+    ax, ay = x.abs(), y.abs()
+    facing_arc = (ay + offset) * half_length >= offset * ax
+    lens = torch.where(
+        facing_arc,
+        torch.hypot(ax, ay + offset) - radius,
+        torch.hypot(ax - half_length, ay),
+    )
+    return torch.hypot(lens.clamp_min(0), z) - thickness
+
+
+Rgb = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Paint:
+    """Two colours mixed by a product of cosines along the part's axes.
+
+    One period makes stripes, two a checkerboard, three a checkerboard in space; a threshold
+    above zero shrinks the accent from half of the surface to spots.
+
+    Attributes:
+        base: colour where the pattern is low.
+        accent: colour where the pattern is high, as at the part's origin.
+        periods: length of a full period along x, y, z in world units; 0: constant along it.
+        threshold: where, in −1 … 1, base turns into accent.
+        sharpness: steepness of the edges. They stay soft, so that an image of about 100 pixels
+            does not alias.
+    """
+
+    base: Rgb
+    accent: Rgb
+    periods: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    threshold: float = 0.0
+    sharpness: float = 6.0
+
+
+class PaintedParts:
+    """The paints of K parts in the parts' own frames.
+
+    Attributes:
+        rotation: (K, 3, 3) axes of each part as columns, world ← part, at rest.
+        origin: (K, 3) origin of each part at rest, world units.
+    """
+
+    def __init__(self, paints: Sequence[Paint], rotation: Tensor, origin: Tensor) -> None:
+        """The table of ``paints`` (K of them) in frames (K, 3, 3), (K, 3)."""
+
+        def table(rows: list[tuple[float, ...]]) -> Tensor:
+            return torch.tensor(rows, dtype=torch.float64)
+
+        self.rotation = rotation
+        self.origin = origin
+        self._base = table([p.base for p in paints])
+        self._accent = table([p.accent for p in paints])
+        # Radians per world unit along the part's axes.
+        self._wave = table(
+            [tuple(2 * math.pi / q if q else 0.0 for q in p.periods) for p in paints]
+        )
+        self._edge = table([(p.threshold, p.sharpness) for p in paints])
+
+    def color(self, material: Material) -> Tensor:
+        """Albedo (M, 3) of the material."""
+        rest, part = material.rest, material.part
+        offset = rest - self.origin.to(rest)[part]
+        local = torch.einsum("mji,mj->mi", self.rotation.to(rest)[part], offset)
+        pattern = (local * self._wave.to(rest)[part]).cos().prod(dim=-1)
+        threshold, sharpness = self._edge.to(rest)[part].unbind(-1)
+        share = ((pattern - threshold) * sharpness).sigmoid()[:, None]
+        return torch.lerp(self._base.to(rest)[part], self._accent.to(rest)[part], share)
+
+    def outline(self, half: Tensor, middle: Tensor) -> Material:
+        """A grid of points over the boxes around the parts.
+
+        Args:
+            half: (K, 3) half edges along the parts' axes, world units.
+            middle: (K, 3) where in its frame each box has its middle.
+        """
+        steps = torch.linspace(-1, 1, 7)
+        cube = torch.cartesian_prod(steps, steps, steps)
+        local = cube * half[:, None] + middle[:, None]
+        rest = torch.einsum("kij,kmj->kmi", self.rotation.float(), local)
+        rest = rest + self.origin.float()[:, None]
+        part = torch.arange(len(half)).repeat_interleave(len(cube))
+        return Material(rest.reshape(-1, 3), part)
+
 
 Xyz = tuple[float, float, float]
 

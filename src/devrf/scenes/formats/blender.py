@@ -1,0 +1,125 @@
+"""Inward-facing scenes on disk: DeVRF's folders, and D-NeRF's or NeRF-synthetic's single folder."""
+
+from __future__ import annotations
+
+import logging
+import os
+from dataclasses import KW_ONLY, replace
+from pathlib import Path
+
+from pydantic.dataclasses import dataclass
+
+from devrf.scenes.files import existing_folder, scene_folder
+from devrf.scenes.flow_files import FlowDirection, read_flow
+from devrf.scenes.image_folders import Missing
+from devrf.scenes.images import image_size
+from devrf.scenes.layout import Layout, fewer, load_layout, static_alone, without_static_set
+from devrf.scenes.reader import Count, InwardReader, Time
+from devrf.scenes.scene import OpticalFlow, Scene, Views
+from devrf.scenes.splits import Split, at_rest, in_motion, one_moment, one_moment_in_words
+from devrf.scenes.transforms import Transforms, read_transforms
+from devrf.scenes.validation import scene_error
+from devrf.scenes.view_folders import chosen_dynamic, dynamic_folders
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class BlenderReader(InwardReader):
+    """Reads ``transforms_{train,test}.json`` and images.
+
+    Two layouts: ``static/``, next to ``dynamic_<V>views/`` unless the scene is at rest; or the
+    JSON files in ``root`` itself: with times (D-NeRF) the static capture is taken from the training
+    images, without them (NeRF-synthetic) the scene is at rest. Without ``transforms_test.json``
+    ``transforms_val.json`` is held out.
+
+    Attributes:
+        dynamic: which ``dynamic_*views`` folder, where there are several.
+        train_views: train on the first so many dynamic views; None: all.
+        static_until: without a static set, the latest time of an image that counts as static.
+    """
+
+    _: KW_ONLY
+    dynamic: str | None = None
+    train_views: Count | None = None
+    static_until: Time = 1.0
+
+    def read(self) -> Scene:
+        """See :meth:`devrf.scenes.reader.SceneReader.read`."""
+        folder = scene_folder(self.root)
+        layout, flow_folder = _layout(folder, self.dynamic, self.static_until, self.missing)
+        layout, thinned = fewer(layout, self.train_views, self.frames)
+        static, dynamic = load_layout(layout, folder, self.downscale)
+        if not layout.moves:
+            return self.scene(folder, static, dynamic)
+        if self.wants_flow_files and thinned:
+            log.info("flow files dropped: data.frames=%s leaves out neighbours", self.frames)
+        elif self.wants_flow_files and layout.dynamic_train.transforms.skipped:
+            log.info("flow files dropped: they are numbered by images of which some are absent")
+        elif self.wants_flow_files:
+            flow = _flow(dynamic.train, layout.dynamic_train, flow_folder, "bwd")
+            dynamic = replace(dynamic, train=replace(dynamic.train, flow=flow))
+        return self.scene(folder, static, dynamic)
+
+    def forward_flow(self, views: Views) -> OpticalFlow | None:
+        """See :meth:`devrf.scenes.reader.SceneReader.forward_flow`."""
+        folder = scene_folder(self.root)
+        layout, flow_folder = _layout(folder, self.dynamic, self.static_until, self.missing)
+        layout, thinned = fewer(layout, self.train_views, self.frames)
+        if thinned or not layout.moves or layout.dynamic_train.transforms.skipped:
+            return None
+        return _flow(views, layout.dynamic_train, flow_folder, "fwd")
+
+
+def _layout(
+    root: Path, dynamic: str | None, static_until: float, missing: Missing
+) -> tuple[Layout, Path]:
+    """The splits, and the folder where flow files would lie."""
+    static = root / "static"
+    if not os.path.isdir(static) and not dynamic_folders(root):
+        if not os.path.isfile(root / "transforms_train.json"):
+            raise scene_error(
+                root,
+                "expected static/ and dynamic_<V>views/, or transforms_train.json; "
+                "set data.root to the scene's folder",
+            )
+        train, test = _train_and_test(root, root, missing)
+        if one_moment(train, test):
+            return static_alone(train, test, one_moment_in_words(train)), root
+        layout = without_static_set(in_motion(train), in_motion(test), static_until)
+        return layout, root / "train_flow"
+    existing_folder(static)
+    if dynamic is None and not dynamic_folders(root):
+        why = "there is no folder dynamic_<V>views"
+        return static_alone(*_train_and_test(static, root, missing), why), root
+    moving = chosen_dynamic(root, dynamic)
+    rest_sets, moving_sets = (
+        _train_and_test(static, root, missing),
+        _train_and_test(moving, root, missing),
+    )
+    return Layout(*map(at_rest, rest_sets), *map(in_motion, moving_sets)), moving / "train_flow"
+
+
+def _train_and_test(folder: Path, root: Path, missing: Missing) -> tuple[Transforms, Transforms]:
+    """The images of a capture to learn from, and those held out."""
+    test, val = folder / "transforms_test.json", folder / "transforms_val.json"
+    held_out = val if os.path.isfile(val) and not os.path.isfile(test) else test
+    train = read_transforms(folder / "transforms_train.json", root, missing)
+    return train, read_transforms(held_out, root, missing)
+
+
+def _flow(views: Views, split: Split, folder: Path, direction: FlowDirection) -> OpticalFlow | None:
+    first, last = split.times.min(), split.times.max()
+    if any(not known.distortion.none for known in split.transforms.intrinsics):
+        log.warning("flow files in %s left out: they are of images before undistortion", folder)
+        return None
+    used = int(split.index[0])
+    expected = views.times > first + 1e-6 if direction == "bwd" else views.times < last - 1e-6
+    return read_flow(
+        folder,
+        split.index.tolist(),
+        expected.tolist(),
+        image_size(split.transforms.images[used], split.transforms.intrinsics[used].size),
+        (views.width, views.height),
+        direction,
+    )

@@ -1,0 +1,426 @@
+"""``scene.json`` of Nerfies' layout: the world, and where in it the scene is."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import pydantic
+import torch
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from torch import Tensor
+
+from devrf.geometry.cameras import Distortion
+from devrf.scenes.bounds import FALLBACK_BOUND_SCALE, axes_do_meet, box_of_frusta
+from devrf.scenes.files import (
+    Ids,
+    Number,
+    Positive,
+    Vector2,
+    Vector3,
+    inside,
+    read_json,
+    scene_folder,
+)
+from devrf.scenes.image_folders import (
+    Downscale,
+    ImageFolder,
+    Missing,
+    folder_factor,
+    image_folder,
+    present_images,
+)
+from devrf.scenes.layout import Layout, fewer, load_layout, static_alone, without_static_set
+from devrf.scenes.lens import Intrinsics
+from devrf.scenes.reader import EstimatedFlow, Holdout, InwardReader, Time
+from devrf.scenes.scene import Capture, Scene
+from devrf.scenes.splits import every_nth, in_motion, one_moment
+from devrf.scenes.transforms import Transforms
+from devrf.scenes.validation import (
+    FARTHEST,
+    abbreviated,
+    first_error,
+    in_reach,
+    is_rotation,
+    scene_error,
+)
+
+log = logging.getLogger(__name__)
+
+
+SCENE = "scene.json"
+
+Length = Annotated[Positive, Field(le=FARTHEST)]
+
+
+class World(BaseModel):
+    """The frame of reference, (position − center) · scale.
+
+    Attributes:
+        center: of the world, in the cameras' units.
+        scale: world units in one of the cameras'.
+        near: distance before which nothing is, world units.
+        far: distance behind which nothing is, world units.
+    """
+
+    center: Vector3
+    scale: Length
+    near: Length
+    far: Length
+
+
+_WORLD = TypeAdapter(World)
+
+
+def read_world(folder: Path) -> World:
+    """The world of the scene in ``folder``.
+
+    Raises:
+        DevrfError: the file is missing or wrong.
+    """
+    return read_json(
+        folder / SCENE, _WORLD, "it says where the scene is; set data.root to its folder"
+    )
+
+
+def placed(
+    reader: InwardReader, folder: Path, world: World, static: Capture, dynamic: Capture
+) -> Scene:
+    """The scene of two captures, near and far as the options or else the world have them.
+
+    Without alpha masks the scene has no end, or, where the cameras look in nearly one direction,
+    the box is all that they see between near and far.
+
+    Args:
+        reader: the options.
+        folder: where the captures were read from.
+        world: what ``scene.json`` says.
+        static: the scene at rest.
+        dynamic: the scene in motion.
+
+    Raises:
+        DevrfError: what :meth:`devrf.scenes.reader.InwardReader.scene` raises.
+    """
+    near = world.near if reader.near is None else reader.near
+    far = world.far if reader.far is None else reader.far
+    options, cameras = replace(reader, near=near, far=far), static.train.cameras
+    wide = reader.box is None and not static.train.cut_out and 0 <= near < far
+    if not wide or (reader.space != "world" and axes_do_meet(cameras)):
+        return options.scene(folder, static, dynamic)
+    # Without mattes the backdrop is to be learned too.
+    seen = box_of_frusta(cameras, near, far)
+    scale = FALLBACK_BOUND_SCALE if reader.bound_scale == "auto" else reader.bound_scale
+    box = [seen.low, seen.high]
+    options = replace(options, box=box, space="world", bound_scale=scale)
+    scene = options.scene(folder, static, dynamic)
+    why = "data.space=world" if reader.space == "world" else "the cameras look in one direction"
+    bounds = replace(scene.bounds, reason=why, box_source="all that the cameras see up to far")
+    return replace(scene, bounds=bounds)
+
+
+class Camera(BaseModel):
+    """What a camera file says; pixels are those of the full image.
+
+    Attributes:
+        orientation: rows of the world-to-camera rotation.
+        position: of the camera, in the file's units.
+        focal_length: pixels, horizontally.
+        pixel_aspect_ratio: vertical over horizontal focal length.
+        skew: pixels.
+        image_size: width, height.
+        principal_point: pixels.
+        radial_distortion: k1, k2, k3.
+        tangential_distortion: p1, p2; the example in Nerfies' documentation says "tangential".
+    """
+
+    orientation: tuple[Vector3, Vector3, Vector3]
+    position: Vector3
+    focal_length: Positive
+    pixel_aspect_ratio: Positive = 1.0
+    skew: Number = 0.0
+    image_size: tuple[Positive, Positive]
+    principal_point: Vector2
+    radial_distortion: Vector3 = (0.0, 0.0, 0.0)
+    tangential_distortion: Vector2 = Field(
+        (0.0, 0.0), validation_alias=AliasChoices("tangential", "tangential_distortion")
+    )
+
+
+_CAMERA = TypeAdapter(Camera)
+
+
+def read_camera(
+    folder: Path, item: str, center: tuple[float, float, float], scale: float
+) -> tuple[Tensor, Intrinsics]:
+    """The camera of image ``item``.
+
+    Args:
+        folder: the scene's folder.
+        item: the image's id.
+        center: x, y, z of the world's origin, in the file's units.
+        scale: world units in one of the file's.
+
+    Returns:
+        The camera-to-world transform (3, 4) float32 in OpenGL axes, world units, and the
+        intrinsics in pixels of the full image.
+
+    Raises:
+        DevrfError: the file is missing, or a value in it is wrong.
+    """
+    file = inside(folder, folder / "camera", f"{item}.json", folder / "dataset.json")
+    camera = read_json(file, _CAMERA, "every image needs its camera; add it")
+    focal = camera.focal_length
+    return _pose(camera, file, center, scale), Intrinsics(
+        None,
+        (focal, focal * camera.pixel_aspect_ratio),
+        camera.principal_point,
+        camera.image_size,
+        Distortion((*camera.radial_distortion, 0.0), camera.tangential_distortion),
+        camera.skew,
+    )
+
+
+def _pose(camera: Camera, file: Path, center: tuple[float, float, float], scale: float) -> Tensor:
+    world_to_camera = torch.tensor(camera.orientation, dtype=torch.float64)
+    if not bool(is_rotation(world_to_camera)):
+        raise scene_error(
+            file,
+            "orientation is no rotation (scaled, sheared or mirrored axes); correct it",
+        )
+    # OpenCV's y points down and its z ahead; ours point up and back.
+    axes = world_to_camera.T * world_to_camera.new_tensor([1, -1, -1])
+    where = (axes.new_tensor(camera.position) - axes.new_tensor(center)) * scale
+    if not bool(in_reach(where)):
+        raise scene_error(
+            file,
+            f"position is farther than {FARTHEST:g} from the scene's center, in units of "
+            "scene.json; correct it, or center and scale there",
+        )
+    return torch.cat([axes, where[:, None]], dim=1).float()
+
+
+@dataclass(frozen=True)
+class ListedItems:
+    """The images of a list that are there.
+
+    Attributes:
+        file: the list.
+        items: N ids, in its order.
+        images: N existing files.
+        place: what place among these an image has, by its position in the list.
+    """
+
+    file: Path
+    items: tuple[str, ...]
+    images: tuple[Path, ...]
+    place: dict[int, int]
+
+    def positions(self, wanted: Sequence[int]) -> list[int]:
+        """Those of the positions in the list that are there, among the N; else DevrfError."""
+        kept = [self.place[position] for position in wanted if position in self.place]
+        if not kept:
+            raise scene_error(
+                self.file,
+                "all images to learn from, or all that are held out, are absent; add them",
+            )
+        return kept
+
+
+def images_at(folder: Path, downscale: int | str) -> ImageFolder:
+    """The folder ``rgb/<n>x`` to read from, and by how much its images are to be made smaller."""
+    names = {"full": "1x", "reduced": "{}x"}
+    return image_folder(folder / "rgb", folder_factor(folder / "rgb", downscale, **names), **names)
+
+
+def list_items(
+    folder: Path, file: Path, items: Sequence[str], images: ImageFolder, missing: Missing
+) -> ListedItems:
+    """The images that are there.
+
+    Args:
+        folder: the scene's folder.
+        file: what lists the images, in the scene's folder.
+        items: their ids.
+        images: the folder that they are in.
+        missing: as for :func:`devrf.scenes.image_folders.present_images`.
+
+    Raises:
+        DevrfError: what :func:`devrf.scenes.image_folders.present_images` raises.
+    """
+    names = [f"rgb/{images.path.name}/{item}" for item in items]
+    present = present_images(names, file, folder, missing)
+    place = {position: k for k, position in enumerate(present)}
+    return ListedItems(
+        file, tuple(items[position] for position in present), tuple(present.values()), place
+    )
+
+
+def posed_items(
+    folder: Path, listed: ListedItems, world: World, moments: Sequence[float]
+) -> Transforms:
+    """The images with cameras and times.
+
+    Args:
+        folder: the scene's folder.
+        listed: N images.
+        world: the frame of reference.
+        moments: when each was taken, on some scale; the first becomes 0, the last 1.
+
+    Raises:
+        DevrfError: a camera is missing or wrong.
+    """
+    cameras = [read_camera(folder, item, world.center, world.scale) for item in listed.items]
+    first, span = min(moments), (max(moments) - min(moments)) or 1.0
+    return Transforms(
+        listed.file,
+        tuple(intrinsics for _, intrinsics in cameras),
+        listed.images,
+        torch.stack([pose for pose, _ in cameras]),
+        tuple((moment - first) / span for moment in moments),
+    )
+
+
+def motion_layout(
+    transforms: Transforms, train: list[int], test: list[int], source: str, until: float
+) -> Layout:
+    """The layout of one capture without a static set, or of one moment.
+
+    Args:
+        transforms: all images.
+        train: positions of those to learn from.
+        test: positions of those held out.
+        source: the file that says the times, for the log.
+        until: the latest time of an image that counts as static.
+
+    Raises:
+        DevrfError: what :func:`devrf.scenes.layout.without_static_set` raises.
+    """
+    if not one_moment(transforms):
+        return without_static_set(in_motion(transforms[train]), in_motion(transforms[test]), until)
+    why = f"all images have one time in {source}"
+    return static_alone(transforms[train], transforms[test], why)
+
+
+DATASET, METADATA = "dataset.json", "metadata.json"
+
+
+class _Dataset(BaseModel):
+    """``dataset.json``: the ids of the images; numbers are taken for text."""
+
+    model_config = ConfigDict(coerce_numbers_to_str=True)
+
+    count: int | None = None
+    ids: Ids | None = None
+    train_ids: Ids | None = None
+    val_ids: Ids | None = None
+
+
+class _Moment(BaseModel):
+    """An entry of ``metadata.json``: when an image was taken, on some scale."""
+
+    time_id: Number | None = None
+    warp_id: Number | None = None
+
+
+_DATASET = TypeAdapter(_Dataset)
+_ENTRIES: TypeAdapter[dict[str, Any]] = TypeAdapter(dict[str, Any])
+
+
+@pydantic.dataclasses.dataclass(frozen=True)
+class NerfiesReader(InwardReader):
+    """Reads ``dataset.json``, ``metadata.json``, ``scene.json``, ``camera/`` and ``rgb/<n>x/``.
+
+    World units are those of ``scene.json``: (position − center) · scale; it gives near and far,
+    too. The time of an image is its ``time_id`` (HyperNeRF), else its ``warp_id``, brought to
+    [0, 1]. Images come from ``rgb/<downscale>x``, or from a larger folder and are made smaller;
+    they are undistorted. With one time for all of them the scene is at rest.
+    Without alpha masks the scene has no end, or, where the cameras look in
+    nearly one direction, the box is all that they see between near and far.
+
+    Attributes:
+        holdout: without ``val_ids``, one of so many images is held out.
+        static_until: the latest time of an image that counts as static: there is no static set.
+    """
+
+    _: KW_ONLY
+    downscale: Downscale = "up_to_4"
+    flow: EstimatedFlow = "auto"
+    holdout: Holdout = 8
+    static_until: Time = 1.0
+
+    def read(self) -> Scene:
+        """See :meth:`devrf.scenes.reader.SceneReader.read`."""
+        folder = scene_folder(self.root)
+        world = read_world(folder)
+        items, train, test = _items(folder / DATASET, self.holdout)
+        images = images_at(folder, self.downscale)
+        listed = list_items(folder, folder / DATASET, items, images, self.missing)
+        times = _times(folder / METADATA, listed.items)
+        transforms = posed_items(folder, listed, world, times)
+        train, test = listed.positions(train), listed.positions(test)
+        layout = motion_layout(transforms, train, test, METADATA, self.static_until)
+        layout, _ = fewer(layout, None, self.frames)
+        return placed(self, folder, world, *load_layout(layout, folder, images.downscale))
+
+
+def _items(file: Path, holdout: int) -> tuple[list[str], list[int], list[int]]:
+    """The ids of the images, and the positions of those to learn from and those held out."""
+    listed = read_json(file, _DATASET, "it lists the images; add it")
+    ids, train, val = listed.ids or [], listed.train_ids or [], listed.val_ids or []
+    if ids and listed.count not in (None, len(ids)):
+        raise scene_error(
+            file, f'"count" is {listed.count}, but "ids" lists {len(ids)} images; correct it'
+        )
+    items = ids or list(dict.fromkeys(train + val))
+    position = {item: i for i, item in enumerate(items)}
+    unknown = [item for item in train + val if item not in position]
+    if unknown:
+        raise scene_error(
+            file, f'{abbreviated(unknown[0])} is in train_ids or val_ids, but not in "ids"'
+        )
+    if len(items) < 2:
+        raise scene_error(
+            file, f"lists {len(items)} images, expected at least two; correct its ids"
+        )
+    if not val:
+        chosen = [position[item] for item in train] or list(range(len(items)))
+        if len(chosen) < 2:
+            raise scene_error(file, "one image in train_ids and none in val_ids; list more")
+        learn, held_out = every_nth(len(chosen), holdout)
+        return items, [chosen[i] for i in learn], [chosen[i] for i in held_out]
+    held = set(val)
+    both = [item for item in train if item in held]
+    if both:
+        log.warning("%s: %d images of val_ids are in train_ids too; held out", file, len(both))
+    learned = [position[item] for item in train or items if item not in held]
+    if not learned:
+        raise scene_error(file, "all images are held out by val_ids; list some in train_ids only")
+    return items, learned, [position[item] for item in val]
+
+
+def _times(file: Path, items: Sequence[str]) -> tuple[float, ...]:
+    """When each image was taken, on the scale of the file."""
+    content = read_json(
+        file,
+        _ENTRIES,
+        "it says when each image was taken; add it, with one time_id for all of a scene at rest",
+    )
+    moments = []
+    for item in items:
+        if item not in content:
+            raise scene_error(file, f"says nothing of image {abbreviated(item)}; add its warp_id")
+        try:
+            moments.append(_Moment.model_validate(content[item]))
+        except ValidationError as error:
+            raise first_error(error, f"{file}: {item}.") from None
+    key = "warp_id" if any(moment.time_id is None for moment in moments) else "time_id"
+    ids = []
+    for item, moment in zip(items, moments, strict=True):
+        value = getattr(moment, key)
+        if value is None:
+            raise scene_error(file, f"image {abbreviated(item)} has no {key}; add it")
+        ids.append(value)
+    return tuple(ids)

@@ -1,0 +1,203 @@
+"""Scenes in nerfstudio's and instant-ngp's layout: one ``transforms.json`` for all images."""
+
+from __future__ import annotations
+
+import logging
+import os
+from dataclasses import KW_ONLY
+from pathlib import Path
+
+import torch
+from pydantic.dataclasses import dataclass
+from torch import Tensor
+
+from devrf.scenes.files import inside, scene_folder
+from devrf.scenes.images import find_image, image_at
+from devrf.scenes.layout import Layout, fewer, load_layout, static_alone, without_static_set
+from devrf.scenes.masks import Masks
+from devrf.scenes.reader import Count, EstimatedFlow, Holdout, PosedReader, Time
+from devrf.scenes.scene import Scene
+from devrf.scenes.splits import (
+    at_rest,
+    distinct_poses,
+    every_nth,
+    in_motion,
+    one_moment,
+    one_moment_in_words,
+)
+from devrf.scenes.transforms import Transforms, posed_images, read_listing
+from devrf.scenes.validation import abbreviated, scene_error
+
+log = logging.getLogger(__name__)
+
+
+FILE = "transforms.json"
+# So many images at time 0 are a static set: from fewer no field can be learned.
+_SEVERAL = 3
+_AT_REST = 1e-6
+
+
+@dataclass(frozen=True)
+class NerfstudioReader(PosedReader):
+    """Reads ``transforms.json`` and images.
+
+    The file may lie in ``root``, with a ``time`` in [0, 1] on every frame, or in
+    ``root/static`` and, with times, in ``root/dynamic``. Without times, or without
+    ``root/dynamic``, the scene is at rest. Cameras may stand still or move.
+    Held-out images are those in ``test_filenames`` (else ``val_filenames``), else every
+    ``holdout``-th. Images are undistorted; the world is that of the file's poses.
+
+    A frame's ``mask_path`` is a grey image of the size of the image or of its camera, black
+    where pixels are left out. In nerfstudio's meaning these pixels say nothing (people who walk
+    by): ``ignore`` neither learns from them nor scores them, and the fields show there what
+    other images say. ``matte`` takes them for background (a person who was cut out), as an
+    alpha channel would be taken: that also shows where the scene is and where it moves.
+
+    Attributes:
+        train_views: train on the first so many dynamic views; None: all.
+        holdout: without lists in the file, one of so many images is held out.
+        static_until: in one file, the latest time of an image that counts as static; None: 0
+            where several images are of time 0, else 1.
+        masks: what the masks of the frames are taken for; ``none`` leaves them alone.
+        space: as of :class:`~devrf.scenes.reader.PosedReader`; a file of ``stage=capture``
+            says itself (``scene_bounds``) what ``auto`` is.
+    """
+
+    _: KW_ONLY
+    flow: EstimatedFlow = "auto"
+    train_views: Count | None = None
+    holdout: Holdout = 8
+    static_until: Time | None = None
+    masks: Masks = "ignore"
+
+    def read(self) -> Scene:
+        """See :meth:`devrf.scenes.reader.SceneReader.read`."""
+        folder = scene_folder(self.root)
+        layout = _layout(folder, self)
+        layout, _ = fewer(layout, self.train_views, self.frames)
+        static, dynamic = load_layout(layout, folder, self.downscale, self.masks)
+        bounds = layout.static_train.transforms.bounds
+        return self.placed(folder, static, dynamic, bounds, f"scene_bounds in {FILE}")
+
+
+def _layout(root: Path, options: NerfstudioReader) -> Layout:
+    if os.path.isfile(root / FILE):
+        train, test = _train_and_test(root / FILE, root, options)
+        if one_moment(train, test):
+            return static_alone(train, test, one_moment_in_words(train))
+        return _one_file(train, test, options.static_until)
+    still, moving = root / "static" / FILE, root / "dynamic" / FILE
+    if not os.path.isfile(still) and not os.path.isfile(moving):
+        raise scene_error(
+            root,
+            f"expected {FILE}, or static/{FILE} (and dynamic/{FILE}); set data.root to the "
+            "scene's folder",
+        )
+    rest = _train_and_test(still, root, options)
+    if not os.path.isfile(moving):
+        return static_alone(*rest, f"there is no dynamic/{FILE}")
+    motion = _train_and_test(moving, root, options)
+    if motion[0].times is None:
+        raise scene_error(
+            moving,
+            'its frames have no "time", which a capture of a moving scene needs; '
+            "give every frame its time in [0, 1]",
+        )
+    return Layout(at_rest(rest[0]), at_rest(rest[1]), in_motion(motion[0]), in_motion(motion[1]))
+
+
+def _train_and_test(
+    file: Path, root: Path, options: NerfstudioReader
+) -> tuple[Transforms, Transforms]:
+    listing = read_listing(file)
+    transforms = posed_images(
+        listing, file, root, masked=options.masks != "none", missing=options.missing
+    )
+    count = len(transforms.images)
+    listed = {
+        split: _listed(getattr(listing, f"{split}_filenames"), split, transforms, root)
+        for split in ("train", "val", "test")
+    }
+    test = listed["test"] or listed["val"]
+    elsewhere = set(listed["val"] + listed["test"])
+    train = listed["train"] or [i for i in range(count) if i not in elsewhere]
+    if listed["train"] and not test:
+        test = sorted(set(range(count)) - set(train))
+    elif not test and count > 1:
+        train, test = every_nth(count, options.holdout)
+    if not train or not test or set(train) & set(test):
+        raise scene_error(
+            file,
+            f"{len(train)} images to learn from, {len(test)} held out, "
+            f"{len(set(train) & set(test))} of them both; expected at least one of each and none "
+            "twice: correct train_filenames and test_filenames",
+        )
+    return transforms[train], transforms[test]
+
+
+def _listed(names: list[str] | None, split: str, transforms: Transforms, root: Path) -> list[int]:
+    """Positions in the file, ascending, of the images that it lists for a split."""
+    position = {image: i for i, image in enumerate(transforms.images)}
+    found = []
+    for name in names or []:
+        place = inside(root, transforms.file.parent, name, transforms.file)
+        if transforms.skipped and image_at(place) is None:
+            continue
+        image = find_image(place)
+        if image not in position:
+            raise scene_error(
+                transforms.file,
+                f"{split}_filenames lists {abbreviated(name)}, which is in none of the frames; "
+                "correct it",
+            )
+        found.append(position[image])
+    return sorted(set(found))
+
+
+def _one_file(train: Transforms, test: Transforms, static_until: float | None) -> Layout:
+    """The layout of a file that holds the scene at rest and in motion."""
+    times = _times(train)
+    at_zero = times <= _AT_REST
+    if static_until is None:
+        static_until = 0.0 if int(at_zero.sum()) >= _SEVERAL else 1.0
+    if static_until > 0 or not bool(at_zero.any()):
+        return without_static_set(in_motion(train), in_motion(test), static_until)
+    still = at_zero.nonzero()[:, 0].tolist()
+    still_test = (_times(test) <= _AT_REST).nonzero()[:, 0].tolist()
+    moving, moving_test = _seen_moving(train), _seen_moving(test)
+    if not moving or not moving_test:
+        raise scene_error(
+            train.file,
+            f"{len(moving)} images to learn motion from and {len(moving_test)} held "
+            "out, expected at least one of each at a time above 0; correct the times, or "
+            "train_filenames and test_filenames",
+        )
+    if not still_test:
+        log.warning("no held-out image at time 0: the static scene is tested on one in training")
+        still_test, rest_test = still[:1], train
+    else:
+        rest_test = test
+    log.info("%d images at time 0 are the static set of %d", len(still), len(times))
+    return Layout(
+        at_rest(train[still]),
+        at_rest(rest_test[still_test]),
+        in_motion(train[moving]),
+        in_motion(test[moving_test]),
+    )
+
+
+def _seen_moving(transforms: Transforms) -> list[int]:
+    """The images at later times, and those at time 0 by cameras that stay to see more.
+
+    What else there is at time 0 tells nothing of motion, and its many cameras would hide that
+    the others stand still.
+    """
+    later = _times(transforms) > _AT_REST
+    camera = distinct_poses(transforms.poses)
+    kept: list[int] = (later | torch.isin(camera, camera[later])).nonzero()[:, 0].tolist()
+    return kept
+
+
+def _times(transforms: Transforms) -> Tensor:
+    assert transforms.times is not None  # else the scene is at rest
+    return torch.tensor(transforms.times)

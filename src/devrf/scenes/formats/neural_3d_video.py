@@ -1,0 +1,238 @@
+"""``cam00.mp4``, ``cam01.mp4`` …: synchronised videos by cameras that stand still."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import KW_ONLY, dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import pydantic
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from devrf.scenes.files import Positive, entries, scene_folder
+from devrf.scenes.footage import FilmHeader, Size, chosen, film_header
+from devrf.scenes.formats.llff_poses import PosedSet, read_static_poses
+from devrf.scenes.image_folders import Downscale, whole_factor
+from devrf.scenes.images import workers
+from devrf.scenes.reader import Count, EstimatedFlow, SceneReader, SeveralFrames
+from devrf.scenes.resampling import shrink_pixels
+from devrf.scenes.scene import Capture, Scene, Views
+from devrf.scenes.space import one_sided_scene
+from devrf.scenes.validation import check_memory, reduced_size, scene_error
+
+log = logging.getLogger(__name__)
+
+
+_VIDEO = re.compile(r"cam(\d{1,6})\.mp4", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class CameraVideos:
+    """Videos of one length and one size.
+
+    Attributes:
+        paths: V files in the order of their names.
+        numbers: V numbers in these names.
+        frames: how many frames each has.
+        size: width and height of the frames in pixels.
+    """
+
+    paths: tuple[Path, ...]
+    numbers: tuple[int, ...]
+    frames: int
+    size: Size
+
+    def name_of(self, video: int, frame: int) -> str:
+        """What a frame is called in messages and tables."""
+        return f"{self.paths[video].name} frame {frame}"
+
+
+def camera_videos(folder: Path) -> CameraVideos:
+    """The videos in a folder; their frames are not read yet.
+
+    Raises:
+        DevrfError: there are fewer than two, one cannot be read, or they differ in length or size.
+    """
+    found = [
+        (path, int(match[1]))
+        for path in entries(folder)
+        if (match := _VIDEO.fullmatch(path.name)) and os.path.isfile(path)
+    ]
+    if len(found) < 2:
+        raise scene_error(
+            folder,
+            f"{len(found)} videos cam00.mp4, cam01.mp4, …, expected at least 2: one to learn from, "
+            "one to hold out; set data.root to the folder of poses_bounds.npy and the videos",
+        )
+    paths, numbers = (tuple(part) for part in zip(*found, strict=True))
+    headers = [film_header(path) for path in paths]
+    first = headers[0]
+    for path, header in zip(paths, headers, strict=True):
+        if header != first:
+            raise scene_error(
+                path,
+                f"{_in_words(header)}, but {paths[0].name} has {_in_words(first)}; all videos show "
+                "the same moments, in the same size: cut or convert them",
+            )
+    if first.frames < 2:
+        raise scene_error(paths[0], f"{first.frames} frames, expected at least 2")
+    return CameraVideos(paths, numbers, first.frames, first.size)
+
+
+def _in_words(header: FilmHeader) -> str:
+    return f"{header.frames} frames of {header.size[0]}x{header.size[1]} px"
+
+
+def read_frames(
+    videos: CameraVideos, wanted: Sequence[int], frames: Sequence[int], downscale: int
+) -> Tensor:
+    """The chosen frames of the chosen videos; of others nothing is kept in memory.
+
+    Args:
+        videos: where to read from.
+        wanted: K of their positions.
+        frames: T positions of frames, ascending.
+        downscale: integer factor ≥ 1; each side becomes floor(side / downscale), by area averages.
+
+    Returns:
+        (T · K, H, W, 3) uint8: all videos at the first frame, then all at the next.
+
+    Raises:
+        DevrfError: a video is damaged, or they do not fit into memory.
+    """
+    start, (width, height) = time.perf_counter(), videos.size
+    size = reduced_size(width, height, downscale, videos.paths[0])
+    shape = (len(frames), len(wanted), size[1], size[0], 3)
+    what = f"{len(frames)} frames of {len(wanted)} videos at {size[0]}x{size[1]} px"
+    check_memory(int(np.prod(shape, dtype=object)), videos.paths[0].parent, what)
+    pixels, row = np.empty(shape, dtype=np.uint8), {frame: t for t, frame in enumerate(frames)}
+
+    def fill(column: int) -> None:
+        path = videos.paths[wanted[column]]
+        for frame, picture in chosen(path, frames):
+            if picture.shape[:2] != (height, width):
+                raise scene_error(
+                    path, f"frame {frame} is not of {width}x{height} px; convert the video"
+                )
+            pixels[row[frame], column] = (
+                picture if downscale == 1 else shrink_pixels(picture, *size)
+            )
+
+    with ThreadPoolExecutor(workers(width, height)) as pool:
+        for _ in pool.map(fill, range(len(wanted))):
+            pass
+    log.info("read %s from %s in %.1f s", what, videos.paths[0].parent, time.perf_counter() - start)
+    return torch.from_numpy(pixels.reshape(-1, *shape[2:]))
+
+
+@pydantic.dataclasses.dataclass(frozen=True)
+class Neural3DVideoReader(SceneReader):
+    """Reads ``poses_bounds.npy`` and ``cam00.mp4``, ``cam01.mp4`` … of one length.
+
+    Row k of the poses is the camera of the k-th video in the order of names: numbers may be left
+    out. No camera moves. The static set is the first frame of every camera, the dynamic set the
+    chosen frames. World, near plane and space are those of LLFF's scenes
+    (:class:`devrf.scenes.formats.llff.LlffReader`).
+
+    Attributes:
+        test_view: the number in the name of the video to hold out: 0 is ``cam00.mp4``.
+        length: the first so many frames of each video are the recording; None: all.
+        frames: keep so many of them, evenly spread, first and last included; None: all.
+        near: distance of the near plane from the average camera, in the world's unit; the
+            nearest point of the scene is at 1/0.75.
+        train_views: train on the first so many of the cameras that are not held out; None: all.
+    """
+
+    _: KW_ONLY
+    downscale: Downscale = "up_to_4"
+    flow: EstimatedFlow = "auto"
+    test_view: Annotated[int, Field(strict=True, ge=0)] = 0
+    near: Positive = 1.0
+    train_views: Count | None = None
+    length: SeveralFrames | None = None
+    frames: SeveralFrames | None = 50
+
+    def read(self) -> Scene:
+        """See :meth:`devrf.scenes.reader.SceneReader.read`."""
+        folder = scene_folder(self.root)
+        posed, videos = read_static_poses(folder), camera_videos(folder)
+        if len(posed) != len(videos.paths):
+            raise scene_error(
+                posed.file,
+                f"has {len(posed)} cameras, but there are {len(videos.paths)} videos "
+                f"{videos.paths[0].name} … {videos.paths[-1].name}; remove the videos without a "
+                "camera, or write the cameras again",
+            )
+        posed = posed.normalised()
+        test, train = self._split(videos)
+        frames, times = self._moments(videos)
+        factor = whole_factor(self.downscale, lambda factor: min(videos.size) // factor)
+        moving = Capture(
+            *(_views(videos, posed, chosen, frames, times, factor) for chosen in (train, [test]))
+        )
+        still = Capture(_at_rest(moving.train), _at_rest(moving.test))
+        return one_sided_scene(self.name_of(folder), still, moving, self.near, self.background)
+
+    def _split(self, videos: CameraVideos) -> tuple[int, list[int]]:
+        """Positions of the held-out video and of those to learn from."""
+        if self.test_view not in videos.numbers:
+            names = ", ".join(path.name for path in videos.paths)
+            raise scene_error(
+                "data.test_view",
+                f"{self.test_view} is the number of none of the videos ({names}); give one of them",
+            )
+        test = videos.numbers.index(self.test_view)
+        train = [k for k in range(len(videos.paths)) if k != test]
+        if self.train_views is not None and self.train_views > len(train):
+            raise scene_error(
+                "data.train_views",
+                f"{self.train_views} were asked for, but there are {len(train)} videos next to "
+                "the held-out one; ask for fewer",
+            )
+        return test, train[: self.train_views]
+
+    def _moments(self, videos: CameraVideos) -> tuple[list[int], Tensor]:
+        """The frames that are read, ascending, and their times in [0, 1]."""
+        total = videos.frames if self.length is None else self.length
+        if total > videos.frames:
+            raise scene_error(
+                "data.length", f"{total} is more than the {videos.frames} frames of each video"
+            )
+        count = total if self.frames is None else min(self.frames, total)
+        frames = torch.linspace(0, total - 1, count, dtype=torch.float64).round().long()
+        return frames.tolist(), (frames / (total - 1)).float()
+
+
+def _views(
+    videos: CameraVideos,
+    posed: PosedSet,
+    chosen: list[int],
+    frames: list[int],
+    times: Tensor,
+    factor: int,
+) -> Views:
+    """All chosen videos at the first frame, then all at the next."""
+    pixels = read_frames(videos, chosen, frames, factor)
+    height, width = pixels.shape[1:3]
+    view = torch.arange(len(chosen)).repeat(len(frames))
+    return Views(
+        pixels,
+        posed.cameras(width, height)[torch.tensor(chosen)][view],
+        times.repeat_interleave(len(chosen)),
+        view,
+        tuple(videos.name_of(video, frame) for frame in frames for video in chosen),
+    )
+
+
+def _at_rest(views: Views) -> Views:
+    """The first frame of each view."""
+    return views[(views.times == 0).nonzero()[:, 0]]

@@ -1,0 +1,157 @@
+"""Camera rigs around the origin: many for the scene at rest, a few that watch it move."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from devrf.geometry.cameras import Cameras
+from devrf.geometry.poses import average_pose, relative_to
+
+
+@dataclass(frozen=True)
+class Rig:
+    """How cameras stand around the origin.
+
+    Attributes:
+        distance: from the origin, world units.
+        field_of_view: radians across the image's shorter side, at least.
+        lowest: sine of the lowest elevation of a static view.
+        highest: sine of the highest.
+    """
+
+    distance: float
+    field_of_view: float
+    lowest: float
+    highest: float
+
+
+# As in NeRF's synthetic scenes.
+STUDIO = Rig(distance=4.0, field_of_view=0.69, lowest=-0.3, highest=0.95)
+# A telephone in the hand of someone who walks around: above the floor, and a wider lens.
+HAND_HELD = Rig(distance=3.4, field_of_view=0.96, lowest=0.05, highest=0.75)
+_FIRST_AZIMUTH = math.radians(-60)
+_ELEVATIONS = (math.radians(22), math.radians(34))
+_TEST_ELEVATION = math.radians(28)
+
+
+def static_rig(
+    train: int, test: int, *, width: int, height: int, reach: float, rig: Rig = STUDIO
+) -> tuple[Cameras, Cameras]:
+    """Training and held-out cameras, spread evenly from the rig's lowest elevation upwards.
+
+    All are points of one Fibonacci lattice; the held-out ones lie evenly between the others.
+
+    Args:
+        train: number of training cameras.
+        test: number of held-out cameras.
+        width: image width in pixels.
+        height: image height in pixels.
+        reach: radius of the ball about the origin that every image must hold.
+        rig: how the cameras stand.
+    """
+    count = train + test
+    index = torch.arange(count, dtype=torch.float64)
+    sine = rig.lowest + (rig.highest - rig.lowest) * (index + 0.5) / count
+    golden = math.pi * (3 - math.sqrt(5))
+    cameras = _around(golden * index, sine.asin(), width, height, reach, rig)
+    held_out = ((torch.arange(test) + 0.5) * count / test).long()
+    mask = torch.zeros(count, dtype=torch.bool)
+    mask[held_out] = True
+    return cameras[~mask], cameras[mask]
+
+
+def dynamic_rig(
+    train: int, *, width: int, height: int, reach: float, rig: Rig = STUDIO
+) -> tuple[Cameras, Cameras]:
+    """``train`` fixed cameras all around, and one held out between the first two of them."""
+    step = 2 * math.pi / train
+    index = torch.arange(train, dtype=torch.float64)
+    low, high = _ELEVATIONS
+    elevation = torch.where(index % 2 == 0, low, high).double()
+    cameras = _around(_FIRST_AZIMUTH + step * index, elevation, width, height, reach, rig)
+    # A lone camera sees one side only: then the held-out one stays on that side.
+    azimuth = torch.tensor([_FIRST_AZIMUTH + min(step / 2, math.pi / 4)], dtype=torch.float64)
+    elevation = torch.full_like(azimuth, _TEST_ELEVATION)
+    return cameras, _around(azimuth, elevation, width, height, reach, rig)
+
+
+def _around(
+    azimuth: Tensor, elevation: Tensor, width: int, height: int, reach: float, rig: Rig
+) -> Cameras:
+    """Float32 cameras that look at the origin from directions (N,), (N,) in radians."""
+    directions = torch.stack(
+        [elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin()], dim=-1
+    )
+    positions = (rig.distance * directions).float()
+    field = max(rig.field_of_view, 2 * math.asin(min(reach / rig.distance, 0.95)))
+    focal = min(width, height) / 2 / math.tan(field / 2)
+    return Cameras.looking_at(
+        positions, torch.zeros_like(positions), focal=focal, width=width, height=height
+    )
+
+
+FIELD_OF_VIEW = 1.05  # radians across the image's longer side
+# Half axes (x, y) of the ellipse of static cameras and of that of the fixed dynamic ones; all
+# look at one point on the −z axis. World units.
+_STATIC = (0.45, 0.24)
+_DYNAMIC = (0.36, 0.18)
+_HELD_OUT = (0.07, -0.04)
+_TARGET_DEPTH = 3.4
+# Static cameras deviate this much from a plane, as hand-held ones do.
+_UNEVEN = 0.05
+
+
+def facing_static_rig(count: int, *, width: int, height: int) -> Cameras:
+    """``count`` cameras evenly over an ellipse, whose average pose is the identity.
+
+    Args:
+        count: number of cameras.
+        width: image width in pixels.
+        height: image height in pixels.
+    """
+    index = torch.arange(count, dtype=torch.float64)
+    radius = ((index + 0.5) / count).sqrt()
+    angle = math.pi * (3 - math.sqrt(5)) * index
+    x, y = _STATIC[0] * radius * angle.cos(), _STATIC[1] * radius * angle.sin()
+    positions = torch.stack([x, y, _UNEVEN * (2.0 * index).sin()], dim=-1)
+    return _facing(positions, width, height, centred=True)
+
+
+def facing_dynamic_rig(train: int, *, width: int, height: int) -> tuple[Cameras, Cameras]:
+    """``train`` fixed cameras on an ellipse, and one held out near its middle.
+
+    Args:
+        train: number of cameras to learn from.
+        width: image width in pixels.
+        height: image height in pixels.
+    """
+    angle = math.pi / 4 + 2 * math.pi * torch.arange(train, dtype=torch.float64) / train
+    level = torch.zeros_like(angle)
+    around = torch.stack([_DYNAMIC[0] * angle.cos(), _DYNAMIC[1] * angle.sin(), level], dim=-1)
+    middle = torch.tensor([[*_HELD_OUT, 0.0]], dtype=torch.float64)
+    return _facing(around, width, height), _facing(middle, width, height)
+
+
+def _facing(positions: Tensor, width: int, height: int, *, centred: bool = False) -> Cameras:
+    """Float32 cameras at positions (N, 3) float64 that look at the rig's target, y up."""
+    cameras = Cameras.looking_at(
+        positions,
+        positions.new_tensor([0.0, 0.0, -_TARGET_DEPTH]).expand_as(positions),
+        focal=max(width, height) / 2 / math.tan(FIELD_OF_VIEW / 2),
+        width=width,
+        height=height,
+        up=positions.new_tensor([0.0, 1.0, 0.0]),
+    )
+    poses = cameras.camera_to_world
+    if centred:
+        poses = relative_to(average_pose(poses), poses)
+    return replace(
+        cameras,
+        camera_to_world=poses.float(),
+        focal=cameras.focal.float(),
+        center=cameras.center.float(),
+    )

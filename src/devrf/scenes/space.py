@@ -1,0 +1,178 @@
+"""Which space an inward-facing scene is learned in, and where it is there."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import replace
+from typing import Literal
+
+import torch
+
+from devrf.geometry.box import Box
+from devrf.geometry.contraction import ContractedSpace
+from devrf.geometry.ndc import NormalizedDevice
+from devrf.geometry.poses import average_pose, relative_to
+from devrf.geometry.space import WORLD, Space
+from devrf.scenes.bounds import (
+    STILL,
+    box_from_cameras,
+    forward_bounds,
+    inward_bounds,
+    reference_space,
+)
+from devrf.scenes.scene import Background, Bounds, Capture, Scene, Views
+from devrf.scenes.silhouettes import motion_box
+from devrf.scenes.validation import scene_error
+
+log = logging.getLogger(__name__)
+
+
+SpaceChoice = Literal["auto", "world", "contracted"]
+
+# Thickness of the shell in half edges of the inner box, as in the paper of contraction. In a
+# thinner one walls are a voxel or two deep, and are learned as fog before them (measured).
+SHELL = 1.0
+# Nothing is nearer to a camera than this share of its distance to what it looks at. With less, fog
+# before each lens explains its picture and spoils those of others (measured).
+NEAR_SHARE = 0.25
+
+
+def inward_space(
+    choice: SpaceChoice,
+    static: Views,
+    dynamic: Views | None,
+    everyone: list[Views],
+    *,
+    bound_scale: float | str = "auto",
+    near: float | None = None,
+    far: float | None = None,
+    box: Box | None = None,
+) -> tuple[Space, Bounds]:
+    """The space of a scene that its cameras look in at, and its bounds there.
+
+    Args:
+        choice: the space, or ``auto``: contracted without mattes and ``box``, else the world.
+        static: training views at rest, whose cameras give the box.
+        dynamic: training views in motion; None: the scene is at rest.
+        everyone: all views, test included.
+        bound_scale: as for :func:`~devrf.scenes.bounds.inward_bounds`; a number makes the inner
+            box of contracted space so much larger, unless it is given.
+        near: distance in world units, or None for the cameras to say.
+        far: distance in world units, or None; contracted space has no end.
+        box: the scene's box, or None.
+
+    Raises:
+        DevrfError: the cameras do not say where the scene is, or near is not before far.
+    """
+    given = "data.box is given" if box else ""
+    mattes = "the images have mattes" if static.cut_out else "the images have no mattes"
+    if choice == "world" or (choice == "auto" and (static.cut_out or box)):
+        bounds = inward_bounds(
+            static, dynamic, everyone, bound_scale=bound_scale, near=near, far=far, box=box
+        )
+        why = "data.space=world" if choice == "world" else given or mattes
+        where = given or "what the static cameras all see"
+        return WORLD, _because(bounds, why, where)
+    inner, where = box or box_from_cameras(static.cameras), given
+    if box is None:
+        where = "what the static cameras all see"
+        motion = motion_box(dynamic, inner) if dynamic is not None and dynamic.cut_out else None
+        if motion is not None:
+            inner, where = inner.union(motion), where + ", and where the silhouettes move"
+        if bound_scale != "auto":
+            inner, where = inner.scaled(float(bound_scale)), where + f" x {float(bound_scale):g}"
+    space = ContractedSpace(inner.low, inner.high, SHELL)
+    if near is None:
+        middle = static.cameras.positions.new_tensor(inner.middle)
+        distances = [(views.cameras.positions - middle).norm(dim=1).min() for views in everyone]
+        near = NEAR_SHARE * float(min(distances))
+    if not 0 <= near < math.inf:
+        raise scene_error("data.near", f"expected a distance of 0 or more, not {near:g}")
+    bounds = Bounds(space.box, near, math.inf, None, 1.0, "the box")
+    why = "data.space=contracted" if choice == "contracted" else f"{mattes}, data.box is not given"
+    return space, _because(bounds, why, where)
+
+
+def _because(bounds: Bounds, why: str, where: str) -> Bounds:
+    return replace(bounds, reason=why, box_source=where)
+
+
+# Where the room for motion comes from.
+SEEN = "all that the cameras see (forward-facing)"
+
+
+def one_sided_scene(
+    name: str, static: Capture, dynamic: Capture, near: float, background: Background
+) -> Scene:
+    """The scene of two captures whose static cameras have the identity as their average pose.
+
+    Its space is NDC of a camera at the origin that looks along −z.
+
+    Args:
+        name: the scene's name.
+        static: the scene at rest.
+        dynamic: the scene in motion; ``static`` itself where it is always at rest.
+        near: distance of the near plane from the average camera, world units.
+        background: what is behind alpha masks.
+
+    Raises:
+        DevrfError: a camera sees something that is not before the average camera.
+    """
+    space = reference_space(static.train.cameras, near)
+    # The captures of a scene at rest, and of a video, share images.
+    learned, held_out = (
+        list({id(v): v for v in both}.values())
+        for both in ((static.train, dynamic.train), (static.test, dynamic.test))
+    )
+    moves = dynamic.train is not static.train or len(set(dynamic.train.times.tolist())) > 1
+    bounds = forward_bounds(learned, space, SEEN if moves else STILL)
+    # The held-out cameras need not see inside the box, but they have to look the same way.
+    forward_bounds(held_out, space, "")
+    _warn_of_cameras_beyond(near, learned + held_out)
+    return Scene(name, "forward", static, dynamic, bounds, background, space)
+
+
+def centred(static: Capture, dynamic: Capture) -> tuple[Capture, Capture]:
+    """Both captures in a world in which the static cameras' average pose is the identity."""
+    both = (static.train, static.test)
+    frame = average_pose(torch.cat([v.cameras.camera_to_world.double() for v in both]))
+    moved: dict[int, Views] = {}
+    for views in (*both, dynamic.train, dynamic.test):
+        if id(views) not in moved:  # captures that share images go on sharing them
+            poses = relative_to(frame, views.cameras.camera_to_world.double()).float()
+            moved[id(views)] = replace(views, cameras=replace(views.cameras, camera_to_world=poses))
+    first, second = (
+        Capture(moved[id(one.train)], moved[id(one.test)]) for one in (static, dynamic)
+    )
+    return first, second
+
+
+def _warn_of_cameras_beyond(near: float, everyone: list[Views]) -> None:
+    """A camera beyond the near plane would look through what is behind it."""
+    for views in everyone:
+        beyond = (views.cameras.positions[:, 2] <= -near).nonzero().flatten()
+        if len(beyond):
+            log.warning(
+                "%d cameras are beyond the near plane, %s the first of them; set data.near higher",
+                len(beyond),
+                views.names[int(beyond[0])],
+            )
+
+
+def dynamic_only(scene: Scene) -> Scene:
+    """The scene without its static set: the dynamic images of time 0 stand in for it.
+
+    Bounds are found anew, from the dynamic training cameras alone.
+
+    Raises:
+        DevrfError: these cameras do not say where the scene is.
+    """
+    views, held_out = scene.dynamic.train, scene.dynamic.test
+    at_rest = [v[(v.times == v.times.min()).nonzero()[:, 0]] for v in (views, held_out)]
+    if isinstance(scene.space, NormalizedDevice):
+        bounds = forward_bounds([views], scene.space, "all that the dynamic cameras see")
+        return replace(scene, static=Capture(*at_rest), bounds=bounds)
+    choice: SpaceChoice = "world" if scene.space.is_linear else "contracted"
+    space, bounds = inward_space(choice, views, views, [views, held_out])
+    return replace(scene, static=Capture(*at_rest), bounds=bounds, space=space)

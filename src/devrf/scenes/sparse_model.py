@@ -1,0 +1,340 @@
+"""COLMAP's sparse models, and the world of one: its origin, axes and unit, where the scene is."""
+
+from __future__ import annotations
+
+import importlib
+import os
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from devrf.geometry.cameras import Distortion
+from devrf.geometry.poses import average_pose, relative_to
+from devrf.scenes.files import decoding
+from devrf.scenes.lens import Intrinsics
+from devrf.scenes.validation import FARTHEST, in_reach, scene_error
+
+# Parameters of each camera model that can be read, in COLMAP's order.
+PARAMETERS = {
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fx", "fy", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+}
+
+
+@dataclass(frozen=True)
+class ModelCamera:
+    """An entry of ``cameras``.
+
+    Attributes:
+        model: one of :data:`PARAMETERS`.
+        size: width and height of its images in pixels.
+        parameters: in the order of :data:`PARAMETERS`, pixels; (0, 0) is the outer corner of the
+            first pixel.
+    """
+
+    model: str
+    size: tuple[int, int]
+    parameters: tuple[float, ...]
+
+    @property
+    def keys(self) -> dict[str, float]:
+        """The camera as a frame of a transforms file has it: ``fl_x``, ``cx``, ``k1``."""
+        given = dict(zip(PARAMETERS[self.model], self.parameters, strict=True))
+        fx, fy = (given.pop(name, given.get("f", 0.0)) for name in ("fx", "fy"))
+        given.pop("f", None)
+        return {"fl_x": fx, "fl_y": fy, "w": self.size[0], "h": self.size[1], **given}
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """The camera as the readers have it."""
+        keys = self.keys
+        return Intrinsics(
+            None,
+            (keys["fl_x"], keys["fl_y"]),
+            (keys["cx"], keys["cy"]),
+            (float(self.size[0]), float(self.size[1])),
+            Distortion(
+                (keys.get("k1", 0.0), keys.get("k2", 0.0), 0.0, 0.0),
+                (keys.get("p1", 0.0), keys.get("p2", 0.0)),
+            ),
+        )
+
+
+@dataclass(frozen=True)
+class ModelImage:
+    """An entry of ``images``.
+
+    Attributes:
+        name: relative to the folder of images.
+        camera: number of its camera.
+        quaternion: w, x, y, z of the world-to-camera rotation, x right, y down, z ahead.
+        translation: of the same.
+        points: (K,) int64, numbers of the points that it shows.
+    """
+
+    name: str
+    camera: int
+    quaternion: tuple[float, float, float, float]
+    translation: tuple[float, float, float]
+    points: npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class SparseModel:
+    """A model, images in the order of their names.
+
+    Attributes:
+        folder: where it is from.
+        cameras: by their numbers.
+        images: N of them.
+        points: (P, 3) float64, world units.
+        numbers: (P,) int64 ascending, the numbers of the points.
+    """
+
+    folder: Path
+    cameras: dict[int, ModelCamera]
+    images: tuple[ModelImage, ...]
+    points: npt.NDArray[np.float64]
+    numbers: npt.NDArray[np.int64]
+
+    @cached_property
+    def poses(self) -> Tensor:
+        """(N, 3, 4) float64 camera-to-world, OpenGL axes, world units.
+
+        Raises:
+            DevrfError: a rotation or a position is none.
+        """
+        quaternion = torch.tensor([one.quaternion for one in self.images], dtype=torch.float64)
+        length = quaternion.norm(dim=1, keepdim=True)
+        w, x, y, z = (quaternion / length).unbind(dim=1)
+        rows = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+        to_camera = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+        moved = torch.tensor([one.translation for one in self.images], dtype=torch.float64)
+        position = -(to_camera.mT @ moved[:, :, None])
+        # COLMAP's y points down and its z ahead; ours point up and back.
+        axes = to_camera.mT * to_camera.new_tensor([1, -1, -1])
+        good = ((length[:, 0] - 1).abs() < 1e-2) & in_reach(position[:, :, 0])
+        if not bool(good.all()):
+            name = self.images[int((~good).nonzero()[0])].name
+            raise scene_error(
+                self.folder, f"the pose of image {name} is no rigid transform; write it again"
+            )
+        return torch.cat([axes, position], dim=2)
+
+    def depths(self, image: int) -> Tensor:
+        """(K,) float64: how far along its axis the points of an image are, world units."""
+        shown = np.intersect1d(self.images[image].points, self.numbers)
+        place = np.searchsorted(self.numbers, shown)
+        pose = self.poses[image]
+        away = torch.from_numpy(self.points[place]) - pose[:, 3]
+        return -(away @ pose[:, 2])
+
+
+def model_folder(root: Path) -> Path | None:
+    """Where a scene's model is: ``sparse/0``, ``sparse`` or ``colmap/sparse/0``; None: nowhere."""
+    for inner in ("sparse/0", "sparse", "colmap/sparse/0"):
+        if suffix_of(root / inner) is not None:
+            return root / inner
+    return None
+
+
+def suffix_of(folder: Path) -> str | None:
+    """How the model in a folder is written, ``.bin`` or ``.txt``; None: there is none."""
+    for suffix in (".bin", ".txt"):
+        if all(os.path.isfile(folder / f"{part}{suffix}") for part in ("cameras", "images")):
+            return suffix
+    return None
+
+
+def read_model(folder: Path) -> SparseModel:
+    """The sparse model in a folder, as pycolmap reads it: binary where both forms are there.
+
+    Raises:
+        DevrfError: pycolmap is not installed, a file is missing or damaged, or a camera's model is
+            not supported.
+    """
+    if find_spec("pycolmap") is None:
+        raise scene_error(folder, 'pycolmap reads it; run pip install "devrf[capture]"')
+    library: Any = importlib.import_module("pycolmap")
+    library.logging.minloglevel = 3
+    with decoding(folder, "COLMAP model", "run COLMAP's mapper again"):
+        found = library.Reconstruction(folder)
+        numbers = np.array(sorted(found.point3D_ids()), np.int64)
+        points = np.array([found.point3D(n).xyz for n in numbers.tolist()], np.float64)
+        cameras = {number: _camera(folder, camera) for number, camera in found.cameras.items()}
+        images = [_image(image) for image in found.images.values() if image.has_pose]
+    if not images:
+        raise scene_error(folder, "poses no image; run COLMAP's mapper again")
+    ordered = tuple(sorted(images, key=lambda image: image.name))
+    return SparseModel(folder, cameras, ordered, points.reshape(-1, 3), numbers)
+
+
+def _camera(folder: Path, camera: Any) -> ModelCamera:
+    model = str(camera.model_name)
+    if model not in PARAMETERS:
+        raise scene_error(
+            folder,
+            f"camera model {model} is not supported, only {', '.join(PARAMETERS)}; run COLMAP's "
+            "image_undistorter, and give its folder",
+        )
+    return ModelCamera(model, (camera.width, camera.height), tuple(camera.params.tolist()))
+
+
+def _image(image: Any) -> ModelImage:
+    pose = image.cam_from_world()
+    x, y, z, w = pose.rotation.quat.tolist()
+    shown = [point.point3D_id for point in image.get_observation_points2D()]
+    return ModelImage(
+        image.name,
+        image.camera_id,
+        (w, x, y, z),
+        tuple(pose.translation.tolist()),
+        np.array(shown, np.int64),
+    )
+
+
+Corner = tuple[float, float, float]
+Facing = Literal["auto", "forward", "inward"]
+
+# Cameras that all look within so many degrees of one direction face the scene from one side.
+ONE_SIDE = 45.0
+# From fewer points, each counted in every image that shows it, nothing is said.
+LEAST_POINTS = 50
+# Of the points so many per cent on either side may be wrong.
+OUTLIERS = 1.0
+# In the forward-facing world, the unit that makes the nearest point's distance 1/0.75: LLFF's.
+NEAREST = 1 / 0.75
+# Median distance of cameras around a scene from its middle, in world units.
+AROUND = 4.0
+
+
+@dataclass(frozen=True)
+class World:
+    """The normalised scene.
+
+    Attributes:
+        poses: (N, 3, 4) float64 camera-to-world, OpenGL axes, world units.
+        points: (P, 3) float64.
+        space: ``ndc`` or ``contracted``.
+        near: distance before which nothing is, world units.
+        far: distance behind which no sparse point is, world units.
+        box: low and high corner of what is looked at; None of ``ndc``, and where the cameras' axes
+            meet: what all cameras see is then the better guess.
+    """
+
+    poses: Tensor
+    points: Tensor
+    space: Literal["ndc", "contracted"]
+    near: float
+    far: float
+    box: tuple[Corner, Corner] | None
+
+
+def normalised(model: SparseModel, facing: Facing = "auto") -> World:
+    """The scene of a model in a world of its own origin, axes and unit.
+
+    Args:
+        model: cameras and points, in any world.
+        facing: from where the cameras look.
+
+    Raises:
+        DevrfError: the points or the cameras do not say where the scene is.
+    """
+    poses, points = model.poses, torch.from_numpy(model.points)
+    depths = torch.cat([model.depths(k) for k in range(len(model.images))])
+    depths = depths[depths > 0]
+    if len(depths) < LEAST_POINTS:
+        raise scene_error(
+            model.folder,
+            f"its images show {len(depths)} sparse points, expected {LEAST_POINTS} or more to say "
+            "where the scene is; take it with more texture in sight, or write points3D again",
+        )
+    near, far = (float(np.percentile(depths.numpy(), p)) for p in (OUTLIERS, 100 - OUTLIERS))
+    if facing == "auto":
+        facing = "forward" if widest_angle(poses) <= ONE_SIDE else "inward"
+    world = (_forward if facing == "forward" else _inward)(poses, points, near, far)
+    here = bool(in_reach(world.poses[:, :, 3]).all())
+    if not here or not 0 < world.near < world.far <= FARTHEST:  # NaN compares false
+        raise scene_error(
+            model.folder,
+            f"its cameras and points are no scene that cameras look {facing} at (all at one place, "
+            "or far apart); run COLMAP's mapper again",
+        )
+    return world
+
+
+def widest_angle(poses: Tensor) -> float:
+    """The largest angle in degrees between a camera's axis and their mean."""
+    axes = -poses[:, :, 2]
+    mean = normalize(axes.sum(dim=0), dim=0)
+    return float(torch.rad2deg((axes @ mean).clamp(-1, 1).acos()).max())
+
+
+def _forward(poses: Tensor, points: Tensor, near: float, far: float) -> World:
+    frame, scale = average_pose(poses), NEAREST / near
+    return World(*_moved(poses, points, frame, scale), "ndc", 1.0, far * scale, None)
+
+
+def _inward(poses: Tensor, points: Tensor, near: float, far: float) -> World:
+    met = _axes_meet(poses)
+    middle = points.median(dim=0).values if met is None else met
+    # z up, as far as the cameras were held upright.
+    up = normalize(poses[:, :, 1].sum(dim=0), dim=0)
+    aside = torch.eye(3, dtype=poses.dtype)[int(up.abs().argmin())]
+    right = normalize(torch.linalg.cross(aside, up), dim=0)
+    frame = torch.stack([right, torch.linalg.cross(up, right), up, middle], dim=1)
+    scale = AROUND / float((poses[:, :, 3] - middle).norm(dim=1).median())
+    poses, points = _moved(poses, points, frame, scale)
+    near, far = 0.5 * near * scale, far * scale
+    if met is not None:
+        # Sparse points are on floor and walls, too: in their box the thing would have a fraction of
+        # the voxels.
+        return World(poses, points, "contracted", near, far, None)
+    # What the sparse points around the middle span, and no more than the cameras go round.
+    around = points[points.norm(dim=1) < AROUND]
+    if len(around) < 10:
+        around = points
+    low, high = (
+        np.clip(np.percentile(around.numpy(), p, axis=0), -AROUND, AROUND)
+        for p in (2 * OUTLIERS, 100 - 2 * OUTLIERS)
+    )
+    margin = 0.1 * np.maximum(high - low, 0.1 * AROUND)
+    box = _corner(low - margin), _corner(high + margin)
+    return World(poses, points, "contracted", near, far, box)
+
+
+def _corner(values: npt.NDArray[np.float64]) -> Corner:
+    x, y, z = values.tolist()
+    return x, y, z
+
+
+def _axes_meet(poses: Tensor) -> Tensor | None:
+    """The point (3,) nearest to all axes; None where they hardly meet."""
+    across = torch.eye(3, dtype=poses.dtype) - poses[:, :, 2:3] * poses[:, :, 2].unsqueeze(1)
+    whole = across.mean(dim=0)
+    if float(torch.linalg.eigvalsh(whole)[0]) < 1e-2:
+        return None
+    found: Tensor = torch.linalg.solve(whole, (across @ poses[:, :, 3:])[..., 0].mean(dim=0))
+    return found
+
+
+def _moved(poses: Tensor, points: Tensor, frame: Tensor, scale: float) -> tuple[Tensor, Tensor]:
+    """Poses and points in the world in which ``frame`` is the identity, ``scale`` times larger."""
+    turned = relative_to(frame, poses)
+    turned[:, :, 3] *= scale
+    return turned, (points - frame[:, 3]) @ frame[:, :3] * scale

@@ -1,0 +1,120 @@
+"""The catalogue names scenes that devrf can read; of an archive the scene's folder is unpacked."""
+
+from __future__ import annotations
+
+import io
+import tarfile
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from devrf.cli.config import config_folder
+from devrf.errors import DevrfError
+from devrf.scenes.fetch import Collection, PublishedScene, _unpacked, catalogue, published_scene
+
+SCENES = catalogue()
+
+
+def test_names_are_unique():
+    names = [scene.name for scene in SCENES]
+    assert len(set(names)) == len(names)
+    assert {"fox", "fern", "lego"} <= set(names)
+
+
+def test_each_scene_has_a_layout_and_addresses():
+    for scene in SCENES:
+        assert (config_folder() / "data" / f"{scene.collection.data}.yaml").is_file()
+        for url in scene.downloads.values():
+            assert url.startswith("https://") and not set("{} ") & set(url)
+        assert scene.is_archive or scene.marker in scene.downloads
+        assert set(scene.collection.sha256) <= set(scene.collection.scenes)
+
+
+def test_a_misspelt_name_is_answered_with_the_closest():
+    with pytest.raises(DevrfError, match="knows no 'fxo'; choose one of fox, .*mean scene=fox"):
+        published_scene("fxo")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[[collection]]\nscenes.a = 'x'",
+        "not TOML",
+        "[[collection]]\npage='https://a'\nlicence=''\ndata='inward'\nlearn=''\nurl='file:///etc'\n"
+        "scenes.a=''",
+        "[[collection]]\npage='https://a'\nlicence=''\ndata='inward'\nlearn=''\nurl='https://a'\n"
+        "scenes.'../a'=''",
+        "[[collection]]\npage='https://a'\nlicence=''\ndata='inward'\nlearn=''\nurl='https://a'\n"
+        "files=['../a']\nscenes.a=''",
+    ],
+)
+def test_another_catalogue_has_the_same_form(tmp_path, text):
+    (tmp_path / "mine.toml").write_text(text)
+    with pytest.raises(DevrfError, match="fetch.catalogue: .* cannot be read"):
+        catalogue(tmp_path / "mine.toml")
+
+
+FILES = {
+    "data/lego/transforms_train.json": b"{}",
+    "data/lego/train/r_0.png": b"picture",
+    "data/ship/transforms_train.json": b"[]",
+    "__MACOSX/data/lego/transforms_train.json": b"resource fork",
+}
+
+
+def lego(folder: str | None = "lego") -> PublishedScene:
+    """A scene that is published in an archive."""
+    words = {"page": "https://a", "licence": "", "data": "inward", "learn": "", "url": "https://a"}
+    return PublishedScene("lego", "", Collection(**words, folder=folder, scenes={"lego": ""}))
+
+
+def written(work: Path, kind: str, files: dict[str, bytes]) -> Path:
+    """An archive of files where a download leaves it."""
+    archive = work / "files" / "archive"
+    archive.parent.mkdir()
+    if kind == "zip":
+        with zipfile.ZipFile(archive, "w") as packed:
+            for name, content in files.items():
+                packed.writestr(name, content)
+    else:
+        with tarfile.open(archive, "w:gz") as packed:
+            for name, content in files.items():
+                member = tarfile.TarInfo(name)
+                member.size = len(content)
+                packed.addfile(member, io.BytesIO(content))
+    return archive
+
+
+@pytest.mark.parametrize("kind", ["zip", "tar"])
+def test_one_of_several_scenes_without_the_folders_around_it(tmp_path, kind):
+    written(tmp_path, kind, FILES)
+    folder = _unpacked(lego(), tmp_path)
+    assert (folder / "transforms_train.json").read_bytes() == b"{}"
+    assert (folder / "train/r_0.png").read_bytes() == b"picture"
+
+
+@pytest.mark.parametrize("kind", ["zip", "tar"])
+def test_nothing_leaves_the_folder(tmp_path, kind):
+    written(tmp_path, kind, {"lego/transforms_train.json": b"{}", "lego/../../../x.txt": b"out"})
+    if kind == "tar":
+        with pytest.raises(DevrfError, match="cannot be unpacked"):
+            _unpacked(lego(None), tmp_path)
+    else:
+        _unpacked(lego(None), tmp_path)
+    assert not list(tmp_path.parent.rglob("x.txt"))
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"<html>not an archive</html>", "cannot be unpacked"),
+        (None, "holds no hotdog with"),
+    ],
+)
+def test_another_file_than_expected_is_refused(tmp_path, content, said):
+    archive = written(tmp_path, "zip", FILES)
+    if content is not None:
+        archive.write_bytes(content)
+    with pytest.raises(DevrfError, match=said):
+        _unpacked(lego("hotdog"), tmp_path)
