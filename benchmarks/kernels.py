@@ -18,11 +18,15 @@ from torch.utils.benchmark import Timer
 
 from devrf.cli.messages import report_user_errors
 from devrf.geometry.box import Box
-from devrf.ops.adam_step import AdamRule, adam_step, smooth_adam_step
-from devrf.ops.compositing import composite_segments, sum_segments
-from devrf.ops.dispatch import Kind, passes_check, using
+from devrf.ops.adam_step import (
+    AdamRule,
+    adam_step,
+    add_total_variation_gradient,
+    smooth_adam_step,
+)
+from devrf.ops.compositing import composite_segments
+from devrf.ops.dispatch import Kind, triton_runs, using
 from devrf.ops.search import Thresholds, find_samples
-from devrf.ops.total_variation import add_total_variation_gradient
 from devrf.ops.trilinear import interpolate
 from devrf.ops.warped_depth import warped_depth
 
@@ -40,7 +44,7 @@ def main() -> None:
     given = arguments.parse_args()
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     kinds: tuple[Kind, ...] = ("torch",)
-    if device.type == "cuda" and passes_check(device):
+    if triton_runs(torch.zeros(1, device=device)):
         kinds = ("torch", "triton")
     with report_user_errors():
         rows = []
@@ -82,7 +86,7 @@ def operations(side: int, rays: int, device: torch.device) -> Mapping[str, Calla
     density, features, slices = draw(*shape, 1), draw(*shape, CHANNELS), draw(*shape, 3) / 10
     points, coords = draw(samples, 3), (side - 1) * (draw(samples, 3) + 1) / 2
     first = torch.arange(rays + 1, device=device) * SAMPLES_PER_RAY
-    depth, colors = draw(samples).abs(), draw(samples, 3)
+    depth = draw(samples).abs()
     directions = torch.nn.functional.normalize(draw(rays, 3), dim=1)
     count = torch.full((rays,), 2 * side, device=device)
     grid, spare, gradient, mean = (draw(*shape, 3) for _ in range(4))
@@ -116,7 +120,6 @@ def operations(side: int, rays: int, device: torch.device) -> Mapping[str, Calla
         ),
         "find_samples": search,
         "composite_segments": with_gradients(lambda tau: composite_segments(tau, first)[0], depth),
-        "sum_segments": with_gradients(lambda w, c: sum_segments(w, c, first), depth, colors),
         "add_total_variation_gradient": lambda: add_total_variation_gradient(grid, gradient, 1e-6),
         "adam_step": lambda: adam_step(grid, gradient, mean, square, rule, clear=False),
         "smooth_adam_step": lambda: smooth_adam_step(

@@ -127,7 +127,7 @@ class Tracing(TorchDispatchMode):  # type: ignore[no-untyped-call]
         self.count.taken = max(self.count.taken, sum(self._living.values()))
 
     def run(self, kernel: Any, programs: int, *args: Any, **constants: Any) -> None:
-        """Stands in for ``devrf.ops.kernels.launch.run``."""
+        """Stands in for ``devrf.accel.blocks.run``."""
         name = kernel.fn.__name__
         self.count.triton[name] += 1
         tensors = {id(value): value for value in args if isinstance(value, Tensor)}
@@ -176,15 +176,15 @@ def _tensors(values: Any) -> Iterator[Tensor]:
 @contextmanager
 def tracing() -> Iterator[Tracing]:
     """Count launches; Triton's kernels do not run."""
-    from devrf.ops.kernels import launch
+    from devrf.accel import blocks
 
-    trace, usual = Tracing(), launch.run
-    launch.run = trace.run
+    trace, usual = Tracing(), blocks.run
+    blocks.run = trace.run
     try:
         with trace:
             yield trace
     finally:
-        launch.run = usual
+        blocks.run = usual
 
 
 def views(count: int, frames: int, *, flow: bool) -> Views:

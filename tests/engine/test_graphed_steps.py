@@ -20,6 +20,7 @@ from lightning import Trainer
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from devrf.accel import blocks
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.graphs import GraphedStep, Work
@@ -31,7 +32,6 @@ from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.settings import MotionSettings
 from devrf.ops.dispatch import Kind, using
-from devrf.ops.kernels import launch
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.sample_capacity import SampleCapacity
 
@@ -143,7 +143,7 @@ class Watch(TorchDispatchMode):
 @contextmanager
 def watching() -> Iterator[Watch]:
     """Record torch's operations and kernel launches, but not the interpreter's operations."""
-    usual, watch = launch.run, Watch()
+    usual, watch = blocks.run, Watch()
 
     def run(kernel: Any, programs: int, *args: Any, **constants: Any) -> None:
         watch.note(str(kernel), [programs, *args, *constants.values()], constants)
@@ -151,7 +151,7 @@ def watching() -> Iterator[Watch]:
             usual(kernel, programs, *args, **constants)
 
     with pytest.MonkeyPatch.context() as patch, watch:
-        patch.setattr(launch, "run", run)
+        patch.setattr(blocks, "run", run)
         yield watch
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from devrf.ops.adam import GridAdam
-from devrf.ops.total_variation import add_total_variation_gradient
+from devrf.ops.adam_step import add_total_variation_gradient
 
 SHAPE = (2, 3, 2, 2)
 

@@ -8,7 +8,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from devrf.ops.adam_step import AdamRule, adam_step, smooth_adam_step
+from devrf.ops.adam_step import (
+    AdamRule,
+    adam_step,
+    add_total_variation_gradient,
+    smooth_adam_step,
+)
 
 
 def rule(step: int = 1, **options: Any) -> AdamRule:
@@ -43,15 +48,47 @@ def test_smoothing_pulls_at_a_peak_and_its_neighbours_by_their_old_values() -> N
     assert into[0, 1, 1].item() == pytest.approx(0.1)
 
 
-@pytest.mark.parametrize("skip_zero", [False, True])
-def test_smoothing_of_what_is_touched_leaves_the_rest(skip_zero: bool) -> None:
+def test_smoothing_of_what_is_touched_leaves_the_rest() -> None:
     values, into, gradient = peak(), torch.empty(2, 2, 2, 1), torch.zeros(2, 2, 2, 1)
     gradient[1, 1, 1] = 1.0
     mean, square = torch.zeros_like(values), torch.zeros_like(values)
     tensors = (values, into, gradient, mean, square)
-    smooth_adam_step(*tensors, rule(skip_zero=skip_zero), smoothing=0.5, touched_only=True)
+    smooth_adam_step(*tensors, rule(skip_zero=True), smoothing=0.5)
     assert mean[1, 1, 1].item() == pytest.approx(0.25)
     assert mean.count_nonzero() == 1 and not gradient.any()
     expected = peak()
     expected[1, 1, 1] = 4.9
     torch.testing.assert_close(into, expected)
+
+
+def total_variation(grid: Tensor) -> Tensor:
+    """The Huber penalty of the differences along each axis."""
+    pairs = [
+        (grid.narrow(k, 1, grid.shape[k] - 1), grid.narrow(k, 0, grid.shape[k] - 1))
+        for k in range(3)
+    ]
+    return sum(torch.nn.functional.huber_loss(*pair, reduction="sum") for pair in pairs)
+
+
+def test_the_gradient_of_the_total_variation(rng: torch.Generator) -> None:
+    grid = torch.randn(4, 3, 5, 2, generator=rng, dtype=torch.float64).mul_(1.5).requires_grad_()
+    (truth,) = torch.autograd.grad(total_variation(grid), grid)
+    ours = torch.zeros_like(grid)
+    add_total_variation_gradient(grid.detach(), ours, 1.0)
+    torch.testing.assert_close(ours, truth)
+    values, gradient = peak(), torch.full((2, 2, 2, 1), 10.0)
+    add_total_variation_gradient(values, gradient, 0.5)
+    # At the peak Σ clamp(5, −1, 1) = 3, at each neighbour −1.
+    assert gradient[1, 1, 1].item() == pytest.approx(11.5)
+    assert gradient[0, 1, 1].item() == pytest.approx(9.5)
+    assert gradient[0, 0, 0].item() == pytest.approx(10.0)
+
+
+def test_only_what_is_touched_is_smoothed(rng: torch.Generator) -> None:
+    grid = torch.randn(3, 4, 2, 2, generator=rng)
+    gradient = torch.randn(3, 4, 2, 2, generator=rng).clamp(min=0)
+    everywhere, touched = gradient.clone(), gradient.clone()
+    add_total_variation_gradient(grid, everywhere, 0.3)
+    add_total_variation_gradient(grid, touched, 0.3, touched_only=True)
+    torch.testing.assert_close(touched, torch.where(gradient != 0, everywhere, 0.0))
+    assert (touched == 0).any() and (touched != 0).any()

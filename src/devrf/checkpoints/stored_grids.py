@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from devrf.ops.resampling import resample
+from devrf.ops.trilinear import resample
 
 # Grid points of the detailed grid to one of the thinned-out grid.
 THINNING = 4

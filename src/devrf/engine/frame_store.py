@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from devrf.ops.resampling import resample
+from devrf.ops.trilinear import resample
 from devrf.system.memory import page_locked
 
 log = logging.getLogger(__name__)

@@ -9,9 +9,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from devrf.ops.adam_step import AdamRule, adam_steps, smooth_adam_step
-from devrf.ops.dispatch import triton_runs
-from devrf.ops.total_variation import add_total_variation_gradient
+from devrf.ops.adam_step import (
+    AdamRule,
+    adam_steps,
+    add_total_variation_gradient,
+    smooth_adam_step,
+)
+from devrf.ops.dispatch import accelerated
 
 
 class GridAdam(torch.optim.Optimizer):
@@ -109,7 +113,7 @@ class GridAdam(torch.optim.Optimizer):
             rules = [AdamRule(rate, step, **options) for *_, step in taken]
             tensors = [four for *four, _ in taken]
             smoothing, touched_only = group["smoothing"], group["touched_only"]
-            if smoothing and not touched_only and triton_runs(*tensors[0]):
+            if smoothing and not touched_only and accelerated("adam", *tensors[0]):
                 for each, rule in zip(tensors, rules, strict=True):
                     values, gradient, mean, square = each
                     spare = self._spare_of(values)

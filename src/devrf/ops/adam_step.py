@@ -1,4 +1,4 @@
-"""One step of Adam on one tensor, with the total variation of a grid in the same pass.
+"""One step of Adam on one tensor, and the total variation of a grid, also in the same pass.
 
 The learning rate and the step number are tensors on the device: a captured CUDA graph uses their
 present values.
@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from devrf.ops.dispatch import triton_runs
-from devrf.ops.total_variation import add_total_variation_gradient
+from devrf.ops.dispatch import accelerated
 
 
 @dataclass(frozen=True)
@@ -61,10 +60,9 @@ def adam_step(
         clear: whether to set the gradient to zero afterwards.
     """
     tensors = (values, gradient, mean, square)
-    if all(tensor.is_contiguous() for tensor in tensors) and triton_runs(*tensors):
-        from devrf.ops.kernels.adam import step_in_one_pass
-
-        step_in_one_pass(values, values, gradient, mean, square, **vars(rule), clear=clear)
+    contiguous = all(tensor.is_contiguous() for tensor in tensors)
+    if contiguous and (kernels := accelerated("adam", *tensors)):
+        kernels.adam_step(values, values, gradient, mean, square, **vars(rule), clear=clear)
         return
     _step(values, gradient, mean, square, rule)
     if clear:
@@ -87,10 +85,9 @@ def adam_steps(
     plain = not (rules[0].skip_zero or rules[0].per_voxel_lr is not None) if rules else False
     every = [tensor for four in tensors for tensor in four]
     contiguous = all(tensor.is_contiguous() for tensor in every)
-    if len(tensors) > 1 and plain and clear and contiguous and triton_runs(*every):
-        from devrf.ops.kernels.adam import step_several
-
-        step_several(tensors, [rule.step for rule in rules], rules[0])
+    several = len(tensors) > 1 and plain and clear and contiguous
+    if several and (kernels := accelerated("adam", *every)):
+        kernels.adam_steps(tensors, [rule.step for rule in rules], rules[0])
         return
     for (values, gradient, mean, square), rule in zip(tensors, rules, strict=True):
         adam_step(values, gradient, mean, square, rule, clear=clear)
@@ -105,7 +102,6 @@ def smooth_adam_step(
     rule: AdamRule,
     *,
     smoothing: float,
-    touched_only: bool = False,
 ) -> None:
     """As :func:`adam_step`, with the gradient of the total variation added in the same pass.
 
@@ -119,24 +115,56 @@ def smooth_adam_step(
         mean: first moments, the same shape, changed in place.
         square: second moments, likewise.
         rule: the settings; ``skip_zero`` refers to ``gradient`` alone.
-        smoothing: weight of the total variation, as for
-            :func:`~devrf.ops.total_variation.add_total_variation_gradient`.
-        touched_only: smooth only entries whose ``gradient`` is not zero.
+        smoothing: weight of the total variation, as for :func:`add_total_variation_gradient`.
     """
     tensors = (values, into, gradient, mean, square)
-    if all(tensor.is_contiguous() for tensor in tensors) and triton_runs(*tensors):
-        from devrf.ops.kernels.adam import step_in_one_pass
-
-        options = {**vars(rule), "smoothing": smoothing, "touched_only": touched_only}
-        step_in_one_pass(*tensors, **options)
+    contiguous = all(tensor.is_contiguous() for tensor in tensors)
+    if contiguous and (kernels := accelerated("adam", *tensors)):
+        kernels.adam_step(*tensors, **vars(rule), smoothing=smoothing)
         return
     smooth = torch.zeros_like(gradient)
     add_total_variation_gradient(values, smooth, smoothing)
-    if touched_only or rule.skip_zero:
+    if rule.skip_zero:
         smooth *= gradient != 0
     into.copy_(values)
     _step(into, gradient + smooth, mean, square, rule)
     gradient.zero_()
+
+
+def add_total_variation_gradient(
+    grid: Tensor, gradient: Tensor, weight: float, *, touched_only: bool = False
+) -> None:
+    """Add ``weight`` times the gradient of a grid's total variation to ``gradient`` in place.
+
+    The total variation is Σ over pairs of neighbours of h(v − v'), with the Huber penalty
+    h(d) = d²/2 for |d| ≤ 1 and |d| − 1/2 beyond. Its derivative at a voxel is
+    Σ_neighbours clamp(v − v', −1, 1); in closed form, because an autograd graph over every voxel
+    at every step would be slow.
+
+    Args:
+        grid: (X, Y, Z, C).
+        gradient: the same shape.
+        weight: factor of the penalty.
+        touched_only: add only to entries that are not zero.
+    """
+    contiguous = grid.is_contiguous() and gradient.is_contiguous()
+    if contiguous and (kernels := accelerated("adam", grid, gradient)):
+        kernels.add_total_variation_gradient(grid, gradient, weight, touched_only=touched_only)
+        return
+    into = torch.zeros_like(gradient) if touched_only else gradient
+    for axis in range(3):
+        after, before = _neighbours(grid, axis)
+        slope = (after - before).clamp_(-1, 1)
+        into_after, into_before = _neighbours(into, axis)
+        into_after.add_(slope, alpha=weight)
+        into_before.sub_(slope, alpha=weight)
+    if touched_only:
+        gradient += into * (gradient != 0)
+
+
+def _neighbours(grid: Tensor, axis: int) -> tuple[Tensor, Tensor]:
+    length = grid.shape[axis] - 1
+    return grid.narrow(axis, 1, length), grid.narrow(axis, 0, length)
 
 
 def _step(values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, rule: AdamRule) -> None:

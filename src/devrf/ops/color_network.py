@@ -13,8 +13,8 @@ from torch import Tensor
 from torch.autograd.function import FunctionCtx
 from torch.nn.functional import linear
 
-from devrf.ops.corners import Corners, shape_of, to_grid
-from devrf.ops.dispatch import triton_runs
+from devrf.ops.corners import Corners, axes_of, shape_of, to_grid
+from devrf.ops.dispatch import accelerated
 from devrf.ops.trilinear import interpolate, kept_gradient
 
 # The widest hidden layers that a program's registers have room for.
@@ -72,13 +72,14 @@ def listed_colors(
     # Triton's interpreter, the one that runs on a CPU, cannot multiply bfloat16.
     multiplied = precision != torch.bfloat16 or points.device.type != "cpu"
     narrow = len(network.hidden_bias) <= WIDEST.get(precision, 0)
-    if multiplied and narrow and triton_runs(grid, points, viewdirs, *network[:7]):
-        from devrf.ops.kernels.color_network import colors_in_one_pass
-
+    floats = grid, points, viewdirs, *network[:7]
+    if multiplied and narrow and (kernels := accelerated("color_network", *floats)):
+        known, axes = (viewdirs, ray, first), axes_of(box, grid)
         buffers = [kept_gradient(tensor) for tensor in (grid, *network[:7])]
-        return colors_in_one_pass(
-            grid, points, box, viewdirs, ray, first, network, precision, buffers
+        colors: Tensor = kernels.listed_colors(
+            grid, points, axes, known, network, precision, buffers
         )
+        return colors
     coords = to_grid(points, box, shape_of(grid))
     features = interpolate(grid, coords, gradient=kept_gradient(grid))
     return decode(features, viewdirs, ray, network, precision)

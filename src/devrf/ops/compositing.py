@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from devrf.ops.dispatch import triton_runs
+from devrf.ops.dispatch import accelerated
 
 
 def composite(depth: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
@@ -32,7 +32,7 @@ def composite(depth: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:
     Returns:
         weights (S,) and end transmittance (R,), differentiable once in ``depth``.
     """
-    if triton_runs(depth):
+    if accelerated("compositing", depth):
         return composite_segments(depth, _firsts(ray, rays))
     weights, end = _Composite.apply(depth, ray, rays)  # type: ignore[no-untyped-call]
     return weights, end
@@ -50,12 +50,8 @@ def composite_segments(depth: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
         weights (S,), zero in the padding, and end transmittance (R,), differentiable once in
         ``depth``.
     """
-    if triton_runs(depth):
-        from devrf.ops.kernels.compositing import Composite
-
-        weights, end = Composite.apply(  # type: ignore[no-untyped-call]
-            depth.contiguous(), first.contiguous()
-        )
+    if kernels := accelerated("compositing", depth):
+        weights, end = kernels.composite_segments(depth, first)
         return weights, end
     rays = len(first) - 1
     ray = _rays_of(first, len(depth))
@@ -68,6 +64,8 @@ def composite_segments(depth: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
 def sum_segments(weights: Tensor, values: Tensor, first: Tensor) -> Tensor:
     """Sums (R, C) of ``w_i · c_i`` over each ray's samples, without the padding.
 
+    Plain PyTorch on all devices: :func:`composite_colors` has a kernel of its own.
+
     Args:
         weights: (S,) w.
         values: (S, C) c, finite in the padding too.
@@ -76,13 +74,6 @@ def sum_segments(weights: Tensor, values: Tensor, first: Tensor) -> Tensor:
     Returns:
         (R, C), differentiable once in ``weights`` and ``values``.
     """
-    if triton_runs(weights, values):
-        from devrf.ops.kernels.compositing import SumSegments
-
-        sums: Tensor = SumSegments.apply(  # type: ignore[no-untyped-call]
-            weights.contiguous(), values.contiguous(), first.contiguous()
-        )
-        return sums
     ray = _rays_of(first, len(weights))
     return sum_by_ray(weights[:, None] * values, ray, len(first))[:-1]
 
@@ -109,11 +100,10 @@ def composite_colors(
         Colour (R, 3), differentiable once in ``weights``, ``colors`` and ``transmittance``, and
         depth (R,), which is not differentiable.
     """
-    if triton_runs(weights, colors, distance, transmittance, background):
-        from devrf.ops.kernels.compositing import CompositeColors
-
-        image, depth = CompositeColors.apply(  # type: ignore[no-untyped-call]
-            weights, colors, transmittance, distance, first, background
+    floats = weights, colors, distance, transmittance, background
+    if kernels := accelerated("compositing", *floats):
+        image, depth = kernels.composite_colors(
+            weights, colors, distance, first, transmittance, background
         )
         return image, depth
     seen = sum_segments(weights, colors, first)

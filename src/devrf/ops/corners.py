@@ -38,10 +38,16 @@ def to_grid(points: Tensor, box: Corners, shape: Shape) -> Tensor:
     return (points - low) * scale
 
 
-def scales(box: Corners, shape: Shape) -> Triple:
-    """Grid points per unit of length along each axis, rounded to float32."""
-    x, y, z = _scale(box.low, box.high, shape, torch.float32).tolist()
-    return x, y, z
+def axes_of(box: Corners | None, grid: Tensor) -> Tensor:
+    """What kernels know of a grid (X, Y, Z) or (X, Y, Z, C) that fills a box, float32 (9,).
+
+    For x, y, z the low corner, then the grid points per unit of length, then their number. Without
+    a box positions are in units of the grid.
+    """
+    x, y, z = shape_of(grid)
+    if box is None:
+        return _axes((0.0, 0.0, 0.0), (x - 1.0, y - 1.0, z - 1.0), (x, y, z), grid.device)
+    return _axes(box.low, box.high, (x, y, z), grid.device)
 
 
 def shape_of(grid: Tensor) -> Shape:
@@ -65,3 +71,10 @@ def _on_device(
     with torch.inference_mode(False):
         corner = torch.tensor(low, dtype=dtype).to(device)
         return corner, _scale(low, high, shape, dtype).to(device)
+
+
+@lru_cache(maxsize=256)
+def _axes(low: Triple, high: Triple, shape: Shape, device: torch.device) -> Tensor:
+    with torch.inference_mode(False):
+        corner, points = torch.tensor(low), torch.tensor(shape, dtype=torch.float32)
+        return torch.cat([corner, _scale(low, high, shape, torch.float32), points]).to(device)

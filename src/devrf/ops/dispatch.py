@@ -1,7 +1,7 @@
 """The choice of an operation's implementation: plain PyTorch, or Triton on a CUDA device.
 
-A function of this package calls :func:`triton_runs` once; its backward pass, which autograd may run
-in another thread, belongs to the same implementation.
+An operation asks :func:`accelerated` once; its backward pass, which autograd may run in another
+thread, belongs to the same implementation.
 
 This module imports none of the operations. The check that a device must pass before Triton runs on
 it compares all of them, so ``devrf.ops.__init__`` registers it here.
@@ -11,12 +11,13 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache
+from importlib import import_module
 from importlib.util import find_spec
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -26,7 +27,10 @@ from devrf.errors import DevrfError
 log = logging.getLogger(__name__)
 
 Kind = Literal["auto", "torch", "triton"]
-Check = Callable[[torch.device], None]
+# Why kernels cannot be used on a device, by operation.
+Check = Callable[[torch.device], Mapping[str, str]]
+# Without Triton the shapes of these depend on data: they find samples, and touched rows of grids.
+NEEDED_FOR_FIXED_LISTS = ("search", "adam")
 
 _chosen: ContextVar[Kind] = ContextVar("kernels", default="auto")
 _checks: list[Check] = []
@@ -37,9 +41,10 @@ def using(kind: Kind) -> Iterator[None]:
     """Choose the implementation of all operations inside the context.
 
     Args:
-        kind: ``torch``, ``triton`` or ``auto``: Triton for float32 tensors on a CUDA device where
-            its kernels pass their check, unless torch is to be deterministic (the kernels add in
-            no fixed order); else PyTorch. A thread started inside the context has ``auto``.
+        kind: ``torch``, ``triton`` or ``auto``: Triton for float32 tensors on a CUDA device for
+            each operation whose kernels pass their check there, unless torch is to be
+            deterministic (the kernels add in no fixed order); else PyTorch. A thread started
+            inside the context has ``auto``.
 
     Raises:
         DevrfError: ``kind`` is none of the three.
@@ -53,12 +58,34 @@ def using(kind: Kind) -> Iterator[None]:
         _chosen.reset(token)
 
 
-def triton_runs(*tensors: Tensor) -> bool:
-    """Whether to use Triton for an operation on these tensors.
+def accelerated(operation: str, *tensors: Tensor) -> Any:
+    """The module of :mod:`devrf.accel` that runs an operation on these tensors; None: PyTorch does.
 
     Raises:
         DevrfError: ``triton`` was chosen and cannot run.
     """
+    if not _triton_suits(*tensors):
+        return None
+    if _chosen.get() == "auto" and operation in rejected(tensors[0].device):
+        return None
+    return import_module(f"devrf.accel.{operation}")
+
+
+def triton_runs(*tensors: Tensor) -> bool:
+    """Whether Triton runs on these tensors, so that lists have a fixed length.
+
+    Raises:
+        DevrfError: ``triton`` was chosen and cannot run.
+    """
+    if not _triton_suits(*tensors):
+        return False
+    return _chosen.get() == "triton" or rejected(tensors[0].device).isdisjoint(
+        NEEDED_FOR_FIXED_LISTS
+    )
+
+
+def _triton_suits(*tensors: Tensor) -> bool:
+    """Whether Triton is chosen and can run on these tensors."""
     kind = _chosen.get()
     if kind == "torch":
         return False
@@ -66,7 +93,7 @@ def triton_runs(*tensors: Tensor) -> bool:
     single = all(tensor.dtype == torch.float32 for tensor in tensors)
     ordered = torch.are_deterministic_algorithms_enabled()
     if kind == "auto":
-        return first.is_cuda and single and not ordered and passes_check(first.device)
+        return first.is_cuda and single and not ordered
     if ordered:
         raise DevrfError(
             "kernels: triton adds in no fixed order: choose kernels=auto, or deterministic=false"
@@ -93,27 +120,22 @@ def reaches(device: torch.device) -> bool:
 
 
 def register_check(check: Check) -> None:
-    """Add a check that a device must pass before ``auto`` runs Triton there; it raises if not."""
-    _checks.append(check)
+    """Set the check that ``auto`` makes before Triton runs on a device."""
+    _checks[:] = [check]
 
 
 @cache
-def passes_check(device: torch.device) -> bool:
-    """Whether the Triton kernels agree with PyTorch on this device; if not, a warning says why.
+def rejected(device: torch.device) -> frozenset[str]:
+    """The operations whose Triton kernels differ from PyTorch on a device; warnings name them.
 
     The check runs once in a process and takes milliseconds after compilation. It waits for the
     device, so it must precede the capture of a CUDA graph.
     """
-    try:
-        for check in _checks:
-            check(device)
-    except Exception as error:
-        reason = f"{type(error).__name__}: {error}".splitlines()[0]
+    reasons = {operation: why for check in _checks for operation, why in check(device).items()}
+    for why in dict.fromkeys(reasons.values()):
+        operations = ", ".join(name for name in reasons if reasons[name] == why)
         log.warning(
-            "kernels: plain PyTorch runs on %s, since the Triton kernels failed their check "
-            "there (%s)",
-            device,
-            reason,
+            "kernels: plain PyTorch runs on %s for %s: Triton failed its check (%s)",
+            *(device, operations, why),
         )
-        return False
-    return True
+    return frozenset(reasons)

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from devrf.ops.corners import Corners, Triple, shape_of, to_grid
-from devrf.ops.dispatch import triton_runs
+from devrf.ops.corners import Corners, Triple, axes_of, shape_of, to_grid
+from devrf.ops.dispatch import accelerated
 from devrf.ops.trilinear import interpolate, kept_gradient
 
 # A depth nearer to 0 counts as so much; what is exactly at infinity in NDC, as so much before it.
@@ -104,13 +104,11 @@ def motion_sum(
             in; None: they are in world units.
     """
     floats = *samples[:3], forward, before, *(() if seen is None else (seen.vectors, seen.poses))
-    if triton_runs(*floats):
-        from devrf.ops.kernels.motion import motion_in_one_pass
-
-        gradient = kept_gradient(forward)
+    if kernels := accelerated("motion", *floats):
+        axes, gradient = axes_of(box, forward), kept_gradient(forward)
         return MotionSum(
-            *motion_in_one_pass(
-                samples, forward, before, seen, weights, box, over_samples, ndc, gradient
+            *kernels.motion_sum(
+                samples, forward, before, seen, weights, axes, over_samples, ndc, gradient
             )
         )
     points, q, weight, ray, present = samples

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from devrf.ops.compositing import sum_segments
-from devrf.ops.dispatch import triton_runs
+from devrf.ops.dispatch import accelerated
 
 # The order of terms and of their weights.
 TERMS = ("color", "per_sample_color", "entropy", "matte")
@@ -61,12 +61,9 @@ def photometric_sum(
         alpha: (R,) A, or None.
         weights: of the four terms, in the order of :data:`TERMS`.
     """
-    if triton_runs(image, transmittance, sample_weight, sample_color, truth):
-        from devrf.ops.kernels.photometric import PhotometricInOnePass
-
-        total, terms, seen = PhotometricInOnePass.apply(  # type: ignore[no-untyped-call]
-            image, transmittance, sample_color, sample_weight.detach(), first, truth, alpha, weights
-        )
+    floats = image, transmittance, sample_weight, sample_color
+    if kernels := accelerated("photometric", *floats, truth):
+        total, terms, seen = kernels.photometric_sum(*floats, first, truth, alpha, weights)
         return PhotometricSum(total, terms, seen[0], None if alpha is None else seen[1])
     rays = len(image)
     place = torch.arange(len(sample_weight), device=first.device)

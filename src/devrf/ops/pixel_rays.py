@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from devrf.ops.corners import Corners
-from devrf.ops.dispatch import triton_runs
+from devrf.ops.dispatch import accelerated
 
 
 class GatheredPixels(NamedTuple):
@@ -71,11 +71,10 @@ def gather_pixels(
         flow: vectors (N, H, W, 2) and whether they are valid (N, H, W), or None.
     """
     large = [pixels, *(flow or ())]
-    if all(table.is_contiguous() for table in large) and triton_runs(poses, focal, center, times):
-        from devrf.ops.kernels.pixel_rays import gather_on_device
-
+    contiguous = all(table.is_contiguous() for table in large)
+    if contiguous and (kernels := accelerated("pixel_rays", poses, focal, center, times)):
         return GatheredPixels(
-            *gather_on_device(
+            *kernels.gather_pixels(
                 image, flat, pixels, poses, focal, center, background, times, frames, flow
             )
         )
@@ -114,10 +113,11 @@ def steps_in_box(
         near: distance before which nothing is sampled.
         far: distance behind which nothing is sampled.
     """
-    if triton_runs(origins, directions):
-        from devrf.ops.kernels.pixel_rays import steps_on_device
-
-        return steps_on_device(origins, directions, box, step, near, far)
+    entry: Tensor
+    if kernels := accelerated("pixel_rays", origins, directions):
+        corners, limits = (box.low, box.high), (step, near, far)
+        entry, count = kernels.steps_in_box(origins, directions, corners, limits)
+        return entry, count
     low, high = (origins.new_tensor(corner) for corner in (box.low, box.high))
     d = torch.where(directions.abs() < 1e-9, torch.full_like(directions, 1e-9), directions)
     to_low, to_high = (low - origins) / d, (high - origins) / d

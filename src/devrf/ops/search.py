@@ -7,15 +7,16 @@ never waits for the device, and can be captured in a CUDA graph.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
 from devrf.ops.compositing import transmittances
-from devrf.ops.corners import Corners, shape_of, to_grid
-from devrf.ops.dispatch import triton_runs
+from devrf.ops.corners import Corners, axes_of, shape_of, to_grid
+from devrf.ops.dispatch import accelerated
 from devrf.ops.warped_depth import warped_depth
 
 
@@ -85,6 +86,33 @@ class SampleSubset:
         return self.total > len(self.index)
 
 
+class ListedSubset(NamedTuple):
+    """Some of the samples of a list, in a list of length K, with what is known of them.
+
+    Padding repeats other places of the list: it has any ray and position and no weight, and nothing
+    gets a gradient through it.
+
+    Attributes:
+        first: (R + 1,) int64, as in :class:`PackedSamples`, for the new list.
+        total: () int64, the number of selected samples; more than K if some were dropped.
+        ray: (K,) int64, the ray of each; in the padding any ray, spread over all.
+        distance: (K,) along the ray.
+        points: (K, 3) positions.
+        present: (K,) bool, which places hold a sample.
+        canonical: (K, 3) canonical positions.
+        weight: (K,) weights, 0 in the padding.
+    """
+
+    first: Tensor
+    total: Tensor
+    ray: Tensor
+    distance: Tensor
+    points: Tensor
+    present: Tensor
+    canonical: Tensor
+    weight: Tensor
+
+
 @torch.no_grad()
 def find_samples(
     origins: Tensor,
@@ -134,15 +162,13 @@ def find_samples(
     Returns:
         The samples; ``overflow`` is True if ``capacity`` or ``longest`` was too small.
     """
-    if triton_runs(origins, directions, entry, density, *slices):
-        from devrf.ops.kernels.search import find_samples_on_device
-
-        found = find_samples_on_device(
-            *(origins, directions, entry, count, mask, density, slices, weight),
-            *(step, longest, capacity, mask_box, box, shift, delta),
-            (thresholds.alpha, thresholds.stop, thresholds.weight),
+    if kernels := accelerated("search", origins, directions, entry, density, *slices):
+        grids = axes_of(box, slices[0] if slices else density), axes_of(box, density)
+        numbers = step, weight, shift, delta, *astuple(thresholds)
+        ray, distance, points, significant, first, total = kernels.find_samples(
+            *((origins, directions, entry, count), mask, density, slices),
+            *((axes_of(mask_box, mask), *grids), numbers, longest, capacity),
         )
-        ray, distance, points, significant, first, total = found
         return PackedSamples(ray, distance, points, significant, first, total, count, longest)
     rays = len(origins)
     samples = count.clamp(max=longest)
@@ -205,3 +231,38 @@ def select(flags: Tensor, first: Tensor, capacity: int) -> SampleSubset:
     target = torch.where(flags, running[:-1], capacity).clamp_(max=capacity)
     index = torch.arange(capacity + 1, device=flags.device).scatter_(0, target, place)
     return SampleSubset(index[:capacity], running[first].clamp_(max=capacity), total)
+
+
+def select_listed(
+    found: PackedSamples, canonical: Tensor, weight: Tensor, capacity: int
+) -> ListedSubset:
+    """The significant samples of a list, without waiting for the device.
+
+    Args:
+        found: C samples.
+        canonical: (C, 3) their canonical positions.
+        weight: (C,) their weights.
+        capacity: K ≤ C, the length of the new list; samples that do not fit are dropped.
+
+    Returns:
+        The new list, differentiable once in ``canonical`` and ``weight``.
+    """
+    rays = len(found.first) - 1
+    floats = found.distance, found.points, canonical, weight
+    if capacity <= len(found.ray) and (kernels := accelerated("search", *floats)):
+        listed = found.ray, found.distance, found.points, found.significant, found.first
+        return ListedSubset(*kernels.select_listed(listed, canonical, weight, capacity))
+    chosen = select(found.significant, found.first, capacity)
+    place = torch.arange(capacity, device=chosen.index.device)
+    present = place < chosen.first[-1]
+    taken = canonical.index_select(0, chosen.index)
+    return ListedSubset(
+        chosen.first,
+        chosen.total,
+        torch.where(present, found.ray.index_select(0, chosen.index), place % max(rays, 1)),
+        found.distance.index_select(0, chosen.index),
+        found.points.index_select(0, chosen.index),
+        present,
+        torch.where(present[:, None], taken, taken.detach()),
+        weight.index_select(0, chosen.index) * present,
+    )

@@ -14,8 +14,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import embedding_bag
 
-from devrf.ops.corners import Shape, shape_of
-from devrf.ops.dispatch import triton_runs
+from devrf.ops.corners import Shape, axes_of, shape_of
+from devrf.ops.dispatch import accelerated
 
 Pair = tuple[Tensor, Tensor]
 
@@ -37,14 +37,24 @@ def interpolate(grid: Tensor, coords: Tensor, *, gradient: Tensor | None = None)
     Returns:
         (M, C), differentiable once in ``grid`` and ``coords``.
     """
-    if triton_runs(grid, coords):
-        from devrf.ops.kernels.trilinear import Interpolate
-
-        grid, coords = grid.contiguous(), coords.contiguous()
-        values: Tensor = Interpolate.apply(grid, coords, gradient)  # type: ignore[no-untyped-call]
+    values: Tensor
+    if kernels := accelerated("trilinear", grid, coords):
+        values = kernels.interpolate(grid, coords, axes_of(None, grid), gradient)
         return values
     values = _Interpolate.apply(grid, coords, gradient)  # type: ignore[no-untyped-call]
     return values
+
+
+def resample(values: Tensor, shape: Shape) -> Tensor:
+    """A grid (X, Y, Z, C) at another resolution ``shape``, trilinear, corners kept in place."""
+    if tuple(values.shape[:3]) == tuple(shape):
+        return values.detach().clone()
+    channels_first = values.permute(3, 0, 1, 2)[None]
+    resized = torch.nn.functional.interpolate(
+        channels_first, size=shape, mode="trilinear", align_corners=True
+    )
+    # Not contiguous(): of a single channel it keeps a stray stride, and look-ups become slow.
+    return resized[0].permute(1, 2, 3, 0).clone(memory_format=torch.contiguous_format)
 
 
 def kept_gradient(leaf: Tensor) -> Tensor | None:

@@ -63,7 +63,7 @@ def test_memory_counts_while_it_lives_and_what_was_there_before_is_held(launches
 
 
 def test_a_kernel_reads_eight_corners_of_a_grid_for_each_point(launches: Any) -> None:
-    from devrf.ops.kernels.trilinear import interpolate_kernel
+    from devrf.accel.trilinear import interpolate_kernel
 
     trace, grid, points = launches.Tracing(), torch.zeros(50, 50, 50, 3), torch.zeros(10, 3)
     trace.run(interpolate_kernel, 1, grid, points, torch.zeros(10, 3), 10)

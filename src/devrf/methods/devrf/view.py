@@ -18,7 +18,7 @@ from devrf.methods.devrf.volume_rendering import render
 from devrf.ops.compositing import sum_by_ray
 from devrf.ops.corners import shape_of
 from devrf.ops.dispatch import triton_runs
-from devrf.ops.resampling import resample
+from devrf.ops.trilinear import resample
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.output import RenderedImage
 

@@ -8,8 +8,7 @@ from torch import Tensor, nn
 from devrf.checkpoints.stored_grids import StoredShape
 from devrf.geometry.box import Box
 from devrf.ops.corners import shape_of, to_grid
-from devrf.ops.resampling import resample
-from devrf.ops.trilinear import interpolate, kept_gradient
+from devrf.ops.trilinear import interpolate, kept_gradient, resample
 
 
 def look_up(grid: Tensor, points: Tensor, box: Box) -> Tensor:

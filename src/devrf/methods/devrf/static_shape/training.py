@@ -17,7 +17,7 @@ from devrf.methods.devrf.settings import RenderSettings
 from devrf.methods.devrf.static_shape.sample_search import search
 from devrf.methods.devrf.volume_rendering import VoxelOutput
 from devrf.ops.compositing import composite_colors, composite_segments
-from devrf.ops.selection import select_listed
+from devrf.ops.search import select_listed
 from devrf.ops.trilinear import kept_gradient
 from devrf.ops.warped_depth import warped_depth
 from devrf.rendering.occupancy import Occupancy

@@ -14,7 +14,7 @@ from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.grid_warp import GridWarp
 from devrf.methods.devrf.settings import RenderSettings
 from devrf.methods.devrf.static_shape.sample_search import search
-from devrf.ops.compositing import color_and_depth, composite_segments, sum_segments
+from devrf.ops.compositing import composite_colors, composite_segments
 from devrf.ops.search import PackedSamples, select
 from devrf.ops.warped_depth import warped_depth
 from devrf.rendering.occupancy import Occupancy
@@ -78,13 +78,8 @@ class ListRenderer:
         points, ray = canonical[significant], found.ray[significant]
         residual = None if appearance is None else appearance(points)
         color = field.rgb(points, rays.viewdirs, ray, precision, residual, chosen.first)
-        distance = found.distance[significant, None]
-        seen = sum_segments(
-            weight[significant],
-            torch.cat([color, distance, torch.ones_like(distance)], dim=1),
-            chosen.first,
-        )
-        image, depth = color_and_depth(seen[:, :3], seen[:, 3], seen[:, 4], left, background)
+        listed = weight[significant], color, found.distance[significant], chosen.first
+        image, depth = composite_colors(*listed, left, background)
         return RenderedImage(color=image, depth=depth, opacity=1 - left)
 
     def _search(

@@ -8,7 +8,7 @@ registers would not hold the second layer: it is taken in shares of its units.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 import triton
@@ -16,14 +16,8 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from devrf.ops.corners import Corners, scales, shape_of
-from devrf.ops.kernels.cells import load_vectors, store_vectors
-from devrf.ops.kernels.launch import launch
-from devrf.ops.kernels.numbers import sigmoid
-from devrf.ops.kernels.trilinear import rows_between, spread_rows
-
-if TYPE_CHECKING:
-    from devrf.ops.color_network import ColorNetwork
+from devrf.accel.blocks import launch, load_vectors, sigmoid, store_vectors
+from devrf.accel.trilinear import rows_between, spread_rows
 
 # Samples of a block, and units of the second layer that are computed at a time.
 BLOCK, SHARE = 64, 32
@@ -32,39 +26,42 @@ PRECISIONS = {torch.float32: tl.float32, torch.bfloat16: tl.bfloat16, torch.floa
 LEAST = 16
 
 
-def colors_in_one_pass(
+def listed_colors(
     grid: Tensor,
     points: Tensor,
-    box: Corners,
-    viewdirs: Tensor,
-    ray: Tensor,
-    first: Tensor,
-    network: ColorNetwork,
+    axes: Tensor,
+    known: tuple[Tensor, Tensor, Tensor],
+    network: Sequence[Tensor],
     precision: torch.dtype,
     buffers: Sequence[Tensor | None],
 ) -> Tensor:
     """As devrf.ops.color_network.listed_colors.
 
-    ``buffers`` are the gradients that grid and weights have already; None for those without one.
+    Args:
+        grid: (X, Y, Z, C) features.
+        points: (S, 3).
+        axes: of the grid.
+        known: viewdirs, ray and first.
+        network: the fields of ``ColorNetwork``.
+        precision: what the hidden layers are computed in.
+        buffers: the gradients that grid and weights have already; None for those without one.
     """
     *weights, octaves = network
-    known = tuple(tensor.contiguous() for tensor in (viewdirs, ray, first, octaves))
-    numbers = (*box.low, *scales(box, shape_of(grid)), *shape_of(grid))
     units, encoded = weights[2].shape
     sizes = {
         "CHANNELS": grid.shape[3],
         "PADDED": _padded(grid.shape[3]),
         "DIRECTIONS": encoded,
         "ENCODED": _padded(encoded),
-        "ANGLES": max(1, (encoded - 3) // 2),
         "WIDTH": units,
         "UNITS": _padded(units),
         "SHARE": min(SHARE, _padded(units)),
         "PRECISION": PRECISIONS[precision],
         "BLOCK": BLOCK,
     }
+    given = tuple(tensor.contiguous() for tensor in (*known, octaves))
     colors: Tensor = ListedColors.apply(
-        points.contiguous(), known, numbers, sizes, buffers, grid.contiguous(), *weights
+        points.contiguous(), given, axes, sizes, buffers, grid.contiguous(), *weights
     )
     return colors
 
@@ -81,7 +78,7 @@ class ListedColors(torch.autograd.Function):
         ctx: Any,
         points: Tensor,
         known: Sequence[Tensor],
-        numbers: Sequence[float],
+        axes: Tensor,
         sizes: dict[str, Any],
         buffers: Sequence[Tensor | None],
         grid: Tensor,
@@ -96,12 +93,12 @@ class ListedColors(torch.autograd.Function):
             color_network_kernel,
             triton.cdiv(places, BLOCK),
             points,
-            *(*given, points, grid, features, colors, places, rays, *numbers),
+            *(*given, points, grid, axes, features, colors, places, rays),
             **sizes,
             num_warps=8,
         )
         ctx.save_for_backward(*given, points, grid, features, colors)
-        ctx.numbers, ctx.sizes, ctx.buffers = numbers, sizes, buffers
+        ctx.axes, ctx.sizes, ctx.buffers = axes, sizes, buffers
         return colors
 
     @staticmethod
@@ -124,8 +121,8 @@ class ListedColors(torch.autograd.Function):
                 color_samples_backward_kernel,
                 blocks,
                 points,
-                *(*known, points, grid, points if moved is None else moved, into[0]),
-                *(len(points), rays, *ctx.numbers),
+                *(*known, points, grid, ctx.axes, points if moved is None else moved, into[0]),
+                *(len(points), rays),
                 NEEDS_POINTS=moved is not None,
                 NEEDS_GRID=needs[0],
                 **ctx.sizes,
@@ -182,56 +179,45 @@ def add_matrix(into, change, row, column, ROWS: tl.constexpr, COLUMNS: tl.conste
 
 @triton.jit
 def encoded_directions(
-    viewdirs,
-    octaves,
-    ray,
-    here,
-    DIRECTIONS: tl.constexpr,
-    ENCODED: tl.constexpr,
-    ANGLES: tl.constexpr,
+    viewdirs, octaves, ray, place, here, DIRECTIONS: tl.constexpr, ENCODED: tl.constexpr
 ):
     """d, sin(2^k d), cos(2^k d) of each sample's ray: a tile (BLOCK, ENCODED)."""
+    # Three for each octave; at least one, which is then not used.
+    angles: tl.constexpr = (DIRECTIONS - 3) // 2 if DIRECTIONS > 3 else 1
+    own = tl.load(ray + place, mask=here, other=0)
     column = tl.arange(0, ENCODED)
-    angle = tl.maximum(column - 3, 0) % ANGLES
+    angle = tl.maximum(column - 3, 0) % angles
     axis = tl.where(column < 3, column, angle % 3)
     wanted = here[:, None] & (column < DIRECTIONS)[None, :]
-    along = tl.load(viewdirs + ray[:, None] * 3 + axis[None, :], mask=wanted, other=0.0)
+    along = tl.load(viewdirs + own[:, None] * 3 + axis[None, :], mask=wanted, other=0.0)
     times = tl.load(octaves + angle // 3, mask=(column >= 3) & (column < DIRECTIONS), other=1.0)
     turned = along * times[None, :]
-    waves = tl.where((column < 3 + ANGLES)[None, :], tl.sin(turned), tl.cos(turned))
+    waves = tl.where((column < 3 + angles)[None, :], tl.sin(turned), tl.cos(turned))
     return tl.where(wanted, tl.where((column < 3)[None, :], along, waves), 0.0)
 
 
 @triton.jit
 def lower_units(
     features,
-    viewdirs,
-    octaves,
-    ray,
-    place,
-    here,
+    encoded,
     feature_weight,
     feature_bias,
     direction_weight,
     CHANNELS: tl.constexpr,
-    PADDED: tl.constexpr,
     DIRECTIONS: tl.constexpr,
-    ENCODED: tl.constexpr,
-    ANGLES: tl.constexpr,
     WIDTH: tl.constexpr,
     UNITS: tl.constexpr,
     PRECISION: tl.constexpr,
 ):
-    """What the first layer gives, (BLOCK, UNITS) in ``PRECISION``; and the encoded directions."""
-    own = tl.load(ray + place, mask=here, other=0)
-    encoded = encoded_directions(viewdirs, octaves, own, here, DIRECTIONS, ENCODED, ANGLES)
+    """What the first layer gives, (BLOCK, UNITS) in ``PRECISION``."""
     unit = tl.arange(0, UNITS)
-    weight = matrix(feature_weight, unit, tl.arange(0, PADDED), WIDTH, CHANNELS)
+    channel, column = tl.arange(0, features.shape[1]), tl.arange(0, encoded.shape[1])
+    weight = matrix(feature_weight, unit, channel, WIDTH, CHANNELS)
     x = product(features, tl.trans(weight), PRECISION)
-    weight = matrix(direction_weight, unit, tl.arange(0, ENCODED), WIDTH, DIRECTIONS)
+    weight = matrix(direction_weight, unit, column, WIDTH, DIRECTIONS)
     x += product(encoded, tl.trans(weight), PRECISION)
     x += tl.load(feature_bias + unit, mask=unit < WIDTH, other=0.0)[None, :]
-    return tl.maximum(x, 0.0).to(PRECISION), encoded
+    return tl.maximum(x, 0.0).to(PRECISION)
 
 
 @triton.jit
@@ -281,7 +267,7 @@ def to_logits(colors, upstream, at, here):
     return red, green, to_blue * blue * (1.0 - blue)
 
 
-@triton.jit(do_not_specialize=["places", "rays", "x", "y", "z"])
+@triton.jit(do_not_specialize=["places", "rays"])
 def color_network_kernel(
     viewdirs,
     ray,
@@ -296,24 +282,15 @@ def color_network_kernel(
     output_bias,
     points,
     grid,
+    axes,
     features,
     colors,
     places,
     rays,
-    low_x,
-    low_y,
-    low_z,
-    scale_x,
-    scale_y,
-    scale_z,
-    x,
-    y,
-    z,
     CHANNELS: tl.constexpr,
     PADDED: tl.constexpr,
     DIRECTIONS: tl.constexpr,
     ENCODED: tl.constexpr,
-    ANGLES: tl.constexpr,
     WIDTH: tl.constexpr,
     UNITS: tl.constexpr,
     SHARE: tl.constexpr,
@@ -331,37 +308,19 @@ def color_network_kernel(
     if begin < listed:
         here = place < listed
         px, py, pz = load_vectors(points, at, here)
-        found = rows_between(
-            grid,
-            (px - low_x) * scale_x,
-            (py - low_y) * scale_y,
-            (pz - low_z) * scale_z,
-            x,
-            y,
-            z,
-            here,
-            CHANNELS,
-            PADDED,
-            BLOCK,
-        )
+        found = rows_between(grid, axes, px, py, pz, here, CHANNELS, PADDED, BLOCK)
         channel = tl.arange(0, PADDED)
         wanted = here[:, None] & (channel < CHANNELS)[None, :]
         tl.store(features + place[:, None] * CHANNELS + channel[None, :], found, mask=wanted)
-        lower, _ = lower_units(
+        encoded = encoded_directions(viewdirs, octaves, ray, place, here, DIRECTIONS, ENCODED)
+        lower = lower_units(
             found,
-            viewdirs,
-            octaves,
-            ray,
-            place,
-            here,
+            encoded,
             feature_weight,
             feature_bias,
             direction_weight,
             CHANNELS,
-            PADDED,
             DIRECTIONS,
-            ENCODED,
-            ANGLES,
             WIDTH,
             UNITS,
             PRECISION,
@@ -380,7 +339,7 @@ def color_network_kernel(
     store_vectors(colors, at, red, green, blue, place < places)
 
 
-@triton.jit(do_not_specialize=["places", "rays", "x", "y", "z"])
+@triton.jit(do_not_specialize=["places", "rays"])
 def color_samples_backward_kernel(
     viewdirs,
     ray,
@@ -398,26 +357,17 @@ def color_samples_backward_kernel(
     upstream,
     points,
     grid,
+    axes,
     into_points,
     into_grid,
     places,
     rays,
-    low_x,
-    low_y,
-    low_z,
-    scale_x,
-    scale_y,
-    scale_z,
-    x,
-    y,
-    z,
     NEEDS_POINTS: tl.constexpr,
     NEEDS_GRID: tl.constexpr,
     CHANNELS: tl.constexpr,
     PADDED: tl.constexpr,
     DIRECTIONS: tl.constexpr,
     ENCODED: tl.constexpr,
-    ANGLES: tl.constexpr,
     WIDTH: tl.constexpr,
     UNITS: tl.constexpr,
     SHARE: tl.constexpr,
@@ -433,21 +383,15 @@ def color_samples_backward_kernel(
         here = place < listed
         channel = tl.arange(0, PADDED)
         found = load_features(features, place, channel, here, CHANNELS)
-        lower, _ = lower_units(
+        encoded = encoded_directions(viewdirs, octaves, ray, place, here, DIRECTIONS, ENCODED)
+        lower = lower_units(
             found,
-            viewdirs,
-            octaves,
-            ray,
-            place,
-            here,
+            encoded,
             feature_weight,
             feature_bias,
             direction_weight,
             CHANNELS,
-            PADDED,
             DIRECTIONS,
-            ENCODED,
-            ANGLES,
             WIDTH,
             UNITS,
             PRECISION,
@@ -464,27 +408,12 @@ def color_samples_backward_kernel(
         below = tl.where(lower > 0.0, below, 0.0)
         weight = matrix(feature_weight, tl.arange(0, UNITS), channel, WIDTH, CHANNELS)
         px, py, pz = load_vectors(points, at, here)
-        along_x, along_y, along_z = spread_rows(
-            grid,
-            into_grid,
-            product(below, weight, PRECISION),
-            (px - low_x) * scale_x,
-            (py - low_y) * scale_y,
-            (pz - low_z) * scale_z,
-            x,
-            y,
-            z,
-            here,
-            NEEDS_GRID,
-            NEEDS_POINTS,
-            CHANNELS,
-            PADDED,
+        change = product(below, weight, PRECISION)
+        gx, gy, gz = spread_rows(
+            grid, axes, into_grid, change, px, py, pz, here, NEEDS_GRID, NEEDS_POINTS, CHANNELS
         )
         if NEEDS_POINTS:
-            along_x *= scale_x
-            along_y *= scale_y
-            along_z *= scale_z
-            store_vectors(into_points, at, along_x, along_y, along_z, place < places)
+            store_vectors(into_points, at, gx, gy, gz, place < places)
     else:
         if NEEDS_POINTS:
             nothing = tl.zeros((BLOCK,), dtype=tl.float32)
@@ -521,7 +450,6 @@ def color_weights_backward_kernel(
     PADDED: tl.constexpr,
     DIRECTIONS: tl.constexpr,
     ENCODED: tl.constexpr,
-    ANGLES: tl.constexpr,
     WIDTH: tl.constexpr,
     UNITS: tl.constexpr,
     SHARE: tl.constexpr,
@@ -554,21 +482,15 @@ def color_weights_backward_kernel(
         place = begin + tl.arange(0, BLOCK)
         here = place < listed
         found = load_features(features, place, channel, here, CHANNELS)
-        lower, encoded = lower_units(
+        encoded = encoded_directions(viewdirs, octaves, ray, place, here, DIRECTIONS, ENCODED)
+        lower = lower_units(
             found,
-            viewdirs,
-            octaves,
-            ray,
-            place,
-            here,
+            encoded,
             feature_weight,
             feature_bias,
             direction_weight,
             CHANNELS,
-            PADDED,
             DIRECTIONS,
-            ENCODED,
-            ANGLES,
             WIDTH,
             UNITS,
             PRECISION,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 import triton
@@ -11,20 +11,17 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from devrf.ops.corners import Corners, Triple, scales, shape_of
-from devrf.ops.kernels.cells import (
+from devrf.accel.blocks import (
     cell,
     corner_row,
     corner_slopes,
-    inside,
+    displaced,
+    launch,
     load_vectors,
+    pace,
+    scatter_vectors,
     store_vectors,
 )
-from devrf.ops.kernels.launch import launch
-from devrf.ops.kernels.warped_depth import displaced, scatter
-
-if TYPE_CHECKING:
-    from devrf.ops.motion import ListedSamples, SeenEarlier
 
 BLOCK = 128
 # Numbers that the one program of the second launch reads at a time.
@@ -34,29 +31,38 @@ NEAREST: tl.constexpr = tl.constexpr(1e-8)
 BEFORE_INFINITY: tl.constexpr = tl.constexpr(1e-6)
 
 
-def motion_in_one_pass(
-    samples: ListedSamples,
+def motion_sum(
+    samples: tuple[Tensor, ...],
     forward: Tensor,
     before: Tensor,
-    seen: SeenEarlier | None,
+    seen: tuple[Tensor, ...] | None,
     weights: Sequence[float],
-    box: Corners,
+    axes: Tensor,
     over_samples: bool,
-    ndc: Triple | None,
+    ndc: tuple[float, float, float] | None,
     gradient: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
-    """As devrf.ops.motion.motion_sum; ``gradient`` is what ``forward`` has already, or None."""
+    """As devrf.ops.motion.motion_sum: the weighted sum, and both terms.
+
+    Args:
+        samples: the fields of ``ListedSamples``.
+        forward: Δ_f of the frame.
+        before: Δ_f of the frame before.
+        seen: the fields of ``SeenEarlier``, or None.
+        weights: of cycle and flow.
+        axes: of both grids.
+        over_samples: whether flow is a mean over samples.
+        ndc: slopes and near plane, or None.
+        gradient: what ``forward`` has already, or None.
+    """
     points, canonical, weight, ray, present = samples
-    known = [points.detach(), ray, present.view(torch.uint8), before.detach()]
+    known = [points.detach(), ray, present.view(torch.uint8), before.detach(), axes]
     if seen is None:
         known += [ray, ray, *[points] * 6]  # any pointers
     else:
-        vectors, valid, *others = seen
-        known += [valid.view(torch.uint8), seen.image, vectors, seen.pixel, *others[2:]]
-    numbers = (
-        *(*box.low, *scales(box, shape_of(forward)), *shape_of(forward)),
-        *((1.0, 1.0, 1.0) if ndc is None else ndc),
-    )
+        vectors, valid, pixel, image, *others = seen
+        known += [valid.view(torch.uint8), image, vectors, pixel, *others]
+    numbers = (1.0, 1.0, 1.0) if ndc is None else ndc
     kinds = {"FLOW": seen is not None, "NDC": ndc is not None, "BLOCK": BLOCK}
     total, terms = Motion.apply(
         canonical.contiguous(),
@@ -78,7 +84,7 @@ class Motion(torch.autograd.Function):
         weight: Tensor,
         forward: Tensor,
         known: Sequence[Tensor],
-        numbers: Sequence[float],
+        numbers: tuple[float, float, float],
         kinds: dict[str, Any],
         weights: Sequence[float],
         over_samples: bool,
@@ -89,7 +95,7 @@ class Motion(torch.autograd.Function):
         parts, sums = canonical.new_empty(programs, 4), canonical.new_empty(5)
         given = (canonical, weight, forward, *known)
         launch(motion_kernel, programs, parts, *given, parts, count, *numbers, **kinds)
-        valid = known[4]
+        valid = known[5]
         launch(
             finish_motion_kernel,
             1,
@@ -179,25 +185,23 @@ def missed_flow(x, y, z, ray, image, vectors, pixel, previous, poses, focal, cen
 
 
 @triton.jit
-def pulled(grid, cx, cy, cz, gx, gy, gz, x, y, z, here):
-    """Slopes, per grid unit, of the values of a grid (x, y, z, 3) times (gx, gy, gz)."""
-    i, fx = cell(cx, x)
-    j, fy = cell(cy, y)
-    k, fz = cell(cz, z)
-    along_x = fx * 0.0
-    along_y = fx * 0.0
-    along_z = fx * 0.0
+def pulled(grid, axes, px, py, pz, gx, gy, gz, here):
+    """Slopes, per unit of length, of the values of a grid (X, Y, Z, 3) times (gx, gy, gz)."""
+    first, along_x, along_y, fx, fy, fz = cell(axes, px, py, pz)
+    over_x = fx * 0.0
+    over_y = fx * 0.0
+    over_z = fx * 0.0
     for corner in tl.static_range(8):
-        dx, dy, dz = load_vectors(grid, corner_row(i, j, k, y, z, corner) * 3, here)
+        dx, dy, dz = load_vectors(grid, corner_row(first, along_x, along_y, corner) * 3, here)
         agreed = dx * gx + dy * gy + dz * gz
-        slope_x, slope_y, slope_z = corner_slopes(agreed, fx, fy, fz, corner)
-        along_x += slope_x
-        along_y += slope_y
-        along_z += slope_z
-    return along_x * inside(cx, x), along_y * inside(cy, y), along_z * inside(cz, z)
+        dx, dy, dz = corner_slopes(agreed, fx, fy, fz, corner)
+        over_x += dx
+        over_y += dy
+        over_z += dz
+    return over_x * pace(axes, 0, px), over_y * pace(axes, 1, py), over_z * pace(axes, 2, pz)
 
 
-@triton.jit(do_not_specialize=["count", "x", "y", "z"])
+@triton.jit(do_not_specialize=["count"])
 def motion_kernel(
     canonical,
     weight,
@@ -206,6 +210,7 @@ def motion_kernel(
     ray,
     present,
     before,
+    axes,
     valid,
     image,
     vectors,
@@ -216,15 +221,6 @@ def motion_kernel(
     center,
     parts,
     count,
-    low_x,
-    low_y,
-    low_z,
-    scale_x,
-    scale_y,
-    scale_z,
-    x,
-    y,
-    z,
     slope_x,
     slope_y,
     near,
@@ -237,10 +233,7 @@ def motion_kernel(
     here = (place < count) & (tl.load(present + place, mask=place < count, other=0) != 0)
     at = place.to(tl.int64) * 3
     qx, qy, qz = load_vectors(canonical, at, here)
-    cx = (qx - low_x) * scale_x
-    cy = (qy - low_y) * scale_y
-    cz = (qz - low_z) * scale_z
-    mx, my, mz = displaced(forward, forward, 0.0, qx, qy, qz, cx, cy, cz, x, y, z, here, SLICES=1)
+    mx, my, mz = displaced(forward, forward, 0.0, axes, qx, qy, qz, here, SLICES=1)
     px, py, pz = load_vectors(points, at, here)
     mx -= px
     my -= py
@@ -254,7 +247,7 @@ def motion_kernel(
     if FLOW:
         own = tl.load(ray + place, mask=here, other=0)
         on = here & (tl.load(valid + own, mask=here, other=0) != 0)
-        mx, my, mz = displaced(before, before, 0.0, qx, qy, qz, cx, cy, cz, x, y, z, on, SLICES=1)
+        mx, my, mz = displaced(before, before, 0.0, axes, qx, qy, qz, on, SLICES=1)
         mx, my, mz, _ = to_world(mx, my, mz, slope_x, slope_y, near, NDC)
         across, down, _, _, _, _, _, _ = missed_flow(
             mx, my, mz, own, image, vectors, pixel, previous, poses, focal, center, on
@@ -309,7 +302,7 @@ def finish_motion_kernel(
     tl.store(sums + 4, by_flow)
 
 
-@triton.jit(do_not_specialize=["count", "x", "y", "z"])
+@triton.jit(do_not_specialize=["count"])
 def motion_backward_kernel(
     canonical,
     weight,
@@ -318,6 +311,7 @@ def motion_backward_kernel(
     ray,
     present,
     before,
+    axes,
     valid,
     image,
     vectors,
@@ -332,15 +326,6 @@ def motion_backward_kernel(
     into_weight,
     into_forward,
     count,
-    low_x,
-    low_y,
-    low_z,
-    scale_x,
-    scale_y,
-    scale_z,
-    x,
-    y,
-    z,
     slope_x,
     slope_y,
     near,
@@ -357,26 +342,23 @@ def motion_backward_kernel(
     here = listed & (tl.load(present + place, mask=listed, other=0) != 0)
     at = place.to(tl.int64) * 3
     qx, qy, qz = load_vectors(canonical, at, here)
-    cx = (qx - low_x) * scale_x
-    cy = (qy - low_y) * scale_y
-    cz = (qz - low_z) * scale_z
-    gx, gy, gz = displaced(forward, forward, 0.0, qx, qy, qz, cx, cy, cz, x, y, z, here, SLICES=1)
+    gx, gy, gz = displaced(forward, forward, 0.0, axes, qx, qy, qz, here, SLICES=1)
     px, py, pz = load_vectors(points, at, here)
     slope = tl.where(here, tl.load(upstream) * of_cycle * tl.load(sums + 3), 0.0)
     gx = slope * (gx - px)
     gy = slope * (gy - py)
     gz = slope * (gz - pz)
     if NEEDS_FORWARD:
-        scatter(into_forward, 1.0, cx, cy, cz, gx, gy, gz, x, y, z, here)
-    along_x, along_y, along_z = pulled(forward, cx, cy, cz, gx, gy, gz, x, y, z, here)
-    gx += along_x * scale_x
-    gy += along_y * scale_y
-    gz += along_z * scale_z
+        scatter_vectors(into_forward, 1.0, axes, qx, qy, qz, gx, gy, gz, here)
+    over_x, over_y, over_z = pulled(forward, axes, qx, qy, qz, gx, gy, gz, here)
+    gx += over_x
+    gy += over_y
+    gz += over_z
     change = 0.0 * qx
     if FLOW:
         own = tl.load(ray + place, mask=here, other=0)
         on = here & (tl.load(valid + own, mask=here, other=0) != 0)
-        mx, my, mz = displaced(before, before, 0.0, qx, qy, qz, cx, cy, cz, x, y, z, on, SLICES=1)
+        mx, my, mz = displaced(before, before, 0.0, axes, qx, qy, qz, on, SLICES=1)
         wx, wy, wz, gap = to_world(mx, my, mz, slope_x, slope_y, near, NDC)
         across, down, pose, right, up, depth, focal_x, focal_y = missed_flow(
             wx, wy, wz, own, image, vectors, pixel, previous, poses, focal, center, on
@@ -396,10 +378,10 @@ def motion_backward_kernel(
             uz = far * (uz - mx / slope_x * ux - my / slope_y * uy)
             ux = -wz / slope_x * ux
             uy = -wz / slope_y * uy
-        along_x, along_y, along_z = pulled(before, cx, cy, cz, ux, uy, uz, x, y, z, on)
-        gx += tl.where(on, ux + along_x * scale_x, 0.0)
-        gy += tl.where(on, uy + along_y * scale_y, 0.0)
-        gz += tl.where(on, uz + along_z * scale_z, 0.0)
+        over_x, over_y, over_z = pulled(before, axes, qx, qy, qz, ux, uy, uz, on)
+        gx += tl.where(on, ux + over_x, 0.0)
+        gy += tl.where(on, uy + over_y, 0.0)
+        gz += tl.where(on, uz + over_z, 0.0)
     store_vectors(into_canonical, at, gx, gy, gz, listed)
     tl.store(into_weight + place, change, mask=listed)
 

@@ -11,16 +11,41 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from devrf.ops.kernels.cells import load_vectors, store_vectors
-from devrf.ops.kernels.launch import launch
-from devrf.ops.kernels.padding import PADDING, padding_places, padding_programs
+from devrf.accel.blocks import (
+    PADDING,
+    launch,
+    load_vectors,
+    padding_places,
+    padding_programs,
+    store_vectors,
+)
 
 WARP = {"BLOCK": 32, "num_warps": 1}
 # A transmittance is at least so far from 0 and 1 in the entropy; as in devrf.ops.photometric.
 NEAREST: tl.constexpr = tl.constexpr(1e-6)
 
 
-class PhotometricInOnePass(torch.autograd.Function):
+def photometric_sum(
+    image: Tensor,
+    transmittance: Tensor,
+    sample_weight: Tensor,
+    sample_color: Tensor,
+    first: Tensor,
+    truth: Tensor,
+    alpha: Tensor | None,
+    weights: Sequence[float],
+) -> tuple[Tensor, Tensor, Tensor]:
+    """As devrf.ops.photometric.photometric_sum: total; terms; mean opacity and coverage."""
+    # The transmittance stands in for a missing alpha mask, which is not read.
+    given = sample_weight.detach(), first, truth, transmittance if alpha is None else alpha
+    learned = image, transmittance, sample_color
+    total, terms, seen = Photometric.apply(
+        *(tensor.contiguous() for tensor in (*learned, *given)), alpha is not None, weights
+    )
+    return total, terms, seen
+
+
+class Photometric(torch.autograd.Function):
     """As devrf.ops.photometric.photometric_sum."""
 
     @staticmethod
@@ -32,17 +57,13 @@ class PhotometricInOnePass(torch.autograd.Function):
         sample_weight: Tensor,
         first: Tensor,
         truth: Tensor,
-        alpha: Tensor | None,
+        alpha: Tensor,
+        has_alpha: bool,
         weights: Sequence[float],
     ) -> tuple[Tensor, Tensor, Tensor]:
         rays = len(image)
-        known = tuple(
-            tensor.contiguous()
-            # The transmittance stands in for a missing matte, which is not read.
-            for tensor in (image, transmittance, sample_color, sample_weight, first, truth)
-        ) + ((transmittance if alpha is None else alpha).contiguous(),)
+        known = image, transmittance, sample_color, sample_weight, first, truth, alpha
         parts = image.new_empty(rays, 7)
-        has_alpha = alpha is not None
         launch(
             photometric_kernel, rays, image, *known, parts, *weights, rays, ALPHA=has_alpha, **WARP
         )
@@ -71,7 +92,7 @@ class PhotometricInOnePass(torch.autograd.Function):
             PADDING=PADDING,
             **WARP,
         )
-        return *into, colors, None, None, None, None, None
+        return *into, colors, *[None] * 6
 
 
 @triton.jit

@@ -1,6 +1,6 @@
 """The kernels compile for GPUs that are not there, down to the GPU's own code.
 
-Each kernel once, for one GPU; with DEVRF_ALL_LAUNCHES=1 with all sets of constants, for two.
+Two kernels for one GPU; with DEVRF_ALL_LAUNCHES=1 all, with all sets of constants, for two GPUs.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ CAPABILITIES = (80, 90) if ALL else (90,)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="Triton compiles on Linux")
-def test_every_kernel_compiles_without_a_gpu(tmp_path: Path) -> None:
+def test_kernels_compile_without_a_gpu(tmp_path: Path) -> None:
     pytest.importorskip("triton", reason="Triton is not installed")
     environment = {
         **os.environ,
-        "PYTHONPATH": str(HERE.parents[2] / "src"),
+        "PYTHONPATH": str(HERE.parents[1] / "src"),
         # Nothing from an earlier run, and nothing left behind.
         "TRITON_CACHE_DIR": str(tmp_path),
         "TRITON_INTERPRET": "0",
     }
-    asked = ["all" if ALL else "once", *map(str, CAPABILITIES)]
+    asked = ["all" if ALL else "two", *map(str, CAPABILITIES)]
     done = subprocess.run(
         [sys.executable, str(HERE / "compile_launches.py"), *asked],
         env=environment,

@@ -17,15 +17,14 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from devrf.ops.kernels.launch import launch
-from devrf.ops.kernels.numbers import opacity
+from devrf.accel.blocks import launch, opacity
 
 THREADS = 128
 # Numbers of a program at most: 8 for each of its 128 threads.
 LARGEST = 1024
 
 
-def step_in_one_pass(
+def adam_step(
     values: Tensor,
     into: Tensor,
     gradient: Tensor,
@@ -40,9 +39,8 @@ def step_in_one_pass(
     per_voxel_lr: Tensor | None,
     clear: bool = True,
     smoothing: float = 0.0,
-    touched_only: bool = False,
 ) -> None:
-    """As devrf.ops.adam_step: adam_step if ``into`` is ``values``, else smooth_adam_step."""
+    """As devrf.ops.adam_step.adam_step; as smooth_adam_step if ``into`` is not ``values``."""
     smooth = into is not values
     length = _row(values) if smooth else values.numel()
     beta1, beta2 = betas
@@ -59,14 +57,13 @@ def step_in_one_pass(
         SKIP_ZERO=skip_zero,
         CLEAR=clear,
         SMOOTH=smooth,
-        TOUCHED_ONLY=touched_only or skip_zero,
         CHANNELS=values.shape[-1] if smooth or per_voxel_lr is not None else 1,
         WIDE=_is_wide(values),
         BLOCK=_block(length),
     )
 
 
-def step_several(tensors: Sequence[Sequence[Tensor]], steps: Sequence[Tensor], rule: Any) -> None:
+def adam_steps(tensors: Sequence[Sequence[Tensor]], steps: Sequence[Tensor], rule: Any) -> None:
     """As devrf.ops.adam_step.adam_steps, of rules without options; gradients are set to zero.
 
     Args:
@@ -110,10 +107,10 @@ def _table(
         )
 
 
-def add_gradient_in_one_pass(
+def add_total_variation_gradient(
     grid: Tensor, gradient: Tensor, weight: float, *, touched_only: bool = False
 ) -> None:
-    """As devrf.ops.total_variation.add_total_variation_gradient."""
+    """As devrf.ops.adam_step.add_total_variation_gradient."""
     length = _row(grid)
     launch(
         total_variation_kernel,
@@ -245,7 +242,6 @@ def adam_kernel(
     SKIP_ZERO: tl.constexpr,
     CLEAR: tl.constexpr,
     SMOOTH: tl.constexpr,
-    TOUCHED_ONLY: tl.constexpr,
     CHANNELS: tl.constexpr,
     WIDE: tl.constexpr,
     BLOCK: tl.constexpr,
@@ -263,9 +259,8 @@ def adam_kernel(
     if CLEAR:
         tl.store(gradient + at, tl.zeros((BLOCK,), dtype=tl.float32), mask=touched)
     if SMOOTH:
-        smoothed = touched if TOUCHED_ONLY else here
         g += smoothing * slope_of_variation(
-            values, at, own, smoothed, row, number, length, x, y, CHANNELS
+            values, at, own, active, row, number, length, x, y, CHANNELS
         )
     move = moved(g, mean, square, rate, step, at, active, share1, share2, decay1, decay2, eps)
     if PER_VOXEL_LR:

@@ -15,40 +15,46 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from devrf.ops.kernels.cells import (
+from devrf.accel.blocks import (
     cell,
     corner_row,
     corner_slopes,
     corner_weight,
-    inside,
+    launch,
     load_vectors,
+    pace,
     store_vectors,
 )
-from devrf.ops.kernels.launch import launch
 
 THREADS = 128
+
+
+def interpolate(grid: Tensor, coords: Tensor, axes: Tensor, gradient: Tensor | None) -> Tensor:
+    """As devrf.ops.trilinear.interpolate; ``axes`` are those of the grid in its own units."""
+    values: Tensor = Interpolate.apply(grid.contiguous(), coords.contiguous(), axes, gradient)
+    return values
 
 
 class Interpolate(torch.autograd.Function):
     """As devrf.ops.trilinear.interpolate."""
 
     @staticmethod
-    def forward(ctx: Any, grid: Tensor, coords: Tensor, gradient: Tensor | None) -> Tensor:
+    def forward(
+        ctx: Any, grid: Tensor, coords: Tensor, axes: Tensor, gradient: Tensor | None
+    ) -> Tensor:
         ctx.save_for_backward(grid, coords)
-        ctx.gradient = gradient
+        ctx.axes, ctx.gradient = axes, gradient
         count, tile = len(coords), _tile(grid.shape[3])
         out = grid.new_empty(count, grid.shape[3])
         programs = triton.cdiv(count, tile["BLOCK"])
-        launch(
-            interpolate_kernel, programs, grid, grid, coords, out, count, *grid.shape[:3], **tile
-        )
+        launch(interpolate_kernel, programs, grid, grid, axes, coords, out, count, **tile)
         return out
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
         grid, coords = ctx.saved_tensors
-        needs_grid, needs_coords, _ = ctx.needs_input_grad
+        needs_grid, needs_coords, *_ = ctx.needs_input_grad
         needs_grid = needs_grid or ctx.gradient is not None
         into = None
         if needs_grid:
@@ -59,15 +65,15 @@ class Interpolate(torch.autograd.Function):
             interpolate_backward_kernel,
             triton.cdiv(count, tile["BLOCK"]),
             grid,
-            *(grid, coords, upstream.contiguous()),
+            *(grid, ctx.axes, coords, upstream.contiguous()),
             grid if into is None else into,
             coords if coords_gradient is None else coords_gradient,
-            *(count, *grid.shape[:3]),
+            count,
             NEEDS_GRID=needs_grid,
             NEEDS_COORDS=needs_coords,
             **tile,
         )
-        return into if ctx.gradient is None else None, coords_gradient, None
+        return into if ctx.gradient is None else None, coords_gradient, None, None
 
 
 def _tile(channels: int) -> dict[str, int]:
@@ -79,27 +85,15 @@ def _tile(channels: int) -> dict[str, int]:
 
 @triton.jit
 def rows_between(
-    grid,
-    cx,
-    cy,
-    cz,
-    x,
-    y,
-    z,
-    here,
-    CHANNELS: tl.constexpr,
-    PADDED: tl.constexpr,
-    BLOCK: tl.constexpr,
+    grid, axes, px, py, pz, here, CHANNELS: tl.constexpr, PADDED: tl.constexpr, BLOCK: tl.constexpr
 ):
     """Σ_corners weight · grid[corner], a tile (BLOCK, PADDED); 0 behind the channels."""
-    i, fx = cell(cx, x)
-    j, fy = cell(cy, y)
-    k, fz = cell(cz, z)
+    first, along_x, along_y, fx, fy, fz = cell(axes, px, py, pz)
     channel = tl.arange(0, PADDED)
     wanted = here[:, None] & (channel < CHANNELS)[None, :]
     total = tl.zeros((BLOCK, PADDED), dtype=tl.float32)
     for corner in tl.static_range(8):
-        row = corner_row(i, j, k, y, z, corner)
+        row = corner_row(first, along_x, along_y, corner)
         weight = corner_weight(fx, fy, fz, corner)
         place = row[:, None] * CHANNELS + channel[None, :]
         total += weight[:, None] * tl.load(grid + place, mask=wanted, other=0.0)
@@ -109,58 +103,49 @@ def rows_between(
 @triton.jit
 def spread_rows(
     grid,
-    grid_gradient,
+    axes,
+    into,
     change,
-    cx,
-    cy,
-    cz,
-    x,
-    y,
-    z,
+    px,
+    py,
+    pz,
     here,
     NEEDS_GRID: tl.constexpr,
-    NEEDS_COORDS: tl.constexpr,
+    NEEDS_POINTS: tl.constexpr,
     CHANNELS: tl.constexpr,
-    PADDED: tl.constexpr,
 ):
-    """Scatter weight · change (BLOCK, PADDED) to the corners; slopes along the axes."""
-    i, fx = cell(cx, x)
-    j, fy = cell(cy, y)
-    k, fz = cell(cz, z)
-    channel = tl.arange(0, PADDED)
+    """Scatter weight · change (BLOCK, PADDED) to the corners; the gradients of the positions."""
+    first, along_x, along_y, fx, fy, fz = cell(axes, px, py, pz)
+    channel = tl.arange(0, change.shape[1])
     wanted = here[:, None] & (channel < CHANNELS)[None, :]
     # Padding has no gradient; atomic additions of its zeros to one place would be serialised.
     changed = wanted & (tl.max(tl.abs(change), axis=1) > 0.0)[:, None]
-    along_x = fx * 0.0
-    along_y = fx * 0.0
-    along_z = fx * 0.0
+    gx = fx * 0.0
+    gy = fx * 0.0
+    gz = fx * 0.0
     for corner in tl.static_range(8):
-        row = corner_row(i, j, k, y, z, corner)
+        row = corner_row(first, along_x, along_y, corner)
         weight = corner_weight(fx, fy, fz, corner)
         place = row[:, None] * CHANNELS + channel[None, :]
         if NEEDS_GRID:
-            tl.atomic_add(
-                grid_gradient + place, weight[:, None] * change, mask=changed, sem="relaxed"
-            )
-        if NEEDS_COORDS:
+            tl.atomic_add(into + place, weight[:, None] * change, mask=changed, sem="relaxed")
+        if NEEDS_POINTS:
             value = tl.load(grid + place, mask=wanted, other=0.0)
             agreed = tl.sum(value * change, axis=1)
-            slope_x, slope_y, slope_z = corner_slopes(agreed, fx, fy, fz, corner)
-            along_x += slope_x
-            along_y += slope_y
-            along_z += slope_z
-    return along_x * inside(cx, x), along_y * inside(cy, y), along_z * inside(cz, z)
+            dx, dy, dz = corner_slopes(agreed, fx, fy, fz, corner)
+            gx += dx
+            gy += dy
+            gz += dz
+    return gx * pace(axes, 0, px), gy * pace(axes, 1, py), gz * pace(axes, 2, pz)
 
 
-@triton.jit(do_not_specialize=["count", "x", "y", "z"])
+@triton.jit(do_not_specialize=["count"])
 def interpolate_kernel(
     grid,
+    axes,
     coords,
     out,
     count,
-    x,
-    y,
-    z,
     CHANNELS: tl.constexpr,
     PADDED: tl.constexpr,
     BLOCK: tl.constexpr,
@@ -168,25 +153,23 @@ def interpolate_kernel(
     """out[m] = Σ_corners weight · grid[corner]."""
     point = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = point < count
-    cx, cy, cz = load_vectors(coords, point.to(tl.int64) * 3, here)
-    total = rows_between(grid, cx, cy, cz, x, y, z, here, CHANNELS, PADDED, BLOCK)
+    x, y, z = load_vectors(coords, point.to(tl.int64) * 3, here)
+    total = rows_between(grid, axes, x, y, z, here, CHANNELS, PADDED, BLOCK)
     channel = tl.arange(0, PADDED)
     wanted = here[:, None] & (channel < CHANNELS)[None, :]
     into = point.to(tl.int64)[:, None] * CHANNELS + channel[None, :]
     tl.store(out + into, total, mask=wanted)
 
 
-@triton.jit(do_not_specialize=["count", "x", "y", "z"])
+@triton.jit(do_not_specialize=["count"])
 def interpolate_backward_kernel(
     grid,
+    axes,
     coords,
     upstream,
     grid_gradient,
     coords_gradient,
     count,
-    x,
-    y,
-    z,
     NEEDS_GRID: tl.constexpr,
     NEEDS_COORDS: tl.constexpr,
     CHANNELS: tl.constexpr,
@@ -197,26 +180,13 @@ def interpolate_backward_kernel(
     point = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     here = point < count
     at = point.to(tl.int64) * 3
-    cx, cy, cz = load_vectors(coords, at, here)
+    x, y, z = load_vectors(coords, at, here)
     channel = tl.arange(0, PADDED)
     wanted = here[:, None] & (channel < CHANNELS)[None, :]
     from_ = point.to(tl.int64)[:, None] * CHANNELS + channel[None, :]
     change = tl.load(upstream + from_, mask=wanted, other=0.0)
-    along_x, along_y, along_z = spread_rows(
-        grid,
-        grid_gradient,
-        change,
-        cx,
-        cy,
-        cz,
-        x,
-        y,
-        z,
-        here,
-        NEEDS_GRID,
-        NEEDS_COORDS,
-        CHANNELS,
-        PADDED,
+    gx, gy, gz = spread_rows(
+        grid, axes, grid_gradient, change, x, y, z, here, NEEDS_GRID, NEEDS_COORDS, CHANNELS
     )
     if NEEDS_COORDS:
-        store_vectors(coords_gradient, at, along_x, along_y, along_z, here)
+        store_vectors(coords_gradient, at, gx, gy, gz, here)

@@ -9,14 +9,13 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from devrf.ops.corners import Corners
-from devrf.ops.kernels.cells import load_vectors, store_vectors
-from devrf.ops.kernels.launch import launch
+from devrf.accel.blocks import launch, load_vectors, store_vectors
 
+Triple = tuple[float, float, float]
 BLOCK = 128
 
 
-def gather_on_device(
+def gather_pixels(
     image: Tensor,
     flat: Tensor,
     pixels: Tensor,
@@ -57,10 +56,10 @@ def gather_on_device(
     )
 
 
-def steps_on_device(
-    origins: Tensor, directions: Tensor, box: Corners, step: float, near: float, far: float
+def steps_in_box(
+    origins: Tensor, directions: Tensor, corners: tuple[Triple, Triple], limits: Triple
 ) -> tuple[Tensor, Tensor]:
-    """As devrf.ops.pixel_rays.steps_in_box."""
+    """As devrf.ops.pixel_rays.steps_in_box; ``limits``: step, near, far."""
     rays = len(origins)
     entry = origins.new_empty(rays)
     count = torch.empty(rays, dtype=torch.int64, device=origins.device)
@@ -69,7 +68,7 @@ def steps_on_device(
         triton.cdiv(rays, BLOCK),
         origins,
         *(origins.contiguous(), directions.contiguous(), entry, count, rays),
-        *(*box.low, *box.high, float(step), float(near), float(far)),
+        *(*corners[0], *corners[1], *map(float, limits)),
         BLOCK=BLOCK,
     )
     return entry, count

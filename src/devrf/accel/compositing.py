@@ -15,13 +15,38 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from devrf.ops.kernels.cells import load_vectors, store_vectors
-from devrf.ops.kernels.launch import launch
-from devrf.ops.kernels.numbers import opacity
-from devrf.ops.kernels.padding import PADDING, padding_places, padding_programs
+from devrf.accel.blocks import (
+    PADDING,
+    launch,
+    load_vectors,
+    opacity,
+    padding_places,
+    padding_programs,
+    store_vectors,
+)
 
 # A program is one warp, which processes a block of samples at a time, one for each thread.
 WARP = {"BLOCK": 32, "num_warps": 1}
+
+
+def composite_segments(depth: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
+    """As devrf.ops.compositing.composite_segments."""
+    weights, end = Composite.apply(depth.contiguous(), first.contiguous())
+    return weights, end
+
+
+def composite_colors(
+    weights: Tensor,
+    colors: Tensor,
+    distance: Tensor,
+    first: Tensor,
+    transmittance: Tensor,
+    background: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """As devrf.ops.compositing.composite_colors."""
+    given = weights, colors, transmittance, distance, first, background
+    image, depth = CompositeColors.apply(*(tensor.contiguous() for tensor in given))
+    return image, depth
 
 
 class Composite(torch.autograd.Function):
@@ -61,28 +86,6 @@ class Composite(torch.autograd.Function):
         return into, None
 
 
-class SumSegments(torch.autograd.Function):
-    """As devrf.ops.compositing.sum_segments."""
-
-    @staticmethod
-    def forward(ctx: Any, weights: Tensor, values: Tensor, first: Tensor) -> Tensor:
-        rays = len(first) - 1
-        ctx.save_for_backward(weights, values, first)
-        sums = values.new_empty(rays, values.shape[1])
-        launch(sum_kernel, rays, values, weights, values, first, sums, **_width(values), **WARP)
-        return sums
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, Tensor, None]:
-        weights, values, first = ctx.saved_tensors
-        given = (weights, values, first, upstream.contiguous())
-        into = (torch.zeros_like(weights), torch.zeros_like(values))
-        sizes = {**_width(values), **WARP}
-        launch(sum_backward_kernel, len(first) - 1, values, *given, *into, **sizes)
-        return *into, None
-
-
 class CompositeColors(torch.autograd.Function):
     """As devrf.ops.compositing.composite_colors."""
 
@@ -96,16 +99,13 @@ class CompositeColors(torch.autograd.Function):
         first: Tensor,
         background: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        rays = len(first) - 1
-        weights, colors = weights.contiguous(), colors.contiguous()
-        transmittance, first = transmittance.contiguous(), first.contiguous()
-        background, apart = background.contiguous(), 0 if background.dim() == 1 else 3
+        rays, apart = len(first) - 1, 0 if background.dim() == 1 else 3
         image, depth = colors.new_empty(rays, 3), colors.new_empty(rays)
         launch(
             colors_kernel,
             rays,
             colors,
-            *(weights, colors, transmittance, distance.contiguous(), first, background),
+            *(weights, colors, transmittance, distance, first, background),
             *(image, depth, apart),
             **WARP,
         )
@@ -131,11 +131,6 @@ class CompositeColors(torch.autograd.Function):
             **WARP,
         )
         return *into, None, None, None
-
-
-def _width(values: Tensor) -> dict[str, int]:
-    channels = values.shape[1]
-    return {"CHANNELS": channels, "PADDED": triton.next_power_of_2(channels)}
 
 
 @triton.jit(do_not_specialize=["rays", "places"])
@@ -211,61 +206,6 @@ def composite_backward_kernel(
     else:
         place, empty = padding_places(ray - rays, tl.load(first + rays), places, PADDING)
         tl.store(into + place, tl.zeros((PADDING,), dtype=tl.float32), mask=empty)
-
-
-@triton.jit
-def sum_kernel(
-    weights, values, first, sums, CHANNELS: tl.constexpr, PADDED: tl.constexpr, BLOCK: tl.constexpr
-):
-    """Σ w_i·c_i along a ray."""
-    ray = tl.program_id(0).to(tl.int64)
-    begin = tl.load(first + ray)
-    stop = tl.load(first + ray + 1)
-    lane = tl.arange(0, BLOCK)
-    channel = tl.arange(0, PADDED)
-    total = tl.zeros((PADDED,), dtype=tl.float32)
-    start = begin
-    while start < stop:
-        at = start + lane
-        here = at < stop
-        wanted = here[:, None] & (channel < CHANNELS)[None, :]
-        value = tl.load(values + at[:, None] * CHANNELS + channel[None, :], mask=wanted, other=0.0)
-        weight = tl.load(weights + at, mask=here, other=0.0)
-        total += tl.sum(weight[:, None] * value, axis=0)
-        start += BLOCK
-    tl.store(sums + ray * CHANNELS + channel, total, mask=channel < CHANNELS)
-
-
-@triton.jit
-def sum_backward_kernel(
-    weights,
-    values,
-    first,
-    upstream,
-    into_weights,
-    into_values,
-    CHANNELS: tl.constexpr,
-    PADDED: tl.constexpr,
-    BLOCK: tl.constexpr,
-):
-    """g·c to the weights, g·w to the values."""
-    ray = tl.program_id(0).to(tl.int64)
-    begin = tl.load(first + ray)
-    stop = tl.load(first + ray + 1)
-    lane = tl.arange(0, BLOCK)
-    channel = tl.arange(0, PADDED)
-    gradient = tl.load(upstream + ray * CHANNELS + channel, mask=channel < CHANNELS, other=0.0)
-    start = begin
-    while start < stop:
-        at = start + lane
-        here = at < stop
-        wanted = here[:, None] & (channel < CHANNELS)[None, :]
-        place = at[:, None] * CHANNELS + channel[None, :]
-        value = tl.load(values + place, mask=wanted, other=0.0)
-        weight = tl.load(weights + at, mask=here, other=0.0)
-        tl.store(into_weights + at, tl.sum(value * gradient[None, :], axis=1), mask=here)
-        tl.store(into_values + place, weight[:, None] * gradient[None, :], mask=wanted)
-        start += BLOCK
 
 
 @triton.jit(do_not_specialize=["apart"])

@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from devrf.ops.check import Draw
 from devrf.ops.dispatch import using
 
 Both = Callable[[Callable[[], Sequence[Tensor]]], None]
@@ -28,9 +29,9 @@ def device() -> torch.device:
 
 
 @pytest.fixture
-def draw(device: torch.device, rng: torch.Generator) -> Callable[..., Tensor]:
+def draw(device: torch.device) -> Draw:
     """``draw(*shape)``: numbers in [−1, 1] on the device."""
-    return lambda *shape: (2 * torch.rand(shape, generator=rng) - 1).to(device)
+    return Draw(device, 1)
 
 
 @pytest.fixture

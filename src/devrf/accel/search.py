@@ -1,0 +1,410 @@
+"""The search for visible samples: one program marches along one ray.
+
+The first kernel tests a ray's samples, 32 at a time, until the ray ends or its transmittance falls
+below the threshold. It writes a byte for each sample and a count for each ray. The counts' running
+sum is where each ray's samples end; the second kernel writes them there, and the padding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from devrf.accel.blocks import (
+    PADDING,
+    displaced,
+    grid_coordinate,
+    launch,
+    load_vectors,
+    opacity,
+    padding_places,
+    padding_programs,
+    scalar_at,
+    softplus,
+    store_vectors,
+)
+
+# A program is one warp, which tests one sample for each of its threads at a time.
+LANES = 32
+WARP = {"LANES": LANES, "num_warps": 1}
+
+
+def find_samples(
+    rays: tuple[Tensor, Tensor, Tensor, Tensor],
+    mask: Tensor,
+    density: Tensor,
+    slices: Sequence[Tensor],
+    axes: tuple[Tensor, Tensor, Tensor],
+    numbers: tuple[float, ...],
+    longest: int,
+    capacity: int,
+) -> tuple[Tensor, ...]:
+    """As devrf.ops.search.find_samples: ray, distance, points, significant, first, total.
+
+    Args:
+        rays: origins, directions, entry and count of R rays.
+        mask: the occupancy.
+        density: raw densities.
+        slices: displacements.
+        axes: of the mask, of the slices and of the density.
+        numbers: step, weight of the second slice, shift, delta; thresholds of opacity, of
+            transmittance and of weight.
+        longest: an upper bound of ``count``.
+        capacity: C.
+    """
+    origins, directions, entry, counts = (tensor.contiguous() for tensor in rays)
+    device, number, density = origins.device, len(origins), density.contiguous()
+    # The kernel takes two slices; the density stands in for missing ones, which are not read.
+    before, after = (frame.contiguous() for frame in ([*slices, density, density])[:2])
+    stride = triton.cdiv(longest, LANES) * LANES
+    marks = torch.empty(number, stride, dtype=torch.uint8, device=device)
+    # As wide as their running sum: no cast before it.
+    kept = torch.empty(number, dtype=torch.int64, device=device)
+    reached = torch.empty(number, dtype=torch.int32, device=device)
+    launch(
+        march_kernel,
+        number,
+        origins,
+        *(origins, directions, entry, counts),
+        *(mask.contiguous().view(torch.uint8), density, before, after, *axes),
+        *(marks, kept, reached, longest, stride, *numbers),
+        SLICES=len(slices),
+        **WARP,
+    )
+    ray = torch.empty(capacity, dtype=torch.int64, device=device)
+    distance = torch.empty(capacity, dtype=torch.float32, device=device)
+    points = torch.empty(capacity, 3, dtype=torch.float32, device=device)
+    significant = torch.empty(capacity, dtype=torch.uint8, device=device)
+    first, total = (torch.empty(n, dtype=torch.int64, device=device) for n in (number + 1, ()))
+    launch(
+        list_kernel,
+        # One at least behind the rays, for the total.
+        number + max(1, padding_programs(capacity)),
+        origins,
+        *(origins, directions, entry, marks, reached, kept.cumsum(0)),
+        *(ray, distance, points, significant, first, total, number, stride, capacity, numbers[0]),
+        PADDING=PADDING,
+        **WARP,
+    )
+    return ray, distance, points, significant.view(torch.bool), first, total
+
+
+@triton.jit
+def vector(vectors, number):
+    """The components of one vector."""
+    at = vectors + number * 3
+    return tl.load(at), tl.load(at + 1), tl.load(at + 2)
+
+
+@triton.jit
+def nearest(coordinate, points):
+    """The nearest grid point along an axis, halves to the even one; −1 or ``points`` outside.
+
+    NaN is outside.
+    """
+    coordinate = tl.where(coordinate > -1.0, tl.minimum(coordinate, points * 1.0), -1.0)
+    low = tl.floor(coordinate)
+    number = low.to(tl.int32)
+    above = coordinate - low
+    up = (above > 0.5) | ((above == 0.5) & ((number & 1) == 1))
+    return number + up.to(tl.int32)
+
+
+@triton.jit
+def occupied(mask, axes, px, py, pz, here):
+    """Is the grid point nearest to a position on the grid and True?"""
+    x = tl.load(axes + 6).to(tl.int32)
+    y = tl.load(axes + 7).to(tl.int32)
+    z = tl.load(axes + 8).to(tl.int32)
+    i = nearest(grid_coordinate(axes, 0, px), x)
+    j = nearest(grid_coordinate(axes, 1, py), y)
+    k = nearest(grid_coordinate(axes, 2, pz), z)
+    here = here & (i >= 0) & (i < x) & (j >= 0) & (j < y) & (k >= 0) & (k < z)
+    return tl.load(mask + (i * y + j) * z + k, mask=here, other=0) != 0
+
+
+@triton.jit(do_not_specialize=["longest", "stride"])
+def march_kernel(
+    origins,
+    directions,
+    entry,
+    count,
+    mask,
+    density,
+    before,
+    after,
+    mask_axes,
+    slice_axes,
+    density_axes,
+    marks,
+    kept,
+    reached,
+    longest,
+    stride,
+    step,
+    weight,
+    shift,
+    delta,
+    alpha_threshold,
+    stop,
+    weight_threshold,
+    SLICES: tl.constexpr,
+    LANES: tl.constexpr,
+):
+    """Marks each sample of a ray (0 dropped, 1 kept, 2 significant); counts kept and tested."""
+    ray = tl.program_id(0)
+    ox, oy, oz = vector(origins, ray)
+    dx, dy, dz = vector(directions, ray)
+    begin = tl.load(entry + ray)
+    samples = tl.minimum(tl.load(count + ray).to(tl.int32), longest)
+    into = marks + ray.to(tl.int64) * stride
+    lane = tl.arange(0, LANES)
+    tested = 0
+    number = 0
+    depth = 0.0
+    while (tested < samples) & (tl.exp(-depth) >= stop):
+        sample = tested + lane
+        at = begin + step * sample.to(tl.float32)
+        px = ox + dx * at
+        py = oy + dy * at
+        pz = oz + dz * at
+        there = occupied(mask, mask_axes, px, py, pz, sample < samples)
+        mark = tl.zeros((LANES,), dtype=tl.uint8)
+        if tl.max(there.to(tl.int32), 0) > 0:
+            if SLICES > 0:
+                px, py, pz = displaced(before, after, weight, slice_axes, px, py, pz, there, SLICES)
+            raw = scalar_at(density, density_axes, px, py, pz, there)
+            tau = softplus(raw + shift) * delta
+            alpha = opacity(tau)
+            opaque = there & (alpha >= alpha_threshold)
+            # Nothing is visible behind exp(−32); a larger sum would cost precision.
+            tau = tl.where(opaque, tl.minimum(tau, 32.0), 0.0)
+            left = tl.exp(-(depth + tl.cumsum(tau, 0) - tau))
+            seen = opaque & (left >= stop)
+            significant = seen & (left * alpha >= weight_threshold)
+            mark = (seen.to(tl.int32) + significant.to(tl.int32)).to(tl.uint8)
+            number += tl.sum(seen.to(tl.int32), 0)
+            depth += tl.sum(tau, 0)
+        tl.store(into + sample, mark)
+        tested += LANES
+    tl.store(kept + ray, number)
+    tl.store(reached + ray, tested)
+
+
+@triton.jit(do_not_specialize=["count", "stride", "capacity"])
+def list_kernel(
+    origins,
+    directions,
+    entry,
+    marks,
+    reached,
+    ends,
+    rays,
+    distances,
+    points,
+    significant,
+    first,
+    total,
+    count,
+    stride,
+    capacity,
+    step,
+    LANES: tl.constexpr,
+    PADDING: tl.constexpr,
+):
+    """Writes the kept samples of the ``count`` rays one after another, the padding behind them.
+
+    ``ends`` is the running sum of the rays' numbers of samples.
+    """
+    ray = tl.program_id(0)
+    if ray < count:
+        ox, oy, oz = vector(origins, ray)
+        dx, dy, dz = vector(directions, ray)
+        begin = tl.load(entry + ray)
+        end = tl.load(reached + ray)
+        free = tl.load(ends + ray - 1, mask=ray > 0, other=0)
+        tl.store(first + ray, tl.minimum(free, capacity))
+        from_ = marks + ray.to(tl.int64) * stride
+        lane = tl.arange(0, LANES)
+        tested = 0
+        while (tested < end) & (free < capacity):
+            sample = tested + lane
+            mark = tl.load(from_ + sample).to(tl.int32)
+            kept = (mark > 0).to(tl.int32)
+            place = free + tl.cumsum(kept, 0) - kept
+            fits = (kept > 0) & (place < capacity)
+            at = begin + step * sample.to(tl.float32)
+            tl.store(rays + place, (lane * 0 + ray).to(tl.int64), mask=fits)
+            tl.store(distances + place, at, mask=fits)
+            store_vectors(points, place * 3, ox + dx * at, oy + dy * at, oz + dz * at, fits)
+            tl.store(significant + place, (mark > 1).to(tl.uint8), mask=fits)
+            free += tl.sum(kept, 0)
+            tested += LANES
+    else:
+        used = tl.load(ends + count - 1, mask=count > 0, other=0)
+        if ray == count:
+            tl.store(total, used)
+            tl.store(first + count, tl.minimum(used, capacity))
+        place, empty = padding_places(ray - count, used, capacity, PADDING)
+        nothing = tl.zeros((PADDING,), dtype=tl.float32)
+        tl.store(rays + place, (place * 0 + count).to(tl.int64), mask=empty)
+        tl.store(distances + place, nothing, mask=empty)
+        store_vectors(points, place * 3, nothing, nothing, nothing, empty)
+        tl.store(significant + place, nothing.to(tl.uint8), mask=empty)
+
+
+# Places of a list that a program of the selection goes over.
+PLACES = 256
+
+
+def select_listed(
+    listed: tuple[Tensor, ...], canonical: Tensor, weight: Tensor, capacity: int
+) -> tuple[Tensor, ...]:
+    """As devrf.ops.search.select_listed; ``listed``: ray, distance, points, significant, first."""
+    known = tuple(tensor.contiguous() for tensor in listed)
+    chosen: tuple[Tensor, ...] = SelectListed.apply(
+        canonical.contiguous(), weight.contiguous(), known, capacity
+    )
+    return chosen
+
+
+class SelectListed(torch.autograd.Function):
+    """As devrf.ops.search.select_listed."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, canonical: Tensor, weight: Tensor, listed: tuple[Tensor, ...], capacity: int
+    ) -> tuple[Tensor, ...]:
+        rays_of, reached, where, flags, begin = listed
+        places, rays, running = len(flags), len(begin) - 1, flags.cumsum(0)
+        first, ray = torch.empty_like(begin), rays_of.new_empty(capacity)
+        distance, points = weight.new_empty(capacity), canonical.new_empty(capacity, 3)
+        present = flags.new_empty(capacity)
+        into_canonical, into_weight = torch.empty_like(points), torch.empty_like(distance)
+        launch(
+            select_kernel,
+            triton.cdiv(max(places, rays + 1), PLACES),
+            weight,
+            *(flags.view(torch.uint8), running, begin, rays_of, reached, where, canonical, weight),
+            *(first, ray, distance, points, present.view(torch.uint8), into_canonical, into_weight),
+            *(places, rays, capacity),
+            PLACES=PLACES,
+        )
+        total = running[-1]
+        ctx.save_for_backward(flags, running)
+        ctx.set_materialize_grads(False)
+        known = (first, total, ray, distance, points, present)
+        moves = ctx.needs_input_grad[0]
+        ctx.mark_non_differentiable(*known, *(() if moves else (into_canonical,)))
+        return *known, into_canonical, into_weight
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
+        flags, running = ctx.saved_tensors
+        *_, to_canonical, to_weight = upstream
+        given = [None if up is None else up.contiguous() for up in (to_canonical, to_weight)]
+        into = [None if up is None else up.new_empty(len(flags), *up.shape[1:]) for up in given]
+        launch(
+            select_backward_kernel,
+            triton.cdiv(len(flags), PLACES),
+            flags,
+            *(flags.view(torch.uint8), running),
+            # Any pointer where there is no gradient.
+            *(running if tensor is None else tensor for tensor in (*given, *into)),
+            *(len(flags), max(0 if up is None else len(up) for up in given)),
+            HAS_CANONICAL=to_canonical is not None,
+            HAS_WEIGHT=to_weight is not None,
+            PLACES=PLACES,
+        )
+        return *into, None, None
+
+
+@triton.jit(do_not_specialize=["places", "count", "capacity"])
+def select_kernel(
+    flags,
+    running,
+    first,
+    rays,
+    distances,
+    points,
+    canonical,
+    weights,
+    begin,
+    owner,
+    reached,
+    where,
+    present,
+    into_canonical,
+    into_weight,
+    places,
+    count,
+    capacity,
+    PLACES: tl.constexpr,
+):
+    """Copies flagged samples to the places that the flags' ``running`` sum gives; the padding.
+
+    A place of the padding copies the sample of the same number, which differ: atomic additions of
+    gradients to them do not collide. ``begin`` is where each of the ``count`` rays begins.
+    """
+    place = tl.program_id(0).to(tl.int64) * PLACES + tl.arange(0, PLACES)
+    here = place < places
+    flag = tl.load(flags + place, mask=here, other=0) != 0
+    rank = tl.load(running + place, mask=here, other=0) - 1
+    kept = here & flag & (rank < capacity)
+    empty = (place >= tl.load(running + places - 1)) & (place < capacity)
+    ray = tl.load(rays + place, mask=here, other=0)
+    distance = tl.load(distances + place, mask=here, other=0.0)
+    weight = tl.load(weights + place, mask=kept, other=0.0)
+    x, y, z = load_vectors(points, place * 3, here)
+    qx, qy, qz = load_vectors(canonical, place * 3, here)
+    tl.store(owner + rank, ray, mask=kept)
+    tl.store(reached + rank, distance, mask=kept)
+    store_vectors(where, rank * 3, x, y, z, kept)
+    store_vectors(into_canonical, rank * 3, qx, qy, qz, kept)
+    tl.store(into_weight + rank, weight, mask=kept)
+    tl.store(present + rank, (rank >= 0).to(tl.uint8), mask=kept)
+    tl.store(owner + place, place % count, mask=empty)
+    tl.store(reached + place, distance, mask=empty)
+    store_vectors(where, place * 3, x, y, z, empty)
+    store_vectors(into_canonical, place * 3, qx, qy, qz, empty)
+    tl.store(into_weight + place, distance * 0.0, mask=empty)
+    tl.store(present + place, (place < 0).to(tl.uint8), mask=empty)
+    bounds = place <= count
+    start = tl.load(first + place, mask=bounds, other=0)
+    before = tl.load(running + start - 1, mask=bounds & (start > 0), other=0)
+    tl.store(begin + place, tl.minimum(before, capacity), mask=bounds)
+
+
+@triton.jit(do_not_specialize=["places", "capacity"])
+def select_backward_kernel(
+    flags,
+    running,
+    to_canonical,
+    to_weight,
+    into_canonical,
+    into_weight,
+    places,
+    capacity,
+    HAS_CANONICAL: tl.constexpr,
+    HAS_WEIGHT: tl.constexpr,
+    PLACES: tl.constexpr,
+):
+    """The gradient of each place of the first list: that of the place that took it, or none."""
+    place = tl.program_id(0).to(tl.int64) * PLACES + tl.arange(0, PLACES)
+    here = place < places
+    flag = tl.load(flags + place, mask=here, other=0) != 0
+    rank = tl.load(running + place, mask=here, other=0) - 1
+    kept = here & flag & (rank < capacity)
+    if HAS_CANONICAL:
+        gx, gy, gz = load_vectors(to_canonical, rank * 3, kept)
+        store_vectors(into_canonical, place * 3, gx, gy, gz, here)
+    if HAS_WEIGHT:
+        change = tl.load(to_weight + rank, mask=kept, other=0.0)
+        tl.store(into_weight + place, change, mask=here)
