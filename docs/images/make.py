@@ -22,7 +22,7 @@ from torch import Tensor
 
 from devrf.apps.images import image_grid, scaled, to_bytes
 from devrf.apps.still import still
-from devrf.apps.video import FilmSettings, orbit
+from devrf.apps.video import VideoSettings, orbit
 from devrf.checkpoints.checkpoint import load_checkpoint
 from devrf.geometry.cameras import Cameras
 from devrf.methods.base import DynamicModel
@@ -45,7 +45,7 @@ def scene_columns(run: Path) -> tuple[list[list[Tensor]], list[str]]:
     """Truth, rendering and depth of a run's scene in four columns, cut to what can be seen."""
     data, model = opened(run)
     scene, recipe = data.scene, data.recipe
-    shape, film = recipe.model(), FilmSettings(frames=8, height=HEIGHT)
+    shape, film = recipe.model(), VideoSettings(frames=8, height=HEIGHT)
     camera = film.sized(scene.dynamic.test.cameras[[0]])
     around = orbit(film.sized(scene.static.train.cameras), model.box, film)
     filming = Filming(shape, extent(shape).reach, recipe.supersample, recipe.light)

@@ -27,12 +27,12 @@ from devrf.apps.images import (
 )
 from devrf.apps.still import write_contact_sheet
 from devrf.apps.video import (
-    FilmSettings,
-    film_bytes,
+    VideoSettings,
     held_out_images,
     held_out_pictures,
     orbit,
     orbit_pictures,
+    video_bytes,
     write_video,
 )
 from devrf.evaluation.held_out import HeldOutView, truth_image
@@ -198,7 +198,7 @@ def ring(count: int) -> Cameras:
 
 
 def test_an_orbit_circles_the_box_at_the_cameras_distance(cube: Box) -> None:
-    settings = FilmSettings(frames=8, orbit_turns=2.0, orbit_elevation=30.0)
+    settings = VideoSettings(frames=8, orbit_turns=2.0, orbit_elevation=30.0)
     cameras = orbit(ring(6), cube, settings)
     assert len(cameras) == 8 and (cameras.width, cameras.height) == (15, 10)
     torch.testing.assert_close(cameras.positions.norm(dim=1), torch.full((8,), math.sqrt(10)))
@@ -224,7 +224,7 @@ def test_an_orbit_shows_colour_beside_depth_while_time_runs(moving, reference) -
 def test_held_out_pictures_are_rendered_in_the_films_size_beside_the_truth(
     moving, reference, tiny_scene
 ) -> None:
-    views, film = tiny_scene.dynamic.test, FilmSettings(height=36)
+    views, film = tiny_scene.dynamic.test, VideoSettings(height=36)
     images = held_out_images(views, 3)
     shown = list(held_out_pictures(Renderer(moving), views, images, film, "white"))
     large = views.cameras.of_height(36)
@@ -256,31 +256,31 @@ def test_held_out_images_are_the_nearest_in_time(tiny_scene) -> None:
 
 def test_small_captures_are_filmed_400_pixels_high(tiny_scene) -> None:
     cameras = tiny_scene.dynamic.test.cameras
-    sized = FilmSettings().sized(cameras)
+    sized = VideoSettings().sized(cameras)
     assert (sized.height, sized.width) == (400, round(400 * cameras.width / cameras.height))
     # Magnified intrinsics: the corners of the image see the same.
     small, large = cameras.image_rays(0), sized.image_rays(0)
     middle = small.directions.mean(dim=0), large.directions.mean(dim=0)
     torch.testing.assert_close(*middle, atol=1e-3, rtol=0)
     tall = cameras.of_height(500)
-    assert FilmSettings().sized(tall).height == 500
-    assert FilmSettings(height=40).sized(tall).height == 40
+    assert VideoSettings().sized(tall).height == 500
+    assert VideoSettings(height=40).sized(tall).height == 40
 
 
 def test_rendering_keeps_to_its_seconds() -> None:
-    film = FilmSettings(frames=60, fps=20, max_seconds=12)
+    film = VideoSettings(frames=60, fps=20, max_seconds=12)
     assert film.within_limit(0.2) == film
     fewer = film.within_limit(0.4)
     assert (fewer.frames, fewer.fps) == (30, 10)
     assert film.within_limit(100.0).frames == 8
-    assert FilmSettings(frames=4, max_seconds=1).within_limit(9.0).frames == 4
-    assert FilmSettings(frames=60).within_limit(100.0).frames == 60
+    assert VideoSettings(frames=4, max_seconds=1).within_limit(9.0).frames == 4
+    assert VideoSettings(frames=60).within_limit(100.0).frames == 60
 
 
 def test_videos_are_no_larger_than_was_said(rest, tiny_scene, tmp_path):
     cameras, views = tiny_scene.static.train.cameras, tiny_scene.dynamic.test
     renderer = Renderer(rest.model)
-    film = FilmSettings(frames=8, height=60)
+    film = VideoSettings(frames=8, height=60)
     turned = orbit(film.sized(cameras), rest.model.canonical.box, film)
     images = held_out_images(views, 8)
     shown = (
@@ -290,4 +290,4 @@ def test_videos_are_no_larger_than_was_said(rest, tiny_scene, tmp_path):
     for k, pictures in enumerate(shown):
         write_video(tmp_path / f"{k}.mp4", pictures, film.fps)
     written = sum(path.stat().st_size for path in tmp_path.iterdir())
-    assert 0.02 * film_bytes(film, cameras) < written < film_bytes(film, cameras)
+    assert 0.02 * video_bytes(film, cameras) < written < video_bytes(film, cameras)

@@ -10,8 +10,8 @@ import torch
 from lightning import Trainer
 
 from devrf.apps.still import StillSettings, still
-from devrf.apps.video import FilmSettings
-from devrf.checkpoints.checkpoint import Viewpoints
+from devrf.apps.video import VideoSettings
+from devrf.checkpoints.viewpoints import Viewpoints
 from devrf.errors import DevrfError
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.rendering.renderer import Renderer
@@ -33,8 +33,8 @@ def test_the_camera_that_is_meant(tiny_scene: Scene) -> None:
     [
         (StillSettings, {"view": -1}, "still.view: expected held_out or 0 to 7, not -1"),
         (StillSettings, {"height": 0}, "still.height: expected at least 1, not 0"),
-        (FilmSettings, {"height": 15}, "video.height: expected at least 16, not 15"),
-        (FilmSettings, {"max_seconds": 0}, "video.max_seconds: expected more than 0, not 0"),
+        (VideoSettings, {"height": 15}, "video.height: expected at least 16, not 15"),
+        (VideoSettings, {"max_seconds": 0}, "video.max_seconds: expected more than 0, not 0"),
     ],
 )
 def test_what_cannot_be_shown(

@@ -30,7 +30,7 @@ FEWEST = 8
 
 
 @dataclass(frozen=True)
-class FilmSettings:
+class VideoSettings:
     """The videos that ``stage=render`` writes.
 
     Attributes:
@@ -71,7 +71,7 @@ class FilmSettings:
         """Captured cameras with images of the video's size."""
         return sized(cameras, self.height)
 
-    def within_limit(self, seconds: float) -> FilmSettings:
+    def within_limit(self, seconds: float) -> VideoSettings:
         """The settings for images that take ``seconds`` each: fewer frames if need be."""
         most = self.frames if self.max_seconds is None else int(self.max_seconds / seconds)
         frames = min(self.frames, max(most, FEWEST))
@@ -103,7 +103,7 @@ def held_out_pictures(
     renderer: Renderer,
     views: Views,
     images: Sequence[int],
-    film: FilmSettings,
+    film: VideoSettings,
     background: Background,
 ) -> Iterator[Tensor]:
     """Truth, rendering and depth (H', W', 3) side by side, while time runs from 0 to 1.
@@ -136,7 +136,7 @@ def write_video(path: Path, images: Iterator[Tensor], fps: float) -> None:
     write_pictures(path, (to_bytes(image).numpy() for image in images), fps)
 
 
-def film_bytes(film: FilmSettings, cameras: Cameras) -> int:
+def video_bytes(film: VideoSettings, cameras: Cameras) -> int:
     """Upper estimate of the size in bytes of both videos, for the captured cameras.
 
     Two images a frame in one, three in the other, and labels above them.
@@ -146,12 +146,12 @@ def film_bytes(film: FilmSettings, cameras: Cameras) -> int:
 
 
 # The cameras of a film of some settings, around a scene or before it.
-Ring = Callable[[FilmSettings], Cameras]
+Ring = Callable[[VideoSettings], Cameras]
 # Cameras and as many times in [0, 1].
 Shots = tuple[Cameras, list[float]]
 
 
-def orbit(cameras: Cameras, box: Box, settings: FilmSettings) -> Cameras:
+def orbit(cameras: Cameras, box: Box, settings: VideoSettings) -> Cameras:
     """Cameras on a circle around a box, looking at its middle.
 
     Args:
@@ -170,7 +170,7 @@ def orbit(cameras: Cameras, box: Box, settings: FilmSettings) -> Cameras:
     return _ring(cameras, center, radius * math.cos(height) * axes, middle, up, settings)
 
 
-def spiral(cameras: Cameras, focus: float, settings: FilmSettings) -> Cameras:
+def spiral(cameras: Cameras, focus: float, settings: VideoSettings) -> Cameras:
     """Cameras on a small ring before a forward-facing scene, looking at one point in it.
 
     Args:
@@ -186,12 +186,12 @@ def spiral(cameras: Cameras, focus: float, settings: FilmSettings) -> Cameras:
     return _ring(cameras, middle, radii[:, None] * axes, middle - focus * back, up, settings)
 
 
-def bullet_time(ring: Ring, moment: float, settings: FilmSettings) -> Shots:
+def bullet_time(ring: Ring, moment: float, settings: VideoSettings) -> Shots:
     """Once around the scene while its time stands still at ``moment``."""
     return ring(settings), [moment] * settings.frames
 
 
-def time_freeze(ring: Ring, moment: float, settings: FilmSettings) -> Shots:
+def time_freeze(ring: Ring, moment: float, settings: VideoSettings) -> Shots:
     """Time runs to ``moment`` and stands still while the camera goes round; then it runs on.
 
     Each takes a third of the frames.
@@ -235,7 +235,7 @@ def _ring(
     axes: Tensor,
     target: Tensor,
     up: Tensor,
-    settings: FilmSettings,
+    settings: VideoSettings,
 ) -> Cameras:
     """Cameras on the ellipse about ``center`` with the half axes (2, 3), looking at ``target``."""
     angle = torch.arange(settings.frames) * (2 * math.pi * settings.orbit_turns / settings.frames)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from devrf.apps.video import film_bytes
+from devrf.apps.video import video_bytes
 from devrf.callbacks import PeriodicCheckpoint
 from devrf.cli.context import RunContext
 from devrf.cli.memory import IMAGES, Budget, Parts, estimate, module_needs, tensor_bytes
@@ -131,7 +131,7 @@ def preflight(run: RunContext, learns: Sequence[str], *, films: bool) -> str | N
     if config.resume:  # these files will be replaced
         free += sum(file.stat().st_size for file in run.folder.glob("checkpoints/*.ckpt"))
     if films:
-        videos = film_bytes(instantiate(config.video), run.scene.static.train.cameras)
+        videos = video_bytes(instantiate(config.video), run.scene.static.train.cameras)
     disk = budget.disk(kept=PeriodicCheckpoint.KEPT, films=videos)
     needs.append(Requirement("disk", disk, free, stage.held, disk))
     return check(needs, lambda key: OmegaConf.select(config, key, default="") != "")

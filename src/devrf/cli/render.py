@@ -14,7 +14,7 @@ from torch import Tensor
 from devrf.apps.keyframes import cameras_of, read_path
 from devrf.apps.still import still
 from devrf.apps.video import (
-    FilmSettings,
+    VideoSettings,
     bullet_time,
     focus_distance,
     held_out_images,
@@ -43,7 +43,7 @@ def render(run: RunContext) -> None:
 
     With ``video.path`` that path alone is filmed.
     """
-    film: FilmSettings = instantiate(run.config.video)
+    film: VideoSettings = instantiate(run.config.video)
     path = None if film.path in (None, *PRESETS) else read_path(Path(str(film.path)))
     stored, scene = run.load(), run.scene
     renderer = Renderer(stored.model.to_view(run.device), half=film.half)
@@ -54,7 +54,7 @@ def render(run: RunContext) -> None:
     film, captured = _within_limit(film, renderer, views), film.sized(scene.static.train.cameras)
     forward = scene.kind == "forward"
 
-    def ring(settings: FilmSettings) -> Cameras:
+    def ring(settings: VideoSettings) -> Cameras:
         if forward:
             focus = focus_distance(renderer, scene.static.train.cameras)
             return spiral(captured, focus, settings)
@@ -76,7 +76,7 @@ def render(run: RunContext) -> None:
         _write(run, film, "spiral" if forward else "orbit", shown)
 
 
-def check_path(film: FilmSettings) -> None:
+def check_path(film: VideoSettings) -> None:
     """Check that ``video.path`` can be filmed, long before it is.
 
     Raises:
@@ -86,7 +86,7 @@ def check_path(film: FilmSettings) -> None:
         _ = read_path(Path(str(film.path))).frames
 
 
-def _within_limit(film: FilmSettings, renderer: Renderer, views: Views) -> FilmSettings:
+def _within_limit(film: VideoSettings, renderer: Renderer, views: Views) -> VideoSettings:
     """The settings, with fewer frames where ``video.max_seconds`` would not suffice."""
     if film.max_seconds is None:
         return film
@@ -106,7 +106,7 @@ def _within_limit(film: FilmSettings, renderer: Renderer, views: Views) -> FilmS
     return fewer
 
 
-def _write(run: RunContext, film: FilmSettings, name: str, images: Iterator[Tensor]) -> None:
+def _write(run: RunContext, film: VideoSettings, name: str, images: Iterator[Tensor]) -> None:
     path = run.folder / "videos" / f"{name}.mp4"
     write_video(path, followed(images, film.frames, f"{name}.mp4"), film.fps)
     log.info("video written to %s", path)

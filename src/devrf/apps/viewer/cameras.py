@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from kornia.geometry.conversions import (
@@ -14,21 +13,21 @@ from kornia.geometry.conversions import (
 )
 from torch import Tensor
 
+from devrf.apps.images import evenly, scaled, to_bytes
+from devrf.evaluation.held_out import truth_image
 from devrf.geometry.cameras import Cameras
+from devrf.scenes.scene import Scene, Views
 
 if TYPE_CHECKING:
-    from viser import CameraHandle
-import threading
-
-import viser
-
-from devrf.apps.images import evenly, scaled, to_bytes
-from devrf.checkpoints.checkpoint import Viewpoints
-from devrf.evaluation.held_out import truth_image
-from devrf.scenes.scene import Background, Scene, Views
+    import viser
 
 # From OpenGL's camera axes (y up, z backwards) to OpenCV's (y down, z forwards), and back.
 FLIP = (1.0, -1.0, -1.0)
+# Rows of an image in a frustum, and the most frusta of a capture.
+ROWS, MAX_FRUSTA = 96, 60
+# A frustum's depth as a share of the cameras' extent.
+DEPTH = 0.04
+COLOR = (40, 110, 170)
 
 
 @dataclass(frozen=True)
@@ -42,8 +41,8 @@ class Pose:
         aspect: width over height.
     """
 
-    wxyz: tuple[float, ...]
-    position: tuple[float, ...]
+    wxyz: tuple[float, float, float, float]
+    position: tuple[float, float, float]
     fov: float
     aspect: float
 
@@ -52,28 +51,32 @@ class Pose:
         """The pose of a camera (3, 4) with OpenGL axes; ``fov`` in radians."""
         pose = camera_to_world.double().cpu()
         turned = pose[:, :3] * pose.new_tensor(FLIP)
-        wxyz = rotation_matrix_to_quaternion(turned[None])[0]
-        return Pose(tuple(wxyz.tolist()), tuple(pose[:, 3].tolist()), fov, aspect)
+        w, x, y, z = rotation_matrix_to_quaternion(turned[None])[0].tolist()
+        px, py, pz = pose[:, 3].tolist()
+        return Pose((w, x, y, z), (px, py, pz), fov, aspect)
 
     @staticmethod
-    def of_browser(camera: CameraHandle) -> Pose:
+    def of_browser(camera: viser.CameraHandle) -> Pose:
         """The pose that a page is looked at from."""
-        return Pose(tuple(camera.wxyz), tuple(camera.position), camera.fov, camera.aspect)
+        w, x, y, z = map(float, camera.wxyz)
+        px, py, pz = map(float, camera.position)
+        return Pose((w, x, y, z), (px, py, pz), camera.fov, camera.aspect)
 
     @staticmethod
     def of_cameras(cameras: Cameras, index: int) -> Pose:
-        """The pose of one of N cameras."""
-        fov = 2 * math.atan(cameras.height / 2 / float(cameras.focal[index, 1]))
-        # Its pixels need not be square.
-        wide = 2 * math.atan(cameras.width / 2 / float(cameras.focal[index, 0]))
-        return Pose.of(cameras.camera_to_world[index], fov, math.tan(wide / 2) / math.tan(fov / 2))
+        """The pose of one of N cameras, whose pixels need not be square."""
+        fx, fy = cameras.focal[index].tolist()
+        aspect = (cameras.width / fx) / (cameras.height / fy)
+        return Pose.of(
+            cameras.camera_to_world[index], 2 * math.atan(cameras.height / 2 / fy), aspect
+        )
 
     @property
     def camera_to_world(self) -> Tensor:
         """(3, 4) float64, OpenGL axes."""
-        turned = quaternion_to_rotation_matrix(_row(self.wxyz))[0]
-        rotation = turned * turned.new_tensor(FLIP)
-        return torch.cat([rotation, _row(self.position).T], dim=1)
+        turned = quaternion_to_rotation_matrix(torch.tensor([self.wxyz], dtype=torch.float64))[0]
+        position = turned.new_tensor(self.position)
+        return torch.cat([turned * turned.new_tensor(FLIP), position[:, None]], dim=1)
 
     def camera(self, height: int) -> Cameras:
         """One camera, with images ``height`` pixels high."""
@@ -88,142 +91,98 @@ class Pose:
         )
 
 
-def _row(numbers: Sequence[float]) -> Tensor:
-    return torch.tensor([[float(one) for one in numbers]], dtype=torch.float64)
-
-
-# Rows of a picture in a frustum, and the most frusta of a capture.
-ROWS, MOST = 96, 60
-# A frustum's depth as a share of the cameras' extent.
-SHARE = 0.04
-
-
-@dataclass(frozen=True)
-class Frustum:
+class Frustum(NamedTuple):
     """A captured camera.
 
     Attributes:
         name: tells it from others; the same for a fixed camera at every time.
         pose: where it is.
-        picture: (H', W', 3) uint8, what it took; None where no image was read.
+        image: (H', W', 3) uint8, what it took; None where no image was read.
     """
 
     name: str
     pose: Pose
-    picture: Tensor | None
+    image: Tensor | None
 
 
-def moving_frusta(scene: Scene, time: float) -> list[Frustum]:
-    """The cameras that saw the scene move, at their images' time that is nearest to ``time``."""
+def dynamic_frusta(scene: Scene, time: float) -> list[Frustum]:
+    """The cameras that saw the scene move, at one of their images' times."""
     views = scene.dynamic.train
-    nearest = views.times[int((views.times - time).abs().argmin())]
-    images = ((views.times - nearest).abs() < scene.clock.TOLERANCE).nonzero()[:, 0].tolist()
+    images = ((views.times - time).abs() < scene.clock.TOLERANCE).nonzero()[:, 0].tolist()
+    chosen = [images[k] for k in evenly(len(images), MAX_FRUSTA)]
     return [
-        _frustum(views, k, f"moving/{int(views.view[k])}", scene.background) for k in _few(images)
+        Frustum(
+            f"moving/{int(views.view[k])}",
+            Pose.of_cameras(views.cameras, k),
+            _thumbnail(scene, views, k),
+        )
+        for k in chosen
     ]
 
 
-def resting_frusta(scene: Scene) -> list[Frustum]:
-    """The cameras that saw the scene at rest."""
-    views = scene.static.train
+def static_frusta(cameras: Cameras, scene: Scene | None) -> list[Frustum]:
+    """The cameras that saw the scene at rest, with images if there is a scene."""
     return [
-        _frustum(views, k, f"static/{k}", scene.background) for k in _few(list(range(len(views))))
+        Frustum(
+            f"static/{k}",
+            Pose.of_cameras(cameras, k),
+            None if scene is None else _thumbnail(scene, scene.static.train, k),
+        )
+        for k in evenly(len(cameras), MAX_FRUSTA)
     ]
 
 
-def bare_frusta(cameras: Cameras) -> list[Frustum]:
-    """Cameras of which no image was read."""
-    return [
-        Frustum(f"static/{k}", Pose.of_cameras(cameras, k), None)
-        for k in _few(list(range(len(cameras))))
-    ]
-
-
-def frustum_scale(cameras: Cameras) -> float:
-    """How deep frusta are drawn, in world units."""
-    positions = cameras.positions
-    extent = float((positions.amax(dim=0) - positions.amin(dim=0)).norm())
-    return SHARE * extent if extent > 0 else SHARE
-
-
-def _few(images: list[int]) -> list[int]:
-    return [images[k] for k in evenly(len(images), MOST)]
-
-
-def _frustum(views: Views, index: int, name: str, background: Background) -> Frustum:
-    picture = truth_image(views, index, background)
-    if views.height > ROWS:
-        picture = scaled(picture, ROWS)
-    pose = Pose.of_cameras(views.cameras, index)
-    return Frustum(name, pose, to_bytes(picture))
-
-
-COLOR = (40, 110, 170)
+def _thumbnail(scene: Scene, views: Views, index: int) -> Tensor:
+    image = truth_image(views, index, scene.background)
+    return to_bytes(scaled(image, min(views.height, ROWS)))
 
 
 class FrustaLayer:
-    """Frusta in the scene, of which only those that changed are sent to the browser."""
+    """The captured cameras in the page's scene."""
 
-    def __init__(
-        self, server: viser.ViserServer, viewpoints: Viewpoints, scene: Scene | None
-    ) -> None:
+    def __init__(self, server: viser.ViserServer, cameras: Cameras, scene: Scene | None) -> None:
         """Show none yet.
 
         Args:
             server: of the page.
-            viewpoints: the captured cameras.
+            cameras: that saw the scene at rest.
             scene: with their images; None where they cannot be read.
         """
-        self._server, self._scene, self._static = server, scene, viewpoints.static
-        self._scale = frustum_scale(viewpoints.static)
-        self._shown: dict[str, viser.CameraFrustumHandle] = {}
-        self._pictures: dict[str, Tensor | None] = {}
-        self._last: object = None
-        self._lock = threading.Lock()
+        self._server, self._cameras, self._scene = server, cameras, scene
+        extent = float((cameras.positions.amax(dim=0) - cameras.positions.amin(dim=0)).norm())
+        self._depth = DEPTH * (extent or 1.0)
+        self._handles: dict[str, viser.CameraFrustumHandle] = {}
+        self._shown: object = None
 
-    def show(self, moving: bool, resting: bool, time: float) -> None:
-        """Show the cameras of the chosen captures, with their pictures at ``time``."""
-        wanted = (moving, resting, time if moving else 0.0)
-        with self._lock:
-            if wanted != self._last:
-                self._last = wanted
-                self._put(self._chosen(moving, resting, time))
+    def show(self, dynamic: bool, static: bool, time: float) -> None:
+        """Show the cameras of the chosen captures, with their images of the nearest time."""
+        nearest = None
+        if dynamic and self._scene is not None:
+            times = self._scene.dynamic.train.times
+            nearest = float(times[int((times - time).abs().argmin())])
+        if (static, nearest) == self._shown:
+            return
+        self._shown = static, nearest
+        frusta = static_frusta(self._cameras, self._scene) if static else []
+        if nearest is not None and self._scene is not None:
+            frusta += dynamic_frusta(self._scene, nearest)
+        for name in set(self._handles) - {frustum.name for frustum in frusta}:
+            self._handles.pop(name).remove()
+        for frustum in frusta:
+            if frustum.name not in self._handles:
+                self._handles[frustum.name] = self._added(frustum)
+            elif frustum.image is not None:
+                self._handles[frustum.name].image = frustum.image.numpy()
 
-    def _chosen(self, moving: bool, resting: bool, time: float) -> list[Frustum]:
-        scene = self._scene
-        at_rest: list[Frustum] = []
-        if resting:
-            at_rest = bare_frusta(self._static) if scene is None else resting_frusta(scene)
-        return at_rest + (moving_frusta(scene, time) if moving and scene is not None else [])
-
-    def _put(self, frusta: list[Frustum]) -> None:
-        names = {one.name for one in frusta}
-        for name in set(self._shown) - names:
-            self._shown.pop(name).remove()
-            del self._pictures[name]
-        for one in frusta:
-            if one.name not in self._shown:
-                self._shown[one.name] = self._added(one)
-            elif not _same(self._pictures[one.name], one.picture) and one.picture is not None:
-                self._shown[one.name].image = one.picture.numpy()
-            self._pictures[one.name] = one.picture
-
-    def _added(self, one: Frustum) -> viser.CameraFrustumHandle:
-        pose = one.pose
-        w, x, y, z = pose.wxyz
-        px, py, pz = pose.position
+    def _added(self, frustum: Frustum) -> viser.CameraFrustumHandle:
         return self._server.scene.add_camera_frustum(
-            f"/cameras/{one.name}",
-            pose.fov,
-            pose.aspect,
-            scale=self._scale,
-            thickness=0.02 * self._scale,
+            f"/cameras/{frustum.name}",
+            frustum.pose.fov,
+            frustum.pose.aspect,
+            scale=self._depth,
+            thickness=0.02 * self._depth,
             color=COLOR,
-            image=None if one.picture is None else one.picture.numpy(),
-            wxyz=(w, x, y, z),
-            position=(px, py, pz),
+            image=None if frustum.image is None else frustum.image.numpy(),
+            wxyz=frustum.pose.wxyz,
+            position=frustum.pose.position,
         )
-
-
-def _same(one: Tensor | None, other: Tensor | None) -> bool:
-    return one is other or (one is not None and other is not None and torch.equal(one, other))

@@ -1,4 +1,4 @@
-"""What is chosen on the page: time, picture, cameras, crop."""
+"""What is chosen on the page: current time, channel, cameras, crop."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from devrf.apps.viewer.cameras import Pose
 from devrf.apps.viewer.drawing import Drawing, Shot
 from devrf.geometry.box import Box
 
+SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
 # How long the whole recording takes at speed 1, in seconds.
 DURATION = 5.0
 
@@ -24,7 +25,7 @@ class Playback:
     Attributes:
         time: in [0, 1].
         playing: whether time runs.
-        loop: whether it begins anew at its end; otherwise it stops there.
+        loop: whether it restarts at its end; otherwise it stops there.
         speed: recordings for each :data:`DURATION` seconds.
     """
 
@@ -42,12 +43,11 @@ class Playback:
             return replace(self, time=time)
         return replace(self, time=time % 1) if self.loop else replace(self, time=1.0, playing=False)
 
-    def started(self) -> Playback:
-        """Time runs, from its beginning where it stood at its end."""
+    def toggled(self) -> Playback:
+        """Time stands if it ran, else it runs: from its beginning where it stood at its end."""
+        if self.playing:
+            return replace(self, playing=False)
         return replace(self, playing=True, time=0.0 if self.time >= 1 else self.time)
-
-
-SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
 
 
 def set_value(control: Any, value: object) -> None:
@@ -56,16 +56,20 @@ def set_value(control: Any, value: object) -> None:
 
 
 class Controls:
-    """The page's controls, the same for all who have it open."""
+    """The page's controls, the same for all who have it open.
+
+    Attributes:
+        playback: the time that is shown, and whether it runs.
+    """
 
     def __init__(self, server: viser.ViserServer, changed: Callable[[], None]) -> None:
         """Put them on the page.
 
         Args:
             server: of the page.
-            changed: called when a picture must be rendered anew; from any thread.
+            changed: called when a frame must be rendered again; from any thread.
         """
-        self._playback, self._lock, self._changed = Playback(), threading.Lock(), changed
+        self.playback, self._lock, self._changed = Playback(), threading.Lock(), changed
         gui = server.gui
         with gui.add_folder("Time"):
             self._time = gui.add_slider("time", 0.0, 1.0, 0.001, 0.0, hint="0 is the rest state")
@@ -79,8 +83,8 @@ class Controls:
             self._rest = gui.add_checkbox("rest beside", False, hint="the rest state on the left")
             self._status = gui.add_markdown("")
         with gui.add_folder("Cameras", expand_by_default=False):
-            self.moving = gui.add_checkbox("in motion", False, hint="with their pictures then")
-            self.resting = gui.add_checkbox("at rest", False, hint="with their pictures at rest")
+            self.dynamic = gui.add_checkbox("in motion", False, hint="with their pictures then")
+            self.static = gui.add_checkbox("at rest", False, hint="with their pictures at rest")
         with gui.add_folder("Crop", expand_by_default=False):
             self._crop = gui.add_checkbox("crop", False)
             self._sides = [
@@ -89,16 +93,11 @@ class Controls:
             ]
         self._time.on_update(self._time_set)
         self._play.on_click(self._play_pressed)
-        for one in (self._loop, self._speed):
-            one.on_update(self._pace_set)
-        every: list[Any] = [self._channel, self._rest, self.moving, self.resting]
-        for one in (*every, self._crop, *self._sides):
-            one.on_update(lambda _: self._changed())
-
-    @property
-    def playback(self) -> Playback:
-        """The time that is shown, and whether it runs."""
-        return self._playback
+        self._loop.on_update(self._pace_set)
+        self._speed.on_update(self._pace_set)
+        boxes: list[Any] = [self._channel, self._rest, self.dynamic, self.static, self._crop]
+        for control in (*boxes, *self._sides):
+            control.on_update(lambda _: self._changed())
 
     def offer(self, drawing: Drawing) -> None:
         """Offer what can be shown of a scene."""
@@ -106,23 +105,22 @@ class Controls:
         self._channel.options = drawing.channels
         set_value(self._channel, chosen if chosen in drawing.channels else "color")
         self._rest.visible = drawing.has_rest
-        for one in (self._time, self._play, self._loop, self._speed):
-            one.disabled = drawing.at_rest
+        for control in (self._time, self._play, self._loop, self._speed):
+            control.disabled = drawing.at_rest
 
     def advance(self, seconds: float) -> bool:
         """Let time run for ``seconds``; whether it has changed."""
-        before = self._change(lambda now: now.advanced(seconds))
-        if before == self._playback:
+        before = self.playback
+        self._change(lambda now: now.advanced(seconds))
+        if before == self.playback:
             return False
-        set_value(self._time, self._playback.time)
-        self._label()
+        set_value(self._time, self.playback.time)
         return True
 
     def set_time(self, time: float) -> None:
         """Show another time, at which time stands."""
         self._change(lambda now: replace(now, time=time, playing=False))
         set_value(self._time, time)
-        self._label()
 
     def shot(self, pose: Pose, box: Box, *, with_depth: bool) -> Shot:
         """What a camera is to show.
@@ -134,26 +132,29 @@ class Controls:
         """
         crop = None
         if self._crop.value:
-            ends = [[share / 100 for share in one.value] for one in self._sides]
-            low, size = box.low, box.size
+            shares = [[share / 100 for share in slider.value] for slider in self._sides]
+            corners = list(zip(box.low, box.size, shares, strict=True))
             crop = Box.of(
-                [low[k] + ends[k][0] * size[k] for k in range(3)],
-                [low[k] + max(ends[k][1], ends[k][0] + 0.01) * size[k] for k in range(3)],
+                [low + size * first for low, size, (first, _) in corners],
+                [low + size * max(last, first + 0.01) for low, size, (first, last) in corners],
             )
-        with_depth = with_depth or self.moving.value or self.resting.value
+        with_depth = with_depth or self.dynamic.value or self.static.value
         beside = self._rest.value and self._rest.visible
-        return Shot(pose, self._playback.time, self._channel.value, beside, crop, with_depth)
+        return Shot(pose, self.playback.time, self._channel.value, beside, crop, with_depth)
 
-    def say(self, text: str) -> None:
-        """Show a line below the choice of pictures."""
+    def show_status(self, text: str) -> None:
+        """Show a line below the choice of channels."""
         if self._status.content != text:
             self._status.content = text
 
-    def _change(self, change: Callable[[Playback], Playback]) -> Playback:
-        """Change the playback; return what it was."""
-        with self._lock:
-            before, self._playback = self._playback, change(self._playback)
-        return before
+    def _change(self, change: Callable[[Playback], Playback]) -> None:
+        """Change the playback, and the button that says what it does."""
+        with self._lock:  # the clock and the page change it
+            self.playback = change(self.playback)
+        playing = self.playback.playing
+        if self._play.label != ("Pause" if playing else "Play"):
+            self._play.label = "Pause" if playing else "Play"
+            self._play.icon = viser.Icon.PLAYER_PAUSE if playing else viser.Icon.PLAYER_PLAY
 
     def _time_set(self, event: viser.GuiEvent[Any]) -> None:
         if event.client is None:  # set by this program
@@ -162,16 +163,9 @@ class Controls:
         self._changed()
 
     def _play_pressed(self, _: object) -> None:
-        self._change(lambda now: replace(now, playing=False) if now.playing else now.started())
-        self._label()
+        self._change(Playback.toggled)
         self._changed()
 
     def _pace_set(self, _: object) -> None:
         loop, speed = bool(self._loop.value), float(self._speed.value)
         self._change(lambda now: replace(now, loop=loop, speed=speed))
-
-    def _label(self) -> None:
-        playing = self._playback.playing
-        if self._play.label != ("Pause" if playing else "Play"):
-            self._play.label = "Pause" if playing else "Play"
-            self._play.icon = viser.Icon.PLAYER_PAUSE if playing else viser.Icon.PLAYER_PLAY

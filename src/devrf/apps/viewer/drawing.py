@@ -6,7 +6,6 @@ import threading
 import time
 from collections.abc import Callable, Hashable, Iterator
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -24,15 +23,18 @@ from devrf.rendering.view import MovingView
 STEP, SATURATED = 0.05, 0.02
 # A pixel is something that is seen from this opacity on.
 SOLID = 0.5
-# Seconds that a block of rays should take: between blocks a picture can be given up.
-BLOCK_SECONDS, FEWEST = 0.08, 512
+# Seconds that a block of rays should take: between blocks a frame can be given up.
+BLOCK_SECONDS, MIN_RAYS = 0.08, 512
 # In empty space nothing hides what is drawn into the scene.
 NOWHERE = 1e3
+# A finer frame has at most so many times the rows of the one before; one that would be nearly
+# full is full at once.
+FINER, NEARLY = 3, 0.75
 
 
 @dataclass(frozen=True)
 class Shot:
-    """What a picture is to show.
+    """What a frame is to show.
 
     Attributes:
         pose: the camera.
@@ -52,8 +54,8 @@ class Shot:
 
 
 @dataclass(frozen=True)
-class Picture:
-    """A finished picture.
+class Frame:
+    """A finished frame.
 
     Attributes:
         pixels: (H, W, 3) uint8, on the host.
@@ -87,23 +89,23 @@ class Drawing:
         self._rays_per_second = 20_000.0
         self._overhead = 0.0
 
-    def renew(self, renderer: Renderer) -> None:
+    def set_renderer(self, renderer: Renderer) -> None:
         """Draw what the scene has become, by a renderer without views of before."""
         self.renderer = renderer
 
     def height_within(self, seconds: float, aspect: float, height: int) -> int:
-        """The rows of a picture that takes about ``seconds``, at most ``height``."""
+        """The rows of a frame that takes about ``seconds``, at most ``height``."""
         left = max(seconds - self._overhead, seconds / 4)
         rows = (left * self._rays_per_second / aspect) ** 0.5
         return max(min(height, int(rows)), min(height, 16))
 
-    def draw(self, shot: Shot, height: int) -> Iterator[Picture | None]:
-        """Render a shot: None after each block of rays, then the picture."""
+    def draw(self, shot: Shot, height: int) -> Iterator[Frame | None]:
+        """Render a shot: None after each block of rays, then the frame."""
         began = time.perf_counter()
-        moments = [0.0, shot.time] if shot.beside_rest and self.has_rest else [shot.time]
-        parts, depths = [], []
-        for moment in moments:
-            aspect = shot.pose.aspect / len(moments)
+        times = [0.0, shot.time] if shot.beside_rest and self.has_rest else [shot.time]
+        parts, depth = [], None
+        for moment in times:
+            aspect = shot.pose.aspect / len(times)
             camera = replace(shot.pose, aspect=aspect).camera(height).to(self.renderer.device)
             started = time.perf_counter()
             with torch.no_grad():
@@ -116,38 +118,34 @@ class Drawing:
             image = RenderedImage.joined([image for image, _ in blocks])
             vectors = torch.cat([flow for _, flow in blocks])
             parts.append(self._colored(shot.channel, camera, image, vectors))
-            if shot.with_depth and len(moments) == 1:
-                depths.append(self._axial(camera, image))
-            seconds = max(time.perf_counter() - started, 1e-4)
-            speed = camera.width * camera.height / seconds
+            if shot.with_depth and len(times) == 1:
+                depth = self._axial(camera, image)
+            speed = camera.width * camera.height / max(time.perf_counter() - started, 1e-4)
             self._rays_per_second += 0.5 * (speed - self._rays_per_second)
-        yield Picture(
-            to_bytes(torch.cat(parts, dim=1)),
-            depths[0] if depths else None,
-            time.perf_counter() - began,
-        )
+        yield Frame(to_bytes(torch.cat(parts, dim=1)), depth, time.perf_counter() - began)
 
     @torch.no_grad()
     def _blocks(
-        self, shot: Shot, camera: Cameras, moment: float
+        self, shot: Shot, camera: Cameras, time: float
     ) -> Iterator[tuple[RenderedImage, Tensor]]:
         """Consecutive pixels in row-major order, with the motion (K, 2) where it is shown."""
         rays, pixels = camera.image_rays(0), camera.pixel_grid()
         crop = shot.crop or self.renderer.reach(camera.positions[0])
-        size = max(FEWEST, int(BLOCK_SECONDS * self._rays_per_second))
+        size = max(MIN_RAYS, int(BLOCK_SECONDS * self._rays_per_second))
         for first in range(0, len(rays), size):
-            some = slice(first, first + size)
-            image = self.renderer.picture(rays[some], moment, self._background, crop)
-            wanted = shot.channel == "motion"
-            vectors = self._motion(rays[some], pixels[some], camera, moment) if wanted else None
-            yield image, torch.zeros_like(image.color[:, :2]) if vectors is None else vectors
+            block = slice(first, first + size)
+            image = self.renderer.picture(rays[block], time, self._background, crop)
+            vectors = torch.zeros_like(image.color[:, :2])
+            if shot.channel == "motion":
+                vectors = self._motion(rays[block], pixels[block], camera, time)
+            yield image, vectors
 
-    def _motion(self, rays: Rays, pixels: Tensor, camera: Cameras, moment: float) -> Tensor:
+    def _motion(self, rays: Rays, pixels: Tensor, camera: Cameras, time: float) -> Tensor:
         """Optical flow (K, 2) in pixels over the next :data:`STEP`, at the end over the last."""
-        view = self.renderer.at(moment)
+        view = self.renderer.at(time)
         assert isinstance(view, MovingView)
-        later = moment + STEP if moment + STEP <= 1 else moment - STEP
-        own, flows, first = self.renderer.model.space.rays(rays), [], 0
+        later = time + STEP if time + STEP <= 1 else time - STEP
+        first = 0
 
         def flow(part: Rays) -> Tensor:
             nonlocal first
@@ -155,8 +153,8 @@ class Drawing:
             first += len(part)
             return mean
 
-        flows = in_chunks(flow, own, view.chunk)
-        return torch.cat(flows) * (1 if later > moment else -1)
+        flows = in_chunks(flow, self.renderer.model.space.rays(rays), view.chunk)
+        return torch.cat(flows) * (1 if later > time else -1)
 
     def _colored(
         self, channel: str, camera: Cameras, image: RenderedImage, vectors: Tensor
@@ -179,39 +177,21 @@ class Drawing:
     def _axial(self, camera: Cameras, image: RenderedImage) -> Tensor:
         """(H, W) world distances along the camera's axis; far away where nothing is."""
         space = self.renderer.model.space
-        own = space.rays(camera.image_rays(0))
-        points = own.at(torch.arange(len(own), device=own.origins.device), image.depth)
+        rays = space.rays(camera.image_rays(0))
+        points = rays.at(torch.arange(len(rays), device=rays.origins.device), image.depth)
         _, depth = camera.project_into(0, space.to_world(points))
         depth = torch.where(image.opacity > SOLID, depth, NOWHERE)
         return depth.view(camera.height, camera.width).cpu()
 
 
-# A finer picture has at most so many times the rows of the one before.
-FINER = 3
-# Nearly full is made full at once.
-NEARLY = 0.75
-
-
-class Draws(Protocol):
-    """What renders: a :class:`~devrf.apps.viewer.drawing.Drawing`."""
-
-    def height_within(self, seconds: float, aspect: float, height: int) -> int:
-        """The rows of a picture that takes about ``seconds``, at most ``height``."""
-        ...
-
-    def draw(self, shot: Shot, height: int) -> Iterator[Picture | None]:
-        """Render a shot: None as often as it could be given up, then the picture."""
-        ...
-
-
 @dataclass
-class _Asked:
-    """What one viewer wants, and how far it has come.
+class _Request:
+    """What one browser wants, and how far it has come.
 
     Attributes:
         shot: the newest one.
-        number: counts the shots of all viewers, in order.
-        rows: of the last picture of it that was shown; 0 before the first.
+        number: counts the shots of all browsers, in order.
+        rows: of the last frame of it that was shown; 0 before the first.
     """
 
     shot: Shot
@@ -220,108 +200,100 @@ class _Asked:
 
 
 class RenderScheduler:
-    """Renders the newest shot of each viewer, coarse first; a finer picture ends when one moves.
+    """Renders the newest shot of each browser, coarse first; a finer frame ends when one moves.
 
-    Shots may be asked for from any thread; pictures are rendered by the one that calls
-    :meth:`render_next`. A coarse picture is always finished: while a camera moves without pause
-    it would never be seen otherwise.
+    Shots may be asked for from any thread; frames are rendered by the one that calls
+    :meth:`render_next`. A coarse frame is always finished: while a camera moves without pause it
+    would never be seen otherwise.
     """
 
     def __init__(
         self,
-        drawing: Draws,
-        show: Callable[[Hashable, Shot, Picture], None],
+        drawing: Drawing,
+        show: Callable[[Hashable, Frame], None],
         *,
         height: int,
         move_seconds: float,
-        stop: threading.Event | None = None,
+        stop: threading.Event,
     ) -> None:
         """Begin with nothing to render.
 
         Args:
             drawing: renders.
-            show: takes each picture, with the viewer's key.
-            height: rows of a full picture.
-            move_seconds: about what a first picture may take.
-            stop: once set, the present picture is given up, coarse or not.
+            show: takes each frame, with the browser's key.
+            height: rows of a full frame.
+            move_seconds: about what a first frame may take.
+            stop: once set, the current frame is given up, coarse or not.
         """
-        self._stop = stop or threading.Event()
-        self.drawing = drawing
+        self.drawing, self._stop = drawing, stop
         self._show, self._height, self._move_seconds = show, height, move_seconds
-        self._asked: dict[Hashable, _Asked] = {}
+        self._requests: dict[Hashable, _Request] = {}
         self._number = 0
         self._change = threading.Condition()
 
     def ask(self, key: Hashable, shot: Shot) -> None:
-        """Render ``shot`` for the viewer ``key``, instead of what it asked for before."""
+        """Render ``shot`` for the browser ``key``, instead of what it asked for before."""
         with self._change:
             self._number += 1
-            self._asked[key] = _Asked(shot, self._number)
+            self._requests[key] = _Request(shot, self._number)
             self._change.notify()
 
     def again(self) -> None:
-        """Render what every viewer asked for anew: the scene has changed."""
+        """Render again what every browser asked for: the scene has changed."""
         with self._change:
-            for one in self._asked.values():
-                one.rows = 0
-            self._change.notify()
+            for request in self._requests.values():
+                request.rows = 0
 
     def drop(self, key: Hashable) -> None:
-        """Forget a viewer."""
+        """Forget a browser."""
         with self._change:
-            self._asked.pop(key, None)
+            self._requests.pop(key, None)
 
     @property
     def watched(self) -> bool:
         """Whether anyone has asked for anything."""
-        return bool(self._asked)
+        return bool(self._requests)
 
     def render_next(self, timeout: float) -> bool:
-        """Render the most urgent picture, and show it.
+        """Render the most urgent frame, and show it.
 
         Args:
             timeout: seconds to wait for something to render.
 
         Returns:
-            Whether a picture was shown.
+            Whether a frame was shown.
         """
-        until = time.monotonic() + timeout
         with self._change:
-            while (found := self._most_urgent()) is None:
-                left = until - time.monotonic()
-                if left <= 0 or not self._change.wait(left):
-                    return False
-        key, asked = found
-        rows, coarse = self._next_rows(asked), asked.rows == 0
-        for picture in self.drawing.draw(asked.shot, rows):
-            if picture is None:
-                if self._stop.is_set() or (not coarse and self._overtaken(key, asked)):
-                    return False
-                continue
-            with self._change:
-                present = key in self._asked
-                asked.rows = rows
-            if present:
-                self._show(key, asked.shot, picture)
-            return present
+            self._change.wait_for(self._most_urgent, timeout)
+            urgent = self._most_urgent()
+        if urgent is None:
+            return False
+        key, request = urgent
+        rows, coarse = self._next_rows(request), request.rows == 0
+        for frame in self.drawing.draw(request.shot, rows):
+            if frame is not None:
+                request.rows = rows
+                if key in self._requests:
+                    self._show(key, frame)
+                    return True
+            elif self._stop.is_set() or (not coarse and self._overtaken(key, request)):
+                return False
         return False
 
-    def _most_urgent(self) -> tuple[Hashable, _Asked] | None:
-        """The viewer whose picture is the coarsest; of several the one that has waited longest."""
-        waiting = [(k, one) for k, one in self._asked.items() if one.rows < self._height]
+    def _most_urgent(self) -> tuple[Hashable, _Request] | None:
+        """Whose frame is the coarsest; of several the one that has waited longest."""
+        waiting = [item for item in self._requests.items() if item[1].rows < self._height]
         return min(waiting, key=lambda item: (item[1].rows, item[1].number), default=None)
 
-    def _next_rows(self, asked: _Asked) -> int:
-        if asked.rows:
-            rows = asked.rows * FINER
-        else:
-            aspect = asked.shot.pose.aspect
-            rows = self.drawing.height_within(self._move_seconds, aspect, self._height)
+    def _next_rows(self, request: _Request) -> int:
+        rows = FINER * request.rows or self.drawing.height_within(
+            self._move_seconds, request.shot.pose.aspect, self._height
+        )
         return self._height if rows > NEARLY * self._height else rows
 
-    def _overtaken(self, key: Hashable, asked: _Asked) -> bool:
-        """Whether the viewer has moved on, or another waits for its first picture."""
+    def _overtaken(self, key: Hashable, request: _Request) -> bool:
+        """Whether the browser has moved on, or another waits for its first frame."""
         with self._change:
-            return self._asked.get(key) is not asked or any(
-                not one.rows for one in self._asked.values()
+            return self._requests.get(key) is not request or any(
+                not waiting.rows for waiting in self._requests.values()
             )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +10,6 @@ from typing import Any
 import numpy as np
 import torch
 import viser
-from torch import Tensor
 
 from devrf.apps.keyframes import (
     CameraPath,
@@ -21,7 +19,7 @@ from devrf.apps.keyframes import (
     path_from,
     write_path,
 )
-from devrf.apps.video import FilmSettings, bullet_time, orbit, spiral, time_freeze
+from devrf.apps.video import VideoSettings, bullet_time, orbit, spiral, time_freeze
 from devrf.apps.viewer.cameras import Pose
 from devrf.apps.viewer.controls import set_value
 from devrf.errors import DevrfError
@@ -29,89 +27,43 @@ from devrf.geometry.cameras import Cameras
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.rendering.view import Viewable
 
-
-class PathEditor:
-    """A list of keyframes, changed by several threads."""
-
-    def __init__(self) -> None:
-        self._keyframes: tuple[Keyframe, ...] = ()
-        self._lock = threading.Lock()
-
-    @property
-    def keyframes(self) -> tuple[Keyframe, ...]:
-        """All of them, in their order."""
-        return self._keyframes
-
-    def add(self, camera_to_world: Tensor, fov: float, time: float, gap: float) -> None:
-        """Add a keyframe after the others, ``gap`` seconds later.
-
-        Args:
-            camera_to_world: (3, 4), OpenGL axes, world units.
-            fov: the vertical angle of view in degrees.
-            time: the scene's, in [0, 1].
-            gap: seconds, more than 0.
-        """
-        with self._lock:
-            last = self._keyframes[-1:]
-            seconds = last[0].seconds + gap if last else 0.0
-            one = Keyframe(camera_to_world, fov, time, seconds)
-            self._keyframes = (*self._keyframes, one)
-
-    def remove_last(self) -> None:
-        """Remove the newest keyframe, if there is one."""
-        with self._lock:
-            self._keyframes = self._keyframes[:-1]
-
-    def replace(self, keyframes: tuple[Keyframe, ...]) -> None:
-        """Take other keyframes, the first at second 0."""
-        with self._lock:
-            self._keyframes = tuple(
-                replace(one, seconds=one.seconds - keyframes[0].seconds) for one in keyframes
-            )
-
-    def path(self, aspect: float, fps: float) -> CameraPath:
-        """The path through the keyframes.
-
-        Raises:
-            DevrfError: there are fewer than two.
-        """
-        if len(self._keyframes) < 2:
-            raise DevrfError("a path needs two keyframes; add the camera at two places or times")
-        return CameraPath(self._keyframes, aspect, fps)
-
-
-# Keyframes of a path, and the seconds that it takes to go round.
+# Keyframes of a known path, and the seconds that it takes to go round.
 KEYFRAMES, SECONDS = 13, 8.0
-# From a time in [0, 1], at which the film is to stop.
+# Points of the line that shows a path.
+POINTS = 120
+# Keyframes from a time in [0, 1], at which the video is to stop.
 Preset = Callable[[float], tuple[Keyframe, ...]]
+Act = Callable[[viser.GuiEvent[Any]], None]
 
 
 def known_paths(cameras: Cameras, model: Callable[[], Viewable]) -> dict[str, Preset]:
-    """Paths by name: around a scene, or before a forward-facing one.
+    """An orbit while time runs, bullet time, and a freeze in time, by name.
+
+    They lead around a scene, or before a forward-facing one.
 
     Args:
         cameras: the static captured ones.
         model: gives the scene, once there is one.
     """
-    settings = FilmSettings(frames=KEYFRAMES)
+    settings = VideoSettings(frames=KEYFRAMES)
 
-    def ring(film: FilmSettings) -> Cameras:
+    def ring(video: VideoSettings) -> Cameras:
         """Comes back to where it began."""
-        space, film = model().space, replace(film, frames=film.frames - 1)
-        again = [*range(film.frames), 0]
+        space, video = model().space, replace(video, frames=video.frames - 1)
+        closed = [*range(video.frames), 0]
         if isinstance(space, NormalizedDevice):
-            return spiral(cameras, distance_ahead(cameras), film)[again]
-        return orbit(cameras, space.inner(model().box), film)[again]
+            return spiral(cameras, distance_ahead(cameras), video)[closed]
+        return orbit(cameras, space.inner(model().box), video)[closed]
 
-    def orbiting(moment: float) -> tuple[Keyframe, ...]:
+    def orbiting(time: float) -> tuple[Keyframe, ...]:
         return keyframes_of(ring(settings), torch.linspace(0, 1, KEYFRAMES).tolist(), SECONDS)
 
-    def bullet(moment: float) -> tuple[Keyframe, ...]:
-        return keyframes_of(*bullet_time(ring, moment, settings), SECONDS)
+    def bullet(time: float) -> tuple[Keyframe, ...]:
+        return keyframes_of(*bullet_time(ring, time, settings), SECONDS)
 
-    def freeze(moment: float) -> tuple[Keyframe, ...]:
-        longer = FilmSettings(frames=3 * KEYFRAMES)
-        return keyframes_of(*time_freeze(ring, moment, longer), 3 * SECONDS)
+    def freeze(time: float) -> tuple[Keyframe, ...]:
+        longer = VideoSettings(frames=3 * KEYFRAMES)
+        return keyframes_of(*time_freeze(ring, time, longer), 3 * SECONDS)
 
     return {"orbit": orbiting, "bullet time": bullet, "time freeze": freeze}
 
@@ -132,13 +84,12 @@ def distance_ahead(cameras: Cameras) -> float:
     return distance if distance > 0 else extent
 
 
-Act = Callable[[viser.GuiEvent[Any]], None]
-# Points of the line that shows a path.
-POINTS = 120
-
-
 class PathPanel:
-    """The panel; its files lie in a folder ``paths`` of the run."""
+    """The panel; its files lie in a folder ``paths`` of the run.
+
+    Attributes:
+        keyframes: those collected so far, the first at second 0.
+    """
 
     def __init__(
         self,
@@ -146,6 +97,7 @@ class PathPanel:
         folder: Path,
         height: int,
         presets: Mapping[str, Preset],
+        time: Callable[[], float],
         fly: Callable[[CameraPath], None],
         changed: Callable[[], None],
     ) -> None:
@@ -154,35 +106,53 @@ class PathPanel:
         Args:
             server: of the page.
             folder: the run's.
-            height: rows of pictures, for files that say so.
-            presets: keyframes by name, from the scene's present time.
+            height: rows of frames, for files that say so.
+            presets: keyframes by name, from the current time.
+            time: the current time in [0, 1].
             fly: shows a path from its beginning to its end.
             changed: called when a path appears in the scene, or vanishes.
         """
-        self.editor = PathEditor()
+        self.keyframes: tuple[Keyframe, ...] = ()
         self._server, self._folder, self._height = server, folder, height
-        self._presets, self._fly, self._changed = presets, fly, changed
-        self.time: Callable[[], float] = lambda: 0.0
+        self._presets, self._time, self._fly, self._changed = presets, time, fly, changed
         self._line: viser.LineSegmentsHandle | None = None
         gui = server.gui
         with gui.add_folder("Film", expand_by_default=False):
             self._count = gui.add_markdown("")
             self._on(gui.add_button("Add keyframe", icon=viser.Icon.PLUS), self._add)
-            self._on(gui.add_button("Remove the last"), lambda _: self.editor.remove_last())
-            self._on(gui.add_button("Remove all"), lambda _: self.editor.replace(()))
+            self._on(gui.add_button("Remove the last"), lambda _: self._take(self.keyframes[:-1]))
+            self._on(gui.add_button("Remove all"), lambda _: self._take(()))
             self._gap = gui.add_number("seconds to it", 2.0, min=0.05, max=600.0, step=0.05)
             self._fps = gui.add_number("pictures/s", 24.0, min=1.0, max=120.0, step=1.0)
             self._aspect = gui.add_number(
                 "width/height", 1.5, min=0.1, max=10.0, step=0.01, hint="of the film"
             )
             self._preset = gui.add_dropdown("path", tuple(presets), hint="a path that is known")
-            self._on(gui.add_button("Take this path"), self._take)
-            self._on(gui.add_button("Fly through"), lambda _: self._fly(self._path()))
+            self._on(
+                gui.add_button("Take this path"),
+                lambda _: self._take(self._presets[self._preset.value](self._time())),
+            )
+            self._on(gui.add_button("Fly through"), lambda _: self._fly(self.path()))
             self._name = gui.add_text("name", "path")
             self._on(gui.add_button("Save"), self._save)
             self._upload = gui.add_upload_button("Load", mime_type="application/json")
             self._upload.on_upload(self._answer(self._load))
         self._draw()
+
+    @property
+    def drawn(self) -> bool:
+        """Whether a path is drawn into the scene."""
+        return self._line is not None
+
+    def path(self) -> CameraPath:
+        """The path through the keyframes.
+
+        Raises:
+            DevrfError: there are fewer than two.
+        """
+        if len(self.keyframes) < 2:
+            raise DevrfError("a path needs two keyframes; add the camera at two places or times")
+        return CameraPath(self.keyframes, float(self._aspect.value), float(self._fps.value))
 
     def _on(self, button: viser.GuiButtonHandle, act: Act) -> None:
         button.on_click(self._answer(act))
@@ -194,7 +164,7 @@ class PathPanel:
             try:
                 act(event)
             except (DevrfError, OSError) as error:
-                self._say(event, "Not done", str(error))
+                self._notify(event, "Not done", str(error))
             before = self.drawn
             self._draw()
             if before != self.drawn:
@@ -202,57 +172,54 @@ class PathPanel:
 
         return answered
 
-    def _say(self, event: viser.GuiEvent[Any], title: str, text: str) -> None:
+    def _notify(self, event: viser.GuiEvent[Any], title: str, text: str) -> None:
         if event.client is not None:
             event.client.add_notification(title, text, auto_close_seconds=20)
 
     def _add(self, event: viser.GuiEvent[Any]) -> None:
+        """Add the camera of the page after the other keyframes."""
         if event.client is None:
             return
         camera = event.client.camera
-        pose = Pose.of_browser(camera)
-        angle = float(np.degrees(camera.fov))
-        self.editor.add(pose.camera_to_world.float(), angle, self.time(), float(self._gap.value))
+        pose, fov = Pose.of_browser(camera).camera_to_world.float(), float(np.degrees(camera.fov))
+        last = self.keyframes[-1:]
+        seconds = last[0].seconds + float(self._gap.value) if last else 0.0
+        self.keyframes = (*self.keyframes, Keyframe(pose, fov, self._time(), seconds))
 
-    def _take(self, _: object) -> None:
-        self.editor.replace(self._presets[self._preset.value](self.time()))
-
-    def _path(self) -> CameraPath:
-        return self.editor.path(float(self._aspect.value), float(self._fps.value))
+    def _take(self, keyframes: tuple[Keyframe, ...]) -> None:
+        """Take other keyframes, the first at second 0."""
+        self.keyframes = tuple(
+            replace(keyframe, seconds=keyframe.seconds - keyframes[0].seconds)
+            for keyframe in keyframes
+        )
 
     def _save(self, event: viser.GuiEvent[Any]) -> None:
         file = self._folder / "paths" / f"{check_name(self._name.value)}.json"
-        write_path(file, self._path(), self._height)
+        write_path(file, self.path(), self._height)
         command = f"`python -m devrf stage=render hydra.run.dir={self._folder} video.path={file}`"
-        self._say(event, f"Saved {file.name}", f"Film it with {command}")
+        self._notify(event, f"Saved {file.name}", f"Film it with {command}")
 
     def _load(self, _: object) -> None:
-        given = self._upload.value
-        path = path_from(given.content, given.name)
-        self.editor.replace(path.keyframes)
+        upload = self._upload.value
+        path = path_from(upload.content, upload.name)
+        self._take(path.keyframes)
         set_value(self._fps, min(max(path.fps, 1.0), 120.0))
         set_value(self._aspect, min(max(path.aspect, 0.1), 10.0))
 
-    @property
-    def drawn(self) -> bool:
-        """Whether a path is drawn into the scene."""
-        return self._line is not None
-
     def _draw(self) -> None:
         """Show how many keyframes there are, and the way through them."""
-        keyframes = self.editor.keyframes
-        seconds = keyframes[-1].seconds if keyframes else 0.0
-        self._count.content = f"{len(keyframes)} keyframes, {seconds:g} s"
+        seconds = self.keyframes[-1].seconds if self.keyframes else 0.0
+        self._count.content = f"{len(self.keyframes)} keyframes, {seconds:g} s"
         if self._line is not None:
             self._line.remove()
             self._line = None
-        if len(keyframes) < 2:
+        if len(self.keyframes) < 2:
             return
-        shown = CameraPath(keyframes, 1.0, 1.0).sampled(POINTS)
-        way = torch.stack([one.camera_to_world[:, 3] for one in shown]).numpy()
+        shown = CameraPath(self.keyframes, 1.0, 1.0).sampled(POINTS)
+        points = torch.stack([keyframe.camera_to_world[:, 3] for keyframe in shown]).numpy()
         self._line = self._server.scene.add_line_segments(
             "/film",
-            np.stack([way[:-1], way[1:]], axis=1),
+            np.stack([points[:-1], points[1:]], axis=1),
             colors=(200, 60, 40),
             thickness=2.0,
             thickness_units="screen",

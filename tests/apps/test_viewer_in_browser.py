@@ -80,10 +80,10 @@ def canvas(browser: Any) -> np.ndarray:
 def test_the_slider_moves_time_and_the_picture_changes(session, browser):
     by, keys = webdriver.common.by.By, webdriver.common.keys.Keys
     browser.get(session.settings.address)
-    wait_for(lambda: session.pictures > 0 and len(np.unique(canvas(browser))) > 40)
-    before, shown = canvas(browser), session.pictures
+    wait_for(lambda: session.frames > 0 and len(np.unique(canvas(browser))) > 40)
+    before, shown = canvas(browser), session.frames
     browser.find_element(by.CSS_SELECTOR, "[role=slider]").send_keys(keys.END)
-    wait_for(lambda: session.controls.playback.time == 1.0 and session.pictures > shown)
+    wait_for(lambda: session.controls.playback.time == 1.0 and session.frames > shown)
     wait_for(lambda: bool((np.abs(canvas(browser) - before) > 30).any()))
     changed = (np.abs(canvas(browser) - before).max(axis=-1) > 30).mean()
     assert changed > 0.005  # everything has moved by up to 5 % of its box

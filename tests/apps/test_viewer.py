@@ -1,0 +1,335 @@
+"""The viewer: poses, frames of each channel, which is rendered next, time, keyframes, settings."""
+
+from __future__ import annotations
+
+import math
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from devrf.apps.images import to_bytes
+from devrf.apps.settings import ViewerSettings
+from devrf.apps.viewer.cameras import Pose, dynamic_frusta, static_frusta
+from devrf.apps.viewer.drawing import Drawing, Frame, RenderScheduler, Shot
+from devrf.errors import DevrfError
+from devrf.geometry.cameras import Cameras
+from devrf.methods.nerf.ray_view import RayView
+from devrf.rendering.renderer import Renderer
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        return int(probe.getsockname()[1])
+
+
+# Poses: OpenCV's axes in the browser, OpenGL's here.
+
+
+def test_a_camera_without_rotation_in_opencvs_axes():
+    # OpenCV's camera that looks along z with y down is OpenGL's turned about x by half a turn.
+    pose = Pose((1.0, 0, 0, 0), (1.0, 2, 3), math.radians(90), 1.5)
+    assert pose.camera_to_world.tolist() == [[1, 0, 0, 1], [0, -1, 0, 2], [0, 0, -1, 3]]
+    camera = pose.camera(100)
+    assert (camera.width, camera.height) == (150, 100)
+    assert camera.focal.tolist() == [[pytest.approx(50.0)] * 2]
+    assert camera.forwards.tolist() == [[0, 0, 1]]
+
+
+def test_a_pose_there_and_back():
+    cameras = Cameras.looking_at(
+        torch.randn(5, 3) * 3, torch.randn(5, 3), focal=31.0, width=40, height=30
+    )
+    for k in range(5):
+        camera = Pose.of_cameras(cameras, k).camera(30)
+        torch.testing.assert_close(camera.camera_to_world[0], cameras.camera_to_world[k])
+        torch.testing.assert_close(camera.focal[0], cameras.focal[k])
+        assert (camera.width, camera.height) == (40, 30)
+
+
+# Frames: as the renderer's images, in blocks.
+
+
+def drawn(drawing: Drawing, shot: Shot, height: int = 18) -> Frame:
+    *blocks, frame = drawing.draw(shot, height)
+    assert blocks and not any(blocks)
+    return frame
+
+
+@pytest.fixture
+def drawing(moving) -> Drawing:
+    return Drawing(Renderer(moving, times=6), 1.0)
+
+
+@pytest.fixture
+def shot(tiny_scene) -> Shot:
+    return Shot(Pose.of_cameras(tiny_scene.dynamic.test.cameras, 0), 0.7)
+
+
+def test_the_frame_is_the_renderers_in_blocks_of_any_size(drawing, shot, moving, monkeypatch):
+    frame = drawn(drawing, shot)
+    expected = to_bytes(Renderer(moving).view(shot.pose.camera(18), 0, 0.7, 1.0).color)
+    assert frame.pixels.shape == (18, 24, 3) and frame.depth is None
+    difference = frame.pixels.int() - expected.view(18, 24, 3).int()
+    assert int(difference.abs().max()) <= 1 and len(torch.unique(frame.pixels)) > 20
+    monkeypatch.setattr("devrf.apps.viewer.drawing.MIN_RAYS", 100)
+    monkeypatch.setattr("devrf.apps.viewer.drawing.BLOCK_SECONDS", 0)
+    *blocks, small = drawing.draw(shot, 18)
+    assert len(blocks) == 5  # 432 pixels
+    assert int((small.pixels.int() - frame.pixels.int()).abs().max()) <= 1
+
+
+def test_what_a_scene_offers(drawing, learned, moving):
+    assert drawing.channels == ("color", "depth", "opacity", "motion")
+    assert drawing.has_rest and not drawing.at_rest
+    at_rest = Drawing(Renderer(learned[0].scene_model), 1.0)
+    assert at_rest.channels == ("color", "depth", "opacity")
+    assert at_rest.at_rest and not at_rest.has_rest
+
+    class WithoutMotion:
+        device, space, box, depth_limits = moving.device, moving.space, moving.box, (0.0, 1.0)
+
+        def at(self, time: float, *, half: bool = False) -> RayView:
+            return RayView(self, time, self.device, at_rest=False, half=half)
+
+    other = Drawing(Renderer(WithoutMotion()), 1.0)
+    assert other.channels == ("color", "depth", "opacity")
+    assert not other.has_rest and not other.at_rest
+
+
+def test_each_channel_has_a_frame_of_its_own(drawing, shot):
+    color = drawn(drawing, shot).pixels
+    for channel in ("depth", "opacity", "motion"):
+        other = drawn(drawing, replace(shot, channel=channel)).pixels
+        assert other.shape == color.shape and not torch.equal(other, color)
+    opacity = drawn(drawing, replace(shot, channel="opacity")).pixels
+    assert int(opacity[0, 0, 0]) == 0 and int(opacity.max()) > 200
+
+
+def test_the_rest_state_is_on_the_left(drawing, shot):
+    beside = drawn(drawing, replace(shot, beside_rest=True)).pixels
+    half = replace(shot, pose=replace(shot.pose, aspect=shot.pose.aspect / 2))
+    assert torch.equal(beside[:, :12], drawn(drawing, replace(half, time=0.0)).pixels)
+    assert torch.equal(beside[:, 12:], drawn(drawing, half).pixels)
+
+
+def test_depth_is_along_the_axis_and_far_where_nothing_is(drawing, shot, moving):
+    depth = drawn(drawing, replace(shot, with_depth=True)).depth
+    seen = Renderer(moving).view(shot.pose.camera(18), 0, 0.7, 1.0)
+    solid = (seen.opacity > 0.5).view(18, 24)
+    assert float(depth[~solid].min()) == 1000
+    assert bool((depth[solid] < seen.depth.view(18, 24)[solid] + 1e-4).all())
+    assert bool((depth[solid] > 0.9 * seen.depth.view(18, 24)[solid]).all())
+
+
+def test_a_frame_is_as_large_as_the_time_for_it_allows(drawing):
+    drawing._rays_per_second, drawing._overhead = 10_000.0, 0.0
+    assert drawing.height_within(1.0, 1.0, 480) == 100
+    assert drawing.height_within(1.0, 4.0, 480) == 50
+    assert drawing.height_within(100.0, 1.0, 480) == 480
+    assert drawing.height_within(1e-9, 1.0, 480) == 16
+
+
+def test_captured_cameras_have_their_images(tiny_scene):
+    views = tiny_scene.dynamic.train
+    early, late = dynamic_frusta(tiny_scene, 0.0), dynamic_frusta(tiny_scene, 1.0)
+    assert [f.name for f in early] == [f.name for f in late] == ["moving/0", "moving/1"]
+    pixels = views.pixels[int((views.times == 1).nonzero()[0, 0])].float()
+    expected = 255 + pixels[..., 3:] / 255 * (pixels[..., :3] - 255)
+    assert float((late[0].image.float() - expected).abs().max()) <= 1
+    cameras = tiny_scene.static.train.cameras
+    read, unread = static_frusta(cameras, tiny_scene), static_frusta(cameras, None)
+    assert [f.pose for f in read] == [f.pose for f in unread] and len(read) == 8
+    assert all(f.image is not None for f in read) and all(f.image is None for f in unread)
+
+
+# The scheduler: a coarse frame comes first; a finer one ends when its browser moves.
+
+POSE = Pose((1.0, 0, 0, 0), (0.0, 0, 0), 1.0, 1.0)
+FIRST, SECOND = Shot(POSE, 0.1), Shot(POSE, 0.2)
+
+
+class Screen:
+    """A scheduler whose frames have three blocks; ``between`` is called after each."""
+
+    def __init__(self, coarse: int = 20) -> None:
+        self.coarse, self.shown = coarse, list[tuple[object, float, int]]()
+        self.between: Callable[[int], None] = lambda rows: None
+        self.stop = threading.Event()
+        self.scheduler = RenderScheduler(
+            self, self.show, height=100, move_seconds=0.2, stop=self.stop
+        )
+
+    def height_within(self, seconds: float, aspect: float, height: int) -> int:
+        return min(self.coarse, height)
+
+    def draw(self, shot: Shot, height: int) -> Iterator[Frame | None]:
+        for _ in range(3):
+            self.between(height)
+            yield None
+        yield Frame(torch.full((height, 1, 3), shot.time), None, 0.1)
+
+    def show(self, key: object, frame: Frame) -> None:
+        self.shown.append((key, round(float(frame.pixels[0, 0, 0]), 3), len(frame.pixels)))
+
+    def render(self) -> None:
+        for _ in range(20):
+            self.scheduler.render_next(0)
+
+
+def test_coarse_first_then_finer_up_to_the_full_height():
+    screen = Screen()
+    screen.scheduler.ask("a", FIRST)
+    screen.render()
+    assert screen.shown == [("a", 0.1, 20), ("a", 0.1, 60), ("a", 0.1, 100)]
+    screen.scheduler.again()  # the scene has changed
+    screen.scheduler.render_next(0)
+    assert screen.shown[-1] == ("a", 0.1, 20)
+    fast = Screen(coarse=90)
+    threading.Timer(0.02, fast.scheduler.ask, ("a", FIRST)).start()
+    assert fast.scheduler.render_next(20) and fast.shown == [("a", 0.1, 100)]
+
+
+def test_a_move_ends_the_finer_frame_but_not_a_coarse_one():
+    screen = Screen()
+    # A camera that moves on and on would show nothing.
+    screen.between = lambda rows: screen.scheduler.ask("a", SECOND)
+    screen.scheduler.ask("a", FIRST)
+    assert screen.scheduler.render_next(0) and screen.shown == [("a", 0.1, 20)]
+    screen.between = lambda rows: None
+    screen.scheduler.render_next(0)
+    screen.between = lambda rows: rows == 60 and screen.scheduler.ask("a", FIRST)
+    assert not screen.scheduler.render_next(0)
+    screen.between = lambda rows: None
+    screen.render()
+    assert [(t, rows) for _, t, rows in screen.shown[1:]] == [
+        (0.2, 20),
+        (0.1, 20),
+        (0.1, 60),
+        (0.1, 100),
+    ]
+
+
+def test_another_browsers_first_frame_comes_before_the_finer_of_one():
+    screen = Screen()
+    screen.between = lambda rows: rows == 60 and screen.scheduler.ask("b", SECOND)
+    screen.scheduler.ask("a", FIRST)
+    screen.scheduler.render_next(0)
+    assert not screen.scheduler.render_next(0)  # given up
+    screen.between = lambda rows: None
+    screen.render()
+    assert [(key, rows) for key, _, rows in screen.shown][:3] == [("a", 20), ("b", 20), ("a", 60)]
+    assert {key for key, _, rows in screen.shown if rows == 100} == {"a", "b"}
+
+
+def test_nothing_is_shown_to_who_has_left_or_once_it_is_stopped():
+    screen = Screen()
+    screen.between = lambda rows: screen.scheduler.drop("a")
+    screen.scheduler.ask("a", FIRST)
+    assert screen.scheduler.watched
+    screen.render()
+    assert not screen.shown and not screen.scheduler.watched
+    screen.between = lambda rows: screen.stop.set()
+    screen.scheduler.ask("a", FIRST)
+    assert not screen.scheduler.render_next(0) and not screen.shown
+
+
+# The page's controls.
+
+
+def test_time_runs_at_its_speed_and_loops_or_stops():
+    pytest.importorskip("viser", reason="the viewer's extra is not installed")
+    from devrf.apps.viewer.controls import Playback
+
+    assert Playback(time=0.3).advanced(10) == Playback(time=0.3)
+    for speed, time in ((1, 0.4), (0.5, 0.3), (4, 1.0)):
+        later = Playback(time=0.2, playing=True, speed=speed).advanced(1)
+        assert later.time == pytest.approx(time) and later.playing
+    assert Playback(time=0.9, playing=True).advanced(1).time == pytest.approx(0.1)
+    ended = Playback(time=0.9, playing=True, loop=False).advanced(1)
+    assert (ended.time, ended.playing) == (1.0, False)
+    assert ended.toggled() == Playback(time=0.0, playing=True, loop=False)
+
+
+def test_where_cameras_look():
+    pytest.importorskip("viser", reason="the viewer's extra is not installed")
+    from devrf.apps.viewer.paths import distance_ahead
+
+    places = torch.tensor([[3.0, 0, 0], [0, 3, 0], [0, 0, 3.0]])
+    around = Cameras.looking_at(places, torch.zeros(3, 3), focal=1, width=2, height=2)
+    assert distance_ahead(around) == pytest.approx(3.0, abs=1e-4)
+    same_way = Cameras.looking_at(places, places - 1, focal=1, width=2, height=2)
+    assert distance_ahead(same_way) == pytest.approx(6**0.5, abs=1e-4)  # of the mean to each
+
+
+def test_keyframes_are_collected_saved_loaded_and_flown_through(moving, tiny_scene, tmp_path):
+    pytest.importorskip("viser", reason="the viewer's extra is not installed")
+    from devrf.apps.viewer.session import Session
+    from devrf.checkpoints.viewpoints import Viewpoints
+
+    settings = ViewerSettings(port=free_port(), height=48)
+    session = Session(settings, Viewpoints.of(tiny_scene), tiny_scene, tmp_path)
+    try:
+        session.present(Drawing(Renderer(moving, times=6), 1.0))
+        panel, told = session.paths, list[str]()
+        camera = SimpleNamespace(wxyz=(1, 0, 0, 0), position=(0, 0, 3), fov=1.0, aspect=1.5)
+        client = SimpleNamespace(
+            camera=camera, add_notification=lambda title, text, **_: told.append(text)
+        )
+        event = SimpleNamespace(client=client)
+        panel._answer(panel._save)(event)
+        assert "a path needs two keyframes" in told[0] and not panel.drawn
+        for time in (0.0, 0.5, 1.0):
+            session.controls.set_time(time)
+            panel._answer(panel._add)(event)
+        assert [(k.time, k.seconds) for k in panel.keyframes] == [(0, 0), (0.5, 2), (1, 4)]
+        assert panel.drawn
+        panel._answer(panel._save)(event)
+        assert "stage=render" in told[1]
+        content = (tmp_path / "paths" / "path.json").read_bytes()
+        panel._take(())
+        panel._upload = SimpleNamespace(value=SimpleNamespace(content=content, name="path.json"))
+        panel._answer(panel._load)(event)
+        assert [k.seconds for k in panel.keyframes] == [0, 2, 4]
+        for preset in panel._presets.values():
+            panel._take(preset(0.5))
+            assert panel.path().duration > 7
+        session.controls.dynamic.value = session.controls.static.value = True
+        session._fly(panel.path())
+        session.step(0.0)
+        assert len(session._frusta._handles) == 10
+    finally:
+        session.close()
+
+
+# Settings.
+
+
+@pytest.mark.parametrize(
+    ("keys", "expected"),
+    [
+        ({"port": 70000}, "viewer.port: expected 1 to 65535, not 70000"),
+        ({"height": 3}, "viewer.height: expected 16 to 4096, not 3"),
+        ({"move_seconds": 0}, "viewer.move_seconds: "),
+        ({"share": 2}, "viewer.share: "),
+    ],
+)
+def test_settings_that_cannot_be(keys, expected):
+    with pytest.raises(DevrfError) as error:
+        ViewerSettings(**keys)
+    assert str(error.value).startswith(expected)
+
+
+def test_an_address_that_cannot_be_listened_on():
+    assert ViewerSettings().address == "http://127.0.0.1:8080"  # this machine alone
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        with pytest.raises(DevrfError, match=rf"^viewer\.port: {port} on 127\.0\.0\.1 is in use"):
+            ViewerSettings(port=port).check_free()
+    ViewerSettings(port=port).check_free()
+    with pytest.raises(DevrfError, match=r"^viewer\.host: cannot listen on"):
+        ViewerSettings(host="192.0.2.1").check_free()
