@@ -149,7 +149,7 @@ def main() -> None:
     arguments.add_argument("--scene", choices=tuple(SCENES), default="forward")
     arguments.add_argument("--folder", type=Path, help="default: outputs/benchmarks/capture/SCENE")
     arguments.add_argument("--lens", default="SIMPLE_PINHOLE", help="as capture.camera")
-    arguments.add_argument("--mattes", help="as capture.mattes")
+    arguments.add_argument("--mattes", help="as capture.alpha_masks")
     arguments.add_argument("--cameras", action="store_true", help="do not learn the scene")
     given = arguments.parse_args()
     folder: Path = given.folder or Path("outputs/benchmarks/capture") / given.scene
@@ -158,7 +158,7 @@ def main() -> None:
     into = folder / "captured"
     shutil.rmtree(into, ignore_errors=True)
     began = time.perf_counter()
-    settings = replace(film.settings, into=str(into), camera=given.lens, mattes=given.mattes)
+    settings = replace(film.settings, into=str(into), camera=given.lens, alpha_masks=given.mattes)
     captured = scene_from_footage(settings)
     row: dict[str, Any] = {"scene": given.scene, "capture s": time.perf_counter() - began}
     frames = json.loads((captured / "transforms.json").read_text())["frames"]

@@ -70,7 +70,7 @@ def test_a_path_has_both_its_ends():
     path = CameraPath((keyframe(1), keyframe(3, x=1.0)), 1.5, 10)
     assert (path.duration, path.frames) == (2, 21)
     assert [one.seconds for one in path.sampled(3)] == [1, 2, 3]
-    with pytest.raises(DevrfError, match="expected at most 90000 pictures"):
+    with pytest.raises(DevrfError, match="expected at most 90000 frames"):
         _ = CameraPath((keyframe(0), keyframe(1e7)), 1, 10).frames
 
 

@@ -78,7 +78,7 @@ SCALED = [2 * value for value in MATRIX[:12]] + MATRIX[12:]
         (content(keyframes=[frame(fov=190)]), "p: keyframes[0].fov: "),
         (content(keyframes=[frame(), frame(render_time=2)]), "p: keyframes[1].render_time: "),
         (content(keyframes=[frame(matrix=[1, 2])]), "p: keyframes[0].matrix"),
-        (content(keyframes=[frame(matrix="x")]), "p: keyframes[0].matrix: expected a list of 16"),
+        (content(keyframes=[frame(matrix="x")]), "p: keyframes[0].matrix: should be a valid array"),
         (content(keyframes=[frame(matrix=SCALED)]), "p: keyframes[0].matrix: is no rigid transfo"),
         (content(keyframes=[frame(), frame()]), "p: keyframes[1].seconds: expected more than 0"),
         (content(camera_type="equirectangular"), "p: camera_type: "),

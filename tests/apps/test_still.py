@@ -11,7 +11,7 @@ from lightning import Trainer
 
 from devrf.apps.still import StillSettings, still
 from devrf.apps.video import VideoSettings
-from devrf.checkpoints.viewpoints import Viewpoints
+from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.errors import DevrfError
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.rendering.renderer import Renderer

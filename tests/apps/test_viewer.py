@@ -269,7 +269,7 @@ def test_where_cameras_look():
 def test_keyframes_are_collected_saved_loaded_and_flown_through(moving, tiny_scene, tmp_path):
     pytest.importorskip("viser", reason="the viewer's extra is not installed")
     from devrf.apps.viewer.session import Session
-    from devrf.checkpoints.viewpoints import Viewpoints
+    from devrf.checkpoints.checkpoint import Viewpoints
 
     settings = ViewerSettings(port=free_port(), height=48)
     session = Session(settings, Viewpoints.of(tiny_scene), tiny_scene, tmp_path)

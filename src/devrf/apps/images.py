@@ -18,6 +18,14 @@ from devrf.system.files import atomic_write
 
 # Grey level of invalid flow; valid flow is white or coloured.
 UNKNOWN = 0.85
+# White pixels between images side by side.
+GAP = 4
+# Longest name that fits below a small image, in characters.
+LONGEST_NAME = 30
+# Grey levels of text, and of the lines around images, most of which have a white background.
+INK, LINE = "#262626", "#c8c8c8"
+# Text is so high for each pixel of an image's height, and between these heights, in pixels.
+TEXT, SMALLEST_TEXT, LARGEST_TEXT = 0.05, 9, 26
 
 
 def depth_colors(depth: Tensor, opacity: Tensor, near: float, far: float) -> Tensor:
@@ -77,11 +85,6 @@ def _mapped(values: Tensor, name: str) -> Tensor:
     return apply_colormap(values[None, None].cpu().float(), table)[0].permute(1, 2, 0)
 
 
-GAP = 4
-# Longest name that fits below a small image, in characters.
-LONGEST_NAME = 30
-
-
 def write_image(path: Path, image: Tensor) -> None:
     """Write an image (H, W, 3) in [0, 1] as a PNG."""
     with atomic_write(path) as partial:
@@ -103,12 +106,6 @@ def short_name(name: str) -> str:
 def evenly(count: int, most: int) -> list[int]:
     """At most ``most`` of the positions 0 … count − 1, evenly spread, both ends among them."""
     return [round(k) for k in np.linspace(0, count - 1, min(count, most))]
-
-
-# Grey levels of text, and of the lines around images, most of which have a white background.
-INK, LINE = "#262626", "#c8c8c8"
-# Text is so high for each pixel of an image's height, and between these heights, in pixels.
-TEXT, SMALLEST_TEXT, LARGEST_TEXT = 0.05, 9, 26
 
 
 def image_grid(

@@ -3,37 +3,39 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from kornia.geometry.conversions import (
     quaternion_to_rotation_matrix,
     rotation_matrix_to_quaternion,
 )
-from pydantic import BaseModel, Field, TypeAdapter, ValidationError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, TypeAdapter, ValidationError
 from torch import Tensor
 
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
-from devrf.scenes.files import MAX_BYTES, Number, Positive, read_json
+from devrf.scenes.files import Number, Positive, read_json
 from devrf.scenes.validation import first_error, in_reach, is_rotation, scene_error
 from devrf.system.files import write_json
 
 # More frames than this are a mistake in the file: an hour at 25 a second.
-MOST_FRAMES = 90_000
+MAX_FRAMES = 90_000
 
 
 @dataclass(frozen=True)
 class Keyframe:
-    """A camera at one moment of a film.
+    """A camera at one point of a video.
 
     Attributes:
         camera_to_world: (3, 4) rigid, OpenGL axes, world units.
         fov: the vertical angle of view in degrees.
         time: the scene's time in [0, 1].
-        seconds: when the film is there, from its beginning.
+        seconds: when the video is there, from its beginning.
     """
 
     camera_to_world: Tensor
@@ -53,8 +55,8 @@ class CameraPath:
 
     Attributes:
         keyframes: at least one, their seconds ascending.
-        aspect: width over height of the film.
-        fps: its pictures a second.
+        aspect: width over height of the video.
+        fps: its frames a second.
     """
 
     keyframes: tuple[Keyframe, ...]
@@ -68,45 +70,36 @@ class CameraPath:
 
     @property
     def frames(self) -> int:
-        """The pictures of the film, both ends included.
+        """The frames of the video, both ends included.
 
         Raises:
             DevrfError: too many.
         """
         count = round(self.duration * self.fps) + 1
-        if count > MOST_FRAMES:
+        if count > MAX_FRAMES:
             raise DevrfError(
-                f"the path takes {self.duration:g} s at {self.fps:g} pictures a second, expected "
-                f"at most {MOST_FRAMES} pictures; lower its fps, or the seconds of its keyframes"
+                f"the path takes {self.duration:g} s at {self.fps:g} frames a second, expected "
+                f"at most {MAX_FRAMES} frames; lower its fps, or the seconds of its keyframes"
             )
         return count
 
-    def at(self, moments: Tensor) -> list[Keyframe]:
-        """The camera and the scene's time at ``moments`` (N,), in seconds of the film."""
-        frames = self.keyframes
-        knots = torch.tensor([one.seconds for one in frames], dtype=torch.float64)
-        moments = moments.double().clamp(knots[0], knots[-1])
-        poses = torch.stack([one.camera_to_world.double() for one in frames])
-        angles = torch.tensor([[one.fov] for one in frames], dtype=torch.float64)
-        known = torch.cat([poses[:, :, 3], angles, _one_side(poses[:, :, :3])], dim=1)
-        seen = hermite(knots, known, moments)
-        position, fov, wxyz = seen[:, :3], seen[:, 3], seen[:, 4:]
-        turned = quaternion_to_rotation_matrix(torch.nn.functional.normalize(wxyz, dim=1))
-        times = torch.tensor([[one.time] for one in frames], dtype=torch.float64)
-        times = straight(knots, times, moments)
-        path = torch.cat([turned, position[:, :, None]], dim=2)
-        return [
-            Keyframe(
-                path[k].float(),
-                min(max(float(fov[k]), 1.0), 179.0),
-                min(max(float(times[k]), 0.0), 1.0),
-                float(moments[k]),
-            )
-            for k in range(len(moments))
-        ]
+    def at(self, seconds: Tensor) -> list[Keyframe]:
+        """The camera and the scene's time at ``seconds`` (N,) of the video."""
+        poses = torch.stack([frame.camera_to_world.double() for frame in self.keyframes])
+        rows = [[frame.seconds, frame.fov, frame.time] for frame in self.keyframes]
+        knots, fovs, times = torch.tensor(rows, dtype=torch.float64).T.contiguous()
+        seconds = seconds.double().clamp(knots[0], knots[-1])
+        known = torch.cat([poses[:, :, 3], fovs[:, None], _quaternions(poses[:, :, :3])], dim=1)
+        values = hermite(knots, known, seconds)
+        position, fov, wxyz = values[:, :3], values[:, 3:4], values[:, 4:]
+        rotation = quaternion_to_rotation_matrix(torch.nn.functional.normalize(wxyz, dim=1))
+        path = torch.cat([rotation, position[:, :, None]], dim=2).float()
+        time = _linear(knots, times[:, None], seconds)
+        rows = torch.cat([fov.clamp(1, 179), time.clamp(0, 1), seconds[:, None]], dim=1).tolist()
+        return [Keyframe(pose, *row) for pose, row in zip(path, rows, strict=True)]
 
     def sampled(self, frames: int) -> list[Keyframe]:
-        """``frames`` keyframes, evenly spread over the film."""
+        """``frames`` keyframes, evenly spread over the video."""
         first, last = self.keyframes[0].seconds, self.keyframes[-1].seconds
         return self.at(torch.linspace(first, last, frames, dtype=torch.float64))
 
@@ -116,7 +109,7 @@ def cameras_of(keyframes: list[Keyframe], aspect: float, height: int) -> Cameras
     width = max(1, round(aspect * height))
     focal = torch.tensor([height / 2 / math.tan(math.radians(k.fov) / 2) for k in keyframes])
     return Cameras(
-        torch.stack([one.camera_to_world for one in keyframes]),
+        torch.stack([keyframe.camera_to_world for keyframe in keyframes]),
         focal[:, None].expand(-1, 2),
         torch.tensor([width / 2, height / 2]).expand(len(keyframes), 2),
         width,
@@ -129,13 +122,8 @@ def keyframes_of(cameras: Cameras, times: list[float], seconds: float) -> tuple[
     angle = 2 * torch.atan(cameras.height / 2 / cameras.focal[:, 1])
     steps = max(len(cameras) - 1, 1)
     return tuple(
-        Keyframe(
-            cameras.camera_to_world[k],
-            math.degrees(float(angle[k])),
-            times[k],
-            seconds * k / steps,
-        )
-        for k in range(len(cameras))
+        Keyframe(pose, math.degrees(float(angle[k])), times[k], seconds * k / steps)
+        for k, pose in enumerate(cameras.camera_to_world)
     )
 
 
@@ -152,13 +140,11 @@ def hermite(knots: Tensor, values: Tensor, at: Tensor) -> Tensor:
     """
     if len(knots) == 1:
         return values.expand(len(at), -1)
-    after = torch.searchsorted(knots, at, right=True).clamp(1, len(knots) - 1)
-    before = after - 1
-    neighbours = torch.arange(len(knots))
-    low, high = (neighbours - 1).clamp(min=0), (neighbours + 1).clamp(max=len(knots) - 1)
+    before, u = _segments(knots, at)
+    after, k = before + 1, torch.arange(len(knots))
+    low, high = (k - 1).clamp(min=0), (k + 1).clamp(max=len(knots) - 1)
     slope = (values[high] - values[low]) / (knots[high] - knots[low])[:, None]
     step = (knots[after] - knots[before])[:, None]
-    u = (at - knots[before])[:, None] / step
     return (
         (1 + 2 * u) * (1 - u) ** 2 * values[before]
         + u * (1 - u) ** 2 * step * slope[before]
@@ -167,25 +153,49 @@ def hermite(knots: Tensor, values: Tensor, at: Tensor) -> Tensor:
     )
 
 
-def straight(knots: Tensor, values: Tensor, at: Tensor) -> Tensor:
+def _linear(knots: Tensor, values: Tensor, at: Tensor) -> Tensor:
     """As :func:`hermite`, on straight lines from one value to the next."""
     if len(knots) == 1:
         return values.expand(len(at), -1)
-    after = torch.searchsorted(knots, at, right=True).clamp(1, len(knots) - 1)
-    before = after - 1
-    share = ((at - knots[before]) / (knots[after] - knots[before]))[:, None]
-    return values[before] + share * (values[after] - values[before])
+    before, u = _segments(knots, at)
+    return values[before] + u * (values[before + 1] - values[before])
 
 
-def _one_side(rotations: Tensor) -> Tensor:
+def _segments(knots: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
+    """The knot (N,) before each place, and the share (N, 1) of the way to the next."""
+    before = torch.searchsorted(knots, at, right=True).clamp(1, len(knots) - 1) - 1
+    return before, ((at - knots[before]) / (knots[before + 1] - knots[before]))[:, None]
+
+
+def _quaternions(rotations: Tensor) -> Tensor:
     """Quaternions (K, 4) of rotations, each with the sign that is nearer to the one before."""
-    found = rotation_matrix_to_quaternion(rotations)
-    flips = (found[1:] * found[:-1]).sum(dim=1) < 0
-    signs = torch.where(flips, -1.0, 1.0).to(found).cumprod(dim=0)
-    return torch.cat([found[:1], found[1:] * signs[:, None]])
+    wxyz = rotation_matrix_to_quaternion(rotations)
+    flips = (wxyz[1:] * wxyz[:-1]).sum(dim=1) < 0
+    signs = torch.where(flips, -1.0, 1.0).to(wxyz).cumprod(dim=0)
+    return torch.cat([wxyz[:1], wxyz[1:] * signs[:, None]])
 
 
-Matrix = Annotated[list[Number], Field(min_length=16, max_length=16)]
+def _pose(numbers: list[float]) -> Tensor:
+    """The camera (3, 4) in 16 numbers, row by row."""
+    return torch.tensor(numbers, dtype=torch.float64).view(4, 4)[:3]
+
+
+def _rigid(numbers: list[float]) -> list[float]:
+    pose = _pose(numbers)
+    if not bool(is_rotation(pose[:, :3])) or not bool(in_reach(pose[:, 3])):
+        raise ValueError("is no rigid transform; give a rotation and a translation")
+    return numbers
+
+
+def _with_seconds(keyframes: Any) -> Any:
+    """devrf's own keyframes; without seconds they are nerfstudio's, which are not used."""
+    own = isinstance(keyframes, list) and all(
+        isinstance(keyframe, dict) and keyframe.get("seconds") is not None for keyframe in keyframes
+    )
+    return keyframes if own else []
+
+
+Matrix = Annotated[list[Number], Field(min_length=16, max_length=16), AfterValidator(_rigid)]
 Angle = Annotated[Number, Field(gt=0, lt=180)]
 Time = Annotated[Number, Field(ge=0, le=1)]
 
@@ -198,16 +208,15 @@ class _PathCamera(BaseModel):
 
 
 class _PathKeyframe(BaseModel):
-    # nerfstudio's earlier viewer wrote its matrix as text; such a keyframe is not used.
-    matrix: Matrix | str | None = None
-    fov: Angle | None = None
+    matrix: Matrix
+    fov: Angle
     aspect: Positive = 1.0
-    render_time: Time | None = None
-    seconds: Annotated[Number, Field(ge=0)] | None = None
+    render_time: Time
+    seconds: Annotated[Number, Field(ge=0)]
 
 
 class _PathFile(BaseModel):
-    keyframes: list[_PathKeyframe] = []
+    keyframes: Annotated[list[_PathKeyframe], BeforeValidator(_with_seconds)] = []
     camera_path: list[_PathCamera] = []
     camera_type: Literal["perspective"] = "perspective"
     fps: Positive = 24.0
@@ -218,6 +227,12 @@ _FILE = TypeAdapter(_PathFile)
 
 def read_path(file: Path) -> CameraPath:
     """The camera path in a file.
+
+    nerfstudio's viewer and renderer read these files, too. Its own have ``camera_path``, a camera
+    for each frame: ``camera_to_world`` (4×4, row by row, OpenGL axes), ``fov`` (vertical, degrees),
+    ``aspect``, and ``render_time`` where the scene moves; and ``keyframes`` from which its viewer
+    made them. devrf adds ``seconds`` and ``render_time`` to each keyframe and goes through them
+    itself. In a file without these, each camera of ``camera_path`` counts as a keyframe.
 
     Raises:
         DevrfError: there is no such file, or it is no camera path.
@@ -231,8 +246,6 @@ def path_from(content: bytes, name: str) -> CameraPath:
     Raises:
         DevrfError: it is none.
     """
-    if len(content) > MAX_BYTES:
-        raise scene_error(name, f"larger than {MAX_BYTES >> 20} MiB, expected a camera path")
     try:
         return _path(_FILE.validate_json(content), name)
     except ValidationError as error:
@@ -240,8 +253,17 @@ def path_from(content: bytes, name: str) -> CameraPath:
 
 
 def write_path(file: Path, path: CameraPath, height: int) -> None:
-    """Write a camera path, whole or not at all; ``height`` is that of nerfstudio's pictures."""
-    first, shots = path.keyframes[0].seconds, path.sampled(path.frames)
+    """Write a camera path, whole or not at all; ``height`` is that of nerfstudio's frames."""
+
+    def entry(keyframe: Keyframe, matrix: str) -> dict[str, Any]:
+        return {
+            matrix: [*keyframe.camera_to_world.flatten().tolist(), 0.0, 0.0, 0.0, 1.0],
+            "fov": keyframe.fov,
+            "aspect": path.aspect,
+            "render_time": keyframe.time,
+        }
+
+    first = path.keyframes[0].seconds
     content = {
         "camera_type": "perspective",
         "render_height": height,
@@ -252,81 +274,41 @@ def write_path(file: Path, path: CameraPath, height: int) -> None:
         "smoothness_value": 0.0,
         "default_fov": path.keyframes[0].fov,
         "keyframes": [
-            {
-                "matrix": _row_by_row(one.camera_to_world),
-                "fov": one.fov,
-                "aspect": path.aspect,
-                "render_time": one.time,
-                "seconds": one.seconds - first,
-            }
-            for one in path.keyframes
+            entry(keyframe, "matrix") | {"seconds": keyframe.seconds - first}
+            for keyframe in path.keyframes
         ],
         "camera_path": [
-            {
-                "camera_to_world": _row_by_row(one.camera_to_world),
-                "fov": one.fov,
-                "aspect": path.aspect,
-                "render_time": one.time,
-            }
-            for one in shots
+            entry(keyframe, "camera_to_world") for keyframe in path.sampled(path.frames)
         ],
     }
     write_json(file, content)
 
 
-def _path(read: _PathFile, where: object) -> CameraPath:
-    own = [one for one in read.keyframes if one.seconds is not None]
-    if own and len(own) == len(read.keyframes):
-        made = [_own_keyframe(one, f"{where}: keyframes[{k}]") for k, one in enumerate(own)]
-        seconds = [one.seconds for one in made]
-        for k in range(1, len(seconds)):
-            if seconds[k] <= seconds[k - 1]:
-                raise scene_error(
-                    f"{where}: keyframes[{k}].seconds",
-                    f"expected more than {seconds[k - 1]:g}, as before it, not {seconds[k]:g}",
-                )
-        return CameraPath(tuple(made), own[0].aspect, read.fps)
-    shots = read.camera_path
-    if not shots:
+def _path(content: _PathFile, where: object) -> CameraPath:
+    cameras, last = content.camera_path, max(len(content.camera_path) - 1, 1)
+    keyframes = [
+        Keyframe(_pose(own.matrix).float(), own.fov, own.render_time, own.seconds)
+        for own in content.keyframes
+    ] or [
+        Keyframe(
+            _pose(camera.camera_to_world).float(),
+            camera.fov,
+            k / last if camera.render_time is None else camera.render_time,
+            k / content.fps,
+        )
+        for k, camera in enumerate(cameras)
+    ]
+    if not keyframes:
         raise scene_error(
             where, "holds no camera path; expected keyframes with seconds, or camera_path"
         )
-    last = max(len(shots) - 1, 1)
-    return CameraPath(
-        tuple(
-            Keyframe(
-                _pose(one.camera_to_world, f"{where}: camera_path[{k}].camera_to_world"),
-                one.fov,
-                k / last if one.render_time is None else one.render_time,
-                k / read.fps,
+    for k, (before, after) in enumerate(pairwise(keyframes), 1):
+        if after.seconds <= before.seconds:
+            raise scene_error(
+                f"{where}: keyframes[{k}].seconds",
+                f"expected more than {before.seconds:g}, as before it, not {after.seconds:g}",
             )
-            for k, one in enumerate(shots)
-        ),
-        shots[0].aspect,
-        read.fps,
-    )
-
-
-def _own_keyframe(one: _PathKeyframe, where: str) -> Keyframe:
-    for name in ("matrix", "fov", "render_time"):
-        if getattr(one, name) is None:
-            raise scene_error(f"{where}.{name}", "is missing; add it")
-    assert one.fov is not None and one.render_time is not None and one.seconds is not None
-    return Keyframe(_pose(one.matrix, f"{where}.matrix"), one.fov, one.render_time, one.seconds)
-
-
-def _pose(numbers: list[float] | str | None, where: str) -> Tensor:
-    """The camera (3, 4) in 16 numbers, row by row."""
-    if not isinstance(numbers, list):
-        raise scene_error(where, "expected a list of 16 numbers, row by row")
-    pose = torch.tensor(numbers, dtype=torch.float64).view(4, 4)[:3]
-    if not bool(is_rotation(pose[:, :3])) or not bool(in_reach(pose[:, 3])):
-        raise scene_error(where, "is no rigid transform; give a rotation and a translation")
-    return pose.float()
-
-
-def _row_by_row(camera_to_world: Tensor) -> list[float]:
-    return [*camera_to_world.flatten().tolist(), 0.0, 0.0, 0.0, 1.0]
+    return CameraPath(tuple(keyframes), (content.keyframes or cameras)[0].aspect, content.fps)
 
 
 def check_name(name: str) -> str:
@@ -335,8 +317,6 @@ def check_name(name: str) -> str:
     Raises:
         DevrfError: it would lie in another folder, or holds what a file's name does not.
     """
-    if not name or len(name) > 100 or not all(c.isalnum() or c in "-_ ." for c in name):
+    if not re.fullmatch(r"[\w-][\w .-]{0,99}", name):
         raise DevrfError(f"{name!r}: expected a name of letters, digits, '-', '_' and '.'")
-    if name.startswith("."):
-        raise DevrfError(f"{name!r}: expected a name that does not begin with a dot")
     return name

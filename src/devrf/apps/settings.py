@@ -12,7 +12,7 @@ from typing import Literal
 
 from devrf.errors import DevrfError
 
-# capture.mattes=subtract
+# capture.alpha_masks=subtract
 SUBTRACT = "subtract"
 
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"]
@@ -29,7 +29,8 @@ class CaptureSettings:
         into: the scene's folder.
         frames: so many frames are picked from a moving camera's video, the sharpest of each
             stretch; of a folder of photographs all are taken.
-        moments: at most so many times are taken from the fixed cameras' videos, evenly spread.
+        max_timesteps: at most so many times are taken from the fixed cameras' videos, evenly
+            spread.
         size: images are written with at most so many pixels of the longer side.
         camera: COLMAP's model of the lenses.
         intrinsics: whether each video has a lens of its own (``separate``), or all have one.
@@ -41,8 +42,8 @@ class CaptureSettings:
             (``inward``); ``auto``: as their axes say.
         test_view: which of the fixed views is held out, counted from 1; −1 is the last.
         holdout: one frame of so many of a moving camera is held out; of a single fixed view, one
-            moment.
-        mattes: a folder of mattes of all footage (:mod:`devrf.apps.capture.images`);
+            time.
+        alpha_masks: a folder of masks of all footage (:mod:`devrf.apps.capture.images`);
             ``subtract``: none, but what moves before the fixed cameras says where the box is;
             None: neither.
     """
@@ -51,7 +52,7 @@ class CaptureSettings:
     views: Sequence[str | Path] = ()
     into: str | Path | None = None
     frames: int = 60
-    moments: int = 50
+    max_timesteps: int = 50
     size: int = 960
     camera: CameraModel = "SIMPLE_RADIAL"
     intrinsics: Literal["separate", "shared"] = "separate"
@@ -60,12 +61,12 @@ class CaptureSettings:
     facing: Literal["auto", "forward", "inward"] = "auto"
     test_view: int = -1
     holdout: int = 8
-    mattes: str | Path | None = None
+    alpha_masks: str | Path | None = None
 
     @property
     def subtracts(self) -> bool:
         """Whether the background of the fixed views is to be subtracted."""
-        return str(self.mattes) == SUBTRACT
+        return str(self.alpha_masks) == SUBTRACT
 
     @property
     def monocular(self) -> bool:
@@ -86,7 +87,7 @@ class CaptureSettings:
                 "capture.static: needs a video, or a folder of photographs, of the scene at rest; "
                 "give capture.static=PATH (a moving camera's video alone is capture.views=[PATH])"
             )
-        least = {"frames": 3, "moments": 2, "size": 64, "holdout": 2}
+        least = {"frames": 3, "max_timesteps": 2, "size": 64, "holdout": 2}
         for key, value in least.items():
             if getattr(self, key) < value:
                 raise DevrfError(
@@ -99,9 +100,10 @@ class CaptureSettings:
                 "each, 0 for the first, or null"
             )
         if self.subtracts and (views < 2 or self.monocular):
+            fixed = 0 if self.monocular else views
             raise DevrfError(
-                f"capture.mattes: subtract needs at least 2 views by cameras that stand still, not "
-                f"{0 if self.monocular else views}; give capture.mattes=FOLDER, or leave it out"
+                "capture.alpha_masks: subtract needs at least 2 views by cameras that stand still, "
+                f"not {fixed}; give capture.alpha_masks=FOLDER, or leave it out"
             )
         if self.test_view == 0 or (views > 1 and not -views <= self.test_view <= views):
             raise DevrfError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import wrap
 from typing import Literal, NamedTuple
 
 import torch
@@ -32,6 +33,9 @@ from devrf.scenes.scene import Background, Views
 
 # Pictures of small images are rendered at this height, in pixels, unless another is asked for.
 READABLE = 400
+# Contact sheets: lower images are enlarged to this height, higher ones reduced to the other.
+MIN_HEIGHT, MAX_HEIGHT = 300, 640
+HEADINGS = ("truth", "rendered", "error: 0 to 0.25 or more", "depth: near is bright")
 
 
 @dataclass(frozen=True)
@@ -139,11 +143,6 @@ def preview(model: Viewable, views: Views, index: int, background: Background) -
     return Preview({"view": shown, "depth": depth}, psnr(compared, truth))
 
 
-# Lower images are enlarged to this height, higher ones reduced to the other, in pixels.
-LEAST_HEIGHT, MOST_HEIGHT = 300, 640
-HEADINGS = ("truth", "rendered", "error: 0 to 0.25 or more", "depth: near is bright")
-
-
 def write_contact_sheet(path: Path, views: Sequence[HeldOutView], rows: int = 6) -> Tensor:
     """Write a PNG with ``rows`` of the views, evenly spread, each with name, time and scores.
 
@@ -161,7 +160,7 @@ def write_contact_sheet(path: Path, views: Sequence[HeldOutView], rows: int = 6)
         )
         for view in shown
     ]
-    height = min(max(shown[0].truth.shape[0], LEAST_HEIGHT), MOST_HEIGHT)
+    height = min(max(shown[0].truth.shape[0], MIN_HEIGHT), MAX_HEIGHT)
     sheet = image_grid(
         [[scaled(tile, height) for tile in row] for row in tiles],
         HEADINGS,
@@ -171,18 +170,10 @@ def write_contact_sheet(path: Path, views: Sequence[HeldOutView], rows: int = 6)
     return sheet
 
 
-def _label(view: HeldOutView) -> tuple[str, ...]:
-    scores = (f"PSNR {view.psnr:.2f} dB", f"SSIM {view.ssim:.3f}")
-    return (*_broken(short_name(view.name)), f"time {view.time:.2f}", *scores)
-
-
-def _broken(name: str) -> list[str]:
-    """A name in lines of about 16 characters, broken at its spaces."""
-    lines = [""]
-    for word in name.split():
-        fits = len(lines[-1]) + len(word) < 16
-        lines = [*lines[:-1], f"{lines[-1]} {word}".strip()] if fits else [*lines, word]
-    return [line for line in lines if line]
+def _label(view: HeldOutView) -> list[str]:
+    name = wrap(short_name(view.name), 16, break_long_words=False, break_on_hyphens=False)
+    scores = [f"PSNR {view.psnr:.2f} dB", f"SSIM {view.ssim:.3f}"]
+    return [*name, f"time {view.time:.2f}", *scores]
 
 
 def _depth_range(views: Sequence[HeldOutView]) -> tuple[float, float]:

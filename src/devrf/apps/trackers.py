@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, cast, runtime_checkable
 
 from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
+from tabulate import tabulate
 from torch import Tensor
 
 from devrf.apps.images import to_bytes
@@ -47,11 +48,6 @@ def trackers(loggers: Iterable[Logger]) -> list[Tracker]:
     return [logger for logger in loggers if isinstance(logger, Tracker)]
 
 
-def columns(rows: Sequence[Row]) -> list[str]:
-    """The keys of the rows, in order of appearance."""
-    return list(dict.fromkeys(key for row in rows for key in row))
-
-
 class TensorBoardTracker(TensorBoardLogger):
     """One set of event files for all stages of a devrf run, added to by each."""
 
@@ -75,9 +71,8 @@ class TensorBoardTracker(TensorBoardLogger):
 
     def show_table(self, name: str, rows: Sequence[Row]) -> None:
         """Log a table as Markdown."""
-        names = columns(rows)
-        cells = [names, ["---"] * len(names), *([_cell(row.get(k)) for k in names] for row in rows)]
-        self.experiment.add_text(name, "\n".join(f"| {' | '.join(line)} |" for line in cells))
+        table = tabulate(rows, headers="keys", tablefmt="github", floatfmt=".6g")
+        self.experiment.add_text(name, table)
 
     def conclude(self, values: Mapping[str, float]) -> None:
         """Log each number once."""
@@ -88,12 +83,6 @@ class TensorBoardTracker(TensorBoardLogger):
         """Write out what is still in memory."""
         if self._experiment is not None:
             self._experiment.close()
-
-
-def _cell(value: str | float | None) -> str:
-    if value is None:
-        return ""
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 # The longest name that wandb takes.
@@ -177,7 +166,7 @@ class WandbTracker(WandbLogger):
 
     def show_table(self, name: str, rows: Sequence[Row]) -> None:
         """Log a table."""
-        names = columns(rows)
+        names = list(dict.fromkeys(key for row in rows for key in row))
         self.log_table(name, names, [[row.get(key) for key in names] for row in rows])
 
     def conclude(self, values: Mapping[str, float]) -> None:

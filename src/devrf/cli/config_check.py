@@ -32,6 +32,8 @@ ROOT: dict[str, Any] = {
 }
 # Keys of earlier versions and their new names; then values, by key.
 RENAMED = {
+    "capture.mattes": "capture.alpha_masks",
+    "capture.moments": "capture.max_timesteps",
     "schedule.deformation.sides": "schedule.deformation.levels.N.side",
     "schedule.deformation.iterations_per_frame": "schedule.deformation.levels.N.iterations",
     "schedule.deformation.parallel_frames": "schedule.deformation.levels.N.parallel_frames",

@@ -4,8 +4,8 @@
        │
     survey      how sharp each frame is, and how much moves from one frame to the next
        ├──────────────► picking     the sharpest frame of each stretch of the static video
-       └──────────────► alignment   what the fixed videos' clocks differ by; the moments, and
-       │                            each video's frame that is nearest to each moment
+       └──────────────► alignment   what the fixed videos' clocks differ by; the times, and
+       │                            each video's frame that is nearest to each time
     frames      these frames as image files of one size
        │
     structure   structure from motion over the picked frames and the first frame of each fixed

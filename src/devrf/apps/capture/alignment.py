@@ -1,12 +1,11 @@
-"""Videos aligned in time: what their clocks differ by, and which frames show one moment."""
+"""Videos aligned in time: what their clocks differ by, and which frames show one time."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -32,44 +31,34 @@ Signal = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Timeline:
-    """Moments that all fixed views show.
+    """Times that all fixed views show.
 
     Attributes:
         offsets: V seconds that each video began after the first.
         times: T times in [0, 1], ascending, the first 0 and the last 1.
-        positions: V tuples of T positions, the frame of each video nearest to each moment.
+        positions: V tuples of T positions, the frame of each video nearest to each time.
     """
 
     offsets: tuple[float, ...]
     times: tuple[float, ...]
     positions: tuple[tuple[int, ...], ...]
 
-    def plain(self) -> dict[str, Any]:
-        """As JSON can hold it."""
-        return asdict(self)
-
-    @staticmethod
-    def of(plain: dict[str, Any]) -> Timeline:
-        """What :meth:`plain` made."""
-        positions = tuple(map(tuple, plain["positions"]))
-        return Timeline(tuple(plain["offsets"]), tuple(plain["times"]), positions)
-
 
 def timeline(
     paths: Sequence[Path],
     surveys: Sequence[Survey],
-    moments: int,
+    max_timesteps: int,
     offsets: Sequence[float] | None = None,
 ) -> Timeline:
     """Align the videos of the fixed views.
 
-    The moments are frames of the video with the lowest rate, every n-th where that has more of
-    them than ``moments``; of the others the nearest frames are taken.
+    The times are those of the frames of the video with the lowest rate, every n-th where it has
+    more of them than ``max_timesteps``; of the others the nearest frames are taken.
 
     Args:
         paths: V videos, for messages.
         surveys: what they show.
-        moments: at most so many.
+        max_timesteps: at most so many.
         offsets: V seconds that each began after the first; None: found from the motion.
 
     Raises:
@@ -77,8 +66,8 @@ def timeline(
     """
     begun = list(map(float, offsets)) if offsets is not None else offsets_found(paths, surveys)
     shown = [
-        (begin + one.times[0], begin + one.times[-1])
-        for begin, one in zip(begun, surveys, strict=True)
+        (begin + survey.times[0], begin + survey.times[-1])
+        for begin, survey in zip(begun, surveys, strict=True)
     ]
     start, end = max(first for first, _ in shown), min(last for _, last in shown)
     shortest = min(last - first for first, last in shown)
@@ -99,7 +88,7 @@ def timeline(
     slack = 0.5 / surveys[slowest].rate
     clock = np.array(surveys[slowest].times) + begun[slowest]
     usable = np.flatnonzero((clock >= start - slack) & (clock <= end + slack))
-    usable = usable[:: -(-len(usable) // moments)]
+    usable = usable[:: -(-len(usable) // max_timesteps)]
     if len(usable) < 2:
         raise DevrfError(
             f"{paths[slowest]}: {len(usable)} frames in the time that all videos show, expected "
@@ -107,8 +96,8 @@ def timeline(
         )
     instants = clock[usable]
     positions = tuple(
-        _nearest(np.array(one.times) + begin, instants)
-        for begin, one in zip(begun, surveys, strict=True)
+        _nearest(np.array(survey.times) + begin, instants)
+        for begin, survey in zip(begun, surveys, strict=True)
     )
     scaled = (instants - instants[0]) / (instants[-1] - instants[0])
     return Timeline(tuple(begun), tuple(scaled.tolist()), positions)

@@ -35,13 +35,13 @@ class Chosen:
         path: the footage.
         label: the folder of its images: ``static``, ``view1`` …
         positions: of its frames, ascending where distinct; a frame may be wanted twice.
-        mattes: of all its frames, which become the images' alpha; None: the images have none.
+        masks: of all its frames, which become the images' alpha; None: the images have none.
     """
 
     path: Path
     label: str
     positions: tuple[int, ...]
-    mattes: Path | None = None
+    masks: Path | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -79,19 +79,19 @@ def write_frames(folder: Path, footage: Chosen, size: Size, filmed: Size) -> Ite
 
     Raises:
         DevrfError: what :func:`devrf.scenes.footage.chosen` and
-            :func:`devrf.apps.capture.images.chosen_mattes` raise, or an image cannot be written.
+            :func:`devrf.apps.capture.images.chosen_masks` raise, or an image cannot be written.
     """
     (folder / footage.label).mkdir(parents=True, exist_ok=True)
     places = dict(zip(footage.positions, footage.names, strict=True))
     wanted = sorted(places)
-    mattes: Iterator[tuple[int, Matte] | None] = repeat(None, len(wanted))
-    if footage.mattes is not None:
-        mattes = chosen_mattes(footage.mattes, footage.path, wanted, filmed)
-    for (position, picture), matte in zip(chosen(footage.path, wanted), mattes, strict=False):
+    masks: Iterator[tuple[int, Mask] | None] = repeat(None, len(wanted))
+    if footage.masks is not None:
+        masks = chosen_masks(footage.masks, footage.path, wanted, filmed)
+    for (position, picture), mask in zip(chosen(footage.path, wanted), masks, strict=False):
         path = folder / places[position]
         image = cv2.cvtColor(fitted(picture, size), cv2.COLOR_RGB2BGR)
-        if matte is not None:
-            image = np.dstack([image, fitted(matte[1], size)])
+        if mask is not None:
+            image = np.dstack([image, fitted(mask[1], size)])
         if not cv2.imwrite(str(path), image):
             raise DevrfError(f"{path}: cannot be written; see that there is room, and permission")
         yield path
@@ -111,19 +111,19 @@ def fitted(picture: Picture, size: Size) -> Picture:
 
 
 # 8-bit grey, (H, W): white is kept, black is background.
-Matte = npt.NDArray[np.uint8]
+Mask = npt.NDArray[np.uint8]
 
 VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm")
 
 
-def mattes_of(folder: Path, footage: Path, count: int) -> Path:
-    """The mattes of some footage: ``<folder>/<its name without suffix>``, a folder or a video.
+def alpha_masks_of(folder: Path, footage: Path, count: int) -> Path:
+    """The alpha masks of some footage: ``<folder>/<its name without suffix>``, a folder or a video.
 
     Of photographs it is a folder with a file of each one's name; of a video one with as many
     images as it has frames, in the order of their names, or a video of as many frames.
 
     Args:
-        folder: ``capture.mattes``.
+        folder: ``capture.alpha_masks``.
         footage: the video, or the folder of photographs.
         count: how many frames it has.
 
@@ -132,15 +132,16 @@ def mattes_of(folder: Path, footage: Path, count: int) -> Path:
     """
     if not os.path.isdir(folder):
         raise DevrfError(
-            f"{folder}: no such folder of mattes; correct capture.mattes, or give subtract"
+            f"{folder}: no such folder of alpha masks; correct "
+            "capture.alpha_masks, or give subtract"
         )
     place = folder / footage.stem
     video = next((v for v in (folder / f"{footage.stem}{s}" for s in VIDEOS) if v.is_file()), None)
     if not os.path.isdir(place):
         if video is None or is_folder(footage):
             raise DevrfError(
-                f"{place}: no such folder, expected the mattes of {footage}; add it with an image "
-                f"for each {'photograph' if is_folder(footage) else 'frame'}"
+                f"{place}: no such folder, expected the alpha masks of {footage}; add it with an "
+                f"image for each {'photograph' if is_folder(footage) else 'frame'}"
             )
         return video
     if is_folder(footage):
@@ -148,19 +149,19 @@ def mattes_of(folder: Path, footage: Path, count: int) -> Path:
             _of_photograph(place, photograph)
     elif len(listed_images(place)) != count:
         raise DevrfError(
-            f"{place}: {len(listed_images(place))} mattes, but {footage} has {count} frames; give "
-            "an image for each frame, in the order of their names"
+            f"{place}: {len(listed_images(place))} alpha masks, but {footage} has {count} frames; "
+            "give an image for each frame, in the order of their names"
         )
     return place
 
 
-def chosen_mattes(
-    mattes: Path, footage: Path, positions: Sequence[int], size: tuple[int, int]
-) -> Iterator[tuple[int, Matte]]:
-    """The mattes of the frames at ``positions``, ascending, each with its position.
+def chosen_masks(
+    masks: Path, footage: Path, positions: Sequence[int], size: tuple[int, int]
+) -> Iterator[tuple[int, Mask]]:
+    """The alpha masks of the frames at ``positions``, ascending, each with its position.
 
     Args:
-        mattes: what :func:`mattes_of` returned.
+        masks: what :func:`alpha_masks_of` returned.
         footage: what they belong to.
         positions: of the frames.
         size: width and height of the frames.
@@ -168,31 +169,31 @@ def chosen_mattes(
     Raises:
         DevrfError: one is no grey image, has another size than its frame, or is missing.
     """
-    if is_folder(mattes):
-        files = listed_images(mattes)
+    if is_folder(masks):
+        files = listed_images(masks)
         if is_folder(footage):
-            files = [_of_photograph(mattes, one) for one in listed_images(footage)]
+            files = [_of_photograph(masks, one) for one in listed_images(footage)]
         for position in positions:
             yield position, read_mask(files[position], size, None, footage)
         return
-    for position, picture in chosen(mattes, positions):
+    for position, picture in chosen(masks, positions):
         height, width = picture.shape[:2]
         if (width, height) != size:
             raise DevrfError(
-                f"{mattes}: {width}x{height} px, but {footage} has {size[0]}x{size[1]} px; give "
-                "mattes of its size"
+                f"{masks}: {width}x{height} px, but {footage} has {size[0]}x{size[1]} px; give "
+                "masks of its size"
             )
         # Grey as it is, whatever compression has made of its colours.
         yield position, picture.mean(axis=2).round().astype(np.uint8)
 
 
-def _of_photograph(mattes: Path, photograph: Path) -> Path:
-    for one in listed_images(mattes):
+def _of_photograph(masks: Path, photograph: Path) -> Path:
+    for one in listed_images(masks):
         if one.stem == photograph.stem:
             return one
     raise DevrfError(
-        f"{mattes / photograph.stem}.png: no such matte, of {photograph}; give each photograph one "
-        "of its name"
+        f"{masks / photograph.stem}.png: no such alpha mask, of {photograph}; give each photograph "
+        "one of its name"
     )
 
 
@@ -207,8 +208,6 @@ _FAR, _LEAST_VARIANCE = 25.0, 16.0
 _MOST_OF_THE_TIME = 0.5
 # Connected pixels that are a smaller share of the image are noise.
 _SPECK = 5e-4
-
-Mask = npt.NDArray[np.uint8]
 
 
 def silhouettes(pictures: Sequence[Picture]) -> list[Mask]:
@@ -286,8 +285,8 @@ def box_of_motion(
     found = None if coarse is None else motion_box(views, coarse)
     if found is None:
         raise DevrfError(
-            "capture.mattes: subtract needs at least 2 fixed views that see something move at one "
-            "time; leave capture.mattes out"
+            "capture.alpha_masks: subtract needs at least 2 fixed views that see something move at "
+            "one time; leave capture.alpha_masks out"
         )
     log.info("what moves is in %s", found)
     return found

@@ -7,14 +7,18 @@ import json
 import logging
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from torch import Tensor
-
 from devrf.apps.capture.alignment import Timeline, timeline
-from devrf.apps.capture.images import Chosen, box_of_motion, common_size, mattes_of, write_frames
+from devrf.apps.capture.images import (
+    Chosen,
+    alpha_masks_of,
+    box_of_motion,
+    common_size,
+    write_frames,
+)
 from devrf.apps.capture.structure import check_library, checked_model, reconstruct
 from devrf.apps.capture.survey import Survey, check_sharp, sharpest, survey
 from devrf.apps.settings import CaptureSettings
@@ -31,116 +35,8 @@ log = logging.getLogger(__name__)
 
 # Part of every key: a change of a step makes what was kept before foreign.
 VERSION = 1
-
-
-def kept(
-    file: Path, source: Any, make: Callable[[], dict[str, Any]], *, files: Path | None = None
-) -> dict[str, Any]:
-    """What ``make`` returns, or what it returned before from the same source.
-
-    Args:
-        file: the JSON file that keeps it.
-        source: all that it depends on, as JSON can hold it.
-        make: finds it anew.
-        files: a folder of files that belong to it; without it, it is found anew.
-    """
-    key = digest(source)
-    if file.is_file() and (files is None or files.is_dir()):
-        try:
-            found = json.loads(file.read_text())
-            if found["key"] == key and isinstance(found["result"], dict):
-                log.info("%s: found before", file.stem)
-                return dict(found["result"])
-        except (ValueError, KeyError, TypeError):
-            log.warning("%s: damaged; it is found again", file)
-    result = make()
-    write_json(file, {"key": key, "result": result})
-    return result
-
-
-def digest(source: Any) -> str:
-    """A short hash of something that JSON can hold."""
-    text = json.dumps([VERSION, source], sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-def stamp(path: Path) -> list[Any]:
-    """What tells one state of a file, or of a folder of files, from another."""
-    files = sorted(path.iterdir()) if path.is_dir() else [path]
-    found = [(file, file.stat()) for file in files if file.is_file()]
-    return [str(path.resolve()), *([f.name, s.st_size, s.st_mtime_ns] for f, s in found)]
-
-
-# Below the scene's folder.
-IMAGES = "images"
-
-
-@dataclass(frozen=True)
-class Shot:
-    """One image of the scene.
-
-    Attributes:
-        name: of its file, relative to the folder of images.
-        pose: (3, 4) camera-to-world, OpenGL axes, world units.
-        lens: ``fl_x``, ``cx``, ``k1`` … in pixels of the image.
-        time: in [0, 1], 0 at rest.
-        held_out: whether it is scored instead of learned from.
-    """
-
-    name: str
-    pose: Tensor
-    lens: dict[str, float]
-    time: float
-    held_out: bool
-
-
-def write_scene(
-    folder: Path, shots: Sequence[Shot], world: World, model: str, *, cut_out: bool = False
-) -> Path:
-    """Write ``transforms.json``; the images are there already.
-
-    Args:
-        folder: the scene's.
-        shots: all images.
-        world: where the scene is.
-        model: the lenses' camera model.
-        cut_out: whether the images have mattes: there is nothing around what they cut out, and
-            the reader finds its box.
-
-    Returns:
-        The file.
-    """
-    path = folder / FILE
-    bounds: dict[str, Any] = {"space": world.space, "near": world.near, "far": world.far}
-    if world.box is not None:
-        bounds["box"] = world.box
-    if cut_out and world.space == "contracted":
-        bounds = {"space": "world"}
-    write_json(
-        path,
-        {
-            "camera_model": model,
-            "scene_bounds": bounds,
-            "frames": [_frame(shot) for shot in shots],
-            "train_filenames": [f"{IMAGES}/{one.name}" for one in shots if not one.held_out],
-            "test_filenames": [f"{IMAGES}/{one.name}" for one in shots if one.held_out],
-        },
-    )
-    return path
-
-
-def _frame(shot: Shot) -> dict[str, Any]:
-    matrix = [*shot.pose.tolist(), [0.0, 0.0, 0.0, 1.0]]
-    return {
-        "file_path": f"{IMAGES}/{shot.name}",
-        "time": shot.time,
-        **shot.lens,
-        "transform_matrix": matrix,
-    }
-
-
-# Below the scene's folder: what the steps have found.
-WORK = "capture"
+# Below the scene's folder: what the steps have found, and the images.
+WORK, IMAGES = "capture", "images"
 
 
 def scene_from_footage(settings: CaptureSettings) -> Path:
@@ -162,26 +58,29 @@ def scene_from_footage(settings: CaptureSettings) -> Path:
     views = [] if settings.monocular else [_path(view) for view in settings.views]
     source = settings.views[0] if settings.monocular else settings.static
     assert source is not None  # settings.check has seen to it
-    still = _path(source)
-    surveys = {path: _surveyed(path, work) for path in (still, *views)}
+    static = _path(source)
+    surveys = {path: _surveyed(path, work) for path in (static, *views)}
     for path in views:
         if len(surveys[path].times) < 2 or is_folder(path):
             raise DevrfError(f"{path}: expected a video by a camera that stands still")
-    sharp = surveys[still].sharpness
-    picked = list(range(len(sharp))) if is_folder(still) else sharpest(sharp, settings.frames)
-    check_sharp(still, sharp, picked)
-    mattes = _mattes(settings, surveys)
-    moving = Chosen(still, "static", tuple(picked), mattes.get(still))
+    sharp = surveys[static].sharpness
+    picked = list(range(len(sharp))) if is_folder(static) else sharpest(sharp, settings.frames)
+    check_sharp(static, sharp, picked)
+    masks: dict[Path, Path] = {}
+    if settings.alpha_masks is not None and not settings.subtracts:
+        folder = _path(settings.alpha_masks)
+        masks = {path: alpha_masks_of(folder, path, len(s.times)) for path, s in surveys.items()}
+    moving = Chosen(static, "static", tuple(picked), masks.get(static))
     clock = Timeline((), (), ())
     if views:
-        clock = timeline(views, [surveys[v] for v in views], settings.moments, settings.offsets)
+        in_view = [surveys[view] for view in views]
+        clock = timeline(views, in_view, settings.max_timesteps, settings.offsets)
     fixed = [
-        Chosen(path, f"view{k}", positions, mattes.get(path))
+        Chosen(path, f"view{k}", positions, masks.get(path))
         for k, (path, positions) in enumerate(zip(views, clock.positions, strict=True), 1)
     ]
-    filmed = {path: one.size for path, one in surveys.items()}
-    size = common_size(filmed, settings.size)
-    _written(into, work, [moving, *fixed], size, filmed)
+    filmed = {path: survey.size for path, survey in surveys.items()}
+    _write_images(into, work, [moving, *fixed], common_size(filmed, settings.size), filmed)
     model = _model(into, work, moving, fixed, settings)
     world = normalised(model, settings.facing)
     if settings.facing == "auto":
@@ -189,11 +88,60 @@ def scene_from_footage(settings: CaptureSettings) -> Path:
         log.info("cameras look %s-facing; capture.facing says otherwise", facing)
     if settings.subtracts:
         world = _around_motion(world, model, into / IMAGES, fixed)
-    taken = surveys[still].times if settings.monocular else None
-    shots = _shots(model, world, moving, fixed, clock, settings, taken)
-    path = write_scene(into, shots, world, settings.camera, cut_out=bool(mattes))
-    log.info("%d images written to %s", len(shots), path)
+    taken = surveys[static].times if settings.monocular else None
+    frames, test = _frames(model, world, moving, fixed, clock, settings, taken)
+    names = [frame["file_path"] for frame in frames]
+    bounds: dict[str, Any] = {"space": world.space, "near": world.near, "far": world.far}
+    if world.box is not None:
+        bounds["box"] = world.box
+    if masks and world.space == "contracted":
+        # There is nothing around what is cut out, and the reader finds its box.
+        bounds = {"space": "world"}
+    content = {
+        "camera_model": settings.camera,
+        "scene_bounds": bounds,
+        "frames": frames,
+        "train_filenames": [name for name in names if name not in test],
+        "test_filenames": [name for name in names if name in test],
+    }
+    write_json(into / FILE, content)
+    log.info("%d images written to %s", len(frames), into / FILE)
     return into
+
+
+def kept(file: Path, source: Any, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """What ``make`` returns, or what it returned before from the same source.
+
+    Args:
+        file: the JSON file that keeps it.
+        source: all that it depends on, as JSON can hold it.
+        make: makes it again.
+    """
+    key = _digest(source)
+    if file.is_file():
+        try:
+            stored = json.loads(file.read_text())
+            if stored["key"] == key:
+                log.info("%s: found before", file.stem)
+                return dict(stored["result"])
+        except (ValueError, KeyError, TypeError):
+            log.warning("%s: damaged; it is made again", file)
+    result = make()
+    write_json(file, {"key": key, "result": result})
+    return result
+
+
+def _digest(source: Any) -> str:
+    """A short hash of something that JSON can hold."""
+    text = json.dumps([VERSION, source], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _stamp(path: Path) -> list[Any]:
+    """What tells one state of a file, or of a folder of files, from another."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    states = [(file.name, file.stat()) for file in files if file.is_file()]
+    return [str(path.resolve()), *([name, s.st_size, s.st_mtime_ns] for name, s in states)]
 
 
 def _folders(settings: CaptureSettings) -> tuple[Path, Path]:
@@ -226,68 +174,55 @@ def _surveyed(path: Path, work: Path) -> Survey:
 
     def make() -> dict[str, Any]:
         frames = followed(pictures(path), frame_count(path), f"looking at {path.name}")
-        return survey(path, frames).plain()
+        return asdict(survey(path, frames))
 
-    source = stamp(path)
-    return Survey.of(kept(work / f"survey-{_slug(path)}.json", source, make))
-
-
-def _slug(path: Path) -> str:
-    return f"{path.stem}-{digest(str(path.resolve()))[:6]}"
+    slug = f"{path.stem}-{_digest(str(path.resolve()))[:6]}"
+    values = kept(work / f"survey-{slug}.json", _stamp(path), make)
+    return Survey(*(tuple(values[key]) for key in ("size", "times", "sharpness", "motion")))
 
 
-def _mattes(settings: CaptureSettings, surveys: dict[Path, Survey]) -> dict[Path, Path]:
-    """The mattes of each footage, or none of any."""
-    if settings.mattes is None or settings.subtracts:
-        return {}
-    folder = _path(settings.mattes)
-    return {path: mattes_of(folder, path, len(one.times)) for path, one in surveys.items()}
-
-
-def _written(
+def _write_images(
     into: Path,
     work: Path,
     footage: Sequence[Chosen],
     size: tuple[int, int],
     filmed: dict[Path, tuple[int, int]],
 ) -> None:
-    """The images, written anew where anything has changed."""
-    images = into / IMAGES
+    """The images, written again where anything has changed."""
+    images, file = into / IMAGES, work / "images.json"
     source = [
-        [one.label, stamp(one.path), one.positions, one.mattes and stamp(one.mattes)]
-        for one in footage
+        [video.label, _stamp(video.path), video.positions, video.masks and _stamp(video.masks)]
+        for video in footage
     ]
 
     def make() -> dict[str, Any]:
         # What they belong to is no longer whole.
         (into / FILE).unlink(missing_ok=True)
         shutil.rmtree(images, ignore_errors=True)
-        for one in footage:
-            count = len(set(one.positions))
-            written = write_frames(images, one, size, filmed[one.path])
-            for _ in followed(written, count, f"images of {one.label}"):
+        for video in footage:
+            written = write_frames(images, video, size, filmed[video.path])
+            for _ in followed(written, len(set(video.positions)), f"images of {video.label}"):
                 pass
         return {"size": size}
 
-    kept(work / "images.json", [source, size], make, files=images)
+    if not images.is_dir():
+        file.unlink(missing_ok=True)
+    kept(file, [source, size], make)
 
 
 def _model(
     into: Path, work: Path, moving: Chosen, fixed: Sequence[Chosen], settings: CaptureSettings
 ) -> SparseModel:
-    first = {one.names[0]: one.path for one in fixed}
+    first = {video.names[0]: video.path for video in fixed}
     options = [settings.camera, settings.intrinsics, settings.matching]
-    images = [[one.label, stamp(one.path), one.positions] for one in (moving, *fixed)]
+    images = [[video.label, _stamp(video.path), video.positions] for video in (moving, *fixed)]
 
     def make() -> dict[str, Any]:
-        def say(what: str) -> None:
-            log.info("structure from motion: %s", what)
-
-        folder = reconstruct(into / IMAGES, work, moving, list(first), settings, say)
+        folder = reconstruct(into / IMAGES, work, moving, list(first), settings)
         return {"model": folder.name}
 
-    found = kept(work / "structure.json", [images, options, settings.size], make)
-    return checked_model(work / "models" / found["model"], moving, first)
+    result = kept(work / "structure.json", [images, options, settings.size], make)
+    return checked_model(work / "models" / result["model"], moving, first)
 
 
 def _around_motion(
@@ -296,19 +231,19 @@ def _around_motion(
     """The world with the box of what moves, where it has a box."""
     if world.space != "contracted":
         log.warning(
-            "capture.mattes=subtract: a forward-facing scene has no box, it changes nothing"
+            "capture.alpha_masks=subtract: a forward-facing scene has no box, it changes nothing"
         )
         return world
-    place = {one.name: k for k, one in enumerate(model.images)}
-    first = [place[one.names[0]] for one in fixed]
-    lenses = [_lens(model, model.images[k].camera) for k in first]
-    poses = world.poses[first]
+    place = {image.name: k for k, image in enumerate(model.images)}
+    first = [place[video.names[0]] for video in fixed]
+    lenses = [model.cameras[model.images[k].camera].keys for k in first]
     around = Box.of([-AROUND] * 3, [AROUND] * 3)
-    box = box_of_motion(images, [one.names for one in fixed], poses, lenses, around)
+    names = [video.names for video in fixed]
+    box = box_of_motion(images, names, world.poses[first], lenses, around)
     return replace(world, box=(box.low, box.high))
 
 
-def _shots(
+def _frames(
     model: SparseModel,
     world: World,
     moving: Chosen,
@@ -316,46 +251,42 @@ def _shots(
     clock: Timeline,
     settings: CaptureSettings,
     taken: Sequence[float] | None,
-) -> list[Shot]:
-    """All images with cameras, times and whether they are held out.
+) -> tuple[list[dict[str, Any]], set[str]]:
+    """All images with cameras and times, as nerfstudio's file has them; which are held out.
 
     Args:
         model: the structure from motion.
         world: the same, normalised.
         moving: the moving camera's images.
         fixed: those of the fixed views.
-        clock: the moments of the fixed views.
+        clock: the times of the fixed views.
         settings: what is held out.
         taken: seconds of the moving camera's frames, if the scene moved before it; else None.
     """
-    place = {one.name: k for k, one in enumerate(model.images)}
-    lens = [_lens(model, one.camera) for one in model.images]
+    place = {image.name: k for k, image in enumerate(model.images)}
+    frames, test = list[dict[str, Any]](), set[str]()
 
-    def shot(name: str, camera: str, time: float, held_out: bool) -> Shot:
-        k = place[camera]
-        return Shot(name, world.poses[k], lens[k], time, held_out)
+    def add(name: str, camera: str, time: float, held_out: bool) -> None:
+        k, path = place[camera], f"{IMAGES}/{name}"
+        lens = model.cameras[model.images[k].camera].keys
+        pose = [*world.poses[k].tolist(), [0.0, 0.0, 0.0, 1.0]]
+        frames.append({"file_path": path, "time": time, **lens, "transform_matrix": pose})
+        if held_out:
+            test.add(path)
 
-    known = [
-        (position, name)
-        for position, name in zip(moving.positions, moving.names, strict=True)
-        if name in place
-    ]
-    _, out = every_nth(len(known), settings.holdout)
+    named = zip(moving.positions, moving.names, strict=True)
+    known = [(position, name) for position, name in named if name in place]
+    _, held_out = every_nth(len(known), settings.holdout)
     first, last = known[0][0], known[-1][0]
-    shots = []
     for k, (position, name) in enumerate(known):
         time = 0.0
         if taken is not None:
             time = (taken[position] - taken[first]) / (taken[last] - taken[first])
-        shots.append(shot(name, name, time, k in out))
-    test = settings.test_view - 1 if settings.test_view > 0 else len(fixed) + settings.test_view
-    _, later = every_nth(len(clock.times), settings.holdout) if fixed else ([], [])
-    for v, one in enumerate(fixed):
-        for k, (name, time) in enumerate(zip(one.names, clock.times, strict=True)):
-            held_out = v == test if len(fixed) > 1 else k in later
-            shots.append(shot(name, one.names[0], time, held_out))
-    return shots
-
-
-def _lens(model: SparseModel, camera: int) -> dict[str, float]:
-    return model.cameras[camera].keys
+        add(name, name, time, k in held_out)
+    test_view = settings.test_view - (settings.test_view > 0)
+    _, held_out = every_nth(len(clock.times), settings.holdout) if fixed else ([], [])
+    for v, video in enumerate(fixed):
+        for k, (name, time) in enumerate(zip(video.names, clock.times, strict=True)):
+            is_test = v == test_view % len(fixed) if len(fixed) > 1 else k in held_out
+            add(name, video.names[0], time, is_test)
+    return frames, test

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import logging
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib.util import find_spec
 from itertools import combinations
 from pathlib import Path
@@ -72,7 +72,6 @@ def reconstruct(
     moving: Chosen,
     fixed: Sequence[str],
     settings: CaptureSettings,
-    advance: Callable[[str], None],
 ) -> Path:
     """Run structure from motion and write the model.
 
@@ -82,7 +81,6 @@ def reconstruct(
         moving: the moving camera's images.
         fixed: one image of each fixed view, all of the scene at rest.
         settings: the lens model, whether lenses are shared, and what is compared.
-        advance: is told what is done next.
 
     Returns:
         The folder of the largest model.
@@ -98,7 +96,7 @@ def reconstruct(
     shutil.rmtree(models, ignore_errors=True)
     models.mkdir(parents=True)
     names = [*dict.fromkeys([*moving.names, *fixed])]
-    advance(f"features of {len(names)} images")
+    log.info("structure from motion: features of %d images", len(names))
     modes = library.CameraMode
     reading = library.ImageReaderOptions()
     reading.camera_model = settings.camera
@@ -115,7 +113,7 @@ def reconstruct(
     )
     compared = pairs(moving.names, [n for n in fixed if n not in moving.names], settings.matching)
     listed.write_text("".join(f"{a} {b}\n" for a, b in compared))
-    advance(f"matches of {len(compared)} pairs")
+    log.info("structure from motion: matches of %d pairs", len(compared))
     matching = library.FeatureMatchingOptions()
     matching.use_gpu = False
     wanted = library.ImportedPairingOptions()
@@ -123,7 +121,7 @@ def reconstruct(
     verification = library.TwoViewGeometryOptions()
     verification.ransac.random_seed = 0
     library.match_image_pairs(base, matching, wanted, verification, device=library.Device.cpu)
-    advance("cameras and points")
+    log.info("structure from motion: cameras and points")
     mapping = library.IncrementalPipelineOptions()
     mapping.random_seed = 0
     mapping.min_model_size = 3

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -47,16 +46,6 @@ class Survey:
     def rate(self) -> float:
         """Frames a second, the median."""
         return 1 / float(np.median(np.diff(self.times)))
-
-    def plain(self) -> dict[str, Any]:
-        """As JSON can hold it."""
-        return asdict(self)
-
-    @staticmethod
-    def of(plain: dict[str, Any]) -> Survey:
-        """What :meth:`plain` made."""
-        parts = (tuple(plain[key]) for key in ("size", "times", "sharpness", "motion"))
-        return Survey(*parts)
 
 
 def survey(path: Path, followed: Iterable[tuple[float, Picture]] | None = None) -> Survey:

@@ -20,7 +20,7 @@ from devrf.apps.viewer.cameras import FrustaLayer, Pose
 from devrf.apps.viewer.controls import Controls
 from devrf.apps.viewer.drawing import Drawing, Frame, RenderScheduler
 from devrf.apps.viewer.paths import PathPanel, distance_ahead, known_paths
-from devrf.checkpoints.viewpoints import Viewpoints
+from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.rendering.view import Viewable
 from devrf.scenes.scene import Scene
 

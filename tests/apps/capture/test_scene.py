@@ -1,0 +1,269 @@
+"""From videos to a scene that is read; what is wrong with footage is said in one line.
+
+Structure from motion itself is left out: its model is that of cameras on a ring, or in a row.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from devrf.apps.capture.pipeline import scene_from_footage
+from devrf.apps.settings import CaptureSettings
+from devrf.data.recognised import recognised_datamodule
+from devrf.errors import DevrfError
+from devrf.geometry.box import Box
+from devrf.geometry.cameras import Cameras
+from devrf.scenes.sparse_model import normalised, read_model
+
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+
+
+def write_model(folder, names, positions, target, points):
+    """A text model: a camera an image, looking at the target; all show all points."""
+    cameras = Cameras.looking_at(
+        positions, target.expand_as(positions), focal=60.0, width=64, height=48, up=UP
+    )
+    shown = " ".join(f"1 1 {k}" for k in range(len(points)))
+    lines = []
+    for k, (name, pose) in enumerate(zip(names, cameras.camera_to_world, strict=True), 1):
+        turn = (pose[:, :3] * pose.new_tensor([1, -1, -1])).T
+        axis = cv2.Rodrigues(turn.numpy())[0][:, 0]
+        half = float(np.linalg.norm(axis)) / 2
+        numbers = [np.cos(half), *(axis / (2 * half) * np.sin(half)), *(-turn @ pose[:, 3])]
+        lines.append(f"{k} {' '.join(str(float(n)) for n in numbers)} 1 {name}\n{shown}\n")
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "cameras.txt").write_text("1 SIMPLE_PINHOLE 64 48 60 32 24\n")
+    (folder / "images.txt").write_text("".join(lines))
+    listed = (f"{k} {x} {y} {z} 0 0 0 0\n" for k, (x, y, z) in enumerate(points))
+    (folder / "points3D.txt").write_text("".join(listed))
+    return folder
+
+
+def ring(folder, names):
+    """Cameras 4 units around 60 points near the origin."""
+    angle = torch.arange(len(names), dtype=torch.float64) * 2 * torch.pi / len(names)
+    positions = torch.stack([4 * angle.cos(), 4 * angle.sin(), torch.ones_like(angle)], dim=1)
+    points = np.random.default_rng(0).uniform(-0.6, 0.6, (60, 3))
+    return write_model(folder, names, positions, torch.zeros(3).double(), points)
+
+
+def row(folder, names):
+    """Cameras before a wall, 20 to 30 units away."""
+    generator = np.random.default_rng(0)
+    points = generator.uniform([-9, 20, -6], [9, 30, 6], (400, 3))
+    positions = torch.tensor(generator.uniform([-3, -0.5, -2], [3, 0.5, 2], (len(names), 3)))
+    return write_model(folder, names, positions, torch.tensor([0.0, 25, 0]).double(), points)
+
+
+@pytest.fixture
+def structure(monkeypatch):
+    """Stands for structure from motion; holds the model, and the images asked for, by call."""
+
+    class Structure:
+        model, calls = staticmethod(ring), []
+
+        def __call__(self, images, work, moving, fixed, settings):
+            self.calls.append([*moving.names, *fixed])
+            return self.model(work / "models" / "0", self.calls[-1])
+
+    stand_in = Structure()
+    stand_in.calls = []
+    monkeypatch.setattr("devrf.apps.capture.pipeline.check_library", lambda: None)
+    monkeypatch.setattr("devrf.apps.capture.pipeline.reconstruct", stand_in)
+    return stand_in
+
+
+@pytest.fixture
+def footage(film, textured):
+    """A walk of 12 frames, and three fixed views of six."""
+    walk = film("walk.mp4", [textured(k) for k in range(12)])
+    views = []
+    for v in range(3):
+        pictures = [textured(20 + v) for _ in range(6)]
+        for t, side in enumerate((0, 9, 3, 15, 5, 7)):
+            pictures[t][10:30, 10 + side : 30 + side] = (255, 40 * v, 0)
+        views.append(film(f"view{v}.mp4", pictures))
+    return walk, views
+
+
+@pytest.fixture
+def capture(footage, structure, tmp_path):
+    """Makes a scene of the walk and the views; returns it as it is read."""
+
+    def run(**settings):
+        walk, views = footage
+        usual = {"static": walk, "views": views, "offsets": [0, 0, 0]}
+        scene_from_footage(CaptureSettings(into=tmp_path / "scene", **{**usual, **settings}))
+        return recognised_datamodule(tmp_path / "scene", flow="none").scene
+
+    return run
+
+
+def test_one_moving_camera_gives_each_frame_a_time(capture, footage):
+    scene = capture(static=None, views=[footage[0]], offsets=None, frames=12, holdout=4)
+    train, test = scene.dynamic.train, scene.dynamic.test
+    assert (scene.kind, len(train), len(test)) == ("inward", 9, 3)
+    times = torch.cat([train.times, test.times]).sort().values
+    assert torch.allclose(times, torch.linspace(0, 1, 12), atol=1e-4)
+    assert len(train.view.unique()) == 9  # the camera moves
+    assert scene.static.train is train  # there is no static set
+
+
+def test_cameras_around_a_thing_share_a_contracted_world(capture):
+    scene = capture()
+    assert not scene.space.is_linear
+    assert scene.bounds.reason == "scene_bounds in transforms.json"
+    assert scene.bounds.box_source == "what the static cameras all see"
+    assert [len(v) for v in (scene.dynamic.train, scene.dynamic.test)] == [12, 6]
+    distances = scene.static.train.cameras.positions.norm(dim=1)
+    assert torch.allclose(distances, torch.full_like(distances, 4.0), atol=1e-3)
+
+
+def test_cameras_in_a_row_share_ndc(capture, structure):
+    structure.model = row
+    scene = capture(holdout=6)
+    assert scene.kind == "forward" and scene.space.near == 1.0
+    # Static: the moving camera's, and the fixed views' first time.
+    assert [len(v) for v in (scene.static.train, scene.static.test)] == [10 + 2, 2 + 1]
+    assert scene.dynamic.train.times.unique().tolist() == pytest.approx([0, 0.2, 0.4, 0.6, 0.8, 1])
+    assert all(name.startswith("images/view3/") for name in scene.dynamic.test.names)
+
+
+def test_alpha_masks_make_a_world_of_the_thing_and_are_found_again(
+    capture, footage, structure, tmp_path
+):
+    grey = np.zeros((48, 64), np.uint8)
+    grey[14:34, 22:42] = 255
+    masks = tmp_path / "masks"
+    for video, count in ((footage[0], 12), *((view, 6) for view in footage[1])):
+        (masks / video.stem).mkdir(parents=True)
+        for k in range(count):
+            cv2.imwrite(str(masks / video.stem / f"{k:02}.png"), grey)
+    scene = capture(alpha_masks=masks)
+    assert scene.static.train.cut_out and scene.dynamic.test.cut_out
+    assert scene.space.is_linear and scene.bounds.motion is not None
+    capture(alpha_masks=masks)
+    assert len(structure.calls) == 1  # found again as long as no mask changes
+    cv2.imwrite(str(masks / "walk" / "00.png"), grey[:24])
+    with pytest.raises(DevrfError, match=r"00\.png: 64x24 px, but its image"):
+        capture(alpha_masks=masks)
+    assert not (tmp_path / "scene" / "transforms.json").exists()
+
+
+def test_subtraction_gives_the_box_of_what_moves(capture):
+    scene = capture(alpha_masks="subtract")
+    assert not scene.static.train.has_alpha and not scene.space.is_linear
+    assert scene.bounds.box_source == "scene_bounds in transforms.json"
+    # Its box is another than that of all sparse points, 1.2 units wide and their margin.
+    assert Box.of(scene.space.low, scene.space.high).longest > 2
+
+
+# The world of a model.
+
+
+def test_the_world_of_cameras_before_a_wall(tmp_path):
+    model = read_model(row(tmp_path / "model", [f"{k}.png" for k in range(9)]))
+    world = normalised(model)
+    assert (world.space, world.near, world.box) == ("ndc", 1.0, None)
+    assert torch.allclose(world.poses[:, :, 3].mean(dim=0), torch.zeros(3).double(), atol=1e-6)
+    mean = world.poses[:, :, 2].mean(dim=0)
+    assert torch.allclose(mean / mean.norm(), UP, atol=1e-6)
+    # All but the nearest hundredth are beyond 1/0.75; the wall is 1.5 times as deep as near.
+    assert float((-world.points[:, 2]).min()) == pytest.approx(4 / 3, rel=0.1)
+    assert 1.3 < world.far / (4 / 3) < 1.7
+    # As if around it: their axes do not meet, so the box is that of the points.
+    world = normalised(model, "inward")
+    assert world.space == "contracted" and world.box is not None
+    low, high = world.points.amin(dim=0), world.points.amax(dim=0)
+    assert bool((torch.tensor(world.box[0]) > 1.2 * low - 0.5).all())
+    assert bool((torch.tensor(world.box[1]) < 1.2 * high + 0.5).all())
+
+
+def test_the_world_of_cameras_around_a_thing(tmp_path):
+    angle = torch.arange(12, dtype=torch.float64) * np.pi / 6
+    around = torch.stack([30 * angle.cos(), 30 * angle.sin(), torch.full_like(angle, 8.0)], dim=1)
+    middle = torch.tensor([5.0, -2.0, 1.0]).double()
+    points = np.random.default_rng(1).uniform(-3, 3, (300, 3)) + middle.numpy()
+    names = [f"{k}.png" for k in range(12)]
+    model = read_model(write_model(tmp_path / "model", names, around + middle, middle, points))
+    world = normalised(model)
+    # The reader's box is better: what all cameras see.
+    assert world.space == "contracted" and world.box is None
+    assert torch.allclose(world.poses[:, :, 3].norm(dim=1), torch.tensor(4.0).double(), atol=1e-4)
+    assert float(world.poses[:, :, 3].mean(dim=0)[2]) == pytest.approx(4 * 8 / 31.05, rel=1e-2)
+
+
+# What is wrong is said in one line, and nothing is left behind.
+
+
+@pytest.fixture
+def into(tmp_path, monkeypatch):
+    monkeypatch.setattr("devrf.apps.capture.pipeline.check_library", lambda: None)
+    return tmp_path / "scene"
+
+
+def refused(into, **settings):
+    """The line that a capture ends with; its folder is no scene then."""
+    with pytest.raises(DevrfError) as error:
+        scene_from_footage(CaptureSettings(into=into, **settings))
+    line = str(error.value)
+    assert "\n" not in line and not (into / "transforms.json").exists()
+    return line
+
+
+def test_settings_that_do_not_go_together(into):
+    with pytest.raises(DevrfError, match=r"^capture\.into: stage=capture needs a folder"):
+        CaptureSettings(static="a.mp4").check()
+    assert refused(into).startswith("capture.static: needs a video, or a folder of photographs")
+    two = {"static": "s.mp4", "views": ["a.mp4", "b.mp4"]}
+    assert refused(into, **two, offsets=[0]).startswith("capture.offsets: 1 offsets for 2 views")
+    assert refused(into, **two, test_view=3).startswith("capture.test_view: 3 is none of the 2")
+    assert refused(into, **two, frames=2) == "capture.frames: expected at least 3, not 2"
+    one = {"static": "s.mp4", "views": ["a.mp4"], "alpha_masks": "subtract"}
+    assert refused(into, **one).startswith("capture.alpha_masks: subtract needs at least 2 views")
+    assert CaptureSettings(views=["a.mp4"]).monocular
+    assert CaptureSettings(static="a.mp4", views=["a.mp4"]).monocular
+    assert not CaptureSettings(static="s.mp4", views=["a.mp4"]).monocular
+
+
+def test_footage_that_cannot_be_read(into, tmp_path, film, textured, capfd):
+    missing = tmp_path / "no.mp4"
+    assert refused(into, static=missing).startswith(f"{missing}: no such video; correct capture.")
+    damaged = tmp_path / "damaged.mp4"
+    damaged.write_bytes(b"not a video" * 50)
+    assert refused(into, static=damaged).startswith(f"{damaged}: not a readable video; convert it")
+    assert not into.exists() and capfd.readouterr().err == ""  # nor do libraries say anything
+    short = film("short.mp4", [textured(0)])
+    expected = f"{short}: a video of 1 frame, expected at least 2; give a longer one"
+    assert refused(into, static=short).startswith(expected)
+
+
+def test_a_folder_that_is_something_else_or_cannot_be_made(tmp_path, into, film, textured):
+    video = film("a.mp4", [textured(k) for k in range(4)])
+    into.mkdir()
+    (into / "mine.txt").touch()
+    assert refused(into, static=video).startswith(f"{into}: is there already, and not from stage=")
+    (tmp_path / "file").touch()
+    with pytest.raises(DevrfError, match=r"file/scene/capture: cannot be made \(Not a directory"):
+        scene_from_footage(CaptureSettings(static=video, into=tmp_path / "file" / "scene"))
+
+
+@pytest.mark.skipif(importlib.util.find_spec("pycolmap") is None, reason="needs devrf[capture]")
+def test_footage_without_overlap(into, film):
+    pictures = np.random.default_rng(0).integers(0, 256, (4, 96, 128, 3), dtype=np.uint8)
+    static = film("static.mp4", list(pictures))
+    line = refused(into, static=static)
+    assert line.startswith(f"{static}: too few matches between its frames to find any camera; film")
+    # What the steps before have found stays.
+    assert (into / "capture" / "images.json").is_file()
+
+
+def test_the_missing_extra_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr("devrf.apps.capture.structure.find_spec", lambda name: None)
+    line = refused(tmp_path / "scene", static="a.mp4")
+    assert line == 'stage=capture: pycolmap is not installed; run pip install "devrf[capture]"'

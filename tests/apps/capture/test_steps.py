@@ -1,0 +1,276 @@
+"""The steps of a capture: survey, alignment, images with alpha masks, structure, box of motion."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from devrf.apps.capture.alignment import offset_between, timeline
+from devrf.apps.capture.images import (
+    Chosen,
+    alpha_masks_of,
+    box_of_motion,
+    common_size,
+    fitted,
+    silhouettes,
+    write_frames,
+)
+from devrf.apps.capture.structure import checked_model, pairs
+from devrf.apps.capture.survey import BLURRED, check_sharp, moved, sharpest, sharpness, survey
+from devrf.errors import DevrfError
+from devrf.geometry.box import Box
+from devrf.geometry.cameras import Cameras
+
+SIZE = (64, 48)
+PATHS = [Path("a.mp4"), Path("b.mp4")]
+
+
+# Survey.
+
+
+def test_blur_lowers_sharpness_whatever_the_contrast(textured):
+    grey = textured(0)[..., 0].astype(np.float32)
+    sharp = sharpness(grey)
+    assert sharpness(0.3 * grey + 20) == pytest.approx(sharp, abs=1e-4)
+    slight, strong = (sharpness(cv2.GaussianBlur(grey, (0, 0), s)) for s in (1.5, 5.0))
+    assert sharp > 0.8 > slight > 0.5 > BLURRED > strong
+    assert sharpness(np.full((48, 64), 7, np.float32)) == 0
+
+
+def test_motion_is_what_exceeds_noise_and_changes_of_all_pixels():
+    before = np.full((10, 10), 100, np.float32)
+    assert moved(before, before + 30) == 0  # exposure
+    after = before.copy()
+    after[:, :2] += 12
+    assert moved(before, after) == pytest.approx(0.2 * (12 - 2))
+
+
+def test_the_sharpest_of_each_stretch_is_picked_and_blurred_footage_refused():
+    assert sharpest([0.1, 0.9, 0.2, 0.8, 0.3, 0.4], 3) == [1, 3, 5]
+    assert sharpest([0.5, 0.4], 3) == [0, 1]
+    with pytest.raises(DevrfError, match=r"a\.mp4: 2 of its 3 sharpest frames are blurred; film"):
+        check_sharp(Path("a.mp4"), [0.1, 0.1, 0.6], [0, 1, 2])
+
+
+def test_a_video_is_surveyed_frame_by_frame(film, textured):
+    rest, other = textured(0), textured(1)
+    blurred = cv2.GaussianBlur(rest, (0, 0), 4)
+    seen = survey(film("a.mp4", [rest, rest, other, blurred], rate=5))
+    assert seen.size == SIZE
+    assert seen.times == pytest.approx([0, 0.2, 0.4, 0.6], abs=1e-3)
+    assert seen.rate == pytest.approx(5, rel=1e-3)
+    assert seen.motion[:2] == (0, pytest.approx(0, abs=0.5)) and seen.motion[2] > 5
+    assert seen.sharpness[3] < 0.5 < seen.sharpness[0]
+
+
+# Alignment.
+
+
+def bursts():
+    """Motion that starts and stops irregularly, over ten seconds."""
+    generator = np.random.default_rng(0)
+    times, heights = generator.uniform(0, 10, 12), generator.uniform(1, 5, 12)
+
+    def motion(at):
+        return sum(h * np.exp(-((at - t) ** 2) / 0.08) for t, h in zip(times, heights, strict=True))
+
+    return motion
+
+
+@pytest.mark.parametrize(("offset", "rate"), [(-1.3, 30), (0.77, 24)])
+def test_the_offset_is_found_within_a_quarter_of_a_frame(surveyed, offset, rate):
+    first = surveyed(bursts(), 30, 8, begin=1.5)
+    second = surveyed(bursts(), rate, 7, begin=1.5 + offset)
+    seconds, correlation = offset_between(first, second)
+    assert seconds == pytest.approx(offset, abs=0.25 / rate)
+    assert correlation > 0.95
+
+
+def test_times_are_those_of_the_slower_video_in_the_common_part(surveyed):
+    surveys = [surveyed(bursts(), 30, 6), surveyed(bursts(), 15, 6, begin=1.0)]
+    clock = timeline(PATHS, surveys, 50, offsets=[0, 1])
+    # 1.0 s to the first video's last frame at 179/30 s: 75 frames of the second, every other one.
+    assert clock.positions[1] == tuple(range(0, 75, 2))
+    assert clock.positions[0] == tuple(range(30, 180, 4))
+    assert clock.times[0] == 0 and clock.times[-1] == 1
+    assert np.allclose(np.diff(clock.times), 1 / 37)
+
+
+def test_what_cannot_be_aligned_is_refused(surveyed):
+    one, still = surveyed(bursts(), 30, 8), surveyed(np.zeros_like, 30, 8)
+    with pytest.raises(DevrfError, match=r"b\.mp4: nothing moves in it; give capture\.offsets="):
+        timeline(PATHS, [one, still], 10)
+    noise = surveyed(lambda t: np.random.default_rng(5).uniform(0, 1, len(t)), 30, 8)
+    with pytest.raises(DevrfError, match=r"b\.mp4: what moves in it does not tell when it began"):
+        timeline(PATHS, [one, noise], 10)
+    with pytest.raises(DevrfError, match=r"b\.mp4: all 2 videos together show 2\.97 s, of 7\.97"):
+        timeline(PATHS, [one, one], 10, offsets=[0, 5])
+
+
+# Images and their alpha masks.
+
+
+def mask(level, size=SIZE):
+    """A mask whose left half is white, the rest of a grey level."""
+    grey = np.full(size[::-1], level, np.uint8)
+    grey[:, : size[0] // 2] = 255
+    return grey
+
+
+@pytest.fixture
+def walk(film, textured):
+    """A video of four frames."""
+    return film("walk.mp4", [textured(k) for k in range(4)])
+
+
+@pytest.fixture
+def masks(tmp_path):
+    """The masks of its frames, each with another level on the right."""
+    folder = tmp_path / "masks" / "walk"
+    folder.mkdir(parents=True)
+    for k in range(4):
+        cv2.imwrite(str(folder / f"{k}.png"), mask(k))
+    return folder.parent
+
+
+def written(footage, into, size=SIZE):
+    """The images (H, W, 4) RGBA that are written of some footage."""
+    paths = list(write_frames(into, footage, size, SIZE))
+    return [cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in paths]
+
+
+def test_masks_of_a_video_are_a_folder_or_a_video(walk, masks, tmp_path, film):
+    folder = alpha_masks_of(masks, walk, 4)
+    one, other = written(Chosen(walk, "static", (1, 3), folder), tmp_path / "images")
+    assert (one[..., 3] == mask(1)).all() and (other[..., 3] == mask(3)).all()
+    small = written(Chosen(walk, "static", (2,), folder), tmp_path / "images", (32, 24))[0]
+    assert small.shape == (24, 32, 4) and (small[:, :15, 3] == 255).all()
+    (tmp_path / "cut").mkdir()
+    film("cut/walk.mp4", [np.full((48, 64, 3), level, np.uint8) for level in (0, 80, 160, 240)])
+    video = alpha_masks_of(tmp_path / "cut", walk, 4)
+    shown = written(Chosen(walk, "static", (1, 3), video), tmp_path / "images")
+    for image, level in zip(shown, (80, 240), strict=True):
+        assert image[..., 3].astype(float).mean() == pytest.approx(level, abs=3)
+
+
+def test_photographs_have_masks_of_their_names(tmp_path, textured, masks):
+    (tmp_path / "walk").mkdir()
+    for k in (1, 3):
+        cv2.imwrite(str(tmp_path / "walk" / f"{k}.jpg"), textured(k))
+    folder = alpha_masks_of(masks, tmp_path / "walk", 2)
+    shown = written(Chosen(tmp_path / "walk", "static", (0, 1), folder), tmp_path / "images")
+    assert [int(image[0, -1, 3]) for image in shown] == [1, 3]
+    (masks / "walk" / "3.png").unlink()
+    with pytest.raises(DevrfError, match=r"masks/walk/3\.png: no such alpha mask, of .*/3\.jpg"):
+        alpha_masks_of(masks, tmp_path / "walk", 2)
+
+
+def test_masks_that_do_not_fit_are_refused(walk, masks, tmp_path):
+    with pytest.raises(DevrfError, match=r"nowhere: no such folder of alpha masks; correct"):
+        alpha_masks_of(tmp_path / "nowhere", walk, 4)
+    with pytest.raises(DevrfError, match=r"masks/left: no such folder, expected the alpha masks"):
+        alpha_masks_of(masks, Path("left.mp4"), 4)
+    with pytest.raises(DevrfError, match=r"walk: 4 alpha masks, but .*walk\.mp4 has 5 frames"):
+        alpha_masks_of(masks, walk, 5)
+    cv2.imwrite(str(masks / "walk" / "2.png"), mask(0, (32, 24)))
+    with pytest.raises(DevrfError, match=r"2\.png: 32x24 px, but its image .* has 64x48 px"):
+        written(Chosen(walk, "static", (2,), masks / "walk"), tmp_path / "images")
+
+
+def test_frames_are_cropped_to_common_proportions_and_shrunk(textured):
+    a, b = PATHS
+    assert common_size({a: (1920, 1080), b: (1280, 720)}, 960) == (960, 540)
+    with pytest.raises(DevrfError, match=r"b\.mp4: 720x1280 px, but a\.mp4 has 1920x1080 px; hold"):
+        common_size({a: (1920, 1080), b: (720, 1280)}, 960)
+    picture = textured(0)
+    assert (fitted(picture, (48, 48)) == picture[:, 8:56]).all()
+    assert fitted(picture, (32, 24)).shape == (24, 32, 3)
+
+
+# What moves.
+
+
+def test_what_moves_says_where_the_box_is(tmp_path):
+    angle = torch.arange(4) * torch.pi / 2 + 0.4
+    around = torch.stack([4 * angle.cos(), 4 * angle.sin(), torch.full_like(angle, 1.5)], dim=1)
+    ring = Cameras.looking_at(around, torch.zeros_like(around), focal=100.0, width=96, height=96)
+    names, generator = [], np.random.default_rng(0)
+    for v in range(4):
+        wall = generator.integers(0, 180, (24, 24, 3), dtype=np.uint8)
+        wall = cv2.resize(wall, (96, 96), interpolation=cv2.INTER_LINEAR)
+        names.append([f"view{v}/{t}.png" for t in range(12)])
+        (tmp_path / f"view{v}").mkdir()
+        for t, name in enumerate(names[-1]):
+            # A white ball of radius 0.3 before the wall.
+            center = torch.tensor([[2 * t / 11 - 1, 0.0, 0.2]])
+            place, depth = ring.project(torch.tensor([v]), center)
+            at = tuple((place[0].numpy() * 16).round().astype(int).tolist())
+            radius, white = round(16 * 0.3 * 100 / float(depth)), (255, 255, 255)
+            picture = cv2.circle(wall.copy(), at, radius, white, -1, cv2.LINE_8, 4)
+            noise = generator.integers(-2, 3, wall.shape)
+            cv2.imwrite(str(tmp_path / name), (picture + noise).clip(0, 255).astype(np.uint8))
+    lens = {"fl_x": 100.0, "fl_y": 100.0, "cx": 48.0, "cy": 48.0, "w": 96, "h": 96}
+    area, poses = Box.of([-2.0] * 3, [2.0] * 3), ring.camera_to_world.double()
+    box = box_of_motion(tmp_path, names, poses, [lens] * 4, area)
+    exact = [(-1.3, 1.3), (-0.3, 0.3), (-0.1, 0.5)]
+    for low, high, (least, most) in zip(box.low, box.high, exact, strict=True):
+        assert least - 0.35 < low <= least + 0.1 and most - 0.1 <= high < most + 0.35
+    still = [[view[0]] * 3 for view in names]
+    with pytest.raises(DevrfError, match=r"capture\.alpha_masks: subtract needs at least 2 fixed"):
+        box_of_motion(tmp_path, still, poses, [lens] * 4, area)
+
+
+def test_noise_is_no_silhouette():
+    generator = np.random.default_rng(1)
+    wall = generator.integers(20, 230, (48, 64, 3))
+    pictures = [(wall + generator.normal(0, 2, wall.shape)).astype(np.uint8) for _ in range(10)]
+    assert not any(silhouette.any() for silhouette in silhouettes(pictures))
+
+
+# Structure from motion.
+
+MOVING = Chosen(Path("walk.mp4"), "static", (0, 10, 20, 30))
+
+
+def model(folder, *names, turned=()):
+    """A model of cameras in a row; the ``turned`` ones by half a turn about y."""
+    folder.mkdir()
+    (folder / "cameras.txt").write_text("# cameras\n1 SIMPLE_PINHOLE 64 48 50 32 24\n")
+    turns = ["0 0 1 0" if k in turned else "1 0 0 0" for k in range(len(names))]
+    lines = [f"{k} {turns[k]} 0 0 {k} 1 {name}\n\n" for k, name in enumerate(names)]
+    (folder / "images.txt").write_text("".join(lines))
+    return folder
+
+
+def test_sequential_matching_leaves_out_what_is_far_in_order():
+    moving, fixed = [str(k) for k in range(30)], ["a", "b"]
+    assert len(pairs(moving, fixed, "exhaustive")) == 32 * 31 / 2
+    chosen = set(pairs(moving, fixed, "sequential"))
+    assert {("0", "10"), ("0", "20"), ("29", "a"), ("a", "b")} <= chosen
+    assert ("0", "11") not in chosen and ("0", "21") not in chosen
+
+
+def test_a_model_that_does_not_hold_the_scene_is_refused(tmp_path):
+    fixed = {"view1/00003.png": Path("left.mp4")}
+    folder = model(tmp_path / "whole", *MOVING.names, *fixed)
+    assert len(checked_model(folder, MOVING, fixed).images) == 5
+    with pytest.raises(DevrfError, match=r"right\.mp4: its camera could not be placed among"):
+        checked_model(folder, MOVING, {**fixed, "view2/00000.png": Path("right.mp4")})
+    folder = model(tmp_path / "few", *MOVING.names[:2], *fixed)
+    with pytest.raises(DevrfError, match=r"walk\.mp4: cameras were found for 2 of 4 frames only"):
+        checked_model(folder, MOVING, {})
+
+
+def test_cameras_that_jump_within_a_video_are_refused(tmp_path):
+    moving = Chosen(Path("walk.mp4"), "static", tuple(range(6)))
+    folder = model(tmp_path / "model", *moving.names, turned=(4, 5))
+    expected = r"walk\.mp4: between 00003 and 00004, .* its camera seems to turn by 180 degrees"
+    with pytest.raises(DevrfError, match=expected):
+        checked_model(folder, moving, {})
+    (tmp_path / "photographs").mkdir()
+    photographs = Chosen(tmp_path / "photographs", "static", tuple(range(6)))
+    assert len(checked_model(folder, photographs, {}).images) == 6
