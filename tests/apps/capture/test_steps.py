@@ -240,8 +240,9 @@ def model(folder, *names, turned=()):
     """A model of cameras in a row; the ``turned`` ones by half a turn about y."""
     folder.mkdir()
     (folder / "cameras.txt").write_text("# cameras\n1 SIMPLE_PINHOLE 64 48 50 32 24\n")
+    (folder / "points3D.txt").touch()
     turns = ["0 0 1 0" if k in turned else "1 0 0 0" for k in range(len(names))]
-    lines = [f"{k} {turns[k]} 0 0 {k} 1 {name}\n\n" for k, name in enumerate(names)]
+    lines = [f"{k + 1} {turns[k]} 0 0 {k} 1 {name}\n\n" for k, name in enumerate(names)]
     (folder / "images.txt").write_text("".join(lines))
     return folder
 
