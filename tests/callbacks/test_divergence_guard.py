@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import logging
 import math
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +16,7 @@ from lightning import Callback, Trainer
 from torch import Tensor
 
 from devrf.callbacks import DivergenceGuard, PeriodicCheckpoint, TrainingRecord
+from devrf.callbacks.divergence_guard import emptied, filled
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.checkpoints.checkpoint_file import read_checkpoint_file
 from devrf.data.datamodule import SceneDataModule
@@ -30,7 +30,7 @@ from devrf.scenes.scene import Scene
 MOVING = DeformationSchedule(levels=(Level(4, 6), Level(6, 4)), rays=64)
 # A phase of the canonical stage from 0 to 9, one from 10 to 23; and longer ones.
 SHORT: dict[str, Any] = {"iterations": 24, "doublings": (10,), "decay_iterations": 100}
-LONG: dict[str, Any] = {**SHORT, "iterations": 60, "doublings": (20,), "rays": 128}
+LONG: dict[str, Any] = {**SHORT, "iterations": 50, "doublings": (10,), "rays": 128}
 
 
 @pytest.fixture(autouse=True)
@@ -39,14 +39,9 @@ def warnings_of_devrf(caplog: pytest.LogCaptureFixture) -> None:
 
 
 @pytest.fixture
-def moving(rest: LoadedCheckpoint) -> Callable[..., DeformationStage]:
-    """``moving(**schedule)``: a deformation stage of the tiny scene, by default ``MOVING``."""
-
-    def build(**schedule: Any) -> DeformationStage:
-        made = DeformationSchedule(**schedule, rays=64) if schedule else MOVING
-        return DeformationStage(copy.deepcopy(rest), made, iterations_per_step=1)
-
-    return build
+def moving(rest: LoadedCheckpoint) -> Callable[[], DeformationStage]:
+    """``moving()``: a deformation stage of the tiny scene."""
+    return lambda: DeformationStage(copy.deepcopy(rest), MOVING, iterations_per_step=1)
 
 
 @pytest.fixture
@@ -95,7 +90,7 @@ def finite_file(path: Path) -> bool:
     return finite(read_checkpoint_file(path)["state_dict"])
 
 
-@pytest.mark.parametrize("what", ["gradient", "nan", "inf"])
+@pytest.mark.parametrize("what", ["gradient", "inf"])
 def test_the_first_time_is_rolled_back(fit, canonical, caplog, what: str) -> None:
     spoil, guard = Spoil(what, 14), DivergenceGuard(every_iterations=4)
     stage = fit(canonical(**SHORT), TrainingRecord(), spoil, guard)
@@ -110,12 +105,6 @@ def test_the_first_time_is_rolled_back(fit, canonical, caplog, what: str) -> Non
     assert rates[1] == pytest.approx(rates[0] / 2)
     first, again = (state for iteration, state in spoil.drawn if iteration == 10)
     assert not torch.equal(first, again)
-
-
-def test_the_iteration_that_went_wrong_is_named(fit, canonical, caplog) -> None:
-    fit(canonical(**SHORT), Spoil("nan", 12, group=1), DivergenceGuard())
-    # The colours, spoilt in iteration 12: in the loss of the next, the fourteenth.
-    assert "the loss is nan by iteration 14 of 24 (13x8x13): back to iteration 10" in caplog.text
 
 
 def test_the_second_time_ends_the_stage_in_its_last_good_state(
@@ -151,34 +140,13 @@ def test_what_went_wrong_is_never_saved(fit, canonical, tmp_path: Path) -> None:
     assert all(finite_file(path) for path in tmp_path.iterdir())
 
 
-def test_the_last_iteration_is_looked_at(fit, canonical) -> None:
-    stage = fit(canonical(**SHORT), Spoil("gradient", 23), DivergenceGuard())
-    assert stage.num_rollbacks == 1 and stage.iteration == 24 and finite(stage.state_dict())
-
-
-@pytest.mark.parametrize("iteration", [0, 13, 21, 29])
+@pytest.mark.parametrize("iteration", [0, 21])
 def test_a_frame_is_visited_again(fit, moving, caplog, iteration: int) -> None:
     stage = fit(moving(), Spoil("nan", iteration), DivergenceGuard())
     phase = MOVING.phase(iteration, 3)
     assert f"(frame {phase.frames[0]}, " in caplog.text
     assert f"back to iteration {phase.start}," in caplog.text
     assert (stage.iteration, stage.num_rollbacks) == (30, 1) and finite(stage.state_dict())
-
-
-def test_parallel_frames_are_visited_again_together(
-    fit, moving, caplog, four_frames: SceneDataModule
-) -> None:
-    stage = moving(levels=(Level(4, 2), Level(6, 5, parallel_frames=2)))
-    fit(stage, Spoil("nan", 15), DivergenceGuard(), data=four_frames)
-    assert "of 18 (frames 1, 3, " in caplog.text and "back to iteration 13," in caplog.text
-    assert (stage.iteration, stage.num_rollbacks) == (18, 1) and finite(stage.state_dict())
-
-
-def test_a_deformation_that_goes_wrong_twice_ends(fit, moving) -> None:
-    stage = moving()
-    with pytest.raises(DevrfError, match="deformation stage: .*frame 2.*motion.learning_rate"):
-        fit(stage, Spoil("nan", 3, 15), DivergenceGuard())
-    assert stage.iteration == 12 and finite(stage.state_dict())
 
 
 @pytest.mark.parametrize(
@@ -188,20 +156,19 @@ def test_a_field_that_empties_or_fills_is_rolled_back(
     fit, canonical, caplog, density: str, words: str, carve: bool
 ) -> None:
     guard = DivergenceGuard(every_iterations=20)
-    stage = fit(canonical(**LONG, carve=carve), Spoil(density, 40), guard)
+    stage = fit(canonical(**LONG, carve=carve), Spoil(density, 30), guard)
     assert f"everything has become {words} by iteration" in caplog.text
     assert "data.background" in caplog.text and "data.box" in caplog.text
-    assert stage.num_rollbacks == 1 and stage.iteration == 60
+    assert stage.num_rollbacks == 1 and stage.iteration == 50
 
 
-@pytest.mark.parametrize("masks", [True, False])
 def test_a_field_that_keeps_emptying_ends_the_stage(
-    fit, canonical, datamodule: SceneDataModule, without_masks: SceneDataModule, masks: bool
+    fit, canonical, without_masks: SceneDataModule
 ) -> None:
-    stage = canonical(**{**LONG, "doublings": ()}, alpha_init=0.1)
+    stage = canonical(**{**LONG, "iterations": 60, "doublings": ()}, alpha_init=0.1)
     spoil, guard = Spoil("-100", 20, 40), DivergenceGuard(every_iterations=20)
     with pytest.raises(DevrfError) as caught:
-        fit(stage, spoil, guard, data=datamodule if masks else without_masks)
+        fit(stage, spoil, guard, data=without_masks)
     said = str(caught.value)
     assert said.startswith("canonical stage: everything has become empty by iteration ")
     assert "data.background" in said and "begin afresh with resume=false" in said
@@ -219,34 +186,6 @@ def test_a_stage_that_never_saw_anything_warns(fit, canonical, caplog) -> None:
         fit(canonical(**SHORT, **clear), guard)
 
 
-def test_motion_that_leaves_the_image_without_masks_only_warns(
-    fit, moving, without_masks: SceneDataModule, caplog
-) -> None:
-    stage = moving(levels=(Level(4, 40),))
-    fit(stage, Spoil("100", 45), DivergenceGuard(every_iterations=20), data=without_masks)
-    assert caplog.text.count("everything has become empty by") == 1
-    assert stage.num_rollbacks == 0
-
-
-def test_a_frame_whose_loss_stands_out_is_named(
-    fit, moving, monkeypatch: pytest.MonkeyPatch, caplog
-) -> None:
-    usual = DeformationStage.loss
-
-    def dear(stage: DeformationStage, *others: Any) -> Any:
-        total, terms = usual(stage, *others)
-        factor = 50.0 if stage.iteration >= 50 else 1.0
-        return total * factor, {**terms, "render": terms["render"] * factor}
-
-    monkeypatch.setattr(DeformationStage, "loss", dear)
-    guard = DivergenceGuard()
-    seen = {"kind": "level 1", "visited": [0.01, 0.011, 0.012, 0.01]}
-    guard.load_state_dict({**guard.state_dict(), **seen})
-    monkeypatch.setattr(guard, "_reset", lambda: None)
-    fit(moving(levels=(Level(4, 20),)), guard)
-    assert "times that of the frames before" in caplog.text and "(frame 2, " in caplog.text
-
-
 def test_a_sound_stage_is_not_touched(fit, canonical, moving, caplog) -> None:
     def learned(*callbacks: Callback) -> list[dict[str, Any]]:
         stages = [canonical(**SHORT), moving()]
@@ -261,24 +200,33 @@ def test_a_sound_stage_is_not_touched(fit, canonical, moving, caplog) -> None:
                 assert torch.equal(value, other[name]), name
 
 
-def test_checks_cost_next_to_nothing(fit, canonical, monkeypatch: pytest.MonkeyPatch) -> None:
-    spent = [0.0]
-    for name in ("on_train_batch_start", "on_train_batch_end"):
-        usual = getattr(DivergenceGuard, name)
-
-        def timed(*arguments: Any, usual: Any = usual) -> None:
-            began = time.process_time()
-            usual(*arguments)
-            spent[0] += time.process_time() - began
-
-        monkeypatch.setattr(DivergenceGuard, name, timed)
-    stage = canonical(**{**SHORT, "iterations": 120, "side": 24, "rays": 512})
-    began = time.process_time()
-    fit(stage, DivergenceGuard())
-    assert spent[0] < 0.02 * (time.process_time() - began)
-
-
-@pytest.mark.parametrize(("every", "factor"), [(0, 0.5), (10, 0.0), (10, 1.5)])
+@pytest.mark.parametrize(("every", "factor"), [(0, 0.5), (10, 1.5)])
 def test_senseless_settings_are_refused(every: int, factor: float) -> None:
-    with pytest.raises(DevrfError, match="callbacks.health: expected"):
+    with pytest.raises(DevrfError, match="callbacks.divergence_guard: expected"):
         DivergenceGuard(every, factor)
+
+
+@pytest.mark.parametrize(
+    ("seen", "most", "expected", "gone"),
+    [
+        (0.001, 0.2, 0.3, True),
+        (0.02, 0.2, 0.3, False),  # faint, but there
+        (0.001, 0.02, 0.3, False),  # it has never been there
+        (0.0, 0.2, 0.01, False),  # nothing should be there
+    ],
+)
+def test_emptied(seen: float, most: float, expected: float, gone: bool) -> None:
+    assert emptied(seen, most, expected) is gone
+
+
+@pytest.mark.parametrize(
+    ("seen", "least", "expected", "full"),
+    [
+        (0.7, 0.2, 0.2, True),
+        (0.5, 0.2, 0.2, False),  # three fifths of the light still pass
+        (0.7, 0.5, 0.2, False),  # it never passed: fog, at the beginning
+        (1.0, 0.1, 0.99, False),  # no light should pass
+    ],
+)
+def test_filled(seen: float, least: float, expected: float, full: bool) -> None:
+    assert filled(seen, least, expected) is full

@@ -68,11 +68,6 @@ def test_the_scene_is_shown_as_it_is_learned(fitted):
     assert page.pictures[0] != page.pictures[-1]
 
 
-def test_nothing_is_rendered_for_nobody(fitted):
-    live, page, _ = fitted(watched=False, share=1.0)
-    assert not page.pictures and live.seconds == 0
-
-
 def test_pictures_take_their_share_alone(fitted):
     live, page, seconds = fitted(watched=True, share=0.01)
     # One is due at once; the next when a hundred times its time has gone.

@@ -89,17 +89,6 @@ def lines(caplog: pytest.LogCaptureFixture) -> Callable[[], list[str]]:
     return lambda: [line for line in caplog.messages if line.startswith("dynamic ")]
 
 
-def test_progress_writes_lines_where_there_is_no_terminal(
-    fit, rest: LoadedCheckpoint, lines: Callable[[], list[str]]
-) -> None:
-    stage = DeformationStage(rest, DEFORMATION, iterations_per_step=100)
-    fit(stage, Progress(line_every_seconds=0.0))
-    # A line at the end of each phase: 6, 9, 13 and 15 iterations.
-    assert [line.split()[1] for line in lines()] == ["6/15", "9/15", "13/15", "15/15"]
-    shape = "x".join(str(n) for n in stage.resolution)
-    assert "it/s" in lines()[-1] and lines()[-1].endswith(f"{shape}  frame 2")
-
-
 def test_progress_and_curves_name_the_frames_of_a_visit(
     rest: LoadedCheckpoint,
     four_frames: SceneDataModule,
@@ -115,17 +104,3 @@ def test_progress_and_curves_name_the_frames_of_a_visit(
     assert last[-1] == "frames 1, 3"  # nothing is left
     assert " dB" in lines()[-1]
     assert fitted.callback_metrics["dynamic/frame"] == 1
-
-
-def test_phases_are_entered_once(fit, canonical, monkeypatch: pytest.MonkeyPatch) -> None:
-    stage = canonical()
-    entered: list[Any] = []
-    enter = stage.enter
-
-    def noted(phase: Any) -> None:
-        entered.append(phase)
-        enter(phase)
-
-    monkeypatch.setattr(stage, "enter", noted)
-    fit(stage)
-    assert entered == list(stage.schedule.phases)

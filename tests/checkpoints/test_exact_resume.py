@@ -21,7 +21,6 @@ from devrf.checkpoints.checkpoint import (
     save_checkpoint,
 )
 from devrf.checkpoints.checkpoint_file import read_checkpoint_file
-from devrf.checkpoints.progress import progress_files
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.stage import ScheduledStage
 from devrf.errors import DevrfError
@@ -295,11 +294,3 @@ def test_another_scene_is_refused(
     fewer = replace(tiny_scene.static, train=tiny_scene.static.train[torch.arange(7)])
     other = serve(replace(tiny_scene, static=fewer))
     assert "another scene" in refused(trainer(max_epochs=1), canonical(), other, left)
-
-
-def test_the_furthest_progress_comes_first(tmp_path: Path) -> None:
-    for name in ("9", "10", "100", "1x", ""):
-        (tmp_path / f"canonical-progress-{name}.ckpt").write_text("")
-    (tmp_path / "deformation-progress-7.ckpt").write_text("")
-    found = [path.name for path in progress_files(tmp_path, "canonical")]
-    assert found == [f"canonical-progress-{n}.ckpt" for n in (100, 10, 9)]

@@ -39,12 +39,6 @@ def test_elsewhere_the_mean_of_what_is_left_out(keep):
     assert torch.equal(unpack(pack(grids, keep, smooth=False)), grids)
 
 
-def test_one_mask_serves_all_grids(keep):
-    grids = torch.randn(5, 9, 7, 6, 1, generator=torch.Generator().manual_seed(1))
-    back = unpack(pack(grids, keep[:1], smooth=False))
-    assert torch.equal(back[:, keep[0]], grids[:, keep[0]].half().float())
-
-
 def test_the_size_is_two_bytes_a_kept_value():
     grids = torch.zeros(4, 40, 40, 40, 3)
     keep = torch.zeros(4, 40, 40, 40, dtype=torch.bool)
@@ -76,8 +70,3 @@ def test_masks_are_packed_to_bits() -> None:
     mask = torch.rand(3, 5, 7) > 0.5
     assert pack_bits(mask).numel() == 14  # 105 bits
     assert torch.equal(unpack_bits(pack_bits(mask), mask.shape), mask)
-
-
-def test_the_first_cell_is_the_lowest_bit() -> None:
-    mask = torch.tensor([True, False, False, True, False, False, False, False, True])
-    assert pack_bits(mask).tolist() == [0b1001, 1]

@@ -60,7 +60,7 @@ SHORT = (
     "trainer=cpu",
 )
 # The plots of training take a tenth of the time of such a run.
-PLAIN = "~callbacks.curve"
+PLAIN = "~callbacks.training_curve"
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ def short() -> tuple[str, ...]:
 @pytest.fixture(scope="session")
 def often() -> tuple[str, ...]:
     """Overrides that write a progress file after every iteration."""
-    saving = ("callbacks.saving.every_seconds=0", "callbacks.saving.share=1.0")
+    saving = ("callbacks.checkpoint.every_seconds=0", "callbacks.checkpoint.share=1.0")
     steps = ("canonical.iterations_per_step=1", "deformation.iterations_per_step=1")
     return (*saving, *steps, "trainer.log_every_n_steps=100")
 

@@ -188,8 +188,8 @@ def test_the_estimate_is_near_what_is_taken(warm, tiny, tmp_path, size) -> None:
         "video.frames=1",
         "video.height=40",
         "evaluation.metrics=[]",
-        "callbacks.saving.every_seconds=0",
-        "callbacks.saving.share=1.0",
+        "callbacks.checkpoint.every_seconds=0",
+        "callbacks.checkpoint.share=1.0",
         "trainer.log_every_n_steps=1",
     )
     for stage in ("canonical", "deformation"):

@@ -50,7 +50,7 @@ def test_what_decides_nothing_may_change(again):
         "stage=canonical",
         "video.frames=9",
         "evaluation.metrics=[]",
-        "callbacks.saving.share=0.5",
+        "callbacks.checkpoint.share=0.5",
         "trainer.log_every_n_steps=2",
         "logger.name=curves",
         "data.export=elsewhere",

@@ -31,8 +31,8 @@ COMMAND = (
     "schedule.motion.occupancy_every=3",
     "canonical.iterations_per_step=2",
     "deformation.iterations_per_step=2",
-    "callbacks.saving.every_seconds=0",
-    "callbacks.saving.share=1.0",
+    "callbacks.checkpoint.every_seconds=0",
+    "callbacks.checkpoint.share=1.0",
     "trainer.log_every_n_steps=3",
     "evaluation.metrics=[]",
     "video.frames=1",
@@ -123,7 +123,7 @@ def test_a_signal_ends_a_run_saved_and_it_goes_on(
     warm, command, whole, tmp_path, number, step, where
 ):
     # Nothing is written now and then: what it goes on from was written at the signal.
-    rarely = (*command, "callbacks.saving.every_seconds=1000")
+    rarely = (*command, "callbacks.checkpoint.every_seconds=1000")
     # Launchers may say it twice.
     outcome = warm(tmp_path, *rarely, after=("step", step), signals=(number, signal.SIGTERM))
     assert outcome.status == 128 + number
@@ -170,7 +170,7 @@ def test_a_signal_ends_a_sweep(warm, command, tmp_path):
 
 
 def test_a_full_disk_is_said_and_the_run_goes_on_when_there_is_room(warm, command, whole, tmp_path):
-    command = tuple(word for word in command if word != "~callbacks.curve")
+    command = tuple(word for word in command if word != "~callbacks.training_curve")
     # Left after iteration 6; from then on no file may be as large as a checkpoint.
     assert warm(tmp_path, *command, after=("step", 6), signals=(signal.SIGTERM,)).status == 143
     good = tmp_path / "run" / "checkpoints" / "canonical-progress-6.ckpt"

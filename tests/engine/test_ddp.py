@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import socket
-import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from types import SimpleNamespace
@@ -14,7 +13,7 @@ import pytest
 import torch
 from torch import distributed
 
-from devrf.callbacks import PeriodicCheckpoint, periodic_checkpoint
+from devrf.callbacks import PeriodicCheckpoint
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine import ddp
 from devrf.engine.ddp import (
@@ -72,12 +71,8 @@ def conversation(number: int, port: int, answer: Connection) -> None:
     saving = PeriodicCheckpoint()
     if number == 1:
         saving.ask_to_stop()
-    # A step of rank 0 has taken 10 ms, one of the other 1 s.
-    periodic_checkpoint.time = SimpleNamespace(monotonic=lambda: 1.0 if number else 0.01)
-    # The other one's request, and rank 0's file; then nothing until a second has passed.
+    # The other one's request, and rank 0's file; then nothing for some steps.
     found["agreed"] = [saving._agreed(number == 0, here) for _ in range(3)]
-    periodic_checkpoint.time = time
-    found["next"] = saving._next
 
     found["means"] = average(torch.tensor([[3.0 * number, 1.0]])).tolist()
 
@@ -148,11 +143,6 @@ def test_two_processes(found: list[dict[str, Any]]) -> None:
 def test_every_process_names_tensors_that_differ(found: list[dict[str, Any]], case: str) -> None:
     for one in found:
         assert "the processes have learned different fields (other)" in one[case]
-
-
-def test_processes_agree_about_once_a_second_as_rank_0_counts(found: list[dict[str, Any]]) -> None:
-    first, second = (one["next"] for one in found)
-    assert first == second == 100
 
 
 def test_one_process_changes_nothing() -> None:

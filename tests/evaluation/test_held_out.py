@@ -4,30 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any
 
 import pytest
 import torch
 from lightning import Trainer
 
-from devrf.checkpoints.checkpoint import LoadedCheckpoint
-from devrf.evaluation.held_out import background_value, score, truth_image
-from devrf.evaluation.suite import MetricSuite
-from devrf.geometry.clock import FrameClock
-from devrf.methods.devrf import view as view_module
+from devrf.evaluation.held_out import score, truth_image
 from devrf.methods.devrf.canonical_stage import CanonicalStage
-from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.metrics.image import psnr, ssim
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene
-
-
-@pytest.mark.parametrize(("name", "value"), [("white", 1.0), ("black", 0.0), ("random", 1.0)])
-def test_backgrounds_of_held_out_views(
-    name: Literal["white", "black", "random"], value: float
-) -> None:
-    assert background_value(name) == value
 
 
 def test_truth_by_hand(tiny_scene: Scene) -> None:
@@ -88,24 +76,3 @@ def test_static_views_are_scored_at_rest_whatever_their_time(
     moved, rest = (score(renderer, views, 2, "white", time=time) for time in (None, 0.0))
     assert (moved.time, rest.time) == (1.0, 1.0)
     assert rest.psnr == rest.rest_pose_psnr == moved.rest_pose_psnr != moved.psnr
-
-
-def test_the_occupancy_of_a_frame_is_found_once(
-    rest: LoadedCheckpoint, tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    model, looked = rest.model, []
-    model.deformation = DeformationField(model.canonical.box, FrameClock((0.0, 0.5, 1.0)), voxels=8)
-
-    usual: Callable[..., Any] = view_module.occupancy_through
-
-    def counted(*arguments: Any) -> Any:
-        looked.append(1)
-        return usual(*arguments)
-
-    monkeypatch.setattr(view_module, "occupancy_through", counted)
-    suite = MetricSuite(("psnr_masked", "flow_error"))
-    view = score(Renderer(model), tiny_scene.dynamic.test, 1, "white", suite)
-    # The picture, the rest pose and the flow: the field is at rest, so all flow is missed.
-    assert view.further["flow_error"] is not None
-    assert view.psnr == pytest.approx(view.rest_pose_psnr, abs=1e-3)
-    assert len(looked) == 1

@@ -113,17 +113,6 @@ def test_every_metric_of_a_learned_scene(
     assert view.further["ms_ssim"] is None and view.further["lpips"] is None
 
 
-def test_what_a_scene_does_not_know_is_none(
-    learned: tuple[CanonicalStage, Trainer], tiny_scene: Scene
-) -> None:
-    held_out = tiny_scene.dynamic.test
-    bare = replace(held_out, pixels=held_out.pixels[..., :3], flow=None, depth=None)
-    names = [name for name in MEASURES if not name.startswith("lpips")]
-    suite = Evaluation(metrics=names).suite(HOST)
-    found = score(Renderer(learned[0].scene_model), bare, 1, "white", suite).further
-    assert found == dict.fromkeys(names)
-
-
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [

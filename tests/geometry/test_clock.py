@@ -63,11 +63,6 @@ def test_frames_of_gives_the_nearest_frame_in_any_shape() -> None:
     assert UNEVEN.frames_of(torch.tensor([-0.1, 1.7])).tolist() == [0, len(UNEVEN) - 1]
 
 
-def test_frames_of_many_frames_takes_no_memory_of_their_square() -> None:
-    times = torch.linspace(0, 1, 90_000, dtype=torch.float64)
-    assert torch.equal(FrameClock(tuple(times.tolist())).frames_of(times), torch.arange(90_000))
-
-
 @pytest.mark.parametrize("times", [(0.1, 0.2), (0.0, 0.5, 0.5), (0.0, 0.6, 0.5), ()])
 def test_a_clock_without_rest_or_out_of_order_is_an_error(times: tuple[float, ...]) -> None:
     with pytest.raises(ValueError, match="frame clock"):

@@ -84,18 +84,6 @@ def test_samples_are_evenly_spaced_in_disparity_along_a_ray() -> None:
     torch.testing.assert_close(rays.ends(), 1.5 * x)
 
 
-def test_a_ray_from_outside_is_contracted_on_its_way_in_too() -> None:
-    x = torch.tensor([[1.0, 0.0, 0.0]])
-    rays = CUBE.rays(Rays(-5 * x, x, x))
-    entry, leave = CUBE.box.crossing(rays, 0.0, math.inf)
-    # It starts at −1.4 of −1.5; in the inner box its distance is the world's, from 4 to 6.
-    torch.testing.assert_close(entry, torch.tensor([3.6]))
-    torch.testing.assert_close(leave, torch.tensor([6.5]))
-    ray = torch.zeros(3, dtype=torch.int64)
-    points = rays.at(ray, torch.tensor([3.6, 4.5, 6.25]))
-    torch.testing.assert_close(points[:, 0], torch.tensor([-1.4, -0.5, 1.25]))
-
-
 @pytest.mark.parametrize("scale", [0.3, 2.0, 6.0])
 def test_a_step_is_never_much_longer_in_contracted_space(
     rng: torch.Generator, scale: float
@@ -112,13 +100,6 @@ def test_a_step_is_never_much_longer_in_contracted_space(
     every = torch.linspace(0, 1, count)[:, None] * (leave - entry) + entry
     points = rays.at(torch.arange(len(rays)).repeat(count), every.reshape(-1))
     assert bool(CUBE.box.contains(points).all())
-
-
-def test_parts_of_rays_stay_contracted(rng: torch.Generator) -> None:
-    rays = CUBE.rays(_rays(rng, 10, 2.0))
-    again = Rays.joined([rays[:4], rays[torch.arange(4, 10)]])
-    ray, distance = torch.arange(10), torch.full((10,), 2.0)
-    assert torch.equal(again.at(ray, distance), rays.at(ray, distance))
 
 
 # Slopes 2·8/16 = 1 and 2·9/12 = 1.5: not square, so that a swap shows.
@@ -143,13 +124,6 @@ def test_ndc_points_by_hand(
 ) -> None:
     torch.testing.assert_close(NDC.from_world(torch.tensor([world])), torch.tensor([device]))
     torch.testing.assert_close(NDC.to_world(torch.tensor([device])), torch.tensor([world]))
-
-
-def test_ndc_there_and_back_with_another_near_plane(rng: torch.Generator) -> None:
-    ndc = NormalizedDevice(20, 10, (13.0, 11.0), near=0.7)
-    points = torch.randn(100, 3, generator=rng, dtype=torch.float64)
-    points[:, 2] = -0.7 - 5 * torch.rand(100, generator=rng, dtype=torch.float64)
-    torch.testing.assert_close(ndc.to_world(ndc.from_world(points)), points)
 
 
 def test_an_ndc_ray_by_hand() -> None:

@@ -70,12 +70,6 @@ def test_psnr_of_a_constant_offset(offset: float, decibels: float) -> None:
     assert psnr(truth + offset, truth) == pytest.approx(decibels, abs=1e-4)
 
 
-def test_psnr_is_of_the_mean_square_not_the_mean_of_psnrs() -> None:
-    truth, other = torch.zeros(2, 1, 3), torch.zeros(2, 1, 3)
-    other[0] = 0.2
-    assert psnr(other, truth) == pytest.approx(-10 * np.log10(0.02), abs=1e-4)
-
-
 def test_equal_images_have_a_similarity_of_one(image: Tensor, large: Tensor) -> None:
     assert ssim(image, image) == pytest.approx(1.0, abs=1e-6)
     assert ms_ssim(large, large) == pytest.approx(1.0, abs=1e-6)
@@ -97,12 +91,6 @@ def test_ssim_of_flat_images_by_hand() -> None:
     # No variance: (2·0.25·0.5 + C1) / (0.25² + 0.5² + C1).
     a, b = torch.full((15, 13, 3), 0.25), torch.full((15, 13, 3), 0.5)
     assert ssim(a, b) == pytest.approx(0.2501 / 0.3126, abs=1e-4)
-
-
-def test_ssim_of_an_image_smaller_than_the_window_is_still_a_number(image: Tensor) -> None:
-    small = image[:8, :9]
-    assert ssim(small, small) == pytest.approx(1.0, abs=1e-6)
-    assert 0 < ssim(small.flip(0), small) < 0.99
 
 
 def test_ms_ssim_agrees_with_an_independent_implementation(

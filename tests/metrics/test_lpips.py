@@ -1,4 +1,4 @@
-"""LPIPS: two checked distances, torchmetrics' own put together from our trunks, and no weights."""
+"""LPIPS: torchmetrics' own put together from our trunks; and no weights."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import logging
 from pathlib import Path
 from urllib.error import URLError
 
-import imageio.v3 as iio
 import pytest
 import torch
 from torch import Tensor, nn
@@ -14,8 +13,6 @@ from torchmetrics.functional.image import lpips as theirs
 
 from devrf.errors import DevrfError
 from devrf.metrics.lpips import TRUNKS, Lpips, Network, load_lpips, read_lpips
-
-SHARED = Path(__file__).parents[3] / "shared" / "weights"
 
 
 def random_weights(network: Network, folder: Path) -> Path:
@@ -41,21 +38,6 @@ def empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     checkpoints = tmp_path / "hub" / "checkpoints"
     checkpoints.mkdir(parents=True)
     return checkpoints
-
-
-@pytest.mark.skipif(not SHARED.is_dir(), reason="the weights are not beside this checkout")
-def test_checked_distances() -> None:
-    lpips = read_lpips("vgg", SHARED / "vgg16_features_fp16.pth")
-
-    def image(name: str) -> Tensor:
-        pixels = iio.imread(SHARED / "lpips_fixture" / f"{name}.png")
-        return torch.from_numpy(pixels).float() / 255
-
-    truth = image("ex_ref")
-    for name, distance in (("ex_p0", 0.5686), ("ex_p1", 0.4217)):
-        assert lpips(image(name), truth) == pytest.approx(distance, abs=2e-3)
-        everywhere = torch.ones(64, 64, dtype=torch.bool)
-        assert lpips.inside(image(name), truth, everywhere) == pytest.approx(distance, abs=2e-3)
 
 
 @pytest.mark.parametrize("network", ["vgg", "alex"])

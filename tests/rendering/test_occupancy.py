@@ -26,13 +26,6 @@ def test_a_point_is_looked_up_at_its_nearest_grid_point() -> None:
     assert occupancy.at(points).tolist() == [True, True, False, False, False]
 
 
-def test_everything_outside_the_box_is_empty(cube: Box) -> None:
-    full = Occupancy.full((3, 3, 3), cube)
-    points = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [1.6, 0.0, 0.0], [0.0, -9.0, 0.0]])
-    assert full.at(points).tolist() == [True, True, False, False]
-    assert full.share == 1.0
-
-
 def test_dilate_grows_a_cube_and_stops_at_the_border() -> None:
     grown = dilate(single((7, 6, 5), (3, 1, 4)), 2)
     expected = torch.zeros(7, 6, 5, dtype=torch.bool)

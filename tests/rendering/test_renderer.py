@@ -38,16 +38,6 @@ def test_it_renders_what_the_model_renders(
     assert not seen.color.requires_grad
 
 
-def test_a_view_has_the_occupancy_and_displacement_of_its_time(moving: DeVRFModel) -> None:
-    view = moving.at(0.4)
-    assert torch.equal(view.occupancy.mask, moving.occupancy_at(0.4).mask)
-    assert not view.at_rest and view.displacement is not None
-    assert moving.deformation is not None
-    torch.testing.assert_close(view.displacement, moving.deformation.to_canonical[1])
-    rest = moving.at(0.0)
-    assert rest.at_rest and rest.occupancy is moving.occupancy and rest.displacement is None
-
-
 def test_the_views_of_the_last_times_are_cached(
     moving: DeVRFModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 
 import pytest
@@ -30,18 +29,6 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
         raise RuntimeError("disk full")
     assert path.read_text() == "old"
     assert [p.name for p in tmp_path.iterdir()] == ["metrics.json"]
-
-
-def test_the_content_is_on_the_disk_before_it_has_its_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    steps: list[str] = []
-    sync, replace = os.fsync, os.replace
-    monkeypatch.setattr(os, "fsync", lambda handle: (steps.append("sync"), sync(handle)))
-    monkeypatch.setattr(os, "replace", lambda *names: (steps.append("name"), replace(*names)))
-    with atomic_write(tmp_path / "a") as partial:
-        partial.write_text("whole")
-    assert steps == ["sync", "name", "sync"]  # the file, its name, the folder that has the name
 
 
 def test_what_the_system_refuses_is_named_by_the_file(tmp_path: Path) -> None:

@@ -10,14 +10,11 @@ import psutil
 import pytest
 import torch
 
-from devrf.system.device import multiplies_bfloat16
 from devrf.system.memory import (
     free_host_memory,
-    free_memory,
     gib,
     is_oom,
     numbers,
-    own_memory,
     page_locked,
 )
 
@@ -60,11 +57,6 @@ def test_a_container_sees_its_own_group_as_the_root(root: Path) -> None:
     assert free_host_memory(root) == 300 * MIB
 
 
-def test_this_machine() -> None:
-    assert free_memory(torch.device("cpu")) > 0
-    assert 50 * MIB < own_memory() < 2**40
-
-
 @pytest.mark.parametrize(
     ("error", "short"),
     [
@@ -97,15 +89,6 @@ def test_the_numbers_of_an_error(said: str, asked: str) -> None:
 
 def test_bytes_in_gib() -> None:
     assert [gib(n * 2**30) for n in (21.34, 1.16, 0.0342)] == ["21.3", "1.2", "0.034"]
-
-
-@pytest.mark.parametrize(("capability", "expected"), [((7, 5), False), ((8, 0), True)])
-def test_what_a_gpu_multiplies(
-    capability: tuple[int, int], expected: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: capability)
-    assert multiplies_bfloat16(torch.device("cuda", 0)) is expected
-    assert not multiplies_bfloat16(torch.device("cpu"))
 
 
 class Runtime:

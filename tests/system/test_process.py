@@ -7,9 +7,7 @@ import mmap
 import os
 import signal
 import sys
-import threading
 from collections.abc import Iterator
-from types import ModuleType
 
 import pytest
 
@@ -68,19 +66,6 @@ def test_while_modules_are_imported_no_garbage_is_looked_for(before: bool) -> No
         (gc.enable if enabled else gc.disable)()
 
 
-def test_new_modules_are_left_alone_by_later_looks(monkeypatch: pytest.MonkeyPatch) -> None:
-    def kept(name: str) -> bool:
-        return not any(one is sys.modules[name] for one in gc.get_objects())
-
-    monkeypatch.setitem(sys.modules, "known", ModuleType("known"))
-    with importing():
-        pass
-    assert not kept("known")
-    with importing():
-        monkeypatch.setitem(sys.modules, "new", ModuleType("new"))
-    assert kept("new")
-
-
 @pytest.fixture(autouse=True)
 def handlers_as_before() -> Iterator[None]:
     before = {number: signal.getsignal(number) for number in STOP_SIGNALS}
@@ -122,28 +107,6 @@ def test_other_programs_handlers_stay() -> None:
     with handle_signals(ours.append):
         send(signal.SIGUSR2, signal.SIGINT, signal.SIGTERM)
     assert (theirs, ours) == ([signal.SIGUSR2], [signal.SIGTERM])
-
-
-def test_signals_are_taken_back_from_a_library() -> None:
-    heard: list[int] = []
-    with handle_signals(heard.append) as take:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
-        take()
-        send(signal.SIGTERM)
-    assert heard == [signal.SIGTERM]
-
-
-def test_outside_the_main_thread_nothing_is_taken() -> None:
-    found: list[object] = []
-
-    def work() -> None:
-        with handle_signals(end_at_once):
-            found.append(signal.getsignal(signal.SIGTERM))
-
-    thread = threading.Thread(target=work)
-    thread.start()
-    thread.join()
-    assert found == [signal.getsignal(signal.SIGTERM)]
 
 
 def test_ending_at_once_has_the_status_of_a_shell() -> None:

@@ -79,22 +79,18 @@ class ResumableCSVLogger(CSVLogger):
         """Write the rows that the file lacks."""
         if self._written == len(self._rows):
             return
-        text = io.StringIO()
-        table = csv.DictWriter(text, self._columns)
         try:
             if self._written is None:
-                table.writeheader()
-                table.writerows(self._rows)
-                with atomic_write(self.path) as partial:
-                    partial.write_text(text.getvalue(), newline="")
+                with atomic_write(self.path) as partial, partial.open("w", newline="") as file:
+                    table = csv.DictWriter(file, self._columns)
+                    table.writeheader()
+                    table.writerows(self._rows)
             else:
-                table.writerows(self._rows[self._written :])
                 with self.path.open("a", newline="") as file:
-                    file.write(text.getvalue())
+                    csv.DictWriter(file, self._columns).writerows(self._rows[self._written :])
         except OSError as error:
-            self._written = None
             if not self._failing:
                 log.warning("%s: %s; its rows wait in memory", self.path, error.strerror)
-            self._failing = True
+            self._written, self._failing = None, True
         else:
             self._written, self._failing = len(self._rows), False

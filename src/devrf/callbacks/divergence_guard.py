@@ -1,26 +1,18 @@
-"""Notices divergence, rolls back once, then ends the stage."""
+"""Notices divergence: says what happened, goes back once with lower learning rates, then stops."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from statistics import mean
-from typing import Any
+from typing import Any, NamedTuple
 
+import torch
 from lightning import Callback, LightningModule, Trainer
 from torch import Tensor
 
-from devrf.callbacks.divergence import (
-    GONE,
-    THERE,
-    Snapshot,
-    emptied,
-    filled,
-    not_finite,
-    read,
-    stands_out,
-)
-from devrf.engine.stage import ScheduledStage
+from devrf.engine.stage import Phase, ScheduledStage
 from devrf.errors import DevrfError
 
 log = logging.getLogger(__name__)
@@ -29,7 +21,44 @@ BACKGROUND = "is data.background that of the images, data.box around what they s
 # Iterations between snapshots in a long phase.
 SNAPSHOT_EVERY = 1000
 # The fewest iterations between checks that allow a judgement of opacity.
-TELLING = 20
+MIN_ITERATIONS = 20
+# An expected opacity (or transparency) below this is too small to judge by.
+FAINT = 0.02
+# Shares of the expected opacity: seen before, and as good as gone.
+THERE, GONE = 0.1, 0.01
+# Shares of the expected transparency. Much light passes beside the field whatever happens.
+CLEAR, BLOCKED = 0.8, 0.5
+
+
+def emptied(seen: float, most: float, expected: float) -> bool:
+    """Whether what should be seen was there and is gone.
+
+    Args:
+        seen: the mean opacity of rays.
+        most: the highest mean opacity so far.
+        expected: what it should be.
+    """
+    return expected > FAINT and most > THERE * expected and seen < GONE * expected
+
+
+def filled(seen: float, least: float, expected: float) -> bool:
+    """Whether light that should pass did so, and no longer does.
+
+    Args:
+        seen: the mean opacity of rays.
+        least: the lowest mean opacity so far.
+        expected: what it should be.
+    """
+    clear = 1 - expected
+    return clear > FAINT and 1 - least > CLEAR * clear and 1 - seen < BLOCKED * clear
+
+
+class Snapshot(NamedTuple):
+    """Copies of the optimiser's parameters, in its order, at an iteration of a phase."""
+
+    phase: Phase
+    iteration: int
+    values: tuple[Tensor, ...]
 
 
 class DivergenceGuard(Callback):
@@ -37,10 +66,7 @@ class DivergenceGuard(Callback):
 
     If not, the stage returns to its last good snapshot (at the latest of the phase's start; for
     the deformation, of the frame's) and goes on with lower learning rates and other pixels. The
-    second time the stage ends in that state. A frame whose loss is an outlier is only logged.
-    Parallel frames are judged by their mean loss.
-
-    Nothing is read from the device between checks.
+    second time the stage ends in that state. Nothing is read from the device between checks.
     """
 
     def __init__(self, every_iterations: int = 100, rate_factor: float = 0.5) -> None:
@@ -53,8 +79,8 @@ class DivergenceGuard(Callback):
         """
         if every_iterations < 1 or not 0 < rate_factor <= 1:
             raise DevrfError(
-                "callbacks.health: expected every_iterations of 1 or more and a rate_factor above "
-                f"0, at most 1, not {every_iterations} and {rate_factor}"
+                "callbacks.divergence_guard: expected every_iterations of 1 or more and a "
+                f"rate_factor above 0, at most 1, not {every_iterations} and {rate_factor}"
             )
         self.every_iterations = every_iterations
         self.rate_factor = rate_factor
@@ -64,10 +90,8 @@ class DivergenceGuard(Callback):
         self._steps: list[tuple[int, dict[str, Tensor]]] = []
         self._good: Snapshot | None = None
         self._checked = 0
-        self._kind = ""
-        self._range = [1.0, 0.0]
-        self._visited: list[float] = []
-        self._told = False
+        # Of the opacity, since grids of this kind are learned.
+        self._kind, self._range = "", [1.0, 0.0]
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Forget the stage before."""
@@ -75,17 +99,11 @@ class DivergenceGuard(Callback):
 
     def state_dict(self) -> dict[str, Any]:
         """What later checks compare with."""
-        return {
-            "kind": self._kind,
-            "range": list(self._range),
-            "visited": list(self._visited),
-            "told": self._told,
-        }
+        return {"kind": self._kind, "range": list(self._range)}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Compare with what :meth:`state_dict` gave."""
         self._kind, self._range = state_dict["kind"], list(state_dict["range"])
-        self._visited, self._told = list(state_dict["visited"]), state_dict["told"]
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Count from here."""
@@ -103,9 +121,7 @@ class DivergenceGuard(Callback):
         self._snapshot(pl_module)
         if phase.kind != self._kind:
             self._kind = phase.kind
-            if phase.frames:
-                self._visited = []  # losses differ from level to level
-            else:
+            if not phase.frames:
                 self._range = [1.0, 0.0]  # a new field begins as fog
 
     def on_train_batch_end(
@@ -124,42 +140,22 @@ class DivergenceGuard(Callback):
         """Roll the stage back, or end it, if it has diverged since the last check."""
         if not self._steps:
             return
-        *steps, fields = read(stage, [means for _, means in self._steps])
-        iterations = [iteration for iteration, _ in self._steps]
-        since, self._checked = stage.iteration - self._checked, stage.iteration
-        self._steps = []
-        wrong = self._not_finite(stage, iterations, steps, fields)
+        iterations, since = [done for done, _ in self._steps], stage.iteration - self._checked
+        *steps, fields = _read(stage, [means for _, means in self._steps])
+        self._steps, self._checked = [], stage.iteration
+        wrong = _not_finite(stage, iterations, steps, fields)
         wrong = wrong or self._collapsed(stage, steps, since)
-        if wrong is not None:
-            self._rollback(stage, wrong)
-            return
         assert self._good is not None and stage.phase is not None
-        if stage.iteration >= stage.phase.stop:
-            if stage.phase.frames:
-                # Regularisers differ widely from frame to frame; the rendering loss does not.
-                self._compare(stage, steps[-1].get("render", steps[-1]["loss"]))
-        elif stage.iteration - self._good.iteration >= SNAPSHOT_EVERY:
+        if wrong is not None:
+            self._rollback(stage, self._good, wrong)
+        elif stage.phase.stop > stage.iteration >= self._good.iteration + SNAPSHOT_EVERY:
             self._snapshot(stage)
 
     def _snapshot(self, stage: ScheduledStage) -> None:
+        assert stage.phase is not None
         self._good = None  # its memory is free before the next takes as much
-        self._good = Snapshot.of(stage)
-
-    def _not_finite(
-        self,
-        stage: ScheduledStage,
-        iterations: Sequence[int],
-        steps: Sequence[dict[str, float]],
-        fields: dict[str, float],
-    ) -> str | None:
-        """What is not finite, and where that was first seen, in words."""
-        for iteration, means in zip(iterations, steps, strict=True):
-            if name := not_finite(means):
-                kind = "the loss" if name == "loss" else f"the loss term {name}"
-                return f"{kind} is {means[name]} by {stage.describe(iteration)}"
-        if name := not_finite(fields):
-            return f"values of {name} are not finite by {stage.describe(stage.iteration)}"
-        return None
+        values = tuple(value.detach().clone() for value in _trained(stage))
+        self._good = Snapshot(stage.phase, stage.iteration, values)
 
     def _collapsed(
         self, stage: ScheduledStage, steps: Sequence[dict[str, float]], since: int
@@ -171,29 +167,25 @@ class DivergenceGuard(Callback):
         covered = mean(means["coverage"] for means in late) if "coverage" in late[0] else None
         least, most = self._range
         where = f"{stage.describe(stage.iteration)} ({BACKGROUND})"
-        if since >= TELLING:
+        if since >= MIN_ITERATIONS:
             self._range = [min(least, seen), max(most, seen)]
             if covered is not None and filled(seen, least, covered):
                 return f"everything has become opaque by {where}"
-            if emptied(seen, most, most if covered is None else covered):
-                words = f"everything has become empty by {where}"
-                if covered is not None or stage.name == "canonical":
-                    return words
-                self._warn_once(stage, words)  # what moves may have left the picture
+            # Without alpha masks, what moves may have left the picture.
+            judged = covered is not None or stage.name == "canonical"
+            if judged and emptied(seen, most, most if covered is None else covered):
+                return f"everything has become empty by {where}"
         if stage.iteration >= stage.total_iterations and seen < GONE * (covered or THERE):
-            self._warn_once(stage, f"nothing is to be seen at the end ({BACKGROUND})")
+            log.warning("%s: nothing is to be seen at the end (%s)", stage.name, BACKGROUND)
         return None
 
-    def _warn_once(self, stage: ScheduledStage, words: str) -> None:
-        if not self._told:
-            log.warning("%s: %s", stage.name, words)
-        self._told = True
-
-    def _rollback(self, stage: ScheduledStage, wrong: str) -> None:
+    @torch.no_grad()
+    def _rollback(self, stage: ScheduledStage, good: Snapshot, wrong: str) -> None:
         """Restore the last good state; the second time, end there."""
-        assert self._good is not None
         again, scale = stage.num_rollbacks > 0, stage.lr_scale
-        self._good.restore(stage, self.rate_factor)
+        for value, stored in zip(_trained(stage), good.values, strict=True):
+            value.copy_(stored)
+        stage.rollback(good.iteration, self.rate_factor)
         self._checked = stage.iteration
         if again:
             stage.abort(
@@ -204,22 +196,43 @@ class DivergenceGuard(Callback):
             return
         log.warning(
             "%s: %s: back to iteration %d, learning rates at %g of the schedule's",
-            stage.name,
-            wrong,
-            stage.iteration,
-            stage.lr_scale,
+            *(stage.name, wrong, stage.iteration, stage.lr_scale),
         )
 
-    def _compare(self, stage: ScheduledStage, loss: float) -> None:
-        """Log a frame that ends with an outlying loss."""
-        factor = stands_out(loss, self._visited)
-        if factor is not None:
-            log.warning(
-                "%s: the rendering loss is %.3g by %s, %.1f times that of the frames before; are "
-                "its images and its flow as they should be?",
-                stage.name,
-                loss,
-                stage.describe(stage.iteration),
-                factor,
-            )
-        self._visited.append(loss)
+
+def _trained(stage: ScheduledStage) -> list[Tensor]:
+    return [value for group in stage.optimizer.param_groups for value in group["params"]]
+
+
+@torch.no_grad()
+def _read(stage: ScheduledStage, steps: Sequence[Mapping[str, Tensor]]) -> list[dict[str, float]]:
+    """The values of steps, then one row with the sum of each parameter group, by name.
+
+    A sum is not finite if any value is not. This is the one place that waits for the device.
+    """
+    fields: dict[str, Tensor] = {}
+    for group in stage.optimizer.param_groups:
+        sums = [value.sum(dtype=torch.float32) for value in group["params"]]
+        fields[group["name"]] = torch.stack(sums).sum() if sums else torch.zeros(())
+    rows = [*steps, fields]
+    flat = [value.float().to(stage.device) for row in rows for value in row.values()]
+    numbers = iter(torch.stack(flat).tolist())
+    return [{name: next(numbers) for name in row} for row in rows]
+
+
+def _not_finite(
+    stage: ScheduledStage,
+    iterations: Sequence[int],
+    steps: Sequence[Mapping[str, float]],
+    fields: Mapping[str, float],
+) -> str | None:
+    """What is not finite, and where that was first seen, in words."""
+    for iteration, means in zip(iterations, steps, strict=True):
+        for name, value in means.items():
+            if not math.isfinite(value):
+                term = "the loss" if name == "loss" else f"the loss term {name}"
+                return f"{term} is {value} by {stage.describe(iteration)}"
+    for name, value in fields.items():
+        if not math.isfinite(value):
+            return f"values of {name} are not finite by {stage.describe(stage.iteration)}"
+    return None

@@ -1,4 +1,4 @@
-"""Writes progress files at intervals, and when the stage is asked to stop.
+"""Writes progress files at intervals, and when a signal asks the stage to stop.
 
 Lightning's ModelCheckpoint does less: it bounds no share of the time, ends the training on a full
 disk, and may write what has diverged.
@@ -7,7 +7,10 @@ disk, and may write what has diverged.
 from __future__ import annotations
 
 import logging
+import signal
 import time
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +23,12 @@ from devrf.checkpoints.progress import progress_file, progress_files
 from devrf.engine.ddp import largest
 from devrf.engine.stage import ScheduledStage
 from devrf.errors import DevrfError
+from devrf.system.process import Interrupted, handle_signals
 
 log = logging.getLogger(__name__)
 
-# How often several processes tell one another of signals, and after how many steps at the latest.
-AGREE_SECONDS, MOST_STEPS = 1.0, 200
+# Steps after which several processes tell one another of signals.
+AGREE_EVERY = 10
 
 
 class PeriodicCheckpoint(Callback):
@@ -51,7 +55,7 @@ class PeriodicCheckpoint(Callback):
         """
         if every_seconds < 0 or not 0 < share <= 1:
             raise DevrfError(
-                "callbacks.saving: expected every_seconds of 0 or more and a share above 0, at "
+                "callbacks.checkpoint: expected every_seconds of 0 or more and a share above 0, at "
                 f"most 1, not {every_seconds} and {share}"
             )
         self.folder = Path(folder)
@@ -61,8 +65,7 @@ class PeriodicCheckpoint(Callback):
         self._asked = False
         self._failing = False
         self._due = 0.0
-        # Steps since processes last agreed, until they do next, and when that was.
-        self._steps, self._next, self._last = 0, 1, 0.0
+        self._steps = 0
 
     def ask_to_stop(self) -> None:
         """End the training after the present Lightning step, with a progress file written."""
@@ -73,9 +76,8 @@ class PeriodicCheckpoint(Callback):
         assert isinstance(pl_module, ScheduledStage)
         self._failing = False
         self.saved = pl_module.iteration or None
-        self._last = time.monotonic()
-        self._due = self._last + self.every_seconds
-        self._steps, self._next = 0, 1
+        self._due = time.monotonic() + self.every_seconds
+        self._steps = 0
         if trainer.is_global_zero:
             for path in self.folder.glob(f".partial-{pl_module.name}*.ckpt"):
                 path.unlink(missing_ok=True)
@@ -97,9 +99,9 @@ class PeriodicCheckpoint(Callback):
         last = trainer.should_stop or 0 < trainer.max_steps <= trainer.global_step
         if asked or last or due and not row_follows:
             callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
-            for one in callbacks:
-                if isinstance(one, DivergenceGuard):
-                    one.check(pl_module)  # rolls back first: a diverged state is never written
+            for guard in callbacks:
+                if isinstance(guard, DivergenceGuard):
+                    guard.check(pl_module)  # rolls back first: a diverged state is never written
             if trainer.is_global_zero:
                 self._write(trainer, pl_module)
         if asked:
@@ -108,17 +110,12 @@ class PeriodicCheckpoint(Callback):
     def _agreed(self, leads: bool, device: torch.device) -> tuple[bool, bool]:
         """Whether any process was asked to stop, and whether rank 0's next file is due.
 
-        Processes wait for one another to tell that, so they do it about every ``AGREE_SECONDS``, as
-        rank 0 counts them, and in between nothing is asked or due.
+        Processes wait for one another to tell that: in most steps nothing is asked or due.
         """
         self._steps += 1
-        if self._steps < self._next:
+        if self._steps % AGREE_EVERY != 1:
             return False, False
-        now = time.monotonic()
-        pace = AGREE_SECONDS * self._steps / max(now - self._last, 1e-6)
-        mine = [self._asked, leads and now >= self._due, int(min(pace, MOST_STEPS)) * leads]
-        asked, due, steps = largest(mine, device)
-        self._steps, self._next, self._last = 0, max(1, steps), now
+        asked, due = largest([self._asked, leads and time.monotonic() >= self._due], device)
         return bool(asked), bool(due)
 
     def _write(self, trainer: Trainer, stage: ScheduledStage) -> None:
@@ -130,9 +127,7 @@ class PeriodicCheckpoint(Callback):
                 good = "there is none yet" if self.saved is None else f"iteration {self.saved}"
                 log.warning(
                     "%s: %s; training goes on, the last good progress file stays (%s)",
-                    path,
-                    error.strerror,
-                    good,
+                    *(path, error.strerror, good),
                 )
             self._failing = True
         else:
@@ -145,3 +140,40 @@ class PeriodicCheckpoint(Callback):
         now = time.monotonic()
         rest = (now - began) * (1 / self.share - 1)
         self._due = now + max(self.every_seconds, rest)
+
+
+class StopOnSignal(Callback):
+    """The first signal stops the stage, saved; a later Ctrl-C ends the run at once.
+
+    Other later signals are ignored: launchers may repeat theirs. As a context manager it handles
+    signals within its block; as a callback it takes them back from Lightning, whose handler would
+    end the run with nothing written.
+
+    Attributes:
+        number: the first signal; None before it.
+    """
+
+    def __init__(self, saving: PeriodicCheckpoint) -> None:
+        self.number: int | None = None
+        self._saving = saving
+        self._block = ExitStack()
+        self._take: Callable[[], None] | None = None
+
+    def __enter__(self) -> StopOnSignal:
+        self._take = self._block.enter_context(handle_signals(self._answer))
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._block.close()
+
+    def _answer(self, number: int) -> None:
+        if self.number is None:
+            self.number = number
+            self._saving.ask_to_stop()
+        elif number == signal.SIGINT:
+            raise Interrupted(number, "ended at once; run the same command again to go on")
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Take the signals back from Lightning."""
+        if self._take is not None:
+            self._take()

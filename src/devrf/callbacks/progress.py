@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemaini
 from rich.progress import Progress as Bar
 from torch import Tensor
 
-from devrf.callbacks.training_curve import batch_psnr
+from devrf.callbacks.curves import batch_psnr
 from devrf.engine.stage import ScheduledStage, in_words
 from devrf.system.progress import time_left
 

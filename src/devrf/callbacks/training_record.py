@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from lightning import Callback, LightningModule, Trainer
 
-from devrf.callbacks.previews import Previews
+from devrf.callbacks.curves import Previews
 from devrf.engine.stage import ScheduledStage
 from devrf.ops.dispatch import triton_runs
 from devrf.system.device import wait

@@ -32,6 +32,12 @@ ROOT: dict[str, Any] = {
 }
 # Keys of earlier versions and their new names; then values, by key.
 RENAMED = {
+    "callbacks.health.every_iterations": "callbacks.divergence_guard.every_iterations",
+    "callbacks.health.rate_factor": "callbacks.divergence_guard.rate_factor",
+    "callbacks.saving.every_seconds": "callbacks.checkpoint.every_seconds",
+    "callbacks.saving.share": "callbacks.checkpoint.share",
+    "callbacks.saving.folder": "callbacks.checkpoint.folder",
+    "callbacks.curve.folder": "callbacks.training_curve.folder",
     "capture.mattes": "capture.alpha_masks",
     "capture.moments": "capture.max_timesteps",
     "schedule.deformation.sides": "schedule.deformation.levels.N.side",

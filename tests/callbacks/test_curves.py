@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import math
-import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,11 +12,11 @@ import imageio.v3 as iio
 import pytest
 import torch
 from lightning import Callback, Trainer
-from lightning.pytorch.loggers import CSVLogger, Logger
+from lightning.pytorch.loggers import Logger
 from torch import Tensor
 
 from devrf.apps.trackers import Row
-from devrf.callbacks import Meter, Previews, TrainingCurve, TrainingRecord
+from devrf.callbacks import Meter, Previews, TrainingCurve
 from devrf.data.datamodule import SceneDataModule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 
@@ -137,25 +136,6 @@ def test_watching_changes_nothing_of_what_is_learned(learn) -> None:
     alone = learn(Album()).scene_model
     assert torch.equal(watched.canonical.density.values, alone.canonical.density.values)
     assert torch.equal(watched.canonical.color.values, alone.canonical.color.values)
-
-
-def test_what_previews_take_is_not_time_of_training(learn) -> None:
-    class Slow(Album):
-        def show_image(self, name: str, image: Tensor, step: int | None = None) -> None:
-            time.sleep(0.5)
-
-    seconds = learn(Album(), TrainingRecord()).record["seconds"]
-    slow = Previews(times=1)
-    again = learn(Slow(), slow, TrainingRecord()).record["seconds"]
-    assert slow.seconds > 1.0  # two pictures
-    assert again < seconds + 0.5
-
-
-def test_without_a_tracker_no_picture_is_made(
-    learn, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("devrf.callbacks.previews.preview", lambda *_: pytest.fail("rendered"))
-    learn(CSVLogger(tmp_path), Previews(times=3))
 
 
 def test_curves_stand_in_the_rows_of_the_losses(learn) -> None:

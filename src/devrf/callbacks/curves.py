@@ -1,0 +1,212 @@
+"""Curves and pictures of a stage while it learns: for loggers, and drawn at its end."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning import Callback, LightningModule, Trainer
+from torch import Tensor
+
+from devrf.apps.records import peak_host_memory
+from devrf.apps.still import preview
+from devrf.apps.trackers import trackers
+from devrf.engine.stage import ScheduledStage
+
+log = logging.getLogger(__name__)
+
+# Steps whose values are read from the device at once.
+AT_ONCE = 200
+
+
+def batch_psnr(means: Mapping[str, Tensor]) -> Tensor | None:
+    """PSNR () in dB of a step's batches; None where no loss is the error of colours.
+
+    Args:
+        means: the step's mean losses () by name; ``color`` or ``render`` is the mean squared
+            error of pixels in [0, 1].
+    """
+    error = means.get("color", means.get("render"))
+    return None if error is None else -10 * error.detach().clamp_min(1e-12).log10()
+
+
+class Meter(Callback):
+    """Logs the batches' PSNR, learning rates, speed, resolution and memory beside the losses."""
+
+    def __init__(self) -> None:
+        self._last = (0.0, 0)
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start the clock."""
+        assert isinstance(pl_module, ScheduledStage)
+        self._last = (time.perf_counter(), pl_module.iteration)
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Log in the steps in which Lightning logs; nothing is read from the device."""
+        assert isinstance(pl_module, ScheduledStage)
+        if not pl_module.logs(batch_idx):
+            return
+        now, done = time.perf_counter(), pl_module.iteration
+        since, before = self._last
+        self._last = (now, done)
+        values: dict[str, float | None] = {
+            "iterations_per_second": (done - before) / (now - since),
+            "peak_host_gb": peak_host_memory(),
+        }
+        if pl_module.resolution:
+            values["voxels"] = math.prod(pl_module.resolution)
+        for group in pl_module.optimizer.param_groups:
+            values[f"lr/{group['name']}"] = group["lr"]
+        if pl_module.phase is not None and pl_module.phase.frames:
+            values["frame"] = pl_module.phase.frames[0]  # a column has one number
+        if pl_module.device.type == "cuda":
+            values["peak_gpu_gb"] = torch.cuda.max_memory_allocated(pl_module.device) / 2**30
+        psnr = batch_psnr(pl_module.logged if outputs else {})
+        if psnr is not None:
+            pl_module.log(f"{pl_module.capture}/psnr", psnr)
+        # Tensors on the host: Lightning would copy numbers to the device, and wait.
+        known = {name: torch.tensor(float(v)) for name, v in values.items() if v is not None}
+        pl_module.log_dict({f"{pl_module.capture}/{name}": v for name, v in known.items()})
+
+
+class Previews(Callback):
+    """Shows the held-out view in the middle of the recording, where a logger takes pictures.
+
+    Attributes:
+        seconds: what the pictures of the present stage have taken.
+        psnr: (iteration, dB) of the pictures of the present stage.
+    """
+
+    def __init__(self, times: int = 6) -> None:
+        """``times``: pictures of each stage, evenly spread, the last at its end."""
+        self.times = times
+        self.seconds = 0.0
+        self.psnr: list[tuple[int, float]] = []
+        self._shown = 0
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Forget the stage before."""
+        self.psnr = []
+
+    def state_dict(self) -> dict[str, Any]:
+        """The PSNR of the pictures so far."""
+        return {"psnr": list(self.psnr)}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on with what :meth:`state_dict` gave."""
+        self.psnr = [(int(k), float(value)) for k, value in state_dict["psnr"]]
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Begin to count."""
+        assert isinstance(pl_module, ScheduledStage)
+        self.seconds, self._shown = 0.0, self._due(pl_module)
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Show the view, if a picture is due."""
+        assert isinstance(pl_module, ScheduledStage)
+        due = self._due(pl_module)
+        if due == self._shown or not trainer.is_global_zero:
+            return
+        self._shown = due
+        started = time.perf_counter()
+        if watching := trackers(trainer.loggers):
+            views = pl_module.scene.capture(pl_module.scored_capture).test
+            seen = preview(
+                pl_module.current_model(), views, len(views) // 2, pl_module.scene.background
+            )
+            done, capture = pl_module.iteration, pl_module.capture
+            self.psnr = [point for point in self.psnr if point[0] < done] + [(done, seen.psnr)]
+            for tracker in watching:
+                for name, image in seen.images.items():
+                    tracker.show_image(f"{capture}/{name}", image, done)
+            for logger in trainer.loggers:
+                logger.log_metrics({f"{capture}/held_out_psnr": seen.psnr}, done)
+        self.seconds += time.perf_counter() - started
+
+    def _due(self, stage: ScheduledStage) -> int:
+        return stage.iteration * self.times // stage.total_iterations
+
+
+class TrainingCurve(Callback):
+    """Draws ``training_<stage>.png``: the batches' PSNR of every step, and that of previews.
+
+    Values are read from the device every 200 steps. A resumed stage's curve begins at its start.
+    """
+
+    def __init__(self, folder: str | Path = "images") -> None:
+        """``folder``: gets the picture."""
+        self.folder = Path(folder)
+        self._forget()
+
+    def _forget(self) -> None:
+        self._points: list[tuple[int, float]] = []
+        self._unread: list[tuple[int, Tensor]] = []
+        self._grids: list[tuple[int, str]] = []
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Forget the stage before."""
+        self._forget()
+
+    def state_dict(self) -> dict[str, Any]:
+        """The curve so far."""
+        self._read()
+        return {"points": list(self._points), "grids": list(self._grids)}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on with what :meth:`state_dict` gave."""
+        self._points = [(int(k), float(value)) for k, value in state_dict["points"]]
+        self._grids = [(int(k), str(shape)) for k, shape in state_dict["grids"]]
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Keep the step's PSNR, and the grid's size where it changes."""
+        assert isinstance(pl_module, ScheduledStage)
+        psnr, done = batch_psnr(outputs or {}), pl_module.iteration
+        if psnr is None or not trainer.is_global_zero:
+            return
+        self._unread.append((done, psnr))
+        shape = "x".join(map(str, pl_module.resolution))
+        if shape != (self._grids[-1][1] if self._grids else ""):
+            self._grids.append((done, shape))
+        if len(self._unread) >= AT_ONCE:
+            self._read()
+
+    def _read(self) -> None:
+        """Read what waits on the device; a step that was rolled back gives way to the later one."""
+        if not self._unread:
+            return
+        values = torch.stack([value.float() for _, value in self._unread]).tolist()
+        for (iteration, _), value in zip(self._unread, values, strict=True):
+            while self._points and self._points[-1][0] >= iteration:
+                self._points.pop()
+            self._points.append((iteration, value))
+        self._unread = []
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Draw the curve."""
+        assert isinstance(pl_module, ScheduledStage)
+        self._read()
+        if not self._points:
+            return
+        # Only this hook draws with matplotlib.
+        from devrf.apps.report.plots import write_training_curve
+
+        callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
+        previews = [
+            point for other in callbacks if isinstance(other, Previews) for point in other.psnr
+        ]
+        path = self.folder / f"training_{pl_module.name}.png"
+        try:
+            write_training_curve(path, pl_module.name, self._points, previews, self._grids)
+        except OSError as error:  # a full disk must not cost what was learned
+            log.warning("%s: %s; the curve is not drawn", path, error.strerror)
