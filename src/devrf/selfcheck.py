@@ -28,7 +28,7 @@ from lightning.pytorch.callbacks import LambdaCallback
 from devrf.callbacks import GridUpscaling, LearningRateDecay, PeriodicCheckpoint, StopOnSignal
 from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, LoadedCheckpoint
 from devrf.checkpoints.progress import progress_files
-from devrf.data.procedural import ProceduralDataModule
+from devrf.data.rendered import ProceduralDataModule
 from devrf.engine.graphs import CudaGraphCapture, Graphs, Work
 from devrf.engine.stage import ScheduledStage
 from devrf.errors import DevrfError, did_you_mean

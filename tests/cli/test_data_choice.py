@@ -70,7 +70,7 @@ def test_the_options_of_the_reader_reach_it(devrf, tmp_path, moving, short):
     done = devrf(f"data.root={moving}", *options, *short, "stage=canonical")
     assert (done.status, done.err) == (0, "")
     stored = OmegaConf.load(tmp_path / "outputs/w/quickstart/checkpoints/config.yaml").data
-    assert stored._target_ == "devrf.data.inward.InwardFacingDataModule"
+    assert stored._target_ == "devrf.data.recorded.InwardFacingDataModule"
     assert (stored.downscale, stored.train_views, stored.frames) == (2, 1, 2)
     assert (stored.background, stored.bound_scale) == ("white", "auto")
     assert str(stored.flow_cache).endswith("flow.npz")

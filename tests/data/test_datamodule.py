@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-import inspect
 import itertools
 from types import SimpleNamespace
-from typing import Any, get_type_hints
+from typing import Any
 
 import pytest
 import torch
 
-from devrf.data.forward import ForwardFacingDataModule
-from devrf.data.inward import InwardFacingDataModule
-from devrf.data.nerfies import NerfiesDataModule
-from devrf.data.nerfstudio import NerfstudioDataModule
-from devrf.data.procedural import ProceduralDataModule
-from devrf.data.rendered import RenderedDataModule
+from devrf.data.recorded import (
+    READERS,
+    ForwardFacingDataModule,
+    InwardFacingDataModule,
+    RecordedDataModule,
+)
+from devrf.data.rendered import ProceduralDataModule, RenderedDataModule
 from devrf.errors import DevrfError
-from devrf.scenes.export import export_blender
+from devrf.scenes.export import export
+from devrf.scenes.procedural import ProceduralForwardScene
 from devrf.scenes.scene import Scene
 
 
@@ -79,32 +80,32 @@ def test_the_procedural_module_renders_what_it_was_told():
     assert scene.clock.times == (0.0, 1.0)
 
 
-@pytest.mark.parametrize(
-    ("module", "sources"),
-    [
-        (InwardFacingDataModule, "'auto', 'files', 'dis', 'raft' or 'none'"),
-        (ForwardFacingDataModule, "'auto', 'files', 'dis', 'raft' or 'none'"),
-        (NerfiesDataModule, "'auto', 'dis', 'raft' or 'none'"),
-        (NerfstudioDataModule, "'auto', 'dis', 'raft' or 'none'"),
-    ],
-)
-def test_options_are_checked_before_anything_is_read(module, sources):
-    with pytest.raises(DevrfError, match=f"data.flow: should be {sources}, not 'farneback'"):
-        module("nowhere", flow="farneback")
+def test_options_are_checked_before_anything_is_read():
+    inward = "'auto', 'files', 'dis', 'raft' or 'none'"
+    with pytest.raises(DevrfError, match=f"data.flow: should be {inward}, not 'farneback'"):
+        InwardFacingDataModule("nowhere", flow="farneback")
+    with pytest.raises(DevrfError, match="data.flow: should be 'auto', 'dis', 'raft' or 'none'"):
+        RecordedDataModule(READERS["nerfies"], "nowhere", flow="files")
     with pytest.raises(DevrfError, match="data.rot: no such option"):
-        module("nowhere", rot=3)
+        ForwardFacingDataModule("nowhere", rot=3)
     with pytest.raises(DevrfError, match="data.root: is missing"):
-        module()
+        InwardFacingDataModule()
 
 
-def test_a_datamodule_has_the_options_of_its_reader_with_their_types():
-    parameters = inspect.signature(NerfiesDataModule).parameters
-    assert parameters["root"].default is inspect.Parameter.empty
-    assert (parameters["downscale"].default, parameters["holdout"].default) == ("up_to_4", 8)
-    assert "train_views" not in parameters and "export" not in parameters
-    hints = get_type_hints(NerfiesDataModule.__init__)
-    assert hints["downscale"] == int | str and hints["frames"] == int | None
-    assert inspect.signature(ProceduralDataModule).parameters["export"].default is None
+@pytest.mark.parametrize("facing", ["inward", "forward"])
+def test_a_scene_written_to_disk_is_read_with_its_flow(facing, tiny_scene, tmp_path):
+    numbers = {"width": 24, "height": 16, "static_views": 7, "train_views": 2, "frames": 2}
+    toy = ProceduralDataModule("toy", recipe=ProceduralForwardScene, supersample=1, **numbers)
+    scene = tiny_scene if facing == "inward" else toy.scene
+    assert scene.kind == facing
+    export(scene, tmp_path / "toy")
+    module = InwardFacingDataModule if facing == "inward" else ForwardFacingDataModule
+    read = module(tmp_path / "toy").scene
+    ours, flow = scene.dynamic.train.flow, read.dynamic.train.flow
+    assert read.name == "toy" and ours is not None and flow is not None
+    assert torch.equal(flow.vectors, ours.vectors)
+    bare = module(tmp_path / "toy", name="bare", flow="none").scene
+    assert bare.name == "bare" and bare.dynamic.train.flow is None
 
 
 def test_exact_forward_flow_undoes_backward_flow_once_it_is_asked_for(tiny_recipe):
@@ -134,7 +135,7 @@ def test_forward_flow_is_read_from_files_else_estimated_beside_the_backward_one(
     tiny_scene, tmp_path, written
 ):
     folder = tmp_path / "scene"
-    export_blender(tiny_scene, folder)
+    export(tiny_scene, folder)
     flows = next(folder.glob("dynamic_*views")) / "train_flow"
     if written:
         for path in flows.glob("*_bwd.npz"):

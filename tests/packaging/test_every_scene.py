@@ -173,14 +173,14 @@ def write_scene(
     write_sparse: Callable[..., None],
     write_rig: Callable[..., None],
 ) -> Callable[[str, Path], None]:
-    """A function that writes a tiny scene in the layout that a datamodule reads."""
+    """A function that writes a tiny scene in the layout that a reader reads."""
     writers: dict[str, Callable[[Path], None]] = {
-        "NerfstudioDataModule": partial(write_nerfstudio, tiny_scene),
-        "NerfiesDataModule": partial(write_nerfies, tiny_scene),
-        "DycheckDataModule": partial(write_dycheck, tiny_scene),
-        "ColmapDataModule": partial(write_colmap, tiny_scene, write_sparse=write_sparse),
-        "Neural3DVideoDataModule": partial(write_videos, forward_scene, write_rig=write_rig),
-        "ForwardFacingDataModule": partial(export, forward_scene),
+        "NerfstudioReader": partial(write_nerfstudio, tiny_scene),
+        "NerfiesReader": partial(write_nerfies, tiny_scene),
+        "DycheckReader": partial(write_dycheck, tiny_scene),
+        "ColmapReader": partial(write_colmap, tiny_scene, write_sparse=write_sparse),
+        "Neural3DVideoReader": partial(write_videos, forward_scene, write_rig=write_rig),
+        "LlffReader": partial(export, forward_scene),
     }
 
     def write(target: str, root: Path) -> None:
@@ -197,7 +197,8 @@ def scene_config(
 ) -> Any:
     """The whole config of ``data=<name>`` with a tiny scene and tiny fields."""
     choice = [f"data={name}"]
-    target = composed(*choice).data["_target_"]
+    data = composed(*choice).data
+    target = (data.get("reader") or data.get("recipe") or data)["_target_"]
     if name in EMBEDDED:
         choice += [
             *EMBEDDED[name],
@@ -210,7 +211,7 @@ def scene_config(
     else:
         write_scene(target, tmp_path / "scene")
         choice.append(f"data.root={tmp_path}/scene")
-    facing = "Forward" in target or "Video" in target
+    facing = any(word in target for word in ("Forward", "Llff", "Video"))
     return composed(*choice, *(FORWARD if facing else ()), *TINY)
 
 

@@ -71,10 +71,10 @@ def application(tmp_path: Path):
 
 def test_groups_resolvers_and_choices_are_there(application):
     config = application()
-    assert config["scene"]["_target_"] == "devrf.data.procedural.ProceduralDataModule"
+    assert config["scene"]["_target_"] == "devrf.data.rendered.ProceduralDataModule"
     assert config["schedule"]["canonical"]["side"] == 160
     assert (config["run"], config["label"]) == ("theirs-base", "robot")
     config = application("data@scene=inward", "scene.root=/scenes/suzanne", "schedule=quick")
-    assert config["scene"]["_target_"] == "devrf.data.inward.InwardFacingDataModule"
+    assert config["scene"]["_target_"] == "devrf.data.recorded.InwardFacingDataModule"
     assert config["label"] == "suzanne"
     assert config["schedule"]["canonical"]["side"] < 160

@@ -126,4 +126,4 @@ def test_another_application_finds_the_installed_configs(environment, tmp_path):
     )
     (tmp_path / "app.yaml").write_text("defaults: [_self_, data@scene: procedural]\n")
     done = run(environment / "bin" / "python", "-c", script, folder=tmp_path)
-    assert "devrf.data.procedural.ProceduralDataModule" in done.stdout
+    assert "devrf.data.rendered.ProceduralDataModule" in done.stdout

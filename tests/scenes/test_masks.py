@@ -18,8 +18,8 @@ from devrf.apps.inspection.advice import image_advice
 from devrf.apps.inspection.picture import shown
 from devrf.apps.inspection.report import inspect_scene
 from devrf.data.batch import all_pixels
-from devrf.data.flow_source import with_flow
-from devrf.data.nerfstudio import NerfstudioDataModule
+from devrf.data.flow import with_flow
+from devrf.data.recorded import READERS, RecordedDataModule
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.scenes.formats.nerfstudio import NerfstudioReader
@@ -181,7 +181,7 @@ def test_a_mask_that_leaves_nothing(root):
 
 def test_only_valid_pixels_are_drawn(root):
     plain(root)
-    train = NerfstudioDataModule(root, flow="none").scene.dynamic.train
+    train = RecordedDataModule(READERS["nerfstudio"], root, flow="none").scene.dynamic.train
     assert train.valid_mask is not None
     pool = all_pixels(train, torch.tensor([2, 0]))
     assert len(pool) == 2 * WIDTH * HEIGHT // 2

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from devrf.data.flow_source import with_flow
+from devrf.data.flow import with_flow
 from devrf.scenes.formats.blender import BlenderReader
 from devrf.scenes.formats.llff import LlffReader
 from devrf.scenes.formats.nerfstudio import NerfstudioReader

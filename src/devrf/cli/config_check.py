@@ -102,6 +102,11 @@ def _check_group(raw: Node, resolved: Node, path: str, read: set[str]) -> None:
 
 def _check_part(raw: Node, resolved: Node, path: str, read: set[str]) -> None:
     settings = _settings(str(resolved["_target_"]), path)
+    for part in resolved.values():
+        if "**" in settings and isinstance(part, Mapping) and part.get("_partial_"):
+            # It is made later, of the keys beside it.
+            settings = {**_settings(str(part["_target_"]), path), **settings}
+            del settings["**"]
     for key in (key for key in raw if key not in RESERVED):
         where, given, value = f"{path}{key}", raw[key], resolved[key]
         if key not in settings and "**" not in settings:

@@ -13,9 +13,9 @@ from devrf.cli.config import config_folder
 from devrf.errors import DevrfError
 
 # What conf/data/auto.yaml names.
-AUTOMATIC = "devrf.data.recognised.recognised_datamodule"
+AUTOMATIC = "devrf.data.recorded.recognised_datamodule"
 # Not passed over with the other options.
-OF_ALL = ("_target_", "flow_cache")
+OF_ALL = ("_target_", "reader", "flow_cache")
 
 
 def with_data_choice(arguments: Sequence[str]) -> list[str]:

@@ -7,7 +7,7 @@ from kornia.filters import gaussian_blur2d
 from torch import Tensor
 from torch.nn.functional import grid_sample, max_pool2d
 
-from devrf.data.correspondence import previous_images
+from devrf.data.flow import previous_images
 from devrf.scenes.scene import Views
 
 # Images of which colours are followed, evenly spread, and frames that they are followed back.

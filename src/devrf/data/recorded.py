@@ -3,24 +3,50 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from pathlib import Path
+from typing import Any
 
 from devrf.data.datamodule import SceneDataModule
-from devrf.data.flow_source import with_flow, with_forward_flow
+from devrf.data.flow import with_flow, with_forward_flow
+from devrf.scenes.formats import recognise
+from devrf.scenes.formats.blender import BlenderReader
+from devrf.scenes.formats.colmap import ColmapReader
+from devrf.scenes.formats.dycheck import DycheckReader
+from devrf.scenes.formats.llff import LlffReader
+from devrf.scenes.formats.nerfies import NerfiesReader
+from devrf.scenes.formats.nerfstudio import NerfstudioReader
+from devrf.scenes.formats.neural_3d_video import Neural3DVideoReader
 from devrf.scenes.reader import SceneReader
 from devrf.scenes.scene import Scene
 
 log = logging.getLogger(__name__)
 
+# By the option of ``data=``.
+READERS: dict[str, type[SceneReader]] = {
+    "inward": BlenderReader,
+    "forward": LlffReader,
+    "nerfies": NerfiesReader,
+    "nerfstudio": NerfstudioReader,
+    "colmap": ColmapReader,
+    "neural_3d_video": Neural3DVideoReader,
+    "dycheck": DycheckReader,
+}
+
 
 class RecordedDataModule(SceneDataModule):
     """A scene read from disk when it is first needed, its flow estimated if that is asked for."""
 
-    def __init__(self, reader: SceneReader) -> None:
-        """Say which reader reads the scene, and with which options."""
+    def __init__(self, reader: Callable[..., SceneReader], *where: Any, **options: Any) -> None:
+        """Say who reads the scene, and how.
+
+        Args:
+            reader: of :data:`READERS`, or another.
+            where: the scene's folder.
+            options: of the reader.
+        """
         super().__init__()
-        self.reader = reader
+        self.reader = reader(*where, **options)
 
     def load(self) -> Scene:
         """Read the scene, and estimate its optical flow if that is asked for."""
@@ -48,3 +74,37 @@ class RecordedDataModule(SceneDataModule):
         """Where estimated flow is kept."""
         cache = self.reader.flow_cache
         return None if cache is None else Path(cache)
+
+
+class InwardFacingDataModule(RecordedDataModule):
+    """A scene that cameras look in at, in DeVRF's published Blender layout or D-NeRF's."""
+
+    def __init__(
+        self, *where: Any, reader: Callable[..., SceneReader] = BlenderReader, **options: Any
+    ) -> None:
+        """Say where the scene is and how to read it; see :class:`BlenderReader`."""
+        super().__init__(reader, *where, **options)
+
+
+class ForwardFacingDataModule(RecordedDataModule):
+    """A scene that cameras face from one side, in DeVRF's published layout or LLFF's."""
+
+    def __init__(
+        self, *where: Any, reader: Callable[..., SceneReader] = LlffReader, **options: Any
+    ) -> None:
+        """Say where the scene is and how to read it; see :class:`LlffReader`."""
+        super().__init__(reader, *where, **options)
+
+
+def recognised_datamodule(root: str | Path, **options: Any) -> RecordedDataModule:
+    """The datamodule that reads the scene in the folder ``root``.
+
+    Args:
+        root: the scene's folder.
+        options: of its reader; those that are None have the reader's own defaults.
+
+    Raises:
+        DevrfError: the layout is unknown, or its reader has no such option.
+    """
+    given = {name: value for name, value in options.items() if value is not None}
+    return RecordedDataModule(READERS[recognise(root).choice], root, **given)

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from devrf.data.datamodule import SceneDataModule
 from devrf.scenes.procedural.filming import forward_flow
-from devrf.scenes.procedural.recipe import Recipe
+from devrf.scenes.procedural.recipe import ProceduralScene, Recipe
 from devrf.scenes.scene import Scene
 
 
@@ -37,3 +38,24 @@ class RenderedDataModule(SceneDataModule):
         if wanted and isinstance(self.recipe, Recipe):
             train = replace(train, forward_flow=forward_flow(self.recipe.filmed(), train))
             self.replace(replace(scene, dynamic=replace(scene.dynamic, train=train)))
+
+
+class ProceduralDataModule(RenderedDataModule):
+    """An embedded scene: ``robot`` or ``flower``, or another recipe's."""
+
+    def __init__(
+        self,
+        *shape: Any,
+        recipe: Callable[..., Recipe] = ProceduralScene,
+        export: str | Path | None = None,
+        **numbers: Any,
+    ) -> None:
+        """Say what to render.
+
+        Args:
+            shape: which shape, or the scene's name.
+            recipe: :class:`ProceduralScene` or :class:`ProceduralForwardScene`.
+            export: the folder that ``stage=prepare`` writes the scene to.
+            numbers: of the recipe.
+        """
+        super().__init__(recipe(*shape, **numbers), export)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from devrf.data.batch import pixel_positions
-from devrf.data.correspondence import previous_images
+from devrf.data.flow import previous_images
 from devrf.errors import DevrfError, did_you_mean
 from devrf.metrics.geometric import SOLID, depth_error, end_point_error
 from devrf.metrics.image import ms_ssim, psnr_masked, ssim_masked

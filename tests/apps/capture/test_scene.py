@@ -14,7 +14,7 @@ import torch
 
 from devrf.apps.capture.pipeline import scene_from_footage
 from devrf.apps.settings import CaptureSettings
-from devrf.data.recognised import recognised_datamodule
+from devrf.data.recorded import recognised_datamodule
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from devrf.data.batch import PixelPool, all_pixels
-from devrf.data.correspondence import previous_images
+from devrf.data.flow import previous_images
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from devrf.data.batch import RayBatch
-from devrf.data.correspondence import previous_images
+from devrf.data.flow import previous_images
 from devrf.engine.batches import gather_batch
 from devrf.geometry.cameras import Cameras
 from devrf.methods.devrf.losses import (

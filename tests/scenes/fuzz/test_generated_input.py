@@ -24,13 +24,7 @@ from hypothesis import strategies as st
 from hypothesis.strategies import DrawFn, SearchStrategy
 from PIL import ExifTags, Image
 
-from devrf.data.colmap import ColmapDataModule
-from devrf.data.dycheck import DycheckDataModule
-from devrf.data.forward import ForwardFacingDataModule
-from devrf.data.inward import InwardFacingDataModule
-from devrf.data.nerfies import NerfiesDataModule
-from devrf.data.nerfstudio import NerfstudioDataModule
-from devrf.data.neural_3d_video import Neural3DVideoDataModule
+from devrf.data.recorded import READERS, RecordedDataModule
 from devrf.scenes.flow_files import load_flow, read_flow_file
 from devrf.scenes.formats.llff_poses import read_dynamic_poses, read_static_poses
 from devrf.scenes.formats.nerfies import read_camera
@@ -42,6 +36,10 @@ WIDTH, HEIGHT = 32, 24
 Fixture = Callable[[str], Any]
 # What to draw inputs from, and how one of them is written and read.
 Prepared = tuple[SearchStrategy[Any], Callable[[Any], Any]]
+
+
+def loaded(choice: str, root: Path, **options: Any) -> Any:
+    return RecordedDataModule(READERS[choice], root, **options).load()
 
 
 def written(file: Path, content: bytes | str) -> Path:
@@ -300,7 +298,7 @@ def nerfies_lists(fixture: Fixture) -> Prepared:
 
 
 def read_nerfies(root: Path) -> Any:
-    return NerfiesDataModule(root, downscale=1, flow="none", bound_scale=1.5).load()
+    return loaded("nerfies", root, downscale=1, flow="none", bound_scale=1.5)
 
 
 # --- COLMAP, DyCheck, Neural 3D Video
@@ -319,7 +317,7 @@ def colmap_folder(fixture: Fixture) -> Path:
 
 
 def read_colmap(root: Path) -> Any:
-    return ColmapDataModule(root, downscale=1, flow="none").load()
+    return loaded("colmap", root, downscale=1, flow="none")
 
 
 def colmap_text(fixture: Fixture) -> Prepared:
@@ -360,7 +358,7 @@ def dycheck_splits(fixture: Fixture) -> Prepared:
 
     def read(text: str) -> Any:
         written(file, text)
-        return DycheckDataModule(root, downscale=1, flow="none", bound_scale=1.5).load()
+        return loaded("dycheck", root, downscale=1, flow="none", bound_scale=1.5)
 
     return fixture("damage").json(content), read
 
@@ -371,9 +369,9 @@ def videos(fixture: Fixture) -> Prepared:
     cameras = ring(60, width=WIDTH, height=HEIGHT, angle=0.8)[torch.arange(2)]
     fixture("write_rig")(root, {"cam00.mp4": film, "cam01.mp4": film}, cameras, 2.0, 9.0)
     file = root / "cam01.mp4"
-    return fixture("damage").bytes(file.read_bytes()), lambda data: Neural3DVideoDataModule(
-        written(file, data).parent, downscale=1, flow="none"
-    ).load()
+    return fixture("damage").bytes(file.read_bytes()), lambda data: loaded(
+        "neural_3d_video", written(file, data).parent, downscale=1, flow="none"
+    )
 
 
 # --- whole scenes
@@ -402,7 +400,7 @@ def nerfstudio(fixture: Fixture) -> Prepared:
 
 
 def read_nerfstudio(root: Path) -> Any:
-    return NerfstudioDataModule(root, flow="none", bound_scale=1.5).load()
+    return loaded("nerfstudio", root, flow="none", bound_scale=1.5)
 
 
 CHANGES = "gone empty folder loop dangling pipe half rubbish damaged swapped".split()
@@ -499,7 +497,7 @@ INPUTS = int(os.environ.get("DEVRF_FUZZ_INPUTS", "1000"))
 
 
 def inward_files(root: Path) -> Any:
-    return InwardFacingDataModule(root, flow="files", bound_scale=1.5).load()
+    return loaded("inward", root, flow="files", bound_scale=1.5)
 
 
 # What is read, how large a part of all inputs it gets (in 1,000), and how they are made.
@@ -528,7 +526,7 @@ PARSERS: dict[str, tuple[int, Callable[[Fixture], Prepared]]] = {
     ),
     "files of a forward-facing scene": (
         12,
-        scene_files(forward, lambda root: ForwardFacingDataModule(root, flow="files").load()),
+        scene_files(forward, lambda root: loaded("forward", root, flow="files")),
     ),
     "files of nerfstudio": (12, scene_files(nerfstudio_folder, read_nerfstudio)),
     "files of nerfies": (12, scene_files(nerfies_folder, read_nerfies)),

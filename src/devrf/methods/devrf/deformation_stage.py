@@ -14,7 +14,7 @@ from torch import Tensor
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import Pixels, all_pixels
-from devrf.data.correspondence import previous_images
+from devrf.data.flow import previous_images
 from devrf.engine.batches import frame_pools, images_of
 from devrf.engine.convergence import Convergence
 from devrf.engine.ddp import broadcast

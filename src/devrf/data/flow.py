@@ -1,4 +1,4 @@
-"""Where a scene's optical flow comes from: its files, an estimate, or nowhere."""
+"""Where a scene's optical flow comes from (files, an estimate, nowhere), and where it leads."""
 
 from __future__ import annotations
 
@@ -6,9 +6,12 @@ import logging
 from dataclasses import replace
 from pathlib import Path
 
+import torch
+from torch import Tensor
+
 from devrf.scenes.optical_flow import FlowMethod, camera_turn, estimate_flow, frame_pairs
 from devrf.scenes.reader import FlowSource
-from devrf.scenes.scene import OpticalFlow, Scene
+from devrf.scenes.scene import OpticalFlow, Scene, Views
 
 log = logging.getLogger(__name__)
 
@@ -79,3 +82,18 @@ def with_forward_flow(
     if train.valid_mask is not None:
         flow = replace(flow, valid=flow.valid & train.valid_mask)
     return replace(scene, dynamic=replace(scene.dynamic, train=replace(train, forward_flow=flow)))
+
+
+def previous_images(views: Views) -> Tensor:
+    """For each of N images the one that its backward flow leads to.
+
+    That is the image before it in the same view; a moving camera's images (each its own view)
+    follow one another as one sequence. An image without a predecessor is its own.
+
+    Returns:
+        (N,) int64 on the device of the views.
+    """
+    previous = torch.arange(len(views), device=views.times.device)
+    for image, earlier in frame_pairs(views):
+        previous[image] = earlier
+    return previous
