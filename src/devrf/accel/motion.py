@@ -12,6 +12,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from devrf.accel.blocks import (
+    BLOCK,
+    blocks,
     cell,
     corner_row,
     corner_slopes,
@@ -23,9 +25,8 @@ from devrf.accel.blocks import (
     store_vectors,
 )
 
-BLOCK = 128
 # Numbers that the one program of the second launch reads at a time.
-AT_ONCE = 1024
+AT_ONCE: tl.constexpr = tl.constexpr(1024)
 # As in devrf.ops.motion.
 NEAREST: tl.constexpr = tl.constexpr(1e-8)
 BEFORE_INFINITY: tl.constexpr = tl.constexpr(1e-6)
@@ -63,7 +64,7 @@ def motion_sum(
         vectors, valid, pixel, image, *others = seen
         known += [valid.view(torch.uint8), image, vectors, pixel, *others]
     numbers = (1.0, 1.0, 1.0) if ndc is None else ndc
-    kinds = {"FLOW": seen is not None, "NDC": ndc is not None, "BLOCK": BLOCK}
+    kinds = {"FLOW": seen is not None, "NDC": ndc is not None}
     total, terms = Motion.apply(
         canonical.contiguous(),
         weight.contiguous(),
@@ -91,7 +92,7 @@ class Motion(torch.autograd.Function):
         gradient: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
         count = len(canonical)
-        programs = int(triton.cdiv(count, BLOCK))
+        programs = blocks(count)
         parts, sums = canonical.new_empty(programs, 4), canonical.new_empty(5)
         given = (canonical, weight, forward, *known)
         launch(motion_kernel, programs, parts, *given, parts, count, *numbers, **kinds)
@@ -102,7 +103,6 @@ class Motion(torch.autograd.Function):
             parts,
             *(parts, valid, sums, programs, len(valid), *weights),
             OVER_RAYS=kinds["FLOW"] and not over_samples,
-            BLOCK=AT_ONCE,
         )
         ctx.save_for_backward(*given, sums)
         ctx.numbers, ctx.kinds, ctx.weights, ctx.gradient = numbers, kinds, weights, gradient
@@ -123,7 +123,7 @@ class Motion(torch.autograd.Function):
         moved, changed = torch.empty_like(canonical), torch.empty_like(weight)
         launch(
             motion_backward_kernel,
-            triton.cdiv(len(canonical), BLOCK),
+            blocks(len(canonical)),
             canonical,
             *(*given, sums, upstream.contiguous(), moved, changed),
             *(forward if into is None else into, len(canonical), *ctx.numbers, *ctx.weights),
@@ -226,7 +226,6 @@ def motion_kernel(
     near,
     FLOW: tl.constexpr,
     NDC: tl.constexpr,
-    BLOCK: tl.constexpr,
 ):
     """A block's sums of both terms, and of the samples that each is over."""
     place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -267,14 +266,13 @@ def finish_motion_kernel(
     of_cycle,
     of_flow,
     OVER_RAYS: tl.constexpr,
-    BLOCK: tl.constexpr,
 ):
     """Cycle, flow, their weighted sum; and one by what each is divided by."""
-    lane = tl.arange(0, BLOCK)
-    cycle = tl.zeros((BLOCK,), dtype=tl.float32)
-    samples = tl.zeros((BLOCK,), dtype=tl.float32)
-    flow = tl.zeros((BLOCK,), dtype=tl.float32)
-    counted = tl.zeros((BLOCK,), dtype=tl.float32)
+    lane = tl.arange(0, AT_ONCE)
+    cycle = tl.zeros((AT_ONCE,), dtype=tl.float32)
+    samples = tl.zeros((AT_ONCE,), dtype=tl.float32)
+    flow = tl.zeros((AT_ONCE,), dtype=tl.float32)
+    counted = tl.zeros((AT_ONCE,), dtype=tl.float32)
     start = 0
     while start < programs:
         part = parts + (start + lane) * 4
@@ -283,14 +281,14 @@ def finish_motion_kernel(
         samples += tl.load(part + 1, mask=here, other=0.0)
         flow += tl.load(part + 2, mask=here, other=0.0)
         counted += 2.0 * tl.load(part + 3, mask=here, other=0.0)
-        start += BLOCK
+        start += AT_ONCE
     if OVER_RAYS:
-        counted = tl.zeros((BLOCK,), dtype=tl.float32)
+        counted = tl.zeros((AT_ONCE,), dtype=tl.float32)
         start = 0
         while start < rays:
             there = tl.load(valid + start + lane, mask=start + lane < rays, other=0)
             counted += (there != 0).to(tl.float32)
-            start += BLOCK
+            start += AT_ONCE
     by_cycle = 1.0 / tl.maximum(tl.sum(samples, 0), 1.0)
     by_flow = 1.0 / tl.maximum(tl.sum(counted, 0), 1.0)
     mean_cycle = tl.sum(cycle, 0) * by_cycle
@@ -334,7 +332,6 @@ def motion_backward_kernel(
     NEEDS_FORWARD: tl.constexpr,
     FLOW: tl.constexpr,
     NDC: tl.constexpr,
-    BLOCK: tl.constexpr,
 ):
     """Gradients of q and w, and of Δ_f, which are scattered to its grid."""
     place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from devrf.accel.blocks import (
+    LANES,
     PADDING,
     launch,
     load_vectors,
@@ -20,7 +21,6 @@ from devrf.accel.blocks import (
     store_vectors,
 )
 
-WARP = {"BLOCK": 32, "num_warps": 1}
 # A transmittance is at least so far from 0 and 1 in the entropy; as in devrf.ops.photometric.
 NEAREST: tl.constexpr = tl.constexpr(1e-6)
 
@@ -65,7 +65,15 @@ class Photometric(torch.autograd.Function):
         known = image, transmittance, sample_color, sample_weight, first, truth, alpha
         parts = image.new_empty(rays, 7)
         launch(
-            photometric_kernel, rays, image, *known, parts, *weights, rays, ALPHA=has_alpha, **WARP
+            photometric_kernel,
+            rays,
+            image,
+            *known,
+            parts,
+            *weights,
+            rays,
+            ALPHA=has_alpha,
+            num_warps=1,
         )
         sums = parts.sum(dim=0)
         total, terms, seen = sums[4], sums[:4], sums[5:]
@@ -89,8 +97,7 @@ class Photometric(torch.autograd.Function):
             *(*known, upstream.contiguous(), *into, colors),
             *(*ctx.weights, rays, places),
             ALPHA=ctx.has_alpha,
-            PADDING=PADDING,
-            **WARP,
+            num_warps=1,
         )
         return *into, colors, *[None] * 6
 
@@ -117,7 +124,6 @@ def photometric_kernel(
     of_matte,
     rays,
     ALPHA: tl.constexpr,
-    BLOCK: tl.constexpr,
 ):
     """A ray's share of each term, of their weighted sum, and of mean opacity and matte."""
     ray = tl.program_id(0).to(tl.int64)
@@ -131,7 +137,7 @@ def photometric_kernel(
     color = share * (off_red * off_red + off_green * off_green + off_blue * off_blue) / 3.0
     stop = tl.load(first + ray + 1)
     start = tl.load(first + ray)
-    lane = tl.arange(0, BLOCK)
+    lane = tl.arange(0, LANES)
     missed = 0.0
     while start < stop:
         at = start + lane
@@ -142,7 +148,7 @@ def photometric_kernel(
         g -= green
         b -= blue
         missed += tl.sum(weight * (r * r + g * g + b * b), 0)
-        start += BLOCK
+        start += LANES
     missed = missed * share
     left = tl.load(transmittance + ray)
     unsure = share * entropy(tl.minimum(tl.maximum(left, NEAREST), 1.0 - NEAREST))
@@ -183,8 +189,6 @@ def photometric_backward_kernel(
     rays,
     places,
     ALPHA: tl.constexpr,
-    BLOCK: tl.constexpr,
-    PADDING: tl.constexpr,
 ):
     """Gradients of a ray's colour and transmittance, and of its samples' colours."""
     program = tl.program_id(0)
@@ -207,7 +211,7 @@ def photometric_backward_kernel(
         tl.store(into_transmittance + ray, change)
         start = tl.load(first + ray)
         stop = tl.load(first + ray + 1)
-        lane = tl.arange(0, BLOCK)
+        lane = tl.arange(0, LANES)
         while start < stop:
             at = start + lane
             here = at < stop
@@ -217,8 +221,8 @@ def photometric_backward_kernel(
             g = steep * (g - green)
             b = steep * (b - blue)
             store_vectors(into_color, at * 3, r, g, b, here)
-            start += BLOCK
+            start += LANES
     else:
-        place, empty = padding_places(program - rays, tl.load(first + rays), places, PADDING)
+        place, empty = padding_places(program - rays, tl.load(first + rays), places)
         nothing = tl.zeros((PADDING,), dtype=tl.float32)
         store_vectors(into_color, place * 3, nothing, nothing, nothing, empty)

@@ -9,10 +9,9 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from devrf.accel.blocks import launch, load_vectors, store_vectors
+from devrf.accel.blocks import BLOCK, blocks, launch, load_vectors, store_vectors
 
 Triple = tuple[float, float, float]
-BLOCK = 128
 
 
 def gather_pixels(
@@ -39,7 +38,7 @@ def gather_pixels(
         seen, valid = torch.empty_like(pixel), known.new_empty(rays)
     launch(
         gather_kernel,
-        triton.cdiv(rays, BLOCK),
+        blocks(rays),
         poses,
         *(image.contiguous(), flat.contiguous(), pixels),
         *(poses.contiguous(), focal.contiguous(), center.contiguous(), background.contiguous()),
@@ -48,7 +47,6 @@ def gather_pixels(
         *(rays, width, height * width, 0 if background.dim() == 1 else 3),
         CHANNELS=channels,
         FLOW=flow is not None,
-        BLOCK=BLOCK,
     )
     return (
         *(origins, directions, color, alpha if channels == 4 else None, time, frame, pixel),
@@ -65,11 +63,10 @@ def steps_in_box(
     count = torch.empty(rays, dtype=torch.int64, device=origins.device)
     launch(
         steps_kernel,
-        triton.cdiv(rays, BLOCK),
+        blocks(rays),
         origins,
         *(origins.contiguous(), directions.contiguous(), entry, count, rays),
         *(*corners[0], *corners[1], *map(float, limits)),
-        BLOCK=BLOCK,
     )
     return entry, count
 
@@ -117,7 +114,6 @@ def gather_kernel(
     apart,
     CHANNELS: tl.constexpr,
     FLOW: tl.constexpr,
-    BLOCK: tl.constexpr,
 ):
     """Looks a pixel up; its ray. ``apart`` is 3 where each ray has a background, else 0."""
     ray = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -187,7 +183,6 @@ def steps_kernel(
     step,
     near,
     far,
-    BLOCK: tl.constexpr,
 ):
     """Where a ray enters the box, and how many steps it takes to its exit."""
     ray = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)

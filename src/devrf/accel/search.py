@@ -17,7 +17,10 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from devrf.accel.blocks import (
+    BLOCK,
+    LANES,
     PADDING,
+    blocks,
     displaced,
     grid_coordinate,
     launch,
@@ -29,10 +32,6 @@ from devrf.accel.blocks import (
     softplus,
     store_vectors,
 )
-
-# A program is one warp, which tests one sample for each of its threads at a time.
-LANES = 32
-WARP = {"LANES": LANES, "num_warps": 1}
 
 
 def find_samples(
@@ -62,7 +61,7 @@ def find_samples(
     device, number, density = origins.device, len(origins), density.contiguous()
     # The kernel takes two slices; the density stands in for missing ones, which are not read.
     before, after = (frame.contiguous() for frame in ([*slices, density, density])[:2])
-    stride = triton.cdiv(longest, LANES) * LANES
+    stride = blocks(longest, LANES.value) * LANES.value
     marks = torch.empty(number, stride, dtype=torch.uint8, device=device)
     # As wide as their running sum: no cast before it.
     kept = torch.empty(number, dtype=torch.int64, device=device)
@@ -75,7 +74,7 @@ def find_samples(
         *(mask.contiguous().view(torch.uint8), density, before, after, *axes),
         *(marks, kept, reached, longest, stride, *numbers),
         SLICES=len(slices),
-        **WARP,
+        num_warps=1,
     )
     ray = torch.empty(capacity, dtype=torch.int64, device=device)
     distance = torch.empty(capacity, dtype=torch.float32, device=device)
@@ -89,8 +88,7 @@ def find_samples(
         origins,
         *(origins, directions, entry, marks, reached, kept.cumsum(0)),
         *(ray, distance, points, significant, first, total, number, stride, capacity, numbers[0]),
-        PADDING=PADDING,
-        **WARP,
+        num_warps=1,
     )
     return ray, distance, points, significant.view(torch.bool), first, total
 
@@ -155,7 +153,6 @@ def march_kernel(
     stop,
     weight_threshold,
     SLICES: tl.constexpr,
-    LANES: tl.constexpr,
 ):
     """Marks each sample of a ray (0 dropped, 1 kept, 2 significant); counts kept and tested."""
     ray = tl.program_id(0)
@@ -215,8 +212,6 @@ def list_kernel(
     stride,
     capacity,
     step,
-    LANES: tl.constexpr,
-    PADDING: tl.constexpr,
 ):
     """Writes the kept samples of the ``count`` rays one after another, the padding behind them.
 
@@ -251,16 +246,12 @@ def list_kernel(
         if ray == count:
             tl.store(total, used)
             tl.store(first + count, tl.minimum(used, capacity))
-        place, empty = padding_places(ray - count, used, capacity, PADDING)
+        place, empty = padding_places(ray - count, used, capacity)
         nothing = tl.zeros((PADDING,), dtype=tl.float32)
         tl.store(rays + place, (place * 0 + count).to(tl.int64), mask=empty)
         tl.store(distances + place, nothing, mask=empty)
         store_vectors(points, place * 3, nothing, nothing, nothing, empty)
         tl.store(significant + place, nothing.to(tl.uint8), mask=empty)
-
-
-# Places of a list that a program of the selection goes over.
-PLACES = 256
 
 
 def select_listed(
@@ -289,12 +280,11 @@ class SelectListed(torch.autograd.Function):
         into_canonical, into_weight = torch.empty_like(points), torch.empty_like(distance)
         launch(
             select_kernel,
-            triton.cdiv(max(places, rays + 1), PLACES),
+            blocks(max(places, rays + 1)),
             weight,
             *(flags.view(torch.uint8), running, begin, rays_of, reached, where, canonical, weight),
             *(first, ray, distance, points, present.view(torch.uint8), into_canonical, into_weight),
             *(places, rays, capacity),
-            PLACES=PLACES,
         )
         total = running[-1]
         ctx.save_for_backward(flags, running)
@@ -313,7 +303,7 @@ class SelectListed(torch.autograd.Function):
         into = [None if up is None else up.new_empty(len(flags), *up.shape[1:]) for up in given]
         launch(
             select_backward_kernel,
-            triton.cdiv(len(flags), PLACES),
+            blocks(len(flags)),
             flags,
             *(flags.view(torch.uint8), running),
             # Any pointer where there is no gradient.
@@ -321,7 +311,6 @@ class SelectListed(torch.autograd.Function):
             *(len(flags), max(0 if up is None else len(up) for up in given)),
             HAS_CANONICAL=to_canonical is not None,
             HAS_WEIGHT=to_weight is not None,
-            PLACES=PLACES,
         )
         return *into, None, None
 
@@ -346,14 +335,13 @@ def select_kernel(
     places,
     count,
     capacity,
-    PLACES: tl.constexpr,
 ):
     """Copies flagged samples to the places that the flags' ``running`` sum gives; the padding.
 
     A place of the padding copies the sample of the same number, which differ: atomic additions of
     gradients to them do not collide. ``begin`` is where each of the ``count`` rays begins.
     """
-    place = tl.program_id(0).to(tl.int64) * PLACES + tl.arange(0, PLACES)
+    place = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = place < places
     flag = tl.load(flags + place, mask=here, other=0) != 0
     rank = tl.load(running + place, mask=here, other=0) - 1
@@ -394,10 +382,9 @@ def select_backward_kernel(
     capacity,
     HAS_CANONICAL: tl.constexpr,
     HAS_WEIGHT: tl.constexpr,
-    PLACES: tl.constexpr,
 ):
     """The gradient of each place of the first list: that of the place that took it, or none."""
-    place = tl.program_id(0).to(tl.int64) * PLACES + tl.arange(0, PLACES)
+    place = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = place < places
     flag = tl.load(flags + place, mask=here, other=0) != 0
     rank = tl.load(running + place, mask=here, other=0) - 1

@@ -16,6 +16,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from devrf.accel.blocks import (
+    BLOCK,
+    blocks,
     displaced,
     launch,
     load_vectors,
@@ -27,8 +29,6 @@ from devrf.accel.blocks import (
     softplus,
     store_vectors,
 )
-
-BLOCK = 128
 
 
 def warped_depth(
@@ -77,11 +77,10 @@ class WarpedDepth(torch.autograd.Function):
         warped, tau = torch.empty_like(points), points.new_empty(count)
         launch(
             warped_depth_kernel,
-            triton.cdiv(count, BLOCK),
+            blocks(count),
             points,
             *(points, density, before, after, *axes, warped, tau, count, *numbers),
             SLICES=slices,
-            BLOCK=BLOCK,
         )
         ctx.save_for_backward(points, density, before, after, warped)
         ctx.slices, ctx.axes, ctx.numbers, ctx.buffers = slices, axes, numbers, buffers
@@ -115,7 +114,7 @@ class WarpedDepth(torch.autograd.Function):
             warped_gradient = torch.zeros_like(points) if any(needs[1:]) else points
         launch(
             warped_depth_backward_kernel,
-            triton.cdiv(len(points), BLOCK),
+            blocks(len(points)),
             points,
             *(points, density, warped, warped_gradient.contiguous(), tau_gradient.contiguous()),
             *(*into, *ctx.axes, len(points), *ctx.numbers),
@@ -123,7 +122,6 @@ class WarpedDepth(torch.autograd.Function):
             NEEDS_BEFORE=needs[1],
             NEEDS_AFTER=needs[2],
             TWO=ctx.slices > 1,
-            BLOCK=BLOCK,
         )
         return None, *gradients, None, None, None, None
 
@@ -143,7 +141,6 @@ def warped_depth_kernel(
     shift,
     delta,
     SLICES: tl.constexpr,
-    BLOCK: tl.constexpr,
 ):
     """q = x + Δ(x), τ = softplus(v(q) + b)·δ."""
     point = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -177,7 +174,6 @@ def warped_depth_backward_kernel(
     NEEDS_BEFORE: tl.constexpr,
     NEEDS_AFTER: tl.constexpr,
     TWO: tl.constexpr,
-    BLOCK: tl.constexpr,
 ):
     """Gradients of q and τ, scattered to the density grid and to the slices."""
     point = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)

@@ -7,7 +7,7 @@ never waits for the device, and can be captured in a CUDA graph.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -65,32 +65,17 @@ class PackedSamples:
         """() bool, whether any samples were dropped."""
         return (self.total > len(self.ray)) | (self.steps > self.longest).any()
 
-
-@dataclass(frozen=True)
-class SampleSubset:
-    """Some of the samples of a list, in a list of length K.
-
-    Attributes:
-        index: (K,) int64, their places in the original list; any place in the padding.
-        first: (R + 1,) int64, as in :class:`PackedSamples`, for the new list.
-        total: () int64, the number of selected samples; more than K if some were dropped.
-    """
-
-    index: Tensor
-    first: Tensor
-    total: Tensor
-
-    @property
-    def overflow(self) -> Tensor:
-        """() bool, whether any samples were dropped."""
-        return self.total > len(self.index)
+    def head(self, count: int) -> PackedSamples:
+        """The first ``count`` places of the lists, which hold all samples."""
+        names = "ray", "distance", "points", "significant"
+        return replace(self, **{name: getattr(self, name)[:count] for name in names})
 
 
 class ListedSubset(NamedTuple):
     """Some of the samples of a list, in a list of length K, with what is known of them.
 
     Padding repeats other places of the list: it has any ray and position and no weight, and nothing
-    gets a gradient through it.
+    gets a gradient through it. The places differ, so that atomic additions to them do not collide.
 
     Attributes:
         first: (R + 1,) int64, as in :class:`PackedSamples`, for the new list.
@@ -210,29 +195,6 @@ def _occupied(mask: Tensor, coords: Tensor) -> Tensor:
     return mask.reshape(-1)[row] & inside
 
 
-@torch.no_grad()
-def select(flags: Tensor, first: Tensor, capacity: int) -> SampleSubset:
-    """The samples with a flag, without waiting for the device.
-
-    Padding indexes different places of the list, so that atomic additions of its gradients do not
-    collide at one of them. It belongs to no ray.
-
-    Args:
-        flags: (C,) bool, False in the padding.
-        first: (R + 1,) places where each ray's samples begin.
-        capacity: K ≤ C, the length of the new list; samples that do not fit are dropped.
-    """
-    if capacity > len(flags):
-        raise ValueError(f"{capacity} of {len(flags)} samples cannot be selected")
-    place = torch.arange(len(flags), device=flags.device)
-    running = pad(flags.cumsum(0), (1, 0))
-    total = running[-1]
-    # One extra place receives everything that is not selected.
-    target = torch.where(flags, running[:-1], capacity).clamp_(max=capacity)
-    index = torch.arange(capacity + 1, device=flags.device).scatter_(0, target, place)
-    return SampleSubset(index[:capacity], running[first].clamp_(max=capacity), total)
-
-
 def select_listed(
     found: PackedSamples, canonical: Tensor, weight: Tensor, capacity: int
 ) -> ListedSubset:
@@ -252,17 +214,24 @@ def select_listed(
     if capacity <= len(found.ray) and (kernels := accelerated("search", *floats)):
         listed = found.ray, found.distance, found.points, found.significant, found.first
         return ListedSubset(*kernels.select_listed(listed, canonical, weight, capacity))
-    chosen = select(found.significant, found.first, capacity)
-    place = torch.arange(capacity, device=chosen.index.device)
-    present = place < chosen.first[-1]
-    taken = canonical.index_select(0, chosen.index)
+    if capacity > len(found.ray):
+        raise ValueError(f"{capacity} of {len(found.ray)} samples cannot be selected")
+    flags, running = found.significant, pad(found.significant.cumsum(0), (1, 0))
+    # One extra place receives everything that is not selected.
+    target = torch.where(flags, running[:-1], capacity).clamp_(max=capacity)
+    index = torch.arange(capacity + 1, device=flags.device)
+    index.scatter_(0, target, torch.arange(len(flags), device=flags.device))
+    index, first = index[:capacity], running[found.first].clamp_(max=capacity)
+    place = torch.arange(capacity, device=flags.device)
+    present = place < first[-1]
+    taken = canonical.index_select(0, index)
     return ListedSubset(
-        chosen.first,
-        chosen.total,
-        torch.where(present, found.ray.index_select(0, chosen.index), place % max(rays, 1)),
-        found.distance.index_select(0, chosen.index),
-        found.points.index_select(0, chosen.index),
+        first,
+        running[-1],
+        torch.where(present, found.ray.index_select(0, index), place % max(rays, 1)),
+        found.distance.index_select(0, index),
+        found.points.index_select(0, index),
         present,
         torch.where(present[:, None], taken, taken.detach()),
-        weight.index_select(0, chosen.index) * present,
+        weight.index_select(0, index) * present,
     )

@@ -15,7 +15,7 @@ from devrf.methods.devrf.grid_warp import GridWarp
 from devrf.methods.devrf.settings import RenderSettings
 from devrf.methods.devrf.static_shape.sample_search import search
 from devrf.ops.compositing import composite_colors, composite_segments
-from devrf.ops.search import PackedSamples, select
+from devrf.ops.search import PackedSamples, select_listed
 from devrf.ops.warped_depth import warped_depth
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.output import RenderedImage
@@ -62,9 +62,9 @@ class ListRenderer:
         """
         field = self.field
         warp = GridWarp(() if displacement is None else (displacement,), field.box)
-        found, count = self._search(rays, occupancy, warp)
+        found = self._search(rays, occupancy, warp)
         canonical, tau = warped_depth(
-            found.points[:count],
+            found.points,
             field.density.values,
             warp.slices,
             box=field.box,
@@ -72,20 +72,18 @@ class ListRenderer:
             delta=field.step_in_base_voxels(self.settings.step),
         )
         weight, left = composite_segments(tau, found.first)
-        chosen = select(found.significant[:count], found.first, count)
-        significant = chosen.index[: int(chosen.total)]
+        chosen = select_listed(found, canonical, weight, len(found.ray))
+        used = int(chosen.total)
         precision = torch.float16 if self.half and tau.is_cuda else torch.float32
-        points, ray = canonical[significant], found.ray[significant]
+        points, ray = chosen.canonical[:used], chosen.ray[:used]
         residual = None if appearance is None else appearance(points)
         color = field.rgb(points, rays.viewdirs, ray, precision, residual, chosen.first)
-        listed = weight[significant], color, found.distance[significant], chosen.first
+        listed = chosen.weight[:used], color, chosen.distance[:used], chosen.first
         image, depth = composite_colors(*listed, left, background)
         return RenderedImage(color=image, depth=depth, opacity=1 - left)
 
-    def _search(
-        self, rays: Rays, occupancy: Occupancy, warp: GridWarp
-    ) -> tuple[PackedSamples, int]:
-        """The samples that can be seen, in lists that are long enough, and how many they are."""
+    def _search(self, rays: Rays, occupancy: Occupancy, warp: GridWarp) -> PackedSamples:
+        """The samples that can be seen, in lists without padding."""
         while True:
             found = search(
                 rays,
@@ -98,5 +96,5 @@ class ListRenderer:
             )
             total = int(found.total)
             if total <= self._capacity:
-                return found, total
+                return found.head(total)
             self._capacity = int(SPARE * total)
