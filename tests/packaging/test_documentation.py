@@ -123,6 +123,19 @@ def test_equations_become_mathml():
             assert mathml.startswith("<math") and "\\" not in mathml, line or display
 
 
+def test_architecture_names_every_package():
+    page = (REPOSITORY / "docs" / "architecture.md").read_text()
+    packages = {init.parent.relative_to(PACKAGE) for init in PACKAGE.rglob("__init__.py")}
+    assert not [str(name) for name in sorted(packages - {Path()}) if f"`{name}/`" not in page]
+
+
+def test_packages_are_drawn_above_what_they_import():
+    hook = load_hook("packages")
+    edges = {"a": {"b", "c"}, "b": {"c"}, "c": set(), "d": {"c"}}
+    assert hook.rows(edges) == [["a"], ["b", "d"], ["c"]]
+    assert hook.reduced(edges)["a"] == {"b"}
+
+
 def load_hook(name: str) -> ModuleType:
     path = REPOSITORY / "docs" / "hooks" / f"{name}.py"
     spec = importlib.util.spec_from_file_location(f"docs_hook_{name}", path)
