@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import ExifTags, Image, ImageOps
 
-from devrf.apps.inspection.advice import image_advice
+from devrf.apps.inspection.advice import advice_on
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.formats.nerfstudio import NerfstudioReader
@@ -124,8 +124,8 @@ def test_inspecting_names_the_files_of_which_nobody_can_tell(tmp_path):
     capture(tmp_path, 6)
     scene = NerfstudioReader(tmp_path).read()
     assert (scene.dynamic.train.width, scene.dynamic.train.height) == HIGH
-    said = [str(advice) for advice in image_advice(scene) if "EXIF" in advice.what]
+    said = [str(advice) for advice in advice_on(scene) if "EXIF" in advice.what]
     assert len(said) == 1
     assert said[0].startswith("0.jpg, 1.jpg, 2.jpg and 6 more: its EXIF orientation says")
     capture(tmp_path, 1)
-    assert not [a for a in image_advice(NerfstudioReader(tmp_path).read()) if "EXIF" in a.what]
+    assert not [a for a in advice_on(NerfstudioReader(tmp_path).read()) if "EXIF" in a.what]

@@ -14,9 +14,9 @@ import pytest
 import torch
 from PIL import Image
 
-from devrf.apps.inspection.advice import image_advice
+from devrf.apps.inspection.advice import advice_on
 from devrf.apps.inspection.picture import shown
-from devrf.apps.inspection.report import inspect_scene
+from devrf.apps.inspection.report import image_facts
 from devrf.data.batch import all_pixels
 from devrf.data.flow import with_flow
 from devrf.data.recorded import READERS, RecordedDataModule
@@ -215,17 +215,16 @@ def test_inspecting_says_how_much_they_cover(root, caplog):
     with caplog.at_level(logging.INFO):
         scene = NerfstudioReader(root).read()
     assert "masks of 8 images leave out 50.0 % of the pixels of all" in caplog.text
-    facts = inspect_scene(scene).sets[0]
-    assert facts.alpha_share is None and facts.masked_share == pytest.approx(0.5)
-    assert not [advice for advice in image_advice(scene) if "masks" in advice.what]
+    assert image_facts(scene)[0][4:6] == ("no", "leave out 50 %")
+    assert not [advice for advice in advice_on(scene) if "masks" in advice.what]
     image, pixels = shown(scene.dynamic.train, 0), scene.dynamic.train.pixels[0].numpy()
     assert (image[:, :40] == pixels[:, :40]).all() and (image[:, 40:] >= 232).all()
-    matte = inspect_scene(NerfstudioReader(root, masks="matte").read()).sets[0]
-    assert matte.alpha_share == pytest.approx(0.5) and matte.masked_share is None
+    matte = NerfstudioReader(root, masks="matte").read()
+    assert image_facts(matte)[0][4:6] == ("cover 50 %", "no")
 
 
 def test_masks_that_cut_out_the_subject_are_told_from_others(root):
-    found = [a for a in image_advice(NerfstudioReader(root).read()) if "masks" in a.what]
+    found = [a for a in advice_on(NerfstudioReader(root).read()) if "masks" in a.what]
     assert len(found) == 1 and "set data.masks=matte" in found[0].remedy
     assert found[0].where.startswith("static training set, ")
 

@@ -7,7 +7,7 @@ import logging
 from rich.console import Console
 from rich.filesize import decimal
 
-from devrf.apps.inspection.report import as_text, inspect_scene, inspection_text
+from devrf.apps.inspection.report import as_text, inspection_text
 from devrf.cli.context import RunContext
 from devrf.cli.preflight import requirements
 from devrf.errors import DevrfError
@@ -36,7 +36,7 @@ def inspect(run: RunContext) -> None:
     from devrf.apps.inspection.picture import write_inspection_picture
 
     needs = [(name, decimal(size)) for name, size in requirements(run).rows()]
-    report = inspection_text(inspect_scene(run.scene), needs)
+    report = inspection_text(run.scene, needs)
     console = Console()
     if console.is_terminal:
         console.print(report)

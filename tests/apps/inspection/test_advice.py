@@ -10,8 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from devrf.apps.inspection.advice import listed
-from devrf.apps.inspection.report import inspect_scene
+from devrf.apps.inspection.advice import advice_on, listed
 from devrf.geometry.box import Box
 from devrf.scenes.bounds import box_from_cameras
 from devrf.scenes.procedural import ProceduralScene
@@ -118,31 +117,31 @@ PROBLEMS: list[tuple[Spoil, str, str]] = [
 
 @pytest.mark.parametrize(("spoil", "where", "what"), PROBLEMS)
 def test_a_problem(healthy: Scene, spoil: Spoil, where: str, what: str) -> None:
-    (found,) = inspect_scene(spoil(healthy)).advice
-    assert where in found.where and what in found.what
-    assert str(found) == f"{found.where}: {found.what}; {found.remedy}"
+    (advice,) = advice_on(spoil(healthy))
+    assert where in advice.where and what in advice.what
+    assert str(advice) == f"{advice.where}: {advice.what}; {advice.remedy}"
 
 
 def test_no_problem(healthy: Scene) -> None:
-    assert inspect_scene(healthy).advice == ()
+    assert advice_on(healthy) == []
 
 
 def test_held_out_views_that_are_learned_from(healthy: Scene) -> None:
     train = healthy.dynamic.train
     spoil = changed("dynamic.test", lambda _: train[torch.tensor([0, 4])])
-    (found,) = inspect_scene(spoil(healthy)).advice
-    assert found.where == "dynamic test set"
-    assert train.names[0] in found.what and train.names[4] in found.what
+    (advice,) = advice_on(spoil(healthy))
+    assert advice.where == "dynamic test set"
+    assert train.names[0] in advice.what and train.names[4] in advice.what
     # The same camera at another time may be held out.
     test = replace(train[torch.tensor([0])], times=torch.tensor([0.25]))
-    assert inspect_scene(changed("dynamic.test", lambda _: test)(healthy)).advice == ()
+    assert advice_on(changed("dynamic.test", lambda _: test)(healthy)) == []
 
 
 def test_a_box_that_is_only_guessed(healthy: Scene) -> None:
     guess = box_from_cameras(healthy.static.train.cameras)
-    (found,) = inspect_scene(without_alpha(healthy, guess)).advice
-    assert "data.box=" in found.remedy
-    assert inspect_scene(without_alpha(healthy, guess.scaled(0.9))).advice == ()
+    (advice,) = advice_on(without_alpha(healthy, guess))
+    assert "data.box=" in advice.remedy
+    assert advice_on(without_alpha(healthy, guess.scaled(0.9))) == []
 
 
 def test_long_lists_are_cut_short() -> None:

@@ -27,33 +27,34 @@ def ran(runs):
         name,
         scene="robot",
         *,
-        method=None,
-        protocol=None,
+        method="devrf",
+        protocol="two_stage",
         scores=None,
         seconds=(10.0, 20.0),
         gpu=(None, None),
         ablation="full",
         choices=None,
-        overrides=(),
-        seed=0,
         frames=(),
         **of_run,
     ):
-        # Without a method: as earlier versions wrote it.
-        new = {"method": method, "protocol": protocol} if method else {}
-        static, dynamic = ("static", "dynamic") if method else ("canonical", "deformation")
-        scored = {"psnr": 29.0, "ssim": 0.95, "lpips": None, **(scores or {})}
+        choices = choices or {}
+        learned = {f"{key}.chosen": value for key, value in choices.items() if key != "logger"}
+        sections = {
+            "static": {"psnr": 33.0, "seconds": seconds[0], "peak_gpu_gb": gpu[0]},
+            "dynamic": {"psnr": 29.0, "ssim": 0.95, "lpips": None, **(scores or {})}
+            | {"seconds": seconds[1], "peak_gpu_gb": gpu[1]},
+        }
+        usual = {"device": "a processor", "git": "0123456789abcdef", "overrides": [], "seed": 0}
+        named = {"ablation": ablation, "method": method, "protocol": protocol, **choices}
         record = {
             "scene": scene,
-            **new,
-            static: {"psnr": 33.0, "seconds": seconds[0], "peak_gpu_gb": gpu[0]},
-            dynamic: {**scored, "seconds": seconds[1], "peak_gpu_gb": gpu[1]},
+            "method": method,
+            "protocol": protocol,
+            **sections,
             "run": {
-                "device": "a processor",
-                "git": "0123456789abcdef",
-                "choices": {"ablation": ablation, "logger": "csv", **new, **(choices or {})},
-                "overrides": list(overrides),
-                "seed": seed,
+                **usual,
+                "choices": named,
+                "settings": {"loss.terms": ablation, **learned},
                 **of_run,
             },
         }

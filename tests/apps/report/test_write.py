@@ -1,4 +1,4 @@
-"""The report's folder."""
+"""The report's folder: text, plots, videos, a row a run."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import csv
 import subprocess
 import sys
 
+import imageio.v3 as iio
+import numpy as np
 import pytest
 
 from devrf.apps.report.runs import collect
@@ -47,13 +49,13 @@ def test_csv_has_a_row_for_each_run_and_failure_and_every_number(runs, ran, fail
     assert rows["at_rest"]["row"] == ""
     expected = {"status": "finished", "scene": "robot", "method": "devrf", "protocol": "two_stage"}
     expected |= {"row": "Ours w/ c2f, tv, cycle, flow", "run.seed": "1", "run.overrides": "seed=1"}
-    expected |= {"deformation.psnr": "31.0", "deformation.lpips": "", "peak_gpu_gb": ""}
-    expected |= {"canonical.seconds": "3", "deformation.seconds": "20", "train_seconds": "23.0"}
+    expected |= {"dynamic.psnr": "31.0", "dynamic.lpips": "", "peak_gpu_gb": ""}
+    expected |= {"static.seconds": "3", "dynamic.seconds": "20", "train_seconds": "23.0"}
     expected |= {"run.choices.ablation": "full", "run.git": "0123456789abcdef"}
     assert rows["a"].items() >= expected.items()
     expected = {"status": "failed", "error": "data.frames: expected 2, or more", "mistake": "true"}
     expected |= {"run.overrides": "data.frames=1 seed=0", "run.choices.ablation": "base"}
-    assert rows["7_robot"].items() >= {**expected, "deformation.psnr": ""}.items()
+    assert rows["7_robot"].items() >= {**expected, "dynamic.psnr": ""}.items()
 
 
 def test_failures_alone_are_a_report(runs, failed):
@@ -79,3 +81,41 @@ def test_a_sweep_imports_nothing_heavy_before_its_report():
     script = f"import sys, {modules}; assert not {heavy} & set(sys.modules)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+# Videos of a scene's rows side by side.
+
+TRUTH, DEPTH = (40, 40, 40), (200, 200, 200)
+
+
+def film(folder, colors, height=48):
+    """A run's video of its held-out views: truth, rendering in some colour, depth."""
+    (folder / "videos").mkdir()
+    pictures = np.empty((len(colors), height, 3 * height, 3), np.uint8)
+    for picture, color in zip(pictures, colors, strict=True):
+        for column, shown in enumerate((TRUTH, color, DEPTH)):
+            picture[:, column * height : (column + 1) * height] = shown
+    iio.imwrite(folder / "videos" / "held_out.mp4", pictures, fps=10)
+
+
+def test_each_row_is_a_tile_beside_the_truth_at_the_same_time(runs, ran):
+    red, green, blue = (220, 30, 30), (30, 180, 30), (30, 30, 220)
+    film(ran("a", method="devrf", protocol="two_stage"), [red, red, green])
+    film(ran("b", method="dnerf", protocol="joint"), [blue, blue], height=64)
+    ran("c", method="nsff", protocol="joint")  # filmed nothing
+    text = write_report(ReportSettings(runs)).path.read_text(encoding="utf-8")
+    assert "(<videos/side_by_side_robot.mp4>)" in text
+    pictures = iio.imread(runs / "report" / "videos" / "side_by_side_robot.mp4")
+    assert len(pictures) == 2  # as many as the shorter video
+    # Labels stand above pictures of 48 pixels.
+    for picture, first in zip(pictures, (red, green), strict=True):
+        tiles = [picture[46, 24], picture[46, 76], picture[46, 128]]
+        for found, wanted in zip(tiles, (TRUTH, first, blue), strict=True):
+            assert np.abs(found.astype(int) - wanted).max() < 24
+
+
+def test_one_filmed_row_needs_no_comparison(runs, ran):
+    film(ran("a"), [(0, 0, 0)])
+    ran("b", ablation="base")
+    write_report(ReportSettings(runs))
+    assert not (runs / "report" / "videos").exists()

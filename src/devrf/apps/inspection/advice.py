@@ -15,6 +15,20 @@ from devrf.scenes.bounds import box_from_cameras
 from devrf.scenes.optical_flow import frame_pairs
 from devrf.scenes.scene import Scene, Views
 
+# Largest gap between neighbouring static views, as seen from the box's middle, in degrees.
+WIDEST_GAP = 120.0
+# Two cameras are the same when their axes differ by less than this (radians, about), and their
+# positions by less than this share of the distance to the scene.
+SAME = 1e-4
+# An image whose values all lie within this of one another, of 255, shows nothing.
+FLAT = 2
+# A pixel is in the alpha mask above this, of 255.
+OPAQUE = 127
+# Share of the pixels (in the alpha mask, where there is one) that the flow should cover at least.
+MIN_FLOW = 0.02
+# Masks of passers-by rarely leave out more than this share of the pixels.
+MUCH_MASKED = 0.5
+
 
 @dataclass(frozen=True)
 class Advice:
@@ -32,6 +46,22 @@ class Advice:
 
     def __str__(self) -> str:
         return f"{self.where}: {self.what}; {self.remedy}"
+
+
+def advice_on(scene: Scene) -> list[Advice]:
+    """Problems that cameras, images, masks, times and flow show."""
+    return [
+        *_held_out(scene),
+        *_looking_away(scene),
+        *_box_unknown(scene),
+        *_one_side(scene),
+        *_blank(scene),
+        *_turned(scene),
+        *_alpha(scene),
+        *_masks(scene),
+        *_times(scene),
+        *_flow(scene.dynamic.train),
+    ]
 
 
 def image_sets(scene: Scene) -> dict[str, Views]:
@@ -62,18 +92,6 @@ def listed(names: Sequence[str], most: int = 3) -> str:
     """The first ``most`` names, and how many more there are."""
     more = len(names) - most
     return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
-
-
-# Largest gap between neighbouring static views, as seen from the box's middle, in degrees.
-WIDEST_GAP = 120.0
-# Two cameras are the same when their axes differ by less than this (radians, about), and their
-# positions by less than this share of the distance to the scene.
-SAME = 1e-4
-
-
-def camera_advice(scene: Scene) -> list[Advice]:
-    """Problems that the cameras alone show."""
-    return [*_held_out(scene), *_looking_away(scene), *_box_unknown(scene), *_one_side(scene)]
 
 
 def _held_out(scene: Scene) -> Iterator[Advice]:
@@ -154,28 +172,6 @@ def _one_side(scene: Scene) -> Iterator[Advice]:
             "expect fog on that side, or add views there "
             "(data=forward is for scenes from one side)",
         )
-
-
-# An image whose values all lie within this of one another, of 255, shows nothing.
-FLAT = 2
-# A pixel is in the alpha mask above this, of 255.
-OPAQUE = 127
-# Share of the pixels (in the alpha mask, where there is one) that the flow should cover at least.
-LEAST_FLOW = 0.02
-# Masks of passers-by rarely leave out more than this share of the pixels.
-MUCH_MASKED = 0.5
-
-
-def image_advice(scene: Scene) -> list[Advice]:
-    """Problems that images, masks, times and flow show."""
-    return [
-        *_blank(scene),
-        *_turned(scene),
-        *_alpha(scene),
-        *_masks(scene),
-        *_times(scene),
-        *_flow(scene.dynamic.train),
-    ]
 
 
 def mean_share(masks: Iterable[Tensor]) -> float:
@@ -317,7 +313,7 @@ def _flow(views: Views) -> Iterator[Advice]:
         what, remedy = "valid where it is not a number", "mask these pixels, or set data.flow=none"
         yield Advice(f"flow of {listed(broken)}", what, remedy)
     share = sum(covered) / max(len(covered), 1)
-    if covered and share < LEAST_FLOW:
+    if covered and share < MIN_FLOW:
         where = "the alpha masks" if views.has_alpha else "the pixels"
         yield Advice(
             "optical flow",

@@ -1,8 +1,8 @@
 """Which runs share a row of a table, and the row's label.
 
 Runs of one scene share a row if they were learned with the same settings but the seed, on the same
-device by the same version, whatever was typed. A run that does not record its settings is told by
-what was typed. A label says only what distinguishes its row from the others of the scene.
+device by the same version, whatever was typed. A label says only what distinguishes its row from
+the others of the scene.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ CHOICES, SETTINGS = "run.choices.", "run.settings."
 # Without an experiment a run has the config of this one.
 DEFAULT_EXPERIMENT = "quickstart"
 # Traits that distinguish rows, most important first; other groups and overrides come before LAST.
-ALWAYS = ("method", "folder")
+ALWAYS = ("method",)
 FIRST = ("protocol", "views", "experiment", "schedule", "field", "sampling", "loss")
 LAST = ("images", "capture", "device", "revision", "version")
 # All that tells a run from unequal ones, whatever it is called; never part of a label.
@@ -101,36 +101,26 @@ def _traits(run: Mapping[str, Any]) -> dict[str, str]:
         for key, option in run.items()
         if key.startswith(CHOICES)
     }
-    settings = _settings(run)
     ablation = options.get("ablation", "")
     found = {"method": _method(run["method"], ablation), "protocol": run["protocol"]}
     for trait, key, kind, words in RECORDED:
         value = run.get(f"run.{key}")
         if isinstance(value, kind):
             found[trait] = words(value)
-    if settings:
-        found |= settings
-        own = {key: text for key, text in found.items() if key != "method"}
-        found[IDENTITY] = json.dumps({**own, "method": run["method"]}, sort_keys=True)
-        if run["method"] == DEFAULT_METHOD:
-            options["experiment"] = options.get("experiment") or DEFAULT_EXPERIMENT
-    elif not any(options.values()):  # without its configuration a run shares no row
-        found["folder"] = run["folder"]
+    found |= _settings(run)
+    own = {key: text for key, text in found.items() if key != "method"}
+    found[IDENTITY] = json.dumps({**own, "method": run["method"]}, sort_keys=True)
+    if run["method"] == DEFAULT_METHOD:
+        options["experiment"] = options.get("experiment") or DEFAULT_EXPERIMENT
     for group, option in options.items():
         if option and group != "ablation" and option != run.get(group):
             found[f"={group}" if group in found else group] = f"{group}={option}"
-    if not settings:
-        for override in run["run.overrides"]:
-            key, _, value = override.lstrip("+~").partition("=")
-            if key not in options and key not in IGNORED:
-                found[f"={key}"] = f"{key}={value}"
     parts = {key: re.split("[./]", key.lstrip("="))[0] for key in found}
-    told = {key: text for key, text in found.items() if parts[key] not in LOGGING}
-    return {IDENTITY: json.dumps(told, sort_keys=True), **told}
+    return {key: text for key, text in found.items() if parts[key] not in LOGGING}
 
 
 def _settings(run: Mapping[str, Any]) -> dict[str, str]:
-    """The settings that a run was learned with, by key; empty where it does not record them."""
+    """The settings that a run was learned with, by key."""
     found = {}
     for column, value in run.items():
         key = column.removeprefix(SETTINGS)

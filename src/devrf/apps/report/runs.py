@@ -20,9 +20,7 @@ COLUMNS = (
     *("train_seconds", "peak_gpu_gb", "dynamic.psnr", "dynamic.ssim", "dynamic.lpips"),
     *("run.device", "run.overrides", "run.seed", "run.checkpoint", "run.date", "path"),
 )
-# Earlier versions knew one method and one protocol, and named sections after its stages.
 DEFAULT_METHOD, DEFAULT_PROTOCOL = "devrf", "two_stage"
-EARLIER_SECTIONS = {"static": "canonical", "dynamic": "deformation"}
 Section = dict[str, Any]
 
 
@@ -41,14 +39,12 @@ class _Metrics(BaseModel):
 
     model_config = ConfigDict(strict=True, extra="allow")
     scene: str
-    method: str = DEFAULT_METHOD
-    protocol: str = DEFAULT_PROTOCOL
+    method: str
+    protocol: str
     at_rest: bool = False
     run: _Setup = _Setup()
     static: Section = {}
     dynamic: Section = {}
-    canonical: Section = {}
-    deformation: Section = {}
 
 
 class _Failure(_Setup):
@@ -142,19 +138,12 @@ def _natural(name: str) -> tuple[int, int, str]:
 
 def _finished(content: bytes) -> dict[str, Any]:
     metrics = _Metrics.model_validate_json(content)
-    values = metrics.model_dump(exclude_unset=True)
-    for section in filter(None, map(values.get, EARLIER_SECTIONS.values())):
-        if "back_offs" in section:
-            section.setdefault("num_rollbacks", section.pop("back_offs"))
-    for name, earlier in EARLIER_SECTIONS.items():
-        values[name] = {**values.get(earlier, {}), **values.get(name, {})}
-    values |= {"method": metrics.method, "protocol": metrics.protocol}
-    values |= {"at_rest": metrics.at_rest}
+    values = metrics.model_dump(exclude_unset=True) | {"at_rest": metrics.at_rest}
     # Other protocols may have no stage of their own for the static capture.
-    stages = [] if metrics.at_rest else [values["dynamic"]]
-    of_static = metrics.at_rest or values["static"].get("seconds") is not None
+    stages = [] if metrics.at_rest else [metrics.dynamic]
+    of_static = metrics.at_rest or metrics.static.get("seconds") is not None
     if of_static or metrics.protocol == DEFAULT_PROTOCOL:
-        stages.append(values["static"])
+        stages.append(metrics.static)
     frame = pd.DataFrame(stages, columns=["seconds", "peak_gpu_gb"], dtype=object).map(number)
     values["train_seconds"] = frame["seconds"].sum(skipna=False)
     values["peak_gpu_gb"] = frame["peak_gpu_gb"].max(skipna=False)

@@ -319,10 +319,10 @@ def _sampled(runs: pd.DataFrame) -> list[str]:
         runs.get(f"run.settings.ray_stage.model.settings.{key}", absent)
         for key in ("sampling", "hull")
     )
-    # A hull of mattes only counts where samples are taken by occupancy; Neural Volumes' always are.
+    # A hull of alpha masks counts with samples by occupancy only; Neural Volumes' always are.
     carved = hull.eq(True) & kind.fillna("occupancy").eq("occupancy")
     way = kind.where(kind.notna() | hull.isna(), "even steps")
-    way = way.where(~carved, way.astype(str) + " within hulls of mattes")
+    way = way.where(~carved, way.astype(str) + " within hulls of alpha masks")
     names = runs["name"].groupby(way, sort=False).unique()
     return [f"Samples by {one}: {', '.join(found)}." for one, found in names.items()]
 
