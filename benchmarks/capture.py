@@ -40,18 +40,18 @@ def levels(*rows: tuple[int, int]) -> list[str]:
 # What is learned: half of the images' size, for some hundred iterations.
 LEARNED = {
     "forward": (
-        *("experiment=quickstart_forward", "schedule.canonical.doublings=[60,120]"),
+        *("experiment=quickstart_forward", "schedule.canonical.upsample_at=[60,120]"),
         "schedule.canonical.iterations=300",
         *levels((8, 16), (16, 10)),
     ),
     "inward": (
-        *("experiment=quickstart", "schedule.canonical.doublings=[50,100,150]"),
+        *("experiment=quickstart", "schedule.canonical.upsample_at=[50,100,150]"),
         "schedule.canonical.iterations=300",
         *levels((8, 12), (12, 8)),
         "schedule.deformation.rays=768",
     ),
     "monocular": (
-        *("experiment=quickstart", "schedule.canonical.doublings=[40,80,120]"),
+        *("experiment=quickstart", "schedule.canonical.upsample_at=[40,80,120]"),
         *("schedule.canonical.iterations=250", "schedule.canonical.rays=1024"),
         *levels((8, 6), (12, 3)),
         "schedule.deformation.rays=768",

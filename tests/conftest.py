@@ -359,10 +359,10 @@ def canonical() -> Callable[..., CanonicalStage]:
     schedule = CanonicalSchedule(
         search_iterations=0,
         search_side=12,
-        carve=True,
+        visual_hull_init=True,
         iterations=12,
         side=12,
-        doublings=(3, 7),
+        upsample_at=(3, 7),
         decay_iterations=6,
         rays=64,
     )
@@ -390,10 +390,10 @@ def learned(tiny_scene: Scene) -> tuple[CanonicalStage, Trainer]:
     schedule = CanonicalSchedule(
         search_iterations=0,
         search_side=16,
-        carve=True,
+        visual_hull_init=True,
         iterations=120,
         side=20,
-        doublings=(40,),
+        upsample_at=(40,),
         rays=256,
     )
     stage = CanonicalStage(schedule, SMALL)

@@ -137,11 +137,11 @@ class SmallScene:
             schedule = CanonicalSchedule(
                 search_iterations=0,
                 search_side=max(12, self.side // 2),
-                carve=True,
-                least_views=1,
+                visual_hull_init=True,
+                min_views=1,
                 iterations=self.iterations,
                 side=self.side,
-                doublings=(self.iterations // 2,),
+                upsample_at=(self.iterations // 2,),
                 decay_iterations=self.iterations,
                 rays=self.rays,
             )
@@ -156,7 +156,7 @@ class SmallScene:
         parallel = (self.frames - 1) // 2
         second = Level(fine, max(1, self.iterations // 8), parallel_frames=parallel)
         motion = DeformationSchedule((first, second), rays=self.rays)
-        settings = MotionSettings(2e-3, unit="box", views="one", start="flow", store="host")
+        settings = MotionSettings(2e-3, unit="box", views="one", init_from="flow", store="host")
         return DeformationStage(copy.deepcopy(self.canonical), motion, settings, **common)
 
     def learn(

@@ -107,7 +107,7 @@ def test_the_curve_of_a_stage_has_every_step(
     logged = {row["step"]: row["static/psnr"] for row in album.rows if "static/psnr" in row}
     assert {k: psnr for k, psnr in batches if k in logged} == pytest.approx(logged)
     assert [iteration for iteration, _ in previews] == [4, 8, 12]
-    assert [iteration for iteration, _ in grids] == [1, 4, 8]  # the schedule's doublings: 3, 7
+    assert [iteration for iteration, _ in grids] == [1, 4, 8]  # the schedule's upsample_at: 3, 7
     height, width, _ = iio.imread(tmp_path / "images" / "training_canonical.png").shape
     assert height > 400 and width > 800
 

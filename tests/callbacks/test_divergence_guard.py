@@ -29,8 +29,8 @@ from devrf.scenes.scene import Scene
 # Three frames. Level 0: frame 1 in 0–11, frame 2 in 12–17; level 1: 18–25 and 26–29.
 MOVING = DeformationSchedule(levels=(Level(4, 6), Level(6, 4)), rays=64)
 # A phase of the canonical stage from 0 to 9, one from 10 to 23; and longer ones.
-SHORT: dict[str, Any] = {"iterations": 24, "doublings": (10,), "decay_iterations": 100}
-LONG: dict[str, Any] = {**SHORT, "iterations": 50, "doublings": (10,), "rays": 128}
+SHORT: dict[str, Any] = {"iterations": 24, "upsample_at": (10,), "decay_iterations": 100}
+LONG: dict[str, Any] = {**SHORT, "iterations": 50, "upsample_at": (10,), "rays": 128}
 
 
 @pytest.fixture(autouse=True)
@@ -156,7 +156,7 @@ def test_a_field_that_empties_or_fills_is_rolled_back(
     fit, canonical, caplog, density: str, words: str, carve: bool
 ) -> None:
     guard = DivergenceGuard(every_iterations=20)
-    stage = fit(canonical(**LONG, carve=carve), Spoil(density, 30), guard)
+    stage = fit(canonical(**LONG, visual_hull_init=carve), Spoil(density, 30), guard)
     assert f"everything has become {words} by iteration" in caplog.text
     assert "data.background" in caplog.text and "data.box" in caplog.text
     assert stage.num_rollbacks == 1 and stage.iteration == 50
@@ -165,7 +165,7 @@ def test_a_field_that_empties_or_fills_is_rolled_back(
 def test_a_field_that_keeps_emptying_ends_the_stage(
     fit, canonical, without_masks: SceneDataModule
 ) -> None:
-    stage = canonical(**{**LONG, "iterations": 60, "doublings": ()}, alpha_init=0.1)
+    stage = canonical(**{**LONG, "iterations": 60, "upsample_at": ()}, alpha_init=0.1)
     spoil, guard = Spoil("-100", 20, 40), DivergenceGuard(every_iterations=20)
     with pytest.raises(DevrfError) as caught:
         fit(stage, spoil, guard, data=without_masks)
@@ -178,7 +178,7 @@ def test_a_field_that_keeps_emptying_ends_the_stage(
 def test_a_stage_that_never_saw_anything_warns(fit, canonical, caplog) -> None:
     clear = {"alpha_init": 1e-7, "rates": CanonicalRates(density=1e-9)}
     guard = DivergenceGuard(every_iterations=20)
-    stage = fit(canonical(**{**SHORT, "doublings": ()}, **clear), guard)
+    stage = fit(canonical(**{**SHORT, "upsample_at": ()}, **clear), guard)
     assert "canonical: nothing is to be seen at the end (is data.background" in caplog.text
     assert (stage.iteration, stage.num_rollbacks) == (24, 0)
     # With a second phase there is nothing to draw pixels from.

@@ -48,10 +48,10 @@ def fitted(trainer, datamodule, tiny_scene, monkeypatch):
         schedule = CanonicalSchedule(
             search_iterations=0,
             search_side=16,
-            carve=True,
+            visual_hull_init=True,
             iterations=60,
             side=16,
-            doublings=(),
+            upsample_at=(),
             rays=64,
         )
         stage = CanonicalStage(schedule, iterations_per_step=2)

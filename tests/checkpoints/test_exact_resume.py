@@ -35,14 +35,14 @@ from devrf.methods.devrf.settings import MotionSettings
 from devrf.scenes.scene import Scene
 
 SMALL = Architecture(channels=4, width=8, frequencies=1, search_alpha_init=1e-2)
-# Search 0–7, then fine 8–19 with doublings after 4 and 8 of its iterations.
+# Search 0–7, then fine 8–19 with upsample_at after 4 and 8 of its iterations.
 SEARCHING = CanonicalSchedule(
     search_iterations=8,
     search_side=12,
-    carve=True,
+    visual_hull_init=True,
     iterations=12,
     side=14,
-    doublings=(4, 8),
+    upsample_at=(4, 8),
     decay_iterations=6,
     rays=64,
 )
@@ -55,7 +55,7 @@ ALONG_TRACKS = MotionSettings(
     views="all",
     pixels="occupied",
     occupancy_every=3,
-    start="tracks",
+    init_from="tracks",
 )
 # Four frames. Level 0 in 0–15; level 1: frame 2 in 16–21, frames 1 and 3 in 22–27.
 TOGETHER = DeformationSchedule(levels=(Level(4, 4), Level(6, 6, parallel_frames=2)), rays=64)
@@ -153,7 +153,7 @@ def learn(
 
 
 def test_the_canonical_stage_goes_on_exactly(learn) -> None:
-    # In the search, before, at and after its end, mid-level, around both doublings, at last.
+    # In the search, before, at and after its end, mid-level, around both upsample_at, at last.
     leaves = (1, 8, 9, 12, 16, 19)
     assert_same(learn(canonical, *leaves), learn(canonical))
 
@@ -198,7 +198,7 @@ def test_frames_that_are_visited_together_go_on_exactly(
 def test_colours_that_change_go_on_exactly(
     learn, rest: LoadedCheckpoint, four_frames: SceneDataModule
 ) -> None:
-    appearance = AppearanceSettings(learn="always", side=5, first_level=1)
+    appearance = AppearanceSettings(learn="always", side=5, start_level=2)
 
     def build() -> ScheduledStage:
         return DeformationStage(

@@ -34,7 +34,7 @@ from devrf.scenes.scene import Scene
 
 SMALL = Architecture(channels=4, width=16, frequencies=2)
 CANONICAL = CanonicalSchedule(
-    search_iterations=0, search_side=8, iterations=10, side=10, doublings=(5,), rays=64
+    search_iterations=0, search_side=8, iterations=10, side=10, upsample_at=(5,), rays=64
 )
 DEFORMATION = DeformationSchedule(levels=(Level(4, 2), Level(8, 2)), rays=64)
 POINTS, GRID_BYTES = 10**3, 10**3 * (1 + 4) * 4

@@ -68,9 +68,9 @@ MISTAKES = {
         ["data=inward", "data.root=.", "data.flow=farneback"],
         "data.flow: expected one of auto",
     ),
-    "descending doublings": (
-        ["schedule.canonical.doublings=[5,3]"],
-        "schedule.canonical.doublings",
+    "descending upsample_at": (
+        ["schedule.canonical.upsample_at=[5,3]"],
+        "schedule.canonical.upsample_at",
     ),
     "a level without a side": (
         ["schedule.deformation.levels.4={iterations:2}", "schedule.deformation.levels.3=null"],

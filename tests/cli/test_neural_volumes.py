@@ -48,7 +48,10 @@ def test_a_protocol_trains_scores_and_films(devrf, tmp_path, tiny_data, protocol
         (["data.train_views=1"], "expected 2 fixed training cameras with an image of every frame"),
         (["data.surroundings=room"], "robot_room has no end; give images with alpha masks"),
         (["ray_stage.model.settings.warp=rigid"], "expected one of conv, affine"),
-        (["ray_stage.schedule.moments=0"], "ray_stage.schedule.moments: expected at least 1"),
+        (
+            ["ray_stage.schedule.times_per_batch=0"],
+            "ray_stage.schedule.times_per_batch: expected at least 1",
+        ),
         (["ray_stage.schedule.rays_without_hull=0"], "rays_without_hull: expected at least 1"),
         (["ray_stage.model.settings.warp_side=5"], "warp_side: expected a power of two, not 5"),
     ],

@@ -49,8 +49,8 @@ def test_a_protocol_trains_scores_and_films(devrf, tmp_path, request, protocol, 
         (["protocol=joint", "ray_stage.model.settings.sampling=hierarchical"],
          "expected one of stratified, occupancy"),
         (["protocol=joint", "+ray_stage.loss.elastic=1"], "ray_stage.loss: nsff has no term"),
-        (["protocol=joint", "ray_stage.model.settings.warmup.least_frames=99"],
-         "warmup.least_frames: expected 1 … most_frames (30), not 99"),
+        (["protocol=joint", "ray_stage.model.settings.warmup.min_frames=99"],
+         "warmup.min_frames: expected 1 … max_frames (30), not 99"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_said_in_one_line(devrf, tiny_data, asked, said):

@@ -121,7 +121,7 @@ def canonical_colors(folder: Path) -> torch.Tensor:
 LARGE = (
     "schedule.canonical.rays=60000",
     "schedule.canonical.iterations=2",
-    "schedule.canonical.doublings=[]",
+    "schedule.canonical.upsample_at=[]",
     "stage=canonical",
     "hydra.run.dir=run",
 )
@@ -157,7 +157,7 @@ SIZES = {
         "schedule.canonical.side=32",
         "schedule.canonical.rays=1024",
         "schedule.canonical.iterations=4",
-        "schedule.canonical.doublings=[1]",
+        "schedule.canonical.upsample_at=[1]",
         "schedule.deformation.levels.1={side:8,iterations:1}",
         "schedule.deformation.levels.2={side:24,iterations:1}",
         "schedule.deformation.rays=1024",
@@ -169,7 +169,7 @@ SIZES = {
         "schedule.canonical.side=80",
         "schedule.canonical.rays=4096",
         "schedule.canonical.iterations=2",
-        "schedule.canonical.doublings=[1]",
+        "schedule.canonical.upsample_at=[1]",
         "schedule.deformation.levels.1={side:56,iterations:1}",
         "schedule.deformation.levels.2=null",
         "schedule.deformation.rays=4096",

@@ -63,9 +63,14 @@ def test_what_decides_nothing_may_change(again):
     ("arguments", "key", "before", "now"),
     [
         (["loss.fine.color=2"], "loss.fine.color", "1.0", "2"),
-        (["schedule.canonical.doublings=[3]"], "schedule.canonical.doublings", "[2]", "[3]"),
+        (["schedule.canonical.upsample_at=[3]"], "schedule.canonical.upsample_at", "[2]", "[3]"),
         (["seed=1"], "seed", "0", "1"),
-        (["schedule.motion.start=previous"], "schedule.motion.start", '"flow"', '"previous"'),
+        (
+            ["schedule.motion.init_from=previous"],
+            "schedule.motion.init_from",
+            '"flow"',
+            '"previous"',
+        ),
     ],
 )
 def test_another_config_is_refused_by_the_name_of_the_key(again, run, arguments, key, before, now):
@@ -102,7 +107,7 @@ def test_beginning_afresh_keeps_the_old_run_whole(again, run):
 
 def test_a_deformation_learned_afresh_keeps_its_canonical_field(again, run):
     before = contents(run / "checkpoints")
-    outcome = again("resume=false", "stage=deformation", "schedule.motion.start=previous")
+    outcome = again("resume=false", "stage=deformation", "schedule.motion.init_from=previous")
     assert (outcome.status, outcome.err) == (0, "")
     assert contents(run / "previous-1" / "checkpoints") == before
     now = contents(run / "checkpoints")
@@ -116,7 +121,7 @@ def test_a_deformation_learned_afresh_keeps_its_canonical_field(again, run):
         ("stage=evaluate", 0),
         ("stage=render", 0),
         ("loss.deformation.cycle=high", 2),
-        ("schedule.canonical.doublings=[9]", 2),
+        ("schedule.canonical.upsample_at=[9]", 2),
     ],
 )
 def test_where_nothing_is_learned_nothing_is_archived(again, run, argument, status):

@@ -43,10 +43,10 @@ SMALL = Architecture(channels=4, width=8, frequencies=1, search_alpha_init=1e-2)
 SCHEDULE = CanonicalSchedule(
     search_iterations=3,
     search_side=5,
-    carve=True,
+    visual_hull_init=True,
     iterations=6,
     side=5,
-    doublings=(3,),
+    upsample_at=(3,),
     decay_iterations=6,
     rays=5,
 )

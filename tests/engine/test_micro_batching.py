@@ -32,10 +32,10 @@ SMALL = Architecture(channels=4, width=8, frequencies=1)
 SCHEDULE = CanonicalSchedule(
     search_iterations=0,
     search_side=12,
-    carve=True,
+    visual_hull_init=True,
     iterations=8,
     side=12,
-    doublings=(),
+    upsample_at=(),
     decay_iterations=100,
     rays=64,
 )

@@ -211,7 +211,7 @@ def test_flow_initialises_only_frames_whose_predecessor_was_learned(
         "devrf.methods.devrf.deformation_stage.start_from_tracks",
         lambda field, number, *rest, **options: followed.append(number),
     )
-    stage = DeformationStage(rest, TOGETHER, MotionSettings(start="flow"))
+    stage = DeformationStage(rest, TOGETHER, MotionSettings(init_from="flow"))
     trainer(max_epochs=1).fit(stage, datamodule=four_frames)
     # Not frame 2, which comes first: flow leads there from frame 1, not yet learned.
     assert followed == [1, 3]

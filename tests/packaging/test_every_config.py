@@ -181,7 +181,7 @@ def test_every_ablation_is_in_a_table_of_both_embedded_scenes(composed):
 
 
 STEPS = (
-    "published",
+    "paper_terms",
     "along_flow",
     "changing_colors",
     "elastic",

@@ -33,7 +33,7 @@ TINY = [
     "schedule.canonical.search_side=12",
     "schedule.canonical.iterations=2",
     "schedule.canonical.side=12",
-    "schedule.canonical.doublings=[]",
+    "schedule.canonical.upsample_at=[]",
     "schedule.canonical.rays=128",
     "schedule.deformation.levels.1={side:4,iterations:2}",
     "schedule.deformation.levels.2=null",
@@ -43,7 +43,12 @@ TINY = [
     "deformation.iterations_per_step=1",
     "trainer=cpu",
 ]
-FORWARD = ["field=forward", "loss=forward", "field.planes=8", "schedule.canonical.carve=false"]
+FORWARD = [
+    "field=forward",
+    "loss=forward",
+    "field.planes=8",
+    "schedule.canonical.visual_hull_init=false",
+]
 # Layouts of what does not move.
 AT_REST = ["colmap"]
 # The embedded scenes in sizes that take no time.

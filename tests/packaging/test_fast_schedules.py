@@ -33,5 +33,5 @@ def test_iterations(composed, overrides, frames, canonical, deformation, of_pape
     # The same grids, which are as fine as they get well before the end.
     assert rest.side == before["canonical"].side
     assert sides(moves) == sides(before["deformation"])
-    assert max(rest.doublings) < canonical / 2
-    assert config.schedule.motion.start == "flow" and config.schedule.motion.views == "all"
+    assert max(rest.upsample_at) < canonical / 2
+    assert config.schedule.motion.init_from == "flow" and config.schedule.motion.views == "all"

@@ -32,7 +32,7 @@ def test_the_published_sizes_and_schedule(composed):
         learning_rate=1e-4,
         final_learning_rate=1e-4,
         betas=[0.9, 0.999],
-        moments=16,
+        times_per_batch=16,
     )
 
 
@@ -57,8 +57,8 @@ def test_defaults_of_the_code_are_those_of_the_config(composed):
 def test_profiles(composed):
     fast = composed(METHOD, "protocol=joint", "profile=fast").ray_stage
     assert len(fast.model.settings.template_channels) == 7
-    assert (fast.schedule.iterations, fast.schedule.moments) == (50_000, 4)
+    assert (fast.schedule.iterations, fast.schedule.times_per_batch) == (50_000, 4)
     small = composed(METHOD, "protocol=joint", "profile=small").ray_stage
     assert len(small.model.settings.template_channels) == 5
-    assert (small.model.settings.code, small.schedule.moments) == (64, 4)
+    assert (small.model.settings.code, small.schedule.times_per_batch) == (64, 4)
     assert small.schedule.rays == 4 * 512

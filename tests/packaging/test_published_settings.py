@@ -37,10 +37,10 @@ def test_canonical_schedule(paper):
         search_side=100,
         iterations=20_000,
         side=160,
-        doublings=[1000, 2000, 3000, 4000],
+        upsample_at=[1000, 2000, 3000, 4000],
         rays=8192,
-        carve=False,
-        least_views=3,
+        visual_hull_init=False,
+        min_views=3,
     )
     search, *fine = schedule.phases
     assert (search.kind, search.start, search.stop, search.voxels) == ("search", 0, 5000, 100**3)
@@ -91,7 +91,7 @@ def test_loss_weights(paper):
         "entropy": 0.01,
         "elastic": 0.0,
         "bending": 0.0,
-        "matte": 0.0,
+        "alpha_mask": 0.0,
     }
 
 
@@ -118,7 +118,7 @@ def test_the_code_defaults_to_the_paper(paper):
 )
 def test_the_rows_of_the_ablation_tables(composed, ablation, off, coarse_to_fine):
     config = composed("experiment=paper_inward", ROOT, f"ablation={ablation}")
-    never = {"elastic", "bending", "matte"}
+    never = {"elastic", "bending", "alpha_mask"}
     without = {name for name, weight in config.loss.deformation.items() if not weight}
     assert without == off | never
     assert config.schedule.deformation.coarse_to_fine is coarse_to_fine

@@ -12,7 +12,7 @@ SMALLER = {
     "search_side=48": "search_side=12",
     "iterations=400": "iterations=6",
     "side=56": "side=14",
-    "doublings=[80, 160, 240]": "doublings=[2]",
+    "upsample_at=[80, 160, 240]": "upsample_at=[2]",
     "rays=1024": "rays=64",
     "[Level(12, 36), Level(20, 18), Level(32, 18)]": "[Level(4, 2)]",
 }

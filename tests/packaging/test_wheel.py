@@ -28,7 +28,7 @@ TINY = [
     "schedule.canonical.iterations=6",
     "schedule.canonical.side=16",
     "schedule.canonical.search_side=16",
-    "schedule.canonical.doublings=[2]",
+    "schedule.canonical.upsample_at=[2]",
     "schedule.canonical.rays=64",
 ]
 

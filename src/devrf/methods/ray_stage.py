@@ -58,8 +58,8 @@ class RaySchedule:
         betas: of Adam.
         eps: of Adam.
         curriculum: share of a stage during which frames are added in the order of their times.
-        moments: times of a batch, for a method whose cost grows with them; of a batch of both
-            captures the static images' time is one of them. None: any number.
+        times_per_batch: for a method whose cost grows with them; of a batch of both captures the
+            static images' time is one of them. None: any number.
         iterations_per_step: optimiser iterations in one Lightning step.
     """
 
@@ -70,7 +70,7 @@ class RaySchedule:
     betas: Sequence[float] = (0.9, 0.999)
     eps: float = 1e-8
     curriculum: float = 0.0
-    moments: int | None = None
+    times_per_batch: int | None = None
     rays_without_hull: int | None = None
     iterations_per_step: int = 10
 
@@ -80,7 +80,7 @@ class RaySchedule:
                 raise DevrfError(
                     f"ray_stage.schedule.{name}: expected at least 1, not {getattr(self, name)}"
                 )
-        for name in ("moments", "rays_without_hull"):
+        for name in ("times_per_batch", "rays_without_hull"):
             if (given := getattr(self, name)) is not None and given < 1:
                 raise DevrfError(
                     f"ray_stage.schedule.{name}: expected at least 1, or null, not {given}"
@@ -220,7 +220,7 @@ class RayStage(ScheduledStage):
             if len(self.pools) > 1:
                 counts = [round(rays * self.static_share), rays - round(rays * self.static_share)]
             images, flats, offset = [], [], 0
-            left = self.schedule.moments
+            left = self.schedule.times_per_batch
             for pool, count in zip(self.pools, counts, strict=True):
                 shown = self._shown_frames(pool)
                 image, flat = pool.draw(count, shown, self.generator, moments=left)

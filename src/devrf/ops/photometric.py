@@ -15,7 +15,7 @@ from devrf.ops.compositing import sum_segments
 from devrf.ops.dispatch import accelerated
 
 # The order of terms and of their weights.
-TERMS = ("color", "per_sample_color", "entropy", "matte")
+TERMS = ("color", "per_sample_color", "entropy", "alpha_mask")
 # A transmittance is at least so far from 0 and 1 in the entropy.
 NEAREST = 1e-6
 

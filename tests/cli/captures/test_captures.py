@@ -38,7 +38,7 @@ def learned(
     place: Path, devrf_in: Callable[..., Any], short: tuple[str, ...]
 ) -> dict[str, tuple[Any, Any]]:
     """What ``stage=inspect`` and the pipeline said of each, and the runs below ``outputs``."""
-    quick = (*short, "schedule.canonical.carve=false", "video.frames=3")
+    quick = (*short, "schedule.canonical.visual_hull_init=false", "video.frames=3")
     return {
         name: (
             devrf_in(place, "stage=inspect", f"data.root={name}", "trainer=cpu"),
@@ -79,7 +79,7 @@ def test_the_stage_at_rest_alone_is_scored_alike(
     short: tuple[str, ...],
 ) -> None:
     """What COLMAP has posed: stage=canonical and evaluate, or the pipeline."""
-    quick = (*short, "schedule.canonical.carve=false", "hydra.run.dir=alone")
+    quick = (*short, "schedule.canonical.visual_hull_init=false", "hydra.run.dir=alone")
     for stage in ("canonical", "evaluate"):
         done = devrf_in(place, "data.root=garden", *quick, f"stage={stage}")
         assert (done.status, done.err) == (0, "")

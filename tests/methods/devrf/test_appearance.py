@@ -26,7 +26,7 @@ from devrf.scenes.scene import Scene, Views
 
 SHORT = DeformationSchedule(levels=(Level(4, 6), Level(6, 6)), rays=128)
 FAST = MotionSettings(learning_rate=5e-3, views="all", pixels="occupied")
-LEARNED = AppearanceSettings(learn="always", side=6, first_level=0, learning_rate=0.1)
+LEARNED = AppearanceSettings(learn="always", side=6, start_level=1, learning_rate=0.1)
 CLOCK = FrameClock((0.0, 0.5, 1.0))
 
 
@@ -135,7 +135,8 @@ def test_auto_learns_colours_that_drift_early_and_others_late(
     first: int | None,
 ) -> None:
     monkeypatch.setattr("devrf.methods.devrf.appearance_learning.color_drift", lambda views: drift)
-    chosen = replace(LEARNED, learn="auto", first_level_if_steady=if_steady)
+    start = None if if_steady is None else if_steady + 1
+    chosen = replace(LEARNED, learn="auto", start_level_static_color=start)
     stage = DeformationStage(rest, SHORT, FAST, appearance=chosen)
     model, groups = stage.scene_model, stage.optimizer.param_groups
     stage.appearance.setup(model, tiny_scene.clock, stage.optimizer, tiny_scene.dynamic.train)
@@ -156,7 +157,7 @@ def test_terms_count_less_at_levels_that_learn_colours_that_drift(
 ) -> None:
     monkeypatch.setattr("devrf.methods.devrf.appearance_learning.color_drift", lambda views: drift)
     chosen = AppearanceSettings(
-        learn="auto", side=6, first_level_if_steady=1, factors_if_drifting={"cycle": 0.25}
+        learn="auto", side=6, start_level_static_color=2, loss_scale_if_color_drift={"cycle": 0.25}
     )
     schedule = replace(SHORT, levels=(Level(4, 6), Level(6, 6, weight_factors={"cycle": 2.0})))
     stage = DeformationStage(
@@ -178,8 +179,10 @@ def test_terms_count_less_at_levels_that_learn_colours_that_drift(
 
 
 def test_a_factor_of_no_term_is_told(rest: LoadedCheckpoint) -> None:
-    chosen = AppearanceSettings(factors_if_drifting={"flaw": 0.1})
-    with pytest.raises(DevrfError, match="factors_if_drifting: flaw is no term of loss.deformatio"):
+    chosen = AppearanceSettings(loss_scale_if_color_drift={"flaw": 0.1})
+    with pytest.raises(
+        DevrfError, match="loss_scale_if_color_drift: flaw is no term of loss.deformatio"
+    ):
         DeformationStage(rest, SHORT, FAST, appearance=chosen)
 
 
@@ -204,7 +207,7 @@ def test_its_rate_is_its_own_at_every_level(
 def test_a_level_before_the_first_leaves_colours_alone(
     rest: LoadedCheckpoint, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
 ) -> None:
-    stage = DeformationStage(rest, SHORT, FAST, appearance=replace(LEARNED, first_level=1))
+    stage = DeformationStage(rest, SHORT, FAST, appearance=replace(LEARNED, start_level=2))
     trainer(max_steps=3).fit(stage, datamodule=datamodule)
     assert stage.scene_model.appearance is not None
     assert not stage.scene_model.appearance.values.any()
@@ -237,9 +240,12 @@ def test_a_checkpoint_keeps_the_colours(
     ("wrong", "told"),
     [
         ({"side": 1}, "schedule.appearance.side: expected at least 2, not 1"),
-        ({"first_level": -1}, "schedule.appearance.first_level: expected at least 0"),
-        ({"factors_if_drifting": {"flow": -1.0}}, "factors_if_drifting.flow: expected at least 0"),
-        ({"first_level_if_steady": -1}, "first_level_if_steady: expected at least 0, not -1"),
+        ({"start_level": 0}, "schedule.appearance.start_level: expected at least 1"),
+        (
+            {"loss_scale_if_color_drift": {"flow": -1.0}},
+            "loss_scale_if_color_drift.flow: expected at least 0",
+        ),
+        ({"start_level_static_color": -1}, "start_level_static_color: expected at least 1"),
         ({"learning_rate": 0.0}, "schedule.appearance.learning_rate: expected more than 0"),
     ],
 )

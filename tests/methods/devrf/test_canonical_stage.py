@@ -26,14 +26,14 @@ SMALL = Architecture(channels=4, width=16, frequencies=2)
 CARVED = CanonicalSchedule(
     search_iterations=0,
     search_side=16,
-    carve=True,
+    visual_hull_init=True,
     iterations=60,
     side=16,
-    doublings=(20,),
+    upsample_at=(20,),
     rays=256,
 )
 SEARCHED = CanonicalSchedule(
-    search_iterations=300, search_side=12, iterations=20, side=16, doublings=(), rays=256
+    search_iterations=300, search_side=12, iterations=20, side=16, upsample_at=(), rays=256
 )
 
 
@@ -166,7 +166,7 @@ def test_no_matter_is_possible_before_a_lens(
 ) -> None:
     bounds = replace(tiny_scene.bounds, box=Box((-3.0, -3.0, -3.0), (3.0, 3.0, 3.0)), near=3.0)
     datamodule._scene = replace(tiny_scene, bounds=bounds)
-    schedule = CanonicalSchedule(2, 16, False, 2, 8, (), rays=16, least_views=1)
+    schedule = CanonicalSchedule(2, 16, False, 2, 8, (), rays=16, min_views=1)
     stage = CanonicalStage(schedule, SMALL)
     trainer(max_steps=1).fit(stage, datamodule=datamodule)
     occupancy = stage.scene_model.occupancy
@@ -182,10 +182,10 @@ def test_no_matter_is_possible_where_too_few_cameras_look(tiny_scene: Scene) -> 
     points = bounds.box.grid_points((12, 12, 12), torch.zeros(()))
     seen = view_count(scene.static.train.cameras, points)
     assert 0 < (seen < 3).float().mean() < 1
-    apart = {n: possible_matter(scene, (12, 12, 12), carve=False, least_views=n) for n in (1, 3)}
+    apart = {n: possible_matter(scene, (12, 12, 12), carve=False, min_views=n) for n in (1, 3)}
     assert torch.equal(apart[3], apart[1] & (seen >= 3))
     # A capture of fewer views than that is kept whole.
-    everywhere = possible_matter(scene, (12, 12, 12), carve=False, least_views=1000)
+    everywhere = possible_matter(scene, (12, 12, 12), carve=False, min_views=1000)
     assert torch.equal(everywhere, apart[1])
 
 

@@ -130,23 +130,25 @@ def test_grids_are_longer_by_four_fifths_of_the_box() -> None:
 
 
 def test_contracted_space_learns_directions_in_the_second_half_unless_told_otherwise() -> None:
-    schedule = CanonicalSchedule(search_iterations=5, iterations=60, doublings=())
+    schedule = CanonicalSchedule(search_iterations=5, iterations=60, upsample_at=())
     assert schedule.learns_directions(5)
     half = schedule.in_space(SPACE)
-    assert half.directions_from == 30
+    assert half.view_dependence_start == 30
     assert [half.learns_directions(n) for n in (5, 34, 35)] == [False, False, True]
-    assert replace(schedule, directions_from=0).in_space(SPACE).directions_from == 0
+    assert replace(schedule, view_dependence_start=0).in_space(SPACE).view_dependence_start == 0
 
 
 def test_grids_start_coarse_and_double_evenly_in_contracted_space() -> None:
-    # 50 · 1.2 = 60 voxels a side from 15: six doublings, over 600 of 800 iterations.
-    schedule = CanonicalSchedule(side=50, iterations=800, doublings=(10,), contracted_start=15)
+    # 50 · 1.2 = 60 voxels a side from 15: six upsample_at, over 600 of 800 iterations.
+    schedule = CanonicalSchedule(
+        side=50, iterations=800, upsample_at=(10,), unbounded_initial_side=15
+    )
     grown = schedule.in_space(SPACE)
-    assert grown.doublings == (100, 200, 300, 400, 500, 600)
+    assert grown.upsample_at == (100, 200, 300, 400, 500, 600)
     first = next(phase for phase in grown.phases if phase.kind == "fine")
     assert first.voxels == pytest.approx(15**3, rel=1e-3)
-    assert replace(schedule, contracted_start=None).in_space(SPACE).doublings == (10,)
-    assert replace(schedule, contracted_start=200).in_space(SPACE).doublings == ()
+    assert replace(schedule, unbounded_initial_side=None).in_space(SPACE).upsample_at == (10,)
+    assert replace(schedule, unbounded_initial_side=200).in_space(SPACE).upsample_at == ()
 
 
 def test_the_fields_opacity_does_not_depend_on_its_resolution() -> None:
@@ -165,10 +167,10 @@ def test_a_room_is_learned_and_moves_inside_the_inner_box(
     schedule = CanonicalSchedule(
         search_iterations=0,
         search_side=16,
-        carve=True,
+        visual_hull_init=True,
         iterations=60,
         side=20,
-        doublings=(20, 40),
+        upsample_at=(20, 40),
         rays=256,
     )
     stage = CanonicalStage(schedule, BUILD)
@@ -186,7 +188,7 @@ def test_a_room_is_learned_and_moves_inside_the_inner_box(
     moving = DeformationStage(
         stage.result(),
         DeformationSchedule(levels=(Level(6, 10),), rays=256),
-        MotionSettings(unit="box", views="all", start="flow"),
+        MotionSettings(unit="box", views="all", init_from="flow"),
     )
     trainer(max_epochs=1).fit(moving, datamodule=data)
     assert moving.field.box == room.space.inner(room.bounds.box) and moving.field.still_outside

@@ -164,7 +164,7 @@ def test_the_flow_of_a_moving_camera_neither_starts_nor_teaches_a_frame(
     if moving:
         train = replace(train, view=torch.arange(len(train)))
     module = serve(replace(tiny_scene, dynamic=replace(tiny_scene.dynamic, train=train)))
-    motion = MotionSettings(learning_rate=1e-9, start="flow")
+    motion = MotionSettings(learning_rate=1e-9, init_from="flow")
     stage = DeformationStage(rest, SHORT, motion, iterations_per_step=1)
     with caplog.at_level("INFO"):
         trainer(max_steps=1).fit(stage, datamodule=module)
@@ -266,7 +266,7 @@ def test_adam_begins_anew_at_each_visit_or_goes_on_above_the_coarsest_level(
 ) -> None:
     # Three frames; frame 1 gets the share of frame 0 as well.
     schedule = DeformationSchedule(levels=(Level(4, 2), Level(6, 2)), rays=16)
-    motion = replace(FAST, moments=moments)
+    motion = replace(FAST, adam_state=moments)
     stage, counts = DeformationStage(rest, schedule, motion, iterations_per_step=1), StepCounts()
     trainer(counts, max_epochs=1).fit(stage, datamodule=datamodule)
     assert counts.levels == {0: [1, 2, 3, 4, 1, 2], 1: fine}

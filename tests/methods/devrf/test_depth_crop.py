@@ -129,7 +129,7 @@ def test_the_growing_grid_may_give_up_depths(
     )
     monkeypatch.setattr(datamodule, "given", forward_scene)
     schedule = CanonicalSchedule(
-        0, least_views=1, iterations=6, side=20, doublings=(2, 4), rays=64, crop=True
+        0, min_views=1, iterations=6, side=20, upsample_at=(2, 4), rays=64, crop=True
     )
     stage = CanonicalStage(schedule, Architecture(channels=4, width=16, frequencies=0, planes=32))
     trainer(max_epochs=1).fit(stage, datamodule=datamodule)

@@ -40,7 +40,7 @@ def forward_scene() -> Scene:
 
 
 def test_the_grid_has_so_many_points_to_a_pixel(forward_scene: Scene) -> None:
-    schedule = CanonicalSchedule(side=30, doublings=(), voxels_per_pixel=0.5)
+    schedule = CanonicalSchedule(side=30, upsample_at=(), voxels_per_pixel=0.5)
     fitted, sizes = fitted_to(forward_scene, schedule, Architecture(planes=40))
     box = forward_scene.bounds.box
     field = sizes.radiance_field(box, round(fitted.side**3), round(fitted.side**3))
@@ -53,7 +53,7 @@ def test_the_grid_has_so_many_points_to_a_pixel(forward_scene: Scene) -> None:
 
 
 def test_planes_are_told_by_the_scene_where_none_are_given(forward_scene: Scene) -> None:
-    schedule = CanonicalSchedule(side=30, doublings=())
+    schedule = CanonicalSchedule(side=30, upsample_at=())
     asked = fitted_to(forward_scene, schedule, Architecture())
     assert asked == (schedule, Architecture(planes=32))
     given = Architecture(planes=7)

@@ -17,9 +17,9 @@ from devrf.methods.devrf.losses import (
     PHOTOMETRIC_TERMS,
     VISIBILITY,
     Prediction,
+    alpha_mask,
     background_entropy,
     color_error,
-    matte,
     per_sample_color,
 )
 from devrf.methods.devrf.volume_rendering import VoxelOutput
@@ -89,9 +89,9 @@ def test_entropy_has_finite_gradients_at_its_ends(prediction: Prediction, p: flo
 
 def test_matte_by_hand_and_without_one(prediction: Prediction) -> None:
     # T − (1 − alpha) = 0.25, 0, −0.3.
-    assert matte(prediction).item() == pytest.approx((0.0625 + 0.09) / 3)
+    assert alpha_mask(prediction).item() == pytest.approx((0.0625 + 0.09) / 3)
     without = replace(prediction, batch=replace(prediction.batch, alpha=None))
-    assert matte(without).item() == 0
+    assert alpha_mask(without).item() == 0
 
 
 def test_composer_weighs_what_counts_and_reports_it_unweighted() -> None:
@@ -112,18 +112,20 @@ def test_composer_weighs_what_counts_and_reports_it_unweighted() -> None:
 def test_composer_reports_what_is_logged_where_there_is_such_a_thing(
     prediction: Prediction,
 ) -> None:
-    loss = WeightedLoss(PHOTOMETRIC_TERMS, {"matte": 2.0}, VISIBILITY)
+    loss = WeightedLoss(PHOTOMETRIC_TERMS, {"alpha_mask": 2.0}, VISIBILITY)
     total, values = loss(prediction)
-    assert list(values) == ["matte", "opacity", "coverage"] and total == 2 * values["matte"]
+    assert (
+        list(values) == ["alpha_mask", "opacity", "coverage"] and total == 2 * values["alpha_mask"]
+    )
     # 1 − (0.25 + 1 + 0.2) / 3, and (1 + 0 + 0.5) / 3.
     assert values["opacity"].item() == pytest.approx(1.55 / 3)
     assert values["coverage"].item() == pytest.approx(0.5)
     without = replace(prediction, batch=replace(prediction.batch, alpha=None))
-    assert loss(without)[1].keys() == {"matte", "opacity"}
+    assert loss(without)[1].keys() == {"alpha_mask", "opacity"}
 
 
 def test_composer_names_an_unknown_term_and_the_known_ones() -> None:
-    with pytest.raises(DevrfError, match=r"'colour'.*color, entropy, matte, per_sample_color"):
+    with pytest.raises(DevrfError, match=r"'colour'.*alpha_mask, color, entropy, per_sample_color"):
         WeightedLoss(PHOTOMETRIC_TERMS, {"colour": 1.0})
 
 

@@ -194,10 +194,12 @@ def test_without_coarse_to_fine_the_finest_level_says_how_many() -> None:
     st.lists(st.integers(1, 199), max_size=5, unique=True).map(sorted),
     st.integers(7, 60),
 )
-def test_canonical_phases_tile_every_schedule(search: int, doublings: list[int], side: int) -> None:
-    schedule = CanonicalSchedule(search, 10, False, 200, side, doublings)
+def test_canonical_phases_tile_every_schedule(
+    search: int, upsample_at: list[int], side: int
+) -> None:
+    schedule = CanonicalSchedule(search, 10, False, 200, side, upsample_at)
     phases = canonical_phases(schedule)
-    edges = [0, *([search] if search else []), *(search + d for d in doublings), search + 200]
+    edges = [0, *([search] if search else []), *(search + d for d in upsample_at), search + 200]
     assert [(p.start, p.stop) for p in phases] == list(zip(edges, edges[1:], strict=False))
     for phase in phases:
         for at in (phase.start, phase.stop - 1):
@@ -245,17 +247,17 @@ def test_deformation_phases_tile_every_schedule(
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"doublings": (1000, 1000)},
-        {"doublings": (2000, 1000)},
-        {"doublings": (0, 1000)},
-        {"doublings": (1000, 30000)},
-        {"iterations": 0, "doublings": ()},
+        {"upsample_at": (1000, 1000)},
+        {"upsample_at": (2000, 1000)},
+        {"upsample_at": (0, 1000)},
+        {"upsample_at": (1000, 30000)},
+        {"iterations": 0, "upsample_at": ()},
         {"search_iterations": -1},
         {"side": 2},  # 8 voxels cannot be halved four times
         {"decay_iterations": 0},
         {"rays": 0},
-        {"directions_from": -1},
-        {"contracted_start": 1},
+        {"view_dependence_start": -1},
+        {"unbounded_initial_side": 1},
     ],
     ids=str,
 )

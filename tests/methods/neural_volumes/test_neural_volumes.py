@@ -36,7 +36,7 @@ QUICK = RaySchedule(
     rays=64,
     learning_rate=1e-2,
     final_learning_rate=1e-3,
-    moments=2,
+    times_per_batch=2,
     iterations_per_step=2,
 )
 LOSS = {"color": 1.0, "kl": 1e-5, "opacity_prior": 1e-4, "tv": 1e-4}
@@ -102,7 +102,7 @@ def test_codes_between_two_frames_are_their_blend(
 def test_a_batch_has_few_moments(
     step: ProtocolStage, moments: int, trainer: Trainers, four_frames: SceneDataModule
 ) -> None:
-    one, seen = stage(step, schedule=replace(QUICK, moments=moments, rays=60)), []
+    one, seen = stage(step, schedule=replace(QUICK, times_per_batch=moments, rays=60)), []
     forward = one.scene_model.forward
 
     def noted(batch: Any) -> Any:
@@ -152,5 +152,7 @@ def test_what_it_cannot_learn_from_is_refused(
     with pytest.raises(DevrfError, match="expected 3 fixed training cameras .* robot has 2"):
         model = NeuralVolumes(replace(TINY, encoder_views=3))
         fit(stage(model=model), trainer, datamodule)
-    with pytest.raises(DevrfError, match=r"ray_stage.schedule.moments: expected at least 1"):
-        replace(QUICK, moments=0)
+    with pytest.raises(
+        DevrfError, match=r"ray_stage.schedule.times_per_batch: expected at least 1"
+    ):
+        replace(QUICK, times_per_batch=0)

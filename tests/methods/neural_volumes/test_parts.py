@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from devrf.errors import DevrfError
-from devrf.methods.neural_volumes.encoder import MomentEncoder, cameras_of_every_frame
+from devrf.methods.neural_volumes.encoder import TimeEncoder, cameras_of_every_frame
 from devrf.methods.neural_volumes.layers import doubling
 from devrf.methods.neural_volumes.losses import (
     code_divergence,
@@ -66,7 +66,7 @@ def test_a_doubled_volume_begins_without_a_checkerboard() -> None:
 
 
 def test_the_encoder_halves_images_and_shrinks_codes() -> None:
-    encoder = MomentEncoder(2, (8, 16), (4, 4), 6, 5)
+    encoder = TimeEncoder(2, (8, 16), (4, 4), 6, 5)
     assert encoder.joined[0].in_features == 2 * 4 * 2 * 4
     mean, log_deviation = encoder(torch.rand(3, 2, 3, 8, 16))
     assert mean.shape == log_deviation.shape == (3, 5)

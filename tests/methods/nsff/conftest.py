@@ -23,7 +23,7 @@ from devrf.scenes.scene import Scene
 TINY = NSFFSettings(
     width=8, depth=2, skip=None, bands=2, direction_bands=1, density_noise=0.0,
     sampling="occupancy", samples=8, steps=16, occupancy_side=8, hard_rays=4,
-    warmup=Warmup(steps_per_frame=1, least_frames=1, most_frames=2, chained_from=1.0),
+    warmup=Warmup(steps_per_frame=1, min_frames=1, max_frames=2, chained_from=1.0),
 )  # fmt: skip
 QUICK = RaySchedule(
     iterations=4, rays=32, learning_rate=1e-2, final_learning_rate=1e-3, iterations_per_step=2

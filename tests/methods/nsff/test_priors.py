@@ -83,7 +83,7 @@ def test_pixels_that_move_are_those_of_fixed_cameras_with_long_flow(tiny_scene: 
 
 
 def test_the_first_batches_have_rays_that_move(tiny: NSFFSettings, tiny_scene: Scene) -> None:
-    model = NSFF(replace(tiny, warmup=Warmup(steps_per_frame=1, least_frames=3, most_frames=3)))
+    model = NSFF(replace(tiny, warmup=Warmup(steps_per_frame=1, min_frames=3, max_frames=3)))
     model.setup(tiny_scene)
     generator = torch.Generator().manual_seed(0)
     assert model.further_pixels(generator) is None  # nothing has been looked at

@@ -22,7 +22,7 @@ WEIGHTS = {
     "small_flow": 0.1, "smooth_space": 0.1, "smooth_time": 0.1, "depth": 0.04, "flow": 0.02,
     "disocclusion": 0.1, "blend_entropy": 1e-3,
 }  # fmt: skip
-WARMUP = {"steps_per_frame": 1000, "most_frames": 250, "chained_from": 2, "prior_decay": 10}
+WARMUP = {"steps_per_frame": 1000, "max_frames": 250, "chained_from": 2, "prior_decay": 10}
 
 
 def profile(*names: str) -> Any:
@@ -93,7 +93,7 @@ def test_the_beginning_grows_with_the_frames_within_limits(frames: int, steps: i
 
 
 def test_priors_fall_tenfold_after_each_beginning() -> None:
-    warmup = Warmup(steps_per_frame=10, least_frames=1)
+    warmup = Warmup(steps_per_frame=10, min_frames=1)
     factors = [warmup.prior_factor(step, frames=5) for step in (0, 49, 50, 99, 100)]
     assert factors == pytest.approx([1, 1, 0.1, 0.1, 0.01])
 
@@ -105,7 +105,7 @@ def test_priors_fall_tenfold_after_each_beginning() -> None:
         (lambda: NSFFSettings(hard_rays=-1), "settings.hard_rays: expected 0 or more, not -1"),
         (lambda: NSFFSettings(flow_reach=0.0), "settings.flow_reach: expected more than 0"),
         (lambda: Warmup(steps_per_frame=0), "warmup.steps_per_frame: expected at least 1, not 0"),
-        (lambda: Warmup(least_frames=300), r"warmup.least_frames: expected 1 … most_frames \(250"),
+        (lambda: Warmup(min_frames=300), r"warmup.min_frames: expected 1 … max_frames \(250"),
         (lambda: Warmup(prior_decay=0.5), "warmup.prior_decay: expected at least 1, not 0.5"),
     ],
 )

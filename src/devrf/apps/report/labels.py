@@ -32,7 +32,7 @@ ABLATIONS = {
     "c2f_tv": "Ours w/ c2f, tv",
     "c2f_tv_cycle": "Ours w/ c2f, tv, cycle",
     "full": "Ours w/ c2f, tv, cycle, flow",
-    "published": "Ours, the paper's terms",
+    "paper_terms": "Ours, the paper's terms",
     "along_flow": "+ start along flow",
     "changing_colors": "+ changing colours",
     "elastic": "+ elastic motion",

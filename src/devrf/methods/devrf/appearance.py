@@ -26,23 +26,23 @@ class AppearanceSettings:
             (docs/method.md#color-drift).
         side: the grid of a frame has about side³ voxels.
         learning_rate: logits a step: how far a value moves at most.
-        first_level: the first level that learns it, from 0; the last one where there are fewer.
+        start_level: the first level that learns it, from 1; the last one where there are fewer.
             The levels before find the motion alone.
-        first_level_if_steady: the same where ``auto`` finds that colours do not drift, so that
+        start_level_static_color: the same where ``auto`` finds that colours do not drift, so that
             shading alone changes; None: no level.
-        factors_if_drifting: of the weights of ``loss.deformation``, by the term's name, at the
-            levels that learn it where it is not steady: 1 for terms that are not named.
+        loss_scale_if_color_drift: factors of the weights of ``loss.deformation``, by the term's
+            name, at the levels that learn colours that drift: 1 for terms that are not named.
     """
 
     learn: Literal["never", "always", "auto"] = "never"
     side: int = 64
     learning_rate: float = 0.1
-    first_level: int = 1
-    first_level_if_steady: int | None = None
-    factors_if_drifting: Mapping[str, float] = field(default_factory=dict)
+    start_level: int = 2
+    start_level_static_color: int | None = None
+    loss_scale_if_color_drift: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name, least in (("side", 2), ("first_level", 0), ("first_level_if_steady", 0)):
+        for name, least in (("side", 2), ("start_level", 1), ("start_level_static_color", 1)):
             if (given := getattr(self, name)) is not None and given < least:
                 raise DevrfError(
                     f"schedule.appearance.{name}: expected at least {least}, not {given}"
@@ -51,10 +51,10 @@ class AppearanceSettings:
             raise DevrfError(
                 f"schedule.appearance.learning_rate: expected more than 0, not {self.learning_rate}"
             )
-        for name, factor in self.factors_if_drifting.items():
+        for name, factor in self.loss_scale_if_color_drift.items():
             if factor < 0:
                 raise DevrfError(
-                    f"schedule.appearance.factors_if_drifting.{name}: expected at least 0, "
+                    f"schedule.appearance.loss_scale_if_color_drift.{name}: expected at least 0, "
                     f"not {factor}"
                 )
 

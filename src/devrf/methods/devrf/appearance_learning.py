@@ -60,7 +60,7 @@ class AppearanceLearning:
         self._schedule = schedule
         self._smoothing = loss.get("tv", 0.0)
         self._residual = loss.get("residual", 0.0)
-        self._first = settings.first_level
+        self._first = settings.start_level - 1
         # Of the weights of loss.deformation, from that level on.
         self._factors: Mapping[str, float] = {}
 
@@ -84,9 +84,9 @@ class AppearanceLearning:
         if first is None:
             return
         if drifting:
-            self._factors = self.settings.factors_if_drifting
+            self._factors = self.settings.loss_scale_if_color_drift
         # The ablation without levels has one.
-        self._first = min(first, len(self._schedule.levels) - 1)
+        self._first = min(first, len(self._schedule.levels)) - 1
         voxels, rate = self.settings.side**3, self.settings.learning_rate
         model.appearance = AppearanceField(model.box, clock, voxels=voxels)
         group = {"params": [], "lr": rate, "base_lr": rate, "name": GROUP}
@@ -96,10 +96,10 @@ class AppearanceLearning:
         """From which level residuals are learned, None: never; whether colours are to drift."""
         s = self.settings
         if s.learn != "auto":
-            return (s.first_level if s.learn == "always" else None), True
+            return (s.start_level if s.learn == "always" else None), True
         drift = color_drift(views)
         drifting = drift is not None and drift >= CHANGING
-        first = s.first_level if drifting else s.first_level_if_steady
+        first = s.start_level if drifting else s.start_level_static_color
         said = "cannot be followed" if drift is None else f"drift by {100 * drift:.1f} %"
         learned = "not learned" if first is None else f"learned from level {first} on"
         log.info("colours %s: their change is %s", said, learned)

@@ -39,49 +39,49 @@ class CanonicalSchedule:
     Attributes:
         search_iterations: length of the coarse geometry search; 0 leaves it out.
         search_side: the search grid has about search_side³ voxels.
-        carve: begin with the visual hull of the static views, if the images have mattes; then
-            the search may be short, or left out.
+        visual_hull_init: begin with the visual hull of the static views, if the images have alpha
+            masks; then the search may be short, or left out.
         iterations: length of the radiance field's learning.
         side: the final grid has about side³ voxels.
-        doublings: iterations, from the search's end, at which the number of voxels doubles; it
-            starts at side³ / 2^len(doublings).
+        upsample_at: iterations, from the search's end, at which the number of voxels doubles; it
+            starts at side³ / 2^len(upsample_at).
         decay_iterations: after as many iterations the learning rates have fallen to a tenth.
         rays: of a batch.
-        least_views: cells that fewer training views have in the picture are empty from the
+        min_views: cells that fewer training views have in the picture are empty from the
             start; 1 keeps those that no camera sees as well.
         dense_tv_iterations: so long, from the search's end, the total variation smooths all
             voxels; afterwards those that a batch has touched.
         voxels_per_pixel: in forward-facing scenes, grid points for each pixel of a row or column;
             decides ``side``. None: ``side`` is as it says.
-        directions_from: so many iterations from the search's end colours do not depend on the
+        view_dependence_start: so many iterations from the search's end colours do not depend on the
             viewing direction. None: 0; in contracted space half of ``iterations``
             (docs/method.md#scene-contraction).
-        contracted_start: in contracted space the grid starts with about as many voxels along an
-            edge, and doubles at equal intervals over the first three quarters of ``iterations``
-            in place of ``doublings``. None: ``doublings`` hold there, too.
+        unbounded_initial_side: in contracted space the grid starts with about as many voxels
+            along an edge, and doubles at equal intervals over the first three quarters of
+            ``iterations`` in place of ``upsample_at``. None: ``upsample_at`` holds there, too.
         crop: in forward-facing scenes, whether the grid, each time it grows, gives up the depths
             at which the static views see nothing (docs/method.md#crop).
     """
 
     search_iterations: int = 5000
     search_side: int = 100
-    carve: bool = False
+    visual_hull_init: bool = False
     iterations: int = 20000
     side: float = 160
-    doublings: Sequence[int] = (1000, 2000, 3000, 4000)
+    upsample_at: Sequence[int] = (1000, 2000, 3000, 4000)
     decay_iterations: int = 20000
     rays: int = 8192
-    least_views: int = 3
+    min_views: int = 3
     dense_tv_iterations: int = 0
     voxels_per_pixel: float | None = None
-    directions_from: int | None = None
-    contracted_start: float | None = 26
+    view_dependence_start: int | None = None
+    unbounded_initial_side: float | None = 26
     crop: bool = False
     phases: tuple[CanonicalPhase, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         least = {"search_side": 2, "side": 2}
-        least |= dict.fromkeys(("least_views", "iterations", "decay_iterations", "rays"), 1)
+        least |= dict.fromkeys(("min_views", "iterations", "decay_iterations", "rays"), 1)
         for name, bound in {"search_iterations": 0, "dense_tv_iterations": 0, **least}.items():
             if getattr(self, name) < bound:
                 raise DevrfError(
@@ -93,32 +93,32 @@ class CanonicalSchedule:
                 "schedule.canonical.voxels_per_pixel: expected above 0, at most 4, or null, not "
                 f"{self.voxels_per_pixel}"
             )
-        if self.directions_from is not None and self.directions_from < 0:
+        if self.view_dependence_start is not None and self.view_dependence_start < 0:
             raise DevrfError(
-                "schedule.canonical.directions_from: expected 0 or more, or null, not "
-                f"{self.directions_from}"
+                "schedule.canonical.view_dependence_start: expected 0 or more, or null, not "
+                f"{self.view_dependence_start}"
             )
-        if self.contracted_start is not None and self.contracted_start < 2:
+        if self.unbounded_initial_side is not None and self.unbounded_initial_side < 2:
             raise DevrfError(
-                "schedule.canonical.contracted_start: expected at least 2, or null, not "
-                f"{self.contracted_start}"
+                "schedule.canonical.unbounded_initial_side: expected at least 2, or null, not "
+                f"{self.unbounded_initial_side}"
             )
-        if self.side**3 < 8 * 2 ** len(self.doublings):
+        if self.side**3 < 8 * 2 ** len(self.upsample_at):
             raise DevrfError(
-                f"schedule.canonical.doublings: {len(self.doublings)} of them are too many for "
+                f"schedule.canonical.upsample_at: {len(self.upsample_at)} of them are too many for "
                 f"side {self.side}; start from 8 voxels or more"
             )
-        edges = [0, *self.doublings, self.iterations]
+        edges = [0, *self.upsample_at, self.iterations]
         if any(a >= b for a, b in zip(edges, edges[1:], strict=False)):
             raise DevrfError(
-                "schedule.canonical.doublings must ascend between 0 and iterations "
-                f"({self.iterations}), not {list(self.doublings)}"
+                "schedule.canonical.upsample_at must ascend between 0 and iterations "
+                f"({self.iterations}), not {list(self.upsample_at)}"
             )
         offset, phases = self.search_iterations, []
         if offset:
             phases.append(CanonicalPhase("search", 0, offset, self.search_side**3))
         for k, (start, stop) in enumerate(zip(edges, edges[1:], strict=False)):
-            voxels = round(self.side**3) // 2 ** (len(self.doublings) - k)
+            voxels = round(self.side**3) // 2 ** (len(self.upsample_at) - k)
             phases.append(CanonicalPhase("fine", offset + start, offset + stop, voxels))
         object.__setattr__(self, "phases", tuple(phases))
 
@@ -137,28 +137,29 @@ class CanonicalSchedule:
 
     def learns_directions(self, iteration: int) -> bool:
         """Whether ``iteration`` teaches the network what viewing directions change."""
-        return iteration - self.search_iterations >= (self.directions_from or 0)
+        return iteration - self.search_iterations >= (self.view_dependence_start or 0)
 
     def in_space(self, space: Space) -> CanonicalSchedule:
         """The same schedule with what contracted space changes (docs/method.md#scene-contraction).
 
-        Sides are longer by the space's factor; ``doublings`` and ``directions_from`` are filled in.
+        Sides are longer by the space's factor; ``upsample_at`` and ``view_dependence_start`` are
+        filled in.
         """
         if space.is_linear:
             return self
-        side, late = self.side * space.side_factor, self.directions_from
+        side, late = self.side * space.side_factor, self.view_dependence_start
         return replace(
             self,
             side=side,
             search_side=round(self.search_side * space.side_factor),
-            doublings=self._doublings_from(self.contracted_start, side),
-            directions_from=self.iterations // 2 if late is None else late,
+            upsample_at=self._upsampling_from(self.unbounded_initial_side, side),
+            view_dependence_start=self.iterations // 2 if late is None else late,
         )
 
-    def _doublings_from(self, start: float | None, side: float) -> Sequence[int]:
-        """Equal intervals between the doublings that lead from ``start`` voxels to ``side``."""
+    def _upsampling_from(self, start: float | None, side: float) -> Sequence[int]:
+        """Equal intervals between the upsample_at that lead from ``start`` voxels to ``side``."""
         if start is None:
-            return self.doublings
+            return self.upsample_at
         count = max(0, round(3 * math.log2(side / start)))
         return tuple(3 * self.iterations * (k + 1) // (4 * count) for k in range(count))
 

@@ -143,8 +143,8 @@ class CanonicalStage(VoxelStage):
         possible = possible_matter(
             self.scene,
             shape,
-            carve=schedule.carve,
-            least_views=schedule.least_views,
+            carve=schedule.visual_hull_init,
+            min_views=schedule.min_views,
             device=device,
         )
         occupancy = Occupancy(possible, box)
@@ -236,7 +236,7 @@ class CanonicalStage(VoxelStage):
         log.info("%.1f%% of the searched box may be occupied; fields live in %s", share, box)
         base_voxels = round(self.schedule.side**3)
         field = self.architecture.radiance_field(box, phase.voxels, base_voxels)
-        if self.schedule.directions_from:
+        if self.schedule.view_dependence_start:
             field.forget_directions()
         return field
 

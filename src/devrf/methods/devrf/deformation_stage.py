@@ -224,7 +224,7 @@ class DeformationStage(VoxelStage):
         """No loss for a moving camera's flow (docs/method.md#flow-of-a-moving-camera)."""
         if self.scene.dynamic.train.flow is None or self._follows_flow:
             return
-        if self.motion.start != "previous" or self._weights.get("flow"):
+        if self.motion.init_from != "previous" or self._weights.get("flow"):
             log.info(
                 "the camera moves, and so does all that it sees: frames start where the ones "
                 "before them ended, and the flow loss is left out"
@@ -245,7 +245,7 @@ class DeformationStage(VoxelStage):
             self._tracks = None
             self.field.resize(phase.side**3)
         self._initialise(phase)
-        carried = self.motion.moments == "carried" and phase.level > 0
+        carried = self.motion.adam_state == "carried" and phase.level > 0
         if len(self.active) == len(phase.frames) and not carried:
             for group in range(len(self._optimizer.param_groups)):
                 self._optimizer.forget(group)
@@ -319,8 +319,8 @@ class DeformationStage(VoxelStage):
                 )
                 for number, level in enumerate(self.schedule.levels, 1)
             },
-            "appearance.factors_if_drifting": (
-                self.appearance.settings.factors_if_drifting,
+            "appearance.loss_scale_if_color_drift": (
+                self.appearance.settings.loss_scale_if_color_drift,
                 set(MOTION_TERMS),
             ),
         }
@@ -350,7 +350,7 @@ class DeformationStage(VoxelStage):
                 broadcast([self.field.to_canonical[number], self.field.to_time[number]])
 
     def _starts_along_flow(self, phase: DeformationPhase) -> bool:
-        asked = self.motion.start != "previous" and self._follows_flow
+        asked = self.motion.init_from != "previous" and self._follows_flow
         return asked and phase.level == 0 and phase.has_previous
 
     def _prefetch_after(self, phase: DeformationPhase) -> None:
@@ -383,7 +383,7 @@ class DeformationStage(VoxelStage):
         """Follows the training views' pixels back, at the coarsest level."""
         if self._tracks is None:
             seen = self.scene_model, self.views, self.previous_images
-            self._tracks = FlowTracks(*seen, by_color=self.motion.start == "tracks")
+            self._tracks = FlowTracks(*seen, by_color=self.motion.init_from == "tracks")
         return self._tracks
 
     @property

@@ -16,7 +16,7 @@ def possible_matter(
     shape: tuple[int, int, int],
     *,
     carve: bool,
-    least_views: int = 1,
+    min_views: int = 1,
     device: torch.device | None = None,
 ) -> Tensor:
     """Where matter can be at rest: (X, Y, Z) bool on the host, on a grid over the scene's box.
@@ -24,7 +24,7 @@ def possible_matter(
     It is found on ``device``; None: on the host.
 
     Not nearer to a camera than its near plane: fog before a lens would explain its image
-    perfectly. Not where fewer than ``least_views`` cameras look, if there are so many: fog would
+    perfectly. Not where fewer than ``min_views`` cameras look, if there are so many: fog would
     explain two images as well. ``carve`` leaves nothing outside the visual hull, if the images
     have mattes and all show the rest state, and the box is not endless.
     """
@@ -36,8 +36,8 @@ def possible_matter(
     places = space.from_world(positions)
     for position in positions[(box.nearest(places) - places).norm(dim=1) < near]:
         possible &= (points - position.to(points)).norm(dim=-1) > near
-    if 1 < least_views <= len(positions):
-        possible &= view_count(cameras, points) >= least_views
+    if 1 < min_views <= len(positions):
+        possible &= view_count(cameras, points) >= min_views
     at_rest = float(views.times.max() - views.times.min()) <= FrameClock.TOLERANCE
     if carve and space.is_linear and views.has_alpha and at_rest:
         possible &= visual_hull(views, box, shape, device)

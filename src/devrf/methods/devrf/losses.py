@@ -52,7 +52,7 @@ def background_entropy(prediction: Prediction) -> Tensor:
     return -(p * p.log() + (1 - p) * torch.log1p(-p)).mean()
 
 
-def matte(prediction: Prediction) -> Tensor:
+def alpha_mask(prediction: Prediction) -> Tensor:
     """Mean (T_end − (1 − A))², A the images' alpha channel; 0 without one."""
     alpha = prediction.batch.alpha
     if alpha is None:
@@ -75,7 +75,7 @@ PHOTOMETRIC_TERMS = {
     "color": color_error,
     "per_sample_color": per_sample_color,
     "entropy": background_entropy,
-    "matte": matte,
+    "alpha_mask": alpha_mask,
 }
 # Logged beside the terms.
 VISIBILITY: dict[str, Callable[[Prediction], Tensor | None]] = {

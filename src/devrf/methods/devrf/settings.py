@@ -23,7 +23,7 @@ DEFORMATION_LOSS = {
     "entropy": 0.01,
     "elastic": 0.0,
     "bending": 0.0,
-    "matte": 0.0,
+    "alpha_mask": 0.0,
 }
 APPEARANCE_LOSS = {"residual": 1e-3, "tv": 0.002}
 
@@ -83,7 +83,7 @@ class RenderSettings:
 class MotionSettings:
     """How the deformation field is learned, beside its schedule.
 
-    What ``unit``, ``views``, ``pixels`` and ``start`` add to the paper: docs/method.md#departures.
+    docs/method.md#departures says what ``unit``, ``views``, ``pixels`` and ``init_from`` add.
 
     Attributes:
         learning_rate: base rate, in ``unit`` per step: how far a voxel moves at most
@@ -95,7 +95,7 @@ class MotionSettings:
         pixels: ``all`` draws from whole images; ``occupied`` from the pixels of the alpha mask
             and those whose rays hit what the present field has moved there.
         occupancy_every: iterations between updates of the frame's occupancy.
-        start: where a frame starts from at the coarsest level: ``previous`` is the result of
+        init_from: where a frame starts from at the coarsest level: ``previous`` is the result of
             the frame before it; ``flow`` moves that along the observed optical flow, if there is
             any and no camera has moved; ``tracks`` follows the flow back to a frame in which the
             model shows each pixel's colour (docs/method.md#flow-initialisation).
@@ -104,7 +104,7 @@ class MotionSettings:
             several processes keeps them on its device.
         store_half: whether they are kept in half precision; ``auto``: on a GPU. Active frames
             never are.
-        moments: ``fresh`` begins each visit with a fresh Adam; ``carried`` goes on, above the
+        adam_state: ``fresh`` begins each visit with a fresh Adam; ``carried`` goes on, above the
             coarsest level, with the moments of the visit before
             (docs/method.md#motion-learning-rate).
         min_rel_improvement: a visit ends early when two Lightning steps have taken less than
@@ -116,8 +116,8 @@ class MotionSettings:
     views: Literal["one", "all"] = "one"
     pixels: Literal["all", "occupied"] = "all"
     occupancy_every: int = 25
-    start: Literal["previous", "flow", "tracks"] = "previous"
-    moments: Literal["fresh", "carried"] = "fresh"
+    init_from: Literal["previous", "flow", "tracks"] = "previous"
+    adam_state: Literal["fresh", "carried"] = "fresh"
     store: Literal["auto", "device", "host"] = "auto"
     store_half: bool | Literal["auto"] = "auto"
     min_rel_improvement: float | None = None

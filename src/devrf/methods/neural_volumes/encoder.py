@@ -14,7 +14,7 @@ from devrf.scenes.scene import Views
 MEAN, DEVIATION = 100 / 255, 25 / 255
 
 
-class MomentEncoder(nn.Module):
+class TimeEncoder(nn.Module):
     """K images of a moment → μ and log s of its code (docs/methods/neural_volumes.md#encoder)."""
 
     def __init__(

@@ -20,7 +20,7 @@ from devrf.methods.nerf.occupancy_frames import OccupancyFrames
 from devrf.methods.nerf.ray_samples import RaySamples
 from devrf.methods.nerf.ray_view import RayView
 from devrf.methods.neural_volumes.capture import check_scene, encoder_images
-from devrf.methods.neural_volumes.encoder import MomentEncoder
+from devrf.methods.neural_volumes.encoder import TimeEncoder
 from devrf.methods.neural_volumes.layers import VolumeDecoder
 from devrf.methods.neural_volumes.losses import (
     code_divergence,
@@ -54,7 +54,7 @@ class NeuralVolumes(DynamicModel):
         """
         super().__init__()
         self.settings = s = settings or NeuralVolumesSettings()
-        self.encoder = MomentEncoder(
+        self.encoder = TimeEncoder(
             s.encoder_views, s.encoder_size, s.encoder_channels, s.encoder_width, s.code
         )
         self.template = VolumeDecoder(s.code, s.template_channels, 4)

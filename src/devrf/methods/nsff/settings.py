@@ -16,15 +16,15 @@ class Warmup:
 
     Attributes:
         steps_per_frame: N₀ = steps_per_frame · (number of frames, within the two limits).
-        least_frames: fewer frames count as so many.
-        most_frames: more frames count as so many.
+        min_frames: fewer frames count as so many.
+        max_frames: more frames count as so many.
         chained_from: after how many times N₀ the term ``chained`` counts.
         prior_decay: by what depth and flow priors are divided after each N₀.
     """
 
     steps_per_frame: int = 1000
-    least_frames: int = 30
-    most_frames: int = 250
+    min_frames: int = 30
+    max_frames: int = 250
     chained_from: float = 2.0
     prior_decay: float = 10.0
 
@@ -34,17 +34,17 @@ class Warmup:
             raise DevrfError(
                 f"{key}.steps_per_frame: expected at least 1, not {self.steps_per_frame}"
             )
-        if not 1 <= self.least_frames <= self.most_frames:
+        if not 1 <= self.min_frames <= self.max_frames:
             raise DevrfError(
-                f"{key}.least_frames: expected 1 … most_frames ({self.most_frames}), not "
-                f"{self.least_frames}"
+                f"{key}.min_frames: expected 1 … max_frames ({self.max_frames}), not "
+                f"{self.min_frames}"
             )
         if self.prior_decay < 1:
             raise DevrfError(f"{key}.prior_decay: expected at least 1, not {self.prior_decay}")
 
     def steps(self, frames: int) -> int:
         """N₀ of a scene of so many frames."""
-        return self.steps_per_frame * min(max(frames, self.least_frames), self.most_frames)
+        return self.steps_per_frame * min(max(frames, self.min_frames), self.max_frames)
 
     def prior_factor(self, step: int, frames: int) -> float:
         """Factor of the priors' weights at iteration ``step``: 1, then divided once every N₀."""
