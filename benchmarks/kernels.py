@@ -24,7 +24,7 @@ from devrf.ops.adam_step import (
     add_total_variation_gradient,
     smooth_adam_step,
 )
-from devrf.ops.compositing import composite_segments
+from devrf.ops.compositing import composite_colors, composite_segments
 from devrf.ops.dispatch import Kind, triton_runs, using
 from devrf.ops.search import Thresholds, find_samples
 from devrf.ops.trilinear import interpolate
@@ -86,7 +86,7 @@ def operations(side: int, rays: int, device: torch.device) -> Mapping[str, Calla
     density, features, slices = draw(*shape, 1), draw(*shape, CHANNELS), draw(*shape, 3) / 10
     points, coords = draw(samples, 3), (side - 1) * (draw(samples, 3) + 1) / 2
     first = torch.arange(rays + 1, device=device) * SAMPLES_PER_RAY
-    depth = draw(samples).abs()
+    depth, colors, left = draw(samples).abs(), draw(samples, 3), draw(rays).abs()
     directions = torch.nn.functional.normalize(draw(rays, 3), dim=1)
     count = torch.full((rays,), 2 * side, device=device)
     grid, spare, gradient, mean = (draw(*shape, 3) for _ in range(4))
@@ -120,6 +120,13 @@ def operations(side: int, rays: int, device: torch.device) -> Mapping[str, Calla
         ),
         "find_samples": search,
         "composite_segments": with_gradients(lambda tau: composite_segments(tau, first)[0], depth),
+        "composite_colors": with_gradients(
+            lambda weights, colors: composite_colors(weights, colors, depth, first, left, left[:3])[
+                0
+            ],
+            depth,
+            colors,
+        ),
         "add_total_variation_gradient": lambda: add_total_variation_gradient(grid, gradient, 1e-6),
         "adam_step": lambda: adam_step(grid, gradient, mean, square, rule, clear=False),
         "smooth_adam_step": lambda: smooth_adam_step(

@@ -127,23 +127,6 @@ def test_search(draw: Draw, agree: Both, changed: dict[str, Any]) -> None:
     )
 
 
-def test_search_halfway_between_grid_points(draw: Draw, agree: Both) -> None:
-    # On a grid of unit cells the samples at 0.5, 1.5, … belong to the even grid point.
-    cube, device = Box((0.0, 0.0, 0.0), (4.0, 4.0, 4.0)), draw.device
-    origin, direction = torch.tensor([[0.5, 1.5, -1.0]]), torch.tensor([[0.0, 0.0, 1.0]])
-    along = origin.to(device), direction.to(device), torch.zeros(1, device=device)
-    mask, density = draw(5, 5, 5) > -0.2, draw(5, 5, 5, 1)
-    common: dict[str, Any] = {"mask_box": cube, "box": cube, "shift": 0.0, "delta": 0.5}
-    limits: dict[str, Any] = {"step": 0.5, "longest": 14, "capacity": 20}
-    count = torch.tensor([14], device=device)
-    none = Thresholds(0.0, 0.0, 0.0)
-    agree(
-        lambda: astuple(
-            find_samples(*along, count, mask, density, **common, **limits, thresholds=none)
-        )
-    )
-
-
 @pytest.mark.parametrize("capacity", [0, 70, 900, 1500])
 @pytest.mark.parametrize("moves", [True, False])
 def test_selection(draw: Draw, agree: Both, capacity: int, moves: bool) -> None:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import ast
 import logging
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -107,14 +105,3 @@ def test_triton_that_cannot_run_is_refused_with_the_reason(
     monkeypatch.setattr(dispatch, "find_spec", lambda name: installed)
     with using("triton"), pytest.raises(DevrfError, match=f"kernels: .*{expected}"):
         triton_runs(tensor)
-
-
-def test_nothing_loads_triton_before_it_is_needed() -> None:
-    modules = sorted(Path(dispatch.__file__).parent.glob("*.py"))
-    assert len(modules) > 5
-    for module in modules:
-        for statement in ast.parse(module.read_text()).body:
-            if isinstance(statement, ast.Import):
-                assert not any("triton" in name.name for name in statement.names), module
-            if isinstance(statement, ast.ImportFrom):
-                assert "accel" not in str(statement.module), module

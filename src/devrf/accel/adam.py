@@ -270,15 +270,7 @@ def adam_kernel(
 
 @triton.jit
 def adam_several_kernel(
-    addresses,
-    pieces,
-    rate,
-    share1,
-    share2,
-    decay1,
-    decay2,
-    eps,
-    BLOCK: tl.constexpr,
+    addresses, pieces, rate, share1, share2, decay1, decay2, eps, BLOCK: tl.constexpr
 ):
     """A piece of one of several tensors; as :func:`adam_kernel` without its options."""
     program = tl.program_id(0)

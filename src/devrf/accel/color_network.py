@@ -1,5 +1,8 @@
 """The colour network on listed samples: features, layers and sigmoid of a block in one program.
 
+With features f and encoded directions e, RGB = sigmoid(w₃·h₂ + b₃), h₂ = relu(w₂·h₁ + b₂) and
+h₁ = relu(w₁·f + v₁·e + b₁): so weights are named.
+
 Products are those of tensor cores, summed in single precision. The backward pass computes the
 layers again, in one launch for what samples lead to and in another for the weights. A program's
 registers would not hold the second layer: it is taken in shares of its units.
@@ -200,9 +203,9 @@ def encoded_directions(
 def lower_units(
     features,
     encoded,
-    feature_weight,
-    feature_bias,
-    direction_weight,
+    w1,
+    b1,
+    v1,
     CHANNELS: tl.constexpr,
     DIRECTIONS: tl.constexpr,
     WIDTH: tl.constexpr,
@@ -212,45 +215,39 @@ def lower_units(
     """What the first layer gives, (BLOCK, UNITS) in ``PRECISION``."""
     unit = tl.arange(0, UNITS)
     channel, column = tl.arange(0, features.shape[1]), tl.arange(0, encoded.shape[1])
-    weight = matrix(feature_weight, unit, channel, WIDTH, CHANNELS)
+    weight = matrix(w1, unit, channel, WIDTH, CHANNELS)
     x = product(features, tl.trans(weight), PRECISION)
-    weight = matrix(direction_weight, unit, column, WIDTH, DIRECTIONS)
+    weight = matrix(v1, unit, column, WIDTH, DIRECTIONS)
     x += product(encoded, tl.trans(weight), PRECISION)
-    x += tl.load(feature_bias + unit, mask=unit < WIDTH, other=0.0)[None, :]
+    x += tl.load(b1 + unit, mask=unit < WIDTH, other=0.0)[None, :]
     return tl.maximum(x, 0.0).to(PRECISION)
 
 
 @triton.jit
 def upper_units(
-    lower,
-    hidden_weight,
-    hidden_bias,
-    unit,
-    WIDTH: tl.constexpr,
-    UNITS: tl.constexpr,
-    PRECISION: tl.constexpr,
+    lower, w2, b2, unit, WIDTH: tl.constexpr, UNITS: tl.constexpr, PRECISION: tl.constexpr
 ):
     """What units of the second layer give, (BLOCK, SHARE) in ``PRECISION``, and their weights."""
-    weight = matrix(hidden_weight, unit, tl.arange(0, UNITS), WIDTH, WIDTH).to(PRECISION)
+    weight = matrix(w2, unit, tl.arange(0, UNITS), WIDTH, WIDTH).to(PRECISION)
     x = product(lower, tl.trans(weight), PRECISION)
-    x += tl.load(hidden_bias + unit, mask=unit < WIDTH, other=0.0)[None, :]
+    x += tl.load(b2 + unit, mask=unit < WIDTH, other=0.0)[None, :]
     return tl.maximum(x, 0.0).to(PRECISION), weight
 
 
 @triton.jit
-def output_weights(output_weight, unit, WIDTH: tl.constexpr):
+def output_weights(w3, unit, WIDTH: tl.constexpr):
     """The weights of units of the second layer for red, green and blue, (1, SHARE) each."""
     known = unit < WIDTH
-    red = tl.load(output_weight + unit, mask=known, other=0.0)
-    green = tl.load(output_weight + WIDTH + unit, mask=known, other=0.0)
-    blue = tl.load(output_weight + 2 * WIDTH + unit, mask=known, other=0.0)
+    red = tl.load(w3 + unit, mask=known, other=0.0)
+    green = tl.load(w3 + WIDTH + unit, mask=known, other=0.0)
+    blue = tl.load(w3 + 2 * WIDTH + unit, mask=known, other=0.0)
     return red[None, :], green[None, :], blue[None, :]
 
 
 @triton.jit
-def to_upper(red, green, blue, upper, output_weight, unit, WIDTH: tl.constexpr):
+def to_upper(red, green, blue, upper, w3, unit, WIDTH: tl.constexpr):
     """From gradients of logits to those of units of the second layer, (BLOCK, SHARE)."""
-    of_red, of_green, of_blue = output_weights(output_weight, unit, WIDTH)
+    of_red, of_green, of_blue = output_weights(w3, unit, WIDTH)
     change = red[:, None] * of_red
     change += green[:, None] * of_green
     change += blue[:, None] * of_blue
@@ -273,13 +270,13 @@ def color_network_kernel(
     ray,
     first,
     octaves,
-    feature_weight,
-    feature_bias,
-    direction_weight,
-    hidden_weight,
-    hidden_bias,
-    output_weight,
-    output_bias,
+    w1,
+    b1,
+    v1,
+    w2,
+    b2,
+    w3,
+    b3,
     points,
     grid,
     axes,
@@ -314,28 +311,19 @@ def color_network_kernel(
         tl.store(features + place[:, None] * CHANNELS + channel[None, :], found, mask=wanted)
         encoded = encoded_directions(viewdirs, octaves, ray, place, here, DIRECTIONS, ENCODED)
         lower = lower_units(
-            found,
-            encoded,
-            feature_weight,
-            feature_bias,
-            direction_weight,
-            CHANNELS,
-            DIRECTIONS,
-            WIDTH,
-            UNITS,
-            PRECISION,
+            found, encoded, w1, b1, v1, CHANNELS, DIRECTIONS, WIDTH, UNITS, PRECISION
         )
         for start in tl.static_range(0, UNITS, SHARE):
             unit = start + tl.arange(0, SHARE)
-            upper, _ = upper_units(lower, hidden_weight, hidden_bias, unit, WIDTH, UNITS, PRECISION)
+            upper, _ = upper_units(lower, w2, b2, unit, WIDTH, UNITS, PRECISION)
             upper = upper.to(tl.float32)
-            of_red, of_green, of_blue = output_weights(output_weight, unit, WIDTH)
+            of_red, of_green, of_blue = output_weights(w3, unit, WIDTH)
             red += tl.sum(upper * of_red, axis=1)
             green += tl.sum(upper * of_green, axis=1)
             blue += tl.sum(upper * of_blue, axis=1)
-        red = tl.where(here, sigmoid(red + tl.load(output_bias)), 0.0)
-        green = tl.where(here, sigmoid(green + tl.load(output_bias + 1)), 0.0)
-        blue = tl.where(here, sigmoid(blue + tl.load(output_bias + 2)), 0.0)
+        red = tl.where(here, sigmoid(red + tl.load(b3)), 0.0)
+        green = tl.where(here, sigmoid(green + tl.load(b3 + 1)), 0.0)
+        blue = tl.where(here, sigmoid(blue + tl.load(b3 + 2)), 0.0)
     store_vectors(colors, at, red, green, blue, place < places)
 
 
@@ -345,13 +333,13 @@ def color_samples_backward_kernel(
     ray,
     first,
     octaves,
-    feature_weight,
-    feature_bias,
-    direction_weight,
-    hidden_weight,
-    hidden_bias,
-    output_weight,
-    output_bias,
+    w1,
+    b1,
+    v1,
+    w2,
+    b2,
+    w3,
+    b3,
     features,
     colors,
     upstream,
@@ -385,28 +373,17 @@ def color_samples_backward_kernel(
         found = load_features(features, place, channel, here, CHANNELS)
         encoded = encoded_directions(viewdirs, octaves, ray, place, here, DIRECTIONS, ENCODED)
         lower = lower_units(
-            found,
-            encoded,
-            feature_weight,
-            feature_bias,
-            direction_weight,
-            CHANNELS,
-            DIRECTIONS,
-            WIDTH,
-            UNITS,
-            PRECISION,
+            found, encoded, w1, b1, v1, CHANNELS, DIRECTIONS, WIDTH, UNITS, PRECISION
         )
         red, green, blue = to_logits(colors, upstream, at, here)
         below = tl.zeros((BLOCK, UNITS), dtype=tl.float32)
         for start in tl.static_range(0, UNITS, SHARE):
             unit = start + tl.arange(0, SHARE)
-            upper, weight = upper_units(
-                lower, hidden_weight, hidden_bias, unit, WIDTH, UNITS, PRECISION
-            )
-            change = to_upper(red, green, blue, upper, output_weight, unit, WIDTH)
+            upper, weight = upper_units(lower, w2, b2, unit, WIDTH, UNITS, PRECISION)
+            change = to_upper(red, green, blue, upper, w3, unit, WIDTH)
             below += product(change, weight, PRECISION)
         below = tl.where(lower > 0.0, below, 0.0)
-        weight = matrix(feature_weight, tl.arange(0, UNITS), channel, WIDTH, CHANNELS)
+        weight = matrix(w1, tl.arange(0, UNITS), channel, WIDTH, CHANNELS)
         px, py, pz = load_vectors(points, at, here)
         change = product(below, weight, PRECISION)
         gx, gy, gz = spread_rows(
@@ -426,23 +403,23 @@ def color_weights_backward_kernel(
     ray,
     first,
     octaves,
-    feature_weight,
-    feature_bias,
-    direction_weight,
-    hidden_weight,
-    hidden_bias,
-    output_weight,
-    output_bias,
+    w1,
+    b1,
+    v1,
+    w2,
+    b2,
+    w3,
+    b3,
     features,
     colors,
     upstream,
-    into_feature_weight,
-    into_feature_bias,
-    into_direction_weight,
-    into_hidden_weight,
-    into_hidden_bias,
-    into_output_weight,
-    into_output_bias,
+    into_w1,
+    into_b1,
+    into_v1,
+    into_w2,
+    into_b2,
+    into_w3,
+    into_b3,
     rays,
     programs,
     NEEDS_DIRECTIONS: tl.constexpr,
@@ -484,20 +461,9 @@ def color_weights_backward_kernel(
         found = load_features(features, place, channel, here, CHANNELS)
         encoded = encoded_directions(viewdirs, octaves, ray, place, here, DIRECTIONS, ENCODED)
         lower = lower_units(
-            found,
-            encoded,
-            feature_weight,
-            feature_bias,
-            direction_weight,
-            CHANNELS,
-            DIRECTIONS,
-            WIDTH,
-            UNITS,
-            PRECISION,
+            found, encoded, w1, b1, v1, CHANNELS, DIRECTIONS, WIDTH, UNITS, PRECISION
         )
-        upper, weight = upper_units(
-            lower, hidden_weight, hidden_bias, unit, WIDTH, UNITS, PRECISION
-        )
+        upper, weight = upper_units(lower, w2, b2, unit, WIDTH, UNITS, PRECISION)
         red, green, blue = to_logits(colors, upstream, place.to(tl.int64) * 3, here)
         reds += red
         greens += green
@@ -506,7 +472,7 @@ def color_weights_backward_kernel(
         of_red += tl.sum(red[:, None] * single, axis=0)
         of_green += tl.sum(green[:, None] * single, axis=0)
         of_blue += tl.sum(blue[:, None] * single, axis=0)
-        change = to_upper(red, green, blue, upper, output_weight, unit, WIDTH)
+        change = to_upper(red, green, blue, upper, w3, unit, WIDTH)
         of_hidden += product(tl.trans(change), lower, PRECISION)
         of_upper_bias += tl.sum(change, axis=0)
         below = tl.where(lower > 0.0, product(change, weight, PRECISION), 0.0)
@@ -516,16 +482,16 @@ def color_weights_backward_kernel(
             of_directions += product(tl.trans(below), encoded, PRECISION)
         begin += programs * BLOCK
     known = unit < WIDTH
-    add_matrix(into_feature_weight, of_features, below_unit, channel, WIDTH, CHANNELS)
-    add_matrix(into_hidden_weight, of_hidden, unit, below_unit, WIDTH, WIDTH)
-    tl.atomic_add(into_feature_bias + below_unit, of_lower_bias, mask=below_unit < WIDTH)
-    tl.atomic_add(into_hidden_bias + unit, of_upper_bias, mask=known)
-    tl.atomic_add(into_output_weight + unit, of_red, mask=known)
-    tl.atomic_add(into_output_weight + WIDTH + unit, of_green, mask=known)
-    tl.atomic_add(into_output_weight + 2 * WIDTH + unit, of_blue, mask=known)
+    add_matrix(into_w1, of_features, below_unit, channel, WIDTH, CHANNELS)
+    add_matrix(into_w2, of_hidden, unit, below_unit, WIDTH, WIDTH)
+    tl.atomic_add(into_b1 + below_unit, of_lower_bias, mask=below_unit < WIDTH)
+    tl.atomic_add(into_b2 + unit, of_upper_bias, mask=known)
+    tl.atomic_add(into_w3 + unit, of_red, mask=known)
+    tl.atomic_add(into_w3 + WIDTH + unit, of_green, mask=known)
+    tl.atomic_add(into_w3 + 2 * WIDTH + unit, of_blue, mask=known)
     if share == 0:
-        tl.atomic_add(into_output_bias, tl.sum(reds, 0))
-        tl.atomic_add(into_output_bias + 1, tl.sum(greens, 0))
-        tl.atomic_add(into_output_bias + 2, tl.sum(blues, 0))
+        tl.atomic_add(into_b3, tl.sum(reds, 0))
+        tl.atomic_add(into_b3 + 1, tl.sum(greens, 0))
+        tl.atomic_add(into_b3 + 2, tl.sum(blues, 0))
     if NEEDS_DIRECTIONS:
-        add_matrix(into_direction_weight, of_directions, below_unit, column, WIDTH, DIRECTIONS)
+        add_matrix(into_v1, of_directions, below_unit, column, WIDTH, DIRECTIONS)

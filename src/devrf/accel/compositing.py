@@ -129,15 +129,7 @@ class CompositeColors(torch.autograd.Function):
 
 
 @triton.jit(do_not_specialize=["rays", "places"])
-def composite_kernel(
-    depth,
-    first,
-    weights,
-    transmittance,
-    ends,
-    rays,
-    places,
-):
+def composite_kernel(depth, first, weights, transmittance, ends, rays, places):
     """w_i = T_i·α_i with T_i = exp(−Σ_{j<i} τ_j), and T_end; w is 0 in the padding."""
     ray = tl.program_id(0)
     if ray < rays:
@@ -163,15 +155,7 @@ def composite_kernel(
 
 @triton.jit(do_not_specialize=["rays", "places"])
 def composite_backward_kernel(
-    first,
-    weights,
-    transmittance,
-    ends,
-    weights_gradient,
-    end_gradient,
-    into,
-    rays,
-    places,
+    first, weights, transmittance, ends, weights_gradient, end_gradient, into, rays, places
 ):
     """∂/∂τ_i = g_i·T_{i+1} − Σ_{j>i} g_j·w_j − g_end·T_end, from the back to the front."""
     ray = tl.program_id(0)
@@ -200,17 +184,7 @@ def composite_backward_kernel(
 
 
 @triton.jit(do_not_specialize=["apart"])
-def colors_kernel(
-    weights,
-    colors,
-    transmittance,
-    distance,
-    first,
-    background,
-    image,
-    depth,
-    apart,
-):
+def colors_kernel(weights, colors, transmittance, distance, first, background, image, depth, apart):
     """Σ w_i·c_i + T_end·background and Σ w_i·z_i / Σ w_i of a ray.
 
     ``apart`` is 3 where each ray has a background of its own, else 0.

@@ -258,14 +258,7 @@ def motion_kernel(
 
 @triton.jit(do_not_specialize=["programs", "rays"])
 def finish_motion_kernel(
-    parts,
-    valid,
-    sums,
-    programs,
-    rays,
-    of_cycle,
-    of_flow,
-    OVER_RAYS: tl.constexpr,
+    parts, valid, sums, programs, rays, of_cycle, of_flow, OVER_RAYS: tl.constexpr
 ):
     """Cycle, flow, their weighted sum; and one by what each is divided by."""
     lane = tl.arange(0, AT_ONCE)
