@@ -46,17 +46,16 @@ def test_canonical_rates_and_phases_are_the_schedules_at_every_step(fit, canonic
         assert rates == pytest.approx([0.1 * factor, 0.1 * factor, 1e-3 * factor])
 
 
-@pytest.mark.parametrize("unit", ["world", "box"])
 def test_deformation_rates_and_phases_are_the_schedules_at_every_step(
-    fit, rest: LoadedCheckpoint, unit: Any
+    fit, rest: LoadedCheckpoint
 ) -> None:
-    watch, motion = Watch(), MotionSettings(learning_rate=2e-3, unit=unit)
+    watch, motion = Watch(), MotionSettings(learning_rate=2e-3, unit="box")
     stage = fit(DeformationStage(rest, DEFORMATION, motion), watch)
     assert [step for step, _, _ in watch.steps] == list(range(15))
     # Three frames, shares of 3 and 2; frame 1 has two shares.
     visits = [(phase.level, *phase.frames) for _, phase, _ in watch.steps]
     assert visits == [(0, 1)] * 6 + [(0, 2)] * 3 + [(1, 1)] * 4 + [(1, 2)] * 2
-    scale = stage.field.box.longest if unit == "box" else 1.0
+    scale = stage.field.box.longest
     for _, phase, rates in watch.steps:
         assert rates == pytest.approx([2e-3 * scale * 10 ** (-phase.level / 4)])
     assert stage.resolution == stage.field.box.grid_shape(6**3)
@@ -82,25 +81,20 @@ def test_the_record_says_what_training_took(fit, canonical) -> None:
     assert stage.metadata().records["canonical"] == stage.record
 
 
-@pytest.fixture
-def lines(caplog: pytest.LogCaptureFixture) -> Callable[[], list[str]]:
-    """The lines of progress that were logged."""
-    caplog.set_level(logging.INFO, logger="devrf")
-    return lambda: [line for line in caplog.messages if line.startswith("dynamic ")]
-
-
 def test_progress_and_curves_name_the_frames_of_a_visit(
     rest: LoadedCheckpoint,
     four_frames: SceneDataModule,
     trainer: Callable[..., Trainer],
-    lines: Callable[[], list[str]],
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
+    caplog.set_level(logging.INFO, logger="devrf")
     schedule = replace(DEFORMATION, coarse_to_fine=False, levels=(Level(6, 5, parallel_frames=2),))
     stage = DeformationStage(rest, schedule, iterations_per_step=100)
     fitted = trainer(Progress(line_every_seconds=0.0), Meter(), max_epochs=1)
     fitted.fit(stage, datamodule=four_frames)
-    first, last = (line.split("  ") for line in lines())
+    lines = [line for line in caplog.messages if line.startswith("dynamic ")]
+    first, last = (line.split("  ") for line in lines)
     assert first[-2] == "frame 2" and re.fullmatch(r"about \d+ (s|min) left", first[-1])
     assert last[-1] == "frames 1, 3"  # nothing is left
-    assert " dB" in lines()[-1]
+    assert " dB" in lines[-1]
     assert fitted.callback_metrics["dynamic/frame"] == 1

@@ -46,16 +46,15 @@ def write_checkpoint_file(path: Path, content: dict[str, Any]) -> None:
     nested = json.dumps(_flatten(content, tensors))
     # The widest elements first, so that all stand at multiples of their width.
     tensors = dict(sorted(tensors.items(), key=lambda item: -item[1].element_size()))
-    digest = hashlib.sha256(nested.encode())
+    sums = {}
     with atomic_write(path) as partial, partial.open("wb") as file:
         file.write(_header(nested, tensors, UNKNOWN))
         for name, tensor in tensors.items():
             data = _data(tensor)
-            digest.update(_described(name, tensor))
-            digest.update(data)
+            sums[name] = _sum(tensor, data)
             file.write(data)
         file.seek(0)
-        file.write(_header(nested, tensors, digest.hexdigest()))
+        file.write(_header(nested, tensors, _digest(nested, sums)))
 
 
 def read_checkpoint_file(path: Path) -> dict[str, Any]:
@@ -64,15 +63,12 @@ def read_checkpoint_file(path: Path) -> dict[str, Any]:
     Raises:
         DevrfError: the file is damaged, of another format, or not devrf's.
     """
-    metadata, tensors = _metadata(path), dict[str, Tensor]()
-    digest = hashlib.sha256(metadata["nested"].encode())
+    metadata = _metadata(path)
     with safe_open(path, "pt") as file:
-        for name in file.offset_keys():
-            # The library maps the file into memory: a copy does not change with it.
-            tensor = tensors[name] = file.get_tensor(name).clone()
-            digest.update(_described(name, tensor))
-            digest.update(_data(tensor))
-    if digest.hexdigest() != metadata["sha256"]:
+        # The library maps the file into memory: a copy does not change with it.
+        tensors = {name: file.get_tensor(name).clone() for name in file.keys()}
+    sums = {name: _sum(tensor, _data(tensor)) for name, tensor in tensors.items()}
+    if _digest(metadata["nested"], sums) != metadata["sha256"]:
         raise DevrfError(
             f"{path}: damaged: altered since it was written (its checksum does not match); take a "
             "copy that is whole, or train again"
@@ -140,8 +136,14 @@ def _header(nested: str, tensors: Mapping[str, Tensor], digest: str) -> bytes:
     return len(header).to_bytes(8, "little") + header
 
 
-def _described(name: str, tensor: Tensor) -> bytes:
-    return f"{name} {DTYPES[tensor.dtype]} {list(tensor.shape)}".encode()
+def _sum(tensor: Tensor, data: memoryview) -> str:
+    return f"{DTYPES[tensor.dtype]} {list(tensor.shape)} {hashlib.sha256(data).hexdigest()}"
+
+
+def _digest(nested: str, sums: Mapping[str, str]) -> str:
+    """The SHA-256 of a file's content, whatever the order of its tensors."""
+    content = json.dumps([nested, sorted(sums.items())])
+    return hashlib.sha256(content.encode()).hexdigest()
 
 
 def _data(tensor: Tensor) -> memoryview:

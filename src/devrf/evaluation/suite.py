@@ -64,18 +64,13 @@ def _ms_ssim(inputs: MetricInput) -> float | None:
     return ms_ssim(inputs.prediction, inputs.truth) if inputs.valid_mask is None else None
 
 
-def _lpips(inputs: MetricInput) -> float | None:
+def _lpips(inputs: MetricInput, mask: Tensor | None) -> float | None:
     if inputs.lpips is None:
         return None
-    if inputs.valid_mask is not None:
-        return inputs.lpips.inside(inputs.prediction, inputs.truth, inputs.valid_mask)
+    if mask is not None:
+        return inputs.lpips.inside(inputs.prediction, inputs.truth, mask)
     whole: float | None = inputs.lpips(inputs.prediction, inputs.truth)
     return whole
-
-
-def _lpips_masked(inputs: MetricInput) -> float | None:
-    inside = inputs.lpips.inside if inputs.lpips else None
-    return inside(inputs.prediction, inputs.truth, inputs.mask) if inside else None
 
 
 def _depth_error(inputs: MetricInput) -> float | None:
@@ -88,10 +83,10 @@ def _depth_error(inputs: MetricInput) -> float | None:
 # By name, in the order of tables; None where a view has nothing to compare with.
 MEASURES: dict[str, Callable[[MetricInput], float | None]] = {
     "ms_ssim": _ms_ssim,
-    "lpips": _lpips,
+    "lpips": lambda inputs: _lpips(inputs, inputs.valid_mask),
     "psnr_masked": lambda inputs: psnr_masked(inputs.prediction, inputs.truth, inputs.mask),
     "ssim_masked": lambda inputs: ssim_masked(inputs.prediction, inputs.truth, inputs.mask),
-    "lpips_masked": _lpips_masked,
+    "lpips_masked": lambda inputs: _lpips(inputs, inputs.mask),
     "depth_error": _depth_error,
     "flow_error": lambda inputs: flow_error(inputs.renderer, inputs.views, inputs.index),
 }
