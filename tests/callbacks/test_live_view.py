@@ -43,7 +43,7 @@ def fitted(fit, canonical, tiny_scene, monkeypatch):
         monkeypatch.setattr(live_view, "PAUSE", 0.0)
         page = Page(Pose.of_cameras(tiny_scene.dynamic.test.cameras, 0))
         live, began = live_view.LiveView(page, share), time.perf_counter()
-        fit(canonical(iterations=20, doublings=()), live)
+        fit(canonical(iterations=20, upsample_at=()), live)
         return live, page, time.perf_counter() - began
 
     return learn
