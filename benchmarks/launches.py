@@ -44,10 +44,10 @@ from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformation_schedule import DeformationPhase
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.settings import RenderSettings
 from devrf.ops.adam import GridAdam
 from devrf.ops.dispatch import using
 from devrf.rendering.occupancy import Occupancy
+from devrf.rendering.sampling import RenderSettings
 from devrf.scenes.scene import OpticalFlow, Views
 
 META = torch.device("meta")
@@ -263,8 +263,8 @@ def deformation() -> ScheduledStage:
     stage.iteration = int(LATE * stage.total_iterations)
     phase = stage.phase = stage.phase_at(stage.iteration)
     assert isinstance(phase, DeformationPhase)
-    stage.activate(phase)
-    stage._previous_images = torch.arange(len(images), device=META)
+    stage._activate(phase)
+    stage.previous_images = torch.arange(len(images), device=META)
     for frame in stage.active:
         frame.pools = [all_pixels(images, torch.arange(1, device=META))]
     return stage

@@ -47,11 +47,11 @@ from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
 from devrf.geometry.rays import Rays
-from devrf.methods.devrf.appearance import AppearanceField
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_field import DeformationField
+from devrf.methods.devrf.extensions.color_residual import ResidualField
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import CanonicalRates
 from devrf.methods.devrf.volume_rendering import render
@@ -420,9 +420,9 @@ def moving(learned: tuple[CanonicalStage, Trainer], rng: torch.Generator) -> DeV
     shape = motion.to_canonical[1:].shape
     motion.to_canonical[1:] = 0.1 * box.longest * (torch.rand(shape, generator=rng) - 0.5)
     model.deformation = motion
-    model.appearance = AppearanceField(box, motion.clock, voxels=4**3)
-    shape = model.appearance.values[1:].shape
-    model.appearance.values[1:] = 2 * torch.rand(shape, generator=rng) - 1
+    model.color_residual = ResidualField(box, motion.clock, voxels=4**3)
+    shape = model.color_residual.values[1:].shape
+    model.color_residual.values[1:] = 2 * torch.rand(shape, generator=rng) - 1
     return model
 
 
@@ -432,8 +432,8 @@ def plain_picture(
     """What rays in the fields' space see of a model at ``time``, by the plain renderer."""
     scene = model.canonical, model.occupancy_at(time), model.settings
     with torch.no_grad():
-        warp, colors = model.warp(time), model.residual(time)
-        return RenderedImage.of(render(rays, *scene, background, warp, appearance=colors))
+        warp, colors = model.warp(time), model.color_change(time)
+        return RenderedImage.of(render(rays, *scene, background, warp, color_change=colors))
 
 
 @pytest.fixture

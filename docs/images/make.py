@@ -25,7 +25,7 @@ from devrf.apps.still import still
 from devrf.apps.video import VideoSettings, orbit
 from devrf.checkpoints.checkpoint import load_checkpoint
 from devrf.geometry.cameras import Cameras
-from devrf.methods.base import DynamicModel
+from devrf.methods.base import Renderable
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.procedural.filming import Filming, extent
 
@@ -35,7 +35,7 @@ HEIGHT, TILE, MARGIN, TEXT = 400, 210, 8, 19
 ROWS = [["truth"], ["rendered"], ["depth"]]
 
 
-def opened(run: Path) -> tuple[Any, DynamicModel]:
+def opened(run: Path) -> tuple[Any, Renderable]:
     """The data of a run, and what its deformation stage learned from them."""
     data = instantiate(OmegaConf.load(run / "checkpoints" / "config.yaml").data)
     return data, load_checkpoint(run / "checkpoints" / "deformation.ckpt", data.scene).model

@@ -38,6 +38,7 @@ from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
+from devrf.methods.devrf.extensions.tracks import StartAlongFlow
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import MotionSettings, Precision, Sampling
 from devrf.ops.check import CASES, Case, compare
@@ -156,8 +157,10 @@ class SmallScene:
         parallel = (self.frames - 1) // 2
         second = Level(fine, max(1, self.iterations // 8), parallel_frames=parallel)
         motion = DeformationSchedule((first, second), rays=self.rays)
-        settings = MotionSettings(2e-3, unit="box", views="one", init_from="flow", store="host")
-        return DeformationStage(copy.deepcopy(self.canonical), motion, settings, **common)
+        settings = MotionSettings(2e-3, unit="box", views="one", store="host")
+        along = {"tracks": StartAlongFlow("flow")}
+        rest = copy.deepcopy(self.canonical)
+        return DeformationStage(rest, motion, settings, extensions=along, **common)
 
     def learn(
         self,

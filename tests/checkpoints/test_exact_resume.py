@@ -24,13 +24,18 @@ from devrf.checkpoints.checkpoint_file import read_checkpoint_file
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.stage import ScheduledStage
 from devrf.errors import DevrfError
-from devrf.methods.devrf.appearance import AppearanceSettings
+from devrf.geometry.clock import FrameClock
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
-from devrf.methods.devrf.refinement import RefinementSettings
+from devrf.methods.devrf.extension import Extension
+from devrf.methods.devrf.extensions.color_residual import ColorResidual
+from devrf.methods.devrf.extensions.priors import Elastic
+from devrf.methods.devrf.extensions.refinement import RefinementSchedule, RefinementStage
+from devrf.methods.devrf.extensions.tracks import StartAlongFlow
 from devrf.methods.devrf.settings import MotionSettings
 from devrf.scenes.scene import Scene
 
@@ -49,13 +54,12 @@ SEARCHING = CanonicalSchedule(
 # Three frames. Level 0: frame 1 in 0–11, frame 2 in 12–17; level 1: 18–25 and 26–29.
 MOVING = DeformationSchedule(levels=(Level(4, 6), Level(6, 4)), rays=64)
 # The occupancy is looked up anew in iterations 3, 6, 9 of a visit; frames start along tracks.
-ALONG_TRACKS = MotionSettings(
+OFTEN = MotionSettings(
     learning_rate=2e-3,
     unit="box",
     views="all",
     pixels="occupied",
     occupancy_every=3,
-    init_from="tracks",
 )
 # Four frames. Level 0 in 0–15; level 1: frame 2 in 16–21, frames 1 and 3 in 22–27.
 TOGETHER = DeformationSchedule(levels=(Level(4, 4), Level(6, 6, parallel_frames=2)), rays=64)
@@ -68,6 +72,20 @@ BACKWARD = replace(
         Level(6, 4, parallel_frames=2, order="backward"),
     ),
 )
+
+
+def along_tracks() -> dict[str, Extension]:
+    return {"tracks": StartAlongFlow("tracks")}
+
+
+def elastic() -> dict[str, Extension]:
+    return {"elastic": Elastic()}
+
+
+def colors(start_level: int = 2) -> dict[str, Extension]:
+    return {"color_residual": ColorResidual("always", side=5, start_level=start_level)}
+
+
 PRIORS = {"render": 1.0, "cycle": 100.0, "tv": 1.0, "elastic": 0.1}
 # The field would not keep exactly what a visit has learned.
 ROUNDED = MotionSettings(occupancy_every=3, store="host", store_half=True)
@@ -158,12 +176,14 @@ def test_the_canonical_stage_goes_on_exactly(learn) -> None:
     assert_same(learn(canonical, *leaves), learn(canonical))
 
 
-@pytest.mark.parametrize("motion", [ALONG_TRACKS, ROUNDED], ids=["all views", "in half precision"])
+@pytest.mark.parametrize("motion", [OFTEN, ROUNDED], ids=["all views", "in half precision"])
 def test_the_deformation_stage_goes_on_exactly(
     learn, rest: LoadedCheckpoint, motion: MotionSettings
 ) -> None:
     def build() -> ScheduledStage:
-        return DeformationStage(copy.deepcopy(rest), MOVING, motion, iterations_per_step=1)
+        return DeformationStage(
+            copy.deepcopy(rest), MOVING, motion, iterations_per_step=1, extensions=along_tracks()
+        )
 
     # Mid-frame, around a look at the occupancy, around a frame's end, around a level's, at last.
     leaves = (2, 3, 4, 12, 13, 18, 26, 29)
@@ -174,7 +194,7 @@ def test_the_deformation_stage_goes_on_exactly(
     ("motion", "leaves"),
     [
         # Around each visit of level 1, and mid-visit.
-        (ALONG_TRACKS, (16, 17, 22, 24)),
+        (OFTEN, (16, 17, 22, 24)),
         # A visit ends after three steps, as their losses tell.
         (replace(ROUNDED, min_rel_improvement=1.0), (16, 17, 18, 23)),
     ],
@@ -188,7 +208,9 @@ def test_frames_that_are_visited_together_go_on_exactly(
     four_frames: SceneDataModule,
 ) -> None:
     def build() -> ScheduledStage:
-        return DeformationStage(copy.deepcopy(rest), TOGETHER, motion, iterations_per_step=1)
+        return DeformationStage(
+            copy.deepcopy(rest), TOGETHER, motion, iterations_per_step=1, extensions=along_tracks()
+        )
 
     whole = learn(build, data=four_frames)
     assert_same(learn(build, *leaves, data=four_frames), whole)
@@ -198,11 +220,13 @@ def test_frames_that_are_visited_together_go_on_exactly(
 def test_colours_that_change_go_on_exactly(
     learn, rest: LoadedCheckpoint, four_frames: SceneDataModule
 ) -> None:
-    appearance = AppearanceSettings(learn="always", side=5, start_level=2)
-
     def build() -> ScheduledStage:
         return DeformationStage(
-            copy.deepcopy(rest), TOGETHER, ROUNDED, iterations_per_step=1, appearance=appearance
+            copy.deepcopy(rest),
+            TOGETHER,
+            ROUNDED,
+            iterations_per_step=1,
+            extensions=colors(),
         )
 
     # Mid-visit at both levels, around a frame's end, around the level's.
@@ -212,20 +236,17 @@ def test_colours_that_change_go_on_exactly(
 
 
 def test_the_refinement_goes_on_exactly(learn, rest: LoadedCheckpoint) -> None:
-    def build() -> ScheduledStage:
-        return DeformationStage(
-            copy.deepcopy(rest),
-            MOVING,
-            ALONG_TRACKS,
-            iterations_per_step=1,
-            appearance=AppearanceSettings(learn="always", side=5),
-            refinement=RefinementSettings(iterations=6),
-        )
+    moving = DeformationField(rest.model.box, FrameClock((0.0, 0.5, 1.0)), voxels=4**3)
+    rest.model.deformation = moving
 
-    # At its beginning, within, before its end.
+    def build() -> ScheduledStage:
+        schedule = RefinementSchedule(6, rays=64)
+        return RefinementStage(copy.deepcopy(rest), schedule, iterations_per_step=1)
+
+    # Within, before its end.
     whole = learn(build)
-    assert_same(learn(build, 30, 33), whole)
-    assert whole["iteration"] == 36
+    assert_same(learn(build, 1, 3), whole)
+    assert whole["iteration"] == 6
 
 
 def test_a_second_sweep_with_the_elastic_prior_goes_on_exactly(
@@ -233,7 +254,9 @@ def test_a_second_sweep_with_the_elastic_prior_goes_on_exactly(
 ) -> None:
     def build() -> ScheduledStage:
         stage = copy.deepcopy(rest)
-        return DeformationStage(stage, BACKWARD, ROUNDED, PRIORS, iterations_per_step=1)
+        return DeformationStage(
+            stage, BACKWARD, ROUNDED, PRIORS, extensions=elastic(), iterations_per_step=1
+        )
 
     # Mid-visit, around a look at the occupancy, around visits and levels.
     leaves = (13, 20, 28, 31, 34)
@@ -243,7 +266,9 @@ def test_a_second_sweep_with_the_elastic_prior_goes_on_exactly(
 
 def test_a_step_of_many_iterations_goes_on_exactly(learn, rest: LoadedCheckpoint) -> None:
     def build() -> ScheduledStage:
-        return DeformationStage(copy.deepcopy(rest), MOVING, ALONG_TRACKS, iterations_per_step=4)
+        return DeformationStage(
+            copy.deepcopy(rest), MOVING, OFTEN, iterations_per_step=4, extensions=along_tracks()
+        )
 
     assert_same(learn(build, 4, 16, 26), learn(build))
 

@@ -24,11 +24,11 @@ from devrf.cli.memory import (
     tensor_bytes,
 )
 from devrf.geometry.box import Box
-from devrf.methods.devrf.appearance import AppearanceSettings
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
-from devrf.methods.devrf.refinement import RefinementSettings
+from devrf.methods.devrf.extensions.color_residual import AppearanceSettings
+from devrf.methods.devrf.extensions.refinement import RefinementSettings
 from devrf.methods.devrf.settings import MotionSettings
 from devrf.scenes.scene import Scene
 

@@ -66,8 +66,8 @@ def test_what_decides_nothing_may_change(again):
         (["schedule.canonical.upsample_at=[3]"], "schedule.canonical.upsample_at", "[2]", "[3]"),
         (["seed=1"], "seed", "0", "1"),
         (
-            ["schedule.motion.init_from=previous"],
-            "schedule.motion.init_from",
+            ["schedule.extensions.tracks.init_from=previous"],
+            "schedule.extensions.tracks.init_from",
             '"flow"',
             '"previous"',
         ),
@@ -107,7 +107,9 @@ def test_beginning_afresh_keeps_the_old_run_whole(again, run):
 
 def test_a_deformation_learned_afresh_keeps_its_canonical_field(again, run):
     before = contents(run / "checkpoints")
-    outcome = again("resume=false", "stage=deformation", "schedule.motion.init_from=previous")
+    outcome = again(
+        "resume=false", "stage=deformation", "schedule.extensions.tracks.init_from=previous"
+    )
     assert (outcome.status, outcome.err) == (0, "")
     assert contents(run / "previous-1" / "checkpoints") == before
     now = contents(run / "checkpoints")

@@ -10,9 +10,8 @@ from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.settings import RenderSettings
 from devrf.rendering.occupancy import Occupancy, dilate
-from devrf.rendering.sampling import march
+from devrf.rendering.sampling import RenderSettings, march
 
 
 @pytest.mark.parametrize(("width", "height"), [(40, 28), (37, 25)])

@@ -20,6 +20,7 @@ from devrf.engine.loop import ParallelBatch
 from devrf.engine.streams import StreamParallel
 from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
+from devrf.methods.devrf.extensions.tracks import StartAlongFlow
 from devrf.methods.devrf.settings import MotionSettings
 
 GPU, CPU = torch.device("cuda"), torch.device("cpu")
@@ -208,10 +209,12 @@ def test_flow_initialises_only_frames_whose_predecessor_was_learned(
 ) -> None:
     followed: list[int] = []
     monkeypatch.setattr(
-        "devrf.methods.devrf.deformation_stage.start_from_tracks",
+        "devrf.methods.devrf.extensions.tracks.start_from_tracks",
         lambda field, number, *rest, **options: followed.append(number),
     )
-    stage = DeformationStage(rest, TOGETHER, MotionSettings(init_from="flow"))
+    stage = DeformationStage(
+        rest, TOGETHER, MotionSettings(), extensions={"tracks": StartAlongFlow("flow")}
+    )
     trainer(max_epochs=1).fit(stage, datamodule=four_frames)
     # Not frame 2, which comes first: flow leads there from frame 1, not yet learned.
     assert followed == [1, 3]

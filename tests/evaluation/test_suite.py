@@ -23,11 +23,11 @@ from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.settings import RenderSettings
 from devrf.metrics.image import psnr_masked, ssim_masked
 from devrf.metrics.lpips import TRUNKS
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.renderer import Renderer
+from devrf.rendering.sampling import RenderSettings
 from devrf.scenes.scene import OpticalFlow, Scene, Views
 
 HOST = torch.device("cpu")

@@ -11,12 +11,12 @@ from torch import nn
 
 from devrf.data.batch import RayBatch
 from devrf.errors import DevrfError
-from devrf.methods.base import DynamicModel
+from devrf.methods.base import Renderable
 from devrf.rendering.output import RenderOutput
 from devrf.rendering.view import View
 
 
-class Toy(DynamicModel):
+class Toy(Renderable):
     """Two parts of a few numbers."""
 
     name = "toy"

@@ -11,10 +11,10 @@ import torch
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
 from devrf.methods.devrf.architecture import Architecture
-from devrf.methods.devrf.settings import RenderSettings
-from devrf.methods.devrf.volume_rendering import STOP, render
+from devrf.methods.devrf.volume_rendering import render
 from devrf.ops.search import PackedSamples, Thresholds, find_samples, select_listed
 from devrf.rendering.occupancy import Occupancy
+from devrf.rendering.sampling import STOP, RenderSettings
 
 LINE = Box((0.0, 0.0, 0.0), (4.0, 1.0, 1.0))
 # Opacities of five grid points along x: empty, half, half, opaque, half.

@@ -11,7 +11,7 @@ from hydra.utils import instantiate
 from devrf.cli.config_check import check_config
 from devrf.geometry.box import Box
 from devrf.geometry.ndc import NormalizedDevice
-from devrf.methods.devrf.grid_resolution import fitted_to
+from devrf.methods.devrf.architecture import fitted_to
 from devrf.scenes.procedural import ProceduralForwardScene
 
 

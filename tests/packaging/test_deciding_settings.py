@@ -13,7 +13,7 @@ def test_the_settings_that_decide_are_named_as_the_user_sets_them(composed):
     assert canonical["seed"] == 0 and canonical["data.box"] is None
     moving = deciding_settings(config, "deformation")
     assert moving["loss.deformation.flow"] == 0.005
-    assert moving["schedule.motion.init_from"] == "flow"
+    assert moving["schedule.extensions.tracks.init_from"] == "flow"
     for settings in (canonical, moving):
         words = ("root", "flow_cache", "trainer", "logger", "video", "evaluation", "callbacks")
         assert not [key for key in settings for word in words if word in key]

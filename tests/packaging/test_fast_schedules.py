@@ -34,4 +34,7 @@ def test_iterations(composed, overrides, frames, canonical, deformation, of_pape
     assert rest.side == before["canonical"].side
     assert sides(moves) == sides(before["deformation"])
     assert max(rest.upsample_at) < canonical / 2
-    assert config.schedule.motion.init_from == "flow" and config.schedule.motion.views == "all"
+    assert (
+        config.schedule.extensions.tracks.init_from == "flow"
+        and config.schedule.motion.views == "all"
+    )

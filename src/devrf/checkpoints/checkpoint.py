@@ -93,7 +93,7 @@ class LoadedCheckpoint:
 
     Attributes:
         metadata: which scene, and how it was learned.
-        model: the scene, ready to render: a :class:`~devrf.methods.base.DynamicModel`.
+        model: the scene, ready to render: a :class:`~devrf.methods.base.Renderable`.
         viewpoints: where the scene was seen from; None where the file does not say.
     """
 

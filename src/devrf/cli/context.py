@@ -23,7 +23,7 @@ from devrf.engine.ddp import ManualDDP
 from devrf.engine.stage import ScheduledStage
 from devrf.errors import DevrfError
 from devrf.evaluation.suite import Evaluation
-from devrf.methods.protocol import Protocol
+from devrf.methods.protocol import Protocol, ProtocolStage
 from devrf.scenes.scene import Scene
 
 if TYPE_CHECKING:
@@ -82,7 +82,12 @@ class RunContext:
     @property
     def learning_stages(self) -> tuple[str, ...]:
         """Names of the protocol's stages, in their order."""
-        return tuple(step.name for step in self.protocol.steps)
+        return tuple(step.name for step in self.protocol.steps if self._has(step))
+
+    def _has(self, step: ProtocolStage) -> bool:
+        """Whether the method learns by a stage that is optional: it has one, with iterations."""
+        iterations = OmegaConf.select(self.config, f"{step.name}.schedule.iterations")
+        return not step.optional or bool(iterations)
 
     def stage_key(self, name: str) -> str:
         """The config key of a stage: its own name, or ``ray_stage``."""
@@ -104,6 +109,7 @@ class RunContext:
             self.config[key], _partial_=True, _convert_="all"
         )
         if key == name:
+            build.func.check_settings(**build.keywords)  # type: ignore[attr-defined]
             if self.protocol.freeze is not True:
                 raise DevrfError(
                     f"protocol.freeze: method={self.config.method} has stages of its own, which "

@@ -22,7 +22,7 @@ from devrf.cli.context import GIVEN_REST, OWN_REST, RunContext
 from devrf.cli.scene_stages import stages_with_images
 from devrf.evaluation.held_out import HeldOutView, score
 from devrf.evaluation.suite import MetricSuite
-from devrf.methods.base import DynamicModel
+from devrf.methods.base import Renderable
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import CaptureName
 from devrf.system.files import write_json
@@ -150,7 +150,7 @@ def _origin(run: RunContext, described: CheckpointMetadata) -> dict[str, Any]:
 
 
 def _score(
-    run: RunContext, model: DynamicModel, capture: CaptureName, suite: MetricSuite
+    run: RunContext, model: Renderable, capture: CaptureName, suite: MetricSuite
 ) -> list[HeldOutView]:
     """Score a capture's held-out views; the static ones show the rest state at any time."""
     views, background = run.scene.capture(capture).test, run.scene.background

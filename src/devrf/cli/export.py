@@ -26,7 +26,7 @@ from devrf.cli.context import RunContext
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value
 from devrf.geometry.cameras import Cameras
-from devrf.methods.base import DynamicModel
+from devrf.methods.base import Renderable
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene
 from devrf.system.progress import followed
@@ -41,7 +41,7 @@ def export(run: RunContext) -> None:
     """Write the surface of what was learned, as it moves, or coloured points of each time."""
     settings: ExportSettings = instantiate(run.config.export, _convert_="all")
     stored, scene = run.load(), run.scene
-    model: DynamicModel = stored.model.to_view(run.device)
+    model: Renderable = stored.model.to_view(run.device)
     folder = run.folder / "export" if settings.into is None else Path(settings.into)
     times = settings.moments(scene.clock) if model.moves else (0.0,)
     if _takes_surface(model, settings):
@@ -59,7 +59,7 @@ def export(run: RunContext) -> None:
             log.warning("the files are empty: nothing that the cameras see hides what is behind it")
 
 
-def _takes_surface(model: DynamicModel, settings: ExportSettings) -> bool:
+def _takes_surface(model: Renderable, settings: ExportSettings) -> bool:
     """Whether a surface is exported, not points.
 
     Raises:
@@ -82,7 +82,7 @@ def _takes_surface(model: DynamicModel, settings: ExportSettings) -> bool:
 
 
 def _moving_mesh(
-    model: DynamicModel, scene: Scene, settings: ExportSettings, times: tuple[float, ...]
+    model: Renderable, scene: Scene, settings: ExportSettings, times: tuple[float, ...]
 ) -> MovingMesh:
     field, device = model.surface(), model.device
     assert field is not None
@@ -114,7 +114,7 @@ def _write_mesh(folder: Path, mesh: MovingMesh, scene: Scene, settings: ExportSe
 
 def _write_points(
     folder: Path,
-    model: DynamicModel,
+    model: Renderable,
     scene: Scene,
     settings: ExportSettings,
     times: tuple[float, ...],

@@ -12,14 +12,11 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 import torch
 from torch import Tensor, nn
 
-from devrf.methods.devrf.appearance import AppearanceSettings
-from devrf.methods.devrf.architecture import Architecture
+from devrf.engine.frame_store import active_bytes, resident_bytes
+from devrf.methods.devrf.architecture import Architecture, fitted_to
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
-from devrf.methods.devrf.frame_memory import active_bytes, resident_bytes
-from devrf.methods.devrf.grid_resolution import fitted_to
-from devrf.methods.devrf.refinement import RefinementSettings
 from devrf.methods.devrf.settings import MotionSettings
 from devrf.scenes.scene import Scene, Views
 
@@ -29,7 +26,6 @@ Parts = Mapping[tuple[str, ...], int]
 IMAGES = ("data.downscale", "data.width", "data.frames")
 GRIDS = ("schedule.canonical.side",)
 FRAMES = ("schedule.deformation.levels", "data.frames")
-APPEARANCE = ("schedule.appearance.side", "data.frames")
 PARALLEL = ("schedule.deformation.levels",)
 
 # Python and its libraries on the host, without what the driver of a GPU adds.
@@ -190,8 +186,6 @@ def estimate(
     architecture: Architecture,
     step: float = 0.5,
     motion: MotionSettings | None = None,
-    appearance: AppearanceSettings | None = None,
-    refinement: RefinementSettings | None = None,
 ) -> Budget:
     """What DeVRF needs to learn ``scene``, with samples ``step`` voxels apart.
 
@@ -223,10 +217,6 @@ def estimate(
         _level_needs(scene, field, rest, deformation, level, motion, batch)
         for level in range(len(deformation.levels))
     ]
-    if appearance is not None and appearance.learn != "never":
-        moving = [_with_appearance(one, scene, field, appearance.side) for one in moving]
-    if refinement is not None and refinement.iterations:
-        moving.append(_refinement_needs(moving[-1], scene, field))
     everything = tensor_bytes(scene.captures.values())
     return Budget(everything, {"canonical": rest, "deformation": max(moving, key=StageNeeds.peak)})
 
@@ -243,35 +233,6 @@ def _canonical_needs(scene: Scene, field: CanonicalField, batch: int) -> StageNe
         checkpoint=needs.checkpoint - grids // 2 + points,  # in half precision
         progress=needs.progress + 5 * points,  # with the number of views of each voxel
     )
-
-
-def _with_appearance(
-    needs: StageNeeds, scene: Scene, field: CanonicalField, side: int
-) -> StageNeeds:
-    """What a level needs with residuals of colours, on grids of about side³ voxels."""
-    x, y, z = field.box.grid_shape(side**3)
-    frame = x * y * z * 12
-    learned, active = len(scene.clock) * frame, needs.batches * frame
-    return replace(
-        needs,
-        # An active frame's values, gradients, two moments, and the copy for a rollback.
-        held={**needs.held, APPEARANCE: learned + 5 * active},
-        learned=needs.learned + learned,
-        checkpoint=needs.checkpoint + learned // 2,
-        progress=needs.progress + learned + 2 * active,
-    )
-
-
-def _refinement_needs(last: StageNeeds, scene: Scene, field: CanonicalField) -> StageNeeds:
-    """What refining the canonical field needs, after the ``last`` level, with all of that."""
-    views, points = scene.dynamic.train, field.density.values.numel()
-    parameters = tensor_bytes(field.parameters())
-    pools = len(views) * views.height * views.width * POOLED
-    occupancies = 2 * len(scene.clock) * points
-    # Gradients, two moments, and the copy that a rollback returns to.
-    held = {**last.held, IMAGES: last.held[IMAGES] + pools}
-    held[GRIDS] += 4 * parameters + occupancies
-    return replace(last, held=held, progress=last.progress + 2 * parameters)
 
 
 def _level_needs(

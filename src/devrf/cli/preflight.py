@@ -85,16 +85,16 @@ def _of_rays(run: RunContext) -> Budget:
 
 def _of_devrf(run: RunContext) -> Budget:
     canonical = instantiate(run.config.canonical, _convert_="all")
-    return estimate(
+    budget = estimate(
         run.scene,
         canonical.schedule,
         instantiate(run.config.deformation.schedule, _convert_="all"),
         canonical.architecture,
         canonical.sampling.step,
         instantiate(run.config.deformation.motion, _convert_="all"),
-        instantiate(run.config.deformation.appearance, _convert_="all"),
-        instantiate(run.config.deformation.refinement, _convert_="all"),
     )
+    # It holds what the deformation has learned, and learns the canonical field.
+    return replace(budget, stages={**budget.stages, "refinement": budget.stages["deformation"]})
 
 
 def preflight(run: RunContext, learns: Sequence[str], *, films: bool) -> str | None:

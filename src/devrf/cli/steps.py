@@ -40,9 +40,6 @@ from devrf.cli.view import view
 from devrf.cli.workers import launch_workers
 from devrf.engine.ddp import ManualDDP
 from devrf.errors import DevrfError
-from devrf.methods.devrf.appearance_learning import check_weights
-from devrf.methods.devrf.losses import MOTION_TERMS, PHOTOMETRIC_TERMS
-from devrf.methods.devrf.weighted_loss import WeightedLoss
 from devrf.ops.dispatch import using
 
 log = logging.getLogger(__name__)
@@ -228,11 +225,6 @@ def _check(run: RunContext, asked: Plan) -> None:
     _ = run.datamodule
     for name in run.learning_stages:
         run.stage_builder(name)
-    if "deformation" in config:
-        weights = {k: v for k, v in config.deformation.loss.items() if k != "tv"}
-        WeightedLoss(MOTION_TERMS, weights)
-        WeightedLoss(PHOTOMETRIC_TERMS, dict(config.deformation.refinement_loss))
-        check_weights(config.deformation.appearance_loss)
     run.evaluation.check()
     check_objective(config.objective, run.evaluation.metrics)
     if job.in_search() and "evaluate" not in asked.further:

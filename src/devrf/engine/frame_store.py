@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -20,7 +20,18 @@ from devrf.system.memory import page_locked
 log = logging.getLogger(__name__)
 
 Directions = tuple[Tensor, Tensor]
+Shape = tuple[int, int, int]
 NAMES = ("to_canonical", "to_time")
+
+
+# A displacement: three float32.
+DISPLACEMENT = 12
+# Grids of an active frame: both directions and the forward one of the frame before (3),
+# gradients (2), Adam moments (4), and the copy that a rollback returns to (2).
+ACTIVE_GRIDS = 11
+# The share of a GPU's free memory that frames may take. The rest is for images, the canonical
+# field and batches.
+FRAMES_SHARE = 0.75
 
 
 class FrameStore(nn.Module):
@@ -49,6 +60,12 @@ class FrameStore(nn.Module):
         self._reserved: list[Tensor] = []
         # One for good: the allocator keeps the memory of each stream apart.
         self._side: torch.cuda.Stream | None = None
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Grid points along x, y, z."""
+        _, x, y, z, _ = self.to_canonical.shape
+        return x, y, z
 
     @torch.no_grad()
     def read(self, frame: int, into: Directions) -> None:
@@ -144,6 +161,36 @@ class FrameStore(nn.Module):
             moved = self._empty(frames.shape, torch.float16 if half else torch.float32)
             setattr(self, name, moved.copy_(frames))
 
+    def keep(
+        self,
+        store: Literal["auto", "device", "host"],
+        device: torch.device,
+        shape: Shape,
+        *,
+        half: bool,
+        parallel: int,
+    ) -> None:
+        """Choose where the frames are kept, before the clock of training starts.
+
+        Args:
+            store: on the device, on the host, or on the device if they fit there.
+            device: where they are learned.
+            shape: of their grids in the end.
+            half: whether in half precision.
+            parallel: how many are learned at once.
+        """
+        on_host = store == "host"
+        if store == "auto" and device.type == "cuda":
+            free, _ = torch.cuda.mem_get_info(device)
+            frames = len(self.to_time)
+            on_host = not fits_on_device(free, frames, shape, half=half, parallel=parallel)
+            if on_host:
+                log.info(
+                    "motion: %.1f GB are free on the GPU: frames are kept on the host", free / 1e9
+                )
+        self.offload(on_host=on_host, half=half)
+        self.reserve(shape)
+
     def reserve(self, shape: tuple[int, int, int]) -> None:
         """Lock memory for grids of ``shape`` now, if frames rest in page-locked memory.
 
@@ -191,3 +238,21 @@ class FrameStore(nn.Module):
             if stored is not None and stored.shape != frames.shape:
                 setattr(self, name, self._empty(stored.shape, frames.dtype))
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+
+
+def resident_bytes(frames: int, shape: Shape, half: bool) -> int:
+    """Bytes of T ``frames`` in both directions, on grids of ``shape``, or ``half`` of them."""
+    x, y, z = shape
+    return 2 * frames * x * y * z * DISPLACEMENT // (2 if half else 1)
+
+
+def active_bytes(shape: Shape) -> int:
+    """Bytes of an active frame on a grid of ``shape``."""
+    x, y, z = shape
+    return ACTIVE_GRIDS * x * y * z * DISPLACEMENT
+
+
+def fits_on_device(free: int, frames: int, shape: Shape, *, half: bool, parallel: int) -> bool:
+    """Whether T ``frames``, ``parallel`` of them active, fit into ``free`` bytes of a GPU."""
+    needed = resident_bytes(frames, shape, half) + parallel * active_bytes(shape)
+    return needed <= FRAMES_SHARE * free

@@ -72,7 +72,7 @@ def in_words(frames: tuple[int, ...]) -> str:
 
 
 class LearnedModel(Viewable, Protocol):
-    """What a stage learns: a :class:`~devrf.methods.base.DynamicModel`."""
+    """What a stage learns: a :class:`~devrf.methods.base.Renderable`."""
 
     def config(self) -> dict[str, Any]:
         """Plain data to build it from."""
@@ -194,6 +194,14 @@ class ScheduledStage(LightningModule, ABC):
         """Continue ``phase`` with the state ``kept``; the model's tensors are loaded."""
 
     # What a subclass may define.
+
+    @classmethod
+    def check_settings(cls, **settings: Any) -> None:
+        """Find errors in the arguments of the stage before what it builds on has been learned.
+
+        Raises:
+            DevrfError: one is wrong.
+        """
 
     def prepare(self) -> None:
         """Called before each iteration; may wait for the device."""

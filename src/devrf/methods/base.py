@@ -1,10 +1,11 @@
-"""What every method is: a module that renders a batch of rays and says its losses.
+"""What every method is: a scene that can be rendered, and, of most, a module that learns from rays.
 
 A method's module is configured by ``conf/method/<name>.yaml``; which data trains which of its
-parts is said by ``conf/protocol/*.yaml``, and carried out by a stage (``methods.ray_stage`` for any
-method, ``methods.devrf`` has two of its own). Everything that shows a learned scene (films,
-stills, evaluation) asks for :meth:`DynamicModel.at` alone; exports also for
-:meth:`DynamicModel.surface` and :meth:`DynamicModel.forward_map`, which a method may have.
+parts is said by ``conf/protocol/*.yaml``. :class:`RayTrainable` methods are learned by
+``methods.ray_stage``; DeVRF has stages of its own (``methods.devrf``), and is :class:`Renderable`
+alone. Everything that shows a learned scene (videos, stills, evaluation) asks for
+:meth:`Renderable.at`; exports also for :meth:`Renderable.surface` and
+:meth:`Renderable.forward_map`, which a method may have.
 """
 
 from __future__ import annotations
@@ -27,15 +28,11 @@ from devrf.rendering.view import SurfaceField, View
 from devrf.scenes.scene import Scene, Views
 
 
-class DynamicModel(nn.Module, ABC):
-    """A scene that moves, learned by some method.
+class Renderable(nn.Module, ABC):
+    """A scene, learned by some method, to be rendered from any view at any time.
 
     Attributes:
         name: the method's name: what ``method=`` chooses, and tables say.
-        losses: the names of its loss terms.
-        protocols: the names of the protocols that it learns by; None: every one.
-        priors: what it wants of a scene beside images and backward flow, where it can be had:
-            ``forward_flow``.
         box: what holds the scene, in the space of the fields.
         space: the space that the fields live in: world units, or NDC.
         depth_limits: distances along a ray before and behind which nothing is sampled, in the
@@ -43,9 +40,6 @@ class DynamicModel(nn.Module, ABC):
     """
 
     name: ClassVar[str]
-    losses: ClassVar[tuple[str, ...]] = ("color",)
-    protocols: ClassVar[tuple[str, ...] | None] = None
-    priors: ClassVar[tuple[str, ...]] = ()
     box: Box
     space: Space
     depth_limits: tuple[float, float]
@@ -58,9 +52,79 @@ class DynamicModel(nn.Module, ABC):
         """
 
     @classmethod
-    def from_config(cls, config: Mapping[str, Any]) -> DynamicModel:
+    def from_config(cls, config: Mapping[str, Any]) -> Renderable:
         """The module that :meth:`config` described, with other values in it."""
         return cls(**config)
+
+    @abstractmethod
+    def at(self, time: float, *, half: bool = False) -> View:
+        """The scene at ``time`` in [0, 1], ready to be looked at from anywhere.
+
+        Args:
+            time: in [0, 1].
+            half: let networks work in half precision where device and method can.
+        """
+
+    def surface(self) -> SurfaceField | None:
+        """The scene at rest as a field of which a surface can be taken; None: there is none.
+
+        Exports ask for it, and for :meth:`forward_map`; of a method that has not both they take
+        what :meth:`at` shows.
+        """
+        return None
+
+    def forward_map(self, time: float) -> Callable[[Tensor], Tensor] | None:
+        """q → x(q, t): where canonical points (M, 3) are at ``time``, both in the fields' space.
+
+        The identity at time 0. None: the method knows only the way back, from x to q, or none.
+        """
+        return None
+
+    def to_view(self, device: torch.device) -> Self:
+        """The model on ``device``, to be looked at; what only some times need may come later."""
+        return self.to(device)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the parameters are."""
+        return next(self.parameters()).device
+
+    @property
+    def moves(self) -> bool:
+        """Whether it has learned to move: False for a rest state alone."""
+        return True
+
+    @property
+    def size(self) -> int:
+        """How many numbers are learned."""
+        return sum(parameter.numel() for parameter in self.parameters())
+
+    def stored_state(self) -> dict[str, Any]:
+        """The state for a finished checkpoint: tensors and plain data, as small as can be."""
+        return self.state_dict()
+
+    def load_stored_state(self, state: Mapping[str, Any]) -> None:
+        """Take what :meth:`stored_state` gave, or a full state.
+
+        Raises:
+            RuntimeError | KeyError | ValueError | TypeError: it does not fit.
+        """
+        self.load_state_dict(dict(state))
+
+
+class RayTrainable(Renderable):
+    """A method that renders a batch of rays and says its losses.
+
+    Attributes:
+        losses: the names of its loss terms.
+        protocols: the names of the protocols that it learns by; None: every one.
+        priors: what it wants of a scene beside images and backward flow, where it can be had:
+            ``forward_flow``.
+    """
+
+    losses: ClassVar[tuple[str, ...]] = ("color",)
+    protocols: ClassVar[tuple[str, ...] | None] = None
+    priors: ClassVar[tuple[str, ...]] = ()
 
     def check_protocol(self, protocol: str) -> None:
         """Refuse a protocol that the method cannot learn by.
@@ -162,53 +226,10 @@ class DynamicModel(nn.Module, ABC):
     def on_iteration(self, step: int, total: int) -> None:
         """Called before iteration ``step`` of ``total``: for encoding windows and curricula."""
 
-    @abstractmethod
-    def at(self, time: float, *, half: bool = False) -> View:
-        """The scene at ``time`` in [0, 1], ready to be looked at from anywhere.
-
-        Args:
-            time: in [0, 1].
-            half: let networks work in half precision where device and method can.
-        """
-
-    def surface(self) -> SurfaceField | None:
-        """The scene at rest as a field of which a surface can be taken; None: there is none.
-
-        Exports ask for it, and for :meth:`forward_map`; of a method that has not both they take
-        what :meth:`at` shows.
-        """
-        return None
-
-    def forward_map(self, time: float) -> Callable[[Tensor], Tensor] | None:
-        """q → x(q, t): where canonical points (M, 3) are at ``time``, both in the fields' space.
-
-        The identity at time 0. None: the method knows only the way back, from x to q, or none.
-        """
-        return None
-
-    def to_view(self, device: torch.device) -> Self:
-        """The model on ``device``, to be looked at; what only some times need may come later."""
-        return self.to(device)
-
-    @property
-    def device(self) -> torch.device:
-        """Where the parameters are."""
-        return next(self.parameters()).device
-
-    @property
-    def moves(self) -> bool:
-        """Whether it has learned to move: False for a rest state alone."""
-        return True
-
     @property
     def has_hull(self) -> bool:
         """Whether the scene's mattes tell which space rays need not be sampled in."""
         return False
-
-    @property
-    def size(self) -> int:
-        """How many numbers are learned."""
-        return sum(parameter.numel() for parameter in self.parameters())
 
     def batch_bytes(self, rays: int) -> int:
         """About what learning from a batch of rays takes, the graph of its gradients included.
@@ -217,15 +238,3 @@ class DynamicModel(nn.Module, ABC):
         """
         layers = [module for module in self.modules() if isinstance(module, nn.Linear)]
         return 128 * rays * 12 * sum(layer.out_features for layer in layers)
-
-    def stored_state(self) -> dict[str, Any]:
-        """The state for a finished checkpoint: tensors and plain data, as small as can be."""
-        return self.state_dict()
-
-    def load_stored_state(self, state: Mapping[str, Any]) -> None:
-        """Take what :meth:`stored_state` gave, or a full state.
-
-        Raises:
-            RuntimeError | KeyError | ValueError | TypeError: it does not fit.
-        """
-        self.load_state_dict(dict(state))

@@ -20,10 +20,10 @@ from devrf.engine.ddp import rays_per_rank
 from devrf.engine.loop import ParallelBatch
 from devrf.engine.stage import Phase, ScheduledStage
 from devrf.errors import DevrfError
-from devrf.methods.base import DynamicModel
+from devrf.methods.base import RayTrainable
 from devrf.methods.protocol import ProtocolStage
+from devrf.methods.weighted_loss import counted_weights, visibility, weighted_sum
 from devrf.ops.adam import GridAdam
-from devrf.rendering.output import RenderOutput
 from devrf.scenes.scene import CaptureName, Scene, Views
 from devrf.scenes.space import dynamic_only
 from devrf.system.profiling import span
@@ -92,7 +92,7 @@ class RaySchedule:
 
 
 class RayStage(ScheduledStage):
-    """Learns a :class:`~devrf.methods.base.DynamicModel` from random rays of all its images.
+    """Learns a :class:`~devrf.methods.base.RayTrainable` from random rays of all its images.
 
     A batch's rays have times of their own. Of a stage that learns from both captures a fixed share
     of each batch is static, whatever the numbers of images.
@@ -100,11 +100,11 @@ class RayStage(ScheduledStage):
 
     rate_keys = "ray_stage.schedule.learning_rate or the weights of ray_stage.loss"
     memory_keys = ("ray_stage.schedule.rays",)
-    scene_model: DynamicModel
+    scene_model: RayTrainable
 
     def __init__(
         self,
-        model: DynamicModel,
+        model: RayTrainable,
         schedule: RaySchedule,
         loss: Mapping[str, float],
         step: ProtocolStage,
@@ -124,20 +124,12 @@ class RayStage(ScheduledStage):
         super().__init__(schedule.iterations_per_step)
         self.name, self.capture, self.step_of_protocol = step.name, step.capture, step
         self.schedule, self.static_share = schedule, static_share
-        self.weights = {name: weight for name, weight in loss.items() if weight}
         self.scene_model = model
         self._ready = rest is not None
         if rest is not None:
             self.scene_model = rest.model
             self.earlier_records = rest.metadata.records
-        for name in loss:
-            if name not in self.scene_model.losses:
-                known = ", ".join(self.scene_model.losses)
-                raise DevrfError(
-                    f"ray_stage.loss: {self.scene_model.name} has no term {name!r}; it has {known}"
-                )
-        if not self.weights:
-            raise DevrfError("ray_stage.loss: every weight is zero; at least one term must count")
+        self.weights = counted_weights(loss, self.scene_model.losses, "ray_stage.loss")
         self.pools: list[FramePool] = []
         self._rays = schedule.rays
         self._optimizer: GridAdam | None = None
@@ -252,9 +244,8 @@ class RayStage(ScheduledStage):
         output = self.scene_model(rays)
         with span("losses"):
             values = self.scene_model.loss_terms(output, rays, self.weights)
-            total = torch.stack([self.weights[name] * value for name, value in values.items()])
-            terms = {name: value.detach() for name, value in values.items()}
-            return total.sum(), {**terms, **_visibility(output, rays)}
+            total, terms = weighted_sum(values, self.weights)
+            return total, terms | visibility(output.transmittance, rays.alpha)
 
     def _gather(self, views: Views | tuple[Views, ...], pixels: Pixels) -> RayBatch:
         """The batch of pixels, in the order of their images' captures."""
@@ -280,10 +271,3 @@ class RayStage(ScheduledStage):
     def restore(self, phase: Phase, kept: dict[str, Any]) -> None:
         """Go on with ``phase``, the model being loaded."""
         self.enter(phase)
-
-
-@torch.no_grad()
-def _visibility(output: RenderOutput, batch: RayBatch) -> dict[str, Tensor]:
-    """How much is seen, and how much should be: means over rays in [0, 1]."""
-    seen = {"opacity": 1 - output.transmittance.mean()}
-    return seen if batch.alpha is None else {**seen, "coverage": batch.alpha.mean()}

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
+
+from devrf.rendering.sampling import Samples
+
+# Canonical points (M, 3) → what is added to the logits of their colours, (M, 3).
+ColorChange = Callable[[Tensor], Tensor]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,3 +58,49 @@ class RenderedImage:
             torch.cat([part.depth for part in parts]),
             torch.cat([part.opacity for part in parts]),
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class VoxelOutput(RenderOutput):
+    """What R rays see, and the K samples whose colour was computed.
+
+    Attributes:
+        samples: at their positions x_i at the rays' time.
+        canonical: (K, 3) their canonical positions q_i.
+        weight: (K,) their weights w_i.
+        sample_color: (K, 3) their colours c_i.
+        residual: (K, 3) A_t(q_i) in logits; None without one.
+        first: (R + 1,) where each ray's samples begin in a list of fixed length; None elsewhere.
+    """
+
+    samples: Samples
+    canonical: Tensor
+    weight: Tensor
+    sample_color: Tensor
+    residual: Tensor | None = None
+    first: Tensor | None = None
+
+    def mean_over_samples(self, values: Tensor) -> Tensor:
+        """The mean () of values (K,) of samples, padding left out; 0 without samples."""
+        present = self.samples.present
+        if present is not None:
+            return torch.where(present, values, 0.0).sum() / present.sum().clamp(min=1)
+        return values.mean() if len(values) else values.sum()
+
+    def count_on(self, chosen: Tensor) -> Tensor:
+        """The number () of samples on the ``chosen`` (R,) rays, padding left out."""
+        kept, present = chosen[self.samples.ray], self.samples.present
+        return kept.sum() if present is None else (kept & present).sum()
+
+    def on_rays(self, chosen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Ray (S,), canonical position (S, 3) and weight (S,) of the ``chosen`` (R,) rays' samples.
+
+        A list of fixed length keeps its length: other samples get weight 0 and a harmless position.
+        """
+        ray, kept = self.samples.ray, chosen[self.samples.ray]
+        if self.samples.present is None:
+            index = kept.nonzero()[:, 0]
+            return ray[index], self.canonical[index], self.weight[index]
+        kept = kept & self.samples.present
+        canonical = torch.where(kept[:, None], self.canonical, 0.0)
+        return ray, canonical, torch.where(kept, self.weight, 0.0)

@@ -12,6 +12,27 @@ from devrf.geometry.rays import Rays
 from devrf.ops.pixel_rays import steps_between
 from devrf.rendering.occupancy import Occupancy
 
+# A ray ends where its transmittance is less: what is behind cannot be seen.
+STOP = 1e-4
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """How rays are sampled at the present resolution.
+
+    Attributes:
+        step: distance between samples in voxels of the present resolution.
+        alpha_threshold: samples of a lower opacity, and then of a lower weight, are dropped before
+            their colour is computed.
+        near: distance before which nothing is sampled, in world units (or NDC).
+        far: distance behind which nothing is sampled, likewise.
+    """
+
+    step: float
+    alpha_threshold: float
+    near: float
+    far: float
+
 
 @dataclass(frozen=True)
 class Samples:

@@ -60,7 +60,7 @@ class MovingView(View, Protocol):
 
 
 class Viewable(Protocol):
-    """A scene that can be rendered: a :class:`~devrf.methods.base.DynamicModel`."""
+    """A scene that can be rendered: a :class:`~devrf.methods.base.Renderable`."""
 
     @property
     def box(self) -> Box:

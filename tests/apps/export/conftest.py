@@ -16,8 +16,8 @@ from devrf.geometry.space import WORLD, Space
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.settings import RenderSettings
 from devrf.rendering.occupancy import Occupancy
+from devrf.rendering.sampling import RenderSettings
 
 Distance = Callable[[Tensor], Tensor]
 RADIUS = 0.5

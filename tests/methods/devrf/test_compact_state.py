@@ -11,10 +11,10 @@ from devrf.geometry.rays import Rays
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.settings import RenderSettings
 from devrf.metrics.image import psnr
 from devrf.rendering.occupancy import Occupancy, dilate
 from devrf.rendering.renderer import Renderer
+from devrf.rendering.sampling import RenderSettings
 
 SIDE, MOTION = 24, 18
 TIMES = (0.0, 0.25, 0.5, 0.75, 1.0)

@@ -11,25 +11,25 @@ import torch
 from lightning import Trainer
 
 from devrf.data.rendered import RenderedDataModule
+from devrf.engine.active_frames import ActiveFrame
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.geometry.contraction import ContractedSpace
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import WORLD
-from devrf.methods.devrf.active_frame import ActiveFrame
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.color_decoder import ColorDecoder
-from devrf.methods.devrf.deformation_field import DeformationField
+from devrf.methods.devrf.deformation_field import DeformationField, GridWarp
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
-from devrf.methods.devrf.flow_initialisation import Tracks, start_from_tracks
-from devrf.methods.devrf.grid_warp import GridWarp
+from devrf.methods.devrf.extensions.tracks import StartAlongFlow, Tracks, start_from_tracks
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.settings import MotionSettings, RenderSettings
+from devrf.methods.devrf.settings import MotionSettings
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.renderer import Renderer
+from devrf.rendering.sampling import RenderSettings
 from devrf.scenes.scene import Scene
 
 SPACE = ContractedSpace((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), shell=0.5)
@@ -56,9 +56,12 @@ def test_a_field_and_its_active_frame_agree_on_what_stays() -> None:
     field.to_canonical[1:] = 0.25
     outside = torch.tensor([[1.3, 0.0, 0.0]])
     assert torch.equal(field.warp(outside, 1.0), outside)
-    frame = ActiveFrame.of(field, Occupancy.full((4, 4, 4), SPACE.box))
-    frame.check_out(field, 1)
-    assert torch.equal(frame.warp(outside), outside) and frame.occupancy.box == SPACE.box
+    frame = ActiveFrame.of(field.frames, Occupancy.full((4, 4, 4), SPACE.box), {})
+    frame.check_out(1)
+    assert (
+        torch.equal(field.warp_by(frame.backward)(outside), outside)
+        and frame.occupancy.box == SPACE.box
+    )
     again = DeformationField(Box((0.0,) * 3, (1.0,) * 3), clock, voxels=8)
     again.set_extra_state(field.get_extra_state())
     assert again.still_outside and again.box == SPACE.inner()
@@ -188,7 +191,8 @@ def test_a_room_is_learned_and_moves_inside_the_inner_box(
     moving = DeformationStage(
         stage.result(),
         DeformationSchedule(levels=(Level(6, 10),), rays=256),
-        MotionSettings(unit="box", views="all", init_from="flow"),
+        MotionSettings(unit="box", views="all"),
+        extensions={"tracks": StartAlongFlow("flow")},
     )
     trainer(max_epochs=1).fit(moving, datamodule=data)
     assert moving.field.box == room.space.inner(room.bounds.box) and moving.field.still_outside

@@ -18,6 +18,8 @@ from devrf.evaluation.held_out import score
 from devrf.methods.devrf.compact_state import expanded_state
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
+from devrf.methods.devrf.extensions.priors import Elastic
+from devrf.methods.devrf.extensions.tracks import StartAlongFlow
 from devrf.methods.devrf.settings import MotionSettings
 from devrf.ops.adam_step import add_total_variation_gradient
 from devrf.rendering.renderer import Renderer
@@ -116,7 +118,7 @@ class Seen(Callback):
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: Any, *args: Any) -> None:
         level, group = pl_module.phase.level, pl_module.optimizer.param_groups[0]
-        self.elastic[level] = pl_module.losses.weights["elastic"]
+        self.elastic[level] = pl_module.weights.get("elastic", 0.0)
         self.smoothing[level] = group["smoothing"]
         self.rates.setdefault(level, []).append(group["lr"])
 
@@ -130,7 +132,9 @@ def test_each_level_has_its_weights_and_rates(
     schedule = DeformationSchedule((Level(4, 2, weight_factors={"elastic": 0}), second), rays=16)
     loss = {"render": 1, "elastic": 0.2, "tv": 1}
     motion = MotionSettings(learning_rate=0.01)
-    stage = DeformationStage(rest, schedule, motion, loss=loss, iterations_per_step=1)
+    stage = DeformationStage(
+        rest, schedule, motion, loss, extensions={"e": Elastic()}, iterations_per_step=1
+    )
     seen = Seen()
     trainer(seen, max_epochs=1).fit(stage, datamodule=datamodule)
     assert seen.elastic == {0: 0.0, 1: pytest.approx(0.6)}
@@ -164,12 +168,12 @@ def test_the_flow_of_a_moving_camera_neither_starts_nor_teaches_a_frame(
     if moving:
         train = replace(train, view=torch.arange(len(train)))
     module = serve(replace(tiny_scene, dynamic=replace(tiny_scene.dynamic, train=train)))
-    motion = MotionSettings(learning_rate=1e-9, init_from="flow")
-    stage = DeformationStage(rest, SHORT, motion, iterations_per_step=1)
+    motion, along = MotionSettings(learning_rate=1e-9), {"tracks": StartAlongFlow("flow")}
+    stage = DeformationStage(rest, SHORT, motion, iterations_per_step=1, extensions=along)
     with caplog.at_level("INFO"):
         trainer(max_steps=1).fit(stage, datamodule=module)
     assert (stage.field.to_time[1].abs().amax() > 1e-3) is not moving
-    assert (stage.losses.weights["flow"] > 0) is not moving
+    assert ("flow" in stage.weights) is not moving
     assert sum("the camera moves" in line for line in caplog.messages) == moving
 
 

@@ -9,9 +9,8 @@ import torch
 
 from devrf.errors import DevrfError
 from devrf.geometry.ndc import NormalizedDevice
-from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.architecture import Architecture, fitted_to, resolved_planes
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
-from devrf.methods.devrf.grid_resolution import fitted_to, resolved_planes
 from devrf.scenes.procedural import ProceduralForwardScene
 from devrf.scenes.scene import Scene
 

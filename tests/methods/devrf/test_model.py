@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import pytest
 import torch
 
-from devrf.data.batch import RayBatch
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import WORLD, Space
 from devrf.methods.devrf.architecture import Architecture
-from devrf.methods.devrf.deformation_field import DeformationField
-from devrf.methods.devrf.deformed_occupancy import deformed_occupancy
+from devrf.methods.devrf.deformation_field import DeformationField, deformed_occupancy
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.settings import RenderSettings
 from devrf.rendering.occupancy import Occupancy, dilate
 from devrf.rendering.output import RenderedImage
 from devrf.rendering.renderer import Renderer
+from devrf.rendering.sampling import RenderSettings
 
 SIDE = 11
 SETTINGS = RenderSettings(step=0.5, alpha_threshold=1e-3, near=0.0, far=9.0)
@@ -78,7 +74,7 @@ def test_at_rest_nothing_is_warped(model: DeVRFModel) -> None:
 
 def test_deformed_occupancy_by_hand(model: DeVRFModel) -> None:
     shift = torch.tensor([0.0, 0.4, 0.0])
-    found = deformed_occupancy(model.occupancy, model.canonical, lambda points: points + shift)
+    found = deformed_occupancy(model.occupancy, model.box, lambda points: points + shift)
     assert torch.equal(found.mask, dilate(torch.roll(model.occupancy.mask, -2, dims=1), 1))
     assert found.box == model.canonical.box
 
@@ -94,27 +90,6 @@ def test_depth_is_the_distance_of_the_face_and_zero_beside_it(model: DeVRFModel)
     assert seen.depth[1].item() == 0
     torch.testing.assert_close(seen.color[1], torch.ones(3))
     assert seen.color[0, 0] > 0.99 and seen.color[0, 1] < 0.01
-
-
-def test_a_batch_is_seen_ray_by_ray_at_its_own_time(
-    model: DeVRFModel,
-    ray_batch: Callable[..., RayBatch],
-    reference: Callable[..., RenderedImage],
-) -> None:
-    # Each ray has a background of its own.
-    behind, frame = torch.linspace(0, 1, 45).view(15, 3), torch.arange(15) % 3
-    batch = ray_batch(looking_down(15), background=behind, time=frame / 2, frame=frame)
-    seen = model(batch)
-    for time in (0.0, 0.5, 1.0):
-        own = (batch.time == time).nonzero()[:, 0]
-        alone = reference(model, batch.rays[own], time, batch.background[own])
-        torch.testing.assert_close(seen.color[own], alone.color)
-        torch.testing.assert_close(seen.depth[own], alone.depth)
-        torch.testing.assert_close(seen.transmittance[own], 1 - alone.opacity)
-        assert alone.opacity.max() > 0.9
-    seen.color.sum().backward()
-    gradient = model.canonical.density.values.grad
-    assert gradient is not None and gradient.any()
 
 
 @pytest.mark.parametrize("space", [WORLD, NormalizedDevice(8, 6, (40.0, 40.0), near=2.0)])

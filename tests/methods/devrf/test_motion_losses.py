@@ -12,6 +12,7 @@ from torch import Tensor
 from devrf.data.batch import RayBatch
 from devrf.data.flow import previous_images
 from devrf.engine.batches import gather_batch
+from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.methods.devrf.losses import (
     MotionPrediction,
@@ -20,7 +21,7 @@ from devrf.methods.devrf.losses import (
     induced_flow,
     total_variation_weight,
 )
-from devrf.methods.devrf.volume_rendering import VoxelOutput
+from devrf.rendering.output import VoxelOutput
 from devrf.rendering.sampling import Samples
 from devrf.scenes.procedural import Material, ProceduralScene
 from devrf.scenes.scene import Scene
@@ -78,7 +79,14 @@ def by_hand(ray_batch: Callable[..., RayBatch]) -> MotionPrediction:
     )
     forth, before = torch.tensor([0.3, 0.0, 0.0]), torch.tensor([0.1, 0.0, 0.0])
     return MotionPrediction(
-        output, batch, lambda q: q + forth, lambda q: q + before, cameras, torch.tensor([0, 0])
+        output,
+        batch,
+        lambda q: q + forth,
+        lambda q: q + before,
+        cameras,
+        torch.tensor([0, 0]),
+        torch.zeros(2, 2, 2, 3),
+        Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)),
     )
 
 
@@ -102,7 +110,7 @@ def test_flow_by_hand(by_hand: MotionPrediction) -> None:
 def test_flow_as_a_mean_over_both_components_of_the_samples(by_hand: MotionPrediction) -> None:
     """Two of the three samples are on the ray whose flow is valid."""
     value = (0.5 * 0.5 + 0.25 * 1.0) / (2 * 2)
-    assert flow(by_hand, mean="samples").item() == pytest.approx(value, abs=1e-6)
+    assert flow(replace(by_hand, flow_mean="samples")).item() == pytest.approx(value, abs=1e-6)
 
 
 def test_flow_counts_valid_rays_even_those_that_see_nothing(by_hand: MotionPrediction) -> None:
@@ -147,6 +155,8 @@ def exact(scene: Scene, recipe: ProceduralScene, frame: int) -> MotionPrediction
         lambda q: at(times[frame - 1], q),
         views.cameras,
         previous_images(views),
+        torch.zeros(2, 2, 2, 3),
+        scene.bounds.box,
     )
 
 

@@ -11,9 +11,9 @@ from torch import Tensor
 from devrf.data.batch import RayBatch
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
-from devrf.methods.devrf.grid_warp import GridWarp
-from devrf.methods.devrf.losses import FLOW_TERMS, MOTION_TERMS, MotionPrediction
-from devrf.methods.devrf.volume_rendering import VoxelOutput
+from devrf.methods.devrf.deformation_field import GridWarp
+from devrf.methods.devrf.losses import MOTION_TERMS, MotionPrediction, flow
+from devrf.rendering.output import VoxelOutput
 from devrf.rendering.sampling import Samples
 
 RAYS = 6
@@ -89,10 +89,16 @@ class Case:
             GridWarp((self.slices[1],), BOX),
             self.cameras,
             torch.tensor([0, 0]),
+            self.slices[0],
+            BOX,
         )
 
 
-TERMS = {**MOTION_TERMS, "flow over samples": FLOW_TERMS["samples"]}
+def flow_over_samples(prediction: MotionPrediction) -> Tensor:
+    return flow(replace(prediction, flow_mean="samples"))
+
+
+TERMS = {**MOTION_TERMS, "flow over samples": flow_over_samples}
 
 
 @pytest.mark.parametrize("name", list(TERMS))

@@ -8,22 +8,21 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch import Tensor
 
 from devrf.data.batch import RayBatch
 from devrf.errors import DevrfError
 from devrf.geometry.rays import Rays
 from devrf.methods.devrf.losses import (
     PHOTOMETRIC_TERMS,
-    VISIBILITY,
     Prediction,
     alpha_mask,
     background_entropy,
     color_error,
     per_sample_color,
 )
-from devrf.methods.devrf.volume_rendering import VoxelOutput
-from devrf.methods.devrf.weighted_loss import WeightedLoss
+from devrf.methods.devrf.weighted_loss import weighted_loss
+from devrf.methods.weighted_loss import counted_weights
+from devrf.rendering.output import VoxelOutput
 from devrf.rendering.sampling import Samples
 
 RAY = torch.tensor([0, 0, 2])
@@ -87,33 +86,16 @@ def test_entropy_has_finite_gradients_at_its_ends(prediction: Prediction, p: flo
     assert end.grad is not None and end.grad.isfinite().all()
 
 
-def test_matte_by_hand_and_without_one(prediction: Prediction) -> None:
+def test_alpha_mask_by_hand_and_without_one(prediction: Prediction) -> None:
     # T − (1 − alpha) = 0.25, 0, −0.3.
     assert alpha_mask(prediction).item() == pytest.approx((0.0625 + 0.09) / 3)
     without = replace(prediction, batch=replace(prediction.batch, alpha=None))
     assert alpha_mask(without).item() == 0
 
 
-def test_composer_weighs_what_counts_and_reports_it_unweighted() -> None:
-    def expensive(_: Tensor) -> Tensor:
-        raise AssertionError("computed")
-
-    def cheap(values: Tensor) -> Tensor:
-        return values.sum()
-
-    loss: WeightedLoss[Tensor] = WeightedLoss(
-        {"cheap": cheap, "expensive": expensive}, {"cheap": 2.0, "expensive": 0.0}
-    )
-    total, terms = loss(torch.ones(4, requires_grad=True))
-    assert total.item() == 8 and total.requires_grad
-    assert terms == {"cheap": torch.tensor(4.0)} and not terms["cheap"].requires_grad
-
-
-def test_composer_reports_what_is_logged_where_there_is_such_a_thing(
-    prediction: Prediction,
-) -> None:
-    loss = WeightedLoss(PHOTOMETRIC_TERMS, {"alpha_mask": 2.0}, VISIBILITY)
-    total, values = loss(prediction)
+def test_the_loss_weighs_what_counts_and_reports_it_unweighted(prediction: Prediction) -> None:
+    weights = counted_weights({"alpha_mask": 2.0, "color": 0.0}, PHOTOMETRIC_TERMS, "loss.fine")
+    total, values = weighted_loss(prediction, PHOTOMETRIC_TERMS, weights)
     assert (
         list(values) == ["alpha_mask", "opacity", "coverage"] and total == 2 * values["alpha_mask"]
     )
@@ -121,14 +103,19 @@ def test_composer_reports_what_is_logged_where_there_is_such_a_thing(
     assert values["opacity"].item() == pytest.approx(1.55 / 3)
     assert values["coverage"].item() == pytest.approx(0.5)
     without = replace(prediction, batch=replace(prediction.batch, alpha=None))
-    assert loss(without)[1].keys() == {"alpha_mask", "opacity"}
+    assert weighted_loss(without, PHOTOMETRIC_TERMS, weights)[1].keys() == {"alpha_mask", "opacity"}
 
 
-def test_composer_names_an_unknown_term_and_the_known_ones() -> None:
-    with pytest.raises(DevrfError, match=r"'colour'.*alpha_mask, color, entropy, per_sample_color"):
-        WeightedLoss(PHOTOMETRIC_TERMS, {"colour": 1.0})
-
-
-def test_composer_refuses_to_learn_nothing(prediction: Prediction) -> None:
-    with pytest.raises(DevrfError, match="every weight is zero"):
-        WeightedLoss(PHOTOMETRIC_TERMS, {"color": 0.0})(prediction)
+@pytest.mark.parametrize(
+    ("weights", "told"),
+    [
+        (
+            {"colour": 1.0},
+            r"loss.fine: unknown term 'colour'.*alpha_mask, color, entropy",
+        ),
+        ({"color": 0.0}, "loss.fine: every weight is zero"),
+    ],
+)
+def test_wrong_weights_are_told(weights: dict[str, float], told: str) -> None:
+    with pytest.raises(DevrfError, match=told):
+        counted_weights(weights, PHOTOMETRIC_TERMS, "loss.fine")

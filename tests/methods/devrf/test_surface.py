@@ -11,8 +11,8 @@ from devrf.geometry.clock import FrameClock
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.settings import RenderSettings
 from devrf.rendering.occupancy import Occupancy
+from devrf.rendering.sampling import RenderSettings
 
 SETTINGS = RenderSettings(step=0.5, alpha_threshold=1e-3, near=0.0, far=9.0)
 

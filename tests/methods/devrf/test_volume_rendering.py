@@ -13,9 +13,9 @@ from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField
-from devrf.methods.devrf.settings import RenderSettings
 from devrf.methods.devrf.volume_rendering import render
 from devrf.rendering.occupancy import Occupancy
+from devrf.rendering.sampling import RenderSettings
 
 SIDE = 21
 GREEN = torch.tensor([0.2, 0.7, 0.4])

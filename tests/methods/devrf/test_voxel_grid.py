@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from devrf.geometry.box import Box
-from devrf.methods.devrf.voxel_grid import VoxelGrid, resample
+from devrf.methods.devrf.canonical_field import VoxelGrid, resample
 
 BOX = Box((-1.0, 0.0, 2.0), (3.0, 2.0, 3.0))
 

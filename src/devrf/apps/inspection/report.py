@@ -80,7 +80,7 @@ def scene_facts(scene: Scene) -> list[Row]:
         text = f"differ by {100 * change:.1f} % over a few frames"
         if drift is not None:
             text += f", drift by {100 * drift:.1f} % over all"
-            text += ": try schedule.appearance.learn=always" * (drift >= CHANGING)
+            text += ": try schedule.extensions.color_residual.learn=always" * (drift >= CHANGING)
         rows.append(("colours along the flow", text))
     gap = None
     if scene.kind == "inward":

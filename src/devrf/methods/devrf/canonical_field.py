@@ -8,13 +8,55 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from devrf.checkpoints.stored_grids import StoredShape
 from devrf.geometry.box import Box
 from devrf.methods.devrf.color_decoder import ColorDecoder
-from devrf.methods.devrf.voxel_grid import VoxelGrid
 from devrf.ops.color_network import listed_colors
+from devrf.ops.corners import shape_of, to_grid
+from devrf.ops.trilinear import interpolate, kept_gradient, resample
 
 # What a checkpoint holds beside the tensors and the box.
 SIZES = ("voxels", "base_voxels", "alpha_init", "planes", "aspect")
+
+
+def look_up(grid: Tensor, points: Tensor, box: Box) -> Tensor:
+    """Trilinear values (M, C) of a ``grid`` (X, Y, Z, C) over ``box`` at ``points`` (M, 3).
+
+    Outside they are the border's. Differentiable in the grid and the points; a gradient that the
+    grid has already is added to in place.
+    """
+    coords = to_grid(points, box, shape_of(grid))
+    return interpolate(grid, coords, gradient=kept_gradient(grid))
+
+
+class VoxelGrid(StoredShape):
+    """Values at the points of a grid whose outer points lie on a box.
+
+    Attributes:
+        values: (X, Y, Z, C), channels last so that a grid point is one row of memory.
+    """
+
+    resizable = ("values",)  # a run may have ended at any resolution
+    values: nn.Parameter
+
+    def __init__(self, shape: tuple[int, int, int], channels: int, fill: float = 0.0) -> None:
+        super().__init__()
+        self.values = nn.Parameter(torch.full((*shape, channels), fill))
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Grid points along x, y, z."""
+        x, y, z, _ = self.values.shape
+        return x, y, z
+
+    def forward(self, points: Tensor, box: Box) -> Tensor:
+        """Trilinear values (M, C) at ``points`` (M, 3) in ``box``; outside, the border's."""
+        return look_up(self.values, points, box)
+
+    @torch.no_grad()
+    def resize(self, shape: tuple[int, int, int]) -> None:
+        """Resample to another grid over the same box, trilinearly; a new parameter results."""
+        self.values = nn.Parameter(resample(self.values, shape))
 
 
 class CanonicalField(nn.Module):
@@ -109,6 +151,11 @@ class CanonicalField(nn.Module):
     def _share_of_depth(self) -> float:
         """D / 2: the box's share of the depth from the near plane to infinity, in NDC."""
         return self.box.size[2] / 2
+
+    @property
+    def raw_density(self) -> Tensor:
+        """v (X, Y, Z, 1), before the softplus."""
+        return self.density.values
 
     @property
     def shift(self) -> float:
@@ -213,6 +260,5 @@ class CanonicalField(nn.Module):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_extra_state` gave."""
         self.box = Box.of(state["low"], state["high"])
-        # Files of the first revisions of format 3 have no aspect.
         for name in SIZES:
-            setattr(self, name, {"aspect": 1.0, **state}[name])
+            setattr(self, name, state[name])

@@ -18,31 +18,24 @@ from devrf.engine.graphs import Graphs
 from devrf.engine.loop import ParallelBatch
 from devrf.engine.stage import Phase
 from devrf.errors import DevrfError
-from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.architecture import Architecture, fitted_to
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.canonical_schedule import CanonicalPhase, CanonicalSchedule
-from devrf.methods.devrf.depth_crop import crop_to_visible
+from devrf.methods.devrf.extensions.depth_crop import crop_to_visible
 from devrf.methods.devrf.free_space import possible_matter, view_count_weight
-from devrf.methods.devrf.grid_resolution import fitted_to
 from devrf.methods.devrf.losses import (
     PHOTOMETRIC_TERMS,
-    VISIBILITY,
     Prediction,
     total_variation_weight,
 )
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.settings import (
-    FINE_LOSS,
-    SEARCH_LOSS,
-    CanonicalRates,
-    Precision,
-    RenderSettings,
-    Sampling,
-)
+from devrf.methods.devrf.settings import FINE_LOSS, SEARCH_LOSS, CanonicalRates, Precision, Sampling
 from devrf.methods.devrf.voxel_stage import VoxelStage
-from devrf.methods.devrf.weighted_loss import WeightedLoss
+from devrf.methods.devrf.weighted_loss import weighted_loss
+from devrf.methods.weighted_loss import counted_weights
 from devrf.ops.adam import GridAdam
 from devrf.rendering.occupancy import Occupancy, bounding_box, dilate
+from devrf.rendering.sampling import RenderSettings
 from devrf.scenes.scene import CaptureName, Views
 from devrf.system.profiling import span
 
@@ -95,11 +88,11 @@ class CanonicalStage(VoxelStage):
         self.architecture = architecture or Architecture()
         self.rates = rates or CanonicalRates()
         self.sampling = sampling or Sampling()
-        self.losses, self.tv = {}, {}
+        self.weights, self.tv = {}, {}
         for kind, given in (("search", search_loss), ("fine", fine_loss)):
             weights = dict(given)
             self.tv[kind] = weights.pop("tv", 0.0)
-            self.losses[kind] = WeightedLoss(PHOTOMETRIC_TERMS, weights, VISIBILITY)
+            self.weights[kind] = counted_weights(weights, PHOTOMETRIC_TERMS, f"loss.{kind}")
         self.pool: PixelPool | None = None
         self._optimizer: GridAdam | None = None
 
@@ -195,9 +188,7 @@ class CanonicalStage(VoxelStage):
         field = self.scene_model.canonical
         if self.schedule.crop:
             assert self.pool is not None
-            views = self.trainer.datamodule.training_views(  # type: ignore[attr-defined]
-                self.capture, self.device
-            )
+            views = self.training_views(self.capture)
             crop_to_visible(self.scene_model, self.scene, views, self.pool)
         # Cropping leaves a share of the voxels that the field was built for.
         kept = field.base_voxels / round(self.schedule.side**3)
@@ -307,7 +298,7 @@ class CanonicalStage(VoxelStage):
         occupancy = self.scene_model.occupancy
         prediction = Prediction(*self.render_pixels(views, pixels, occupancy, batch.capacity))
         with span("losses"):
-            return self.losses[self.phase.kind](prediction)
+            return weighted_loss(prediction, PHOTOMETRIC_TERMS, self.weights[self.phase.kind])
 
     @torch.no_grad()
     def on_train_end(self) -> None:

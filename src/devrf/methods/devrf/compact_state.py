@@ -14,9 +14,9 @@ from torch import Tensor
 
 from devrf.checkpoints.stored_grids import pack, unpack
 from devrf.geometry.box import Box
-from devrf.methods.devrf.appearance import AppearanceField
 from devrf.methods.devrf.canonical_field import CanonicalField
-from devrf.methods.devrf.deformation_field import DeformationField
+from devrf.methods.devrf.deformation_field import DeformationField, FrameField
+from devrf.ops.corners import shape_of
 from devrf.rendering.occupancy import Occupancy, dilate
 
 Shape = tuple[int, int, int]
@@ -29,9 +29,9 @@ def compact_state(
     canonical: CanonicalField,
     deformation: DeformationField | None,
     occupancy_at: Callable[[float], Occupancy],
-    appearance: AppearanceField | None = None,
+    color_residual: FrameField | None = None,
     *,
-    endless: bool,
+    unbounded: bool,
 ) -> dict[str, Any]:
     """The ``state`` of a finished scene with its grids packed.
 
@@ -43,12 +43,12 @@ def compact_state(
         canonical: the canonical field.
         deformation: how it deforms, or None.
         occupancy_at: where something is at a time.
-        appearance: how its colours change, or None.
-        endless: whether rays end in the field: its outer faces are then kept.
+        color_residual: how its colours change, or None.
+        unbounded: whether rays end in the field: its outer faces are then kept.
     """
     small = dict(state)
     at_rest = _near(occupancy, canonical.density.shape, canonical.box)[None]
-    if endless:
+    if unbounded:
         rim = torch.ones_like(at_rest)
         rim[:, 1:-1, 1:-1, 1:-1] = False
         at_rest |= rim
@@ -65,9 +65,10 @@ def compact_state(
         small[f"{frames}to_canonical"] = _packed(deformation.to_canonical, moving, smooth=True)
         at_rest = _near(occupancy, shape, box)[None]
         small[f"{frames}to_time"] = _packed(deformation.to_time, at_rest, smooth=True)
-    if appearance is not None:
-        at_rest = _near(occupancy, appearance.shape, appearance.box)[None]
-        small["appearance.values"] = _packed(appearance.values, at_rest, smooth=False)
+    if color_residual is not None:
+        values = color_residual.values
+        at_rest = _near(occupancy, shape_of(values[0]), color_residual.box)[None]
+        small["color_residual.values"] = _packed(values, at_rest, smooth=False)
     return small
 
 

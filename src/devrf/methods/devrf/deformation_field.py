@@ -1,17 +1,76 @@
-"""The 4D deformation field V_motion (docs/method.md#deformation-field)."""
+"""The 4D deformation field V_motion, and the warp that it is (docs/method.md#deformation-field)."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from devrf.engine.frame_store import FrameStore
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
-from devrf.methods.devrf.frame_field import FrameField
-from devrf.methods.devrf.grid_warp import GridWarp
+from devrf.ops.corners import shape_of, to_grid
+from devrf.ops.trilinear import interpolate, kept_gradient
+from devrf.rendering.occupancy import Occupancy, dilate
+
+
+@dataclass(frozen=True)
+class GridWarp:
+    """x → x + Δ(x, t), Δ = (1 − λ) Δ_k + λ Δ_{k+1}, each Δ_k trilinear in space.
+
+    Attributes:
+        slices: Δ_k (X, Y, Z, 3) in the box's units: one frame's, or those of the two frames
+            between which t lies; none is the identity.
+        box: where the grids live.
+        weight: λ in [0, 1].
+        still_outside: whether Δ is 0 outside the box; else it is as on the border.
+    """
+
+    slices: tuple[Tensor, ...]
+    box: Box
+    weight: float = 0.0
+    still_outside: bool = False
+
+    def __call__(self, points: Tensor) -> Tensor:
+        """The points (M, 3) moved, (M, 3); differentiable in the slices and the points."""
+        if not self.slices:
+            return points
+        coords = to_grid(points, self.box, shape_of(self.slices[0]))
+        moves = [interpolate(frame, coords, gradient=kept_gradient(frame)) for frame in self.slices]
+        move = moves[0] if len(moves) == 1 else moves[0].lerp(moves[1], self.weight)
+        if self.still_outside:
+            move = torch.where(self.box.contains(points)[:, None], move, 0.0)
+        return points + move
+
+
+class FrameField(nn.Module):
+    """Where the grids of T frames are, in space and in time; kept in checkpoints.
+
+    Attributes:
+        box: where the field lives.
+        clock: the times of the T frames.
+        values: (T, X, Y, Z, 3) of a field that keeps all its frames in one tensor.
+    """
+
+    values: Tensor
+
+    def __init__(self, box: Box, clock: FrameClock) -> None:
+        super().__init__()
+        self.box = box
+        self.clock = clock
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Box and clock, as plain numbers."""
+        low, high = list(self.box.low), list(self.box.high)
+        return {"low": low, "high": high, "times": list(self.clock.times)}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`get_extra_state` gave."""
+        self.box = Box.of(state["low"], state["high"])
+        self.clock = FrameClock(tuple(state["times"]))
 
 
 class DeformationField(FrameField):
@@ -65,6 +124,10 @@ class DeformationField(FrameField):
         """The map x → x + Δ_b(x, t) at ``time`` t."""
         return self._at(self.to_canonical, time)
 
+    def warp_by(self, *slices: Tensor) -> GridWarp:
+        """The map by ``slices`` (X, Y, Z, 3) over the field's box; by none, the identity."""
+        return GridWarp(slices, self.box, still_outside=self.still_outside)
+
     def _at(self, frames: Tensor, time: float) -> GridWarp:
         moment = self.clock.at(time)
         chosen = (moment.before,) if moment.weight == 0.0 else (moment.before, moment.after)
@@ -98,3 +161,35 @@ class DeformationField(FrameField):
         """Restore what :meth:`get_extra_state` gave."""
         super().set_extra_state(state)
         self.still_outside = bool(state.get("still_outside"))
+
+
+@torch.no_grad()
+def deformed_occupancy(
+    occupancy: Occupancy, box: Box, warp: Callable[[Tensor], Tensor]
+) -> Occupancy:
+    """The occupancy at a time: the grid points whose canonical position is occupied, grown by one.
+
+    Args:
+        occupancy: where something is at rest.
+        box: the canonical field's.
+        warp: x → x + Δ_b(x, t), points (M, 3) at the time into canonical space.
+    """
+    points = occupancy_points(occupancy, box)
+    moved = warp(points.view(-1, 3)).view(points.shape)
+    return occupancy_through(occupancy, box, moved)
+
+
+def occupancy_points(occupancy: Occupancy, box: Box) -> Tensor:
+    """The grid points x (X, Y, Z, 3) at which a time's occupancy is looked up."""
+    x, y, z = occupancy.mask.shape
+    return box.grid_points((x, y, z), torch.empty(0, device=occupancy.mask.device))
+
+
+@torch.no_grad()
+def occupancy_through(occupancy: Occupancy, box: Box, moved: Tensor) -> Occupancy:
+    """:func:`deformed_occupancy` of grid points with canonical positions ``moved`` (X, Y, Z, 3).
+
+    The rim of one grid point is for what lies between the points.
+    """
+    found = occupancy.at(moved.view(-1, 3)).view(moved.shape[:3])
+    return Occupancy(dilate(found, 1), box)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate, pairwise
 from typing import Any, Literal
@@ -170,6 +170,20 @@ class DeformationSchedule:
             iterations = sum(level.iterations for level in self.levels)
             finest = replace(last, iterations=iterations, lr_factor=None, order="forward")
             object.__setattr__(self, "levels", (finest,))
+
+    def check_terms(self, known: Collection[str]) -> None:
+        """Check that the levels' ``weight_factors`` are of ``known`` loss terms.
+
+        Raises:
+            DevrfError: there is no such term.
+        """
+        for number, level in enumerate(self.levels, 1):
+            for name in level.weight_factors:
+                if name not in known:
+                    raise DevrfError(
+                        f"schedule.deformation.levels.{number}.weight_factors: {name} is no term "
+                        f"of loss.deformation; the terms are {', '.join(sorted(known))}"
+                    )
 
     def learning_rate_factor(self, level: int) -> float:
         """Factor of the learning rate when a visit of ``level`` begins."""

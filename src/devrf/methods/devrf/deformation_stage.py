@@ -2,57 +2,38 @@
 
 from __future__ import annotations
 
-import copy
 import logging
 import math
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
-from devrf.data.batch import Pixels, all_pixels
+from devrf.data.batch import Pixels
 from devrf.data.flow import previous_images
-from devrf.engine.batches import frame_pools, images_of
+from devrf.engine.active_frames import ActiveFrames
 from devrf.engine.convergence import Convergence
-from devrf.engine.ddp import broadcast
 from devrf.engine.graphs import Graphs
 from devrf.engine.loop import ParallelBatch
 from devrf.engine.stage import Phase
 from devrf.errors import DevrfError
-from devrf.methods.devrf.active_frame import ActiveFrames
-from devrf.methods.devrf.appearance import AppearanceSettings
-from devrf.methods.devrf.appearance_learning import AppearanceLearning
-from devrf.methods.devrf.deformation_field import DeformationField
+from devrf.methods.devrf.deformation_field import DeformationField, deformed_occupancy
 from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule
-from devrf.methods.devrf.deformed_occupancy import deformed_occupancy
-from devrf.methods.devrf.elastic import occupied_cells
-from devrf.methods.devrf.flow_initialisation import start_from_tracks
-from devrf.methods.devrf.flow_tracks import FlowTracks
-from devrf.methods.devrf.frame_memory import rest_on_host
+from devrf.methods.devrf.extension import Extension, MotionTerm
 from devrf.methods.devrf.losses import (
-    FLOW_TERMS,
     MOTION_TERMS,
-    PRIORS,
-    VISIBILITY,
     FlowMean,
-    MotionGrid,
     MotionPrediction,
     total_variation_weight,
 )
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.refinement import Refinement, RefinementPhase, RefinementSettings
-from devrf.methods.devrf.settings import (
-    APPEARANCE_LOSS,
-    DEFORMATION_LOSS,
-    FINE_LOSS,
-    MotionSettings,
-    Precision,
-)
+from devrf.methods.devrf.settings import DEFORMATION_LOSS, MotionSettings, Precision
 from devrf.methods.devrf.voxel_stage import VoxelStage
-from devrf.methods.devrf.weighted_loss import WeightedLoss
+from devrf.methods.devrf.weighted_loss import weighted_loss
+from devrf.methods.weighted_loss import counted_weights
 from devrf.ops.adam import GridAdam
 from devrf.scenes.scene import CaptureName, Views
 from devrf.system.profiling import span
@@ -64,14 +45,15 @@ class DeformationStage(VoxelStage):
     """Learns from the dynamic views how the scene deforms (docs/method.md#deformation-stage).
 
     Coarse to fine (docs/method.md#coarse-to-fine), frames are learned one after another, or several
-    in parallel, each from batches of its own. Only their two slices are trained, and how their
-    colours change if that is asked for; the canonical field and all other frames are frozen. A last
-    phase may refine the canonical field (docs/method.md#refinement).
+    in parallel, each from batches of its own. Only their two slices are trained, and what
+    extensions add; the canonical field and all other frames are frozen.
     """
 
     schedule: DeformationSchedule
+    phase: DeformationPhase | None
     name = "deformation"
     capture: CaptureName = "dynamic"
+    memory_keys = ("schedule.deformation.levels", "schedule.deformation.rays")
     rate_keys = "schedule.motion.learning_rate or the weights of loss.deformation"
 
     def __init__(
@@ -81,13 +63,10 @@ class DeformationStage(VoxelStage):
         motion: MotionSettings | None = None,
         loss: Mapping[str, float] = DEFORMATION_LOSS,
         flow_mean: FlowMean = "rays",
+        extensions: Mapping[str, Extension] | None = None,
         iterations_per_step: int = 10,
         graphs: Graphs = "auto",
         decoder_precision: Precision = "auto",
-        appearance: AppearanceSettings | None = None,
-        appearance_loss: Mapping[str, float] = APPEARANCE_LOSS,
-        refinement: RefinementSettings | None = None,
-        refinement_loss: Mapping[str, float] = FINE_LOSS,
     ) -> None:
         """Build the stage; the defaults are the paper's for inward-facing scenes.
 
@@ -98,36 +77,27 @@ class DeformationStage(VoxelStage):
             motion: learning rate and how batches are drawn.
             loss: weights of the loss terms; ``tv`` is the total variation of both fields.
             flow_mean: what the flow loss is a mean over (docs/method.md#flow).
+            extensions: what is added beyond the paper, by name.
             iterations_per_step: optimiser iterations in one Lightning step.
             graphs: whether a GPU replays iterations from CUDA graphs: ``auto`` where it can.
             decoder_precision: what the colour network computes in; ``auto``: ``bfloat16`` on a
                 GPU that multiplies it.
-            appearance: whether and how the change of colours is learned.
-            appearance_loss: weights of the squared residuals, ``residual``, and of their total
-                variation, ``tv``.
-            refinement: how the canonical field learns on at the end.
-            refinement_loss: weights of the photometric terms that it learns from.
         """
         super().__init__(iterations_per_step, graphs, decoder_precision)
         self.schedule = schedule or DeformationSchedule()
         self.motion = motion or MotionSettings()
-        weights = dict(loss)
-        self.tv = weights.pop("tv", 0.0)
-        chosen = appearance or AppearanceSettings()
-        self.appearance = AppearanceLearning(chosen, self.schedule, appearance_loss)
-        weights.update(self.appearance.weights)
-        terms = MOTION_TERMS | {"flow": FLOW_TERMS[flow_mean]}
-        self.losses = WeightedLoss(terms, weights, VISIBILITY)
-        # What the schedule's factors are factors of.
-        self._weights = dict(self.losses.weights)
-        self._check_factors()
-        still = rest.model
-        fields = still.canonical, still.occupancy
-        self.refinement = Refinement(self, refinement or RefinementSettings(), refinement_loss)
-        if self.refinement.settings.iterations:
-            fields = copy.deepcopy(fields)  # what rest holds stays as it is
+        self.flow_mean = flow_mean
+        self.extensions = tuple((extensions or {}).values())
+        self.tv = loss.get("tv", 0.0)
+        # The weights are those that the schedule's factors are factors of.
+        self.terms, self._weights = motion_terms(loss, self.extensions, self.schedule)
+        self.weights: Mapping[str, float] = self._weights
         self.scene_model = DeVRFModel(
-            still.architecture, *fields, still.settings, space=still.space
+            rest.model.architecture,
+            rest.model.canonical,
+            rest.model.occupancy,
+            rest.model.settings,
+            space=rest.model.space,
         ).requires_grad_(False)
         self.earlier_records = rest.metadata.records
         placeholder = torch.zeros(2, 2, 2, 3, requires_grad=True)
@@ -136,10 +106,12 @@ class DeformationStage(VoxelStage):
         )
         self.active = ActiveFrames(self)
         self._convergence = Convergence()
-        self._previous_images: Tensor | None = None
-        self._tracks: FlowTracks | None = None
-        # The cells of the motion grid that hold matter at rest; None where no loss asks.
-        self._matter: Tensor | None = None
+
+    @classmethod
+    def check_settings(cls, **settings: Any) -> None:
+        """Check the loss, before what the stage builds on has been learned."""
+        extensions = tuple(settings.get("extensions", {}).values())
+        motion_terms(settings["loss"], extensions, settings["schedule"])
 
     @property
     def field(self) -> DeformationField:
@@ -148,15 +120,9 @@ class DeformationStage(VoxelStage):
         return self.scene_model.deformation
 
     @property
-    def _follows_flow(self) -> bool:
-        """Whether there is flow that tells how the scene moves, not the camera."""
-        recorded = self.scene.dynamic.train
-        return recorded.flow is not None and not recorded.by_moving_camera
-
-    @property
     def total_iterations(self) -> int:
-        """Iterations of all levels and frames, and of the refinement."""
-        return self.schedule.total(len(self.field.clock)) + self.refinement.settings.iterations
+        """Iterations of all levels and frames."""
+        return self.schedule.total(len(self.field.clock))
 
     @property
     def resolution(self) -> tuple[int, ...]:
@@ -165,22 +131,16 @@ class DeformationStage(VoxelStage):
 
     @property
     def optimizer(self) -> GridAdam:
-        """Adam over the two slices of each active frame."""
+        """Adam over the two slices of each active frame, and what extensions learn."""
         return self._optimizer
 
-    def phase_at(self, iteration: int) -> DeformationPhase | RefinementPhase:
-        """The schedule's phase, or the refinement after the last."""
-        frames = len(self.field.clock)
-        last = self.schedule.total(frames)
-        if iteration >= last and self.refinement.settings.iterations:
-            return self.refinement.phase(last)
-        return self.schedule.phase(iteration, frames)
+    def phase_at(self, iteration: int) -> DeformationPhase:
+        """The schedule's visit."""
+        return self.schedule.phase(iteration, len(self.field.clock))
 
     def learning_rate_factor(self, iteration: int) -> float:
         """Of the iteration's level, and of its visit (docs/method.md#motion-learning-rate)."""
         phase = self.phase_at(iteration)
-        if isinstance(phase, RefinementPhase):
-            return phase.learning_rate_factor(iteration)
         share = (iteration - phase.start) / (phase.stop - phase.start)
         return phase.learning_rate_factor * math.pow(phase.lr_final_factor, share)
 
@@ -199,75 +159,60 @@ class DeformationStage(VoxelStage):
                 f"{self.scene.name}: is at rest, so there is no motion to learn; the canonical "
                 "stage is all that it takes"
             )
-        self._leave_out_camera_flow()
+        if self._weights.get("flow") and self.scene.dynamic.train.by_moving_camera:
+            log.info("the camera moves, and so does all that it sees: the flow loss is left out")
+            self._weights = {**self._weights, "flow": 0.0}
         model, motion = self.scene_model, self.motion
         if model.deformation is None:
-            voxels = self.schedule.levels[0].side ** 3
             box = model.space.inner(model.box)
             model.deformation = DeformationField(
-                box, self.scene.clock, voxels=voxels, still_outside=box != model.box
+                box,
+                self.scene.clock,
+                voxels=self.schedule.levels[0].side ** 3,
+                still_outside=box != model.box,
             )
-            self.field.frames.offload(
-                on_host=rest_on_host(self.trainer, model, self.schedule, motion),
-                half=motion.rests_half(self.trainer.strategy.root_device),
+            device, levels = self.trainer.strategy.root_device, self.schedule.levels
+            # Several processes keep frames on their devices.
+            self.field.frames.keep(
+                motion.store if self.trainer.world_size == 1 else "device",
+                device,
+                box.grid_shape(levels[-1].side ** 3),
+                half=motion.rests_half(device),
+                parallel=self.schedule.max_parallel_frames(-1, len(self.scene.clock)),
             )
-            # Before the clock of training starts.
-            self.field.frames.reserve(box.grid_shape(self.schedule.levels[-1].side ** 3))
-            recorded = self.scene.dynamic.train
-            self.appearance.setup(model, self.field.clock, self._optimizer, recorded)
-            if self.refinement.settings.iterations:
-                self.refinement.add_groups()
+            for extension in self.extensions:
+                extension.setup(self)
         scale = self.field.box.longest if motion.unit == "box" else 1.0
         self._optimizer.param_groups[0]["base_lr"] = motion.learning_rate * scale
 
-    def _leave_out_camera_flow(self) -> None:
-        """No loss for a moving camera's flow (docs/method.md#flow-of-a-moving-camera)."""
-        if self.scene.dynamic.train.flow is None or self._follows_flow:
-            return
-        if self.motion.init_from != "previous" or self._weights.get("flow"):
-            log.info(
-                "the camera moves, and so does all that it sees: frames start where the ones "
-                "before them ended, and the flow loss is left out"
-            )
-        self._weights["flow"] = 0.0
-
     def enter(self, phase: Phase) -> None:
         """Go to the phase's frames: grow the grids if a level begins, fresh Adam if asked for."""
-        assert isinstance(phase, DeformationPhase | RefinementPhase)
+        assert isinstance(phase, DeformationPhase)
         previous, self.phase = self.phase, phase
         self.active.write_back()
-        if isinstance(phase, RefinementPhase):
-            self.refinement.grow()
-            self._begin_refinement()
-            return
-        if isinstance(previous, DeformationPhase) and previous.level != phase.level:
+        if previous is not None and previous.level != phase.level:
             self._allocate(0)
-            self._tracks = None
             self.field.resize(phase.side**3)
-        self._initialise(phase)
+        for frame in phase.frames:
+            if phase.init_from_previous:
+                self.field.frames.copy_previous(frame)
+            for extension in self.extensions:
+                extension.initialise(self, phase, frame)
         carried = self.motion.adam_state == "carried" and phase.level > 0
         if len(self.active) == len(phase.frames) and not carried:
             for group in range(len(self._optimizer.param_groups)):
                 self._optimizer.forget(group)
-        self.activate(phase)
+        self._activate(phase)
         self._prefetch_after(phase)
-        self.update_occupancy()
-        for frame in self.active:
-            frame.pools = frame_pools(
-                self.views,
-                frame.number,
-                self.scene_model,
-                frame.occupancy,
-                occupied_only=self.motion.pixels == "occupied",
-                join_views=self.motion.views == "all",
-            )
+        self._update_occupancy()
+        self.active.choose_pixels(
+            self.views,
+            self.scene_model,
+            occupied_only=self.motion.pixels == "occupied",
+            join_views=self.motion.views == "all",
+        )
 
-    def _begin_refinement(self) -> None:
-        """Free what the frames were learned with, and refine the canonical field."""
-        self.active.close()
-        self.refinement.begin(self.views, occupied_only=self.motion.pixels == "occupied")
-
-    def activate(self, phase: DeformationPhase) -> None:
+    def _activate(self, phase: DeformationPhase) -> None:
         """Check out the phase's frames, with memory for them."""
         if len(self.active) != len(phase.frames):
             self._allocate(len(phase.frames))
@@ -278,87 +223,40 @@ class DeformationStage(VoxelStage):
         """Make memory for ``count`` active frames at the field's present resolution."""
         # The memory of the frames before is freed first.
         self.loop.release()
-        assert isinstance(self.phase, DeformationPhase)
-        appearance = self.appearance.at_level(self.scene_model, self.phase.level)
-        fields = self.field, self.scene_model.occupancy, appearance
-        self.active.allocate(0, *fields)
+        assert self.phase is not None
+        level, occupancy = self.phase.level, self.scene_model.occupancy
+        self.active.allocate(0, self.field.frames, occupancy, {})
         for group in range(len(self._optimizer.param_groups)):
             self._optimizer.replace(group, [])
-        self.active.allocate(count, *fields)
-        self._weigh(self.phase.level)
-        self._matter = None
-        if count and any(self.losses.weights.get(name) for name in PRIORS):
-            occupancy = self.scene_model.occupancy
-            self._matter = occupied_cells(occupancy, self.field.box, self.field.shape)
-        tv = self.tv * self.schedule.weight_factor("tv", self.phase.level)
+        further = {k: v for e in self.extensions for k, v in e.frame_fields(self, level).items()}
+        self.active.allocate(count, self.field.frames, occupancy, further)
+        self.weights = {
+            name: factored
+            for name, weight in self._weights.items()
+            if (factored := weight * self._factor(name, level))
+        }
+        tv = self.tv * self.schedule.weight_factor("tv", level)
         smoothing = total_variation_weight(tv, max(self.field.shape), self.schedule.rays)
         learned = [tensor for frame in self.active for tensor in frame.slices]
         self._optimizer.replace(0, learned, smoothing=smoothing)
-        residuals = [frame.residual for frame in self.active if frame.residual is not None]
-        self.appearance.give_parameters(self._optimizer, residuals, self.phase.level)
+        for extension in self.extensions:
+            extension.begin_level(self, level)
         if len(self.active):
             static_shape = self.static_shape(self.scene_model.canonical.density.values)
             parameters = [frame.learned for frame in self.active]
             self.bind(self.schedule.rays, parameters, static_shape=static_shape)
 
-    def _weigh(self, level: int) -> None:
-        """Give each term its weight at ``level``."""
-        by = self.schedule.weight_factor, self.appearance.weight_factor
-        weights = {
-            name: weight * math.prod(factor(name, level) for factor in by)
-            for name, weight in self._weights.items()
-        }
-        self.losses = replace(self.losses, weights=weights)
-
-    def _check_factors(self) -> None:
-        given = {
-            **{
-                f"deformation.levels.{number}.weight_factors": (
-                    level.weight_factors,
-                    {*MOTION_TERMS, "tv"},
-                )
-                for number, level in enumerate(self.schedule.levels, 1)
-            },
-            "appearance.loss_scale_if_color_drift": (
-                self.appearance.settings.loss_scale_if_color_drift,
-                set(MOTION_TERMS),
-            ),
-        }
-        for key, (factors, known) in given.items():
-            for name in factors:
-                if name not in known:
-                    raise DevrfError(
-                        f"schedule.{key}: {name} is no term of loss.deformation; the "
-                        f"terms are {', '.join(sorted(known))}"
-                    )
-
-    def _initialise(self, phase: DeformationPhase) -> None:
-        """Start each frame from the one before it; along the observed flow, if asked to."""
-        self.appearance.initialise(self.scene_model, phase)
-        for number in phase.frames:
-            if phase.init_from_previous:
-                self.field.frames.copy_previous(number)
-            if self._starts_along_flow(phase):
-                views, model = self.views, self.scene_model
-                pool = all_pixels(views, images_of(views, number))
-                # A visit's first frame has its number: the visits before have learned as many.
-                learned = phase.frames[0]
-                tracks = self.tracks.follow(number, pool, self.generator, learned=learned)
-                seen = tracks, views.cameras, model.space
-                start_from_tracks(self.field, number, *seen, capturer=self.loop.capturer())
-                # Each process has followed pixels of its own.
-                broadcast([self.field.to_canonical[number], self.field.to_time[number]])
-
-    def _starts_along_flow(self, phase: DeformationPhase) -> bool:
-        asked = self.motion.init_from != "previous" and self._follows_flow
-        return asked and phase.level == 0 and phase.has_previous
+    def _factor(self, term: str, level: int) -> float:
+        """Factor of a term's weight at ``level``."""
+        factors = (extension.weight_factor(term, level) for extension in self.extensions)
+        return math.prod(factors, start=self.schedule.weight_factor(term, level))
 
     def _prefetch_after(self, phase: DeformationPhase) -> None:
         """Begin to fetch the next phase's frames, unless they change before it begins."""
         following = self.phase_at(phase.stop)
-        if isinstance(following, RefinementPhase):
-            return
-        changed = following.init_from_previous or self._starts_along_flow(following)
+        changed = following.init_from_previous or any(
+            extension.changes(self, following) for extension in self.extensions
+        )
         if following.level == phase.level and following != phase and not changed:
             self.field.frames.prefetch(following.frames)
 
@@ -370,7 +268,6 @@ class DeformationStage(VoxelStage):
     def on_train_end(self) -> None:
         """Write the last frames back."""
         self.active.close()
-        self.refinement.end()
         super().on_train_end()
 
     @property
@@ -378,26 +275,17 @@ class DeformationStage(VoxelStage):
         """The dynamic training views, on the stage's device."""
         return self.training_views(self.capture)
 
-    @property
-    def tracks(self) -> FlowTracks:
-        """Follows the training views' pixels back, at the coarsest level."""
-        if self._tracks is None:
-            seen = self.scene_model, self.views, self.previous_images
-            self._tracks = FlowTracks(*seen, by_color=self.motion.init_from == "tracks")
-        return self._tracks
-
-    @property
+    @cached_property
     def previous_images(self) -> Tensor:
         """(N,) for each image the same view's image one frame earlier; itself without one."""
-        if self._previous_images is None:
-            self._previous_images = previous_images(self.views)
-        return self._previous_images
+        return previous_images(self.views)
 
-    def update_occupancy(self) -> None:
+    def _update_occupancy(self) -> None:
         """Find the occupancy of each active frame under its present displacements."""
         model = self.scene_model
         for frame in self.active:
-            frame.occupancy.refill(deformed_occupancy(model.occupancy, model.canonical, frame.warp))
+            warp = self.field.warp_by(frame.backward)
+            frame.occupancy.refill(deformed_occupancy(model.occupancy, model.box, warp))
 
     def prepare(self) -> None:
         """Update the frames' occupancy every ``occupancy_every`` iterations."""
@@ -405,87 +293,81 @@ class DeformationStage(VoxelStage):
         since = self.iteration - self.phase.start
         if since and since % self.motion.occupancy_every == 0:
             with span("sampling"):
-                self.update_occupancy()
+                self._update_occupancy()
 
     def draw(self, batch: ParallelBatch) -> Pixels:
         """Random pixels of the batch's frame, of its views in turn or of all."""
-        if isinstance(self.phase, RefinementPhase):
-            return self.refinement.draw()
         pools = self.active[batch.number].pools
         return self.draw_pixels(pools[self.iteration % len(pools)])
 
     @property
     def view_cycle(self) -> int:
         """As many as there are pools, which batches are drawn from in turn."""
-        if isinstance(self.phase, RefinementPhase):
-            return 1
         return max(len(frame.pools) for frame in self.active)
 
     def loss(
         self, batch: ParallelBatch, views: Views, pixels: Pixels
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Render a batch of the frame through its warp; compare images and motion."""
-        if isinstance(self.phase, RefinementPhase):
-            return self.refinement.loss(views, pixels)
-        frame, capacity, grid = self.active[batch.number], batch.capacity, None
-        if self._matter is not None:
-            grid = MotionGrid(frame.forward, frame.box, self._matter)
+        frame, capacity, field = self.active[batch.number], batch.capacity, self.field
+        # Before frame 1 nothing has moved; lists of fixed length take the same work each time.
+        before = [frame.before] if capacity is not None or frame.number > 1 else []
+        changes = (extension.color_change(frame) for extension in self.extensions)
+        color_change = next((change for change in changes if change is not None), None)
+        warp = field.warp_by(frame.backward)
         prediction = MotionPrediction(
-            *self.render_pixels(
-                views, pixels, frame.occupancy, capacity, frame.warp, frame.appearance
-            ),
-            frame.unwarp,
-            frame.unwarp_previous(always_interpolate=capacity is not None),
+            *self.render_pixels(views, pixels, frame.occupancy, capacity, warp, color_change),
+            field.warp_by(frame.forward),
+            field.warp_by(*before),
             views.cameras,
             self.previous_images,
+            frame.forward,
+            field.box,
             self.scene_model.space,
-            grid,
+            self.flow_mean,
         )
         with span("losses"):
-            return self.losses(prediction)
+            return weighted_loss(prediction, self.terms, self.weights)
 
     def converged(self, losses: Tensor) -> bool:
         """Whether each active frame's loss has stopped falling, if the schedule asks for that."""
-        least = self.motion.min_rel_improvement
-        if least is None or isinstance(self.phase, RefinementPhase):
-            return False
-        return self._convergence.converged(losses, least)
+        gain = self.motion.min_rel_improvement
+        return gain is not None and self._convergence.converged(losses, gain)
 
     def rollback(self, iteration: int, lr_scale: float) -> None:
         """Go on from an earlier iteration of the present frames, with an occupancy found anew."""
         super().rollback(iteration, lr_scale)
         self._convergence.reset()
-        self.update_occupancy()
-
-    @property
-    def memory_keys(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Grid sizes and rays; how many frames are learned together, if there are several."""
-        levels, phase = len(self.schedule.levels), self.phase
-        number = phase.level + 1 if isinstance(phase, DeformationPhase) else levels
-        level = f"schedule.deformation.levels.{number}"
-        keys = (f"{level}.side", "schedule.deformation.rays")
-        return (*keys, f"{level}.parallel_frames") if len(self.active) > 1 else keys
+        self._update_occupancy()
 
     def phase_state(self) -> dict[str, Any]:
         """The state of each active frame, and its losses so far."""
-        area = self.views.height * self.views.width
         exact = self.motion.rests_half(self.device)
-        return {
-            "frames": [
-                frame.state(images_of(self.views, frame.number), area, exact=exact)
-                for frame in self.active
-            ],
-            "convergence": self._convergence.state(),
-        }
+        frames = self.active.state(self.views, exact=exact)
+        return {"frames": frames, "convergence": self._convergence.state()}
 
     def restore(self, phase: Phase, kept: dict[str, Any]) -> None:
         """Go on with the frames of ``phase``, the field being loaded."""
-        if isinstance(phase, RefinementPhase):
-            self._begin_refinement()
-            return
         assert isinstance(phase, DeformationPhase)
-        self.activate(phase)
-        views = self.views
-        for frame, state in zip(self.active, kept["frames"], strict=True):
-            frame.load_state(state, images_of(views, frame.number), views.height * views.width)
+        self._activate(phase)
+        self.active.load_state(kept["frames"], self.views)
         self._convergence.load_state(kept["convergence"])
+
+
+def motion_terms(
+    loss: Mapping[str, float],
+    extensions: Sequence[Extension],
+    schedule: DeformationSchedule,
+) -> tuple[dict[str, MotionTerm], dict[str, float]]:
+    """The loss terms there are, and the weights of those that count.
+
+    Raises:
+        DevrfError: a weight, or a factor of the schedule, is of no term.
+    """
+    terms: dict[str, MotionTerm] = dict(MOTION_TERMS)
+    weights = {name: weight for name, weight in loss.items() if name != "tv"}
+    for extension in extensions:
+        terms |= extension.terms
+        weights |= extension.weights
+    schedule.check_terms({*terms, "tv"})
+    return terms, counted_weights(weights, terms, "loss.deformation")

@@ -26,7 +26,7 @@ def possible_matter(
     Not nearer to a camera than its near plane: fog before a lens would explain its image
     perfectly. Not where fewer than ``min_views`` cameras look, if there are so many: fog would
     explain two images as well. ``carve`` leaves nothing outside the visual hull, if the images
-    have mattes and all show the rest state, and the box is not endless.
+    have alpha masks and all show the rest state, and the box is not unbounded.
     """
     views, box, space = scene.static.train, scene.bounds.box, scene.space
     cameras = views.cameras if device is None else views.cameras.to(device)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Literal
 
 import torch
@@ -17,9 +16,8 @@ from devrf.data.batch import RayBatch
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.space import WORLD, Space
-from devrf.methods.devrf.bending import bending_energy
-from devrf.methods.devrf.elastic import elastic_energy
-from devrf.methods.devrf.volume_rendering import VoxelOutput, Warp
+from devrf.methods.devrf.volume_rendering import Warp
+from devrf.rendering.output import VoxelOutput
 
 # What the flow loss is a mean over.
 FlowMean = Literal["rays", "samples"]
@@ -60,43 +58,12 @@ def alpha_mask(prediction: Prediction) -> Tensor:
     return (prediction.output.transmittance - (1 - alpha)).square().mean()
 
 
-def opacity(prediction: Prediction) -> Tensor:
-    """Mean 1 − T_end: how much the rays hit."""
-    return 1 - prediction.output.transmittance.mean()
-
-
-def coverage(prediction: Prediction) -> Tensor | None:
-    """Mean A of the images' alpha channel: how much they should hit; None without one."""
-    alpha = prediction.batch.alpha
-    return None if alpha is None else alpha.mean()
-
-
 PHOTOMETRIC_TERMS = {
     "color": color_error,
     "per_sample_color": per_sample_color,
     "entropy": background_entropy,
     "alpha_mask": alpha_mask,
 }
-# Logged beside the terms.
-VISIBILITY: dict[str, Callable[[Prediction], Tensor | None]] = {
-    "opacity": opacity,
-    "coverage": coverage,
-}
-
-
-@dataclass(frozen=True)
-class MotionGrid:
-    """The forward slice of a frame.
-
-    Attributes:
-        displacement: (X, Y, Z, 3) Δ_f(·, t).
-        box: where it lives.
-        occupied: (X−1, Y−1, Z−1) 1 for the cells that hold matter at rest, else 0.
-    """
-
-    displacement: Tensor
-    box: Box
-    occupied: Tensor
 
 
 @dataclass(frozen=True)
@@ -109,16 +76,20 @@ class MotionPrediction(Prediction):
         cameras: the cameras of the images that the batch was drawn from.
         previous_image: (N,) int64, for each image the one that its flow leads to (the same view
             one frame earlier), or the image itself where there is none.
+        forward_slice: (X, Y, Z, 3) Δ_f(·, t) itself, for terms that need no samples.
+        box: where the slices live.
         space: the space that points are in.
-        grid: the forward slice itself, for terms that need no samples; None where none counts.
+        flow_mean: what the flow loss is a mean over.
     """
 
     unwarp: Warp
     unwarp_previous: Warp
     cameras: Cameras
     previous_image: Tensor
+    forward_slice: Tensor
+    box: Box
     space: Space = WORLD
-    grid: MotionGrid | None = None
+    flow_mean: FlowMean = "rays"
 
 
 def cycle(prediction: MotionPrediction) -> Tensor:
@@ -129,7 +100,7 @@ def cycle(prediction: MotionPrediction) -> Tensor:
     return output.mean_over_samples(missed)
 
 
-def flow(prediction: MotionPrediction, mean: FlowMean = "rays") -> Tensor:
+def flow(prediction: MotionPrediction) -> Tensor:
     """L_flow = (1/M) Σ_i w_i m_i |φ_i − φ_i^observed|₁ in pixels (docs/method.md#flow).
 
     M is the number of ``rays`` whose flow is valid, or twice the number of their ``samples``;
@@ -149,34 +120,9 @@ def flow(prediction: MotionPrediction, mean: FlowMean = "rays") -> Tensor:
     )
     error = (induced - batch.flow[ray]).abs().sum(dim=1)
     total = (weight * error).sum()
-    if mean == "rays":
+    if prediction.flow_mean == "rays":
         return total / batch.flow_valid.sum().clamp(min=1)
     return total / (2 * output.count_on(batch.flow_valid)).clamp(min=1)
-
-
-# The flow loss by what it is a mean over.
-FLOW_TERMS: dict[FlowMean, Callable[[MotionPrediction], Tensor]] = {
-    "rays": flow,
-    "samples": partial(flow, mean="samples"),
-}
-
-
-def of_grid(
-    energy: Callable[[Tensor, Box, Tensor], Tensor], prediction: MotionPrediction
-) -> Tensor:
-    """An energy () of the forward slice itself, where there is matter; 0 where no grid counts."""
-    grid = prediction.grid
-    if grid is None:
-        return prediction.output.color.new_zeros(())
-    return energy(grid.displacement, grid.box, grid.occupied)
-
-
-# The terms that look at the forward slice itself: how much it stretches matter
-# (docs/method.md#elastic), and how much it bends it (docs/method.md#bending).
-PRIORS = {
-    "elastic": partial(of_grid, elastic_energy),
-    "bending": partial(of_grid, bending_energy),
-}
 
 
 def induced_flow(
@@ -214,19 +160,9 @@ def total_variation_weight(weight: float, side: int, rays: int) -> float:
     return weight * (side / 128) / rays / 6
 
 
-def residual(prediction: MotionPrediction) -> Tensor:
-    """(1/R) Σ_i w_i |A_t(q_i)|²: colours stay what they are at rest; 0 without residuals."""
-    output = prediction.output
-    if output.residual is None:
-        return output.color.new_zeros(())
-    large = (output.weight.detach() * output.residual.square().sum(dim=1)).sum()
-    return large / len(prediction.batch.rays)
-
-
+# The terms of the paper that constrain the motion, and the photometric ones through the warp.
 MOTION_TERMS: dict[str, Callable[[MotionPrediction], Tensor]] = {
     **{("render" if name == "color" else name): term for name, term in PHOTOMETRIC_TERMS.items()},
     "cycle": cycle,
     "flow": flow,
-    **PRIORS,
-    "residual": residual,
 }

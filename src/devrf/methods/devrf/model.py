@@ -2,35 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+import pkgutil
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import partial
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Protocol, Self, cast
 
 import torch
 from torch import Tensor, nn
 
-from devrf.data.batch import RayBatch
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.geometry.space import WORLD, Space, space_config, space_from
-from devrf.methods.base import DynamicModel
-from devrf.methods.devrf.appearance import AppearanceField, ColorResidual
+from devrf.methods.base import Renderable
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.compact_state import compact_state, expanded_state
-from devrf.methods.devrf.deformation_field import DeformationField
-from devrf.methods.devrf.deformed_occupancy import deformed_occupancy
-from devrf.methods.devrf.settings import RenderSettings
-from devrf.methods.devrf.static_shape.viewing import ListRenderer
-from devrf.methods.devrf.surface import CanonicalSurface
+from devrf.methods.devrf.deformation_field import DeformationField, FrameField, deformed_occupancy
 from devrf.methods.devrf.view import DeVRFView
-from devrf.methods.devrf.volume_rendering import Warp, render
+from devrf.methods.devrf.volume_rendering import Warp
+from devrf.rendering.list_rendering import ListRenderer
 from devrf.rendering.occupancy import Occupancy
-from devrf.rendering.output import RenderOutput
+from devrf.rendering.output import ColorChange
+from devrf.rendering.sampling import RenderSettings
 
 
-class DeVRFModel(DynamicModel):
+class ColorField(Protocol):
+    """A field of frames that changes colours: a :class:`FrameField` of an extension."""
+
+    def at(self, time: float) -> ColorChange | None:
+        """What is added to the colours' logits at ``time`` in [0, 1]; None where nothing is."""
+        ...
+
+
+class DeVRFModel(Renderable):
     """A scene, to be rendered from any view at any time.
 
     Attributes:
@@ -40,7 +45,7 @@ class DeVRFModel(DynamicModel):
         deformation: V_motion; None shows the rest state at every time.
         settings: how rays are sampled.
         space: the space that the fields live in.
-        appearance: how colours change over time; None: they do not.
+        color_residual: how colours change over time; None: they do not.
     """
 
     name: ClassVar[str] = "devrf"
@@ -53,7 +58,7 @@ class DeVRFModel(DynamicModel):
         settings: RenderSettings,
         deformation: DeformationField | None = None,
         space: Space = WORLD,
-        appearance: AppearanceField | None = None,
+        color_residual: FrameField | None = None,
     ) -> None:
         super().__init__()
         self.architecture = architecture
@@ -61,7 +66,7 @@ class DeVRFModel(DynamicModel):
         self.occupancy = occupancy
         self.settings = settings
         self.deformation = deformation
-        self.appearance = appearance
+        self.color_residual = color_residual
         self.space = space
         self._lists: dict[bool, ListRenderer] = {}
 
@@ -83,7 +88,7 @@ class DeVRFModel(DynamicModel):
             "space": space_config(self.space),
             "radiance": self.canonical.has_network,
             "deforms": self.moves,
-            "changes_color": self.appearance is not None,
+            "color_residual": _class_path(self.color_residual),
         }
 
     @classmethod
@@ -100,34 +105,8 @@ class DeVRFModel(DynamicModel):
             RenderSettings(**config["settings"]),
             DeformationField(box, clock, voxels=8) if config["deforms"] else None,
             space_from(config["space"]),
-            AppearanceField(box, clock, voxels=8) if config.get("changes_color") else None,
+            _class_at(config["color_residual"], box, clock),
         )
-
-    def forward(self, batch: RayBatch) -> RenderOutput:
-        """Render rays, those of each distinct time through that time's warp."""
-        rays = len(batch.rays)
-        background = batch.background.expand(rays, 3)
-        color = torch.zeros_like(batch.color)
-        depth, transmittance = color.new_zeros(rays), color.new_zeros(rays)
-        for time in torch.unique(batch.time).tolist():
-            place = (batch.time == time).nonzero()[:, 0]
-            seen = render(
-                batch.rays[place],
-                self.canonical,
-                self.occupancy_at(time),
-                self.settings,
-                background[place],
-                self.warp(time),
-                appearance=self.residual(time),
-            )
-            color = color.index_copy(0, place, seen.color)
-            depth = depth.index_copy(0, place, seen.depth)
-            transmittance = transmittance.index_copy(0, place, seen.transmittance)
-        return RenderOutput(color=color, depth=depth, transmittance=transmittance)
-
-    def parts(self) -> dict[str, Iterable[nn.Parameter]]:
-        """The canonical field; frames of the deformation are learned by ``DeformationStage``."""
-        return {"canonical": self.canonical.parameters()}
 
     def warp(self, time: float) -> Warp | None:
         """x → x + Δ_b(x, t), points (M, 3) at ``time`` → canonical space; None is the identity."""
@@ -136,23 +115,33 @@ class DeVRFModel(DynamicModel):
             return None
         return deformation.warp_at(time)
 
-    def residual(self, time: float) -> ColorResidual | None:
+    def color_change(self, time: float) -> ColorChange | None:
         """q → A_t(q) at ``time``; None where colours are those of the canonical field."""
-        return None if self.appearance is None else self.appearance.at(time)
+        return (
+            None if self.color_residual is None else cast(ColorField, self.color_residual).at(time)
+        )
 
     def occupancy_at(self, time: float) -> Occupancy:
         """Where something is at ``time`` in [0, 1]."""
         warp = self.warp(time)
         if warp is None:
             return self.occupancy
-        return deformed_occupancy(self.occupancy, self.canonical, warp)
+        return deformed_occupancy(self.occupancy, self.canonical.box, warp)
 
     def at(self, time: float, *, half: bool = False) -> DeVRFView:
         """The scene at ``time``: its occupancy and its displacements, ready."""
         lists, present = self._lists.get(half), (self.canonical, self.settings)
         if lists is None or (lists.field, lists.settings) != present:
             lists = self._lists[half] = ListRenderer(*present, half=half)
-        return DeVRFView(self.occupancy, self.deformation, lists, self.space, time, self.appearance)
+        return DeVRFView(
+            self.canonical,
+            self.occupancy,
+            self.deformation,
+            lists,
+            self.space,
+            time,
+            self.color_change(time),
+        )
 
     def surface(self) -> CanonicalSurface:
         """The canonical field."""
@@ -183,17 +172,69 @@ class DeVRFModel(DynamicModel):
     @property
     def size(self) -> int:
         """Values of all fields."""
-        motion, appearance = self.deformation, self.appearance
+        motion, residual = self.deformation, self.color_residual
         frames = [] if motion is None else [motion.to_canonical, motion.to_time]
-        frames += [] if appearance is None else [appearance.values]
+        frames += [] if residual is None else [residual.values]
         return super().size + sum(tensor.numel() for tensor in frames)
 
     def stored_state(self) -> dict[str, Any]:
         """The state with packed grids (``compact_state``)."""
         fields = self.occupancy, self.canonical, self.deformation, self.occupancy_at
-        endless = not self.space.is_linear
-        return compact_state(self.state_dict(), *fields, self.appearance, endless=endless)
+        unbounded = not self.space.is_linear
+        return compact_state(self.state_dict(), *fields, self.color_residual, unbounded=unbounded)
 
     def load_stored_state(self, state: Mapping[str, Any]) -> None:
         """Take a compact or a full state."""
         self.load_state_dict(expanded_state(dict(state)))
+
+
+class CanonicalSurface:
+    """The radiance field at rest, as :class:`~devrf.rendering.view.SurfaceField`.
+
+    Opacities are those of a voxel of the full grid (docs/method.md#step-length).
+    """
+
+    def __init__(self, field: CanonicalField, occupancy: Occupancy) -> None:
+        """Look at a field.
+
+        Args:
+            field: the canonical field.
+            occupancy: where something is at rest; elsewhere nothing is rendered.
+        """
+        self._field, self._occupancy = field, occupancy
+
+    @property
+    def box(self) -> Box:
+        """Where the field lives."""
+        return self._field.box
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """The density grid's points along x, y, z."""
+        return self._field.density.shape
+
+    @torch.no_grad()
+    def optical_depth(self, points: Tensor) -> Tensor:
+        """τ (M,) of one voxel, 0 in cells that are known to be empty."""
+        depth = self._field.optical_depth(points, self._field.step_in_base_voxels(1.0))
+        return torch.where(self._occupancy.at(points), depth, 0.0)
+
+    @torch.no_grad()
+    def color(self, points: Tensor, viewdirs: Tensor) -> Tensor:
+        """RGB (M, 3) of points, each seen in its own direction."""
+        return self._field.rgb(points, viewdirs, torch.arange(len(points), device=points.device))
+
+
+def _class_path(field: nn.Module | None) -> str | None:
+    """Where the field's class is, for :func:`_class_at`."""
+    return None if field is None else f"{type(field).__module__}:{type(field).__qualname__}"
+
+
+def _class_at(path: str | None, box: Box, clock: FrameClock) -> FrameField | None:
+    """A field of a few voxels of the class at ``path``; a checkpoint names those of devrf only."""
+    if path is None:
+        return None
+    if not path.startswith("devrf.methods."):
+        raise ValueError(path)
+    field: FrameField = pkgutil.resolve_name(path)(box, clock, voxels=8)
+    return field

@@ -21,11 +21,8 @@ DEFORMATION_LOSS = {
     "tv": 1.0,
     "per_sample_color": 0.1,
     "entropy": 0.01,
-    "elastic": 0.0,
-    "bending": 0.0,
     "alpha_mask": 0.0,
 }
-APPEARANCE_LOSS = {"residual": 1e-3, "tv": 0.002}
 
 
 @dataclass(frozen=True)
@@ -63,27 +60,10 @@ class Sampling:
 
 
 @dataclass(frozen=True)
-class RenderSettings:
-    """How rays are sampled at the present resolution.
-
-    Attributes:
-        step: distance between samples in voxels of the present resolution.
-        alpha_threshold: as in :class:`Sampling`.
-        near: distance before which nothing is sampled, in world units (or NDC).
-        far: distance behind which nothing is sampled, likewise.
-    """
-
-    step: float
-    alpha_threshold: float
-    near: float
-    far: float
-
-
-@dataclass(frozen=True)
 class MotionSettings:
     """How the deformation field is learned, beside its schedule.
 
-    docs/method.md#departures says what ``unit``, ``views``, ``pixels`` and ``init_from`` add.
+    What ``unit``, ``views`` and ``pixels`` add to the paper: docs/method.md#departures.
 
     Attributes:
         learning_rate: base rate, in ``unit`` per step: how far a voxel moves at most
@@ -95,10 +75,6 @@ class MotionSettings:
         pixels: ``all`` draws from whole images; ``occupied`` from the pixels of the alpha mask
             and those whose rays hit what the present field has moved there.
         occupancy_every: iterations between updates of the frame's occupancy.
-        init_from: where a frame starts from at the coarsest level: ``previous`` is the result of
-            the frame before it; ``flow`` moves that along the observed optical flow, if there is
-            any and no camera has moved; ``tracks`` follows the flow back to a frame in which the
-            model shows each pixel's colour (docs/method.md#flow-initialisation).
         store: where the displacements of all frames are kept while one is learned: ``device``,
             ``host``, or ``auto``: on the device if they fit there beside all else. Each of
             several processes keeps them on its device.
@@ -116,7 +92,6 @@ class MotionSettings:
     views: Literal["one", "all"] = "one"
     pixels: Literal["all", "occupied"] = "all"
     occupancy_every: int = 25
-    init_from: Literal["previous", "flow", "tracks"] = "previous"
     adam_state: Literal["fresh", "carried"] = "fresh"
     store: Literal["auto", "device", "host"] = "auto"
     store_half: bool | Literal["auto"] = "auto"

@@ -8,19 +8,22 @@ from torch import Tensor
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import Space
-from devrf.methods.devrf.appearance import AppearanceField
-from devrf.methods.devrf.deformation_field import DeformationField
-from devrf.methods.devrf.deformed_occupancy import occupancy_points, occupancy_through
-from devrf.methods.devrf.grid_warp import GridWarp
+from devrf.methods.devrf.canonical_field import CanonicalField
+from devrf.methods.devrf.deformation_field import (
+    DeformationField,
+    GridWarp,
+    occupancy_points,
+    occupancy_through,
+)
 from devrf.methods.devrf.losses import induced_flow
-from devrf.methods.devrf.static_shape.viewing import ListRenderer
 from devrf.methods.devrf.volume_rendering import render
 from devrf.ops.compositing import sum_by_ray
 from devrf.ops.corners import shape_of
 from devrf.ops.dispatch import triton_runs
 from devrf.ops.trilinear import resample
+from devrf.rendering.list_rendering import ListRenderer
 from devrf.rendering.occupancy import Occupancy
-from devrf.rendering.output import RenderedImage
+from devrf.rendering.output import ColorChange, RenderedImage
 
 # Rays at once: on a CPU what its caches hold, on a GPU what keeps it busy and fits.
 ON_CPU, ON_GPU, IN_LISTS = 8192, 2**15, 2**18
@@ -38,27 +41,29 @@ class DeVRFView:
     @torch.no_grad()
     def __init__(
         self,
+        canonical: CanonicalField,
         occupancy: Occupancy,
         deformation: DeformationField | None,
         lists: ListRenderer,
         space: Space,
         time: float,
-        appearance: AppearanceField | None = None,
+        color_change: ColorChange | None = None,
     ) -> None:
-        """Blend the displacements and residuals of a time, and find its occupancy.
+        """Blend the displacements of a time, and find its occupancy.
 
         Args:
+            canonical: what the scene looks like at rest.
             occupancy: where something is at rest.
             deformation: how the scene moves; None: it is at rest at every time.
-            lists: renders the canonical field where Triton runs; has the field and its settings.
+            lists: renders the canonical field where Triton runs; has its settings.
             space: the space that the fields live in.
             time: in [0, 1].
-            appearance: how colours change; None: they do not.
+            color_change: what is added to the colours' logits at that time; None: nothing.
         """
-        canonical = self._canonical = lists.field
+        self._canonical = canonical
         self._lists, self._settings, self._space = lists, lists.settings, space
         self._motion = deformation
-        self._residual = None if appearance is None else appearance.at(time)
+        self._color_change = color_change
         self.occupancy, self.displacement = occupancy, None
         self.at_rest = deformation is None or deformation.clock.at(time).after == 0
         self._warp: GridWarp | None = None
@@ -68,14 +73,14 @@ class DeVRFView:
             self._warp = GridWarp(
                 (self.displacement,), deformation.box, still_outside=still_outside
             )
-            points = occupancy_points(occupancy, canonical)
+            points = occupancy_points(occupancy, canonical.box)
             if still_outside:
                 moved = self._warp(points.view(-1, 3)).view(points.shape)
             else:
                 # Interpolation at the points of a grid over the same box is resampling, which is
                 # several times faster.
                 moved = points + resample(self.displacement, shape_of(points))
-            self.occupancy = occupancy_through(occupancy, canonical, moved)
+            self.occupancy = occupancy_through(occupancy, canonical.box, moved)
 
     @property
     def _in_lists(self) -> bool:
@@ -95,7 +100,7 @@ class DeVRFView:
         """What R rays in the fields' space see."""
         if self._in_lists:
             return self._lists.picture(
-                rays, self.occupancy, self.displacement, background, self._residual
+                rays, self.occupancy, self.displacement, background, self._color_change
             )
         return RenderedImage.of(
             render(
@@ -105,7 +110,7 @@ class DeVRFView:
                 self._settings,
                 background,
                 self._warp,
-                appearance=self._residual,
+                color_change=self._color_change,
             )
         )
 

@@ -6,71 +6,19 @@ The samples of each ray, docs/method.md#rays, composited: docs/method.md#composi
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from devrf.geometry.rays import Rays
-from devrf.methods.devrf.appearance import ColorResidual
 from devrf.methods.devrf.canonical_field import CanonicalField
-from devrf.methods.devrf.settings import RenderSettings
 from devrf.ops.compositing import color_and_depth, composite, sum_by_ray, transmittances
 from devrf.rendering.occupancy import Occupancy
-from devrf.rendering.output import RenderOutput
-from devrf.rendering.sampling import Samples, march
+from devrf.rendering.output import ColorChange, VoxelOutput
+from devrf.rendering.sampling import STOP, RenderSettings, Samples, march
 from devrf.system.profiling import span
 
 Warp = Callable[[Tensor], Tensor]
-
-# A ray ends where its transmittance is less: what is behind cannot be seen.
-STOP = 1e-4
-
-
-@dataclass(frozen=True, kw_only=True)
-class VoxelOutput(RenderOutput):
-    """What R rays see, and the K samples whose colour was computed.
-
-    Attributes:
-        samples: at their positions x_i at the rays' time.
-        canonical: (K, 3) their canonical positions q_i.
-        weight: (K,) their weights w_i.
-        sample_color: (K, 3) their colours c_i.
-        residual: (K, 3) A_t(q_i) in logits; None without one.
-        first: (R + 1,) where each ray's samples begin in a list of fixed length; None elsewhere.
-    """
-
-    samples: Samples
-    canonical: Tensor
-    weight: Tensor
-    sample_color: Tensor
-    residual: Tensor | None = None
-    first: Tensor | None = None
-
-    def mean_over_samples(self, values: Tensor) -> Tensor:
-        """The mean () of values (K,) of samples, padding left out; 0 without samples."""
-        present = self.samples.present
-        if present is not None:
-            return torch.where(present, values, 0.0).sum() / present.sum().clamp(min=1)
-        return values.mean() if len(values) else values.sum()
-
-    def count_on(self, chosen: Tensor) -> Tensor:
-        """The number () of samples on the ``chosen`` (R,) rays, padding left out."""
-        kept, present = chosen[self.samples.ray], self.samples.present
-        return kept.sum() if present is None else (kept & present).sum()
-
-    def on_rays(self, chosen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Ray (S,), canonical position (S, 3) and weight (S,) of the ``chosen`` (R,) rays' samples.
-
-        A list of fixed length keeps its length: other samples get weight 0 and a harmless position.
-        """
-        ray, kept = self.samples.ray, chosen[self.samples.ray]
-        if self.samples.present is None:
-            index = kept.nonzero()[:, 0]
-            return ray[index], self.canonical[index], self.weight[index]
-        kept = kept & self.samples.present
-        canonical = torch.where(kept[:, None], self.canonical, 0.0)
-        return ray, canonical, torch.where(kept, self.weight, 0.0)
 
 
 def render(
@@ -81,7 +29,7 @@ def render(
     background: Tensor,
     warp: Warp | None = None,
     precision: torch.dtype = torch.float32,
-    appearance: ColorResidual | None = None,
+    color_change: ColorChange | None = None,
 ) -> VoxelOutput:
     """Colours Ĉ = Σ w_i c_i + T_end · C_background and depths Σ w_i z_i / Σ w_i of rays.
 
@@ -95,10 +43,10 @@ def render(
         background: (3,) or (R, 3) RGB behind everything, if the space does not hold infinity.
         warp: x → q = x + Δ_b(x, t), points (M, 3) to canonical space; None is the identity.
         precision: what the colour network works in.
-        appearance: q → A_t(q), added to the colours' logits; None: nothing is.
+        color_change: q → A_t(q), added to the colours' logits; None: nothing is.
 
     Returns:
-        What the rays see; differentiable in the parameters of field, warp and appearance.
+        What the rays see; differentiable in the parameters of field, warp and colour change.
     """
     delta = field.step_in_base_voxels(settings.step)
     with span("sampling"):
@@ -125,7 +73,7 @@ def render(
         samples, canonical = samples[significant], canonical.index_select(0, significant)
         weight = weight.index_select(0, significant)
     with span("decoder"):
-        residual = None if appearance is None else appearance(canonical)
+        residual = None if color_change is None else color_change(canonical)
         color = field.rgb(canonical, rays.viewdirs, samples.ray, precision, residual)
         ends = rays.ends()
         if ends is not None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import torch
 from torch import Tensor
 
@@ -10,20 +12,27 @@ from devrf.engine.batches import gather_batch
 from devrf.engine.ddp import rays_per_rank
 from devrf.engine.graphs import Graphs
 from devrf.engine.stage import ScheduledStage
-from devrf.methods.devrf.appearance import ColorResidual
-from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
-from devrf.methods.devrf.deformation_schedule import DeformationSchedule
-from devrf.methods.devrf.grid_warp import GridWarp
+from devrf.methods.devrf.deformation_field import GridWarp
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import Precision
-from devrf.methods.devrf.static_shape.training import render_static
-from devrf.methods.devrf.volume_rendering import VoxelOutput, render
+from devrf.methods.devrf.volume_rendering import render
 from devrf.ops.dispatch import triton_runs
+from devrf.rendering.list_rendering import render_static
 from devrf.rendering.occupancy import Occupancy
+from devrf.rendering.output import ColorChange, VoxelOutput
 from devrf.rendering.sample_capacity import SampleCapacity
 from devrf.scenes.scene import Views
 from devrf.system.device import multiplies_bfloat16
 from devrf.system.profiling import span
+
+
+class RayCount(Protocol):
+    """What a schedule says of batches."""
+
+    @property
+    def rays(self) -> int:
+        """Of a batch."""
+        ...
 
 
 class VoxelStage(ScheduledStage):
@@ -36,7 +45,7 @@ class VoxelStage(ScheduledStage):
     """
 
     scene_model: DeVRFModel
-    schedule: CanonicalSchedule | DeformationSchedule
+    schedule: RayCount
 
     def __init__(
         self,
@@ -64,16 +73,18 @@ class VoxelStage(ScheduledStage):
         occupancy: Occupancy,
         capacity: SampleCapacity | None,
         warp: GridWarp | None = None,
-        appearance: ColorResidual | None = None,
+        color_change: ColorChange | None = None,
     ) -> tuple[VoxelOutput, RayBatch]:
         """Render pixels of ``views``, in lists of fixed length if there is a ``capacity``."""
         model, precision = self.scene_model, self._precision
         with span("batch"):
             batch = gather_batch(views, pixels.image, pixels.flat, pixels.background, model.space)
-        fields = model.canonical, occupancy, model.settings, batch.background, warp
+        fields = model.canonical, occupancy, model.settings, batch.background
         if capacity is None:
-            return render(batch.rays, *fields, precision, appearance), batch
-        return render_static(batch.rays, *fields, capacity, precision, appearance), batch
+            return render(batch.rays, *fields, warp, precision, color_change), batch
+        moved = ((), 0.0) if warp is None else (warp.slices, warp.weight)
+        listed = render_static(batch.rays, *fields, *moved, capacity, precision, color_change)
+        return listed, batch
 
     def static_shape(self, density: Tensor) -> bool:
         """Whether batches are rendered in lists of fixed length: where Triton runs.

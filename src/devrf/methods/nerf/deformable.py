@@ -16,7 +16,7 @@ from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import WORLD, Space, space_config, space_from
-from devrf.methods.base import DynamicModel
+from devrf.methods.base import RayTrainable
 from devrf.methods.nerf.hierarchical import flattened, importance, limits, stratified
 from devrf.methods.nerf.occupancy_frames import OccupancyFrames, diagonal_step
 from devrf.methods.nerf.placement import Placement
@@ -30,7 +30,7 @@ from devrf.scenes.scene import Scene
 from devrf.system.device import multiplies_bfloat16
 
 
-class DeformableField(DynamicModel):
+class DeformableField(RayTrainable):
     """(σ, c) = T(x′, w, d), where a deformation leads a point x at time t to x′ and w.
 
     A method says what the deformation is (:meth:`deform`). T lives in normalised space: the box

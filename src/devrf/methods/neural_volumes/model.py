@@ -15,7 +15,7 @@ from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import WORLD
-from devrf.methods.base import DynamicModel
+from devrf.methods.base import RayTrainable
 from devrf.methods.nerf.occupancy_frames import OccupancyFrames
 from devrf.methods.nerf.ray_samples import RaySamples
 from devrf.methods.nerf.ray_view import RayView
@@ -37,7 +37,7 @@ from devrf.scenes.scene import Scene
 MOMENTS = 16
 
 
-class NeuralVolumes(DynamicModel):
+class NeuralVolumes(RayTrainable):
     """z from the images of a moment; a template and a warp from z, seen by adding up opacity."""
 
     name: ClassVar[str] = "neural_volumes"

@@ -18,7 +18,7 @@ from devrf.geometry.clock import FrameClock
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import WORLD, Space, space_config, space_from
-from devrf.methods.base import DynamicModel
+from devrf.methods.base import RayTrainable
 from devrf.methods.nerf.occupancy_frames import OccupancyFrames, diagonal_step
 from devrf.methods.nerf.placement import Placement
 from devrf.methods.nerf.ray_samples import RaySamples
@@ -39,7 +39,7 @@ log = logging.getLogger(__name__)
 REACH_IN_NDC, REACH_IN_A_BOX = 1.0, 0.2
 
 
-class NSFF(DynamicModel):
+class NSFF(RayTrainable):
     """S(x, d) → σ_s, c_s, v and D(x, t, d) → σ_d, c_d, f±, o±, composited in one pass."""
 
     name: ClassVar[str] = "nsff"

@@ -12,14 +12,14 @@ from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.settings import RenderSettings
-from devrf.methods.devrf.static_shape import viewing as module
-from devrf.methods.devrf.static_shape.viewing import ListRenderer
 from devrf.methods.devrf.volume_rendering import render
 from devrf.ops.dispatch import using
+from devrf.rendering import list_rendering as module
+from devrf.rendering.list_rendering import ListRenderer
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.output import RenderedImage
 from devrf.rendering.renderer import Renderer
+from devrf.rendering.sampling import RenderSettings
 from devrf.scenes.scene import Scene
 
 WHITE = torch.ones(3)
@@ -47,7 +47,7 @@ def test_what_the_renderer_shows(
 ) -> None:
     rays, view = tiny_scene.dynamic.test.cameras.image_rays(0), moving.at(time)
     renderer = ListRenderer(moving.canonical, moving.settings, half=True)  # not on a CPU
-    colors = moving.residual(time)
+    colors = moving.color_change(time)
     seen = renderer.picture(rays, view.occupancy, view.displacement, WHITE, colors)
     same(seen, reference(moving, rays, time, WHITE))
     assert int((seen.opacity > 0.5).sum()) > 20

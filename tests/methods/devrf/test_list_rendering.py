@@ -8,17 +8,17 @@ from torch import Tensor
 
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
-from devrf.methods.devrf.appearance import ColorResidual
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField
-from devrf.methods.devrf.grid_warp import GridWarp
-from devrf.methods.devrf.settings import RenderSettings
-from devrf.methods.devrf.static_shape.training import render_static
-from devrf.methods.devrf.volume_rendering import VoxelOutput, render
+from devrf.methods.devrf.deformation_field import GridWarp
+from devrf.methods.devrf.extensions.color_residual import ResidualGrid
+from devrf.methods.devrf.volume_rendering import render
 from devrf.ops.dispatch import Kind, using
+from devrf.rendering.list_rendering import render_static
 from devrf.rendering.occupancy import Occupancy
+from devrf.rendering.output import VoxelOutput
 from devrf.rendering.sample_capacity import SampleCapacity
-from devrf.rendering.sampling import most_steps, steps_through
+from devrf.rendering.sampling import RenderSettings, most_steps, steps_through
 
 RAYS = 24
 SETTINGS = RenderSettings(step=0.5, alpha_threshold=0.02, near=0.2, far=9.0)
@@ -49,7 +49,7 @@ class World:
         self.warp = GridWarp(self.slices, box, 0.3 if frames == 2 else 0.0)
         # Colours change while something moves.
         self.residual = (draw(3, 4, 3, 3)).to(dtype).requires_grad_() if frames else None
-        self.appearance = None if self.residual is None else ColorResidual(self.residual, box)
+        self.color_change = None if self.residual is None else ResidualGrid(self.residual, box)
         origins = torch.tensor([[-3.0, 0.0, 0.0]]) + 0.3 * draw(RAYS, 3)
         directions = torch.nn.functional.normalize(
             torch.tensor([[1.0, 0.0, 0.0]]) + 0.25 * draw(RAYS, 3), dim=1
@@ -70,7 +70,7 @@ class World:
             SETTINGS,
             self.behind,
             self.warp,
-            appearance=self.appearance,
+            color_change=self.color_change,
         )
 
     def listed(self, capacity: SampleCapacity) -> VoxelOutput:
@@ -80,9 +80,10 @@ class World:
             self.occupancy,
             SETTINGS,
             self.behind,
-            self.warp if self.slices else None,
+            self.slices,
+            self.warp.weight,
             capacity,
-            appearance=self.appearance,
+            color_change=self.color_change,
         )
 
 

@@ -12,7 +12,7 @@ from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
 from devrf.methods.devrf.deformation_field import DeformationField
-from devrf.methods.devrf.flow_initialisation import Tracks, start_from_tracks
+from devrf.methods.devrf.extensions.tracks import Tracks, start_from_tracks
 
 BOX = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 SHIFT = torch.tensor([0.3, -0.2, 0.1])

@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor, nn
 
 from devrf.checkpoints.stored_grids import pack_bits, unpack_bits
 from devrf.data.batch import PixelPool
-from devrf.geometry.box import Box
-from devrf.methods.devrf.appearance import AppearanceField, ColorResidual
-from devrf.methods.devrf.deformation_field import DeformationField
-from devrf.methods.devrf.grid_warp import GridWarp
+from devrf.engine.batches import frame_pools, images_of
+from devrf.engine.frame_store import FrameStore
 from devrf.rendering.occupancy import Occupancy
+from devrf.rendering.view import Viewable
+from devrf.scenes.scene import Views
+
+
+class FrameField(Protocol):
+    """A field of frames that keeps them in one tensor."""
+
+    @property
+    def values(self) -> Tensor:
+        """(T, X, Y, Z, C)."""
+        ...
 
 
 @dataclass
@@ -26,42 +35,40 @@ class ActiveFrame:
     that is written back.
 
     Attributes:
+        store: the displacements of all frames.
         backward: (X, Y, Z, 3) Δ_b of the frame, a leaf.
         forward: (X, Y, Z, 3) Δ_f of the frame, a leaf.
         before: (X, Y, Z, 3) Δ_f of the frame before, frozen.
         occupancy: where something is at the frame's time.
-        box: where the displacements live.
-        still_outside: whether nothing moves outside the box.
-        appearance: q → A_t(q) of the frame, its grid a leaf; None where it is not learned.
+        fields: further fields (T, …) whose frames are learned, by name.
+        further: the frame's slice of each, a leaf.
         number: the frame; 0 before the first.
         pools: the pixels to learn from; batches are drawn from each in turn.
     """
 
+    store: FrameStore
     backward: Tensor
     forward: Tensor
     before: Tensor
     occupancy: Occupancy
-    box: Box
-    still_outside: bool
-    appearance: ColorResidual | None = None
+    fields: Mapping[str, FrameField]
+    further: Mapping[str, Tensor]
     number: int = 0
     pools: list[PixelPool] = field(default_factory=list)
 
     @staticmethod
     def of(
-        motion: DeformationField, occupancy: Occupancy, appearance: AppearanceField | None = None
+        store: FrameStore, occupancy: Occupancy, fields: Mapping[str, FrameField]
     ) -> ActiveFrame:
         """Memory at the fields' resolutions, on their device, with an occupancy like the given."""
-        backward, forward, before = (
-            motion.frames.here.new_zeros(*motion.shape, 3) for _ in range(3)
-        )
+        backward, forward, before = (store.here.new_zeros(*store.shape, 3) for _ in range(3))
         empty = Occupancy(torch.zeros_like(occupancy.mask), occupancy.box)
         learned = backward.requires_grad_(), forward.requires_grad_()
-        residual = None
-        if appearance is not None:
-            grid = torch.zeros_like(appearance.values[0]).requires_grad_()
-            residual = ColorResidual(grid, appearance.box)
-        return ActiveFrame(*learned, before, empty, motion.box, motion.still_outside, residual)
+        further = {
+            name: torch.zeros_like(field.values[0]).requires_grad_()
+            for name, field in fields.items()
+        }
+        return ActiveFrame(store, *learned, before, empty, fields, further)
 
     @property
     def slices(self) -> tuple[Tensor, Tensor]:
@@ -71,45 +78,24 @@ class ActiveFrame:
     @property
     def learned(self) -> list[Tensor]:
         """Everything that is learned of the frame."""
-        return [*self.slices, *([] if self.residual is None else [self.residual])]
-
-    @property
-    def residual(self) -> Tensor | None:
-        """(X', Y', Z', 3) A_t of the frame, if it is learned."""
-        return None if self.appearance is None else self.appearance.grid
-
-    @property
-    def warp(self) -> GridWarp:
-        """x → x + Δ_b(x, t)."""
-        return self._by(self.backward)
-
-    @property
-    def unwarp(self) -> GridWarp:
-        """q → q + Δ_f(q, t)."""
-        return self._by(self.forward)
-
-    def unwarp_previous(self, *, always_interpolate: bool) -> GridWarp:
-        """q → q + Δ_f(q, t − 1), the identity for frame 1.
-
-        Args:
-            always_interpolate: look displacements of zero up for frame 1, too, so that every
-                frame takes the same work.
-        """
-        return self._by(*[self.before] if always_interpolate or self.number > 1 else [])
-
-    def _by(self, *slices: Tensor) -> GridWarp:
-        return GridWarp(slices, self.box, still_outside=self.still_outside)
+        return [*self.slices, *self.further.values()]
 
     @torch.no_grad()
-    def check_out(
-        self, motion: DeformationField, number: int, appearance: AppearanceField | None = None
-    ) -> None:
+    def check_out(self, number: int) -> None:
         """Copy a frame out of the fields."""
         self.number = number
-        motion.frames.read(number, self.slices)
-        motion.frames.read_forward(number - 1, self.before)
-        if self.residual is not None and appearance is not None:
-            self.residual.copy_(appearance.values[number])
+        self.store.read(number, self.slices)
+        self.store.read_forward(number - 1, self.before)
+        for name, values in self.further.items():
+            values.copy_(self.fields[name].values[number])
+
+    @torch.no_grad()
+    def write_back(self) -> None:
+        """Copy what was learned into the fields; learning may go on."""
+        if self.number:
+            self.store.write(self.number, self.slices)
+            for name, values in self.further.items():
+                self.fields[name].values[self.number].copy_(values)
 
     def state(self, images: Tensor, area: int, *, exact: bool) -> dict[str, Any]:
         """Occupancy and pixels as plain data, for a progress file.
@@ -139,18 +125,16 @@ class ActiveFrame:
 
 
 class ActiveFrames:
-    """The frames that are trained in parallel, and the field that they belong to."""
+    """The frames that are trained in parallel."""
 
     def __init__(self, module: nn.Module) -> None:
         """No frame yet.
 
         Args:
-            module: a stage whose state holds the field: before it is saved the frames are
+            module: a stage whose state holds the fields: before it is saved the frames are
                 written back, after it was loaded they are checked out again.
         """
         self._frames: list[ActiveFrame] = []
-        self._field: DeformationField | None = None
-        self._appearance: AppearanceField | None = None
         module.register_state_dict_pre_hook(  # type: ignore[no-untyped-call]
             lambda *_: self.write_back()
         )
@@ -170,38 +154,59 @@ class ActiveFrames:
     def allocate(
         self,
         count: int,
-        motion: DeformationField,
+        store: FrameStore,
         occupancy: Occupancy,
-        appearance: AppearanceField | None = None,
+        fields: Mapping[str, FrameField],
     ) -> None:
         """Make memory for ``count`` frames at the fields' present resolutions.
 
         Args:
             count: how many frames are trained in parallel.
-            motion: their displacements.
+            store: the displacements of all frames.
             occupancy: at rest.
-            appearance: their residuals; None where they are not learned.
+            fields: further fields whose frames are learned, by name.
         """
         self._frames = []  # frees the memory of those before
-        self._field, self._appearance = motion, appearance
-        self._frames = [ActiveFrame.of(motion, occupancy, appearance) for _ in range(count)]
+        self._frames = [ActiveFrame.of(store, occupancy, fields) for _ in range(count)]
 
     def check_out(self, numbers: Sequence[int]) -> None:
-        """Copy as many frames as there is memory for out of the field."""
-        assert self._field is not None
+        """Copy as many frames as there is memory for out of the fields."""
         for frame, number in zip(self._frames, numbers, strict=True):
-            frame.check_out(self._field, number, self._appearance)
+            frame.check_out(number)
 
-    @torch.no_grad()
+    def choose_pixels(
+        self, views: Views, model: Viewable, *, occupied_only: bool, join_views: bool
+    ) -> None:
+        """Choose the pixels that each frame is learned from, as :func:`frame_pools` does."""
+        for frame in self._frames:
+            frame.pools = frame_pools(
+                views,
+                frame.number,
+                model,
+                frame.occupancy,
+                occupied_only=occupied_only,
+                join_views=join_views,
+            )
+
+    def state(self, views: Views, *, exact: bool) -> list[dict[str, Any]]:
+        """Each frame's :meth:`ActiveFrame.state`; ``views`` are those that it learns from."""
+        area = views.height * views.width
+        return [
+            frame.state(images_of(views, frame.number), area, exact=exact) for frame in self._frames
+        ]
+
+    def load_state(self, states: Sequence[dict[str, Any]], views: Views) -> None:
+        """Restore what :meth:`state` gave; the frames have been checked out."""
+        area = views.height * views.width
+        for frame, state in zip(self._frames, states, strict=True):
+            frame.load_state(state, images_of(views, frame.number), area)
+
     def write_back(self) -> None:
         """Copy what was learned of the frames into the fields; learning may go on."""
-        if self._field is not None and self._frames:
-            for frame in self._frames:
-                if frame.number:
-                    self._field.frames.write(frame.number, frame.slices)
-                    if frame.residual is not None and self._appearance is not None:
-                        self._appearance.values[frame.number].copy_(frame.residual)
-            self._field.frames.synchronize()
+        for frame in self._frames:
+            frame.write_back()
+        if self._frames:
+            self._frames[0].store.synchronize()
 
     def close(self) -> None:
         """Write the frames back, and free their memory."""
@@ -210,5 +215,5 @@ class ActiveFrames:
 
     def _check_out_again(self) -> None:
         for frame in self._frames:
-            if frame.number and self._field is not None:
-                frame.check_out(self._field, frame.number, self._appearance)
+            if frame.number:
+                frame.check_out(frame.number)

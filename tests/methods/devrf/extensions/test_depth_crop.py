@@ -13,16 +13,16 @@ from devrf.data.datamodule import SceneDataModule
 from devrf.engine.batches import gather_batch
 from devrf.geometry.box import Box
 from devrf.geometry.ndc import NormalizedDevice
-from devrf.methods.devrf import depth_crop
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.color_decoder import SigmoidColor
-from devrf.methods.devrf.depth_crop import crop_to_visible, visible_depths, with_room
+from devrf.methods.devrf.extensions import depth_crop
+from devrf.methods.devrf.extensions.depth_crop import crop_to_visible, visible_depths, with_room
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.settings import RenderSettings
 from devrf.rendering.occupancy import Occupancy
+from devrf.rendering.sampling import RenderSettings
 from devrf.scenes.bounds import box_between
 from devrf.scenes.procedural import ProceduralForwardScene
 from devrf.scenes.scene import Scene
@@ -107,13 +107,13 @@ def test_a_field_is_cropped_to_the_wall_that_it_shows(forward_scene: Scene) -> N
     batch = gather_batch(
         views, pool.image[::9].long(), pool.flat[::9].long(), torch.zeros(3), model.space
     )
-    before = model(batch)
+    before = model.at(0.0).render(batch.rays, batch.background)
     crop_to_visible(model, forward_scene, views, pool)
     # What is seen is the front of it; the field's front is by a twentieth of its depth before.
     assert 0.4 < field.box.low[2] < 0.5 and 0.5 < field.box.high[2] < 0.6
     assert field.density.values.numel() < 0.1 * 20 * 15 * 33
-    after = model(batch)
-    assert float(after.transmittance.detach().max()) < 1e-3
+    after = model.at(0.0).render(batch.rays, batch.background)
+    assert float(after.opacity.min()) > 1 - 1e-3
     torch.testing.assert_close(after.depth, before.depth, atol=0.02, rtol=0)
 
 

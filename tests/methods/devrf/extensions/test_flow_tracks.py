@@ -12,10 +12,10 @@ from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.deformation_field import DeformationField
-from devrf.methods.devrf.flow_tracks import FlowTracks, Tracks
+from devrf.methods.devrf.extensions.tracks import FlowTracks, Tracks
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.settings import RenderSettings
 from devrf.rendering.occupancy import Occupancy
+from devrf.rendering.sampling import RenderSettings
 from devrf.scenes.scene import OpticalFlow, Views
 
 SIDE, WIDTH, HEIGHT = 21, 30, 10

@@ -1,0 +1,223 @@
+"""How colours change over time: a residual in canonical space (docs/method.md#appearance)."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from devrf.checkpoints.stored_grids import StoredShape
+from devrf.data.color_change import CHANGING, color_drift
+from devrf.engine.active_frames import ActiveFrame
+from devrf.errors import DevrfError
+from devrf.geometry.box import Box
+from devrf.geometry.clock import FrameClock
+from devrf.methods.devrf.canonical_field import look_up
+from devrf.methods.devrf.deformation_field import FrameField
+from devrf.methods.devrf.deformation_schedule import DeformationPhase
+from devrf.methods.devrf.extension import Extension, MotionLearner, MotionTerm
+from devrf.methods.devrf.losses import MotionPrediction, total_variation_weight
+from devrf.rendering.output import ColorChange
+from devrf.scenes.scene import Views
+
+log = logging.getLogger(__name__)
+
+# Of the frames' field, and of the optimiser's group.
+NAME = "color_residual"
+
+
+@dataclass(frozen=True)
+class ResidualGrid:
+    """q → A(q), trilinear in space.
+
+    Attributes:
+        grid: (X, Y, Z, 3) logits.
+        box: where the grid lives, in canonical space; outside it A is as on its border.
+    """
+
+    grid: Tensor
+    box: Box
+
+    def __call__(self, points: Tensor) -> Tensor:
+        """A (M, 3) at canonical ``points`` (M, 3); differentiable in the grid and the points."""
+        return look_up(self.grid, points, self.box)
+
+
+class ResidualField(FrameField, StoredShape):
+    """Residuals A_t (T, X, Y, Z, 3) over a box: c = sigmoid(decoder(f(q), d) + A_t(q)).
+
+    Frame 0 is zero and never trained: the scene at rest looks as the canonical field says.
+    Between two frames both are blended, as displacements are.
+
+    Attributes:
+        values: (T, X, Y, Z, 3) logits.
+        box: where the field lives, in canonical space.
+        clock: the times of the T frames.
+    """
+
+    resizable = ("values",)
+    values: Tensor
+
+    def __init__(self, box: Box, clock: FrameClock, *, voxels: int) -> None:
+        """Residuals of zero for the clock's T frames, each on about ``voxels`` voxels."""
+        super().__init__(box, clock)
+        self.register_buffer("values", torch.zeros(len(clock), *box.grid_shape(voxels), 3))
+
+    def at(self, time: float) -> ResidualGrid | None:
+        """q → A(q) at ``time`` in [0, 1]; None where it is zero everywhere."""
+        moment = self.clock.at(time)
+        if moment.after == 0:
+            return None
+        grid = self.values[moment.before]
+        if moment.weight:
+            grid = grid.lerp(self.values[moment.after], moment.weight)
+        return ResidualGrid(grid, self.box)
+
+    @torch.no_grad()
+    def copy_neighbours(self, frames: Sequence[int], *, after: bool = False) -> None:
+        """Initialise ``frames``, from 1 on, from the frames before them, or ``after`` them."""
+        for frame in frames:
+            neighbour = frame + (1 if after else -1)
+            if neighbour < len(self.values):
+                self.values[frame] = self.values[neighbour]
+
+
+class ColorResidual(Extension):
+    """Learns residuals beside the displacements, from some level on."""
+
+    def __init__(
+        self,
+        learn: Literal["never", "always", "auto"] = "never",
+        side: int = 64,
+        learning_rate: float = 0.1,
+        start_level: int = 2,
+        start_level_static_color: int | None = None,
+        loss_scale_if_color_drift: Mapping[str, float] | None = None,
+        residual: float = 1e-3,
+        tv: float = 0.002,
+    ) -> None:
+        """Say whether and how to learn.
+
+        Args:
+            learn: ``never``, ``always``, or ``auto``: where the images say that colours drift
+                (docs/method.md#color-drift).
+            side: the grid of a frame has about side³ voxels.
+            learning_rate: logits a step: how far a value moves at most.
+            start_level: the first level that learns it, from 1; the last one where there are
+                fewer. The levels before find the motion alone.
+            start_level_static_color: the same where ``auto`` finds that colours do not drift, so
+                that shading alone changes; None: no level.
+            loss_scale_if_color_drift: factors of the weights of loss terms, by name, at the levels
+                that learn it where colours drift: 1 for terms that are not named.
+            residual: weight of the squared residuals in the loss.
+            tv: weight of their total variation.
+        """
+        for name, level in (
+            ("start_level", start_level),
+            ("start_level_static_color", start_level_static_color),
+        ):
+            if level is not None and level < 1:
+                raise DevrfError(f"color_residual.{name}: expected at least 1, not {level}")
+        if side < 2 or not learning_rate > 0:
+            raise DevrfError(
+                "color_residual: expected a side of at least 2 and a learning_rate above 0, not "
+                f"{side} and {learning_rate}"
+            )
+        self._learn, self._side, self._learning_rate = learn, side, learning_rate
+        self._start, self._start_if_static = start_level, start_level_static_color
+        self._scale_if_drift = loss_scale_if_color_drift or {}
+        self._residual, self._tv = residual, tv
+        # Once set up: the first level that learns it, from 0; factors of weights from it on.
+        self._first: int | None = None
+        self._scale: Mapping[str, float] = {}
+
+    @property
+    def terms(self) -> Mapping[str, MotionTerm]:
+        """``residual``, how large the residuals are."""
+        return {"residual": squared_residual}
+
+    @property
+    def weights(self) -> Mapping[str, float]:
+        """Its weight; none where nothing can be learned."""
+        return {} if self._learn == "never" else {"residual": self._residual}
+
+    def setup(self, stage: MotionLearner) -> None:
+        """Build the residuals, zero, and their parameter group, empty as yet, if they are learned.
+
+        Raises:
+            DevrfError: a factor is below 0, or of no term of the loss.
+        """
+        first, drifting = self._decide(stage.scene.dynamic.train)
+        if first is None:
+            return
+        self._scale = self._scale_if_drift if drifting else {}
+        # The ablation without levels has one.
+        self._first = min(first, len(stage.schedule.levels)) - 1
+        model, rate = stage.scene_model, self._learning_rate
+        model.color_residual = ResidualField(model.box, stage.field.clock, voxels=self._side**3)
+        stage.optimizer.add_param_group({"params": [], "lr": rate, "base_lr": rate, "name": NAME})
+
+    def _decide(self, views: Views) -> tuple[int | None, bool]:
+        """From which level residuals are learned, None: never; whether colours are to drift."""
+        if self._learn != "auto":
+            return (self._start if self._learn == "always" else None), True
+        drift = color_drift(views)
+        drifting = drift is not None and drift >= CHANGING
+        first = self._start if drifting else self._start_if_static
+        how = "cannot be followed" if drift is None else f"drift by {100 * drift:.1f} %"
+        learned = "not learned" if first is None else f"learned from level {first} on"
+        log.info("colours %s: their change is %s", how, learned)
+        return first, drifting
+
+    def frame_fields(self, stage: MotionLearner, level: int) -> Mapping[str, FrameField]:
+        """The residuals, if ``level`` learns them."""
+        field = stage.scene_model.color_residual
+        if self._first is None or level < self._first:
+            return {}
+        assert isinstance(field, ResidualField)
+        return {NAME: field}
+
+    def begin_level(self, stage: MotionLearner, level: int) -> None:
+        """Let the optimiser learn the active frames' residuals, (X, Y, Z, 3) each.
+
+        Within a visit their rate falls as that of the displacements does; from level to level it
+        does not.
+        """
+        residuals = [frame.further[NAME] for frame in stage.active if NAME in frame.further]
+        for number, group in enumerate(stage.optimizer.param_groups):
+            if group["name"] == NAME:
+                group["base_lr"] = self._learning_rate / stage.schedule.learning_rate_factor(level)
+                longest = max([2, *(max(grid.shape) for grid in residuals)])
+                weight = total_variation_weight(self._tv, longest, stage.schedule.rays)
+                stage.optimizer.replace(number, residuals, smoothing=weight)
+
+    def weight_factor(self, term: str, level: int) -> float:
+        """Where a texture may slide over the surface, some terms tell less."""
+        return 1.0 if self._first is None or level < self._first else self._scale.get(term, 1.0)
+
+    def initialise(self, stage: MotionLearner, phase: DeformationPhase, frame: int) -> None:
+        """At the first level that learns it, start a frame from the one visited before it."""
+        field = stage.scene_model.color_residual
+        if isinstance(field, ResidualField) and phase.level == self._first:
+            field.copy_neighbours([frame], after=phase.backward)
+
+    def color_change(self, frame: ActiveFrame) -> ColorChange | None:
+        """q → A_t(q), as learned so far."""
+        if NAME not in frame.further:
+            return None
+        field = frame.fields[NAME]
+        assert isinstance(field, ResidualField)
+        return ResidualGrid(frame.further[NAME], field.box)
+
+
+def squared_residual(prediction: MotionPrediction) -> Tensor:
+    """(1/R) Σ_i w_i |A_t(q_i)|²: colours stay what they are at rest; 0 without residuals."""
+    output = prediction.output
+    if output.residual is None:
+        return output.color.new_zeros(())
+    large = (output.weight.detach() * output.residual.square().sum(dim=1)).sum()
+    return large / len(prediction.batch.rays)

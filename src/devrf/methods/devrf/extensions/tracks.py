@@ -1,0 +1,329 @@
+"""Frames that start where the observed optical flow leads (docs/method.md#flow-initialisation).
+
+Step 1 follows pixels back along the flow to the canonical points that they see; steps 2 and 3 move
+the frame before to where these points are seen now.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from devrf.data.batch import PixelPool, all_pixels
+from devrf.engine.batches import gather_batch, images_of
+from devrf.engine.ddp import broadcast
+from devrf.engine.graphs import CudaGraphCapture, GraphedStep
+from devrf.geometry.cameras import Cameras
+from devrf.geometry.space import WORLD, Space
+from devrf.methods.devrf.deformation_field import DeformationField
+from devrf.methods.devrf.deformation_schedule import DeformationPhase
+from devrf.methods.devrf.extension import Extension, MotionLearner
+from devrf.methods.devrf.model import DeVRFModel
+from devrf.methods.devrf.volume_rendering import render
+from devrf.ops.compositing import sum_by_ray
+from devrf.ops.trilinear import interpolate
+from devrf.rendering.occupancy import Occupancy
+from devrf.scenes.scene import Views
+
+# By how much a channel of a pixel may differ from what the model shows where it was, to be it.
+LIKENESS = 0.15
+# Frames that a pixel is followed back at most; drift adds up, and memory holds so many occupancies.
+FARTHEST = 16
+
+
+class StartAlongFlow(Extension):
+    """Starts each frame of the coarsest level from the one before it, moved along the flow.
+
+    Without flow, or with that of a camera that moves, frames start where the ones before ended.
+    """
+
+    def __init__(self, init_from: Literal["previous", "flow", "tracks"] = "tracks") -> None:
+        """Say how far pixels are followed.
+
+        Args:
+            init_from: ``flow`` one frame back; ``tracks`` back to a frame in which the model shows
+                the pixel's colour; ``previous`` not at all.
+        """
+        self._init_from = init_from
+        self._tracks: FlowTracks | None = None
+
+    def begin_level(self, stage: MotionLearner, level: int) -> None:
+        """Forget what the level before has seen."""
+        self._tracks = None
+
+    def changes(self, stage: MotionLearner, phase: DeformationPhase) -> bool:
+        """At the coarsest level, where there is flow to follow to a frame that is known."""
+        recorded = stage.scene.dynamic.train
+        # What a moving camera sees moves with it.
+        known = recorded.flow is not None and not recorded.by_moving_camera
+        asked = self._init_from != "previous" and known
+        return asked and phase.level == 0 and phase.has_previous
+
+    def initialise(self, stage: MotionLearner, phase: DeformationPhase, frame: int) -> None:
+        """Fit the frame's displacements to where its pixels are followed back to."""
+        if not self.changes(stage, phase):
+            return
+        views, model, field = stage.views, stage.scene_model, stage.field
+        if self._tracks is None:
+            by_color = self._init_from == "tracks"
+            self._tracks = FlowTracks(model, views, stage.previous_images, by_color=by_color)
+        pool = all_pixels(views, images_of(views, frame))
+        # A visit's first frame has its number: the visits before have learned as many.
+        learned = phase.frames[0]
+        tracks = self._tracks.follow(frame, pool, stage.generator, learned=learned)
+        capturer = stage.loop.capturer()
+        start_from_tracks(field, frame, tracks, views.cameras, model.space, capturer=capturer)
+        # Each process has followed pixels of its own.
+        broadcast([field.to_canonical[frame], field.to_time[frame]])
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """N canonical points that were seen in an earlier frame, and where they are seen now.
+
+    Attributes:
+        canonical: (N, 3) the points q.
+        camera: (N,) int64, the camera that sees each point now.
+        pixel: (N, 2) x, y of the point in its image, in pixels.
+    """
+
+    canonical: Tensor
+    camera: Tensor
+    pixel: Tensor
+
+    def __len__(self) -> int:
+        return self.canonical.shape[0]
+
+    def __getitem__(self, mask: Tensor) -> Tracks:
+        """The tracks where ``mask`` (N,) is True."""
+        return Tracks(self.canonical[mask], self.camera[mask], self.pixel[mask])
+
+
+class FlowTracks:
+    """Follows pixels of a frame back to where the model, learned up to there, shows them.
+
+    One frame back may show something else: an occluder that has since moved away, or a part that
+    the model has lost there. Such a pixel goes on, frame by frame, to one where it was right.
+    """
+
+    def __init__(
+        self, model: DeVRFModel, views: Views, previous: Tensor, *, by_color: bool
+    ) -> None:
+        """Follow pixels of the given views.
+
+        Args:
+            model: the scene; frames before the one that is asked for have been learned.
+            views: the dynamic training views; their flow must be known.
+            previous: (N,) int64, for each image the one that its flow leads to.
+            by_color: whether what is met must have the pixel's colour; else each pixel ends one
+                frame back, whatever it meets there.
+        """
+        self.model = model
+        self.views = views
+        self.previous = previous
+        self.likeness = LIKENESS if by_color else math.inf
+        self.farthest = FARTHEST if by_color else 1
+        self._occupancies: dict[int, Occupancy] = {}
+
+    @torch.no_grad()
+    def follow(
+        self,
+        frame: int,
+        pool: PixelPool,
+        generator: torch.Generator,
+        *,
+        learned: int,
+        most: int = 4096,
+    ) -> Tracks:
+        """Tracks Σ w_i q_i / Σ w_i to a frame.
+
+        Args:
+            frame: the present frame, from 1 on.
+            pool: pixels of its images.
+            generator: of the random choice, on the pool's device.
+            learned: how many of the frames before it have been learned, or are at rest.
+            most: tracks at most, chosen at random.
+        """
+        views = self.views
+        assert views.flow is not None
+        valid = views.flow.valid.flatten()[pool.image.long() * self._area + pool.flat.long()]
+        kept = valid.nonzero()[:, 0]
+        kept = kept[torch.randperm(len(kept), device=kept.device, generator=generator)[:most]]
+        here, flat = pool.image[kept].long(), pool.flat[kept].long()
+        now = gather_batch(views, here, flat, torch.ones(3, device=here.device))
+        place, waiting = now.pixel, torch.arange(len(here), device=here.device)
+        found: list[tuple[Tensor, Tensor]] = []
+        for step in range(1, min(learned, self.farthest) + 1):
+            going, place = self._back(here, place)
+            waiting, here = waiting[going], self.previous[here[going]]
+            point, color, mass = self._look(frame - step, here, place)
+            unlike = (color - now.color[waiting]).abs().amax(dim=1)
+            right = (mass > 0.5) & (unlike < self.likeness)
+            found.append((waiting[right], point[right]))
+            waiting, here, place = waiting[~right], here[~right], place[~right]
+            if len(waiting) == 0:
+                break
+        index, points = (torch.cat(column) for column in zip(*found, strict=True))
+        return Tracks(points, now.image[index], now.pixel[index])
+
+    @property
+    def _area(self) -> int:
+        return self.views.height * self.views.width
+
+    def _back(self, image: Tensor, place: Tensor) -> tuple[Tensor, Tensor]:
+        """Which of N places can be followed one frame back (N,) bool, and where to (M, 2).
+
+        Args:
+            image: (N,) int64, the image of each place.
+            place: (N, 2) x, y in pixels; the flow is that of the pixel it lies in.
+        """
+        flow = self.views.flow
+        assert flow is not None
+        column, row = place.floor().long().unbind(dim=1)
+        going = (column >= 0) & (column < self.views.width)
+        going &= (row >= 0) & (row < self.views.height) & (self.previous[image] != image)
+        at = torch.where(going, image * self._area + row * self.views.width + column, 0)
+        going &= flow.valid.flatten()[at]
+        return going, place[going] + flow.vectors.reshape(-1, 2)[at[going]]
+
+    def _look(self, frame: int, image: Tensor, place: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """What the model shows at places (N, 2) of images (N,) of a frame.
+
+        Returns:
+            The mean canonical point (N, 3), the colour (N, 3) on white, and Σ w_i (N,).
+        """
+        model, deformation = self.model, self.model.deformation
+        assert deformation is not None
+        time = deformation.clock.times[frame]
+        seen = render(
+            model.space.rays(self.views.cameras.rays(image, place)),
+            model.canonical,
+            self._occupancy(frame, time),
+            model.settings,
+            torch.ones(3, device=image.device),
+            model.warp(time),
+        )
+        count, ray = len(image), seen.samples.ray
+        mass = sum_by_ray(seen.weight, ray, count)
+        point = sum_by_ray(seen.weight[:, None] * seen.canonical, ray, count)
+        return point / mass[:, None], seen.color, mass
+
+    def _occupancy(self, frame: int, time: float) -> Occupancy:
+        """The occupancy of a frame, which no longer changes; the newest ones are kept."""
+        if frame not in self._occupancies:
+            self._occupancies[frame] = self.model.occupancy_at(time)
+            self._occupancies.pop(frame - self.farthest, None)
+        return self._occupancies[frame]
+
+
+def start_from_tracks(
+    field: DeformationField,
+    frame: int,
+    tracks: Tracks,
+    cameras: Cameras,
+    space: Space = WORLD,
+    smoothness: float = 0.01,
+    steps: int = 60,
+    capturer: CudaGraphCapture | None = None,
+) -> None:
+    """Fit a frame's two slices, copied from the frame before, to the tracks.
+
+    First Δ_f, so that the tracked points project onto their pixels, then Δ_b, so that it leads
+    from there back to them; both by the smoothest change that does. Errors are in pixels and
+    robust (Huber), since observed flow has outliers.
+
+    Args:
+        field: the deformation field.
+        frame: the frame to start, from 1 on.
+        tracks: where canonical points are seen at that frame.
+        cameras: all cameras.
+        space: the space that the field lives in.
+        smoothness: weight of differences between neighbouring voxels' changes.
+        steps: optimiser steps of each fit.
+        capturer: captures a step of each fit in a CUDA graph; None: steps are done one by one.
+    """
+    if field.still_outside:
+        tracks = tracks[field.box.contains(tracks.canonical)]
+    if len(tracks) == 0:
+        return
+    scale = _pixels_per_unit(tracks, cameras, space, 1e-3 * field.box.longest)
+    backward, forward = (field.frames.here.new_empty(*field.shape, 3) for _ in range(2))
+    field.frames.read(frame, (backward, forward))
+    coords = field.box.to_grid(tracks.canonical, field.shape)
+
+    def misses(change: Tensor) -> Tensor:
+        points = tracks.canonical + interpolate(forward + change, coords)
+        pixel, _ = cameras.project(tracks.camera, space.to_world(points))
+        return pixel - tracks.pixel
+
+    forward += _fit(misses, forward, scale, smoothness, steps, capturer)
+    arrived = tracks.canonical + interpolate(forward, coords)
+    there = field.box.to_grid(arrived, field.shape)
+
+    def errs(change: Tensor) -> Tensor:
+        returned = arrived + interpolate(backward + change, there)
+        return (returned - tracks.canonical) * scale
+
+    backward += _fit(errs, backward, scale, smoothness, steps, capturer)
+    field.frames.write(frame, (backward, forward))
+
+
+def _pixels_per_unit(tracks: Tracks, cameras: Cameras, space: Space, small: float) -> float:
+    """By how many pixels the tracked points move in their images for a unit of ``space``."""
+    first, _ = cameras.project(tracks.camera, space.to_world(tracks.canonical))
+    moves = []
+    for axis in torch.eye(3).to(first):
+        there = space.to_world(tracks.canonical + small * axis)
+        moved, _ = cameras.project(tracks.camera, there)
+        moves.append((moved - first).norm(dim=1).mean() / small)
+    return float(torch.stack(moves).amax())
+
+
+@torch.enable_grad()
+def _fit(
+    residual: Callable[[Tensor], Tensor],
+    like: Tensor,
+    scale: float,
+    smoothness: float,
+    steps: int,
+    capturer: CudaGraphCapture | None,
+) -> Tensor:
+    """The smooth change of a grid (X, Y, Z, 3) that makes ``residual(change)`` small.
+
+    Args:
+        residual: change → residuals (N, 2 or 3) in pixels.
+        like: a grid of the shape and device wanted.
+        scale: pixels per unit of the grid's values.
+        smoothness: weight of the squared differences between neighbours, in pixels.
+        steps: Adam steps; the rate falls linearly from half a pixel a step.
+        capturer: as for :func:`start_from_tracks`.
+    """
+    change, fastest = torch.zeros_like(like).requires_grad_(), 0.5 / scale
+    # A graph reads the rate on the device.
+    rate = fastest if capturer is None else torch.full((), fastest, device=like.device)
+    on_gpu = change.is_cuda
+    optimizer = torch.optim.Adam([change], lr=rate, fused=on_gpu, capturable=on_gpu)
+
+    def step() -> None:
+        optimizer.zero_grad(set_to_none=capturer is None)
+        missed = residual(change)
+        error = torch.nn.functional.huber_loss(missed, torch.zeros_like(missed), delta=1.0)
+        rough = sum(change.diff(dim=axis).square().sum() for axis in range(3)) * scale**2
+        total: Tensor = error + smoothness * rough / like.shape[:3].numel()
+        total.backward()  # type: ignore[no-untyped-call]
+        optimizer.step()
+
+    graphed = GraphedStep(step, capturer)
+    for number in range(steps):
+        now = fastest * (1 - number / steps)
+        if isinstance(rate, Tensor):
+            rate.fill_(now)
+        else:
+            optimizer.param_groups[0]["lr"] = now
+        graphed()
+    return change.detach()

@@ -1,0 +1,57 @@
+"""Weighing the terms of a loss, whatever the method."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+
+import torch
+from torch import Tensor
+
+from devrf.errors import DevrfError
+
+
+def counted_weights(
+    weights: Mapping[str, float], known: Collection[str], key: str
+) -> dict[str, float]:
+    """The weights that are not zero.
+
+    Args:
+        weights: by the term's name.
+        known: the names of all terms.
+        key: the config key of the weights, for messages.
+
+    Raises:
+        DevrfError: there is no such term, or none counts.
+    """
+    counted = {name: weight for name, weight in weights.items() if weight}
+    for name in sorted(map(str, counted)):
+        if name not in known:
+            raise DevrfError(
+                f"{key}: unknown term {name!r}; the terms are {', '.join(sorted(known))}"
+            )
+    if not counted:
+        raise DevrfError(f"{key}: every weight is zero; at least one term must count")
+    return counted
+
+
+def weighted_sum(
+    values: Mapping[str, Tensor], weights: Mapping[str, float]
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Σ weight · value () over ``values`` () by name; and these, detached."""
+    total: Tensor | float = 0.0
+    for name, value in values.items():
+        total = total + weights[name] * value
+    assert isinstance(total, Tensor)
+    return total, {name: value.detach() for name, value in values.items()}
+
+
+@torch.no_grad()
+def visibility(transmittance: Tensor, alpha: Tensor | None) -> dict[str, Tensor]:
+    """How much rays hit, and how much they should: means () over rays in [0, 1].
+
+    Args:
+        transmittance: (R,) T_end.
+        alpha: (R,) A of the images' alpha masks; None: they have none.
+    """
+    hit = {"opacity": 1 - transmittance.mean()}
+    return hit if alpha is None else {**hit, "coverage": alpha.mean()}
