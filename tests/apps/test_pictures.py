@@ -1,16 +1,18 @@
-"""Colour maps, contact sheets and films, read back from the files."""
+"""Colour maps, stills, contact sheets and videos, read back from the files."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from lightning import Trainer
 from torch import Tensor
 
 from devrf.apps.images import (
@@ -19,26 +21,31 @@ from devrf.apps.images import (
     error_colors,
     evenly,
     flow_colors,
-    flow_wheel,
     image_grid,
     scaled,
     short_name,
     to_bytes,
 )
-from devrf.apps.still import write_contact_sheet
+from devrf.apps.still import StillSettings, still, write_contact_sheet
 from devrf.apps.video import (
     VideoSettings,
+    bullet_time,
     held_out_images,
     held_out_pictures,
     orbit,
     orbit_pictures,
+    time_freeze,
     video_bytes,
     write_video,
 )
+from devrf.checkpoints.checkpoint import Viewpoints
+from devrf.errors import DevrfError
 from devrf.evaluation.held_out import HeldOutView, truth_image
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
+from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.rendering.renderer import Renderer
+from devrf.scenes.scene import Scene
 
 
 def flat(height: int, width: int, color: tuple[float, float, float]) -> Tensor:
@@ -79,14 +86,6 @@ def test_flow_as_colours() -> None:
     torch.testing.assert_close(colors[0], expected, atol=1e-5, rtol=0)
 
 
-def test_the_wheel_shows_the_directions_that_it_explains() -> None:
-    wheel = flow_wheel(101)
-    assert torch.equal(wheel[0, 0], torch.ones(3))
-    red, cyan = wheel[50, 99], wheel[50, 1]
-    assert red[0] > 0.85 > 0.1 > red[1] and cyan[0] < 0.1 < 0.85 < cyan[1]
-    torch.testing.assert_close(wheel[50, 50], torch.ones(3), atol=0.02, rtol=0)
-
-
 def view(number: int, height: int = 90, width: int = 120) -> HeldOutView:
     truth = flat(height, width, (0.0, 0.0, 1.0))
     prediction = flat(height, width, (number / 255, 0.0, 0.0))
@@ -104,7 +103,7 @@ def view(number: int, height: int = 90, width: int = 120) -> HeldOutView:
     )
 
 
-@pytest.mark.parametrize(("count", "shades"), [(11, [0, 50, 100]), (2, [0, 10]), (1, [0])])
+@pytest.mark.parametrize(("count", "shades"), [(11, [0, 50, 100]), (1, [0])])
 def test_a_contact_sheet_shows_truth_rendering_error_and_depth_of_spread_views(
     tmp_path: Path, count: int, shades: list[int]
 ) -> None:
@@ -166,7 +165,7 @@ def test_names_and_positions() -> None:
     assert short_name(30 * "a" + "_000.png") == "…" + 21 * "a" + "_000.png"
 
 
-@pytest.mark.parametrize(("height", "width"), [(48, 96), (241, 33), (17, 75)])
+@pytest.mark.parametrize(("height", "width"), [(48, 96), (17, 75)])
 def test_a_video_has_even_sides_and_all_its_pictures(
     tmp_path: Path, height: int, width: int
 ) -> None:
@@ -254,19 +253,6 @@ def test_held_out_images_are_the_nearest_in_time(tiny_scene) -> None:
     assert held_out_images(rest, len(views)) == list(range(len(views)))
 
 
-def test_small_captures_are_filmed_400_pixels_high(tiny_scene) -> None:
-    cameras = tiny_scene.dynamic.test.cameras
-    sized = VideoSettings().sized(cameras)
-    assert (sized.height, sized.width) == (400, round(400 * cameras.width / cameras.height))
-    # Magnified intrinsics: the corners of the image see the same.
-    small, large = cameras.image_rays(0), sized.image_rays(0)
-    middle = small.directions.mean(dim=0), large.directions.mean(dim=0)
-    torch.testing.assert_close(*middle, atol=1e-3, rtol=0)
-    tall = cameras.of_height(500)
-    assert VideoSettings().sized(tall).height == 500
-    assert VideoSettings(height=40).sized(tall).height == 40
-
-
 def test_rendering_keeps_to_its_seconds() -> None:
     film = VideoSettings(frames=60, fps=20, max_seconds=12)
     assert film.within_limit(0.2) == film
@@ -291,3 +277,82 @@ def test_videos_are_no_larger_than_was_said(rest, tiny_scene, tmp_path):
         write_video(tmp_path / f"{k}.mp4", pictures, film.fps)
     written = sum(path.stat().st_size for path in tmp_path.iterdir())
     assert 0.02 * video_bytes(film, cameras) < written < video_bytes(film, cameras)
+
+
+CAMERAS = Cameras.looking_at(
+    torch.tensor([[3.0, 0, 1], [0, 3, 1]]), torch.zeros(2, 3), focal=20, width=24, height=18
+)
+
+
+def circle(settings: VideoSettings) -> Cameras:
+    return orbit(CAMERAS, Box((-1.0, -1, -1), (1.0, 1, 1)), settings)
+
+
+def test_in_bullet_time_the_camera_alone_moves():
+    cameras, times = bullet_time(circle, 0.3, VideoSettings(frames=8))
+    assert times == [0.3] * 8
+    torch.testing.assert_close(cameras.positions, circle(VideoSettings(frames=8)).positions)
+
+
+def test_in_a_time_freeze_time_runs_then_the_camera_then_time():
+    cameras, times = time_freeze(circle, 0.5, VideoSettings(frames=9))
+    assert times == pytest.approx([0, 1 / 6, 1 / 3, 0.5, 0.5, 0.5, 0.5, 0.75, 1])
+    start, around = cameras.positions[0], circle(VideoSettings(frames=3)).positions
+    for k in (1, 2, 6, 7, 8):
+        torch.testing.assert_close(cameras.positions[k], start)
+    torch.testing.assert_close(cameras.positions[3:6], around)
+
+
+@pytest.mark.parametrize("frames", [1, 2, 3, 4, 5, 100])
+def test_as_many_cameras_as_times_and_frames(frames):
+    for film in (bullet_time, time_freeze):
+        cameras, times = film(circle, 0.5, VideoSettings(frames=frames))
+        assert len(cameras) == len(times) == frames
+
+
+def test_time_stops_within_the_recording():
+    with pytest.raises(DevrfError, match=r"video.time: expected 0 to 1, not 1.5"):
+        VideoSettings(time=1.5)
+
+
+def test_the_camera_that_is_meant(tiny_scene: Scene) -> None:
+    held_out = StillSettings().camera(Viewpoints.of(tiny_scene))
+    assert torch.equal(held_out.positions, tiny_scene.dynamic.test.cameras.positions[:1])
+    # The images are 24 x 18: pictures of them are rendered 400 pixels high.
+    assert (held_out.width, held_out.height) == (533, 400)
+    fifth = StillSettings(view=5, height=36).camera(Viewpoints.of(tiny_scene))
+    assert torch.equal(fifth.positions, tiny_scene.static.train.cameras.positions[5:6])
+    assert (fifth.width, fifth.height) == (48, 36)
+
+
+@pytest.mark.parametrize(
+    ("settings", "given", "expected"),
+    [
+        (StillSettings, {"view": -1}, "still.view: expected held_out or 0 to 7, not -1"),
+        (StillSettings, {"height": 0}, "still.height: expected at least 1, not 0"),
+        (VideoSettings, {"height": 15}, "video.height: expected at least 16, not 15"),
+        (VideoSettings, {"max_seconds": 0}, "video.max_seconds: expected more than 0, not 0"),
+    ],
+)
+def test_what_cannot_be_shown(
+    tiny_scene: Scene, settings: type[Any], given: dict[str, int], expected: str
+) -> None:
+    with pytest.raises(DevrfError) as caught:
+        settings(**given).camera(Viewpoints.of(tiny_scene))
+    assert str(caught.value) == expected
+
+
+def test_colour_and_depth_of_any_size(
+    learned: tuple[CanonicalStage, Trainer], tiny_scene: Scene, reference: Callable[..., Any]
+) -> None:
+    model, camera = (
+        learned[0].scene_model,
+        StillSettings(view=2, height=31).camera(Viewpoints.of(tiny_scene)),
+    )
+    color, depth = still(Renderer(model), camera, 0.0, 0.0)
+    assert color.shape == depth.shape == (31, 41, 3)
+    seen = reference(model, camera.image_rays(0), 0.0, torch.zeros(3))
+    torch.testing.assert_close(color.view(-1, 3), seen.color.clamp(0, 1))
+    # Where nothing is, the colour is that of the background, and the depth is white.
+    nothing = seen.opacity.view(31, 41) == 0
+    assert nothing.any() and not color[nothing].any() and (depth[nothing] == 1).all()

@@ -24,9 +24,9 @@ from devrf.scenes.scene import Background, Views
 # Upper bound of the bytes of a pixel in a video: measured on images of 400 pixels and less.
 PIXEL = 0.2
 # H.264 has blocks of so many pixels.
-SMALLEST = 16
+MIN_HEIGHT = 16
 # Fewer frames are no video.
-FEWEST = 8
+MIN_FRAMES = 8
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,8 @@ class VideoSettings:
     def __post_init__(self) -> None:
         if not 0 <= self.time <= 1:
             raise DevrfError(f"video.time: expected 0 to 1, not {self.time}")
-        if self.height is not None and self.height < SMALLEST:
-            raise DevrfError(f"video.height: expected at least {SMALLEST}, not {self.height}")
+        if self.height is not None and self.height < MIN_HEIGHT:
+            raise DevrfError(f"video.height: expected at least {MIN_HEIGHT}, not {self.height}")
         if self.max_seconds is not None and not self.max_seconds > 0:
             raise DevrfError(f"video.max_seconds: expected more than 0, not {self.max_seconds}")
 
@@ -74,7 +74,7 @@ class VideoSettings:
     def within_limit(self, seconds: float) -> VideoSettings:
         """The settings for images that take ``seconds`` each: fewer frames if need be."""
         most = self.frames if self.max_seconds is None else int(self.max_seconds / seconds)
-        frames = min(self.frames, max(most, FEWEST))
+        frames = min(self.frames, max(most, MIN_FRAMES))
         return replace(self, frames=frames, fps=self.fps * frames / self.frames)
 
 
@@ -103,7 +103,7 @@ def held_out_pictures(
     renderer: Renderer,
     views: Views,
     images: Sequence[int],
-    film: VideoSettings,
+    settings: VideoSettings,
     background: Background,
 ) -> Iterator[Tensor]:
     """Truth, rendering and depth (H', W', 3) side by side, while time runs from 0 to 1.
@@ -113,10 +113,10 @@ def held_out_pictures(
         views: the held-out views, on the host.
         images: for each frame the held-out image to show, whose camera is used
             (:func:`~devrf.apps.video.held_out_images`).
-        film: the images' height.
+        settings: the images' height.
         background: what is behind the alpha mask.
     """
-    cameras, behind = film.sized(views.cameras), background_value(background)
+    cameras, behind = settings.sized(views.cameras), background_value(background)
     larger = ", enlarged" if cameras.height > views.height else ""
     for frame, image in enumerate(images):
         time = frame / max(len(images) - 1, 1)
@@ -136,16 +136,16 @@ def write_video(path: Path, images: Iterator[Tensor], fps: float) -> None:
     write_pictures(path, (to_bytes(image).numpy() for image in images), fps)
 
 
-def video_bytes(film: VideoSettings, cameras: Cameras) -> int:
+def video_bytes(settings: VideoSettings, cameras: Cameras) -> int:
     """Upper estimate of the size in bytes of both videos, for the captured cameras.
 
     Two images a frame in one, three in the other, and labels above them.
     """
-    shown = film.sized(cameras)
-    return round(film.frames * 5 * (1.1 * shown.height) * shown.width * PIXEL)
+    shown = settings.sized(cameras)
+    return round(settings.frames * 5 * (1.1 * shown.height) * shown.width * PIXEL)
 
 
-# The cameras of a film of some settings, around a scene or before it.
+# The cameras of a video of some settings, around a scene or before it.
 Ring = Callable[[VideoSettings], Cameras]
 # Cameras and as many times in [0, 1].
 Shots = tuple[Cameras, list[float]]
@@ -186,13 +186,13 @@ def spiral(cameras: Cameras, focus: float, settings: VideoSettings) -> Cameras:
     return _ring(cameras, middle, radii[:, None] * axes, middle - focus * back, up, settings)
 
 
-def bullet_time(ring: Ring, moment: float, settings: VideoSettings) -> Shots:
-    """Once around the scene while its time stands still at ``moment``."""
-    return ring(settings), [moment] * settings.frames
+def bullet_time(ring: Ring, stop: float, settings: VideoSettings) -> Shots:
+    """Once around the scene while its time stands still at ``stop``."""
+    return ring(settings), [stop] * settings.frames
 
 
-def time_freeze(ring: Ring, moment: float, settings: VideoSettings) -> Shots:
-    """Time runs to ``moment`` and stands still while the camera goes round; then it runs on.
+def time_freeze(ring: Ring, stop: float, settings: VideoSettings) -> Shots:
+    """Time runs to ``stop`` and stands still while the camera goes round; then it runs on.
 
     Each takes a third of the frames.
     """
@@ -201,9 +201,9 @@ def time_freeze(ring: Ring, moment: float, settings: VideoSettings) -> Shots:
     cameras = ring(replace(settings, frames=around))
     index = [0] * before + list(range(around)) + [0] * after
     times = [
-        *torch.linspace(0, moment, before + 1)[:-1].tolist(),
-        *[moment] * around,
-        *torch.linspace(moment, 1, after).tolist(),
+        *torch.linspace(0, stop, before + 1)[:-1].tolist(),
+        *[stop] * around,
+        *torch.linspace(stop, 1, after).tolist(),
     ]
     return cameras[index], times
 

@@ -43,7 +43,7 @@ def export(run: RunContext) -> None:
     stored, scene = run.load(), run.scene
     model: Renderable = stored.model.to_view(run.device)
     folder = run.folder / "export" if settings.into is None else Path(settings.into)
-    times = settings.moments(scene.clock) if model.moves else (0.0,)
+    times = settings.export_times(scene.clock) if model.moves else (0.0,)
     if _takes_surface(model, settings):
         mesh = _moving_mesh(model, scene, settings, times)
         path = _write_mesh(folder, mesh, scene, settings)

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from devrf.apps.inspection.advice import advice_on, listed
+from devrf.apps.inspection.advice import advice_on
 from devrf.geometry.box import Box
 from devrf.scenes.bounds import box_from_cameras
 from devrf.scenes.procedural import ProceduralScene
@@ -142,8 +142,3 @@ def test_a_box_that_is_only_guessed(healthy: Scene) -> None:
     (advice,) = advice_on(without_alpha(healthy, guess))
     assert "data.box=" in advice.remedy
     assert advice_on(without_alpha(healthy, guess.scaled(0.9))) == []
-
-
-def test_long_lists_are_cut_short() -> None:
-    assert listed(["a", "b"]) == "a, b"
-    assert listed([str(k) for k in range(9)]) == "0, 1, 2 and 6 more"

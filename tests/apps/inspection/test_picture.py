@@ -11,13 +11,10 @@ import torch
 from matplotlib.figure import Figure
 
 from devrf.apps.inspection.picture import (
-    box_edges,
     compass,
     flow_scale,
     frusta,
     inspection_figure,
-    sample_images,
-    scene_lines,
     shown,
     write_inspection_picture,
 )
@@ -91,13 +88,6 @@ def test_the_file(tiny_scene: Scene, tmp_path: Path) -> None:
     assert [p.name for p in path.parent.iterdir()] == ["inspect.png"]
 
 
-def test_edges_of_a_box(tiny_scene: Scene, cube: Box) -> None:
-    edges = box_edges(tiny_scene, cube)
-    assert edges.shape == (12, 2, 3)
-    torch.testing.assert_close((edges[:, 1] - edges[:, 0]).norm(dim=1), torch.full((12,), 2.0))
-    assert len({tuple(sorted(map(tuple, edge))) for edge in edges.tolist()}) == 12
-
-
 def test_a_camera_is_a_pyramid_that_opens_where_it_looks() -> None:
     cameras = Cameras(
         torch.eye(3, 4)[None], torch.tensor([[10.0, 10.0]]), torch.tensor([[10.0, 5.0]]), 20, 10
@@ -108,11 +98,6 @@ def test_a_camera_is_a_pyramid_that_opens_where_it_looks() -> None:
     torch.testing.assert_close(lines[0], torch.tensor([[0.0, 0, 0], [-2.0, 1.0, -2.0]]))
     # The tick above it shows which way is up.
     torch.testing.assert_close(lines[8, 1], torch.tensor([0.0, 1.4, -2.0]))
-
-
-def test_fixed_cameras_are_drawn_once(tiny_scene: Scene) -> None:
-    counts = {group.label: len(group.ends) for group in scene_lines(tiny_scene)}
-    assert counts["dynamic views (2)"] == 20 and counts["held-out dynamic (1)"] == 10
 
 
 def test_forward_facing_cameras_look_north(forward_scene: Scene) -> None:
@@ -142,16 +127,3 @@ def test_what_alpha_or_masks_leave_out_is_chequered(tiny_scene: Scene) -> None:
         image = shown(changed, 0)
         assert (image[:, :12] == [255, 0, 0]).all()
         assert set(image[:, 12:].reshape(-1).tolist()) == {232, 255}
-
-
-def test_few_views_at_few_times_are_shown(tiny_scene: Scene) -> None:
-    train = tiny_scene.dynamic.train
-    many = train[torch.arange(6).repeat(60)]
-    views = replace(many, view=torch.arange(6).repeat_interleave(60), times=torch.rand(360))
-    rows = sample_images(views)
-    assert [int(views.view[row[0]]) for row in rows] == [0, 2, 3, 5]
-    for row in rows:
-        times = views.times[row]
-        assert len(row) == 6 and bool((times.diff() > 0).all())
-        own = views.times[views.view == views.view[row[0]]]
-        assert (times[0], times[-1]) == (own.min(), own.max())

@@ -63,13 +63,6 @@ def test_methods_and_protocols_have_columns_where_they_differ(table, ran):
     assert rows[0][:3] == [FULL, "joint", "**31.00**"]
 
 
-def test_nothing_is_credited_that_is_not_shown(table, ran):
-    ran("a")
-    text = markdown(table(), {"PSNR over time": "figures/a b.png"})
-    assert "NeurIPS" not in text and "†" not in text and "± " not in text
-    assert "![PSNR over time](<figures/a b.png>)" in text
-
-
 def test_failures_are_listed_with_their_reason(pig_and_robot, failed, runs):
     shared = "data.width=24"
     failed("7_robot", "data.frames: expected 2", overrides=[shared, "data.frames=1"])
@@ -90,12 +83,6 @@ def test_failures_are_listed_with_their_reason(pig_and_robot, failed, runs):
     assert f"failed: {first}\nfailed: {second}\n" in said
     assert said.count("metrics.json: skipped") == 1
     assert f"% failed: {first}\n% failed: {second}\n" in latex(found)
-
-
-def test_overrides_that_all_runs_share_are_left_out(table, ran, failed):
-    failed("1", "lost", overrides=["data.width=24", "seed=1"])
-    ran("0", overrides=["data.width=24", "seed=0"])
-    assert "- 1 (robot seed=1): lost\n" in markdown(table(), {})
 
 
 def test_plain_text_is_aligned_and_marked(pig_and_robot):

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from devrf.apps.report.runs import collect, metric_over_time, number
+from devrf.apps.report.runs import collect, metric_over_time
 
 
 def one(folder):
@@ -44,11 +44,6 @@ def test_the_time_is_that_of_the_stages_of_the_protocol(ran, protocol, static, s
     run = one(ran("new", method="dnerf", protocol=protocol, seconds=(static, 38.0)))
     assert (run["method"], run["protocol"]) == ("dnerf", protocol)
     assert run["train_seconds"] == pytest.approx(seconds, nan_ok=True)
-
-
-def test_only_finite_numbers_are_values():
-    assert number(3) == 3.0
-    assert all(math.isnan(number(value)) for value in (None, True, "3", math.inf, math.nan))
 
 
 def test_a_failure_is_told_in_one_line(runs, failed):

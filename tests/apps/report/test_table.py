@@ -7,7 +7,6 @@ import pytest
 
 from devrf.apps.report.table import GPU, LPIPS, PSNR, SSIM, TIME, TITLES, published, ranked, shown
 from devrf.apps.report.text import latex, markdown, plain
-from devrf.cli.config import config_folder
 
 FULL = "Ours w/ c2f, tv, cycle, flow"
 
@@ -28,12 +27,8 @@ def ranks(rows, column):
         (0.9765, SSIM, "0.977"),
         (0.00744, LPIPS, "0.0074"),
         (3.25, GPU, "3.2"),
-        (0.31, TIME, "0.3 s"),
-        (9.94, TIME, "9.9 s"),
         (9.96, TIME, "10 s"),
-        (55.4, TIME, "55 s"),
         (99.6, TIME, "1.7 min"),
-        (540, TIME, "9.0 min"),
         (22.4 * 3600, TIME, "22.4 h"),
     ],
 )
@@ -79,10 +74,7 @@ def test_novel_times_have_a_column_where_a_run_has_them(table, ran):
         # What looks the same is the same.
         ([29.421, 29.419, 28], PSNR, [1, 1, 2]),
         ([None, 22, 21], PSNR, [0, 1, 2]),
-        ([22], PSNR, [0]),
-        ([22, 22], PSNR, [0, 0]),
-        ([None, None], PSNR, [0, 0]),
-        ([None, 22], PSNR, [0, 0]),
+        ([None, 22, 22], PSNR, [0, 0, 0]),
     ],
 )
 def test_the_best_three_values_are_marked(values, column, expected):
@@ -177,23 +169,6 @@ def test_published_rows_are_those_of_the_scenes_that_were_run(table, ran):
     assert everything[2].measured.empty and len(everything[6].published) == 9
 
 
-def test_published_rows_are_averaged_over_the_same_scenes(table, ran):
-    for scene in ("lego", "pig_toy"):
-        ran(scene, scene)
-    rows = texts(table().blocks[-1].published)
-    # (29.25 + 30.85) / 2; (9 + 10) / 2 minutes.
-    full = rows["DeVRF w/ c2f, tv, cycle, flow"]
-    assert (full[0], full[-1]) == ("30.05", "9.5 min")
-    assert "Neural Volumes" not in rows  # not in the table of pig toy
-
-
-def test_a_column_without_values_is_explained(table, ran):
-    ran("a")
-    (lpips, gpu) = table().notes
-    assert lpips.startswith("No run has LPIPS: ") and "evaluation.lpips_weights" in lpips
-    assert gpu.startswith("No run has GPU (GB): ")
-
-
 def test_runs_scored_at_rest_only_are_named_and_not_tabulated(table, ran):
     ran("a")
     ran("b", scores={"psnr": None})
@@ -225,11 +200,6 @@ def test_every_scene_and_method_of_the_three_tables_is_there():
     for scene, table in SCENES.items():
         assert list(counts.loc[scene]) == [METHODS[table]] * 2
     assert paper.values.notna().all(axis=None) and paper.values.shape == (5 * 17 + 9, 5)
-
-
-def test_scenes_are_called_as_devrf_calls_them():
-    for scene in SCENES:
-        assert f"name: {scene}\n" in (config_folder() / "data" / f"{scene}.yaml").read_text()
 
 
 def test_single_cells_as_printed():

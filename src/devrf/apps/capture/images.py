@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import repeat
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -295,6 +296,13 @@ def box_of_motion(
 def _small(path: Path) -> Picture:
     image = cv2.imread(str(path), cv2.IMREAD_COLOR)
     assert image is not None  # the step before has written it
-    factor = min(1.0, LONGER_SIDE / max(image.shape[:2]))
-    size = (round(image.shape[1] * factor), round(image.shape[0] * factor))
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return np.asarray(shrunk(image, LONGER_SIDE), np.uint8)
+
+
+def shrunk(image: npt.NDArray[Any], longer: int) -> npt.NDArray[Any]:
+    """An image (H, W) or (H, W, 3) with at most ``longer`` pixels of its longer side."""
+    factor = longer / max(image.shape[:2])
+    if factor >= 1:
+        return image
+    height, width = (max(1, round(side * factor)) for side in image.shape[:2])
+    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)

@@ -11,8 +11,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from devrf.apps.capture.images import shrunk
 from devrf.errors import DevrfError
 from devrf.scenes.footage import Picture, pictures
+
+log = logging.getLogger(__name__)
 
 # Frames are looked at with so many pixels of the longer side: much smaller ones hide blur, larger
 # ones show the sensor's noise.
@@ -21,6 +24,11 @@ LONGER_SIDE = 640
 MOTION_SIDE = 160
 # So many grey levels of change are noise.
 NOISE = 2.0
+# Below this, an image of a textured scene is blurred so far that few features are left. Of sharp
+# photographs the value is 0.5 and more; of strong blur up to 0.44, as H.264 makes blocks of it.
+BLURRED = 0.45
+# From fewer images there is no structure from motion worth the name.
+MIN_IMAGES = 3
 
 Grey = npt.NDArray[np.float32]
 
@@ -70,8 +78,10 @@ def survey(path: Path, followed: Iterable[tuple[float, Picture]] | None = None) 
                 f"{size}; bring all images to one size"
             )
         size = width, height
-        grey = _grey(picture, LONGER_SIDE)
-        small = cv2.GaussianBlur(_shrunk(grey, MOTION_SIDE), (0, 0), 1.0).astype(np.float32)
+        grey = shrunk(
+            np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), np.float32), LONGER_SIDE
+        )
+        small = cv2.GaussianBlur(shrunk(grey, MOTION_SIDE), (0, 0), 1.0).astype(np.float32)
         times.append(time)
         sharp.append(sharpness(grey))
         change = 0.0 if before is None else moved(before, small)
@@ -111,29 +121,6 @@ def moved(before: Grey, after: Grey) -> float:
     return float(np.maximum(change - NOISE, 0).mean())
 
 
-def _grey(picture: Picture, longer: int) -> Grey:
-    grey = np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), np.float32)
-    return _shrunk(grey, longer)
-
-
-def _shrunk(grey: Grey, longer: int) -> Grey:
-    """The image with at most ``longer`` pixels of its longer side."""
-    factor = longer / max(grey.shape)
-    if factor >= 1:
-        return grey
-    width, height = (max(1, round(side * factor)) for side in grey.shape[::-1])
-    return np.asarray(cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA), np.float32)
-
-
-log = logging.getLogger(__name__)
-
-# Below this, an image of a textured scene is blurred so far that few features are left. Of sharp
-# photographs the value is 0.5 and more; of strong blur up to 0.44, as H.264 makes blocks of it.
-BLURRED = 0.45
-# From fewer images there is no structure from motion worth the name.
-LEAST = 3
-
-
 def sharpest(sharpness: Sequence[float], count: int) -> list[int]:
     """Positions, ascending, of the sharpest frame of each of ``count`` equal stretches.
 
@@ -154,10 +141,10 @@ def check_sharp(path: Path, sharpness: Sequence[float], picked: Sequence[int]) -
     Raises:
         DevrfError: there are too few frames, or most of them are blurred.
     """
-    if len(picked) < LEAST:
+    if len(picked) < MIN_IMAGES:
         raise DevrfError(
-            f"{path}: {len(picked)} images, expected at least {LEAST}; film the scene from more "
-            "places"
+            f"{path}: {len(picked)} images, expected at least {MIN_IMAGES}; film the scene from "
+            "more places"
         )
     blurred = [position for position in picked if sharpness[position] < BLURRED]
     if len(blurred) > len(picked) / 2:

@@ -90,7 +90,7 @@ class ExportSettings:
         if not (0 <= self.times[0] and self.times[-1] <= 1):
             raise DevrfError(f"export.times: expected times from 0 to 1, not {list(self.times)}")
 
-    def moments(self, clock: FrameClock) -> tuple[float, ...]:
+    def export_times(self, clock: FrameClock) -> tuple[float, ...]:
         """The times to export, of a scene whose training frames have the clock's times."""
         if self.times is not None:
             return tuple(self.times)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,7 +11,7 @@ import matplotlib
 import numpy as np
 import torch
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure, SubFigure
+from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from PIL import Image
 from torch import Tensor
@@ -69,14 +68,16 @@ def inspection_figure(scene: Scene) -> Figure:
         figure = Figure((WIDTH, sum(heights)), dpi=100)
         areas = figure.subfigures(len(heights), squeeze=False, height_ratios=heights)
         cameras, *parts = areas.flat
-        _title(cameras, f"{scene.name}, {scene.kind}-facing", fontsize=24, fontweight="bold")
+        cameras.suptitle(
+            f"{scene.name}, {scene.kind}-facing", x=0.01, ha="left", fontsize=24, fontweight="bold"
+        )
         side = cameras.add_axes((0, 0.1, 0.49, 0.78), projection="3d", title="in perspective")
         plan = cameras.add_axes((0.53, 0.13, 0.43, 0.75))
         plan.set_title("from above, in world units from the middle of the box")
         draw_cameras(scene, side, plan)
         cameras.legend(loc="lower center", ncols=6, frameon=False)
         for part, height, (heading, rows) in zip(parts, heights[1:], sections, strict=True):
-            _title(part, heading, fontsize=17)
+            part.suptitle(heading, x=0.01, ha="left", fontsize=17)
             part.subplots_adjust(
                 left=0.01,
                 right=0.99,
@@ -86,22 +87,14 @@ def inspection_figure(scene: Scene) -> Figure:
                 hspace=CAPTION / tile,
             )
             places = part.subplots(len(rows), COLUMNS, squeeze=False)
-            for axes, row in zip(places, rows, strict=True):
-                _draw_row(axes, row)
+            entries = [row[k] if k < len(row) else None for row in rows for k in range(COLUMNS)]
+            for axes, entry in zip(places.flat, entries, strict=True):
+                if entry is None:
+                    axes.set_axis_off()
+                else:
+                    axes.imshow(entry[0])
+                    axes.set(xticks=[], yticks=[], xlabel=entry[1], anchor="N")
     return figure
-
-
-def _title(part: SubFigure, text: str, **style: Any) -> None:
-    part.suptitle(text, x=0.01, ha="left", **style)
-
-
-def _draw_row(places: Sequence[Axes], tiles: Sequence[Tile]) -> None:
-    for axes, tile in zip_longest(places, tiles):
-        if tile is None:
-            axes.set_axis_off()
-        else:
-            axes.imshow(tile[0])
-            axes.set(xticks=[], yticks=[], xlabel=tile[1], anchor="N")
 
 
 def _dynamic_sections(views: Views) -> list[Section]:
@@ -119,9 +112,12 @@ def _dynamic_sections(views: Views) -> list[Section]:
     if views.flow is None:
         return sections
     longest, flowing = flow_scale(views.flow), {image for image, _ in frame_pairs(views)}
+    images = {
+        k: _smaller(flow_colors(views.flow.vectors[k], views.flow.valid[k], longest))
+        for k in flowing.intersection(label)
+    }
     flow: list[list[Tile]] = [
-        [(_flow_image(views.flow, k, longest), label[k]) if k in flowing else None for k in row]
-        for row in samples
+        [(images[k], label[k]) if k in images else None for k in row] for row in samples
     ]
     # The first image of a view has no frame before it.
     flow[0][0] = (to_bytes(flow_wheel(300)).numpy(), f"rim: {longest:.3g} px or more")
@@ -167,10 +163,6 @@ def shown(views: Views, image: int) -> np.ndarray:
     y, x = np.indices(pixels.shape[:2]) // max(1, views.width // 24)
     squares = torch.from_numpy(np.where((x + y) % 2, 0.91, 1.0)).float()[..., None]
     return _smaller(squares + opacity * (pixels[..., :3] - squares))
-
-
-def _flow_image(flow: OpticalFlow, image: int, longest: float) -> np.ndarray:
-    return _smaller(flow_colors(flow.vectors[image], flow.valid[image], longest))
 
 
 def _smaller(colors: Tensor) -> np.ndarray:
