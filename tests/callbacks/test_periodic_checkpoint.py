@@ -51,29 +51,6 @@ def test_the_last_two_are_kept_and_none_is_written_before_its_time(
     assert saving.saved == (left[-1] if left else None)
 
 
-def test_writing_takes_its_share_of_the_time(
-    learn, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    clock = [100.0]
-    monkeypatch.setattr(module.time, "monotonic", lambda: clock[0])
-    written: list[int] = []
-
-    def write(trainer: Trainer, path: Path, **_: Any) -> None:
-        written.append(trainer.lightning_module.iteration)
-        path.touch()
-        clock[0] += 2.0  # a file takes two seconds, an iteration one
-
-    monkeypatch.setattr(module, "save_checkpoint", write)
-
-    class Tick(Callback):
-        def on_train_batch_end(self, *_: Any) -> None:
-            clock[0] += 1.0
-
-    learn(Tick(), PeriodicCheckpoint(tmp_path, every_seconds=0, share=0.4))
-    # Two seconds are 40% of five: three iterations to wait.
-    assert written == [1, 4, 7, 10]
-
-
 def test_a_row_of_the_curves_that_is_due_is_waited_for(learn, tmp_path: Path) -> None:
     seen: list[list[str]] = []
     watch = At(6, lambda: seen.append(names(tmp_path)))

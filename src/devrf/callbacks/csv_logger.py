@@ -49,14 +49,14 @@ class ResumableCSVLogger(CSVLogger):
     @rank_zero_only
     def drop_rows_beyond(self, capture: str, iteration: int) -> None:
         """Drop the rows of ``capture`` beyond ``iteration``: a resumed run writes them again."""
-        kept = [
+        rows = [
             row
             for row in self._rows
             if not any(key.startswith(f"{capture}/") for key in row)
             or float(row.get("step", 0)) <= iteration
         ]
-        if len(kept) < len(self._rows):
-            self._rows, self._written = kept, None
+        if len(rows) < len(self._rows):
+            self._rows, self._written = rows, None
             self.save()
 
     @rank_zero_only

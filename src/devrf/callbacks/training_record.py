@@ -29,7 +29,7 @@ class TrainingRecord(Callback):
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Check and compile the kernels; then start the clock and the memory's high-water mark."""
         callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
-        self._previews = [one for one in callbacks if isinstance(one, Previews)]
+        self._previews = [other for other in callbacks if isinstance(other, Previews)]
         self._device = pl_module.device
         before = time.perf_counter()
         if triton_runs(torch.zeros(1, device=self._device)):

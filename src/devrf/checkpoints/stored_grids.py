@@ -41,10 +41,10 @@ def pack(grids: Tensor, keep: Tensor, *, smooth: bool) -> Packed:
     if float(grids.abs().amax()) > torch.finfo(torch.float16).max:
         raise ValueError("a value of the grids is too large for half precision")
     thin = _thinned(grids.shape[1:4])
-    kept, elsewhere = [], []
+    details, elsewhere = [], []
     for n, grid in enumerate(grids):
         here = keep[min(n, len(keep) - 1)]
-        kept.append(grid[here].half())
+        details.append(grid[here].half())
         if smooth:
             elsewhere.append(resample(grid, thin).half())
         else:
@@ -54,7 +54,7 @@ def pack(grids: Tensor, keep: Tensor, *, smooth: bool) -> Packed:
     return {
         "shape": list(grids.shape[1:4]),
         "keep": torch.stack([pack_bits(mask) for mask in keep]),
-        "kept": torch.cat(kept),
+        "kept": torch.cat(details),
         "elsewhere": torch.stack(elsewhere),
     }
 

@@ -35,8 +35,8 @@ def ssim_map(prediction: Tensor, truth: Tensor) -> Tensor:
     """
     a, b = (_batched(image) for image in (prediction, truth))
     padding = "valid" if min(a.shape[-2:]) >= WINDOW else "same"
-    found: Tensor = kornia_ssim(a, b, window_size=WINDOW, max_val=1.0, padding=padding)
-    return found[0].permute(1, 2, 0)
+    similarity: Tensor = kornia_ssim(a, b, window_size=WINDOW, max_val=1.0, padding=padding)
+    return similarity[0].permute(1, 2, 0)
 
 
 def ms_ssim(prediction: Tensor, truth: Tensor) -> float | None:

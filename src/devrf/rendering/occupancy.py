@@ -1,4 +1,4 @@
-"""Occupancy: a mask of the cells that may contain matter, so that empty space is not sampled."""
+"""Occupancy: a mask of the cells that may be occupied, so that empty space is not sampled."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class Occupancy(nn.Module):
     """A mask (X, Y, Z) over a box; a point is looked up at its nearest grid point.
 
     Attributes:
-        mask: (X, Y, Z) bool, True where there may be matter.
+        mask: (X, Y, Z) bool, True where something may be.
         vicinity: the mask dilated by ``REACH`` grid points, to test segments of a ray at once.
         box: the box of the mask; outside it everything is empty.
     """
@@ -48,11 +48,11 @@ class Occupancy(nn.Module):
         return float(self.mask.float().mean())
 
     def at(self, points: Tensor) -> Tensor:
-        """Mask (M,): whether there may be matter at ``points`` (M, 3)."""
+        """Mask (M,): whether something may be at ``points`` (M, 3)."""
         return self._look_up(self.mask, points)
 
     def near(self, points: Tensor) -> Tensor:
-        """Mask (M,): whether there may be matter within :attr:`reach` of ``points`` (M, 3)."""
+        """Mask (M,): whether something may be within :attr:`reach` of ``points`` (M, 3)."""
         return self._look_up(self.vicinity, self.box.nearest(points))
 
     def _look_up(self, mask: Tensor, points: Tensor) -> Tensor:

@@ -110,20 +110,14 @@ def march(
     start = torch.arange(len(ray), device=ray.device).sub_(first.index_select(0, ray))
     start *= per_segment
     middle = entry.index_select(0, ray) + step * (start + (per_segment - 1) / 2)
-    kept = occupancy.near(rays.at(ray, middle)).nonzero()[:, 0]
-    ray, start = ray.index_select(0, kept), start.index_select(0, kept)
+    near_occupied = occupancy.near(rays.at(ray, middle)).nonzero()[:, 0]
+    ray, start = ray.index_select(0, near_occupied), start.index_select(0, near_occupied)
     number = (start[:, None] + torch.arange(per_segment, device=ray.device)).reshape(-1)
     ray = ray.repeat_interleave(per_segment)
     distance = entry.index_select(0, ray).add_(number, alpha=step)
     points = rays.at(ray, distance)
-    met = occupancy.at(points) & (number < count.index_select(0, ray))
-    kept = met.nonzero()[:, 0]
-    return Samples(
-        ray.index_select(0, kept),
-        distance.index_select(0, kept),
-        points.t().index_select(1, kept).t(),
-        len(rays),
-    )
+    occupied = occupancy.at(points) & (number < count.index_select(0, ray))
+    return Samples(ray, distance, points, len(rays))[occupied.nonzero()[:, 0]]
 
 
 def _reach(rays: Rays, occupancy: Occupancy) -> float:
