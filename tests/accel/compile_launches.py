@@ -2,12 +2,10 @@
 
     compile_launches.py two|all CAPABILITY…
 
-compiles ``two`` of the kernels for each GPU, or all with all sets of constants that they are
-launched with.
-
-Run by test_compilation.py in a process of its own, without Triton's interpreter. The functions are
-called on CPU tensors; their launches are recorded instead of run, then each is compiled to PTX and
-on to a cubin by the assembler in Triton's wheel. Prints one JSON list.
+compiles ``two`` of the kernels, or all with all constants that they are launched with. Run by
+test_compilation.py in a process of its own, without Triton's interpreter: the operations are called
+on CPU tensors, their launches are recorded instead of run, then each is compiled to PTX and on to a
+cubin by the assembler in Triton's wheel. Prints one JSON list.
 """
 
 from __future__ import annotations
@@ -71,12 +69,7 @@ def type_of(value: Any) -> str:
 def kernel_names() -> set[str]:
     """Every kernel of the package, as opposed to the functions that kernels call."""
     modules = [import_module(m.name) for m in iter_modules(devrf.accel.__path__, "devrf.accel.")]
-    return {
-        name
-        for module in modules
-        for name, value in vars(module).items()
-        if isinstance(value, JITFunction) and name.endswith("_kernel")
-    }
+    return {name for module in modules for name in vars(module) if name.endswith("_kernel")}
 
 
 def main(extent: str, capabilities: list[int]) -> None:
@@ -88,22 +81,15 @@ def main(extent: str, capabilities: list[int]) -> None:
         for cases in CASES.values():
             for case in cases:
                 case(draw)
-    found = []
+    compiled = []
     for (name, *_), (source, options) in recorded.items():
         if extent == "two" and name not in TWO:
             continue
         for capability in capabilities:
-            compiled = triton.compile(source, GPUTarget("cuda", capability, 32), options)
-            ptx, cubin = compiled.asm["ptx"], compiled.asm["cubin"]
-            found.append(
-                {
-                    "kernel": name,
-                    "capability": capability,
-                    "ptx": f".target sm_{capability}" in ptx,
-                    "cubin": cubin[:4] == b"\x7fELF",
-                }
-            )
-    print(json.dumps({"kernels": sorted(TWO if extent == "two" else names), "compiled": found}))
+            asm = triton.compile(source, GPUTarget("cuda", capability, 32), options).asm
+            assert f".target sm_{capability}" in asm["ptx"] and asm["cubin"][:4] == b"\x7fELF"
+            compiled.append((name, capability))
+    print(json.dumps({"kernels": sorted(TWO if extent == "two" else names), "compiled": compiled}))
 
 
 main(sys.argv[1], [int(argument) for argument in sys.argv[2:]])

@@ -68,16 +68,6 @@ def test_the_rate_of_each_voxel_is_scaled(rng: torch.Generator, skip_zero: bool)
     torch.testing.assert_close(moved, factors * run(GridAdam([plain], lr=0.1), plain, grads))
 
 
-def test_the_rate_may_be_a_tensor_that_changes() -> None:
-    parameter, rate = torch.zeros(1, 1, 1, 1, requires_grad=True), torch.tensor(0.5)
-    optimizer = GridAdam([parameter], lr=rate)
-    run(optimizer, parameter, [torch.ones(1, 1, 1, 1)])
-    assert parameter.item() == pytest.approx(-0.5)
-    rate.fill_(0.25)
-    run(optimizer, parameter, [torch.ones(1, 1, 1, 1)])
-    assert parameter.item() == pytest.approx(-0.75)
-
-
 def test_a_restored_optimizer_continues_exactly(rng: torch.Generator) -> None:
     grads = gradients(rng, 6)
     whole, resumed = (torch.zeros(SHAPE, dtype=torch.float64, requires_grad=True) for _ in range(2))
@@ -176,5 +166,7 @@ def test_other_work_may_replace_the_step_after_the_rates_are_set() -> None:
     with optimizer.stepping_by(work):
         optimizer.step(closure)
     assert order == ["asked", "work"] and parameter.item() == pytest.approx(-0.25)
+    # The rate may be a tensor, too.
+    optimizer.param_groups[0]["lr"] = torch.tensor(0.5)
     optimizer.step()
-    assert len(order) == 2
+    assert len(order) == 2 and parameter.item() == pytest.approx(-0.75)

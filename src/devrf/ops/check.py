@@ -186,50 +186,37 @@ def photometric_terms(draw: Draw) -> Results:
 
 
 def color_network(draw: Draw) -> Results:
-    """Colours of listed samples, in single precision, and all gradients."""
-    shapes = (24, 12), (24,), (24, 15), (24, 24), (24,), (3, 24), (3,)
-    weights = [draw.leaf(*shape) for shape in shapes]
-    octaves = torch.tensor([1.0, 2.0]).to(draw.device)
-    return _colors(draw, draw.leaf(4, 3, 5, 12), draw.leaf(90, 3), draw(6, 3), weights, octaves)
+    """Colours of listed samples, in single precision."""
+    return _colors(draw, 24, torch.tensor([1.0, 2.0]), torch.float32)
 
 
 def half_color_network(draw: Draw) -> Results:
-    """The same at the paper's width in half precision, on numbers that it does not round.
+    """The same at the paper's width, in half precision."""
+    reduced = draw.device.type == "cuda" and torch.cuda.is_bf16_supported()
+    return _colors(draw, 128, torch.empty(0), torch.bfloat16 if reduced else torch.float16)
 
-    Features and weights are small integers and quarters, the second layer is sparse. Gradients are
-    rounded to three digits.
+
+def _colors(draw: Draw, units: int, octaves: Tensor, precision: torch.dtype) -> Results:
+    """Colours of samples with padding behind them, and all gradients.
+
+    Features and weights are small integers and quarters, the second layer is sparse, so that half
+    precision rounds none; gradients it rounds to three digits.
     """
-    units, cells = 128, torch.tensor([3, 2, 4])
-    low, high = torch.tensor(BOX.low), torch.tensor(BOX.high)
+    cells, low, high = torch.tensor([3, 2, 4]), torch.tensor(BOX.low), torch.tensor(BOX.high)
     middle = ((0.5 + 0.5 * draw(70, 3).cpu()) * (cells - 1e-3)).floor() + 0.5
-    shapes = (units, 12), (units,), (units, 3), (units, units), (units,), (3, units), (3,)
-    weights = [draw(*shape).sign() for shape in shapes]
+    points = (low + middle / cells * (high - low)).to(draw.device).requires_grad_()
+    directions = 3 + 6 * len(octaves)
+    shapes = (units, 12), (units,), (units, directions), (units, units), (units,), (3, units), (3,)
+    grid, *weights = (draw(*shape).sign() for shape in ((4, 3, 5, 12), *shapes))
     diagonal = torch.eye(units, device=draw.device)
     weights[3] *= diagonal + diagonal.roll(1, 0)
     weights[5] /= units
-    points = (low + middle / cells * (high - low)).to(draw.device).requires_grad_()
-    grid, weights = draw(4, 3, 5, 12).sign().requires_grad_(), [w.requires_grad_() for w in weights]
-    reduced = draw.device.type == "cuda" and torch.cuda.is_bf16_supported()
-    precision = torch.bfloat16 if reduced else torch.float16
-    return _colors(draw, grid, points, draw(6, 3).sign(), weights, draw(0), precision)
-
-
-def _colors(
-    draw: Draw,
-    grid: Tensor,
-    points: Tensor,
-    directions: Tensor,
-    weights: list[Tensor],
-    octaves: Tensor,
-    precision: torch.dtype = torch.float32,
-) -> Results:
-    """Colours of samples with padding behind them, and the gradients of all that is learned."""
-    places, used = len(points), int(0.9 * len(points))
-    ray, first = (2.99 + 2.99 * draw(places)).long(), torch.linspace(0, used, 7).long()
-    network = ColorNetwork(*[*weights, octaves])
-    listed = directions, ray, first.to(draw.device), network, precision
-    colors = listed_colors(grid, points, BOX, *listed)[:used]
-    return draw.gradients((0.2 * colors,), points, grid, *weights)
+    learned = [tensor.requires_grad_() for tensor in (grid, *weights)]
+    network = ColorNetwork(*[*weights, octaves.to(draw.device)])
+    ray, first = (2.99 + 2.99 * draw(70)).long(), torch.linspace(0, 63, 7).long()
+    listed = draw(6, 3).sign(), ray, first.to(draw.device), network, precision
+    colors = listed_colors(grid, points, BOX, *listed)[:63]
+    return draw.gradients((0.2 * colors,), points, *learned)
 
 
 def motion_terms(draw: Draw) -> Results:
