@@ -27,7 +27,7 @@ from filming import SCENES, Filmed
 from torch import Tensor
 
 from devrf.apps.capture.pipeline import scene_from_footage
-from devrf.cli.steps import run_stage
+from devrf.cli.run import run_stage
 from devrf.system.files import write_json
 
 

@@ -25,10 +25,10 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf, open_dict, read_write
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
-from devrf.cli.config import config_folder, register_resolvers
+from devrf.cli.config import config_folder, register_config
 from devrf.cli.config_check import check_config
 from devrf.cli.context import RunContext
-from devrf.cli.steps import run_stage
+from devrf.cli.run import run_stage
 from devrf.errors import DevrfError
 from devrf.ops.dispatch import using
 
@@ -51,7 +51,7 @@ def open_run(overrides: Sequence[str]) -> RunContext:
         DevrfError: a setting is unknown or invalid, or asks for several processes.
     """
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    register_resolvers()
+    register_config()
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
         config = compose("config", overrides=list(overrides), return_hydra_config=True)
     HydraConfig.instance().set_config(config)

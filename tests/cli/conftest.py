@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 
 import devrf as package
-import devrf.cli.steps  # what every command loads is there before the garbage collector looks
+import devrf.cli.run  # what every command loads is there before the garbage collector looks
 from devrf.__main__ import entry
 from devrf.scenes.procedural.recipe import Recipe
 from devrf.scenes.scene import Scene

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, Union
 
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
-from devrf.cli.config_check import check_config
+from devrf.cli.config_check import check_config, unfit
 from devrf.errors import DevrfError
 
 
@@ -81,13 +83,13 @@ def test_a_part_may_take_anything():
         ({"sizes__inner__siez": 1}, "did you mean sizes.inner.size?"),
         ({"sizes__innr": {"size": 3}}, "sizes.innr.size: no such key"),
         ({"loss__fien": {"color": 3.0}}, "loss.fien.color: no such key"),
-        ({"sizes__inner__size": "big"}, "sizes.inner.size: expected a whole number, not 'big'"),
-        ({"loss__fine__color": "high"}, "loss.fine.color: expected a number, not 'high'"),
+        ({"sizes__inner__size": "big"}, "sizes.inner.size: expected a valid integer, not 'big'"),
+        ({"loss__fine__color": "high"}, "loss.fine.color: expected a valid number, not 'high'"),
         (
-            {"schedule": {"motion": {"_target_": f"{__name__}.Inner", "least_gain": 0.1}}},
-            "schedule.motion.least_gain: renamed; write schedule.motion.min_rel_improvement=",
+            {"schedule": {"deformation": {"_target_": f"{__name__}.Inner", "order": 1}}},
+            "schedule.deformation.order: renamed; write schedule.deformation.levels.N.order=",
         ),
-        ({"seed": None}, "seed: expected a whole number, not None"),
+        ({"seed": None}, "seed: expected a valid integer, not None"),
         ({"outer__root": "${nowhere}"}, "nowhere"),
     ],
 )
@@ -97,3 +99,54 @@ def test_the_key_at_fault_is_named(changes, message):
     assert message in str(caught.value)
     if message != "nowhere":
         assert isinstance(caught.value, DevrfError)
+
+
+@pytest.mark.parametrize(
+    ("hint", "fitting", "wrong"),
+    [
+        (int, [3], ["3", 3.0, True, None]),
+        (float, [3, 3.5], [True, "a"]),
+        (str, ["a"], [3]),
+        (Path, ["a/b"], [3]),
+        (Union[int, None], [None, 1], ["a"]),  # noqa: UP007 - the older spelling
+        (Literal["one", "all"], ["one"], ["both"]),
+        (Sequence[int], [[1, 2]], [[1, "a"], 1]),
+        (Sequence[str], [["ab"]], ["ab"]),
+        (Sequence[Sequence[float]], [[[0.0, 1]]], [[0.0]]),
+        (Mapping[str, float], [{"color": 1}], [{"color": "high"}]),
+        (Any, ["anything"], []),
+        (Exception, ["x"], []),  # no config value has the type
+    ],
+)
+def test_values_of_each_type(hint, fitting, wrong):
+    assert not any(unfit(value, hint) for value in fitting)
+    assert all(unfit(value, hint) for value in wrong)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["logger=tensorboard"], ("logger=tensorboard: tensorboard", "tensorboard", "logger=csv")),
+        (
+            ["data=inward", "data.root=nowhere", "data.flow=raft"],
+            ("data.flow=raft: torchvision", "raft", "data.flow=dis"),
+        ),
+        (["stage=export"], ("stage=export: skimage", "export", "stage=render")),
+        (["stage=view"], ("stage=view: viser", "viewer", "stage=render")),
+        (["viewer=true"], ("viewer=true: viser", "viewer", "viewer=false")),
+    ],
+)
+def test_a_missing_package_is_named_first(devrf, tmp_path, monkeypatch, arguments, expected):
+    monkeypatch.setattr("devrf.cli.config_check.find_spec", lambda package: None)
+    outcome = devrf(*arguments)
+    missing, extra, instead = expected
+    said = f'{missing} is not installed; run pip install "devrf[{extra}]", or set {instead}'
+    assert (outcome.status, outcome.err) == (2, f"devrf: {said}\n")
+    assert not list(tmp_path.iterdir())
+
+
+def test_flow_that_was_estimated_before_needs_no_estimator(devrf, tmp_path, monkeypatch):
+    monkeypatch.setattr("devrf.cli.config_check.find_spec", lambda package: None)
+    (tmp_path / "flow.npz").touch()
+    cached = ("data=inward", "data.root=nowhere", "data.flow=raft", "data.flow_cache=flow.npz")
+    assert devrf(*cached).err.startswith("devrf: nowhere: no such folder")

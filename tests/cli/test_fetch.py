@@ -115,7 +115,7 @@ def test_files_that_came_before_an_interruption_are_kept(devrf, web, tmp_path, p
         ([], "knows no 'robot'; choose one of fox, lego"),
         (["scene=fox", "ckpt=x"], "ckpt: stage=fetch starts from nothing"),
         (["scene=fox", "fetch.catalogue=none.toml"], "fetch.catalogue: none.toml cannot be read"),
-        (["scene=fox", "fetch.sha256=0"], "fetch.sha256: expected text or null, not 0"),
+        (["scene=fox", "fetch.sha256=0"], "fetch.sha256: expected a valid string or None, not 0"),
     ],
 )
 def test_one_line_for_a_mistake(devrf, tmp_path, published, arguments, expected):

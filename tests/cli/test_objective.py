@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import pytest
+from devrf.cli.evaluate import check_objective, objective
 
-from devrf.cli.objective import check_objective, objective
 from devrf.errors import DevrfError
 
 FOUND = {

@@ -11,7 +11,6 @@ from omegaconf import OmegaConf
 
 from devrf.checkpoints.checkpoint import load_checkpoint
 from devrf.checkpoints.checkpoint_file import read_checkpoint_file, write_checkpoint_file
-from devrf.cli.resume import archive_previous
 
 
 @pytest.fixture
@@ -129,16 +128,6 @@ def test_a_deformation_learned_afresh_keeps_its_canonical_field(again, run):
 def test_where_nothing_is_learned_nothing_is_archived(again, run, argument, status):
     assert again("resume=false", argument).status == status
     assert not (run / "previous-1").exists()
-
-
-def test_an_archive_gets_a_free_name(tmp_path):
-    for name in ("previous-1", "previous-12", "previous-x", ".hydra", ".devrf"):
-        (tmp_path / name).mkdir()
-    archive_previous(tmp_path)
-    assert not (tmp_path / "previous-13").exists()
-    (tmp_path / "metrics.json").write_text("{}")
-    archive_previous(tmp_path)
-    assert [path.name for path in (tmp_path / "previous-13").iterdir()] == ["metrics.json"]
 
 
 def learned_another_day(path: Path, to: Path) -> None:

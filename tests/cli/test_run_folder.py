@@ -1,11 +1,103 @@
-"""The folder of a run that has made nothing is removed; any other stays."""
+"""One process at a time works in a run's folder, and a mistake leaves none behind."""
 
 from __future__ import annotations
 
-import pytest
+import os
+import re
+from pathlib import Path
 
-from devrf.cli.run_folder import removed_on_user_error
+import pytest
+from filelock import FileLock
+from omegaconf import OmegaConf
+
+from devrf.cli.run_folder import archive_previous, working_in
 from devrf.errors import DevrfError
+
+
+@pytest.fixture
+def hanging(warm, tmp_path):
+    """``hanging(*arguments)``: a process that works in a folder below the test's, and hangs."""
+    yield lambda *arguments: warm.hanging(tmp_path, *arguments)
+    warm.end_all()
+
+
+def seen(folder: Path) -> dict[str, tuple[int, int]]:
+    """Every file below a folder, with its time and size."""
+    # Older releases of filelock touch the empty file that they try to lock.
+    found = {str(path): path.stat() for path in folder.rglob("*") if path.name != "lock"}
+    return {name: (stat.st_mtime_ns, stat.st_size) for name, stat in found.items()}
+
+
+def test_the_second_process_is_refused_until_the_first_is_killed(
+    devrf, hanging, warm, tiny, tmp_path
+):
+    command = (*tiny, "stage=canonical", "hydra.run.dir=run")
+    first = hanging("hydra.run.dir=run")
+    before = seen(tmp_path)
+    outcome = devrf(*command)
+    assert outcome.status == 2
+    assert re.fullmatch(
+        rf"devrf: run: another devrf process \(pid {first} on \S+, since \S+ \S+\) works "
+        r"in this folder; wait for it, or use hydra.run.dir=FOLDER\n",
+        outcome.err,
+    )
+    # Another mistake leaves the first one's folder alone, too.
+    assert devrf("data=inward", "hydra.run.dir=run").status == 2
+    assert seen(tmp_path) == before
+    # A report of other runs may be written meanwhile.
+    assert "no finished run below run" in devrf("stage=report", "report.runs=run").err
+    warm.end(first)
+    assert devrf(*command).status == 0
+    assert (tmp_path / "run" / "checkpoints" / "canonical.ckpt").is_file()
+    assert os.listdir(tmp_path / "run" / ".devrf") == ["lock"]
+
+
+def test_a_sweep_and_its_jobs_have_their_folders_to_themselves(
+    devrf, hanging, warm, tiny, tmp_path
+):
+    sweep = ("stage=canonical", "hydra.sweep.dir=sweep", "seed=0,1")
+    first = hanging("-m", "hydra.sweep.dir=sweep", "seed=0,1")
+    before = seen(tmp_path)
+    outcome = devrf("-m", *tiny, *sweep)
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert outcome.err.startswith(f"devrf: sweep: another devrf process (pid {first} on ")
+    single = devrf(*tiny, "stage=canonical", "hydra.run.dir=sweep/0_robot")
+    assert single.status == 2 and f"(pid {first} on" in single.err
+    assert seen(tmp_path) == before
+    warm.end(first)
+    # Of the jobs, too, only that of a taken folder fails.
+    hanging("hydra.run.dir=sweep/0_robot")
+    outcome = devrf("-m", *tiny, *sweep)
+    assert outcome.status == 3
+    assert "sweep/0_robot: another devrf process" in outcome.err.splitlines()[0]
+    assert (tmp_path / "sweep" / "1_robot" / "checkpoints" / "canonical.ckpt").is_file()
+
+
+@pytest.fixture
+def alone(tmp_path):
+    """``alone(**trainer)``: the block in which no other process works in the test's folder."""
+
+    def block(**trainer):
+        config = OmegaConf.create({"stage": "canonical", "trainer": trainer})
+        return working_in(tmp_path / "run", config, "hydra.run.dir")
+
+    return block
+
+
+@pytest.mark.parametrize("name", ["RANK", "SLURM_PROCID"])
+def test_workers_are_under_the_lock_of_rank_0(alone, tmp_path, monkeypatch, name):
+    together = {"strategy": {"_target_": "devrf.engine.ddp.ManualDDP"}}
+    (tmp_path / "run" / ".devrf").mkdir(parents=True)
+    with FileLock(tmp_path / "run" / ".devrf" / "lock"):
+        monkeypatch.setenv(name, "1")
+        with alone(**together):
+            pass
+        # A task of many that do not learn together; the owner has not written its record yet.
+        with pytest.raises(DevrfError, match=r"run: another devrf process works in"), alone():
+            pass
+        monkeypatch.setenv(name, "0")
+        with pytest.raises(DevrfError), alone(**together):
+            pass
 
 
 @pytest.fixture
@@ -19,7 +111,8 @@ def folder(tmp_path, monkeypatch):
 
 
 def fail(folder, error, made=None):
-    with pytest.raises(type(error)), removed_on_user_error(folder):
+    config = OmegaConf.create({"stage": "canonical", "trainer": {}})
+    with pytest.raises(type(error)), working_in(folder, config, "hydra.run.dir"):
         (folder / "run.log").write_text("reading the scene\n")
         if made:
             (folder / made).write_text("made")
@@ -31,24 +124,19 @@ def test_a_mistake_leaves_nothing(folder, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_the_working_folder_itself_stays(tmp_path, monkeypatch):
-    (tmp_path / ".hydra").mkdir()
-    monkeypatch.chdir(tmp_path)
-    fail(tmp_path, DevrfError("data.root: wrong"))
-    assert tmp_path.is_dir()
-
-
-def test_parents_of_a_folder_elsewhere_stay(tmp_path_factory, folder):
+def test_other_folders_stay(folder, tmp_path, tmp_path_factory, monkeypatch):
+    (folder.parent / "paper").mkdir()
+    fail(folder, DevrfError("data.root: wrong"))
+    assert [p.name for p in folder.parent.iterdir()] == ["paper"]
+    # The parents of a folder elsewhere.
     elsewhere = tmp_path_factory.mktemp("elsewhere") / "mine"
     (elsewhere / "run" / ".hydra").mkdir(parents=True)
     fail(elsewhere / "run", DevrfError("data.root: wrong"))
     assert elsewhere.is_dir() and not list(elsewhere.iterdir())
-
-
-def test_other_runs_stay(folder):
-    (folder.parent / "paper").mkdir()
-    fail(folder, DevrfError("data.root: wrong"))
-    assert [p.name for p in folder.parent.iterdir()] == ["paper"]
+    # The working folder.
+    monkeypatch.chdir(elsewhere)
+    fail(elsewhere, DevrfError("data.root: wrong"))
+    assert elsewhere.is_dir()
 
 
 @pytest.mark.parametrize(
@@ -61,9 +149,15 @@ def test_other_runs_stay(folder):
 def test_results_and_faults_leave_the_folder(folder, error, made):
     fail(folder, error, made)
     assert (folder / "run.log").is_file() and (made is None or (folder / made).is_file())
-
-
-def test_an_earlier_run_stays(folder):
-    (folder / "run.log").write_text("an earlier run\n")
-    fail(folder, DevrfError("ckpt: wrong"))
+    fail(folder, DevrfError("ckpt: wrong"))  # of an earlier run
     assert (folder / "run.log").is_file()
+
+
+def test_an_archive_gets_a_free_name(tmp_path):
+    for name in ("previous-1", "previous-12", "previous-x", ".hydra", ".devrf"):
+        (tmp_path / name).mkdir()
+    archive_previous(tmp_path)
+    assert not (tmp_path / "previous-13").exists()
+    (tmp_path / "metrics.json").write_text("{}")
+    archive_previous(tmp_path)
+    assert [path.name for path in (tmp_path / "previous-13").iterdir()] == ["metrics.json"]

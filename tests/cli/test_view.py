@@ -95,7 +95,7 @@ def test_without_a_checkpoint_it_says_so_in_one_line(devrf, tmp_path, viser, por
     ],
 )
 def test_the_missing_extra_is_named(devrf, tmp_path, monkeypatch, command, setting, instead):
-    monkeypatch.setattr("devrf.cli.extras.find_spec", lambda package: None)
+    monkeypatch.setattr("devrf.cli.config_check.find_spec", lambda package: None)
     outcome = devrf(*command)
     expected = f'devrf: {setting}: viser is not installed; run pip install "devrf[viewer]", or set'
     assert (outcome.status, outcome.err) == (2, f"{expected} {instead}\n")
@@ -115,7 +115,7 @@ def imported(file: Path) -> set[str]:
 
 def test_the_viewer_is_not_loaded_without_being_asked_for():
     source, seen = Path(package.__file__).parents[1], set[str]()
-    waiting = ["devrf.__main__", "devrf.cli.app", "devrf.cli.steps", "devrf.callbacks"]
+    waiting = ["devrf.__main__", "devrf.cli.main", "devrf.cli.run", "devrf.callbacks"]
     while waiting:
         module = waiting.pop()
         stem = source / module.replace(".", "/")
@@ -123,7 +123,7 @@ def test_the_viewer_is_not_loaded_without_being_asked_for():
             if module not in seen and file.is_file():
                 waiting += imported(file)
         seen.add(module)
-    assert "devrf.apps.settings" in seen and "devrf.cli.view" in seen
+    assert "devrf.apps.settings" in seen and "devrf.cli.render" in seen
     assert "viser" not in seen and "devrf.apps.viewer.session" not in seen
 
 
@@ -194,54 +194,3 @@ def test_a_scene_that_cannot_be_read_is_shown_without_pictures(
     assert outcome.status == 0
     assert "its training cameras are shown without pictures" in outcome.out + outcome.err
     assert logging.getLogger("websockets").level == logging.WARNING
-
-
-SIZES = "ray_stage.model.settings"
-RAYS = (f"{SIZES}.width=8", f"{SIZES}.steps=16")
-PEERS = {
-    "dnerf": (*RAYS, f"{SIZES}.deformation_width=8"),
-    "nerfies": (*RAYS, f"{SIZES}.warp_width=8"),
-    "hypernerf": (*RAYS, f"{SIZES}.warp_width=8"),
-    "nsff": (*RAYS, f"{SIZES}.depth=2", f"{SIZES}.samples=8"),
-    "neural_volumes": (
-        f"{SIZES}.code=4",
-        f"{SIZES}.encoder_views=2",
-        f"{SIZES}.encoder_size=[16,16]",
-        f"{SIZES}.encoder_channels=[4,4]",
-        f"{SIZES}.encoder_width=8",
-        f"{SIZES}.template_channels=[8,8,8]",
-        f"{SIZES}.warp_side=4",
-        f"{SIZES}.warp_width=4",
-        f"{SIZES}.step=0.2",
-    ),
-}
-
-
-@pytest.mark.parametrize("method", PEERS)
-def test_another_method_is_looked_at_and_exported(devrf, tmp_path, tiny_data, port, viser, method):
-    learned = devrf(
-        f"method={method}",
-        *("experiment=peer_small", "protocol=joint", "stage=joint"),
-        *(*PEERS[method], f"{SIZES}.occupancy_side=8", *tiny_data),
-        *("ray_stage.schedule.iterations=2", "ray_stage.schedule.rays=32"),
-        *("hydra.run.dir=run", "trainer=cpu"),
-    )
-    assert learned.status == 0, learned.err
-    sender = ended_by(signal.SIGTERM, port)
-    shown = devrf("stage=view", "hydra.run.dir=run", f"viewer.port={port}", "trainer=cpu")
-    sender.join()
-    assert (shown.status, shown.err) == (0, "") and "the viewer has ended" in shown.out
-    file = tmp_path / "run" / "checkpoints" / "joint.ckpt"
-    drawing = Drawing(Renderer(load_checkpoint(file).model.to_view(torch.device("cpu"))), 1.0)
-    pose = Pose.of_cameras(load_checkpoint(file).viewpoints.held_out, 0)
-    for channel in drawing.channels:
-        *_, picture = drawing.draw(Shot(pose, 0.4, channel, with_depth=True), 12)
-        assert picture.pixels.shape[0] == 12 and picture.depth.isfinite().all()
-    command = ("stage=export", "export.format=ply", "export.points=20", "hydra.run.dir=run")
-    done = devrf(*command, "trainer=cpu")
-    assert done.status == 0
-    clouds = sorted((tmp_path / "run" / "export" / "points").glob("frame_*.ply"))
-    most = max(len(trimesh.load(cloud).vertices) for cloud in clouds)
-    assert len(clouds) == 3 and f"{most} coloured points at most at 3 times" in done.out
-    # A few iterations may make nothing that hides what is behind it.
-    assert ("the files are empty" in done.err + done.out) == (most == 0)

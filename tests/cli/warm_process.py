@@ -35,7 +35,7 @@ from hydra.core.plugins import Plugins
 
 import devrf.apps.video
 import devrf.callbacks
-import devrf.cli.steps
+import devrf.cli.run
 from devrf.__main__ import entry
 from devrf.checkpoints import checkpoint_file
 from devrf.ops.adam import GridAdam
@@ -102,7 +102,7 @@ def run(asked: dict[str, Any]) -> int:
         taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (taken + asked["most_memory"],) * 2)
     if asked.get("hangs"):
-        devrf.cli.steps.STEPS["prepare"] = hang
+        devrf.cli.run.STEPS["prepare"] = hang
     fuse = Fuse(asked)
     fuse.install()
     sys.argv = ["devrf", *asked["arguments"]]

@@ -9,11 +9,10 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from devrf.cli.complete import completed
 from omegaconf import OmegaConf
 
-from devrf.cli.arguments import with_viewer_shorthand
 from devrf.cli.config_check import check_config
-from devrf.cli.data_choice import with_data_choice
 
 REPOSITORY = Path(__file__).parents[2]
 PAGES = [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md"]
@@ -81,11 +80,14 @@ def test_docstrings_cite_anchors_of_the_method():
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_commands_compose(command, composed):
+def test_commands_compose(command, composed, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene" / "transforms_train.json").touch()  # so that a layout is recognised
     # Of the values of a sweep, the first.
     words = [word if "[" in word else word.split(",")[0] for word in command.split()]
     words = [re.sub(r"=(PATH|FOLDER|…)$", "=scene", word) for word in words if word != "-m"]
-    check_config(composed(*with_data_choice(with_viewer_shorthand(words))))
+    check_config(composed(*completed(words)))
 
 
 def test_keys_exist(composed):

@@ -11,7 +11,7 @@ from hydra.utils import get_class, instantiate
 from omegaconf import OmegaConf
 
 from devrf.apps.report.labels import ABLATIONS
-from devrf.cli.config import config_folder
+from devrf.cli.config import config_folder, small_experiments
 from devrf.cli.config_check import check_config
 from devrf.cli.context import RunContext
 from devrf.data.datamodule import SceneDataModule
@@ -25,6 +25,7 @@ from devrf.scenes.fetch import catalogue
 GROUPS = sorted({path.name for path in config_folder().iterdir() if path.is_dir()} - {"hydra"})
 NAMES = {g: sorted(p.stem for p in (config_folder() / g).glob("*.yaml")) for g in GROUPS}
 FILES = [f"{group}={name}" for group in GROUPS for name in NAMES[group]]
+SMALL = [f"experiment={name}" for name in small_experiments()]
 NEEDS = {
     "logger=tensorboard": "tensorboard",
     "hparams_search=loss_weights": "hydra_plugins.hydra_optuna_sweeper",
@@ -45,7 +46,7 @@ def rooted(composed, folder, *overrides):
 OTHER_METHODS = ("method=", "comparison=")
 
 
-@pytest.mark.parametrize("choice", [name for name in FILES if not name.startswith(OTHER_METHODS)])
+@pytest.mark.parametrize("choice", [n for n in FILES + SMALL if not n.startswith(OTHER_METHODS)])
 def test_it_composes_and_builds(composed, tmp_path, choice):
     needed = NEEDS.get(choice)
     if needed and importlib.util.find_spec(needed) is None:
@@ -218,9 +219,3 @@ def test_each_row_of_the_quality_table_adds_one_thing(composed, before, after, c
         beside = {part: config[part] for part in ("loss", "sampling", "field")}
         found[row] = {**config.schedule, **beside}
     assert {key for key in found[before] if found[before][key] != found[after][key]} == changed
-
-
-def test_the_last_row_of_the_quality_table_is_best_small_beside_the_embedded_scenes(composed):
-    row = composed("experiment=quickstart", "ablation=best")
-    best = composed("experiment=best_small_procedural")
-    assert all(row[part] == best[part] for part in ("schedule", "loss", "sampling", "field"))

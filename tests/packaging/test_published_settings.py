@@ -8,7 +8,6 @@ from __future__ import annotations
 import pytest
 from hydra.utils import instantiate
 
-from devrf.cli.paper_scene import with_paper_experiment
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.deformation_schedule import PAPER_LEVELS
@@ -157,22 +156,3 @@ def test_each_forward_scene_has_its_published_schedule(
     assert config.schedule.canonical.dense_tv_iterations == 10_000
     assert config.loss.flow_mean == "samples"
     assert (config.field.planes, config.field.channels, config.field.width) == (128, 9, 64)
-
-
-@pytest.mark.parametrize(
-    ("typed", "meant"),
-    [
-        (["experiment=paper", "data=lego"], ["experiment=paper_lego", "data=lego"]),
-        (
-            ["data=inward", "experiment=paper", "seed=1"],
-            ["data=inward", "experiment=paper_inward", "seed=1"],
-        ),
-        (
-            ["-m", "experiment=paper", "data=lego,plant"],
-            ["-m", "experiment=paper_lego,paper_plant"],
-        ),
-        (["experiment=quickstart", "data=lego"], ["experiment=quickstart", "data=lego"]),
-    ],
-)
-def test_the_experiment_paper_is_that_of_its_data(typed, meant):
-    assert with_paper_experiment(typed) == meant

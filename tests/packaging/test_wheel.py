@@ -96,7 +96,7 @@ def test_the_source_distribution_has_what_a_build_needs(built):
     (path,) = built.glob("*.tar.gz")
     with tarfile.open(path) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
-    assert {"pyproject.toml", "conf/config.yaml", "src/devrf/cli/app.py", "LICENSE"} <= names
+    assert {"pyproject.toml", "conf/config.yaml", "src/devrf/cli/main.py", "LICENSE"} <= names
     assert {"mkdocs.yml", "docs/method.md", "CHANGELOG.md", "CITATION.cff"} <= names
 
 

@@ -1,4 +1,4 @@
-"""The configuration's folder and its OmegaConf resolvers."""
+"""The configuration: its folder, its resolvers, the stages' names, and the present Hydra job."""
 
 from __future__ import annotations
 
@@ -6,15 +6,67 @@ import re
 from pathlib import Path
 from typing import Any
 
-from omegaconf import OmegaConf
+from hydra.core.config_store import ConfigStore
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
 
 from devrf.apps.settings import ReportSettings
+from devrf.errors import did_you_mean
+
+PIPELINE = "pipeline"
+# Stages that learn nothing; the protocol's stages come beside these.
+STEPS = (
+    *("prepare", "inspect", "evaluate", "render", "still", "view", "export"),
+    *("report", "fetch", "capture", "selfcheck"),
+)
+# Of these, what uses a checkpoint.
+OF_A_CHECKPOINT = ("evaluate", "render", "still", "view", "export")
+# What users of other programs write, by what it is here.
+SYNONYMS = {
+    "stage=pipeline": ("train", "fit", "learn", "run", "start"),
+    "stage=evaluate": ("eval", "test", "score", "metrics"),
+    "stage=render": ("video", "film"),
+    "stage=view": ("viewer", "browser", "viser", "gui"),
+    "stage=still": ("image", "picture", "photo"),
+    "stage=fetch": ("download", "get"),
+    "stage=export": ("mesh", "gltf", "convert"),
+    "stage=capture": ("footage", "colmap", "sfm", "process"),
+    "stage=inspect": ("check", "info", "show"),
+    "stage=report": ("compare", "table"),
+    "stage=selfcheck": ("doctor", "diagnose", "self-check"),
+    "--help": ("help",),
+    "--version": ("version",),
+}
 
 
 def config_folder() -> Path:
     """The folder ``conf/``: inside an installed package, else beside ``src/`` in a checkout."""
     installed = Path(__file__).parents[1] / "conf"
     return installed if installed.is_dir() else Path(__file__).resolve().parents[3] / "conf"
+
+
+def small_experiments() -> DictConfig:
+    """The experiments of ``conf/experiments.yaml``, by name."""
+    experiments = OmegaConf.load(config_folder() / "experiments.yaml")
+    assert isinstance(experiments, DictConfig)
+    return experiments
+
+
+def known_stages() -> list[str]:
+    """Every stage there is, of all protocols."""
+    learning: dict[str, None] = {}  # in order, each once
+    for path in sorted((config_folder() / "protocol").glob("*.yaml"), reverse=True):
+        learning |= dict.fromkeys(OmegaConf.select(OmegaConf.load(path), "stages"))
+    return [PIPELINE, *learning, *STEPS]
+
+
+def meant_stage(word: str) -> str:
+    """The end of a message: which stage may have been meant by ``word``; else empty."""
+    for meant, words in SYNONYMS.items():
+        if word.lower() in words:
+            return f"; did you mean {meant}?"
+    return did_you_mean(word, known_stages(), "stage=")
 
 
 def scene_name(data: Any) -> str:
@@ -84,7 +136,32 @@ def _of_sweep(mode: Any) -> bool:
     return str(getattr(mode, "name", mode)) == "MULTIRUN"
 
 
-def register_resolvers() -> None:
-    """Register ``${devrf.scene_name:…}`` and the other resolvers."""
+def register_config() -> None:
+    """Make the resolvers ``${devrf.scene_name:…}`` … and the small experiments known to Hydra."""
     for word in (scene_name, run_name, run_folder, config_record, tracked_name, tracked_group):
         OmegaConf.register_new_resolver(f"devrf.{word.__name__}", word, replace=True)
+    for name, experiment in small_experiments().items():
+        ConfigStore.instance().store(str(name), experiment, "experiment", "_global_", "devrf")
+
+
+def choices() -> dict[str, str | None]:
+    """The present job's option of each config group, without Hydra's own; empty outside Hydra."""
+    if not HydraConfig.initialized():
+        return {}
+    chosen = HydraConfig.get().runtime.choices
+    return {str(k): v for k, v in chosen.items() if not str(k).startswith("hydra/")}
+
+
+def overrides() -> list[str]:
+    """The present job's overrides, without Hydra's own; empty outside Hydra."""
+    return list(HydraConfig.get().overrides.task) if HydraConfig.initialized() else []
+
+
+def in_sweep() -> bool:
+    """Whether the present job is one of a multirun."""
+    return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
+
+
+def in_search() -> bool:
+    """Whether the sweeper optimises, and so needs the objective of each job."""
+    return in_sweep() and "direction" in HydraConfig.get().sweeper

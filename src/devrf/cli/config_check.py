@@ -1,18 +1,20 @@
-"""Checks a composed config against the signatures of its ``_target_``, before anything is built."""
+"""A composed config against the signatures of its ``_target_``, before anything is built."""
 
 from __future__ import annotations
 
 import inspect
+import json
 import re
+import types
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import is_dataclass
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 
-from devrf.cli.value_types import choices, described, fits
 from devrf.errors import DevrfError, did_you_mean
 
 # Keys outside the parts.
@@ -30,7 +32,7 @@ ROOT: dict[str, Any] = {
     "graphs": Literal["auto", "off"],
     "decoder_precision": Literal["auto", "float32", "bfloat16"],
 }
-# Keys of earlier versions and their new names; then values, by key.
+# Keys that were renamed, and their new names.
 RENAMED = {
     "callbacks.health.every_iterations": "callbacks.divergence_guard.every_iterations",
     "callbacks.health.rate_factor": "callbacks.divergence_guard.rate_factor",
@@ -63,9 +65,7 @@ RENAMED = {
     "callbacks.health": "callbacks.divergence_guard",
     "callbacks.saving": "callbacks.checkpoint",
     "callbacks.curve": "callbacks.training_curve",
-    "schedule.motion.least_gain": "schedule.motion.min_rel_improvement",
 }
-RENAMED_VALUES = {"schedule.motion.pixels": {"useful": "occupied"}}
 # Hydra's own keys in a part's config.
 RESERVED = {"_target_", "_partial_", "_convert_", "_recursive_", "_args_"}
 REFERENCE = re.compile(r"\$\{([\w.]+)\}")
@@ -168,12 +168,9 @@ def _check_value(where: str, value: object, hint: Any) -> None:
             if key not in hints:
                 raise unknown_key(f"{where}.{key}", hints)
             _check_value(f"{where}.{key}", one, hints[key])
-    elif not fits(value, hint):
-        now = RENAMED_VALUES.get(where, {}).get(str(value))
-        if now:
-            raise DevrfError(f"{where}: {value} was renamed; write {where}={now}")
-        meant = did_you_mean(value, choices(hint), f"{where}=")
-        raise DevrfError(f"{where}: expected {described(hint)}, not {value!r}{meant}")
+    elif expected := unfit(value, hint):
+        meant = did_you_mean(value, choices_of(hint), f"{where}=")
+        raise DevrfError(f"{where}: expected {expected}, not {value!r}{meant}")
 
 
 def unknown_key(where: str, known: Iterable[object]) -> DevrfError:
@@ -183,3 +180,69 @@ def unknown_key(where: str, known: Iterable[object]) -> DevrfError:
     name = where.rpartition(".")[2]
     meant = did_you_mean(name, (k for k in known if k != "**"), where[: -len(name)])
     return DevrfError(f"{where}: no such key{meant or '; --cfg job shows every key there is'}")
+
+
+def unfit(value: object, hint: Any) -> str:
+    """What a parameter annotated ``hint`` takes instead of ``value``; empty where that fits.
+
+    Text counts as a path, a list as any sequence, a whole number as a number. A type that no config
+    value has takes any.
+    """
+    # Imported here: --help is answered before it has loaded.
+    from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
+
+    try:
+        adapter = TypeAdapter(hint, config=ConfigDict(arbitrary_types_allowed=True))
+        # As JSON: of Python objects, strictly, text would be no path and a list no tuple.
+        adapter.validate_json(json.dumps(value, default=str), strict=True)
+    except PydanticUserError:  # a hint that pydantic does not know
+        return ""
+    except ValidationError as error:
+        if any(one["type"] == "needs_python_object" for one in error.errors()):
+            return ""
+        said = (one["msg"].removeprefix("Input should be ") for one in error.errors())
+        return " or ".join(dict.fromkeys(said))
+    return ""
+
+
+def choices_of(hint: Any) -> tuple[object, ...]:
+    """The values that a hint enumerates; none where it does not."""
+    inner = get_args(hint)
+    if get_origin(hint) is Literal:
+        return inner
+    if get_origin(hint) in (Union, types.UnionType):
+        return tuple(value for one in inner for value in choices_of(one))
+    return ()
+
+
+def check_extras(config: DictConfig) -> None:
+    """Check that what the config's settings need beyond devrf's own requirements is installed.
+
+    Launchers and searchers of sweeps are Hydra's plugins: Hydra itself misses them.
+
+    Raises:
+        DevrfError: naming the setting and the extra to install.
+    """
+    if "TensorBoard" in config.logger.get("_target_", ""):
+        _need("tensorboard", "logger=tensorboard", "tensorboard", "logger=csv")
+    if config.stage == "view":
+        _need("viser", "stage=view", "viewer", "stage=render")
+    if config.viewer.get("training") is True:
+        _need("viser", "viewer=true", "viewer", "viewer=false")
+    # Flow that was estimated before is read from its file.
+    cache = config.data.get("flow_cache")
+    if config.data.get("flow") == "raft" and not (cache and Path(cache).is_file()):
+        _need("torchvision", "data.flow=raft", "raft", "data.flow=dis")
+    if config.stage == "export":
+        for package in ("skimage", "trimesh", "fast_simplification"):
+            _need(package, "stage=export", "export", "stage=render")
+        if config.export.format == "usd":
+            _need("pxr", "export.format=usd", "export", "export.format=gltf")
+
+
+def _need(package: str, setting: str, extra: str, instead: str) -> None:
+    if find_spec(package) is None:
+        raise DevrfError(
+            f'{setting}: {package} is not installed; run pip install "devrf[{extra}]", or set '
+            f"{instead}"
+        )

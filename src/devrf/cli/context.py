@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -88,6 +88,34 @@ class RunContext:
         """Whether the method learns by a stage that is optional: it has one, with iterations."""
         iterations = OmegaConf.select(self.config, f"{step.name}.schedule.iterations")
         return not step.optional or bool(iterations)
+
+    @property
+    def stages_with_images(self) -> tuple[str, ...]:
+        """The protocol's stages; of a scene at rest those that learn from the static set alone."""
+        if self.scene.moves:
+            return self.learning_stages
+        return tuple(step.name for step in self.protocol.steps if step.capture == "static")
+
+    def learnable(self, names: Sequence[str]) -> tuple[str, ...]:
+        """Those of the stages ``names`` that the scene has images for; the scene is read.
+
+        Raises:
+            DevrfError: there is none.
+        """
+        known = self.stages_with_images
+        left = tuple(name for name in names if name in known)
+        if left:
+            return left
+        what = f"{self.scene.name} is at rest: all its images show one moment"
+        if known:
+            raise DevrfError(
+                f"stage={names[0]}: learns motion, but {what}; use stage={known[0]} or "
+                "stage=pipeline"
+            )
+        raise DevrfError(
+            f"protocol={self.protocol.name}: learns from images in motion, but {what}; use "
+            "protocol=two_stage"
+        )
 
     def stage_key(self, name: str) -> str:
         """The config key of a stage: its own name, or ``ray_stage``."""

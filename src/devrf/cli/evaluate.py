@@ -1,9 +1,10 @@
-"""``stage=evaluate``: scores on held-out views."""
+"""``stage=evaluate``: scores on held-out views, and the one number that a run is judged by."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from devrf.apps.records import (
@@ -17,9 +18,9 @@ from devrf.apps.records import (
 from devrf.apps.still import write_contact_sheet
 from devrf.checkpoints.checkpoint import CheckpointMetadata, TrainingFigures
 from devrf.checkpoints.checkpoint_file import digest_of
-from devrf.cli import job
+from devrf.cli.config import choices, overrides
 from devrf.cli.context import GIVEN_REST, OWN_REST, RunContext
-from devrf.cli.scene_stages import stages_with_images
+from devrf.errors import DevrfError, did_you_mean
 from devrf.evaluation.held_out import HeldOutView, score
 from devrf.evaluation.suite import MetricSuite
 from devrf.methods.base import Renderable
@@ -37,8 +38,18 @@ TRAINING = ("seconds", "iterations", "iterations_per_second", "peak_gpu_gb", "nu
 EXECUTION = ("kernels", "startup_seconds", "graph_captures", "short_lists", "peak_reserved_gb")
 
 
-def evaluate(run: RunContext) -> None:
-    """Score what was learned on held-out views; write metrics and contact sheets."""
+OF_BOTH = ("psnr", "ssim", *TRAINING, "checkpoint_mb")
+OF_MOTION = ("rest_pose_psnr",)
+# The two sections of metrics.json, and their names after DeVRF's stages.
+STATIC, DYNAMIC = ("static", "canonical"), ("dynamic", "deformation")
+
+
+def evaluate(run: RunContext) -> list[Path]:
+    """Score what was learned on held-out views; write metrics and contact sheets.
+
+    Returns:
+        The files.
+    """
     loaded = run.load()
     model, records = loaded.model.to_view(run.device), loaded.metadata.records
     suite = run.evaluation.suite(run.device)
@@ -74,6 +85,8 @@ def evaluate(run: RunContext) -> None:
         head["at_rest"] = True
     write_json(run.folder / "metrics.json", {**head, **sections, "run": ran})
     _tell(run, sections, frames)
+    sheets = [_sheet(run, capture) for capture in frames]
+    return [run.folder / "metrics.json", run.folder / "frames.csv", *sheets]
 
 
 def _tell(
@@ -131,12 +144,12 @@ def _origin(run: RunContext, described: CheckpointMetadata) -> dict[str, Any]:
     for of_stage in (*described.earlier_configs.values(), described.training_config):
         settings |= of_stage
     frames = scene.clock.frames_of(scene.dynamic.train.times)
-    own = {name: records.get(name, {}) for name in stages_with_images(run)}
+    own = {name: records.get(name, {}) for name in run.stages_with_images}
     learned = {name: record.get("wall_seconds") for name, record in own.items()}
     execution = {name: {key: record.get(key) for key in EXECUTION} for name, record in own.items()}
     return {
-        "choices": job.choices(),
-        "overrides": job.overrides(),
+        "choices": choices(),
+        "overrides": overrides(),
         "seed": settings.get("seed", run.config.seed),
         "settings": {k: settings[k] for k in sorted(settings) if k not in (OWN_REST, GIVEN_REST)},
         "fingerprint": described.fingerprint,
@@ -149,6 +162,10 @@ def _origin(run: RunContext, described: CheckpointMetadata) -> dict[str, Any]:
     }
 
 
+def _sheet(run: RunContext, capture: str) -> Path:
+    return run.folder / "images" / f"{capture}.png"
+
+
 def _score(
     run: RunContext, model: Renderable, capture: CaptureName, suite: MetricSuite
 ) -> list[HeldOutView]:
@@ -157,7 +174,39 @@ def _score(
     time = 0.0 if capture == "static" else None
     renderer = Renderer(model)
     scored = [score(renderer, views, k, background, suite, time=time) for k in range(len(views))]
-    sheet = write_contact_sheet(run.folder / "images" / f"{capture}.png", scored)
+    sheet = write_contact_sheet(_sheet(run, capture), scored)
     for tracker in run.trackers:
         tracker.show_image(f"held_out/{capture}", sheet)
     return scored
+
+
+def check_objective(key: str, metrics: Sequence[str]) -> None:
+    """Check that metrics.json will have ``key``.
+
+    Args:
+        key: ``SECTION.NAME``, such as ``dynamic.psnr``.
+        metrics: ``evaluation.metrics``.
+
+    Raises:
+        DevrfError: it will not.
+    """
+    section, _, name = key.partition(".")
+    if section not in (*STATIC, *DYNAMIC):
+        raise DevrfError(f"objective: expected static.NAME or dynamic.NAME, not {key!r}")
+    known = [*OF_BOTH, *metrics, *(OF_MOTION if section in DYNAMIC else ())]
+    if name not in known:
+        raise DevrfError(
+            f"objective: {section} has no {name!r}; choose from {', '.join(known)}"
+            f"{did_you_mean(name, known, f'objective={section}.')}"
+        )
+
+
+def objective(key: str, found: Mapping[str, Any]) -> float | None:
+    """The number ``key`` of metrics.json; None where it could not be measured.
+
+    The static section stands in for a missing dynamic one.
+    """
+    section, _, name = key.partition(".")
+    section = "static" if section in STATIC else "dynamic"
+    value: float | None = found.get(section, found["static"]).get(name)
+    return value

@@ -1,275 +1,228 @@
-"""How much memory and disk a run needs, estimated before it begins.
+"""Whether memory and disk suffice for a run: an estimate of what is large, before it begins.
 
-Everything is a sum over the tensors that will exist, except what a batch takes: see
-:func:`batch_bytes`.
+Counted are the images, the fields with their gradients and Adam's moments, and a batch. The rest is
+small beside them; where memory runs out all the same, batches are split
+(:mod:`devrf.engine.micro_batching`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields, is_dataclass, replace
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields, is_dataclass
 
 import torch
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
 from torch import Tensor, nn
 
-from devrf.engine.frame_store import active_bytes, resident_bytes
-from devrf.methods.devrf.architecture import Architecture, fitted_to
-from devrf.methods.devrf.canonical_field import CanonicalField
-from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
-from devrf.methods.devrf.deformation_schedule import DeformationSchedule
-from devrf.methods.devrf.settings import MotionSettings
-from devrf.scenes.scene import Scene, Views
+from devrf.cli.context import RunContext
+from devrf.engine.micro_batching import MicroBatching
+from devrf.errors import DevrfError
+from devrf.methods.devrf.architecture import fitted_to
+from devrf.system.files import free_disk
+from devrf.system.memory import free_host_memory, free_memory, gib, is_oom, numbers, own_memory
 
-# Bytes by the config keys that change them, the most effective key first.
-Parts = Mapping[tuple[str, ...], int]
-
-IMAGES = ("data.downscale", "data.width", "data.frames")
-GRIDS = ("schedule.canonical.side",)
-FRAMES = ("schedule.deformation.levels", "data.frames")
-PARALLEL = ("schedule.deformation.levels",)
-
-# Python and its libraries on the host, without what the driver of a GPU adds.
-PROGRAM = 600_000_000
-# Measured on scenes of 48 to 160 pixels: the C library keeps memory that was freed.
-FRAGMENTATION = 1.3
-# A pixel that batches are drawn from: two int32.
-POOLED = 8
-# Measured in scenes with a free-standing object: the share of a ray's samples that may be
-# occupied, and of those the share whose colour counts once surfaces have formed.
-OCCUPIED, DECODED = 0.3, 0.1
+# Python and its libraries on the host; measured, as is what the C library keeps of freed memory.
+PROGRAM, FRAGMENTATION = 600_000_000, 1.3
+# Values, gradients, two moments of Adam, and the copy that a rollback returns to.
+LEARNED = 5
+# Three progress files, each with values and two moments, are there at once.
+PROGRESS = 9
+# Measured around a free-standing object: the share of a ray's samples that are occupied, and of
+# these the share whose colour counts once surfaces have formed.
+OCCUPIED, COLOURED = 0.3, 0.25
+# A part grows with this power of the value of its key, else in proportion.
+POWER = {"downscale": -2, "side": 3, "width": 2}
 
 
 @dataclass(frozen=True)
 class StageNeeds:
-    """What a stage needs at its final resolution, in bytes.
+    """What a stage needs, in bytes.
 
     Attributes:
-        views: the training views, on the training device.
-        held: what that device holds all the time besides.
-        batch: the batches that a GPU works on at the same time.
-        rays: the config key of the batch size.
-        temporary: the most that other work takes between batches.
-        learned: the learned tensors in memory.
-        checkpoint: the file of the finished stage.
-        progress: a progress file.
-        batches: how many batches ``batch`` counts; a CPU takes one after the other.
+        parts: on the device that trains, by the config key that changes them most.
+        rays: the key of the batch among them.
+        learned: the values of the fields.
     """
 
-    views: int
-    held: Parts
-    batch: int
+    parts: Mapping[str, float]
     rays: str
-    temporary: int
-    learned: int
-    checkpoint: int
-    progress: int
-    batches: int = 1
+    learned: float
 
-    def peak(self, pieces: int = 1) -> int:
-        """Peak bytes on the device, with each batch taken in ``pieces``."""
-        return self.views + sum(self.held.values()) + max(self.batch // pieces, self.temporary)
-
-    @property
-    def on_host(self) -> int:
-        """Peak bytes beside the scene's where the host trains; it uses the views in place."""
-        return round(FRAGMENTATION * (self.peak(self.batches) - self.views))
+    def peak(self, pieces: int = 1) -> float:
+        """Bytes on the device, with each batch taken in ``pieces``."""
+        return sum(self.parts.values()) - self.parts[self.rays] * (1 - 1 / pieces)
 
 
 @dataclass(frozen=True)
-class Budget:
-    """What a run needs: ``scene``, bytes of all its views, and its stages in their order."""
+class Needs:
+    """What a run needs in bytes: ``scene``, all its images, and its stages by name."""
 
     scene: int
     stages: Mapping[str, StageNeeds]
 
-    def host(self, *, alone: bool, processes: int = 1) -> int:
-        """Bytes on the host.
+    def host(self, *, alone: bool) -> float:
+        """Bytes on the host, which trains ``alone`` or beside a GPU."""
+        held = (FRAGMENTATION * s.peak() if alone else 2 * s.learned for s in self.stages.values())
+        return PROGRAM + self.scene + max(held)
 
-        Args:
-            alone: whether the host trains. Otherwise it holds what a GPU has learned, to write it,
-                and the checkpoint, to score it.
-            processes: how many train together on this machine, each with its copy of the scene.
-        """
-        own = [one.learned + one.checkpoint for one in self.stages.values()]
-        if alone:
-            own += [one.on_host for one in self.stages.values()]
-        return processes * (PROGRAM + self.scene + max(own))
+    @property
+    def checkpoint(self) -> float:
+        """Bytes of the largest stage's learned values."""
+        return max(stage.learned for stage in self.stages.values())
 
-    def disk(self, *, kept: int, films: int = 0) -> int:
-        """Bytes of files, with ``kept`` progress files beside the one that is being written."""
-        worst = finished = 0
-        for one in self.stages.values():
-            written = kept * one.progress + max(one.progress, one.checkpoint)
-            worst, finished = max(worst, finished + written), finished + one.checkpoint
-        return max(worst, finished + films)
-
-    def rows(self) -> list[tuple[str, int]]:
+    def rows(self) -> list[tuple[str, float]]:
         """A table of names and bytes."""
         return [
-            *((f"GPU, {name} stage", one.peak()) for name, one in self.stages.items()),
+            *((f"GPU, {name} stage", stage.peak()) for name, stage in self.stages.items()),
             ("host, beside a GPU", self.host(alone=False)),
             ("host, without a GPU", self.host(alone=True)),
-            ("checkpoint", max(one.checkpoint for one in self.stages.values())),
+            ("checkpoint", self.checkpoint),
         ]
 
 
 def tensor_bytes(value: object) -> int:
-    """Bytes of all tensors in a module's state, a dataclass (nested too) or an iterable."""
+    """Bytes of all tensors in a dataclass (nested too) or an iterable."""
     if isinstance(value, Tensor):
         return value.nbytes
-    if isinstance(value, nn.Module):
-        return tensor_bytes(value.state_dict().values())
     if is_dataclass(value):
         return tensor_bytes(getattr(value, field.name) for field in fields(value))
     if isinstance(value, Iterable) and not isinstance(value, str):
-        return sum(tensor_bytes(one) for one in value)
+        return sum(map(tensor_bytes, value))
     return 0
 
 
-def module_needs(
-    module: nn.Module, views: Views, *, keys: tuple[str, ...], batch: int, rays: str
-) -> StageNeeds:
-    """What a stage needs that trains all of a module with Adam.
+def needs(run: RunContext) -> Needs:
+    """What the configured run needs; several processes share a batch."""
+    processes = int(getattr(run.strategy, "world_size", 1))
+    stages = (_of_devrf if "canonical" in run.config else _of_rays)(run, processes)
+    # A scene at rest that the protocol has no stage for can be looked at all the same.
+    names = run.stages_with_images or run.learning_stages
+    return Needs(tensor_bytes(run.scene.captures.values()), {name: stages[name] for name in names})
+
+
+def _of_rays(run: RunContext, processes: int) -> dict[str, StageNeeds]:
+    """Each stage of a method of ray stages trains the whole model."""
+    with torch.device("meta"):
+        model: nn.Module = instantiate(run.config.ray_stage.model, _convert_="all")
+    schedule, learned = run.config.ray_stage.schedule, tensor_bytes(model.parameters())
+    # Three values are kept for each output of each layer, for 128 samples of a ray.
+    outputs = sum(layer.out_features for layer in model.modules() if isinstance(layer, nn.Linear))
+    rays = max(schedule.rays, schedule.get("rays_without_hull") or 0) / processes
+    parts = {
+        _key_of_images(run): float(tensor_bytes(run.scene.captures.values())),
+        "ray_stage.model.settings.width": LEARNED * learned,
+        "ray_stage.schedule.rays": rays * 128 * 12 * outputs,
+    }
+    stage = StageNeeds(parts, "ray_stage.schedule.rays", learned)
+    return dict.fromkeys(run.learning_stages, stage)
+
+
+def _of_devrf(run: RunContext, processes: int) -> dict[str, StageNeeds]:
+    """DeVRF's fields at their final resolution: grids of about side³ voxels in any box."""
+    scene, config = run.scene, run.config
+    canonical = instantiate(config.canonical, _convert_="all")
+    schedule, sizes = fitted_to(scene, canonical.schedule, canonical.architecture)
+    moving = instantiate(config.deformation.schedule, _convert_="all")
+    last = [name for name, row in config.schedule.deformation.levels.items() if row][-1]
+    values = 4 * (1 + sizes.channels) * schedule.side**3
+    # With the graph of its gradients: measured, for each sample whose colour counts.
+    sample = 600 + 24 * sizes.width + 96 * sizes.channels
+    along = 2 / 3 * schedule.side * OCCUPIED if sizes.planes is None else sizes.planes
+    ray = along / canonical.sampling.step * sample / processes
+    at_rest = {
+        _key_of_images(run): tensor_bytes(scene.static.train),
+        "schedule.canonical.side": LEARNED * values,
+        "schedule.canonical.rays": schedule.rays * ray,
+    }
+    # Displacements of a frame: three numbers in both directions. Active frames are learned.
+    frame, frames = 24 * moving.levels[-1].side ** 3, len(scene.clock)
+    active = moving.max_parallel_frames(len(moving.levels) - 1, frames)
+    held = active if config.schedule.motion.store == "host" else frames
+    in_motion = {
+        _key_of_images(run): tensor_bytes(scene.dynamic.train),
+        "schedule.canonical.side": values,
+        f"schedule.deformation.levels.{last}.side": frame * (held + LEARNED * active),
+        "schedule.deformation.rays": active * moving.rays * COLOURED * ray,
+    }
+    rays, learned = "schedule.deformation.rays", values + frames * frame
+    refined = {**in_motion, "schedule.canonical.side": LEARNED * values}
+    return {
+        "canonical": StageNeeds(at_rest, "schedule.canonical.rays", values),
+        "deformation": StageNeeds(in_motion, rays, learned),
+        "refinement": StageNeeds(refined, rays, learned),
+    }
+
+
+def _key_of_images(run: RunContext) -> str:
+    return "data.downscale" if "downscale" in run.config.data else "data.frames"
+
+
+def check_memory(run: RunContext, names: Sequence[str]) -> str:
+    """Compare what stages need with what there is; both, in one line.
 
     Args:
-        module: may be on torch's meta device.
-        views: the training views.
-        keys: the config keys of the module's size.
-        batch: as in :class:`StageNeeds`.
-        rays: as in :class:`StageNeeds`.
+        run: the run; its scene is read.
+        names: of the stages that are to be learned.
+
+    Raises:
+        DevrfError: memory or disk cannot suffice.
     """
-    stored, parameters = tensor_bytes(module), tensor_bytes(module.parameters())
-    pool = len(views) * views.height * views.width * POOLED
-    return StageNeeds(
-        views=tensor_bytes(views),
-        # Gradients, two moments, and the copy that a rollback returns to.
-        held={keys: stored + 4 * parameters, IMAGES: pool},
-        batch=batch,
-        rays=rays,
-        temporary=2 * parameters,  # an optimiser step
-        learned=stored,
-        checkpoint=stored,
-        progress=stored + 2 * parameters,
+    every = needs(run)
+    of_run = Needs(every.scene, {name: every.stages[name] for name in names})
+    stage = max(of_run.stages.values(), key=StageNeeds.peak)
+    on_gpu = run.device.type == "cuda"
+    host = of_run.host(alone=not on_gpu)
+    host *= 1 if on_gpu else int(getattr(run.strategy, "num_processes", 1))
+    kept = sum(file.stat().st_size for file in run.folder.glob("checkpoints/*.ckpt"))
+    disk, room = (
+        (PROGRESS + 1) * of_run.checkpoint,
+        free_disk(run.folder) + kept * run.config.resume,
     )
-
-
-def batch_bytes(
-    samples: float, decoded: float, channels: int, width: int, *, warped: bool = False
-) -> int:
-    """About what a batch takes, with the graph of its gradients.
-
-    Counted from the tensors that are alive at once: 230 bytes for each of ``samples`` (position,
-    ray, rows and weights of eight corners), 200 more where it is ``warped``. Each of ``decoded``,
-    whose colour is computed, takes 6 float32 for each hidden unit (``width``), 24 for each feature
-    channel, and 400 bytes besides.
-    """
-    color = 4 * (6 * width + 24 * channels) + 400
-    return round((430 if warped else 230) * samples + color * decoded)
-
-
-def samples_per_ray(field: CanonicalField, voxels: int, step: float) -> float:
-    """Samples of a ray through the whole box, ``step`` voxels apart.
-
-    In a box of cubic voxels, on the mean chord of a convex body: 4 · volume / surface.
-    """
-    if field.planes is not None:
-        return (field.planes - 1) / step + 1
-    x, y, z = field.box.size
-    chord = 2 * field.box.volume / (x * y + y * z + z * x)
-    return chord / (step * field.box.voxel_size(voxels))
-
-
-def estimate(
-    scene: Scene,
-    canonical: CanonicalSchedule,
-    deformation: DeformationSchedule,
-    architecture: Architecture,
-    step: float = 0.5,
-    motion: MotionSettings | None = None,
-) -> Budget:
-    """What DeVRF needs to learn ``scene``, with samples ``step`` voxels apart.
-
-    The fields' box is taken to be the scene's motion box, or its box where that is unknown: grids
-    have about side³ voxels in any box. A store of displacements that is ``auto`` counts as on the
-    device.
-    """
-    canonical, architecture = fitted_to(scene, canonical, architecture)
-    voxels, sizes = round(canonical.side**3), (architecture.channels, architecture.width)
-    with torch.device("meta"):
-        box = (scene.space.is_linear and scene.bounds.motion) or scene.bounds.box
-        field = architecture.radiance_field(box, voxels, voxels)
-    occupied = OCCUPIED if field.planes is None else 1.0
-
-    # The search samples the whole box; its three channels are the colour. The first fine phase
-    # begins as fog: the colour of every sample counts.
-    first = next(phase for phase in canonical.phases if phase.kind == "fine")
-    fog = canonical.rays * occupied * samples_per_ray(field, first.voxels, step)
-    batch = batch_bytes(fog, fog, *sizes)
-    if canonical.search_iterations:
-        seen = canonical.rays * samples_per_ray(field, canonical.search_side**3, step)
-        batch = max(batch, batch_bytes(seen, seen, 3, 0))
-    rest = _canonical_needs(scene, field, batch)
-
-    met = deformation.rays * occupied * samples_per_ray(field, voxels, step)
-    batch = batch_bytes(met, DECODED * met, *sizes, warped=True)
-    motion = motion or MotionSettings()
-    moving = [
-        _level_needs(scene, field, rest, deformation, level, motion, batch)
-        for level in range(len(deformation.levels))
+    compared = [
+        ("host memory", host, host, free_host_memory() + own_memory()),
+        ("disk", disk, disk, room),
     ]
-    everything = tensor_bytes(scene.captures.values())
-    return Budget(everything, {"canonical": rest, "deformation": max(moving, key=StageNeeds.peak)})
+    if on_gpu:
+        least = stage.peak(MicroBatching.MOST)
+        compared.insert(0, ("GPU memory", stage.peak(), least, free_memory(run.device)))
+    said = ", ".join(f"{gib(n)} of {gib(there)} GiB of {what}" for what, n, _, there in compared)
+    for what, _, least, there in compared:
+        if least > there:
+            key = max(stage.parts, key=lambda key: stage.parts[key])
+            share = 1 - (1 - there / least) * stage.peak() / stage.parts[key]
+            raise DevrfError(
+                f"{key}: the run needs about {said}; it would end for lack of {what}: give "
+                f"{_smaller(run, key, share)}, or try all the same with memory_check=false"
+            )
+    split = any(needed > there for _, needed, _, there in compared)
+    return f"needs about {said}{'; batches will be split, slower' if split else ''}"
 
 
-def _canonical_needs(scene: Scene, field: CanonicalField, batch: int) -> StageNeeds:
-    points, grids = field.density.values.numel(), tensor_bytes((field.density, field.color))
-    rays = "schedule.canonical.rays"
-    needs = module_needs(field, scene.static.train, keys=GRIDS, batch=batch, rays=rays)
-    return replace(
-        needs,
-        held={**needs.held, GRIDS: needs.held[GRIDS] + 2 * points},  # with occupancy
-        temporary=max(needs.temporary, 80 * points),  # updating the occupancy
-        learned=needs.learned + points,
-        checkpoint=needs.checkpoint - grids // 2 + points,  # in half precision
-        progress=needs.progress + 5 * points,  # with the number of views of each voxel
-    )
+def _smaller(run: RunContext, key: str, share: float) -> str:
+    """``key=VALUE`` with which its part takes ``share`` as much; in words where that is unknown."""
+    value = OmegaConf.select(run.config, key)
+    if share <= 0 or not isinstance(value, int | float):
+        return f"another {key}"
+    power = POWER.get(key.rpartition(".")[2], 1)
+    scaled = value * share ** (1 / power)
+    return f"{key}={math.ceil(scaled) if power < 0 else max(math.floor(scaled), 1)}"
 
 
-def _level_needs(
-    scene: Scene,
-    field: CanonicalField,
-    rest: StageNeeds,
-    schedule: DeformationSchedule,
-    level: int,
-    motion: MotionSettings,
-    batch: int,
-) -> StageNeeds:
-    """What the deformation stage needs at a level, on top of the canonical field."""
-    views, frames, points = scene.dynamic.train, len(scene.clock), field.density.values.numel()
-    shape, final = (field.box.grid_shape(schedule.levels[k].side ** 3) for k in (level, -1))
-    parallel, slices = schedule.max_parallel_frames(level, frames), resident_bytes(1, shape, False)
-    pool = views.height * views.width * -(-len(views) // frames) * POOLED
-    if motion.store == "host":  # with the next frames, which are being copied
-        resident, active = 0, active_bytes(shape) + slices
-    else:
-        half = motion.store_half is True  # auto is not known to be a GPU's
-        resident, active = resident_bytes(frames, shape, half), active_bytes(shape)
-    learned = resident_bytes(frames, final, False)
-    moments = 2 * resident_bytes(schedule.max_parallel_frames(-1, frames), final, False)
-    return StageNeeds(
-        views=tensor_bytes(views),
-        held={
-            IMAGES: parallel * pool,
-            GRIDS: rest.learned + (2 + parallel) * points,  # with occupancy
-            FRAMES: resident + (active if parallel == 1 else 0),
-            PARALLEL: parallel * active if parallel > 1 else 0,
-        },
-        batch=parallel * batch,
-        rays="schedule.deformation.rays",
-        # An optimiser step with a smoothed copy of each frame, or updating the occupancy.
-        temporary=max((1 + parallel) * slices, 200 * points),
-        learned=rest.learned + learned,
-        checkpoint=rest.checkpoint + learned // 2,
-        progress=rest.learned + learned + moments,
-        batches=parallel,
-    )
+@contextmanager
+def shortage_in_words(name: str, run: RunContext) -> Iterator[None]:
+    """Raise a DevrfError where memory runs out in the step ``name``."""
+    try:
+        yield
+    except (RuntimeError, MemoryError) as error:
+        if not is_oom(error):
+            raise
+        rays = f"schedule.{name}.rays"
+        known = OmegaConf.select(run.config, rays) is not None
+        hint = f"lower {rays}" if known else "free some of it, or use a larger machine"
+        raise DevrfError(
+            f"stage={name}: out of memory ({numbers(str(error), run.device)}); {hint}; what was "
+            "written before stays"
+        ) from error

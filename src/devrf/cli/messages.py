@@ -14,10 +14,8 @@ from pathlib import Path
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf.errors import OmegaConfBaseException
 
-from devrf.cli.config import config_folder
+from devrf.cli.config import config_folder, meant_stage
 from devrf.cli.config_check import unknown_key
-from devrf.cli.overrides import in_quotes
-from devrf.cli.stages import meant_stage
 from devrf.errors import DevrfError, did_you_mean
 
 # Read at import: the entry point sets the variable, so that Hydra raises its errors.
@@ -137,3 +135,11 @@ def _of_hydra(error: BaseException) -> str:
         said = re.sub(r"(?m)^\s*(full_key:|object_type=|reference_type=).*$", "", text)
     key = re.search(r"^\s*full_key: (\S+)$", text, re.MULTILINE)
     return f"{key.group(1)}: {said}" if key else said
+
+
+def in_quotes(text: str) -> str:
+    """``text`` as Hydra's grammar takes it for text, whatever it holds."""
+    mark = "'" if '"' in text and "'" not in text else '"'
+    # Backslashes count as escapes only before a quotation mark and at the end.
+    escaped = re.sub(rf"(\\*)({mark}|$)", lambda m: m[1] * 2 + (m[2] and f"\\{mark}"), text)
+    return f"{mark}{escaped}{mark}"

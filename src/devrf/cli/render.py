@@ -1,18 +1,25 @@
-"""``stage=render``: videos."""
+"""``stage=render``, ``still``, ``view`` and ``export``: what is made of a learned scene."""
 
 from __future__ import annotations
 
 import logging
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
+from threading import Event
 
 from hydra.utils import instantiate
 from torch import Tensor
 
+from devrf.apps.export.geometry import ExportSettings
+from devrf.apps.export.scene import export_scene
+from devrf.apps.images import write_image
 from devrf.apps.keyframes import cameras_of, read_path
-from devrf.apps.still import still
+from devrf.apps.settings import ViewerSettings
+from devrf.apps.still import StillSettings, still
 from devrf.apps.video import (
     VideoSettings,
     bullet_time,
@@ -25,23 +32,33 @@ from devrf.apps.video import (
     time_freeze,
     write_video,
 )
+from devrf.checkpoints.checkpoint import CheckpointMetadata, Viewpoints, check_scene
+from devrf.cli.complete import parsed, value
 from devrf.cli.context import RunContext
+from devrf.cli.resume import deciding_settings
+from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value
 from devrf.geometry.cameras import Cameras
 from devrf.rendering.renderer import Renderer
-from devrf.scenes.scene import Views
+from devrf.scenes.scene import Scene, Views
+from devrf.system.process import handle_signals
 from devrf.system.progress import followed
 
 log = logging.getLogger(__name__)
 
 # What video.path may be beside a file.
 PRESETS = {"bullet_time": bullet_time, "time_freeze": time_freeze}
+# Times whose views stay at hand in the viewer: both ends, the rest state, and where time runs.
+CACHED = 6
 
 
-def render(run: RunContext) -> None:
+def render(run: RunContext) -> list[Path]:
     """Film the held-out views over time, and an orbit (or a spiral) while time runs.
 
     With ``video.path`` that path alone is filmed.
+
+    Returns:
+        The videos.
     """
     film: VideoSettings = instantiate(run.config.video)
     path = None if film.path in (None, *PRESETS) else read_path(Path(str(film.path)))
@@ -63,17 +80,16 @@ def render(run: RunContext) -> None:
     if path is not None:
         keyframes = path.sampled(film.frames)
         cameras = cameras_of(keyframes, path.aspect, captured.height)
-        shown = orbit_pictures(renderer, cameras, behind, [one.time for one in keyframes])
-        _write(run, film, Path(str(film.path)).stem, shown)
-    elif film.path is not None:
+        shown = orbit_pictures(renderer, cameras, behind, [frame.time for frame in keyframes])
+        return [_write(run, film, Path(str(film.path)).stem, shown)]
+    if film.path is not None:
         cameras, times = PRESETS[film.path](ring, film.time, film)
-        _write(run, film, film.path, orbit_pictures(renderer, cameras, behind, times))
-    else:
-        images = held_out_images(views, film.frames)
-        shown = held_out_pictures(renderer, views, images, film, scene.background)
-        _write(run, film, "held_out", shown)
-        shown = orbit_pictures(renderer, ring(film), behind)
-        _write(run, film, "spiral" if forward else "orbit", shown)
+        return [_write(run, film, film.path, orbit_pictures(renderer, cameras, behind, times))]
+    images = held_out_images(views, film.frames)
+    shown = held_out_pictures(renderer, views, images, film, scene.background)
+    held_out = _write(run, film, "held_out", shown)
+    shown = orbit_pictures(renderer, ring(film), behind)
+    return [held_out, _write(run, film, "spiral" if forward else "orbit", shown)]
 
 
 def check_path(film: VideoSettings) -> None:
@@ -106,9 +122,82 @@ def _within_limit(film: VideoSettings, renderer: Renderer, views: Views) -> Vide
     return fewer
 
 
-def _write(run: RunContext, film: VideoSettings, name: str, images: Iterator[Tensor]) -> None:
+def _write(run: RunContext, film: VideoSettings, name: str, images: Iterator[Tensor]) -> Path:
     path = run.folder / "videos" / f"{name}.mp4"
     write_video(path, followed(images, film.frames, f"{name}.mp4"), film.fps)
     log.info("video written to %s", path)
     for tracker in run.trackers:
         tracker.show_video(f"videos/{name}", path)
+    return path
+
+
+def picture(run: RunContext) -> None:
+    """Render the scene from one camera at one time; earlier pictures stay.
+
+    No image of the scene is read where its data is that of the checkpoint.
+    """
+    settings: StillSettings = instantiate(run.config.still)
+    stored = run.load(unread=True)
+    viewpoints = stored.viewpoints
+    if viewpoints is None or not _is_its_data(run, stored.metadata):
+        stored = run.load()  # refuses another scene
+        viewpoints = Viewpoints.of(run.scene)
+    camera = settings.camera(viewpoints)
+    renderer = Renderer(stored.model.to_view(run.device), half=settings.half)
+    color, depth = still(renderer, camera, settings.time, background_value(viewpoints.background))
+    path = _unused(run.folder / "images" / f"{settings.name}.png")
+    for place, image in ((path, color), (path.with_stem(f"{path.stem}_depth"), depth)):
+        write_image(place, image)
+        log.info("picture written to %s", place)
+
+
+def _is_its_data(run: RunContext, metadata: CheckpointMetadata) -> bool:
+    """Whether the configured data is, by its settings, what the checkpoint was learned from."""
+    data = {k: v for k, v in metadata.training_config.items() if k.startswith("data.")}
+    present = deciding_settings(run.config, metadata.stage)
+    if metadata.command is None or data != {k: present[k] for k in present if k in data}:
+        return False
+    root, before = run.config.data.get("root"), value(parsed(metadata.command), "data.root")
+    return root is None or (before is not None and Path(root).resolve() == Path(before).resolve())
+
+
+def _unused(path: Path) -> Path:
+    """The path, with a number where a file of that name is there: ``NAME_2.png``."""
+    names = (path.with_stem(f"{path.stem}_{k}") for k in count(2))
+    return path if not path.exists() else next(name for name in names if not name.exists())
+
+
+def view(run: RunContext) -> None:
+    """Show the run's checkpoint on a page until a signal arrives."""
+    from devrf.apps.viewer.drawing import Drawing
+    from devrf.apps.viewer.session import Session  # an extra
+
+    settings: ViewerSettings = instantiate(run.config.viewer)
+    stored = run.load(unread=True)
+    scene: Scene | None = None
+    try:
+        check_scene(run.checkpoint(), stored.metadata, run.scene)
+        scene = run.scene
+    except DevrfError as error:
+        if stored.viewpoints is None:
+            raise
+        log.warning("%s; its training cameras are shown without pictures", error)
+    viewpoints = stored.viewpoints if scene is None else Viewpoints.of(scene)
+    assert viewpoints is not None
+    renderer = Renderer(stored.model.to_view(run.device), times=CACHED)
+    drawing, stop = Drawing(renderer, background_value(viewpoints.background)), Event()
+    with (
+        handle_signals(lambda _: stop.set()),
+        closing(Session(settings, viewpoints, scene, run.folder, stop)) as session,
+    ):
+        session.present(drawing)
+        log.info("the scene is at %s; Ctrl-C ends the viewer", settings.address)
+        session.serve()
+    log.info("the viewer has ended")
+
+
+def export(run: RunContext) -> None:
+    """Write geometry that moves, for other programs."""
+    settings: ExportSettings = instantiate(run.config.export, _convert_="all")
+    model = run.load().model.to_view(run.device)
+    export_scene(model, run.scene, settings, run.folder / "export")

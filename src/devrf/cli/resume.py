@@ -1,4 +1,4 @@
-"""Where a stage begins when a command is repeated in the same folder.
+"""Where a command that is repeated in the same folder goes on; nothing is done twice.
 
 Each checkpoint holds the settings that decided what was learned:
 
@@ -8,30 +8,37 @@ Each checkpoint holds the settings that decided what was learned:
 * a deformation on top of another canonical field than the run's: it is learned anew.
 
 Settings of logging, scoring, rendering, the device and the place of the data may differ.
+
+What a pipeline has scored and filmed is not done again either: a step notes the files it wrote and
+what it made them with (checkpoint, settings, data, logger, version).
 """
 
 from __future__ import annotations
 
 import json
 import logging
-import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+import devrf
 from devrf.checkpoints.checkpoint import CheckpointMetadata, metadata_in
 from devrf.checkpoints.checkpoint_file import digest_of, read_checkpoint_file
 from devrf.checkpoints.progress import progress_files
 from devrf.cli.config_check import REFERENCE
 from devrf.cli.context import GIVEN_REST, OWN_REST, RunContext
-from devrf.cli.run_folder import AT_FIRST
+from devrf.cli.run_folder import PLACE
 from devrf.errors import DevrfError
+from devrf.system.files import write_json
 
 log = logging.getLogger(__name__)
 
+# The config group that decides what a step makes, by step; other steps are always done.
+DECIDES = {"evaluate": "evaluation", "render": "video"}
+NOTE = "done.json"  # in the folder of the lock
 # Settings of a datamodule or a stage that change nothing that is learned.
 UNDECISIVE = {"root", "name", "flow_cache", "export", "graphs", "store"}
 
@@ -148,30 +155,40 @@ def remove_progress(folder: Path, stage: str) -> None:
         path.unlink(missing_ok=True)
 
 
-def archive_previous(folder: Path, *kept: Path) -> None:
-    """Move the results of earlier commands into ``previous-<n>/`` within the run's folder.
+def done(run: RunContext, step: str) -> list[str]:
+    """The files of a step that need not be done again; none where it must be."""
+    noted, present = _notes(run.folder).get(step), _made_with(run, step)
+    if noted is None or present is None or noted["with"] != present:
+        return []
+    files: list[str] = noted["files"]
+    return files if all((run.folder / name).is_file() for name in files) else []
 
-    ``.hydra`` and the lock are the present command's and stay.
 
-    Args:
-        folder: the run's folder.
-        kept: files that the present command needs: they are copied back.
-    """
-    names = {path.name for path in folder.iterdir()} - AT_FIRST
-    old = [folder / name for name in names if not name.startswith("previous-")]
-    if not old:
-        return
-    for handler in logging.getLogger().handlers:
-        if isinstance(handler, logging.FileHandler):
-            handler.close()  # it opens a new file for the next record
-    taken = [int(p.name[9:]) for p in folder.glob("previous-*") if p.name[9:].isdigit()]
-    previous = folder / f"previous-{max(taken, default=0) + 1}"
-    previous.mkdir()
-    for path in old:
-        path.rename(previous / path.name)
-    for path in kept:
-        moved = previous / path.relative_to(folder)
-        if moved.is_file():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(moved, path)
-    log.info("what was in %s is kept in %s", folder, previous)
+def note_done(run: RunContext, step: str, files: Sequence[Path]) -> None:
+    """Note that a step was done, and the files it wrote."""
+    if step in DECIDES:
+        names = sorted(path.relative_to(run.folder).as_posix() for path in files)
+        note = {step: {"with": _made_with(run, step), "files": names}}
+        write_json(run.folder / PLACE / NOTE, _notes(run.folder) | note)
+
+
+def _made_with(run: RunContext, step: str) -> dict[str, Any] | None:
+    """What decides a step's results, as plain data; None without a checkpoint."""
+    try:
+        checkpoint = digest_of(run.checkpoint())
+    except (DevrfError, OSError):
+        return None
+    config: Any = OmegaConf.to_container(run.config, resolve=True)
+    data = {k: v for k, v in config["data"].items() if k not in ("flow_cache", "export")}
+    if data.get("root") is not None:
+        data["root"] = str(Path(data["root"]).resolve())
+    made = {"checkpoint": checkpoint, "version": devrf.__version__, "data": data}
+    return made | {"logger": config["logger"]["_target_"], "step": config[DECIDES[step]]}
+
+
+def _notes(folder: Path) -> dict[str, Any]:
+    try:
+        notes: dict[str, Any] = json.loads((folder / PLACE / NOTE).read_text())
+    except (OSError, ValueError):
+        return {}
+    return notes

@@ -1,30 +1,155 @@
-"""Removes the folder of a run that ends in a user error before it has made anything."""
+"""A run's folder: one process at a time, nothing left of a mistaken run, earlier results kept.
+
+The lock is the system's on an open file, so it ends with its process. A file beside it tells other
+processes which one that is.
+"""
 
 from __future__ import annotations
 
 import logging
+import os
 import shutil
+import socket
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from datetime import datetime
 from pathlib import Path
+from typing import Any
 
-from devrf.cli.messages import is_user_error
-from devrf.cli.run_lock import PLACE
+from filelock import FileLock, Timeout
+from hydra.core.hydra_config import HydraConfig
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
 
+from devrf.cli.config import in_sweep
+from devrf.cli.messages import REFUSED, is_user_error, report_user_errors
+from devrf.errors import DevrfError
+from devrf.system.files import make_folder
+
+log = logging.getLogger(__name__)
+
+# Within the run's folder; the lock file stays there, empty.
+PLACE = ".devrf"
+LOCK, OWNER = "lock", "process.txt"
 # Made in the folder before the config is checked.
 AT_FIRST = {".hydra", PLACE}
+# Environment variables in which torchrun and SLURM number the processes that they start.
+RANKS = ("RANK", "SLURM_PROCID")
+
+# Hydra writes before it calls the program, so its callback locks, and the program uses that lock.
+_held: dict[Path, FileLock] = {}
+
+
+class RunFolderLock(Callback):
+    """Hydra callback that locks the folder of a run or sweep before anything is written there.
+
+    Hydra ignores what a callback raises, except an exit: errors are reported here.
+    """
+
+    def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Lock the folder of a run; :func:`working_in` releases it."""
+        hydra = HydraConfig.instance()
+        before = hydra.cfg
+        try:
+            hydra.set_config(config)  # Hydra does so later, and the folder may refer to it
+            folder = Path(config.hydra.run.dir)
+        except OmegaConfBaseException:
+            return  # Hydra will report what is wrong with the config
+        finally:
+            hydra.cfg = before
+        with report_user_errors():
+            make_folder(folder)  # as Hydra does next, with a traceback where it cannot
+            if _locks(config):
+                _lock(folder, "hydra.run.dir")
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Lock the folder of a sweep; each of its jobs locks its own."""
+        with report_user_errors():
+            _lock(Path(config.hydra.sweep.dir), "hydra.sweep.dir")
+
+    def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
+        """Release the sweep's folder."""
+        _release(Path(config.hydra.sweep.dir))
 
 
 @contextmanager
-def removed_on_user_error(folder: Path) -> Iterator[None]:
-    """Remove ``folder`` if the run ends in a user error and the folder holds no results."""
-    was_new = _holds_at_most(folder, AT_FIRST)
+def working_in(folder: Path, config: DictConfig, key: str) -> Iterator[None]:
+    """While the block lasts, no other process works in a run's folder.
+
+    A folder that holds no results is removed if the block ends in a user error; that of a sweep's
+    job stays, for the record of its failure.
+
+    Args:
+        folder: the run's folder.
+        config: a composed config.
+        key: the setting that chooses another folder, for the message.
+
+    Raises:
+        DevrfError: another process works there.
+    """
+    if _locks(config):
+        _lock(folder, key)
+    was_new = not in_sweep() and _holds_at_most(folder, AT_FIRST)
     try:
         yield
     except Exception as error:
         if was_new and is_user_error(error):
             remove_if_only(folder, {*AT_FIRST, "run.log"})
         raise
+    finally:
+        _release(folder)
+
+
+def _locks(config: DictConfig) -> bool:
+    """Whether a process needs the lock: rank 0 locks for its workers.
+
+    A report and the viewer only read, but for a camera path that is written at once; stage=fetch
+    locks where it writes.
+    """
+    worker = any(os.environ.get(name, "0") != "0" for name in RANKS)
+    together = worker and config.trainer.get("strategy") is not None
+    return config.stage not in ("report", "fetch", "view") and not together
+
+
+def _lock(folder: Path, key: str) -> None:
+    """Lock a folder unless this process has done so; a file system without locks is told."""
+    if folder.resolve() in _held:
+        return
+    place = folder / PLACE
+    make_folder(place)
+    lock, owner = FileLock(place / LOCK), place / OWNER
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        which = ""
+        with suppress(OSError):  # the other process may not have written it yet
+            which = f" ({owner.read_text()})"
+        raise DevrfError(
+            f"{folder}: another devrf process{which} works in this folder; wait for it, or use "
+            f"{key}=FOLDER"
+        ) from None
+    except (NotImplementedError, OSError) as error:
+        if isinstance(error, OSError) and error.errno in REFUSED:
+            raise
+        log.warning(
+            "%s: its file system has no locks; see that no other process works there", folder
+        )
+        return
+    _held[folder.resolve()] = lock
+    since = datetime.now().astimezone().isoformat(" ", "seconds")
+    owner.write_text(f"pid {os.getpid()} on {socket.gethostname()}, since {since}")
+
+
+def _release(folder: Path) -> None:
+    lock = _held.pop(folder.resolve(), None)
+    if lock is not None:
+        (folder / PLACE / OWNER).unlink(missing_ok=True)
+        lock.release()
+
+
+def _holds_at_most(folder: Path, names: set[str]) -> bool:
+    return folder.is_dir() and {path.name for path in folder.iterdir()} <= names
 
 
 def remove_if_only(folder: Path, names: set[str]) -> None:
@@ -34,10 +159,7 @@ def remove_if_only(folder: Path, names: set[str]) -> None:
     """
     if not _holds_at_most(folder, names):
         return
-    for handler in list(logging.getLogger().handlers):
-        if isinstance(handler, logging.FileHandler):
-            logging.getLogger().removeHandler(handler)
-            handler.close()
+    _close_logs()
     for path in map(folder.joinpath, names):
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)
@@ -46,11 +168,39 @@ def remove_if_only(folder: Path, names: set[str]) -> None:
     here, folder = Path.cwd(), folder.resolve()
     if here.is_relative_to(folder):
         return
-    for path in [folder, *(path for path in folder.parents if here in path.parents)]:
-        if any(path.iterdir()):
-            break
-        path.rmdir()
+    with suppress(OSError):  # the first that is not empty
+        for path in [folder, *(path for path in folder.parents if here in path.parents)]:
+            path.rmdir()
 
 
-def _holds_at_most(folder: Path, names: set[str]) -> bool:
-    return folder.is_dir() and {path.name for path in folder.iterdir()} <= names
+def archive_previous(folder: Path, *needed: Path) -> None:
+    """Move the results of earlier commands into ``previous-<n>/`` within the run's folder.
+
+    ``.hydra`` and the lock are the present command's and stay.
+
+    Args:
+        folder: the run's folder.
+        needed: files that the present command needs: they are copied back.
+    """
+    old = [p for p in folder.iterdir() if p.name not in AT_FIRST and p.name[:9] != "previous-"]
+    if not old:
+        return
+    _close_logs()
+    taken = [int(p.name[9:]) for p in folder.glob("previous-*") if p.name[9:].isdigit()]
+    previous = folder / f"previous-{max(taken, default=0) + 1}"
+    previous.mkdir()
+    for path in old:
+        path.rename(previous / path.name)
+    for path in needed:
+        moved = previous / path.relative_to(folder)
+        if moved.is_file():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(moved, path)
+    log.info("what was in %s is kept in %s", folder, previous)
+
+
+def _close_logs() -> None:
+    """Close the log files; one that is written to again is opened anew."""
+    for handler in logging.getLogger().handlers:
+        if isinstance(handler, logging.FileHandler):
+            handler.close()

@@ -1,26 +1,30 @@
-"""Sweeps: a failed job is recorded, the others go on, and the end names the failed ones."""
+"""Many runs: a sweep's failed jobs are recorded while the others go on; a report compares runs."""
 
 from __future__ import annotations
 
 import gc
 import logging
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hydra.experimental.callback import Callback
+from hydra.utils import instantiate
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from devrf.cli import job
+from devrf.cli.config import choices, overrides
 from devrf.cli.messages import is_user_error, one_line
-from devrf.cli.run_folder import remove_if_only
-from devrf.cli.run_lock import PLACE
+from devrf.cli.run_folder import PLACE, remove_if_only
+from devrf.errors import DevrfError
 from devrf.system.files import write_json
 from devrf.system.process import forget_peak_memory
+
+if TYPE_CHECKING:
+    from devrf.cli.context import RunContext
 
 log = logging.getLogger(__name__)
 
@@ -29,8 +33,16 @@ JOBS_FAILED = 3
 FAILURE = "failure.json"
 # What the sweep's folder holds before Hydra starts the first job.
 OF_SWEEP = {"multirun.yaml", PLACE}
-# How Optuna's error begins when no trial finished.
-NOTHING_FINISHED = "No trials are completed"
+
+
+def report(run: RunContext) -> None:
+    """``stage=report``: tables and plots of the runs below ``report.runs``; needs no scene."""
+    # Slow to import: pandas and matplotlib.
+    from devrf.apps.report.write import write_report
+
+    written = write_report(instantiate(run.config.report))
+    log.info("%s", written.text)
+    log.info("report written to %s", written.path)
 
 
 def run_job(run: Callable[[], float | None], config: DictConfig, folder: Path) -> float | None:
@@ -59,39 +71,36 @@ def forget_failure(folder: Path) -> None:
 
 def _record(error: Exception, config: DictConfig, folder: Path) -> None:
     """Report why a job failed: in its folder, and in one line on stderr."""
-    user_error = is_user_error(error)
+    user_error, where, scene = is_user_error(error), "", None
     said = one_line(error) if user_error else f"{type(error).__name__}: {one_line(error)}"
-    scene = None
     with suppress(OmegaConfBaseException):
         scene = str(config.scene)
-    found = {
+    failure = {
         "scene": scene,
-        "choices": job.choices(),
-        "overrides": job.overrides(),
+        "choices": choices(),
+        "overrides": overrides(),
         "seed": config.get("seed"),
         "error": said,
         "mistake": user_error,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
     }
-    write_json(folder / FAILURE, found)
-    where = ""
+    write_json(folder / FAILURE, failure)
     if not user_error:
-        _into_run_log(error)
+        # The traceback is for the job's log, not for the terminal.
+        trace = (type(error), error, error.__traceback__)
+        record = log.makeRecord(log.name, logging.ERROR, __file__, 0, "the job failed", (), trace)
+        for handler in logging.getLogger().handlers:
+            if isinstance(handler, logging.FileHandler):
+                handler.handle(record)
         where = f"; the traceback is in {folder / 'run.log'}"
     print(f"devrf: job {folder.name}: {said}{where}", file=sys.stderr)
 
 
-def _into_run_log(error: Exception) -> None:
-    """Write the traceback to the job's log, not to the terminal."""
-    trace = (type(error), error, error.__traceback__)
-    record = log.makeRecord(log.name, logging.ERROR, __file__, 0, "the job failed", (), trace)
-    for handler in logging.getLogger().handlers:
-        if isinstance(handler, logging.FileHandler):
-            handler.handle(record)
-
-
 class SweepMonitor(Callback):
-    """Hydra callback that tells :func:`failures_at_the_end` which jobs failed."""
+    """Hydra callback that names the jobs of a sweep that failed, with exit status 3.
+
+    A sweep that a user error ends before its first job leaves no folder behind.
+    """
 
     started: SweepMonitor | None = None
 
@@ -99,52 +108,58 @@ class SweepMonitor(Callback):
         """Note what the sweep's folder holds before the first job."""
         self.folder = Path(config.hydra.sweep.dir)
         self.was_there = self.folder.exists()
-        self.failures, self.jobs = self._stamps(FAILURE), self._stamps(".hydra/config.yaml")
+        self.earlier = self._stamps()
         SweepMonitor.started = self
 
-    def failed(self) -> list[str]:
-        """Folders of failed jobs, relative to the sweep's."""
-        now = self._stamps(FAILURE)
-        return [str(path.parent) for path in sorted(now) if now[path] != self.failures.get(path)]
+    def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
+        """End the program if jobs failed; other callbacks have ended before this one."""
+        SweepMonitor.started = None
+        if self.name_failures():
+            raise SystemExit(JOBS_FAILED)
 
-    def count(self) -> int:
-        """How many jobs have started."""
-        now = self._stamps(".hydra/config.yaml")
-        return sum(stamp != self.jobs.get(path) for path, stamp in now.items())
+    def name_failures(self) -> bool:
+        """Print which jobs failed, if any did."""
+        now = self._stamps()
+        failed = [str(path.parent) for path in sorted(now) if now[path] != self.earlier.get(path)]
+        if failed:
+            print(
+                f"devrf: jobs failed: {', '.join(failed)}; {FAILURE} in each folder below "
+                f" {self.folder} says why",
+                file=sys.stderr,
+            )
+        return bool(failed)
 
-    def _stamps(self, name: str) -> dict[Path, int]:
-        """When each file of that name was written, in nanoseconds."""
-        found = self.folder.rglob(name)
-        return {path.relative_to(self.folder): path.stat().st_mtime_ns for path in found}
+    def _stamps(self) -> dict[Path, int]:
+        """When each record of a failure was written, in nanoseconds."""
+        records = self.folder.rglob(FAILURE)
+        return {path.relative_to(self.folder): path.stat().st_mtime_ns for path in records}
 
 
-@contextmanager
-def failures_at_the_end() -> Iterator[None]:
-    """When a sweep has ended, name the jobs that failed and exit with status 3.
+def name_failures(error: Exception) -> None:
+    """Name the failed jobs of a sweep that ``error`` has ended, or remove its unused folder.
 
-    A sweep that a user error ends before its first job leaves no folder behind.
+    Raises:
+        SystemExit: with status 3: a search ends so when none of its jobs was scored.
     """
-    SweepMonitor.started = None
-    try:
-        yield
-    except Exception as error:
-        sweep = SweepMonitor.started
-        if sweep is not None and is_user_error(error) and not sweep.was_there:
-            remove_if_only(sweep.folder, OF_SWEEP)
-        if not (sweep and sweep.failed()):
-            raise
-        if NOTHING_FINISHED not in str(error):
-            _print_failed(sweep)
-            raise
-    if SweepMonitor.started is not None and SweepMonitor.started.failed():
-        _print_failed(SweepMonitor.started)
-        raise SystemExit(JOBS_FAILED)
+    sweep, SweepMonitor.started = SweepMonitor.started, None
+    if sweep is None:
+        return
+    if is_user_error(error) and not sweep.was_there:
+        remove_if_only(sweep.folder, OF_SWEEP)
+    if sweep.name_failures() and "No trials are completed" in str(error):
+        raise SystemExit(JOBS_FAILED) from None
 
 
-def _print_failed(sweep: SweepMonitor) -> None:
-    failed = sweep.failed()
-    print(
-        f"devrf: {len(failed)} of {sweep.count()} jobs failed: {', '.join(failed)}; "
-        f"{FAILURE} in each folder below {sweep.folder} says why",
-        file=sys.stderr,
-    )
+class SweepReport(Callback):
+    """Hydra callback that compares a sweep's runs once all jobs are done."""
+
+    def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
+        """Write the report into the sweep's folder and print it; nothing if no job was scored."""
+        # Hydra imports this module with every command; pandas and matplotlib are slow to import.
+        from devrf.apps.report.write import write_report
+
+        with suppress(DevrfError):
+            written = write_report(instantiate(config.report, runs=config.hydra.sweep.dir))
+            # Printed, because Hydra's last job has closed the log.
+            print(written.text)
+            print(f"report written to {written.path}")

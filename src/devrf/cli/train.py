@@ -15,9 +15,9 @@ from devrf.callbacks import PeriodicCheckpoint, StopOnSignal, TrainingRecord
 from devrf.callbacks.csv_logger import ResumableCSVLogger
 from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, save_checkpoint
 from devrf.checkpoints.progress import progress_files
-from devrf.cli import job
+from devrf.cli.complete import recorded
+from devrf.cli.config import overrides
 from devrf.cli.context import RunContext
-from devrf.cli.overrides import recorded
 from devrf.cli.resume import ResumePoint, beginning, remove_progress
 from devrf.engine.stage import ScheduledStage
 from devrf.errors import DevrfError
@@ -46,7 +46,7 @@ def learn(run: RunContext, name: str) -> None:
         described = rest.metadata
         stage.earlier_configs = {**described.earlier_configs, below: described.training_config}
     stage.protocol = run.protocol.name
-    stage.command = recorded(job.overrides())
+    stage.command = recorded(overrides())
     _fit(run, stage, begin)
 
 

@@ -62,9 +62,7 @@ def launch_workers(run: RunContext, work: Work) -> Iterator[None]:
         RuntimeError: another error of another process, with its traceback.
     """
     strategy = run.strategy
-    if not isinstance(strategy, ManualDDP):
-        yield
-        return
+    assert isinstance(strategy, ManualDDP)
     environment = strategy.cluster_environment
     assert environment is not None
     outside = environment.creates_processes_externally

@@ -76,7 +76,7 @@ def test_damaged_runs_alone_are_an_error_and_nothing_is_written(runs):
 
 
 def test_a_sweep_imports_nothing_heavy_before_its_report():
-    modules = "devrf.cli.config, devrf.cli.sweep_report"
+    modules = "devrf.cli.config, devrf.cli.sweep"
     heavy = {"torch", "pandas", "matplotlib"}
     script = f"import sys, {modules}; assert not {heavy} & set(sys.modules)"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)

@@ -1,12 +1,14 @@
-"""The steps of ``stage=…``, in which order, after which checks."""
+"""The stages that ``stage=…`` asks for, in their order, after all checks."""
 
 from __future__ import annotations
 
 import gc
 import json
 import logging
+import os
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -17,26 +19,16 @@ from lightning import seed_everything
 from omegaconf import DictConfig
 
 from devrf.apps.settings import ViewerSettings
-from devrf.cli import job
-from devrf.cli.capture import capture
-from devrf.cli.closing import say_what_next
+from devrf.cli.config import OF_A_CHECKPOINT, in_search, in_sweep, meant_stage
 from devrf.cli.context import RunContext
-from devrf.cli.done import done, noting, say_done
-from devrf.cli.evaluate import evaluate
-from devrf.cli.export import export
-from devrf.cli.fetch import fetch
-from devrf.cli.inspect_scene import inspect, prepare
-from devrf.cli.objective import check_objective, objective
-from devrf.cli.preflight import preflight, shortage_in_words
-from devrf.cli.render import check_path, render
-from devrf.cli.report import report
-from devrf.cli.resume import archive_previous, beginning
-from devrf.cli.scene_stages import learnable
-from devrf.cli.selfcheck import selfcheck
-from devrf.cli.stages import OF_A_CHECKPOINT, meant_stage
-from devrf.cli.still import picture
+from devrf.cli.evaluate import check_objective, evaluate, objective
+from devrf.cli.memory import check_memory, shortage_in_words
+from devrf.cli.preparation import capture, fetch, inspect, prepare, say_next, selfcheck
+from devrf.cli.render import check_path, export, picture, render, view
+from devrf.cli.resume import beginning, done, note_done
+from devrf.cli.run_folder import archive_previous
+from devrf.cli.sweep import report
 from devrf.cli.train import learn
-from devrf.cli.view import view
 from devrf.cli.workers import launch_workers
 from devrf.engine.ddp import ManualDDP
 from devrf.errors import DevrfError
@@ -44,9 +36,10 @@ from devrf.ops.dispatch import using
 
 log = logging.getLogger(__name__)
 
-Step = Callable[[RunContext], None]
+# Does its work; returns the files it wrote, where these need not be made again.
+Step = Callable[[RunContext], Sequence[Path] | None]
 
-# What devrf.cli.stages.STEPS names.
+# What devrf.cli.config.STEPS names.
 STEPS: dict[str, Step] = {
     "prepare": prepare,
     "inspect": inspect,
@@ -63,7 +56,9 @@ STEPS: dict[str, Step] = {
 PIPELINE = ("evaluate", "render")
 # Steps for which the run's scene and stages need not be right.
 APART = {"report", "fetch", "capture", "selfcheck"}
-MOVED = {"benchmark": "run python benchmarks/training.py with the other overrides"}
+# What a run's folder may hold that a person looks at first, and what to try next.
+RESULTS = ("metrics.json", "images", "videos/orbit.mp4", "videos/spiral.mp4", "checkpoints")
+NEXT = ("stage=still still.time=0.35 still.height=400", "stage=render video.frames=120")
 
 # Lightning's messages on accelerators, tips and data loaders say nothing about this run.
 for _name in ("lightning.pytorch", "lightning.fabric"):
@@ -97,8 +92,6 @@ def plan(stage: str, protocol: Sequence[str]) -> Plan:
         return Plan((stage,), ())
     if stage in STEPS:
         return Plan((), (stage,))
-    if stage in MOVED:
-        raise DevrfError(f"stage={stage}: moved; {MOVED[stage]}")
     known = ", ".join(["pipeline", *protocol, *STEPS])
     raise DevrfError(f"stage: expected one of {known}, not {stage!r}{meant_stage(stage)}")
 
@@ -119,60 +112,78 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
     run = RunContext(config, folder)
     asked = plan(config.stage, run.learning_stages)
     _check(run, asked)
-    if _all_done(run, asked):
+    several = isinstance(run.strategy, ManualDDP)
+    if not several and _all_done(run, asked):
         return _ended(run, asked)
     if asked.learning and run.leads:
-        asked = _for_the_scene(run, asked)
-    needs = None
-    if asked.learning and config.memory_check and run.leads:
-        needs = preflight(run, asked.learning, films="render" in asked.further)
-    if asked.learning and not config.resume:
-        below = run.protocol[asked.learning[0]].builds_on
-        archive_previous(folder, *([] if below is None else [run.own_checkpoint(below)]))
-    if needs is not None:
-        log.info("%s", needs)
+        asked = _begin(run, asked)
     ended = False
     try:
         if asked.learning:
-            with launch_workers(run, learn_all):
+            with launch_workers(run, learn_all) if several else nullcontext():
                 _learn(run, asked)
         if not asked.learning or run.leads:
             for name in asked.further:
-                if asked.learning and (files := done(run, name)):
-                    say_done(name, files)
-                else:
+                if not (asked.learning and _is_done(run, name)):
                     _take(run, name, STEPS[name])
         ended = True
     finally:
         run.close(failed=not ended)
-    if "evaluate" not in asked.further or not run.leads:
-        return None
-    return _ended(run, asked)
+    return _ended(run, asked) if "evaluate" in asked.further and run.leads else None
+
+
+def _begin(run: RunContext, asked: Plan) -> Plan:
+    """Look at scene, memory and what earlier commands left, before anything is learned.
+
+    Returns:
+        The plan without stages that learn motion, for a scene at rest.
+    """
+    left = replace(asked, learning=run.learnable(asked.learning))
+    if left != asked:
+        steps = ", ".join(left.learning + left.further)
+        log.info("%s is at rest: %s; no motion is learned", run.scene.name, steps)
+    resume = run.config.resume
+    names = [name for name in left.learning if not (resume and run.own_checkpoint(name).is_file())]
+    needed = check_memory(run, names) if names and run.config.memory_check else None
+    if not resume:
+        below = run.protocol[left.learning[0]].builds_on
+        archive_previous(run.folder, *([] if below is None else [run.own_checkpoint(below)]))
+    if needed is not None:
+        log.info("%s", needed)
+    return left
+
+
+def _is_done(run: RunContext, name: str) -> bool:
+    """Whether a step has been done with the same checkpoint and settings; says so."""
+    files = done(run, name)
+    if files:
+        log.info("%s: done already (%s); stage=%s does it again", name, ", ".join(files), name)
+    return bool(files)
 
 
 def _all_done(run: RunContext, asked: Plan) -> bool:
     """Whether nothing of a pipeline is left to do, so that its scene need not be read; says so."""
-    config = run.config
-    if asked.further != PIPELINE or not config.resume or isinstance(run.strategy, ManualDDP):
+    if asked.further != PIPELINE or not run.config.resume:
         return False
-    made = {name: done(run, name) for name in asked.further}
     learned = all(run.own_checkpoint(name).is_file() for name in asked.learning)
-    if not (learned and all(made.values())):
+    if not (learned and all(done(run, name) for name in PIPELINE)):
         return False
     # Refuses other settings than those that it was learned with.
     if not all(beginning(run, name).finished for name in asked.learning):
         return False
-    for name, files in made.items():
-        say_done(name, files)
-    return True
+    return all(_is_done(run, name) for name in PIPELINE)
 
 
 def _ended(run: RunContext, asked: Plan) -> float | None:
-    """The objective; a pipeline ends with what to try next."""
-    if asked.further == PIPELINE and not job.in_sweep():
-        say_what_next(run.folder)
-    found = json.loads((run.folder / "metrics.json").read_text())
-    return objective(run.config.objective, found)
+    """The objective; a pipeline ends with its results, and what to try next."""
+    folder = run.folder
+    if asked.further == PIPELINE and not in_sweep():
+        results = ", ".join(name for name in RESULTS if (folder / name).exists())
+        place = Path(os.path.relpath(folder)) if folder.is_relative_to(Path.cwd()) else folder
+        log.info("results: %s (%s)", place, results)
+        further = [[f"hydra.run.dir={place}", *words.split()] for words in NEXT]
+        say_next(*further, ["stage=report"])
+    return objective(run.config.objective, json.loads((folder / "metrics.json").read_text()))
 
 
 def learn_all(config: DictConfig, folder: Path) -> None:
@@ -182,33 +193,21 @@ def learn_all(config: DictConfig, folder: Path) -> None:
         _learn(run, plan(config.stage, run.learning_stages))
 
 
-def _for_the_scene(run: RunContext, asked: Plan) -> Plan:
-    """The plan without stages that learn motion, for a scene at rest."""
-    left = replace(asked, learning=learnable(run, asked.learning))
-    if left != asked:
-        steps = ", ".join(left.learning + left.further)
-        log.info("%s is at rest: %s; no motion is learned", run.scene.name, steps)
-    return left
-
-
 def _learn(run: RunContext, asked: Plan) -> None:
-    for name in learnable(run, asked.learning):
+    for name in run.learnable(asked.learning):
         _take(run, name, partial(learn, name=name))
-        _release(run.device)
-
-
-def _release(device: torch.device) -> None:
-    """Free what a stage's trainer holds in circles: it would count as the next stage's memory."""
-    gc.collect()
-    if device.type == "cuda":
-        torch.cuda.empty_cache()
+        # What a stage's trainer holds in circles would count as the next stage's memory.
+        gc.collect()
+        if run.device.type == "cuda":
+            torch.cuda.empty_cache()
 
 
 def _take(run: RunContext, name: str, step: Step) -> None:
     seed_everything(run.config.seed, verbose=False)
     run.begin_step()
-    with using(run.config.kernels), shortage_in_words(name, run), noting(run, name):
-        step(run)
+    with using(run.config.kernels), shortage_in_words(name, run):
+        files = step(run)
+    note_done(run, name, files or ())
 
 
 def _check(run: RunContext, asked: Plan) -> None:
@@ -227,7 +226,7 @@ def _check(run: RunContext, asked: Plan) -> None:
         run.stage_builder(name)
     run.evaluation.check()
     check_objective(config.objective, run.evaluation.metrics)
-    if job.in_search() and "evaluate" not in asked.further:
+    if in_search() and "evaluate" not in asked.further:
         raise DevrfError(
             f"stage: a search needs the objective, which stage={config.stage} does not score"
         )

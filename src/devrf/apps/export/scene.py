@@ -1,4 +1,4 @@
-"""``stage=export``: geometry that moves, for other programs."""
+"""What ``stage=export`` writes: geometry that moves, for other programs."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import torch
-from hydra.utils import instantiate
 
 from devrf.apps.export.geometry import (
     ExportSettings,
@@ -22,7 +21,6 @@ from devrf.apps.export.gltf import write_gltf
 from devrf.apps.export.sequence import mesh_files, point_files, write_sequence
 from devrf.apps.export.surface import canonical_surface
 from devrf.apps.export.usd import write_usd
-from devrf.cli.context import RunContext
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value
 from devrf.geometry.cameras import Cameras
@@ -37,12 +35,19 @@ log = logging.getLogger(__name__)
 SINGLE = {"gltf": "scene.glb", "usd": "scene.usdc"}
 
 
-def export(run: RunContext) -> None:
-    """Write the surface of what was learned, as it moves, or coloured points of each time."""
-    settings: ExportSettings = instantiate(run.config.export, _convert_="all")
-    stored, scene = run.load(), run.scene
-    model: Renderable = stored.model.to_view(run.device)
-    folder = run.folder / "export" if settings.into is None else Path(settings.into)
+def export_scene(model: Renderable, scene: Scene, settings: ExportSettings, folder: Path) -> None:
+    """Write the surface of what was learned, as it moves, or coloured points of each time.
+
+    Args:
+        model: ready to be rendered.
+        scene: that it was learned from.
+        settings: what is written.
+        folder: where, unless the settings say.
+
+    Raises:
+        DevrfError: what is asked for cannot be had of the method, or is empty.
+    """
+    folder = folder if settings.into is None else Path(settings.into)
     times = settings.export_times(scene.clock) if model.moves else (0.0,)
     if _takes_surface(model, settings):
         mesh = _moving_mesh(model, scene, settings, times)

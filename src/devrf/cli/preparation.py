@@ -1,0 +1,125 @@
+"""What comes before learning: a scene is fetched, captured, written, inspected; the GPU checked."""
+
+from __future__ import annotations
+
+import logging
+import shlex
+import sys
+from pathlib import Path
+
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+from rich.console import Console
+from rich.filesize import decimal
+
+from devrf.apps.capture.pipeline import scene_from_footage
+from devrf.apps.inspection.report import as_text, inspection_text
+from devrf.apps.settings import CaptureSettings
+from devrf.cli.config import config_folder
+from devrf.cli.context import RunContext
+from devrf.cli.memory import needs
+from devrf.engine.ddp import ManualDDP
+from devrf.errors import DevrfError
+from devrf.scenes.export import export
+from devrf.scenes.fetch import (
+    RECORD,
+    FetchSettings,
+    fetch_scene,
+    fetched_before,
+    published_scene,
+)
+from devrf.system.files import write_json
+
+log = logging.getLogger(__name__)
+
+
+def say_next(*commands: list[str]) -> None:
+    """Log commands that go on from here."""
+    log.info("next:")
+    for words in commands:
+        log.info("  %s", shlex.join(["python", "-m", "devrf", *words]))
+
+
+def fetch(run: RunContext) -> None:
+    """Download the scene ``scene=…`` into ``fetch.into``, and say what to do with it."""
+    settings: FetchSettings = instantiate(run.config.fetch)
+    scene = published_scene(run.config.scene, settings.catalogue)
+    into = Path(settings.into).expanduser()
+    done = fetched_before(scene, into)
+    if done is None:
+        source = scene.collection
+        log.info(
+            "%s: %s; from %s; licence: %s", scene.name, scene.about, source.page, source.licence
+        )
+        done = fetch_scene(scene, into, settings.sha256, progress=sys.stderr.isatty())
+    log.info("%s: %s", scene.name, f"in {done.path}" if done.anew else f"is in {done.path} already")
+    known = f"none was known to compare it with; kept in {done.path / RECORD}"
+    log.info("SHA-256 %s%s", done.sha256, ", as expected" if done.compared else f": {known}")
+    root = f"data.root={done.path}"
+    say_next(["stage=inspect", root], [*scene.collection.learn.split(), root])
+
+
+def capture(run: RunContext) -> None:
+    """Make a scene of the footage ``capture.…``, and report on it as ``stage=inspect`` does."""
+    settings: CaptureSettings = instantiate(run.config.capture, _convert_="all")
+    folder = scene_from_footage(settings)
+    config = run.config.copy()
+    config.data = OmegaConf.load(config_folder() / "data" / "nerfstudio.yaml")
+    config.data.root, config.data.name = str(folder), folder.resolve().name
+    config.data.flow_cache = str(run.folder / "flow.npz")
+    captured = RunContext(config, run.folder)
+    inspect(captured)
+    # The default field is one for cameras around a scene; the layout does not tell which these are.
+    forward = ["experiment=best_small_forward", "data=auto"]
+    say_next([*(forward if captured.scene.kind == "forward" else []), f"data.root={folder}"])
+
+
+def prepare(run: RunContext) -> None:
+    """Write the scene to ``data.export`` in the published layout."""
+    if not hasattr(run.datamodule, "export"):
+        raise DevrfError(
+            "stage=prepare: writes an embedded scene; choose data=procedural or "
+            "data=procedural_forward, and give data.export=PATH"
+        )
+    folder = run.datamodule.export
+    if folder is None:
+        raise DevrfError("data.export: stage=prepare needs a folder; give data.export=PATH")
+    export(run.scene, folder)
+    log.info("scene written to %s", folder)
+
+
+def inspect(run: RunContext) -> None:
+    """Report and draw what the scene holds, what it needs, and what may be wrong with it."""
+    # Only this step draws with matplotlib.
+    from devrf.apps.inspection.picture import write_inspection_picture
+
+    rows = [(name, decimal(round(size))) for name, size in needs(run).rows()]
+    report = inspection_text(run.scene, rows)
+    console = Console()
+    if console.is_terminal:
+        console.print(report)
+    else:
+        log.info("%s", as_text(report))
+    path = run.folder / "images" / "inspect.png"
+    write_inspection_picture(path, run.scene)
+    log.info("picture written to %s", path)
+
+
+def selfcheck(run: RunContext) -> None:
+    """Make the checks on the trainer's device: a line for each, and ``selfcheck.json``.
+
+    Raises:
+        DevrfError: a setting is wrong, or checks have failed.
+    """
+    if isinstance(run.strategy, ManualDDP):
+        raise DevrfError("trainer: stage=selfcheck checks one device; leave out trainer=ddp")
+    results = []
+    run_checks = instantiate(run.config.selfcheck, _convert_="all")
+    for name, verdict, said in run_checks(run.device, run.config.seed):
+        log.info("%s  %s: %s", verdict, name, said)
+        results.append({"name": name, "verdict": verdict, "said": said})
+        # After each, so that the file is there whatever ends the run.
+        write_json(run.folder / "selfcheck.json", {"checks": results})
+    failed = [result["name"] for result in results if result["verdict"] == "failed"]
+    if failed:
+        raise DevrfError(f"stage=selfcheck: {len(failed)} checks failed: {', '.join(failed)}")

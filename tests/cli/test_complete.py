@@ -1,0 +1,354 @@
+"""What was typed is completed: paths, the run that is named, the experiment's form, the reader."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hypothesis import given
+from hypothesis import strategies as st
+from omegaconf import OmegaConf
+
+from devrf.checkpoints.checkpoint_file import read_checkpoint_file, write_checkpoint_file
+from devrf.cli.complete import PATHS, completed, recorded
+from devrf.cli.config import config_folder
+from devrf.cli.main import candidates
+from devrf.cli.messages import in_quotes
+from devrf.scenes.export import export
+from devrf.scenes.formats import LAYOUTS
+from devrf.scenes.procedural import ProceduralForwardScene, ProceduralScene
+
+PARSER = OverridesParser.create()
+
+
+@given(st.text(st.characters(exclude_categories=["Cs", "Cc"]), min_size=1).filter(str.strip))
+def test_text_in_quotes_is_read_as_that_text(text):
+    assert PARSER.parse_override(f"a={in_quotes(text)}").value() == text
+
+
+@pytest.mark.parametrize("key", ["data.root", "+data.root", "report.runs"])
+@pytest.mark.parametrize("path", ["/my scenes/fox [1]", "München (2)", "a=b", 'a "b"', "2026"])
+def test_a_path_is_taken_as_it_is_typed(key, path):
+    argument = completed([f"{key}={path}"])[-1]
+    assert PARSER.parse_override(argument).value() == path
+
+
+def test_the_home_folder_is_filled_in(monkeypatch):
+    monkeypatch.setenv("HOME", "/home/ä b")
+    several = completed(["-m", "data=inward", "data.root=~/a,~/b"])[-1]
+    read = [path.text for path in PARSER.parse_override(several).value().list]
+    assert read == ["/home/ä b/a", "/home/ä b/b"]
+
+
+def test_the_rest_is_left_to_hydra():
+    for argument in ("report.runs=/a/b c", "ckpt=null", "seed=1,2", "--help", "x=[", "viewer=1"):
+        assert completed([argument]) == [argument]
+    assert completed(["viewer=True"]) == ["viewer.training=true"]
+
+
+def test_the_line_prints_what_to_type(devrf):
+    for typed, quoted in (
+        ("data.name=a (1)", "'data.name=\"a (1)\"'"),
+        ("data.root=a,b", "'data.root=\"a,b\"'"),
+    ):
+        outcome = devrf("data=inward", typed)
+        assert outcome.status == 2 and outcome.err.count("\n") == 1
+        assert quoted in outcome.err
+        (argument,) = shlex.split(quoted)
+        assert PARSER.parse_override(argument).value() == typed.partition("=")[2]
+
+
+def test_a_scene_in_a_folder_with_any_name(devrf, tmp_path, tiny):
+    folder = tmp_path / "Käfer [1] (neu) =x"
+    exported = devrf(*tiny, "stage=prepare", f"data.export={folder}", "hydra.run.dir=o [1]")
+    assert (exported.status, exported.err) == (0, "")
+    assert (tmp_path / "o [1]" / "run.log").is_file()
+    read = devrf(f"data.root={folder}", "stage=inspect", "trainer=cpu")
+    assert (read.status, read.err) == (0, "")
+    assert len(list(tmp_path.glob("outputs/*/quickstart/images/inspect.png"))) == 1
+
+
+def test_the_keys_of_paths_exist(devrf):
+    scenes = (["data=inward", "data.root=x"], ["data=procedural"])
+    configs = [OmegaConf.create(devrf(*scene, "--cfg", "all").out) for scene in scenes]
+    for key in PATHS:
+        parent, _, name = key.rpartition(".")
+        nodes = [OmegaConf.select(one, parent) if parent else one for one in configs]
+        assert any(name in node for node in nodes), key
+
+
+# The form of an experiment, and the reader of a scene
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory) -> Path:
+    """``walker`` and ``wall``, an inward-facing and a forward-facing scene, in DeVRF's layout."""
+    folder = tmp_path_factory.mktemp("scenes")
+    size = {"width": 32, "height": 24, "static_views": 5, "train_views": 2, "frames": 3}
+    export(ProceduralScene(static_test_views=1, supersample=1, **size)(), folder / "walker")
+    size["static_views"] = 7
+    export(ProceduralForwardScene(supersample=1, **size)(), folder / "wall")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("typed", "meant"),
+    [
+        ("experiment=paper data=lego", "experiment=paper_lego data=lego"),
+        ("experiment=paper_lego data.root=x", "experiment=paper_lego data.root=x"),
+        ("data=inward experiment=paper seed=1", "data=inward experiment=paper_inward seed=1"),
+        ("experiment=paper data=colmap", "experiment=paper_inward data=colmap"),
+        ("-m experiment=paper data=lego,plant", "-m experiment=paper_lego,paper_plant"),
+        ("experiment=fast data=rabbit", "experiment=fast_forward data=rabbit"),
+        ("experiment=best data=neural_3d_video", "experiment=best_forward data=neural_3d_video"),
+        ("experiment=best_small data=flower", "experiment=best_small_embedded data=flower"),
+        ("experiment=best_small data=inward", "experiment=best_small data=inward"),
+        (
+            "experiment=best_small data=procedural_forward",
+            "experiment=best_small_forward data=procedural_forward",
+        ),
+        ("experiment=best_small data.root=walker", "experiment=best_small data.root=walker"),
+        ("experiment=best_small data.root=wall", "experiment=best_small_forward data.root=wall"),
+        ("experiment=paper data.root=wall", "experiment=paper_forward data.root=wall"),
+        ("experiment=best_small", "experiment=best_small"),
+        ("experiment=paper", "experiment=paper_inward"),
+        ("experiment=cpu_small,best_small", "experiment=cpu_small,best_small"),
+        ("experiment=quickstart data=lego", "experiment=quickstart data=lego"),
+        # The reader.
+        ("data.root=walker", "data=auto data.root=walker"),
+        ("+data.root=walker seed=1", "data=auto +data.root=walker seed=1"),
+        ("data.root=x experiment=cpu_small", "data.root=x experiment=cpu_small"),
+        ("data.root=x experiment=peer_small", "data=auto data.root=x experiment=peer_small"),
+        ("data.root=x experiment=nonsense", "data=auto data.root=x experiment=nonsense"),
+        ("data.root=x data=nerfstudio", "data.root=x data=nerfstudio"),
+    ],
+)
+def test_the_form_for_the_scene_and_its_reader(scenes, monkeypatch, typed, meant):
+    monkeypatch.chdir(scenes)
+    assert completed(typed.split()) == meant.split()
+
+
+def test_a_sweep_over_scenes_that_need_different_forms_is_refused(devrf, scenes):
+    roots = f"data.root={scenes}/walker,{scenes}/wall"
+    outcome = devrf("-m", "experiment=best_small", roots)
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert "experiment=best_small and experiment=best_small_forward" in outcome.err
+
+
+def test_data_auto_has_the_options_of_all_readers():
+    auto = OmegaConf.load(config_folder() / "data" / "auto.yaml")
+    options = set()
+    for choice in {layout.choice for layout in LAYOUTS}:
+        options |= set(OmegaConf.load(config_folder() / "data" / f"{choice}.yaml"))
+    assert set(auto) == options
+    # null stands for the reader's own default.
+    own = options - {"_target_", "root", "flow_cache"}
+    assert all(auto._get_node(key)._value() is None for key in own)
+
+
+def test_the_options_of_the_reader_reach_it(devrf, tmp_path, scenes, short):
+    options = ("data.downscale=2", "data.train_views=1", "data.frames=2", "data.name=w")
+    root = f"data.root={scenes}/walker"
+    done = devrf(root, *options, *short, "stage=canonical")
+    assert (done.status, done.err) == (0, "")
+    stored = OmegaConf.load(tmp_path / "outputs/w/quickstart/checkpoints/config.yaml").data
+    assert (stored.downscale, stored.train_views, stored.frames) == (2, 1, 2)
+    assert (stored.background, stored.bound_scale) == ("white", "auto")
+    # The same run, whichever way its reader is named.
+    again = devrf(root, "data=inward", *options, *short, "stage=canonical")
+    assert "canonical: learned already" in again.out
+
+
+def test_each_job_of_a_sweep_has_the_reader_of_its_scene(devrf, tmp_path, scenes, short):
+    (still := tmp_path / "still").mkdir()
+    content = json.loads((scenes / "walker/static/transforms_train.json").read_text())
+    (still / "images").symlink_to(scenes / "walker/static/train")
+    for frame in content["frames"]:
+        frame["file_path"] = f"images/{Path(frame['file_path']).name}"
+    (still / "transforms.json").write_text(json.dumps(content))
+    sweep = ("experiment=cpu_small", f"data.root={scenes}/walker,{still}", "hydra.sweep.dir=s")
+    done = devrf("-m", *sweep, "stage=inspect", *short)
+    assert (done.status, done.err) == (0, "")
+    assert {path.name for path in (tmp_path / "s").glob("*_*")} == {"0_walker", "1_still"}
+    assert "(data=inward)" in done.out and "(data=nerfstudio)" in done.out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["data.test_view=2"], "data.test_view: {root} is read by data=inward, which takes root, "),
+        (["data.downscael=2"], "data.downscael: no such key; did you mean data.downscale?"),
+        (["data.root=empty"], "empty: no known layout (DyCheck: no splits/train.json"),
+        (["data.root=nowhere", "experiment=best_small"], "nowhere: no such folder"),
+        (["stage=prepare"], "stage=prepare: writes an embedded scene"),
+    ],
+)
+def test_mistakes_in_a_recognised_scene(devrf, tmp_path, scenes, arguments, said):
+    (tmp_path / "empty").mkdir()
+    root = [] if arguments[0].startswith("data.root") else [f"data.root={scenes}/walker"]
+    done = devrf(*root, *arguments)
+    said = said.format(root=scenes / "walker")
+    assert done.status == 2 and done.err.startswith(f"devrf: {said}"), done.err
+    assert len(done.err.splitlines()) == 1 and not (tmp_path / "outputs").exists()
+
+
+# A run that knows itself
+
+
+@pytest.fixture
+def run(trained, tmp_path) -> Path:
+    """A copy of the checkpoints of a whole tiny run, in a run's folder."""
+    shutil.copytree(trained[0] / "checkpoints", tmp_path / "run" / "checkpoints")
+    return tmp_path / "run"
+
+
+@pytest.fixture
+def learned_by(run):
+    """``learned_by(*command)``: the run, as if that command had learned it."""
+
+    def write(*command: str, name: str = "deformation.ckpt") -> Path:
+        content = read_checkpoint_file(run / "checkpoints" / "deformation.ckpt")
+        content["devrf"]["command"] = list(command) or None
+        write_checkpoint_file(run / "checkpoints" / name, content)
+        return run / "checkpoints" / name
+
+    return write
+
+
+def config(folder: Path):
+    return OmegaConf.load(folder / ".hydra" / "config.yaml")
+
+
+def test_in_a_folder_nothing_has_to_be_typed_again(devrf, tiny, run):
+    for stage in ("evaluate", "deformation"):
+        outcome = devrf(f"stage={stage}", "hydra.run.dir=run")
+        assert (outcome.status, outcome.err) == (0, "")
+        assert f"run: as it was learned, with {tiny[0]}" in outcome.out
+        assert ("deformation: learned already" in outcome.out) == (stage == "deformation")
+        found = config(run)
+        assert (found.data.width, found.schedule.canonical.iterations, found.stage) == (
+            24,
+            6,
+            stage,
+        )
+
+
+def test_what_is_typed_differs(devrf, run):
+    assert devrf("stage=still", "hydra.run.dir=run", "video.frames=2").status == 0
+    found = config(run)
+    assert (found.video.frames, found.data.frames) == (2, 3)
+    # It was for that command; the run is as it was.
+    assert devrf("stage=still", "hydra.run.dir=run").status == 0
+    assert config(run).video.frames == 4
+    outcome = devrf("hydra.run.dir=run", "loss.fine.color=2")
+    assert outcome.status == 2 and outcome.err.startswith("devrf: loss.fine.color: ")
+
+
+def test_what_is_made_of_a_checkpoint_goes_to_its_run(devrf, run, tmp_path):
+    last, first = (run / "checkpoints" / f"{stage}.ckpt" for stage in ("deformation", "canonical"))
+    assert devrf("stage=evaluate", f"ckpt={last}", "evaluation.metrics=[]").status == 0
+    assert "deformation" in json.loads((run / "metrics.json").read_text())
+    # An earlier stage does not replace the scores of the whole.
+    assert devrf("stage=evaluate", f"ckpt={first}", "evaluation.metrics=[]").status == 0
+    assert "deformation" in json.loads((run / "metrics.json").read_text())
+    assert "deformation" not in json.loads((run / "canonical" / "metrics.json").read_text())
+    alone = shutil.copy(last, tmp_path / "my copy.ckpt")
+    assert devrf("stage=still", f"ckpt='{alone}'").status == 0
+    assert list((tmp_path / "outputs" / "robot" / "my copy" / "images").iterdir())
+
+
+def test_a_checkpoint_that_does_not_say_how_it_was_learned(devrf, learned_by, tiny):
+    learned_by()
+    outcome = devrf(*tiny, "stage=still", "hydra.run.dir=run")
+    assert outcome.status == 0
+    assert "run/checkpoints/deformation.ckpt: does not say how it was learned" in outcome.out
+
+
+def test_the_jobs_of_a_sweep_go_on(devrf, tiny, tmp_path):
+    there = "hydra.sweep.dir=sweep"
+    assert devrf("-m", *tiny, there, "stage=canonical", "seed=0,1").status == 0
+    outcome = devrf("stage=still", there)
+    assert (outcome.status, outcome.err) == (0, "")
+    assert [config(tmp_path / "sweep" / f"{k}_robot").seed for k in (0, 1)] == [0, 1]
+    assert len(list(tmp_path.glob("sweep/*/images"))) == 2
+    # One of its jobs is a run like any other.
+    assert devrf("stage=still", "hydra.run.dir=sweep/1_robot").status == 0
+    assert config(tmp_path / "sweep" / "1_robot").seed == 1
+
+
+def test_a_job_of_an_experiment_that_sweeps_does_not_start_its_sweep(devrf, run, learned_by, tiny):
+    learned_by("experiment=ablation_table", *tiny[:-1])
+    assert devrf("stage=still", "hydra.run.dir=run").status == 0
+    assert (run / "images").is_dir()
+
+
+def test_a_command_is_recorded_without_what_is_of_that_command_alone(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    typed = ["stage=render", "trainer=cpu", "data.root='a b'", "+x=1", "~y", "still.time=1"]
+    typed += ["ckpt=c", "seed=2", "hydra/launcher=joblib"]
+    assert recorded(typed) == [f'data.root="{tmp_path}/a b"', "+x=1", "~y", "seed=2"]
+
+
+def test_a_checkpoint_does_not_choose_which_code_is_run(run, learned_by):
+    learned_by("data._target_=os.getcwd", "+hydra.callbacks.x={_target_:os.getcwd}", "seed=1")
+    typed = [f"hydra.run.dir={run}", "stage=still"]
+    assert completed(typed) == ["seed=1", "hydra.mode=RUN", *typed]
+
+
+def test_checkpoints_of_a_sweep_share_what_they_have_in_common(learned_by):
+    one = learned_by("data.frames=5", "seed=5")
+    other = learned_by("data.frames=5", "seed=4", name="other.ckpt")
+    typed = ["-m", "stage=still", f"ckpt={one},{other}"]
+    shared = ["data.frames=5", "hydra.sweeper.params=null"]
+    assert completed(typed) == ["-m", *shared, *typed[1:]]
+
+
+def test_another_option_of_a_group_begins_from_its_own_values(run, learned_by):
+    learned_by("data=inward", "data.downscale=2", "seed=1", "field.width=8")
+    there = [f"hydra.run.dir={run}", "stage=inspect"]
+    kept = ["seed=1", "field.width=8", "hydra.mode=RUN"]
+    assert completed([*there, "data=forward"]) == [*kept, *there, "data=forward"]
+    assert completed([*there, "data=inward"])[:2] == ["data.downscale=2", "seed=1"]
+    # Another method has other settings.
+    kept = ["data=inward", "data.downscale=2", "seed=1", "hydra.mode=RUN"]
+    assert completed([*there, "method=dnerf"]) == [*kept, *there, "method=dnerf"]
+
+
+# In the shell
+
+
+@pytest.mark.parametrize(
+    ("typed", "offered"),
+    [
+        ("devrf seed=1 stage=fe", "stage=fetch"),
+        ("devrf stage=fetch scene=", "scene=fox"),
+        ("devrf kernels=", "kernels=triton"),
+        ("devrf experiment=paper_l", "experiment=paper_lego"),
+        ("devrf data=inward data.bound", "data.bound_scale="),
+    ],
+)
+def test_the_shell_completes(typed, offered):
+    assert offered in candidates(typed)
+
+
+def test_bash_completes_the_module_and_the_command(python, tmp_path):
+    installed = python(tmp_path, "-m", "devrf", "-sc", "install=bash")
+    assert installed.status == 0
+    script = tmp_path / "complete.sh"
+    script.write_text(
+        installed.out
+        + """
+for line in "devrf stage=eval" "python -m devrf seed=1 stage=eval" "python other.py stage=eval"; do
+    COMP_LINE="$line" COMP_WORDS=($line) COMP_CWORD=$((${#COMP_WORDS[@]} - 1))
+    _devrf_complete
+    echo "${COMPREPLY[@]}"
+done
+"""
+    )
+    done = subprocess.run(["bash", str(script)], capture_output=True, text=True)
+    assert done.stdout.splitlines() == ["stage=evaluate", "stage=evaluate", ""]

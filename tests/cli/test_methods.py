@@ -1,0 +1,99 @@
+"""Every other method from the command line: trained, scored, filmed, exported like DeVRF."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+SETTINGS = "ray_stage.model.settings"
+NARROW = (f"{SETTINGS}.width=8", f"{SETTINGS}.steps=16", f"{SETTINGS}.occupancy_side=8")
+SMALL = {
+    "dnerf": (*NARROW, f"{SETTINGS}.deformation_width=8"),
+    "nerfies": (*NARROW, f"{SETTINGS}.warp_width=8", "ray_stage.loss.elastic=1e-3"),
+    "hypernerf": (*NARROW, f"{SETTINGS}.warp_width=8", "ray_stage.loss.elastic=1e-3"),
+    "nsff": (*NARROW, f"{SETTINGS}.depth=2", f"{SETTINGS}.samples=8"),
+    "neural_volumes": (
+        f"{SETTINGS}.code=4",
+        f"{SETTINGS}.encoder_views=2",
+        f"{SETTINGS}.encoder_size=[16,16]",
+        f"{SETTINGS}.encoder_channels=[4,4]",
+        f"{SETTINGS}.encoder_width=8",
+        f"{SETTINGS}.template_channels=[8,8,8]",
+        f"{SETTINGS}.warp_side=4",
+        f"{SETTINGS}.warp_width=4",
+        f"{SETTINGS}.step=0.2",
+        f"{SETTINGS}.occupancy_side=8",
+    ),
+}
+FILM = ("trainer=cpu", "video.frames=2", "video.height=20", "hydra.run.dir=run")
+SHORT = ("ray_stage.schedule.iterations=4", "ray_stage.schedule.rays=64", *FILM)
+
+
+@pytest.mark.parametrize(
+    ("method", "protocol", "scene"),
+    [
+        *((method, "joint", "tiny_data") for method in SMALL),
+        ("dnerf", "two_stage", "tiny_data"),
+        ("nerfies", "dynamic", "tiny_data"),
+        ("hypernerf", "two_stage", "tiny_facing"),
+        ("nsff", "dynamic", "tiny_facing"),
+        ("neural_volumes", "dynamic", "tiny_data"),
+    ],
+)
+def test_a_protocol_trains_scores_films_and_exports(
+    devrf, tmp_path, request, method, protocol, scene
+):
+    asked = (f"method={method}", "experiment=peer_small", *SMALL[method], *SHORT)
+    asked += (*request.getfixturevalue(scene), f"protocol={protocol}")
+    done = devrf(*asked)
+    assert done.status == 0, done.err
+    run = tmp_path / "run"
+    found = json.loads((run / "metrics.json").read_text())
+    assert (found["method"], found["protocol"]) == (method, protocol)
+    assert 3 < found["dynamic"]["psnr"] < 40 and 3 < found["static"]["psnr"] < 40
+    assert {"rest_pose_psnr", "seconds", "iterations", "checkpoint_mb"} <= set(found["dynamic"])
+    ring = "spiral" if scene == "tiny_facing" else "orbit"
+    assert {path.stem for path in (run / "videos").iterdir()} == {"held_out", ring}
+    names = {path.stem for path in (run / "checkpoints").glob("*.ckpt")}
+    assert names == ({"canonical", "deformation"} if protocol == "two_stage" else {protocol})
+    # Whatever was learned is not learned again.
+    again = devrf(*asked)
+    assert again.status == 0 and "learned already" in again.out
+    refused = devrf("stage=export", "hydra.run.dir=run", "trainer=cpu")
+    assert refused.status == 2 and f"method={method} is exported as coloured points" in refused.err
+    points = ("export.format=ply", "export.points=20")
+    done = devrf("stage=export", "hydra.run.dir=run", "trainer=cpu", *points)
+    assert (done.status, done.err) == (0, "")
+    assert len(list((run / "export" / "points").glob("frame_*.ply"))) == 3
+
+
+@pytest.mark.parametrize(
+    ("method", "profile"), [("dnerf", "fast"), ("nerfies", "paper"), ("hypernerf", "fast")]
+)
+def test_sizes_for_a_gpu_take_two_steps_on_a_cpu(devrf, tmp_path, tiny_data, method, profile):
+    size = ("ray_stage.schedule.iterations=2", "ray_stage.schedule.rays=8")
+    asked = (f"method={method}", f"experiment=peer_{profile}", "protocol=joint", "stage=joint")
+    done = devrf(*asked, *size, f"{SETTINGS}.occupancy_side=16", *tiny_data, "trainer=cpu")
+    assert done.status == 0, done.err
+    folder = tmp_path / "outputs" / "robot" / f"peer_{profile}-{method}-joint"
+    assert (folder / "checkpoints" / "joint.ckpt").is_file()
+
+
+@pytest.mark.parametrize(
+    ("method", "asked", "said"),
+    [
+        ("dnerf", ["stage=canonical"], "stage: expected one of pipeline, joint,"),
+        ("dnerf", ["+ray_stage.loss.elastic=1"], "ray_stage.loss: dnerf has no term 'elastic'"),
+        ("nerfies", ["ray_stage.loss.temporal=1"], "no such key"),
+        ("nerfies", [f"{SETTINGS}.separate_coarse=true"], "sampling=occupancy has no"),
+        ("hypernerf", [f"{SETTINGS}.slicing=line"], "expected 'surface' or 'plane'"),
+        ("nsff", ["protocol=two_stage"], "method=nsff does not learn by protocol=two_stage; give"),
+        ("neural_volumes", ["data.train_views=1"], "expected 2 fixed training cameras with an"),
+        ("neural_volumes", ["data.surroundings=room"], "images with alpha masks"),
+    ],
+)
+def test_what_cannot_be_is_said_in_one_line(devrf, tiny_data, method, asked, said):
+    small = (f"method={method}", "experiment=peer_small", *SMALL[method], *SHORT)
+    done = devrf(*small, *tiny_data, "protocol=joint", *asked)
+    assert done.status == 2 and said in done.err and done.err.count("\n") == 1, done.err
