@@ -9,9 +9,9 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
-from devrf.cli.complete import completed
 from omegaconf import OmegaConf
 
+from devrf.cli.complete import completed
 from devrf.cli.config_check import check_config
 
 REPOSITORY = Path(__file__).parents[2]

@@ -54,7 +54,7 @@ FORWARD = {"forward", "neural_3d_video", "procedural_forward"}
 EMBEDDED = {"procedural", "procedural_forward"}
 # What conf/data/auto.yaml names, and keys that are not passed on with its options.
 AUTOMATIC = "devrf.data.recorded.recognised_datamodule"
-NOT_PASSED = ("_target_", "flow_cache")
+NOT_PASSED = ("_target_", "reader", "flow_cache")
 
 # Where the present command's settings come from, until a log is there to say so.
 _source: list[str] = []
@@ -302,7 +302,7 @@ def _in_form(texts: list[str], before: Sequence[str]) -> list[str]:
         return texts
     scenes: list[str | None] = [*values(both, "data")]
     if not scenes or "auto" in scenes:
-        from devrf.scenes.layout import recognise  # loads numpy
+        from devrf.scenes.formats import recognise  # loads numpy
 
         scenes = [recognise(root).choice for root in values(both, "data.root")]
     forms = [[_form(name, scene, known) for name in names] for scene in scenes or [None]]
@@ -362,7 +362,7 @@ def with_recognised_data(config: DictConfig) -> DictConfig:
     if OmegaConf.is_missing(data, "root"):
         return config  # the check of the config says so
     # Imported here: --help and a misspelt key are answered before numpy and torch have loaded.
-    from devrf.scenes.layout import recognise
+    from devrf.scenes.formats import recognise
 
     layout = recognise(data.root)
     own = OmegaConf.load(config_folder() / "data" / f"{layout.choice}.yaml")

@@ -1,0 +1,223 @@
+"""What is made of a learned scene: pictures, videos, geometry, the page in a browser."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import signal
+import socket
+import threading
+import time
+
+import imageio.v3 as iio
+import pytest
+import torch
+import trimesh
+
+from devrf.apps.keyframes import CameraPath, Keyframe, write_path
+from devrf.checkpoints.checkpoint import load_checkpoint
+
+
+@pytest.fixture
+def of_run(devrf, trained):
+    """``of_run(*arguments)``: a command about the tiny run's last checkpoint, in ``run``."""
+    checkpoint = f"ckpt={trained[0] / 'checkpoints' / 'deformation.ckpt'}"
+    return lambda *arguments: devrf(checkpoint, "hydra.run.dir=run", *arguments)
+
+
+# Stills and videos
+
+
+def test_stills_in_any_size_read_no_scene_and_stay(of_run, tmp_path, monkeypatch):
+    def unread(self):
+        raise AssertionError("the scene was read")
+
+    monkeypatch.setattr("devrf.data.rendered.RenderedDataModule.load", unread)
+    for typed in (("still.time=0.3", "still.height=70"), (), (), ("still.view=1",)):
+        outcome = of_run("stage=still", *typed)
+        assert (outcome.status, outcome.err) == (0, "")
+    names = ("held_out_t0.3_h70", "held_out_t0.5", "held_out_t0.5_2", "1_t0.5")
+    made = {path.stem: path for path in (tmp_path / "run" / "images").iterdir()}
+    assert set(made) == {f"still_{name}{kind}" for name in names for kind in ("", "_depth")}
+    for name in ("still_held_out_t0.3_h70", "still_held_out_t0.3_h70_depth"):
+        assert iio.imread(made[name]).shape == (70, 84, 3)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["still.view=6"], "still.view: expected held_out or 0 to 5, not 6"),
+        (["still.time=2"], "still.time: expected 0 to 1, not 2"),
+        (["data.frames=4"], "belongs to another scene"),
+    ],
+)
+def test_no_such_still(of_run, tmp_path, arguments, expected):
+    outcome = of_run("stage=still", *arguments)
+    assert outcome.status == 2
+    assert outcome.err.count("\n") == 1 and expected in outcome.err
+    assert not list(tmp_path.iterdir())
+
+
+def test_videos_in_any_size(of_run, tmp_path):
+    outcome = of_run("stage=render", "video.height=30")
+    assert (outcome.status, outcome.err) == (0, "")
+    # Three and two images of 30 x 36 pixels with a gap of 4, below a line of text.
+    for name, width in (("held_out", 3 * 36 + 8), ("orbit", 2 * 36 + 4)):
+        video = iio.imread(tmp_path / "run" / "videos" / f"{name}.mp4")
+        assert video.shape == (4, 18 + 30, width, 3)
+
+
+def test_keyframes_are_filmed(of_run, tmp_path):
+    pose = torch.tensor([[1.0, 0, 0, 0], [0, 0, -1, -3], [0, 1, 0, 0]])
+    further = pose + torch.tensor([[0, 0, 0, 1.0], [0, 0, 0, 0], [0, 0, 0, 0]])
+    keyframes = (Keyframe(pose, 40.0, 0.0, 0.0), Keyframe(further, 40.0, 1.0, 1.0))
+    file = tmp_path / "my path.json"
+    write_path(file, CameraPath(keyframes, 2.0, 4.0), 30)
+    outcome = of_run("stage=render", f"video.path={file}")
+    assert (outcome.status, outcome.err) == (0, "")
+    (video,) = (tmp_path / "run" / "videos").iterdir()
+    # Five pictures in a second, colour beside depth, 40 rows and twice as wide, below text.
+    assert (video.name, iio.imread(video).shape[0]) == ("my path.mp4", 5)
+    assert iio.imread(video).shape[2] == 2 * 80 + 4
+
+
+@pytest.mark.parametrize("name", ["bullet_time", "time_freeze"])
+def test_films_in_which_time_stands_still(of_run, tmp_path, name):
+    outcome = of_run("stage=render", f"video.path={name}")
+    assert (outcome.status, outcome.err) == (0, "")
+    (video,) = (tmp_path / "run" / "videos").iterdir()
+    assert (video.name, len(iio.imread(video))) == (f"{name}.mp4", 4)
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [(None, "no such"), ({"keyframes": []}, "holds no camera path; expected keyframes")],
+)
+def test_a_path_that_is_none_is_refused_before_anything_is_learned(
+    devrf, tmp_path, tiny, content, expected
+):
+    file = tmp_path / "path.json"
+    if content is not None:
+        file.write_text(json.dumps(content))
+    outcome = devrf(*tiny, f"video.path={file}", "hydra.run.dir=run")
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert outcome.err.startswith(f"devrf: {file}: ") and expected in outcome.err
+    assert not (tmp_path / "run").exists()
+
+
+# Geometry: a few iterations make nothing that is more opaque.
+FAINT = "export.threshold=5e-3"
+
+
+def test_one_file_that_plays(of_run, tmp_path):
+    outcome = of_run("stage=export", FAINT, "export.faces=200")
+    assert (outcome.status, outcome.err) == (0, "")
+    path = tmp_path / "run" / "export" / "scene.glb"
+    assert f"vertices at 3 times written to {path}" in outcome.out
+    (mesh,) = trimesh.load_scene(path).geometry.values()
+    assert 100 < len(mesh.faces) <= 200
+
+
+def test_files_of_wanted_times_in_a_wanted_folder(of_run, tmp_path):
+    there = ("export.into=out there", "export.fps=2", "export.seconds=2", "export.format=obj")
+    assert of_run("stage=export", FAINT, *there).status == 0
+    index = json.loads((tmp_path / "out there" / "obj" / "index.json").read_text())
+    assert [frame["time"] for frame in index["frames"]] == [0, 0.25, 0.5, 0.75, 1]
+    assert {frame["file"] for frame in index["frames"]} | {"index.json"} == {
+        path.name for path in (tmp_path / "out there" / "obj").iterdir()
+    }
+
+
+def test_points_of_each_training_frame(of_run, tmp_path):
+    points = ("export.content=points", "export.format=ply", "export.points=50")
+    outcome = of_run("stage=export", *points)
+    assert (outcome.status, outcome.err) == (0, "")
+    index = json.loads((tmp_path / "run" / "export" / "points" / "index.json").read_text())
+    assert index["content"] == "points"
+    assert [frame["time"] for frame in index["frames"]] == pytest.approx([0, 0.5, 1])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ([], "export.threshold: the field is empty: no voxel has the opacity 0.1, the most is"),
+        (["export.format=stl"], "export.format: expected 'gltf', 'ply', 'obj' or 'usd', not 'stl'"),
+        (["export.content=points"], "points are written as ply, not as gltf; give export.format"),
+    ],
+)
+def test_what_cannot_be_exported_is_said_in_one_line(of_run, tmp_path, arguments, expected):
+    outcome = of_run("stage=export", *arguments)
+    assert outcome.status == 2
+    assert outcome.err.count("\n") == 1 and expected in outcome.err
+    assert not (tmp_path / "run" / "export").exists()
+
+
+# The page in a browser
+
+
+@pytest.fixture
+def port() -> int:
+    """A port that is free."""
+    pytest.importorskip("viser", reason="the viewer's extra is not installed")
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        return int(probe.getsockname()[1])
+
+
+def ended_by(number: int, port: int) -> threading.Thread:
+    """Sends this process a signal once something listens on ``port``, 60 s later at most."""
+
+    def send() -> None:
+        for _ in range(600):
+            with socket.socket() as probe:
+                if probe.connect_ex(("127.0.0.1", port)) == 0:
+                    break
+            time.sleep(0.1)
+        time.sleep(0.3)  # the page is there before it is served
+        os.kill(os.getpid(), number)
+
+    thread = threading.Thread(target=send, daemon=True)
+    thread.start()
+    return thread
+
+
+def test_it_serves_until_a_signal_and_ends_well(of_run, tmp_path, port):
+    sender = ended_by(signal.SIGINT, port)
+    outcome = of_run("stage=view", f"viewer.port={port}")
+    sender.join()
+    assert (outcome.status, outcome.err) == (0, "")
+    assert f"http://127.0.0.1:{port}" in outcome.out and "the viewer has ended" in outcome.out
+    with socket.socket() as probe:
+        assert probe.connect_ex(("127.0.0.1", port)) != 0
+    # It is no run: beside its log it leaves nothing, not even a config.
+    assert {path.name for path in (tmp_path / "run").iterdir()} <= {"run.log"}
+
+
+def test_a_scene_that_cannot_be_read_is_shown_without_pictures(of_run, port):
+    sender = ended_by(signal.SIGTERM, port)
+    outcome = of_run("stage=view", f"viewer.port={port}", "data=inward", "data.root=nowhere")
+    sender.join()
+    assert outcome.status == 0
+    assert "its training cameras are shown without pictures" in outcome.out + outcome.err
+    assert logging.getLogger("websockets").level == logging.WARNING
+
+
+def test_a_port_in_use_is_said_in_one_line(of_run, tmp_path, port):
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        used = other.getsockname()[1]
+        outcome = of_run("stage=view", f"viewer.port={used}")
+    assert outcome.status == 2 and outcome.err.count("\n") == 1
+    assert outcome.err.startswith(f"devrf: viewer.port: {used} on 127.0.0.1 is in use")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_run_learns_the_same_with_the_viewer_beside(devrf, tmp_path, tiny, port):
+    found = []
+    for folder, more in (("with", ("viewer=true", f"viewer.port={port}")), ("without", ())):
+        outcome = devrf(*tiny, "stage=canonical", f"hydra.run.dir={folder}", *more)
+        assert (outcome.status, outcome.err) == (0, "")
+        assert (f"http://127.0.0.1:{port}" in outcome.out) == bool(more)
+        loaded = load_checkpoint(tmp_path / folder / "checkpoints" / "canonical.ckpt")
+        assert "viewer" not in " ".join(loaded.metadata.command)
+        found.append(loaded.model.canonical.density.values)
+    assert found[0].equal(found[1])

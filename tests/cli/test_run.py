@@ -1,0 +1,379 @@
+"""The main job, stage by stage and all at once, on a tiny embedded scene."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shlex
+import shutil
+from pathlib import Path
+
+import imageio.v3 as iio
+import pytest
+
+from devrf import selfcheck
+from devrf.cli.evaluate import check_objective, objective
+from devrf.errors import DevrfError
+from devrf.scenes.export import export
+from devrf.scenes.procedural import ProceduralScene
+
+MASKED = {"psnr_masked", "ssim_masked", "lpips_masked"}
+FURTHER = {"ms_ssim", "lpips", "depth_error", "flow_error"} | MASKED
+TRAINING = {"seconds", "iterations", "iterations_per_second", "peak_gpu_gb", "num_rollbacks"}
+CANONICAL_KEYS = {"psnr", "ssim"} | TRAINING | FURTHER
+DEFORMATION_KEYS = CANONICAL_KEYS | {"rest_pose_psnr", "checkpoint_mb"}
+
+
+def metrics(folder: Path) -> dict:
+    return json.loads((folder / "metrics.json").read_text())
+
+
+def scores(folder: Path) -> dict[str, float]:
+    sections = metrics(folder)
+    return {
+        f"{section}.{name}": value
+        for section in ("static", "dynamic")
+        for name, value in sections[section].items()
+        if value is not None and "second" not in name and name != "checkpoint_mb"
+    }
+
+
+def test_metrics_have_the_documented_keys(trained):
+    folder, outcome = trained
+    assert (outcome.status, outcome.err) == (0, "")
+    found = metrics(folder)
+    sections = {"static", "canonical", "dynamic", "deformation"}
+    assert set(found) == {"scene", "method", "protocol", "run", *sections}
+    assert (found["scene"], found["method"], found["protocol"]) == ("robot", "devrf", "two_stage")
+    # DeVRF's sections have the names of its stages, too.
+    assert found["static"] == found["canonical"] and found["dynamic"] == found["deformation"]
+    assert set(found["canonical"]) == CANONICAL_KEYS
+    assert set(found["deformation"]) == DEFORMATION_KEYS
+    assert found["canonical"]["iterations"] == 6
+    assert found["deformation"]["iterations"] == 12  # (2 + 2) for each of 3 frames
+    size = (folder / "checkpoints" / "deformation.ckpt").stat().st_size
+    assert found["deformation"]["checkpoint_mb"] == pytest.approx(size / 1e6, abs=1e-3)
+    # 24 x 20 pixels are too few for MS-SSIM's scales; the flow of what is at rest has no error.
+    assert found["canonical"]["ms_ssim"] is None and found["canonical"]["flow_error"] is None
+    assert found["deformation"]["psnr_masked"] > 0 and found["deformation"]["flow_error"] > 0
+
+
+def test_a_run_says_how_it_came_about(trained):
+    found = metrics(trained[0])
+    ran = found["run"]
+    assert set(ran["execution"]) == {"canonical", "deformation"}
+    for how in ran["execution"].values():
+        assert (how["kernels"], how["graph_captures"], how["short_lists"]) == ("torch", 0, 0)
+    assert ran["parameters"] > 1000 and ran["device"] and ran["torch"]
+    assert ran["choices"]["data"] == "procedural" and ran["choices"]["ablation"] == "full"
+    assert ran["choices"]["experiment"] is None and "hydra/launcher" not in ran["choices"]
+    assert "data.frames=3" in ran["overrides"]
+    assert (ran["seed"], ran["train_views"], ran["test_frames"]) == (0, 2, 3)
+    for stage in ("canonical", "deformation"):
+        assert ran["wall_seconds"][stage] >= found[stage]["seconds"] > 0
+
+
+def test_every_frame_has_a_row(trained):
+    with (trained[0] / "frames.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["capture"] for row in rows] == ["static"] * 2 + ["dynamic"] * 3
+    assert [float(row["time"]) for row in rows[2:]] == [0, 0.5, 1]
+    found = metrics(trained[0])["deformation"]
+    for name in ("psnr", "ssim", "psnr_masked", "rest_pose_psnr"):
+        mean = sum(float(row[name]) for row in rows[2:]) / 3
+        assert mean == pytest.approx(found[name], rel=1e-4)
+    assert rows[2]["flow_error"] == ""  # nothing comes before the first frame
+
+
+def test_everything_lies_in_the_run_folder(trained):
+    folder, _ = trained
+    made = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
+    pictures = ("static", "dynamic", "training_canonical", "training_deformation")
+    assert {
+        *(".hydra/config.yaml", "run.log", "metrics.json", "frames.csv"),
+        *("checkpoints/canonical.ckpt", "checkpoints/deformation.ckpt"),
+        *(f"images/{name}.png" for name in pictures),
+        *("videos/held_out.mp4", "videos/orbit.mp4"),
+    } <= made
+    assert not [name for name in made if "partial" in name]
+    video = iio.imread(folder / "videos" / "held_out.mp4")
+    # Truth, rendering and depth, 48 x 40 px each, side by side below a line of text.
+    assert video.shape == (4, 18 + 40, 3 * 48 + 2 * 4, 3)
+
+
+def test_the_last_lines_are_commands_that_work(devrf, tmp_path, trained):
+    folder, outcome = trained
+    lines = outcome.out.splitlines()
+    at = next(k for k, line in enumerate(lines) if line.startswith("results:"))
+    results = "(metrics.json, images, videos/orbit.mp4, checkpoints)"
+    assert lines[at] == f"results: outputs/robot/quickstart {results}"
+    commands = [shlex.split(line) for line in lines[at + 2 :]]
+    assert [words[:3] for words in commands] == [["python", "-m", "devrf"]] * 3
+    copy = tmp_path / "outputs" / "robot" / "quickstart"
+    shutil.copytree(folder, copy)
+    done = devrf(*commands[0][3:])
+    assert (done.status, done.err) == (0, "")
+    assert list(copy.glob("images/still*.png"))
+
+
+def test_stages_one_by_one_come_to_the_same_in_another_process(warm, tmp_path, tiny, trained):
+    for stage in ("canonical", "deformation", "evaluate"):
+        outcome = warm(tmp_path, *tiny, "deterministic=true", f"stage={stage}", "hydra.run.dir=run")
+        assert outcome.status == 0, outcome.out
+    found = metrics(tmp_path / "run")
+    assert all(seconds > 0 for seconds in found["run"]["wall_seconds"].values())
+    expected = scores(trained[0])
+    assert len(expected) > 8
+    assert scores(tmp_path / "run") == pytest.approx(expected, abs=1e-6, rel=0)
+
+
+def test_another_seed_comes_to_other_scores(warm, tiny, trained, tmp_path):
+    assert warm(tmp_path, *tiny, "seed=1", "hydra.run.dir=run").status == 0
+    assert scores(tmp_path / "run") != pytest.approx(scores(trained[0]), abs=1e-6, rel=0)
+
+
+def test_the_canonical_stage_alone_can_be_scored(devrf, tmp_path, tiny):
+    for stage in ("canonical", "evaluate"):
+        outcome = devrf(*tiny, f"stage={stage}", "data.shape=flower", "ablation=c2f")
+        assert (outcome.status, outcome.err) == (0, "")
+    found = metrics(tmp_path / "outputs" / "flower" / "quickstart-c2f")
+    assert list(found) == ["scene", "method", "protocol", "static", "canonical", "run"]
+    assert found["run"]["wall_seconds"]["deformation"] is None
+
+
+def test_a_checkpoint_from_elsewhere_is_scored_by_fewer_metrics(devrf, tmp_path, tiny, trained):
+    checkpoint = f"ckpt={trained[0] / 'checkpoints' / 'deformation.ckpt'}"
+    few = ("hydra.run.dir=few", "evaluation.metrics=[psnr_masked]")
+    outcome = devrf(*tiny, "stage=evaluate", checkpoint, *few)
+    assert (outcome.status, outcome.err) == (0, "")
+    assert "LPIPS" not in outcome.out
+    found = metrics(tmp_path / "few")["canonical"]
+    assert set(found) == CANONICAL_KEYS - FURTHER | {"psnr_masked"}
+    whole = metrics(trained[0])["canonical"]
+    assert found == {name: whole[name] for name in found}
+
+
+def test_a_deformation_of_another_canonical_field_is_not_passed_off_as_its_own(
+    devrf, tmp_path, tiny, trained
+):
+    folder = tmp_path / "retrained"
+    shutil.copytree(trained[0], folder)
+    assert devrf(*tiny, "stage=canonical", "seed=1", "hydra.run.dir=other").status == 0
+    other = tmp_path / "other" / "checkpoints" / "canonical.ckpt"
+    other.replace(folder / "checkpoints" / "canonical.ckpt")
+    outcome = devrf(*tiny, "stage=evaluate", f"hydra.run.dir={folder}")
+    assert outcome.status == 0
+    assert "deformation.ckpt: left out, it belongs to another canonical.ckpt" in outcome.out
+    assert not {"dynamic", "deformation"} & set(metrics(folder))
+
+
+def test_times_that_no_training_view_has_are_scored_apart_and_reported(devrf, tmp_path, tiny):
+    held_out = ("data.novel_times_every=2", "evaluation.metrics=[psnr_masked]", "video.frames=1")
+    done = devrf(*tiny, *held_out, "hydra.run.dir=runs/one")
+    assert (done.status, done.err) == (0, "")
+    assert "novel times: psnr" in done.out
+    dynamic = metrics(tmp_path / "runs" / "one")["dynamic"]
+    novel, known = dynamic["novel_times"], dynamic["training_times"]
+    # Of three frames the one in the middle is not learned from.
+    assert set(novel) == {"psnr", "ssim", "psnr_masked", "rest_pose_psnr", "images"}
+    assert (novel["images"], known["images"]) == (1, 2)
+    assert dynamic["psnr"] == pytest.approx((novel["psnr"] + 2 * known["psnr"]) / 3, abs=1e-4)
+    done = devrf("stage=report", "report.runs=runs", "hydra.run.dir=report")
+    assert done.status == 0 and "PSNR at novel times" in done.out
+
+
+# What is done already
+
+
+@pytest.fixture
+def run(trained, tmp_path) -> Path:
+    """A copy of the folder of a whole tiny run."""
+    return Path(shutil.copytree(trained[0], tmp_path / "run"))
+
+
+def stamps(run: Path) -> dict[str, int]:
+    paths = [*run.glob("*.json"), *run.glob("*.csv"), *run.glob("images/*"), *run.glob("videos/*")]
+    return {path.name: path.stat().st_mtime_ns for path in paths}
+
+
+def test_a_finished_run_says_so_and_reads_nothing(devrf, tiny, run, monkeypatch):
+    def unread(self):
+        raise AssertionError("the scene was read")
+
+    before = stamps(run)
+    monkeypatch.setattr("devrf.data.rendered.RenderedDataModule.load", unread)
+    outcome = devrf(*tiny, "hydra.run.dir=run")
+    assert (outcome.status, outcome.err) == (0, "")
+    assert "evaluate: done already (frames.csv, " in outcome.out
+    assert "render: done already (videos/held_out.mp4, videos/orbit.mp4)" in outcome.out
+    assert stamps(run) == before
+
+
+SCORES = {"metrics.json", "frames.csv", "static.png", "dynamic.png"}
+
+
+@pytest.mark.parametrize(
+    ("typed", "redone"),
+    [
+        (["stage=evaluate"], SCORES),
+        (["video.frames=3"], {"held_out.mp4", "orbit.mp4"}),
+        (["evaluation.metrics=[]"], SCORES),
+    ],
+)
+def test_what_is_asked_for_differs_or_is_missing_is_done(devrf, tiny, run, typed, redone):
+    before = stamps(run)
+    if typed[0] == "video.frames=3":
+        (run / "videos" / "orbit.mp4").unlink()
+    assert devrf(*tiny, "hydra.run.dir=run", *typed).status == 0
+    assert {name for name, stamp in stamps(run).items() if before[name] != stamp} == redone
+
+
+# The number that a run is judged by
+
+
+def test_the_objective_is_looked_up():
+    found = {"scene": "robot", "static": {"psnr": 30.0, "lpips": None}, "dynamic": {"psnr": 20.0}}
+    for key, value in {
+        **{"dynamic.psnr": 20.0, "static.psnr": 30.0, "static.lpips": None},
+        # DeVRF's sections have the names of its stages, too.
+        **{"deformation.psnr": 20.0, "canonical.psnr": 30.0},
+    }.items():
+        check_objective(key, ["lpips"])
+        assert objective(key, found) == value
+    # Where nothing moves the rest state is judged.
+    assert objective("dynamic.psnr", {"static": {"psnr": 30.0}}) == 30.0
+    assert objective("dynamic.rest_pose_psnr", {"static": {"psnr": 30.0}}) is None
+
+
+@pytest.mark.parametrize(
+    ("key", "said"),
+    [
+        ("run.seed", "objective: expected static.NAME or dynamic.NAME, not 'run.seed'"),
+        ("deformation.flow_error", "objective: deformation has no 'flow_error'"),
+        ("static.rest_pose_psnr", "objective: static has no 'rest_pose_psnr'"),
+    ],
+)
+def test_any_other_objective_is_an_error(key, said):
+    with pytest.raises(DevrfError) as caught:
+        check_objective(key, ["lpips"])
+    assert str(caught.value).startswith(said)
+
+
+# A scene at rest
+
+
+@pytest.fixture(scope="module")
+def at_rest(tmp_path_factory) -> Path:
+    """A scene whose static capture is all there is."""
+    root = tmp_path_factory.mktemp("rest") / "statue"
+    sizes = {"width": 24, "height": 18, "static_views": 6, "static_test_views": 3}
+    export(ProceduralScene(shape="robot", train_views=2, frames=2, supersample=1, **sizes)(), root)
+    (root / "dynamic_2views").rename(root.parent / "moving")
+    return root
+
+
+def test_the_pipeline_of_a_scene_at_rest_learns_no_motion(devrf, tmp_path, short, at_rest):
+    where = ("data=inward", f"data.root={at_rest}", "hydra.run.dir=run")
+    done = devrf(*where, *short, "objective=dynamic.psnr")
+    assert (done.status, done.err) == (0, "")
+    assert "statue is at rest: canonical, evaluate, render; no motion is learned" in done.out
+    run = tmp_path / "run"
+    assert [path.name for path in (run / "checkpoints").glob("*.ckpt")] == ["canonical.ckpt"]
+    found = metrics(run)
+    assert found["at_rest"] is True and found["static"] == found["canonical"]
+    assert "dynamic" not in found
+    assert set(found["run"]["wall_seconds"]) == {"canonical", "evaluate"}
+    assert len(iio.imread(run / "videos" / "held_out.mp4")) == 4
+    report = devrf("stage=report", "report.runs=run")
+    assert report.status == 0 and f"{found['static']['psnr']:.2f}" in report.out
+    assert devrf(*where, *short, "stage=still").status == 0
+    inspected = devrf(*where, "stage=inspect", "trainer=cpu")
+    assert "one moment: the scene is at rest" in inspected.out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["stage=deformation"], "stage=deformation: learns motion, but statue is at rest"),
+        (
+            ["method=dnerf", "protocol=joint"],
+            "protocol=joint: learns from images in motion, but statue is at rest",
+        ),
+        (["data.frames=2"], "data.frames: 2 was asked for, but all images of"),
+    ],
+)
+def test_what_needs_motion_is_refused(devrf, tmp_path, short, at_rest, arguments, said):
+    small = () if "method=dnerf" in arguments else short
+    done = devrf("data=inward", f"data.root={at_rest}", "trainer=cpu", *small, *arguments)
+    assert done.status == 2 and done.err.startswith(f"devrf: {said}")
+    assert len(done.err.splitlines()) == 1 and not (tmp_path / "outputs").exists()
+
+
+# What comes before learning
+
+
+def test_an_embedded_scene_written_to_disk_is_a_scene_from_disk(devrf, tmp_path, tiny, short):
+    assert devrf(*tiny, "stage=prepare", "data.export=robot").status == 0
+    assert (tmp_path / "robot" / "dynamic_2views" / "transforms_test.json").is_file()
+    outcome = devrf(*short, "data=inward", "data.root=robot", "data.bound_scale=1.2")
+    assert (outcome.status, outcome.err) == (0, "")
+    found = metrics(tmp_path / "outputs" / "robot" / "quickstart")
+    assert found["scene"] == "robot" and found["deformation"]["iterations"] == 12
+
+
+def test_a_scene_is_described_and_drawn(devrf, tmp_path, tiny):
+    outcome = devrf(*tiny, "stage=inspect", "data.static_views=16", "hydra.run.dir=run")
+    assert (outcome.status, outcome.err) == (0, "")
+    for part in (
+        *("robot, inward-facing", "static train", "24 x 20", "optical flow", "3 from 0 to 1"),
+        *("GPU, deformation stage", "checkpoint", "no problems found", "inspect.png"),
+    ):
+        assert part in outcome.out
+    assert iio.imread(tmp_path / "run" / "images" / "inspect.png").shape[1] == 1600
+    assert "inward-facing" in (tmp_path / "run" / "run.log").read_text()
+
+
+def test_problems_of_a_scene_are_advice(devrf, tiny):
+    # Two views leave more than half of the circle unseen.
+    outcome = devrf(*tiny, "stage=inspect", "data.static_views=2")
+    assert (outcome.status, outcome.err) == (0, "")
+    assert "problems found: 1" in outcome.out
+    assert "static training set: no view from a sector of" in outcome.out
+
+
+def test_a_mistake_in_footage_is_one_line_and_leaves_nothing(devrf, tmp_path, monkeypatch):
+    monkeypatch.setattr("devrf.apps.capture.pipeline.check_library", lambda: None)
+    outcome = devrf("stage=capture", "capture.static=my walk (1).mp4", "capture.into=scene")
+    expected = "devrf: my walk (1).mp4: no such video; correct capture.static or capture.views\n"
+    assert (outcome.status, outcome.err) == (2, expected)
+    assert not list(tmp_path.iterdir())
+
+
+def test_every_check_of_the_machine_has_a_line_and_failures_end_with_status_2(
+    devrf, tmp_path, monkeypatch
+):
+    def broken(scene):
+        raise ValueError("two\nlines")
+
+    checks = {"well": lambda scene: "1 ms", "wrong": broken, "memory": selfcheck.rendering}
+    monkeypatch.setattr(selfcheck, "CHECKS", checks)
+    outcome = devrf("stage=selfcheck", "trainer=cpu")
+    assert outcome.status == 2
+    assert outcome.err == "devrf: stage=selfcheck: 1 checks failed: wrong\n"
+    lines = ["passed  well: 1 ms", "failed  wrong: ValueError: two lines"]
+    lines.append("skipped  memory: needs a GPU: a CPU has one renderer")
+    assert [line for line in outcome.out.splitlines() if line in lines] == lines
+    record = json.loads((tmp_path / "outputs" / "selfcheck" / "selfcheck.json").read_text())
+    assert [check["verdict"] for check in record["checks"]] == ["passed", "failed", "skipped"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["selfcheck.only=[kernl]"], "not 'kernl'; did you mean kernel?"),
+        (["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2"], "leave out trainer=ddp"),
+    ],
+)
+def test_what_cannot_be_checked_is_one_line(devrf, arguments, expected):
+    outcome = devrf("stage=selfcheck", *arguments)
+    assert outcome.status == 2 and outcome.err.count("\n") == 1 and expected in outcome.err
