@@ -43,13 +43,6 @@ def test_a_row_is_on_the_disk_at_once(path: Path) -> None:
     assert rows[4]["dynamic/flow"] == "0.5"
 
 
-def test_a_table_is_continued(path: Path) -> None:
-    before = path.read_text()
-    again(path).log_metrics({"dynamic/loss": 3.0}, 30)
-    assert path.read_text().startswith(before)
-    assert [row["step"] for row in table(path)] == ["10", "20", "30", "10", "20", "30"]
-
-
 def test_rows_beyond_the_resume_point_are_dropped(path: Path) -> None:
     curves = again(path)
     curves.drop_rows_beyond("dynamic", 10)

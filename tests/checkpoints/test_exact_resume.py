@@ -286,36 +286,12 @@ def test_only_what_is_to_be_gone_on_from_holds_the_way_there(
     assert not load_checkpoint(path, tiny_scene).metadata.complete
 
 
-@pytest.fixture
-def left(datamodule: SceneDataModule, trainer: Callable[..., Trainer], tmp_path: Path) -> Path:
-    """A file to go on from at the canonical stage's iteration 2."""
-    path = tmp_path / "left.ckpt"
-    trainer(Leave(path, 2), max_epochs=1).fit(canonical(), datamodule=datamodule)
-    return path
-
-
-def refused(fit: Trainer, stage: ScheduledStage, datamodule: SceneDataModule, path: Path) -> str:
-    fit.strategy.checkpoint_io = ChecksummedCheckpointIO()
-    with pytest.raises(DevrfError) as caught:
-        fit.fit(stage, datamodule=datamodule, ckpt_path=str(path))
-    assert str(caught.value).startswith(str(path))
-    return str(caught.value)
-
-
 def test_another_schedule_is_refused(
-    left: Path, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
+    datamodule: SceneDataModule, trainer: Callable[..., Trainer], tmp_path: Path
 ) -> None:
-    longer = CanonicalStage(replace(SEARCHING, iterations=13), SMALL)
-    message = refused(trainer(max_epochs=1), longer, datamodule, left)
-    assert "a schedule of 20 iterations, this is the canonical stage on one of 21" in message
-
-
-def test_another_scene_is_refused(
-    left: Path,
-    trainer: Callable[..., Trainer],
-    tiny_scene: Scene,
-    serve: Callable[[Scene], SceneDataModule],
-) -> None:
-    fewer = replace(tiny_scene.static, train=tiny_scene.static.train[torch.arange(7)])
-    other = serve(replace(tiny_scene, static=fewer))
-    assert "another scene" in refused(trainer(max_epochs=1), canonical(), other, left)
+    path, longer = tmp_path / "left.ckpt", CanonicalStage(replace(SEARCHING, iterations=13), SMALL)
+    trainer(Leave(path, 2), max_epochs=1).fit(canonical(), datamodule=datamodule)
+    fit = trainer(max_epochs=1)
+    fit.strategy.checkpoint_io = ChecksummedCheckpointIO()
+    with pytest.raises(DevrfError, match=f"^{path}.*a schedule of 20 iterations, .* one of 21"):
+        fit.fit(longer, datamodule=datamodule, ckpt_path=str(path))

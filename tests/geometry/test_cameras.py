@@ -156,12 +156,3 @@ def test_points_beyond_the_fold_are_not_upright() -> None:
     x = torch.tensor([0.5, fold - 0.01, fold + 0.01, 3.0])
     points = torch.stack([x, torch.zeros(4)], dim=-1)
     assert lens.upright(points).tolist() == [True, True, False, False]
-
-
-@pytest.mark.parametrize("lens", [PHONE, BARREL])
-def test_the_slope_is_that_of_the_equation(lens: Distortion) -> None:
-    point = torch.tensor([0.4, -0.3], dtype=torch.float64)
-    slope = torch.func.jacrev(lens.distort)(point)
-    xx, xy, yy = lens._jacobian(point)
-    expected = torch.stack([torch.stack([xx, xy]), torch.stack([xy, yy])])
-    torch.testing.assert_close(slope, expected)
