@@ -16,7 +16,6 @@ from devrf.data.batch import PixelPool, Pixels
 from devrf.engine.batches import static_pool
 from devrf.engine.graphs import Graphs
 from devrf.engine.loop import ParallelBatch
-from devrf.engine.stage import Phase
 from devrf.errors import DevrfError
 from devrf.methods.devrf.architecture import Architecture, fitted_to
 from devrf.methods.devrf.canonical_field import CanonicalField
@@ -165,9 +164,8 @@ class CanonicalStage(VoxelStage):
         threshold = sampling.search_alpha_threshold if searching else sampling.alpha_threshold
         return RenderSettings(sampling.step, threshold, bounds.near, bounds.far)
 
-    def enter(self, phase: Phase) -> None:
+    def enter(self, phase: CanonicalPhase) -> None:  # type: ignore[override]
         """Make grids, occupancy, rays and optimiser ready for ``phase``."""
-        assert isinstance(phase, CanonicalPhase)
         previous, self.phase = self.phase, phase
         views, model = self.scene.static.train, self.scene_model
         model.settings = self.render_settings(phase)
@@ -323,9 +321,10 @@ class CanonicalStage(VoxelStage):
         images, area = self._images
         return {"pixels": pack_bits(self.pool.mask(images, area))}
 
-    def restore(self, phase: Phase, kept: dict[str, Any]) -> None:
+    def restore(  # type: ignore[override]
+        self, phase: CanonicalPhase, kept: dict[str, Any]
+    ) -> None:
         """Go on with ``phase``, the field being loaded."""
-        assert isinstance(phase, CanonicalPhase)
         images, area = self._images
         mask = unpack_bits(kept["pixels"], (len(images), area), self.device)
         self.pool = PixelPool.of_mask(images, mask)

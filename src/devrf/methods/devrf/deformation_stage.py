@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
 
@@ -18,22 +18,15 @@ from devrf.engine.active_frames import ActiveFrames
 from devrf.engine.convergence import Convergence
 from devrf.engine.graphs import Graphs
 from devrf.engine.loop import ParallelBatch
-from devrf.engine.stage import Phase
 from devrf.errors import DevrfError
 from devrf.methods.devrf.deformation_field import DeformationField, deformed_occupancy
 from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule
-from devrf.methods.devrf.extension import Extension, MotionTerm
-from devrf.methods.devrf.losses import (
-    MOTION_TERMS,
-    FlowMean,
-    MotionPrediction,
-    total_variation_weight,
-)
+from devrf.methods.devrf.extension import Extension
+from devrf.methods.devrf.losses import FlowMean, MotionPrediction
 from devrf.methods.devrf.model import DeVRFModel
+from devrf.methods.devrf.motion_loss import MotionLoss
 from devrf.methods.devrf.settings import DEFORMATION_LOSS, MotionSettings, Precision
 from devrf.methods.devrf.voxel_stage import VoxelStage
-from devrf.methods.devrf.weighted_loss import weighted_loss
-from devrf.methods.weighted_loss import counted_weights
 from devrf.ops.adam import GridAdam
 from devrf.scenes.scene import CaptureName, Views
 from devrf.system.profiling import span
@@ -88,10 +81,7 @@ class DeformationStage(VoxelStage):
         self.motion = motion or MotionSettings()
         self.flow_mean = flow_mean
         self.extensions = tuple((extensions or {}).values())
-        self.tv = loss.get("tv", 0.0)
-        # The weights are those that the schedule's factors are factors of.
-        self.terms, self._weights = motion_terms(loss, self.extensions, self.schedule)
-        self.weights: Mapping[str, float] = self._weights
+        self.motion_loss = MotionLoss(loss, self.extensions, self.schedule)
         self.scene_model = DeVRFModel(
             rest.model.architecture,
             rest.model.canonical,
@@ -111,7 +101,12 @@ class DeformationStage(VoxelStage):
     def check_settings(cls, **settings: Any) -> None:
         """Check the loss, before what the stage builds on has been learned."""
         extensions = tuple(settings.get("extensions", {}).values())
-        motion_terms(settings["loss"], extensions, settings["schedule"])
+        MotionLoss(settings["loss"], extensions, settings["schedule"])
+
+    @property
+    def weights(self) -> Mapping[str, float]:
+        """Of the loss terms that count at the present level."""
+        return self.motion_loss.weights
 
     @property
     def field(self) -> DeformationField:
@@ -159,9 +154,9 @@ class DeformationStage(VoxelStage):
                 f"{self.scene.name}: is at rest, so there is no motion to learn; the canonical "
                 "stage is all that it takes"
             )
-        if self._weights.get("flow") and self.scene.dynamic.train.by_moving_camera:
+        if self.scene.dynamic.train.by_moving_camera and self.weights.get("flow"):
             log.info("the camera moves, and so does all that it sees: the flow loss is left out")
-            self._weights = {**self._weights, "flow": 0.0}
+            self.motion_loss.leave_out("flow")
         model, motion = self.scene_model, self.motion
         if model.deformation is None:
             box = model.space.inner(model.box)
@@ -185,9 +180,8 @@ class DeformationStage(VoxelStage):
         scale = self.field.box.longest if motion.unit == "box" else 1.0
         self._optimizer.param_groups[0]["base_lr"] = motion.learning_rate * scale
 
-    def enter(self, phase: Phase) -> None:
+    def enter(self, phase: DeformationPhase) -> None:  # type: ignore[override]
         """Go to the phase's frames: grow the grids if a level begins, fresh Adam if asked for."""
-        assert isinstance(phase, DeformationPhase)
         previous, self.phase = self.phase, phase
         self.active.write_back()
         if previous is not None and previous.level != phase.level:
@@ -230,14 +224,9 @@ class DeformationStage(VoxelStage):
             self._optimizer.replace(group, [])
         further = {k: v for e in self.extensions for k, v in e.frame_fields(self, level).items()}
         self.active.allocate(count, self.field.frames, occupancy, further)
-        self.weights = {
-            name: factored
-            for name, weight in self._weights.items()
-            if (factored := weight * self._factor(name, level))
-        }
-        tv = self.tv * self.schedule.weight_factor("tv", level)
-        smoothing = total_variation_weight(tv, max(self.field.shape), self.schedule.rays)
+        self.motion_loss.begin_level(level)
         learned = [tensor for frame in self.active for tensor in frame.slices]
+        smoothing = self.motion_loss.smoothing(level, self.field.shape)
         self._optimizer.replace(0, learned, smoothing=smoothing)
         for extension in self.extensions:
             extension.begin_level(self, level)
@@ -245,11 +234,6 @@ class DeformationStage(VoxelStage):
             static_shape = self.static_shape(self.scene_model.canonical.density.values)
             parameters = [frame.learned for frame in self.active]
             self.bind(self.schedule.rays, parameters, static_shape=static_shape)
-
-    def _factor(self, term: str, level: int) -> float:
-        """Factor of a term's weight at ``level``."""
-        factors = (extension.weight_factor(term, level) for extension in self.extensions)
-        return math.prod(factors, start=self.schedule.weight_factor(term, level))
 
     def _prefetch_after(self, phase: DeformationPhase) -> None:
         """Begin to fetch the next phase's frames, unless they change before it begins."""
@@ -327,7 +311,7 @@ class DeformationStage(VoxelStage):
             self.flow_mean,
         )
         with span("losses"):
-            return weighted_loss(prediction, self.terms, self.weights)
+            return self.motion_loss(prediction)
 
     def converged(self, losses: Tensor) -> bool:
         """Whether each active frame's loss has stopped falling, if the schedule asks for that."""
@@ -346,28 +330,10 @@ class DeformationStage(VoxelStage):
         frames = self.active.state(self.views, exact=exact)
         return {"frames": frames, "convergence": self._convergence.state()}
 
-    def restore(self, phase: Phase, kept: dict[str, Any]) -> None:
+    def restore(  # type: ignore[override]
+        self, phase: DeformationPhase, kept: dict[str, Any]
+    ) -> None:
         """Go on with the frames of ``phase``, the field being loaded."""
-        assert isinstance(phase, DeformationPhase)
         self._activate(phase)
         self.active.load_state(kept["frames"], self.views)
         self._convergence.load_state(kept["convergence"])
-
-
-def motion_terms(
-    loss: Mapping[str, float],
-    extensions: Sequence[Extension],
-    schedule: DeformationSchedule,
-) -> tuple[dict[str, MotionTerm], dict[str, float]]:
-    """The loss terms there are, and the weights of those that count.
-
-    Raises:
-        DevrfError: a weight, or a factor of the schedule, is of no term.
-    """
-    terms: dict[str, MotionTerm] = dict(MOTION_TERMS)
-    weights = {name: weight for name, weight in loss.items() if name != "tv"}
-    for extension in extensions:
-        terms |= extension.terms
-        weights |= extension.weights
-    schedule.check_terms({*terms, "tv"})
-    return terms, counted_weights(weights, terms, "loss.deformation")

@@ -32,7 +32,6 @@ class MotionLearner(Protocol):
     Attributes:
         schedule: levels, iterations and rays.
         scene_model: what is learned.
-        weights: of the loss terms that count at the present level.
         generator: draws random numbers, on the stage's device.
         active: the frames that are trained.
         loop: carries iterations out.
@@ -40,10 +39,14 @@ class MotionLearner(Protocol):
 
     schedule: DeformationSchedule
     scene_model: DeVRFModel
-    weights: Mapping[str, float]
     generator: torch.Generator
     active: ActiveFrames
     loop: Loop
+
+    @property
+    def weights(self) -> Mapping[str, float]:
+        """Of the loss terms that count at the present level."""
+        ...
 
     @property
     def scene(self) -> Scene:

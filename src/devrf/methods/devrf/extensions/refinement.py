@@ -165,7 +165,6 @@ class RefinementStage(VoxelStage):
 
     def restore(self, phase: Phase, kept: dict[str, Any]) -> None:
         """Go on with ``phase``, the fields being loaded."""
-        assert isinstance(phase, RefinementPhase)
         self.phase, model = phase, self.scene_model
         assert model.deformation is not None
         times, moving = model.deformation.clock.times, self.training_views("dynamic")
