@@ -4,7 +4,7 @@
 # make house        lines and files of each folder, the longest files, circles of imports
 # make gpu-check    install into .venv and check what this machine's GPU does, in minutes
 # make fuzz         what is too long for make test: the readers' fuzz tests with 100 000 inputs
-#                   (make test has 1000), the kernels at many sizes and compiled for two GPUs
+#                   (make test has 100), the kernels at many sizes and compiled for two GPUs
 # make format       format the code and mend what the linter can
 # make shell        a shell in which .venv is active
 # make clean        remove .venv and everything that tools leave behind
@@ -48,7 +48,7 @@ gpu-check: $(VENV)/.installed
 	$(BIN)/python -m devrf stage=selfcheck
 
 fuzz: $(VENV)/.installed-dev
-	DEVRF_FUZZ_INPUTS=100000 DEVRF_ALL_LAUNCHES=1 $(PYTEST) tests/scenes/fuzz tests/accel
+	DEVRF_FUZZ_INPUTS=100000 DEVRF_ALL_LAUNCHES=1 $(PYTEST) tests/scenes/test_damaged_files.py tests/accel
 
 format: $(VENV)/.installed-dev
 	$(BIN)/ruff check --fix .

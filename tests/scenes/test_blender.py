@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import shutil
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -95,12 +96,6 @@ def test_times_come_from_the_order_where_the_file_gives_none(scene_folder):
     assert scene.dynamic.test.times.tolist() == [0, 0.5, 1]
 
 
-def test_views_are_counted_from_the_poses_not_from_the_folder(scene_folder):
-    scene_folder.dynamic.rename(scene_folder.root / "dynamic_16views")
-    train = BlenderReader(scene_folder.root).read().dynamic.train
-    assert train.view.tolist() == [0, 1, 0, 1, 0, 1]
-
-
 def test_train_views_keeps_the_first_views(scene_folder):
     train = BlenderReader(scene_folder.root, train_views=1).read().dynamic.train
     assert train.view.tolist() == [0, 0, 0] and train.times.tolist() == [0, 0.5, 1]
@@ -153,21 +148,6 @@ def test_images_are_found_with_or_without_suffix_and_may_lack_a_matte(scene_fold
     assert bool(((test.pixels.int() - 77).abs() <= 1).all())
 
 
-def test_an_opaque_image_among_mattes_becomes_rgba(scene_folder):
-    iio.imwrite(scene_folder.static / "test/r_001.png", np.full((24, 32, 3), 9, dtype=np.uint8))
-    pixels = BlenderReader(scene_folder.root).read().static.test.pixels
-    assert pixels.shape[3] == 4 and bool((pixels[1, ..., 3] == 255).all())
-
-
-def test_given_box_and_bound_scale(scene_folder):
-    scene = BlenderReader(
-        scene_folder.root, box=[[-1, -1, 0], [1, 1, 2]], bound_scale=1.2, near=1, far=9
-    ).read()
-    assert scene.bounds.box.low == (-1, -1, 0) and scene.bounds.motion is None
-    assert (scene.bounds.near, scene.bounds.far) == (1, 9)
-    assert scene.bounds.source == "canonical box x bound scale 1.2"
-
-
 def test_single_folder_learns_the_static_scene_from_early_images(single_folder, caplog):
     scene = BlenderReader(single_folder, static_until=0.5).read()
     assert len(scene.static.train) == 4 and len(scene.dynamic.train) == 8
@@ -178,21 +158,6 @@ def test_single_folder_learns_the_static_scene_from_early_images(single_folder, 
     assert scene.bounds.motion is None  # never two cameras at one time
     whole = BlenderReader(single_folder).read()
     assert len(whole.static.train) == 8 and len(whole.static.test) == 3
-
-
-def test_single_folder_without_an_early_test_image_keeps_all_of_them(single_folder):
-    scene = BlenderReader(single_folder, static_until=0.05, box=[[-1, -1, -1], [1, 1, 1]]).read()
-    assert len(scene.static.train) == 1 and len(scene.static.test) == 3
-
-
-def test_a_moving_camera_with_three_by_four_poses(single_folder):
-    file = single_folder / "transforms_train.json"
-    content = json.loads(file.read_text())
-    for frame in content["frames"]:
-        frame["transform_matrix"] = frame["transform_matrix"][:3]
-    file.write_text(json.dumps(content))
-    scene = BlenderReader(single_folder).read()
-    assert scene.dynamic.train.cameras.positions.norm(dim=1).tolist() == pytest.approx([4] * 8)
 
 
 @pytest.mark.skipif(not SUZANNE.is_dir(), reason="the suzanne scene is not next to the repository")
@@ -220,3 +185,156 @@ def test_a_published_scene():
         entry, leave = bounds.motion.crossing(held_out.cameras.image_rays(frame))
         solid = held_out.pixels[frame, ..., 3].flatten() > 127
         assert bool((entry < leave)[solid].all())
+
+
+NAN = float("nan")
+TRAIN = "static/transforms_train.json"
+MOVING = "dynamic_2views/transforms_train.json"
+
+
+@pytest.fixture
+def message_of(refusal) -> Callable[..., str]:
+    return partial(refusal, BlenderReader)
+
+
+def in_first_frame(key: str, value: object) -> Callable[[dict[str, Any]], None]:
+    return lambda content: content["frames"][0].__setitem__(key, value)
+
+
+def without(key: str) -> Callable[[dict[str, Any]], None]:
+    return lambda content: content["frames"][0].pop(key)
+
+
+def pose(first: object) -> list[list[object]]:
+    return [[first, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1], [0, 0, 0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("file", "change", "said"),
+    [
+        (TRAIN, lambda c: c.pop("frames"), "frames: is missing"),
+        (TRAIN, lambda c: c.update(frames=[3]), "frames[0]: should be an object, not 3"),
+        (TRAIN, lambda c: c.pop("camera_angle_x"), '"camera_angle_x"'),
+        (
+            TRAIN,
+            lambda c: c.update(camera_angle_x=NAN),
+            "camera_angle_x: should be a finite number, not nan",
+        ),
+        (
+            TRAIN,
+            in_first_frame("transform_matrix", pose(NAN)),
+            "transform_matrix[0][0]: should be a finite number, not nan",
+        ),
+        (TRAIN, in_first_frame("transform_matrix", pose(-1)), "no rigid transform"),
+        (TRAIN, in_first_frame("file_path", "a\0b"), "is not a path"),
+        (MOVING, in_first_frame("time", 1.5), "frames[0].time: 1.5 is outside [0, 1]"),
+        (MOVING, without("time"), 'frames[0]: has no "time" although others have'),
+    ],
+)
+def test_wrong_json_values(scene_folder, file, change, said, message_of):
+    path = scene_folder.root / file
+    scene_folder.edit(path, change)
+    message = message_of(scene_folder.root)
+    assert str(path) in message and said in message
+
+
+def test_several_captures_are_listed(scene_folder, message_of):
+    shutil.copytree(scene_folder.dynamic, scene_folder.root / "dynamic_3views")
+    message = message_of(scene_folder.root)
+    assert "dynamic_2views, dynamic_3views" in message and "data.dynamic=" in message
+    wrong = message_of(scene_folder.root, dynamic="dynamic_4views")
+    assert "'dynamic_4views'" in wrong and "dynamic_3views" in wrong
+
+
+@pytest.mark.parametrize(
+    "escape",
+    [
+        "../../secret",
+        "/etc/passwd",
+    ],
+)
+def test_image_paths_stay_inside_the_scene(scene_folder, escape, message_of):
+    path = scene_folder.root / TRAIN
+    scene_folder.edit(path, in_first_frame("file_path", escape))
+    message = message_of(scene_folder.root)
+    assert str(path) in message and "outside the scene's folder" in message
+
+
+def test_links_that_lie_in_the_scene_are_followed(scene_folder, tmp_path):
+    (scene_folder.static / "train").rename(tmp_path / "elsewhere")
+    (scene_folder.static / "train").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "scene").rename(tmp_path / "moved")
+    (tmp_path / "link").symlink_to(tmp_path / "moved")
+    assert BlenderReader(tmp_path / "link").read().static.train.names[0] == "static/train/r_000.png"
+
+
+def test_a_scene_beside_the_current_folder(scene_folder, monkeypatch):
+    monkeypatch.chdir(scene_folder.static)
+    assert BlenderReader("..").read().static.train.names[0] == "static/train/r_000.png"
+    inner = str(scene_folder.static / "train/r_001.png")
+    scene_folder.edit(scene_folder.root / TRAIN, in_first_frame("file_path", inner))
+    assert BlenderReader(Path("..")).read().static.train.names[0] == "static/train/r_001.png"
+
+
+@pytest.mark.parametrize("keep", [0, 20, 60])
+def test_a_damaged_image(scene_folder, keep, message_of):
+    path = scene_folder.static / "train/r_001.png"
+    path.write_bytes(path.read_bytes()[:keep])
+    assert f"{path}: not a readable image" in message_of(scene_folder.root)
+
+
+def test_sixteen_bit_images(scene_folder, message_of):
+    path = scene_folder.static / "test/r_000.png"
+    iio.imwrite(path, np.zeros((24, 32), dtype=np.uint16))
+    assert f"{path}: expected 8 bits a channel" in message_of(scene_folder.root)
+
+
+def test_flow_of_another_size(scene_folder, message_of):
+    folder = scene_folder.dynamic / "train_flow"
+    folder.mkdir()
+    np.savez(folder / "002_bwd.npz", flow=np.zeros((12, 16, 2)), mask=np.ones((12, 16), bool))
+    message = message_of(scene_folder.root, downscale=2)
+    assert "002_bwd.npz" in message and "(24, 32, 2)" in message and "data.flow=none" in message
+    assert BlenderReader(scene_folder.root, flow="none").read().dynamic.train.flow is None
+
+
+def test_fixed_views_without_times_have_to_take_turns(scene_folder, message_of):
+    def shuffle(content: dict[str, Any]) -> None:
+        for frame in content["frames"]:
+            del frame["time"]
+        content["frames"].sort(key=lambda f: f["transform_matrix"][0][3])
+
+    path = scene_folder.root / MOVING
+    scene_folder.edit(path, shuffle)
+    message = message_of(scene_folder.root)
+    assert str(path) in message and "2 fixed views do not take turns" in message
+
+
+def test_views_that_are_not_there(scene_folder, single_folder, message_of):
+    assert "the set has 2 views" in message_of(scene_folder.root, train_views=3)
+    assert "needs fixed cameras" in message_of(single_folder, train_views=1)
+
+
+def test_no_image_early_enough_for_the_static_scene(scene_folder, single_folder, message_of):
+    def later(content: dict[str, Any]) -> None:
+        for frame in content["frames"]:
+            frame["time"] = 0.5 + frame["time"] / 2
+
+    scene_folder.edit(single_folder / "transforms_train.json", later)
+    message = message_of(single_folder, static_until=0.1)
+    assert str(single_folder / "transforms_train.json") in message
+    assert "data.static_until=0.1" in message
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"downscale": 2.5}, "data.downscale"),
+        ({"downscale": 4}, "8x6 px"),
+        ({"background": "grey"}, "data.background: should be 'white', 'black' or 'random'"),
+        *(({"bound_scale": scale}, "data.bound_scale") for scale in (0.5, "large", NAN, True)),
+        ({"box": 3}, "data.box"),
+    ],
+)
+def test_wrong_options(scene_folder, options, said, message_of):
+    assert said in message_of(scene_folder.root, **options)

@@ -134,13 +134,6 @@ def test_smaller_images_are_used_where_they_are(folder):
     )
 
 
-def test_absent_images_are_counted_or_left_out(folder, message_of):
-    (folder / "images/round/img_03.png").unlink()
-    assert "1 of the 17 images in images.txt are absent" in message_of(folder)
-    scene = ColmapReader(folder, downscale=1, missing="skip").read()
-    assert len(scene.static.train) + len(scene.static.test) == 16
-
-
 @pytest.fixture
 def moving(folder) -> Path:
     """Three fixed cameras of three frames stand where 00, 02 and 04 were taken."""

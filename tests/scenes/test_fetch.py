@@ -39,14 +39,11 @@ def test_a_misspelt_name_is_answered_with_the_closest():
 @pytest.mark.parametrize(
     "text",
     [
-        "[[collection]]\nscenes.a = 'x'",
         "not TOML",
         "[[collection]]\npage='https://a'\nlicence=''\ndata='inward'\nlearn=''\nurl='file:///etc'\n"
         "scenes.a=''",
         "[[collection]]\npage='https://a'\nlicence=''\ndata='inward'\nlearn=''\nurl='https://a'\n"
         "scenes.'../a'=''",
-        "[[collection]]\npage='https://a'\nlicence=''\ndata='inward'\nlearn=''\nurl='https://a'\n"
-        "files=['../a']\nscenes.a=''",
     ],
 )
 def test_another_catalogue_has_the_same_form(tmp_path, text):

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import logging
 import shutil
+from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -120,15 +123,6 @@ def test_full_size_images_are_made_smaller_where_the_factor_is_missing(llff_fold
     assert LlffReader(llff_folder.root, downscale=2).read().static.train.width == 48
 
 
-def test_images_of_a_lesser_factor_go_the_rest_of_the_way(llff_folder):
-    llff_folder.flow(1, "001", 3.0)
-    scene = LlffReader(llff_folder.root, downscale=8).read()
-    assert scene.static.train.width == 12
-    assert scene.static.train.cameras.focal[0].tolist() == [10, 10]
-    flow = scene.dynamic.train.flow
-    assert flow is not None and flow.vectors[2, 0, 0].tolist() == [1.5, -1.5]
-
-
 @pytest.mark.parametrize(
     ("names", "found"),
     [
@@ -203,21 +197,6 @@ def test_another_view_is_held_out(llff_folder, test_view, held_out):
         assert held_out == 20
 
 
-def test_fewer_views_and_frames(llff_folder):
-    llff_folder.flow(1, "001", 3.0)
-    scene = LlffReader(llff_folder.root, train_views=1, frames=2, holdout=3).read()
-    assert reds(scene.dynamic.train) == [0, 2] and reds(scene.dynamic.test) == [20, 22]
-    assert scene.dynamic.train.times.tolist() == [0, 1]
-    assert scene.dynamic.train.flow is None
-    assert reds(scene.static.test) == [0, 3, 6]
-
-
-def test_the_number_of_views_is_that_of_the_folders(llff_folder):
-    llff_folder.dynamic.rename(llff_folder.root / "dynamic_12views")
-    scene = LlffReader(llff_folder.root).read()
-    assert len(scene.dynamic.train) == 6
-
-
 def test_space_and_box_by_hand(llff_folder):
     scene = LlffReader(llff_folder.root).read()
     assert scene.space == NormalizedDevice(24, 16, (20.0, 20.0), 1.0)
@@ -228,3 +207,144 @@ def test_space_and_box_by_hand(llff_folder):
     assert bounds.box.high == pytest.approx((6.0, 1.0, 1.0))
     assert (bounds.near, bounds.far, bounds.motion, bounds.scale) == (0.0, 1.0, None, 1.0)
     assert LlffReader(llff_folder.root, near=0.5).read().bounds.box.high[0] == pytest.approx(11.0)
+
+
+STATIC = "static/poses_bounds.npy"
+POSES = "dynamic_3views/poses.npy"
+BOUNDS = "dynamic_3views/bds.npy"
+
+
+@pytest.fixture
+def message_of(refusal) -> Callable[..., str]:
+    return partial(refusal, LlffReader)
+
+
+def stored(folder: Any, file: str) -> np.ndarray:
+    values: np.ndarray = np.load(folder.root / file)
+    return values
+
+
+@pytest.mark.parametrize(
+    ("file", "where", "value", "said"),
+    [
+        (STATIC, (2, 3), np.nan, "NaN or infinity"),
+        (STATIC, (2, 14), 0, "camera 2: the focal length is not above 0"),
+        (STATIC, (3, 4), 640, "another shape"),
+        (STATIC, (1, 0), 1, "camera 1: its axes are no rotation"),
+        (STATIC, (0, 15), 0, "camera 0: expected 0 < least depth < largest depth"),
+        (POSES, (4, 2, 4), 0, "camera 4: the focal length"),
+        (BOUNDS, (1, 0), -1, "camera 1: expected 0 < least depth"),
+    ],
+)
+def test_wrong_numbers(llff_folder, file, where, value, said, message_of):
+    values = stored(llff_folder, file)
+    values[where] = value
+    path = llff_folder.save(file, values)
+    message = message_of(llff_folder.root)
+    assert str(path) in message and said in message
+
+
+@pytest.mark.parametrize(
+    "file",
+    [
+        STATIC,
+    ],
+)
+def test_arrays_of_something_else(llff_folder, file, message_of):
+    path = llff_folder.save(file, np.array(["a", "b"]))
+    assert f"{path}: holds values of type" in message_of(llff_folder.root)
+    llff_folder.save(file, np.array([{"a": 1}], dtype=object))
+    assert f"{path}: not a readable npy file" in message_of(llff_folder.root)
+    for shape in ((), (4,), (4, 7), (0, 17), (0, 3, 5), (3, 17, 1)):
+        llff_folder.save(file, np.ones(shape))
+        message = message_of(llff_folder.root)
+        assert f"{path}: has shape" in message and "expected" in message
+    with path.open("wb") as archive:
+        np.savez(archive, poses=np.ones(3))
+    assert f"{path}: not a readable npy file" in message_of(llff_folder.root)
+
+
+def test_poses_without_intrinsics(llff_folder, message_of):
+    rows = stored(llff_folder, STATIC)
+    llff_folder.save(STATIC, np.delete(rows, [4, 9, 14], axis=1))
+    path = llff_folder.static / "hwf_cxcy.npy"
+    assert f"{path}: no such file" in message_of(llff_folder.root)
+    for values, said in (
+        (np.ones(4), "holds 4 numbers"),
+        (np.array([64, 96, 0, 48, 32.0]), "the focal length"),
+        (np.array([64, 96, np.nan, 48, 32.0]), "NaN"),
+        (np.array([96, 64, 80, 48, 32.0]), "another shape"),
+    ):
+        np.save(path, values)
+        message = message_of(llff_folder.root)
+        assert said in message and "static" in message
+
+
+def test_missing_folders(llff_folder, tmp_path, message_of):
+    root = llff_folder.root
+    assert "nowhere: no such folder" in message_of(tmp_path / "nowhere")
+    (llff_folder.dynamic / "view1").rename(llff_folder.dynamic / "view0")
+    assert f"{llff_folder.dynamic}/view0: views are numbered view1, view2" in message_of(root)
+    (llff_folder.dynamic / "view0").rename(llff_folder.dynamic / "view1")
+    (llff_folder.dynamic / "view2").rename(llff_folder.dynamic / "other")
+    assert f"{llff_folder.dynamic}: no folder view2 although there is view3" in message_of(root)
+    for view in ("view1", "view3"):
+        shutil.rmtree(llff_folder.dynamic / view)
+    assert f"{llff_folder.dynamic}: no folders view1" in message_of(root)
+    shutil.rmtree(llff_folder.dynamic)
+    message = message_of(root, dynamic="dynamic_3views")
+    assert f"{root}: no folder 'dynamic_3views' (found: none)" in message
+    shutil.rmtree(llff_folder.static)
+    assert f"{llff_folder.static}: no such folder" in message_of(root)
+
+
+def test_missing_images(llff_folder, message_of):
+    message = message_of(llff_folder.root, downscale=2)
+    assert "no folder images_2 or images (found: images_4)" in message
+    assert "no folder images (found: images_4)" in message_of(llff_folder.root, downscale=1)
+    images = llff_folder.dynamic / "view2" / "images_4"
+    (images / "002.png").unlink()
+    assert f"{images}: has 2 images, but" in message_of(llff_folder.root)
+    shutil.rmtree(images)
+    images.mkdir()
+    assert f"{images}: no images" in message_of(llff_folder.root)
+    shutil.rmtree(images)
+    assert f"{images.parent}: no folder images_4 or images" in message_of(llff_folder.root)
+
+
+def test_cameras_around_a_scene_are_not_forward_facing(llff_folder, message_of):
+    rows = stored(llff_folder, STATIC)
+    matrix = rows[:, :15].reshape(9, 3, 5)
+    for k in range(9):
+        angle = 2 * np.pi * k / 9
+        c, s = np.cos(angle), np.sin(angle)
+        matrix[k, :, :3] = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ matrix[k, :, :3]
+    path = llff_folder.save(STATIC, np.concatenate([matrix.reshape(9, 15), rows[:, 15:]], axis=1))
+    message = message_of(llff_folder.root)
+    assert str(path) in message and "data=inward" in message
+
+
+@pytest.mark.parametrize("camera", [2, 4])
+def test_a_fixed_camera_that_looks_elsewhere(llff_folder, camera, message_of):
+    poses = stored(llff_folder, POSES)
+    # A quarter turn about the vertical axis: right is back, back is left.
+    poses[camera, :, :3] = [[0, 0, -1], [0, 1, 0], [1, 0, 0]]
+    llff_folder.save(POSES, poses)
+    message = message_of(llff_folder.root)
+    assert f"view{camera - 1}/images_4/000.png: its camera does not look along" in message
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"downscale": 12}, "8x5 px"),
+        ({"holdout": 1}, "data.holdout"),
+        ({"train_views": 3}, "there are 2 views to learn from"),
+        ({"test_view": 4}, "none of the 3 views in"),
+        ({"test_view": -4}, "none of the 3 views"),
+        ({"near": 0}, "data.near"),
+        ({"dynamic": "other"}, "'other'"),
+    ],
+)
+def test_wrong_options(llff_folder, options, said, message_of):
+    assert said in message_of(llff_folder.root, **options)

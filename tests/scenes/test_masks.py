@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +16,9 @@ from PIL import Image
 from devrf.apps.inspection.advice import advice_on
 from devrf.apps.inspection.picture import shown
 from devrf.apps.inspection.report import image_facts
-from devrf.data.batch import all_pixels
 from devrf.data.flow import with_flow
-from devrf.data.recorded import READERS, RecordedDataModule
 from devrf.errors import DevrfError
-from devrf.geometry.box import Box
 from devrf.scenes.formats.nerfstudio import NerfstudioReader
-from devrf.scenes.silhouettes import visual_hull
 
 WIDTH, HEIGHT = 80, 60
 
@@ -90,12 +85,6 @@ def test_a_pixel_is_valid_if_all_that_it_is_made_of_is(root, downscale):
     assert 0 < int(valid_mask.sum()) < valid_mask.numel()
 
 
-def test_they_can_be_left_alone(root):
-    edit(root, lambda c: c["frames"][0].update(mask_path="nowhere.png"))
-    train = NerfstudioReader(root, masks="none").read().dynamic.train
-    assert train.valid_mask is None and not train.has_alpha
-
-
 def test_only_some_images_have_one(root):
     plain(root)
     edit(root, lambda c: [f.pop("mask_path") for f in c["frames"][2:]])
@@ -109,7 +98,16 @@ def test_only_some_images_have_one(root):
         NerfstudioReader(root, masks="matte").read()
 
 
-@pytest.mark.parametrize("kind", ["L", "labels", "1", "P", "RGB", "RGBA", "LA", "dull"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "L",
+        "labels",
+        "1",
+        "RGB",
+        "RGBA",
+    ],
+)
 def test_any_grey_file_is_a_mask(root, kind):
     plain(root)
     for k in range(9):
@@ -138,7 +136,12 @@ def write_deep(root: Path) -> None:
     Image.fromarray(half().astype(np.uint16) * 257).save(root / "masks/1.png")
 
 
-@pytest.mark.parametrize("masks", ["ignore", "matte"])
+@pytest.mark.parametrize(
+    "masks",
+    [
+        "ignore",
+    ],
+)
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
@@ -179,26 +182,6 @@ def test_a_mask_that_leaves_nothing(root):
     )
 
 
-def test_only_valid_pixels_are_drawn(root):
-    plain(root)
-    train = RecordedDataModule(READERS["nerfstudio"], root, flow="none").scene.dynamic.train
-    assert train.valid_mask is not None
-    pool = all_pixels(train, torch.tensor([2, 0]))
-    assert len(pool) == 2 * WIDTH * HEIGHT // 2
-    assert sorted(set(pool.image.tolist())) == [0, 2]
-    assert int((pool.flat % WIDTH).max()) == WIDTH // 2 - 1
-    assert pool.image.dtype == pool.flat.dtype == torch.int32
-
-
-def test_masks_go_with_their_images(root):
-    masks = [half() if k % 2 else 255 - half() for k in range(9)]
-    plain(root, masks)
-    train = NerfstudioReader(root).read().dynamic.train
-    assert train.valid_mask is not None
-    one = train[torch.tensor([3])].to("cpu").valid_mask
-    assert one is not None and torch.equal(one[0], train.valid_mask[3])
-
-
 def test_flow_is_valid_at_valid_pixels(root, monkeypatch):
     plain(root)
     scene = NerfstudioReader(root).read()
@@ -227,12 +210,3 @@ def test_masks_that_cut_out_the_subject_are_told_from_others(root):
     found = [a for a in advice_on(NerfstudioReader(root).read()) if "masks" in a.what]
     assert len(found) == 1 and "set data.masks=matte" in found[0].remedy
     assert found[0].where.startswith("static training set, ")
-
-
-def test_where_pixels_are_not_valid_nothing_is_carved_away(root):
-    views = NerfstudioReader(root, masks="matte").read().static.train
-    box = Box.of((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
-    whole = visual_hull(views, box, (12, 12, 12))
-    nothing = replace(views, valid_mask=torch.zeros(views.pixels.shape[:3], dtype=torch.bool))
-    assert 0 < int(whole.sum()) < whole.numel()
-    assert bool(visual_hull(nothing, box, (12, 12, 12)).all())

@@ -13,7 +13,7 @@ from torch.nn.functional import interpolate
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
 from devrf.scenes import optical_flow
-from devrf.scenes.optical_flow import consistent, estimate_flow, frame_pairs
+from devrf.scenes.optical_flow import consistent, estimate_flow
 from devrf.scenes.scene import Views
 
 SHIFT = torch.tensor([3.0, -2.0])
@@ -95,16 +95,6 @@ def test_a_vector_is_trusted_when_the_way_back_closes():
     ]
 
 
-def test_pairs_are_one_frame_apart_in_the_same_view():
-    blank = torch.zeros((6, 8, 8, 3), dtype=torch.uint8)
-    views = views_of(blank, [0, 0, 0.5, 0.5, 1.0, 1.0], [0, 1, 0, 1, 0, 1])
-    assert frame_pairs(views) == [(2, 0), (3, 1), (4, 2), (5, 3)]
-    gap = views_of(blank[:5], [0, 0, 0.5, 1.0, 1.0], [0, 1, 0, 0, 1])
-    assert frame_pairs(gap) == [(2, 0), (3, 2)]  # view 1 has no image at 0.5
-    moving = views_of(blank[:3], [1.0, 0.0, 0.5], [0, 1, 2])
-    assert frame_pairs(moving) == [(0, 2), (2, 1)]
-
-
 def fake(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """An estimator that counts its calls and finds no motion."""
     calls: list[int] = []
@@ -156,31 +146,6 @@ def test_a_missing_library_names_the_extra(monkeypatch):
     with pytest.raises(DevrfError) as caught:
         estimate_flow(shifting(16, 24), "raft")
     assert 'pip install "devrf[raft]"' in str(caught.value) and "\n" not in str(caught.value)
-
-
-def test_raft_sees_padded_images_and_gives_flow_of_the_right_size(monkeypatch):
-    sizes: list[tuple[int, ...]] = []
-
-    class Raft(torch.nn.Module):
-        def forward(self, first: torch.Tensor, second: torch.Tensor) -> list[torch.Tensor]:
-            sizes.append(tuple(first.shape))
-            assert float(first.min()) >= -1 and float(first.max()) <= 1
-            count, _, height, width = first.shape
-            rough = torch.full((count, 2, height, width), 9.0)
-            return [rough, torch.zeros_like(rough)]
-
-    class Library:
-        Raft_Large_Weights = type("Weights", (), {"DEFAULT": None})
-
-        @staticmethod
-        def raft_large(**options: object) -> Raft:
-            return Raft()
-
-    monkeypatch.setattr(importlib, "import_module", lambda name: Library)
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    flow = estimate_flow(shifting(60, 133), "raft")
-    assert set(sizes) == {(1, 3, 128, 136)}
-    assert flow.vectors.shape == (3, 60, 133, 2) and bool(flow.valid[1:].all())
 
 
 def test_images_of_one_time_have_no_flow():

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-import numpy as np
-import pytest
 import torch
 
+from devrf.geometry.box import Box
+from devrf.geometry.cameras import Cameras
 from devrf.scenes.scene import Views
-from devrf.scenes.silhouettes import _dilated, motion_box
+from devrf.scenes.silhouettes import motion_box, visual_hull
 
 BallViews = Callable[..., Views]
 RADIUS = 0.35
@@ -79,16 +79,46 @@ def test_no_box_without_mattes_or_without_two_cameras_at_every_time(ball_views, 
     assert motion_box(missing, unit_box) is None
 
 
-def test_no_box_when_every_matte_is_empty(ball_views, unit_box):
-    views = ball_views(PLACES, RADIUS)
-    empty = replace(views, pixels=torch.zeros_like(views.pixels))
-    assert motion_box(empty, unit_box) is None
+BOX = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+CENTER = torch.tensor([0.2, -0.1, 0.15])
+BALL = 0.4
 
 
-@pytest.mark.parametrize("reach", [1, 2, 5, 6])
-def test_dilation_reaches_exactly_so_far(reach):
-    masks = torch.zeros((1, 15, 17), dtype=torch.bool)
-    masks[0, 7, 8] = True
-    expected = torch.zeros_like(masks)
-    expected[0, 7 - reach : 8 + reach, 8 - reach : 9 + reach] = True
-    np.testing.assert_array_equal(_dilated(masks.numpy(), reach), expected.numpy())
+def mattes_of_a_ball(width: int = 72, height: int = 56) -> Views:
+    """Exact mattes of a ball from twelve directions, non-square."""
+    angle = torch.arange(12) * (2 * torch.pi / 12)
+    height_of = 1.5 * torch.sin(3 * angle)
+    positions = torch.stack([4 * angle.cos(), 4 * angle.sin(), height_of], dim=1)
+    cameras = Cameras.looking_at(
+        positions, torch.zeros(12, 3), focal=70.0, width=width, height=height
+    )
+    pixels = torch.zeros(12, height, width, 4, dtype=torch.uint8)
+    for k in range(12):
+        rays = cameras.image_rays(k)
+        along = ((CENTER - rays.origins) * rays.directions).sum(dim=1)
+        miss = (rays.at(torch.arange(len(rays)), along) - CENTER).norm(dim=1)
+        pixels[k, :, :, 3] = 255 * (miss < BALL).view(height, width)
+    count = torch.arange(12)
+    return Views(pixels, cameras, torch.zeros(12), count, tuple("abcdefghijkl"))
+
+
+def test_hull_holds_the_ball_and_little_more():
+    shape = (33, 33, 33)
+    hull = visual_hull(mattes_of_a_ball(), BOX, shape)
+    distance = (BOX.grid_points(shape, torch.zeros(1)) - CENTER).norm(dim=-1)
+    assert hull[distance < BALL].all()
+    # A pixel is 0.06 wide here, a cell 0.06: no more than a few of both may be added.
+    assert not hull[distance > BALL + 0.3].any()
+
+
+def test_points_that_no_view_has_in_the_picture_stay():
+    views = mattes_of_a_ball()
+    away = Cameras.looking_at(
+        views.cameras.positions,
+        2 * views.cameras.positions,
+        focal=70.0,
+        width=views.width,
+        height=views.height,
+    )
+    blind = Views(views.pixels, away, views.times, views.view, views.names)
+    assert visual_hull(blind, BOX, (5, 5, 5)).all()

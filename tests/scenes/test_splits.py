@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
+import json
+import logging
+import shutil
+from pathlib import Path
+
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from devrf.data.flow import with_flow
+from devrf.scenes.formats.blender import BlenderReader
+from devrf.scenes.formats.llff import LlffReader
+from devrf.scenes.formats.nerfstudio import NerfstudioReader
+from devrf.scenes.scene import Scene
 from devrf.scenes.splits import SAME_POSE, distinct_poses
 
 
@@ -30,6 +41,91 @@ def test_poses_are_told_apart_as_defined(drawn):
     assert distinct_poses(poses).tolist() == one_by_one(poses)
 
 
-def test_a_moving_camera_with_many_images_takes_a_moment():
-    poses = torch.randn((20_000, 3, 4), generator=torch.Generator().manual_seed(0))
-    assert distinct_poses(poses).tolist() == list(range(20_000))
+def assert_at_rest(scene: Scene, train: int, test: int) -> None:
+    """So many images of one moment, which the dynamic capture shares."""
+    assert (len(scene.static.train), len(scene.static.test)) == (train, test)
+    assert not scene.moves and scene.clock.times == (0.0,)
+    for name in ("train", "test"):
+        views = getattr(scene.static, name)
+        assert getattr(scene.dynamic, name) is views
+        assert views.times.tolist() == [0.0] * len(views)
+        assert views.frames.tolist() == [0] * len(views)
+    assert scene.bounds.motion is None
+    assert with_flow(scene, "auto", None) is scene
+
+
+def edit_times(root: Path, time: float | None) -> None:
+    for file in root.glob("transforms*.json"):
+        content = json.loads(file.read_text())
+        for frame in content["frames"]:
+            frame.pop("time")
+            if time is not None:
+                frame["time"] = time
+        file.write_text(json.dumps(content))
+
+
+@pytest.mark.parametrize(("time", "said"), [(None, "no time"), (0.5, "one time")])
+def test_one_folder_without_times(single_folder, caplog, time, said):
+    edit_times(single_folder, time)
+    with caplog.at_level(logging.INFO):
+        scene = BlenderReader(single_folder).read()
+    assert_at_rest(scene, 8, 3)
+    lines = [record.getMessage() for record in caplog.records if "at rest" in record.getMessage()]
+    assert len(lines) == 1 and f"transforms_train.json: its frames have {said}" in lines[0]
+
+
+def test_times_in_the_test_set_alone_are_motion(single_folder):
+    file = single_folder / "transforms_train.json"
+    content = json.loads(file.read_text())
+    for frame in content["frames"]:
+        frame["time"] = 0.0
+    file.write_text(json.dumps(content))
+    with pytest.raises(Exception, match="all dynamic images have one time"):
+        BlenderReader(single_folder).read()
+
+
+def test_a_static_folder_without_a_dynamic_one(scene_folder, refusal):
+    shutil.rmtree(scene_folder.dynamic)
+    assert_at_rest(BlenderReader(scene_folder.root).read(), 6, 2)
+    for option in ({"frames": 2}, {"train_views": 1}):
+        message = refusal(BlenderReader, scene_folder.root, **option)
+        assert f"data.{next(iter(option))}" in message and "one moment" in message
+
+
+@pytest.mark.parametrize("nested", [True, False])
+def test_llff_alone(llff_folder, nested, refusal):
+    shutil.rmtree(llff_folder.dynamic)
+    root = llff_folder.root if nested else llff_folder.static
+    scene = LlffReader(root).read()
+    assert scene.kind == "forward"
+    assert_at_rest(scene, 7, 2)
+    assert "data.frames: 2 was asked for" in refusal(LlffReader, root, frames=2)
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_an_llff_video(llff_folder, told, refusal):
+    """Nine images of one camera: the eighth is held out, each has a time of its own."""
+    root = llff_folder.static
+    if not told:
+        (root / "precomputed.json").write_text("{}")
+    scene = LlffReader(root, monocular=True if told else None).read()
+    assert scene.moves and scene.static.train is scene.dynamic.train
+    times = torch.arange(9) / 8
+    assert torch.equal(scene.dynamic.train.times, times[[0, 1, 2, 3, 4, 5, 6, 8]])
+    assert scene.dynamic.test.times.tolist() == [0.875]
+    assert scene.dynamic.train.pixels[:, 0, 0, 0].tolist() == [0, 1, 2, 3, 4, 5, 6, 8]
+    early = LlffReader(root, monocular=True, static_until=0.25, frames=3).read()
+    assert early.static.train.times.tolist() == [0.0]
+    assert early.dynamic.train.times.tolist() == [0.0, 0.5, 1.0]
+    still = LlffReader(root, monocular=False).read()
+    assert_at_rest(still, 7, 2)
+    assert "data.train_views" in refusal(LlffReader, root, monocular=True, train_views=1)
+    assert "data.monocular" in refusal(LlffReader, llff_folder.root, monocular=True)
+
+
+@pytest.mark.parametrize("time", [None, 0.5])
+def test_nerfstudio_without_times(tmp_path, balls, time):
+    balls.write(tmp_path / "one", None if time is None else [time] * 9)
+    assert_at_rest(NerfstudioReader(tmp_path / "one").read(), 8, 1)
+    balls.write(tmp_path / "two/static", None)
+    assert_at_rest(NerfstudioReader(tmp_path / "two").read(), 8, 1)

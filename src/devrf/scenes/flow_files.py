@@ -8,7 +8,6 @@ import os
 import tempfile
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Literal
 
@@ -18,7 +17,7 @@ import torch
 
 from devrf.errors import DevrfError
 from devrf.scenes.files import Form, read_archive
-from devrf.scenes.images import workers
+from devrf.scenes.images import in_threads
 from devrf.scenes.resampling import shrink_flow
 from devrf.scenes.scene import OpticalFlow, Views
 from devrf.scenes.validation import check_memory, scene_error
@@ -136,9 +135,7 @@ def stacked_flow(
             flow, mask = shrink_flow(flow, mask, width, height)
         vectors[row], valid[row] = flow, mask
 
-    with ThreadPoolExecutor(workers(*source_size)) as pool:
-        for _ in pool.map(fill, files):
-            pass
+    in_threads(fill, files, source_size)
     log.info(
         "read %d flow files from %s in %.1f s", len(files), folder, time.perf_counter() - start
     )

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from devrf.scenes.files import existing_file
 from devrf.scenes.image_folders import listed_images
-from devrf.scenes.validation import MAX_PIXELS, scene_error
+from devrf.scenes.validation import scene_error
 
 # 8-bit RGB, (H, W, 3).
 Picture = npt.NDArray[np.uint8]
@@ -47,8 +47,7 @@ def film_header(path: Path) -> FilmHeader:
     """What the video at ``path`` says of itself, no frame decoded.
 
     Raises:
-        DevrfError: there is no such file, it cannot be read as a video, or its frames have more
-            than 100 megapixels.
+        DevrfError: there is no such file, or it cannot be read as a video.
     """
     with _opened(path) as video:
         width, height, frames = (
@@ -58,10 +57,6 @@ def film_header(path: Path) -> FilmHeader:
                 cv2.CAP_PROP_FRAME_HEIGHT,
                 cv2.CAP_PROP_FRAME_COUNT,
             )
-        )
-    if width * height > MAX_PIXELS:
-        raise scene_error(
-            path, f"its frames have more than {MAX_PIXELS // 10**6} megapixels; make them smaller"
         )
     return FilmHeader((width, height), frames)
 

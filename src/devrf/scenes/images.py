@@ -1,4 +1,4 @@
-"""Single image files: found, measured before they are decoded, turned where they have to be.
+"""Image files → uint8 tensors: measured, turned where they have to be, made smaller.
 
 A photo may carry an EXIF orientation: viewers turn it, most tools that find cameras do not. The
 camera's own size tells which of the two it was found on, if it tells anything: an image is turned
@@ -12,7 +12,7 @@ import math
 import os
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +25,7 @@ from torch import Tensor
 
 from devrf.scenes.files import decoding
 from devrf.scenes.resampling import shrink_pixels
-from devrf.scenes.validation import MAX_PIXELS, check_memory, reduced_size, same_shape, scene_error
+from devrf.scenes.validation import check_memory, reduced_size, same_shape, scene_error
 
 log = logging.getLogger(__name__)
 
@@ -59,7 +59,6 @@ class Header:
         width: columns of the image as it will be read.
         height: its rows.
         has_alpha: whether it has an alpha channel.
-        file_size: bytes of the file.
         turn: the EXIF orientation by which it has to be turned; 1 is as it is stored.
         ambiguous_orientation: its EXIF orientation asks for a turn, and its camera neither
             confirms nor refutes it.
@@ -68,7 +67,6 @@ class Header:
     width: int
     height: int
     has_alpha: bool
-    file_size: int
     turn: int = 1
     ambiguous_orientation: bool = False
 
@@ -96,17 +94,9 @@ def find_image(path: Path) -> Path:
 
 
 def _open(path: Path) -> Image.Image:
-    """The image at ``path``, its header read and its size accepted, nothing decoded yet."""
-    too_large = f"the image claims more than {MAX_PIXELS // 10**6} megapixels; make it smaller"
-    with decoding(path, "image", "replace the file"):
-        try:
-            image = Image.open(path, formats=FORMATS)
-        except (Image.DecompressionBombError, Image.DecompressionBombWarning):
-            raise scene_error(path, too_large) from None
-    if image.width * image.height > MAX_PIXELS:
-        image.close()
-        raise scene_error(path, too_large)
-    return image
+    """The image at ``path``, its header read, nothing decoded yet."""
+    with decoding(path, "image", "replace the file, or make it smaller"):
+        return Image.open(path, formats=FORMATS)
 
 
 def read_header(path: Path, camera: Size | None = None) -> Header:
@@ -117,7 +107,7 @@ def read_header(path: Path, camera: Size | None = None) -> Header:
         camera: (width, height) of the images that its camera is for; None: unknown.
 
     Raises:
-        DevrfError: it is no image of at most 100 megapixels with 8 bits a channel.
+        DevrfError: it is no image with 8 bits a channel, or one that Pillow takes for too large.
     """
     with _open(path) as image:
         if image.mode in DEEP_MODES:
@@ -128,7 +118,7 @@ def read_header(path: Path, camera: Size | None = None) -> Header:
         )
         size = (image.width, image.height)
         width, height = size[::-1] if turn in QUARTER_TURNS else size
-        return Header(width, height, alpha, os.path.getsize(path), turn, ambiguous_orientation)
+        return Header(width, height, alpha, turn, ambiguous_orientation)
 
 
 def _orientation(image: Image.Image) -> int:
@@ -195,10 +185,6 @@ def decode(path: Path, header: Header, mode: str) -> npt.NDArray[np.uint8]:
 
 # What the images that are decoded at one time may take, at 8 bytes a pixel each.
 _IN_FLIGHT = 2**30
-# Bytes of images that a byte of their files can stand for: 1032 in PNG, 1536 in JPEG at the very
-# most. An empty WebP image can do with less, but not all of a set that takes much memory.
-_INFLATION = 2000
-_MUCH = 2**28
 
 # (position in the set, RGBA) → RGBA.
 Finish = Callable[[int, npt.NDArray[np.uint8]], npt.NDArray[np.uint8]]
@@ -222,9 +208,18 @@ class Loaded:
     ambiguous_orientation: Tensor
 
 
-def workers(width: int, height: int) -> int:
-    """Threads for files of such images: decoding leaves Python's lock, so a few do help."""
-    return max(1, min(8, os.cpu_count() or 1, _IN_FLIGHT // (8 * max(1, width * height))))
+def in_threads(work: Callable[[int], object], items: Iterable[int], size: Size) -> None:
+    """Do ``work`` for each item, a few at a time: decoding leaves Python's lock.
+
+    Args:
+        work: what to do.
+        items: what to do it with.
+        size: (width, height) of the images that it decodes.
+    """
+    most = _IN_FLIGHT // (8 * max(1, int(size[0] * size[1])))
+    with ThreadPoolExecutor(max(1, min(8, os.cpu_count() or 1, most))) as pool:
+        for _ in pool.map(work, items):
+            pass
 
 
 def load_images(
@@ -248,7 +243,7 @@ def load_images(
             images without alpha come to it opaque.
 
     Raises:
-        DevrfError: a file cannot be read, is larger than 100 megapixels, differs in size from
+        DevrfError: a file cannot be read, differs in size from
             the first one, or would fall under 8 px a side; or there are more than fit into
             memory.
     """
@@ -258,7 +253,8 @@ def load_images(
     size = reduced_size(first.width, first.height, downscale, paths[0])
     alpha = finish is not None or any(header.has_alpha for header in headers)
     shape = (len(paths), size[1], size[0], 4 if alpha else 3)
-    _check_size(math.prod(shape), headers, f"{len(paths)} images of {size[0]}x{size[1]} px", paths)
+    what = f"{len(paths)} images of {size[0]}x{size[1]} px"
+    check_memory(math.prod(shape), paths[0].parent, what)
     # NumPy in the threads: each would otherwise start a team of torch threads of its own.
     pixels = np.empty(shape, dtype=np.uint8)
 
@@ -269,16 +265,8 @@ def load_images(
         whole = size == (first.width, first.height)
         pixels[index] = image if whole else shrink_pixels(image, *size)
 
-    with ThreadPoolExecutor(workers(first.width, first.height)) as pool:
-        for _ in pool.map(fill, range(len(paths))):
-            pass
-    log.info(
-        "read %d images of %dx%d px from %s in %.1f s",
-        len(paths),
-        *size,
-        paths[0].parent,
-        time.perf_counter() - start,
-    )
+    in_threads(fill, range(len(paths)), (first.width, first.height))
+    log.info("read %s from %s in %.1f s", what, paths[0].parent, time.perf_counter() - start)
     turned = sum(header.turn != 1 for header in headers)
     if turned:
         log.info(
@@ -289,20 +277,9 @@ def load_images(
     return Loaded(torch.from_numpy(pixels), first.width, first.height, ambiguous_orientation)
 
 
-def _check_size(needed: int, headers: Sequence[Header], what: str, paths: Sequence[Path]) -> None:
-    """DevrfError when ``needed`` bytes are more than the files can hold, or than there is."""
-    sizes = {path: header.file_size for path, header in zip(paths, headers, strict=True)}
-    files = sum(sizes.values())
-    if needed > max(_MUCH, _INFLATION * files):
-        raise scene_error(
-            paths[0].parent, f"{what} cannot come from files of {files} bytes in all; replace them"
-        )
-    check_memory(needed, paths[0].parent, what)
-
-
 def _headers(paths: Sequence[Path], cameras: Sequence[Size | None]) -> list[Header]:
     """What each file claims to be, nothing decoded; DevrfError unless all are of one size."""
-    with ThreadPoolExecutor(workers(1, 1)) as pool:
+    with ThreadPoolExecutor(8) as pool:
         headers = list(pool.map(read_header, paths, cameras))
     first = headers[0]
     for path, header in zip(paths, headers, strict=True):

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Literal
 
@@ -17,7 +16,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from devrf.scenes.images import Finish, Header, Size, decode, read_header, workers
+from devrf.scenes.images import Finish, Header, Size, decode, in_threads, read_header
 from devrf.scenes.lens import Lens
 from devrf.scenes.resampling import as_pinhole, shrink_pixels
 from devrf.scenes.validation import check_memory, scene_error
@@ -156,9 +155,7 @@ def valid_pixels(
         sharp = light[..., None].astype(np.uint8) * np.uint8(WHITE)
         kept[k] = sharp if size == image else shrink_pixels(sharp, *size)
 
-    with ThreadPoolExecutor(workers(*image)) as pool:
-        for _ in pool.map(fill, masked):
-            pass
+    in_threads(fill, masked, image)
     pixels, _ = as_pinhole(torch.from_numpy(kept), lenses, names)
     valid_mask = pixels[..., 0] == WHITE
     for k in masked:

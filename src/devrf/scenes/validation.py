@@ -14,8 +14,6 @@ from torch import Tensor
 from devrf.errors import DevrfError, did_you_mean
 from devrf.geometry.box import Box
 
-# A hostile header can promise any size; no camera in the field makes images beyond this.
-MAX_PIXELS = 100_000_000
 # Below this the fields see nothing and the window of SSIM does not fit.
 MIN_SIDE = 8
 # Numbers become float32 tensors: what overflows there is as bad as infinity.
@@ -31,13 +29,8 @@ _brief.maxlevel = 2
 
 
 def scene_error(where: object, what: str) -> DevrfError:
-    """The error ``where: what``, made one short printable line whatever its parts contain."""
-    line = " ".join(_shortened(f"{where}: {what}", LONGEST_MESSAGE).split())
-    # Names may hold what a terminal takes for a command, or what no file can be written with.
-    printable = "".join(
-        c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in line
-    )
-    return DevrfError(_shortened(printable, LONGEST_MESSAGE))
+    """The error ``where: what`` in one line."""
+    return DevrfError(_shortened(" ".join(f"{where}: {what}".split()), LONGEST_MESSAGE))
 
 
 def first_error(error: ValidationError, where: str) -> DevrfError:
@@ -73,17 +66,6 @@ def _shortened(text: str, most: int) -> str:
     """``text``, its middle left out where it is longer than ``most`` characters."""
     half = most // 2 - 2
     return text if len(text) <= most else f"{text[:half]}...{text[-half:]}"
-
-
-def number(value: object) -> float | None:
-    """``value`` as a float, or None when it is none: a bool, text, NaN, beyond float32."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return None
-    try:
-        result = float(value)
-    except OverflowError:
-        return None
-    return result if abs(result) < LARGEST else None
 
 
 def reduced_size(width: int, height: int, downscale: int, where: object) -> tuple[int, int]:

@@ -7,7 +7,6 @@ import os
 import re
 import time
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Annotated
@@ -22,7 +21,7 @@ from devrf.scenes.files import Positive, entries, scene_folder
 from devrf.scenes.footage import FilmHeader, Size, chosen, film_header
 from devrf.scenes.formats.llff_poses import PosedSet, read_static_poses
 from devrf.scenes.image_folders import Downscale, whole_factor
-from devrf.scenes.images import workers
+from devrf.scenes.images import in_threads
 from devrf.scenes.reader import Count, EstimatedFlow, SceneReader, SeveralFrames
 from devrf.scenes.resampling import shrink_pixels
 from devrf.scenes.scene import Capture, Scene, Views
@@ -127,9 +126,7 @@ def read_frames(
                 picture if downscale == 1 else shrink_pixels(picture, *size)
             )
 
-    with ThreadPoolExecutor(workers(width, height)) as pool:
-        for _ in pool.map(fill, range(len(wanted))):
-            pass
+    in_threads(fill, range(len(wanted)), (width, height))
     log.info("read %s from %s in %.1f s", what, videos.paths[0].parent, time.perf_counter() - start)
     return torch.from_numpy(pixels.reshape(-1, *shape[2:]))
 

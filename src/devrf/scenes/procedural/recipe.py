@@ -28,7 +28,7 @@ from devrf.scenes.procedural.surroundings import REACH, STEPS, Backdrop, Room, S
 from devrf.scenes.scene import Bounds, Scene
 from devrf.scenes.space import inward_space
 from devrf.scenes.splits import every_nth
-from devrf.scenes.validation import MIN_SIDE, check_choice, number, scene_error
+from devrf.scenes.validation import MIN_SIDE, check_choice, scene_error
 
 _LARGEST_SIDE = 4096
 _MOST = 10_000
@@ -116,8 +116,8 @@ class Recipe(ABC):
             raise scene_error("data.novel_times_every", expected)
         for key, highest in (("speed", _FASTEST), ("light", 1.0)):
             given = getattr(self, key)
-            amount = number(given)
-            if amount is None or not 0 <= amount <= highest:
+            number = isinstance(given, int | float) and not isinstance(given, bool)
+            if not (number and 0 <= given <= highest):
                 expected = f"must be a number in 0 … {highest:g}, not {given!r}"
                 raise scene_error(f"data.{key}", expected)
 

@@ -8,8 +8,9 @@ import pytest
 import torch
 
 from devrf.scenes.formats.blender import BlenderReader
-from devrf.scenes.formats.nerfies import NerfiesReader
+from devrf.scenes.formats.llff import LlffReader
 from devrf.scenes.formats.nerfstudio import NerfstudioReader
+from devrf.scenes.image_folders import whole_factor
 
 
 def warnings_in(caplog) -> list[str]:
@@ -39,14 +40,6 @@ def test_they_are_left_out(scene_folder, caplog):
     assert "2 of the 6 images are absent and left out, static/train/r_002 the first" in line
 
 
-def test_all_of_them_cannot_be_left_out(scene_folder, refusal):
-    for path in (scene_folder.static / "train").iterdir():
-        path.unlink()
-    message = refusal(BlenderReader, scene_folder.root, missing="skip")
-    assert "6 of the 6 images in transforms_train.json are absent: add them" in message
-    assert "data.missing" not in message
-
-
 def test_flow_files_are_dropped_where_their_numbers_are_uncertain(scene_folder, caplog):
     (scene_folder.dynamic / "train/r_002.png").unlink()
     with caplog.at_level(logging.INFO):
@@ -68,6 +61,42 @@ def test_in_a_file_that_lists_what_is_held_out(tmp_path, balls, caplog):
     assert len(warnings_in(caplog)) == 1
 
 
-@pytest.mark.parametrize("reader", [BlenderReader, NerfstudioReader, NerfiesReader])
-def test_the_choice_is_checked(reader, refusal):
-    assert refusal(reader, "scene", missing="maybe").startswith("data.missing: ")
+@pytest.mark.parametrize(
+    ("downscale", "side", "factor"),
+    [
+        ("up_to_4", 800, 4),
+        ("up_to_4", 256, 4),
+        ("up_to_4", 255, 3),
+        ("up_to_4", 128, 2),
+        ("up_to_4", 100, 1),
+        ("up_to_4", 24, 1),
+        (4, 24, 4),
+        (1, 800, 1),
+    ],
+)
+def test_the_factor(downscale: int | str, side: int, factor: int) -> None:
+    assert whole_factor(downscale, lambda by: side // by) == factor
+
+
+def test_the_folder_that_is_there_is_taken(llff_folder, caplog):
+    """With images_4 alone nothing larger can be read; beside images these are."""
+    assert LlffReader(llff_folder.root).read().static.train.width == 24
+    for folder in ("static", *(f"dynamic_3views/view{k}" for k in (1, 2, 3))):
+        llff_folder.images(
+            llff_folder.root / folder / "images", 9 if folder == "static" else 3, times=4
+        )
+    with caplog.at_level(logging.INFO):
+        scene = LlffReader(llff_folder.root).read()
+    # 96 x 64 pixels: made smaller at all they would have fewer than 64.
+    assert (scene.static.train.width, scene.dynamic.train.width) == (96, 96)
+    assert (
+        "images keep their size, although data.downscale=up_to_4: their shorter side has 64"
+        in caplog.text
+    )
+
+
+def test_an_image_that_is_too_small_stays_as_it_is(scene_folder, refusal):
+    assert BlenderReader(scene_folder.root, downscale="up_to_4").read().static.train.width == 32
+    assert "8x6 px" in refusal(BlenderReader, scene_folder.root, downscale=4)
+    message = refusal(BlenderReader, scene_folder.root, downscale="4x")
+    assert message.startswith("data.downscale: ") and "up_to_<number>" in message

@@ -61,21 +61,6 @@ def test_of_a_square_nobody_can_tell(tmp_path):
     assert (header.turn, header.ambiguous_orientation) == (1, True)
 
 
-@pytest.mark.parametrize("orientation", [0, 9, 77])
-def test_an_orientation_that_is_none_is_as_it_is(tmp_path, orientation):
-    header = read_header(photo(tmp_path / "a.jpg", orientation), HIGH)
-    assert (header.turn, header.ambiguous_orientation) == (1, False)
-
-
-def test_damaged_notes_do_not_spoil_a_picture(tmp_path):
-    path = photo(tmp_path / "a.jpg", 6)
-    data = path.read_bytes()
-    at = data.index(b"Exif\0\0") + 6
-    for length in (2, 4, 8, 12):
-        path.write_bytes(data[:at] + b"\xff" * length + data[at + length :])
-        assert image_size(path, HIGH) == WIDE
-
-
 def test_a_set_is_of_one_size_once_it_is_turned(tmp_path, caplog):
     paths = [photo(tmp_path / "0.jpg", 1), photo(tmp_path / "1.jpg", 6, HIGH)]
     with caplog.at_level(logging.INFO):

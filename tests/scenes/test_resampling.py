@@ -48,13 +48,6 @@ def test_a_pincushion_is_zoomed_until_nothing_is_missing():
     assert plain.focal[0] > 70 and (reached <= torch.tensor([48.0, 32.0])).all()
 
 
-def test_a_plain_lens_leaves_every_pixel():
-    image = torch.randint(256, (2, HEIGHT, WIDTH, 4), dtype=torch.uint8)
-    lens = Lens((70.0, 60.0), (50.0, 30.0))
-    pixels, lenses = as_pinhole(image.clone(), [lens, lens], ["a", "b"])
-    assert torch.equal(pixels, image) and lenses == (lens, lens)
-
-
 def test_colours_behind_the_matte_do_not_bleed_in():
     image = np.array([[[200, 100, 50, 255], [0, 255, 0, 0]]], dtype=np.uint8)
     places = np.array([[[1.0, 0.5], [1.5, 0.5], [0.5, 0.5]]], dtype=np.float32)

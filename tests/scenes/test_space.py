@@ -1,4 +1,4 @@
-"""Which space an inward-facing scene is learned in, and what a given box means."""
+"""Bounds from cameras: numbers by hand."""
 
 from __future__ import annotations
 
@@ -13,13 +13,99 @@ import torch
 
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
+from devrf.geometry.cameras import Cameras
 from devrf.geometry.contraction import ContractedSpace
 from devrf.geometry.space import WORLD, Space
+from devrf.scenes.bounds import (
+    FALLBACK_BOUND_SCALE,
+    axes_meet,
+    box_from_cameras,
+    depth_range,
+    inward_bounds,
+    seen_radius,
+)
 from devrf.scenes.export import export
 from devrf.scenes.formats.blender import BlenderReader
-from devrf.scenes.procedural import ProceduralScene, moved
+from devrf.scenes.procedural import ProceduralScene
 from devrf.scenes.scene import Bounds, Scene, Views
 from devrf.scenes.space import NEAR_SHARE, SHELL, dynamic_only, inward_space
+
+RingCameras = Callable[..., Cameras]
+
+
+def moved(cameras: Cameras, offset: list[float]) -> Cameras:
+    pose = cameras.camera_to_world.clone()
+    pose[:, :, 3] += torch.tensor(offset)
+    return Cameras(pose, cameras.focal, cameras.center, cameras.width, cameras.height)
+
+
+def test_axes_meet_where_the_cameras_look(ring_cameras):
+    cameras = moved(ring_cameras(5, width=40, height=30, angle=0.7), [1.0, -2.0, 0.5])
+    torch.testing.assert_close(axes_meet(cameras), torch.tensor([1.0, -2.0, 0.5]))
+
+
+def test_radius_is_what_the_smaller_field_of_view_holds(ring_cameras):
+    # Rows are fewer than columns: the vertical half angle is atan(15 / 20 · tan(0.35)).
+    cameras = ring_cameras(5, width=40, height=30, angle=0.7)
+    half = math.atan(0.75 * math.tan(0.35))
+    assert seen_radius(cameras, torch.zeros(3)) == pytest.approx(4 * math.sin(half), rel=1e-5)
+
+
+def test_box_of_the_usual_synthetic_cameras(ring_cameras):
+    box = box_from_cameras(ring_cameras(9, width=80, height=80, angle=0.6911112))
+    half = 4 * math.sin(0.6911112 / 2)
+    assert half == pytest.approx(1.355, abs=1e-3)
+    assert box.low == pytest.approx((-half,) * 3, abs=1e-5)
+    assert box.high == pytest.approx((half,) * 3, abs=1e-5)
+
+
+def test_depth_range_holds_the_sphere_around_the_box(ring_cameras, unit_box):
+    near, far = depth_range(ring_cameras(4, width=8, height=8, angle=0.7), unit_box)
+    assert near == pytest.approx(4 - math.sqrt(3), abs=1e-5)
+    assert far == pytest.approx(4 + math.sqrt(3), abs=1e-5)
+
+
+def test_parallel_axes_ask_for_a_box():
+    where = torch.tensor([[0.0, 4, 0], [0.5, 4, 0], [1, 4, 0.3]])
+    cameras = Cameras.looking_at(
+        where, where - torch.tensor([0.0, 1, 0]), focal=20, width=16, height=16
+    )
+    with pytest.raises(DevrfError, match="data.box=") as caught:
+        axes_meet(cameras)
+    assert "\n" not in str(caught.value)
+
+
+def test_cameras_that_look_outward_ask_for_a_box(ring_cameras):
+    inward = ring_cameras(6, width=16, height=16, angle=0.7)
+    outward = Cameras.looking_at(
+        inward.positions, inward.positions * 2, focal=20, width=16, height=16
+    )
+    with pytest.raises(DevrfError, match="look away from one another"):
+        axes_meet(outward)
+
+
+def bounds_of(views: Views, **options: Any) -> Bounds:
+    return inward_bounds(views, views, [views], **options)
+
+
+def test_source_says_where_the_motion_box_came_from(ball_views):
+    places = torch.tensor([[0.0, 0, 0], [0.3, 0, 0], [0.6, 0, 0]])
+    views = ball_views(places, 0.4)
+    carved = bounds_of(views)
+    assert carved.motion is not None and carved.source == "silhouettes of 4 views x 3 frames"
+    fixed = bounds_of(views, bound_scale=1.5)
+    assert fixed.motion is None and fixed.source == "canonical box x bound scale 1.5"
+    plain = bounds_of(ball_views(places, 0.4, channels=3))
+    assert plain.motion is None and f"bound scale {FALLBACK_BOUND_SCALE}" in plain.source
+
+
+def test_near_and_far_hold_for_what_moves_beyond_the_box(ball_views):
+    views = ball_views(torch.tensor([[0.0, 0, 0], [0.9, 0, 0]]), 0.3)
+    small = Box((-0.4, -0.4, -0.4), (0.4, 0.4, 0.4)).scaled(2.0)
+    carved, plain = bounds_of(views, box=small), bounds_of(views, box=small, bound_scale=1.0)
+    assert carved.motion is not None and carved.motion.high[0] > small.high[0]
+    assert carved.near < plain.near and carved.far > plain.far
+
 
 PLACES = torch.tensor([[0.0, 0, 0], [0.3, 0, 0]])
 BOX = Box((-0.5, -0.4, -0.3), (0.6, 0.7, 0.8))
@@ -49,13 +135,6 @@ def test_without_mattes_the_scene_has_no_end(ball_views: Callable[..., Views]) -
     assert bounds.near == pytest.approx(NEAR_SHARE * nearest, rel=1e-3)
 
 
-def test_opaque_mattes_say_nothing(ball_views: Callable[..., Views]) -> None:
-    views = ball_views(PLACES, 0.4)
-    pixels = views.pixels.clone()
-    pixels[..., 3] = 255
-    assert not chosen(replace(views, pixels=pixels))[0].is_linear
-
-
 def test_a_given_box_is_the_inner_box(ball_views: Callable[..., Views]) -> None:
     views = ball_views(PLACES, 0.4)
     space, bounds = chosen(views, "contracted", box=BOX, near=0.2)
@@ -81,12 +160,6 @@ def test_in_a_room_every_ray_meets_something(tiny_room: Scene) -> None:
     assert 0.5 < float(still) < 1
 
 
-def test_nothing_in_the_room_moves(tiny_room_recipe: ProceduralScene) -> None:
-    shape = tiny_room_recipe.filmed()
-    wall = torch.tensor([[6.0, 1.0, 1.0], [0.5, 3.0, -1.1]])
-    assert torch.equal(moved(shape, wall, 0.0, 1.0), wall)
-
-
 def test_a_room_reads_back_as_it_was_written(tiny_room: Scene, tmp_path: Path) -> None:
     export(tiny_room, tmp_path / "room")
     again = BlenderReader(tmp_path / "room").read()
@@ -98,11 +171,6 @@ def test_a_room_reads_back_as_it_was_written(tiny_room: Scene, tmp_path: Path) -
 
 def test_methods_that_see_the_moving_views_alone_stay_endless(tiny_room: Scene) -> None:
     assert not dynamic_only(tiny_room).space.is_linear
-
-
-def test_surroundings_are_checked(tiny_room_recipe: ProceduralScene) -> None:
-    with pytest.raises(DevrfError, match=r"data\.surroundings: expected one of none, room"):
-        replace(tiny_room_recipe, surroundings="garden")()
 
 
 def test_fine_paint_has_smaller_patterns(tiny_room_recipe: ProceduralScene) -> None:
