@@ -88,7 +88,7 @@ def test_masked_pixels_decide_nothing(devrf, short, recorded, tiny_scene, tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("more", "words"), [((), "leave out 15 %"), (("data.masks=matte",), "cover 85 %")]
+    ("more", "words"), [((), "leave out 15 %"), (("data.masks=alpha",), "cover 85 %")]
 )
 def test_inspect_says_what_masks_leave_out(devrf, recorded, more, words):
     outcome = devrf("stage=inspect", *LAYOUT, f"data.root={recorded('a', 0)}", *more)

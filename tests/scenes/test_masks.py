@@ -66,7 +66,7 @@ def plain(root: Path, masks: list[np.ndarray] | None = None) -> None:
 
 @pytest.mark.parametrize("downscale", [1, 2, 3])
 def test_mattes_are_those_of_images_that_were_cut_out(root, downscale):
-    ours = NerfstudioReader(root, downscale=downscale, masks="matte").read().dynamic.train
+    ours = NerfstudioReader(root, downscale=downscale, masks="alpha").read().dynamic.train
     edit(root, lambda c: [f.update(file_path=f"cut_{f['file_path']}") for f in c["frames"]])
     theirs = NerfstudioReader(root, downscale=downscale, masks="none").read().dynamic.train
     assert ours.valid_mask is None and torch.equal(ours.pixels, theirs.pixels)
@@ -80,7 +80,7 @@ def test_a_pixel_is_valid_if_all_that_it_is_made_of_is(root, downscale):
         paint(root, k, sharp)
     valid_mask = NerfstudioReader(root, downscale=downscale).read().dynamic.train.valid_mask
     # Downscaling and undistortion blur the matte as they blur the picture.
-    mattes = NerfstudioReader(root, downscale=downscale, masks="matte").read().dynamic.train
+    mattes = NerfstudioReader(root, downscale=downscale, masks="alpha").read().dynamic.train
     assert valid_mask is not None and torch.equal(valid_mask, mattes.pixels[..., 3] == 255)
     assert 0 < int(valid_mask.sum()) < valid_mask.numel()
 
@@ -95,7 +95,7 @@ def test_only_some_images_have_one(root):
     )
     assert bool(valid_mask[2:].all())
     with pytest.raises(DevrfError, match="2.png: has no mask_path although others have"):
-        NerfstudioReader(root, masks="matte").read()
+        NerfstudioReader(root, masks="alpha").read()
 
 
 @pytest.mark.parametrize(
@@ -126,7 +126,7 @@ def test_a_mask_may_be_of_the_size_of_the_camera(root):
     for k in range(9):
         with Image.open(root / f"{k}.png") as image:
             image.resize((WIDTH // 2, HEIGHT // 2)).save(root / f"{k}.png")
-    for masks in ("ignore", "matte"):
+    for masks in ("ignore", "alpha"):
         train = NerfstudioReader(root, masks=masks).read().dynamic.train  # type: ignore[arg-type]
         kept = train.pixels[..., 3] == 255 if train.valid_mask is None else train.valid_mask
         assert torch.equal(kept[0, 0], torch.arange(WIDTH // 2) < WIDTH // 4)
@@ -178,7 +178,7 @@ def test_a_mask_that_leaves_nothing(root):
         NerfstudioReader(root).read()
     # Nothing may be there to be cut out.
     assert not bool(
-        NerfstudioReader(root, masks="matte").read().dynamic.train.pixels[4, ..., 3].any()
+        NerfstudioReader(root, masks="alpha").read().dynamic.train.pixels[4, ..., 3].any()
     )
 
 
@@ -202,11 +202,11 @@ def test_inspecting_says_how_much_they_cover(root, caplog):
     assert not [advice for advice in advice_on(scene) if "masks" in advice.what]
     image, pixels = shown(scene.dynamic.train, 0), scene.dynamic.train.pixels[0].numpy()
     assert (image[:, :40] == pixels[:, :40]).all() and (image[:, 40:] >= 232).all()
-    matte = NerfstudioReader(root, masks="matte").read()
+    matte = NerfstudioReader(root, masks="alpha").read()
     assert image_facts(matte)[0][4:6] == ("cover 50 %", "no")
 
 
 def test_masks_that_cut_out_the_subject_are_told_from_others(root):
     found = [a for a in advice_on(NerfstudioReader(root).read()) if "masks" in a.what]
-    assert len(found) == 1 and "set data.masks=matte" in found[0].remedy
+    assert len(found) == 1 and "set data.masks=alpha" in found[0].remedy
     assert found[0].where.startswith("static training set, ")

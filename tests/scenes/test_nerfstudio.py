@@ -185,7 +185,7 @@ def test_wrong_values(moving, change, said, message_of, balls):
 @pytest.mark.parametrize(
     ("option", "said"),
     [
-        ({"masks": "yes"}, "data.masks: should be 'ignore', 'matte' or 'none'"),
+        ({"masks": "yes"}, "data.masks: should be 'ignore', 'alpha' or 'none'"),
         ({"train_views": 2}, "these move"),
     ],
 )

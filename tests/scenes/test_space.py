@@ -117,7 +117,7 @@ def chosen(views: Views, choice: Any = "auto", **options: Any) -> tuple[Space, B
 
 def test_mattes_and_a_given_box_mean_the_world(ball_views: Callable[..., Views]) -> None:
     space, bounds = chosen(ball_views(PLACES, 0.4))
-    assert space == WORLD and bounds.reason == "the images have mattes" and not bounds.limited
+    assert space == WORLD and bounds.reason == "the images have alpha masks" and not bounds.limited
     space, bounds = chosen(ball_views(PLACES, 0.4, channels=3), box=BOX)
     assert space == WORLD and bounds.reason == "data.box is given"
     assert bounds.box == BOX and bounds.limited and "data.box" in bounds.source
@@ -127,7 +127,7 @@ def test_without_mattes_the_scene_has_no_end(ball_views: Callable[..., Views]) -
     views = ball_views(PLACES, 0.4, channels=3)
     space, bounds = chosen(views)
     assert isinstance(space, ContractedSpace) and space.shell == SHELL
-    assert bounds.reason == "the images have no mattes, data.box is not given"
+    assert bounds.reason == "the images have no alpha masks, data.box is not given"
     assert bounds.box == space.box and bounds.far == math.inf
     # The inner box is what all cameras see: in their pictures as a whole.
     assert space.inner(bounds.box).longest < 0.75 * bounds.box.longest

@@ -130,8 +130,8 @@ class RayBatch:
     Attributes:
         rays: R rays in the fields' space.
         color: (R, 3) RGB in [0, 1], composited on ``background``.
-        alpha: (R,) matte in [0, 1], or None for images without one.
-        background: (3,) or (R, 3) RGB behind the matte.
+        alpha: (R,) alpha in [0, 1], or None for images without one.
+        background: (3,) or (R, 3) RGB behind the alpha mask.
         time: (R,) the time of each ray in [0, 1].
         frame: (R,) int64, the frame of the scene's clock that is nearest to that time.
         image: (R,) int64, the image of each ray among the views it was drawn from; those of
@@ -175,7 +175,7 @@ def background_color(name: str, rays: int, generator: torch.Generator) -> Tensor
 def concatenated(batches: Sequence[RayBatch]) -> RayBatch:
     """Batches of images without optical flow as one, one after another.
 
-    Images that have no matte count as opaque beside images that have one.
+    Images that have no alpha mask count as opaque beside images that have one.
     """
     alphas = [one.alpha for one in batches]
     alpha = None

@@ -16,7 +16,7 @@ IMAGES, STEPS = 64, 4
 CHANGING = 0.07
 # Colours are smoothed before they are compared: what is finer than the pixels flickers as it moves.
 SIGMA, TAPS = 1.5, 9
-# Pixels nearer than this to the matte's edge, or to an occlusion, are left out.
+# Pixels nearer than this to the alpha mask's edge, or to an occlusion, are left out.
 MARGIN = 4
 
 
@@ -26,7 +26,7 @@ def color_change(views: Views) -> float | None:
 
     C' is the image of the same view ``STEPS`` frames earlier (fewer, where the recording is
     shorter), and the flow is followed back through the images between; both are smoothed. Without
-    mattes only pixels that move by more than half a pixel count: a backdrop says nothing.
+    alpha masks only pixels that move by more than half a pixel count: a backdrop says nothing.
 
     Args:
         views: the dynamic training views.
@@ -102,7 +102,7 @@ def _change(views: Views, chain: list[int]) -> float | None:
 
 
 def _inside(views: Views, image: int) -> Tensor:
-    """(H, W) bool: pixels that are valid and well within the matte, where there is one."""
+    """(H, W) bool: pixels that are valid and well within the alpha mask, where there is one."""
     outside = torch.zeros(views.height, views.width, dtype=torch.bool)
     if views.has_alpha:
         outside |= views.pixels[image, ..., 3] < 253
@@ -113,7 +113,7 @@ def _inside(views: Views, image: int) -> Tensor:
 
 
 def _smooth(views: Views, image: int) -> Tensor:
-    """(3, H, W) the colours of an image in [0, 1], smoothed within the matte."""
+    """(3, H, W) the colours of an image in [0, 1], smoothed within the alpha mask."""
     color = views.pixels[image, ..., :3].permute(2, 0, 1).float() / 255
     weight = torch.ones_like(color[:1])
     if views.has_alpha:

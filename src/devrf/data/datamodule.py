@@ -58,8 +58,8 @@ class SceneDataModule(LightningDataModule, ABC):
         _ = self.scene
 
     def train_dataloader(self) -> DataLoader[Any]:
-        """An endless loader of the same batch: the training views of the stage's capture."""
-        return DataLoader(_Endless(), batch_size=None)
+        """A loader that never ends of the same batch: the training views of the stage's capture."""
+        return DataLoader(_SameBatch(), batch_size=None)
 
     def test_dataloader(self) -> DataLoader[Any]:
         """A loader of the positions of the held-out images, one at a time."""
@@ -96,7 +96,7 @@ class SceneDataModule(LightningDataModule, ABC):
         return ("static", "dynamic") if capture == "both" else (capture,)  # type: ignore[return-value]
 
 
-class _Endless(IterableDataset[None]):
+class _SameBatch(IterableDataset[None]):
     def __iter__(self) -> Iterator[None]:
         while True:
             yield None

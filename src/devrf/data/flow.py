@@ -30,9 +30,6 @@ def with_flow(scene: Scene, source: FlowSource, cache: Path | None) -> Scene:
             estimates with DIS unless the cameras jump from frame to frame, no view has two frames
             in a row, or the scene is at rest; the others change nothing.
         cache: an ``.npz`` that keeps the estimate, or None.
-
-    Raises:
-        DevrfError: what :func:`devrf.scenes.optical_flow.estimate_flow` raises.
     """
     train = scene.dynamic.train
     method = source
@@ -66,9 +63,6 @@ def with_forward_flow(
         source: as of :func:`with_flow`.
         cache: an ``.npz`` beside which the estimate is kept, or None.
         files: what was read from files, if any.
-
-    Raises:
-        DevrfError: what :func:`devrf.scenes.optical_flow.estimate_flow` raises.
     """
     train, flow = scene.dynamic.train, files
     possible = bool(frame_pairs(train)) and camera_turn(train) <= JUMP_DEGREES

@@ -1,4 +1,4 @@
-"""Where a scene is, found from the cameras that look at it (world units)."""
+"""Where a scene is, found from its cameras: inward-facing (world units), forward-facing (NDC)."""
 
 from __future__ import annotations
 
@@ -27,24 +27,39 @@ NEAR_SHARE = 0.02
 LEAST_EDGE = 1e-4
 
 
-def axes_meet(cameras: Cameras) -> Tensor:
-    """The point (3,) nearest to all optical axes, by least squares.
+def nearest_point(origins: Tensor, axes: Tensor, parallel: float) -> Tensor | None:
+    """The point (3,) nearest to N axes (N, 3) through ``origins`` (N, 3), by least squares.
 
     Solves Σ (I − d dᵀ) p = Σ (I − d dᵀ) o for axes through o along d.
+
+    Args:
+        origins: a point of each axis.
+        axes: unit directions.
+        parallel: the mean square sine of the angle between the axes and their common direction
+            from which on there is such a point; with less, None.
+    """
+    across = torch.eye(3, dtype=axes.dtype) - axes[:, :, None] * axes[:, None, :]
+    normal = across.mean(dim=0)
+    if float(torch.linalg.eigvalsh(normal)[0]) < parallel:
+        return None
+    point: Tensor = torch.linalg.solve(normal, (across @ origins[:, :, None])[..., 0].mean(dim=0))
+    return point
+
+
+def axes_meet(cameras: Cameras) -> Tensor:
+    """The point (3,) nearest to all optical axes, by least squares.
 
     Raises:
         DevrfError: the axes are nearly parallel, or meet behind the cameras.
     """
     origin, axis = cameras.positions.double(), cameras.forwards.double()
-    across = torch.eye(3, dtype=torch.float64) - axis[:, :, None] * axis[:, None, :]
-    normal = across.mean(dim=0)
-    if float(torch.linalg.eigvalsh(normal)[0]) < NEARLY_PARALLEL:
+    point = nearest_point(origin, axis, NEARLY_PARALLEL)
+    if point is None:
         raise scene_error(
             "data.box",
             "the static cameras look in nearly one direction, so their axes do not "
             "say where the scene is; set data.box=[[x,y,z],[x,y,z]], data.near and data.far",
         )
-    point: Tensor = torch.linalg.solve(normal, (across @ origin[:, :, None])[..., 0].mean(dim=0))
     if float(((point - origin) * axis).sum(dim=1).median()) <= 0:
         raise scene_error(
             "data.box",
@@ -77,11 +92,7 @@ def seen_radius(cameras: Cameras, center: Tensor) -> float:
 
 
 def box_from_cameras(cameras: Cameras) -> Box:
-    """The cube around the point all cameras look at whose half edge is what they see of it.
-
-    Raises:
-        DevrfError: what :func:`axes_meet` raises.
-    """
+    """The cube around the point all cameras look at whose half edge is what they see of it."""
     center = axes_meet(cameras)
     radius = seen_radius(cameras, center)
     return resolved_box(center - radius, center + radius)

@@ -1,4 +1,4 @@
-"""Writing a scene to disk: a folder that is whole or absent, and the order of its images."""
+"""A scene written to disk in the published layout of its kind: Blender's, or LLFF's."""
 
 from __future__ import annotations
 
@@ -64,8 +64,8 @@ _VALIDATION_VIEWS = 4
 def export_blender(scene: Scene, folder: Path) -> None:
     """Write ``scene`` as ``folder/static`` and ``folder/dynamic_<V>views``.
 
-    Each holds ``transforms_{train,val,test}.json`` and images, RGBA where they have mattes; dynamic
-    images are ordered time-major, and their flow, where there is one, goes to
+    Each holds ``transforms_{train,val,test}.json`` and images, RGBA where they have
+    alpha masks; dynamic images are ordered time-major, and their flow, where there is one, goes to
     ``train_flow/<index>_bwd.npz``. Poses, times and images read back exactly.
 
     Args:

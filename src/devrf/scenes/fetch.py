@@ -111,20 +111,9 @@ class PublishedScene:
         return not self.collection.files
 
     @property
-    def folder(self) -> str | None:
-        """Name of its folder in the archive; None: the only one that holds a scene."""
-        name = self.collection.folder
-        return None if name is None else name.format(scene=self.name)
-
-    @property
     def marker(self) -> str:
         """The file by which its folder is known."""
         return MARKERS[self.collection.data]
-
-    @property
-    def sha256(self) -> str | None:
-        """Its checksum, where it is known."""
-        return self.collection.sha256.get(self.name)
 
 
 def catalogue(file: str | Path | None = None) -> list[PublishedScene]:
@@ -213,7 +202,7 @@ def fetch_scene(scene: PublishedScene, into: Path, sha256: str | None, progress:
         DevrfError: it cannot be fetched, or is not what was expected.
         OSError: the disk refuses.
     """
-    expected = sha256.lower() if sha256 else scene.sha256
+    expected = sha256.lower() if sha256 else scene.collection.sha256.get(scene.name)
     work = into / f".{scene.name}.fetch"
     make_folder(work)
     files = _download(scene, work / "files", progress)
@@ -301,14 +290,15 @@ def _unpacked(scene: PublishedScene, work: Path) -> Path:
             f"{archive}: cannot be unpacked ({error}); remove it, and the same command fetches it "
             "again"
         ) from None
+    folder = scene.collection.folder and scene.collection.folder.format(scene=scene.name)
     found = [
         path.parent
         for path in sorted(place.rglob(scene.marker))
-        if "__MACOSX" not in path.parts and scene.folder in (None, path.parent.name)
+        if "__MACOSX" not in path.parts and folder in (None, path.parent.name)
     ]
     if not found:
         raise DevrfError(
-            f"{archive}: holds no {scene.folder or 'folder'} with {scene.marker}; what is "
+            f"{archive}: holds no {folder or 'folder'} with {scene.marker}; what is "
             "published has changed: unpack it by hand"
         )
     return min(found, key=lambda path: len(path.parts))

@@ -1,4 +1,4 @@
-"""Optical flow from files: ``<index>_bwd.npz``, ``<index>_fwd.npz`` next to a dynamic set."""
+"""Optical flow in files: ``<index>_bwd.npz``, ``<index>_fwd.npz``, and a cache of estimates."""
 
 from __future__ import annotations
 
@@ -82,9 +82,6 @@ def read_flow(
 
     Returns:
         Flow in pixels of the smaller images, or None when not one expected file is there.
-
-    Raises:
-        DevrfError: what :func:`read_flow_file` raises.
     """
     files = {
         row: folder / f"{number:03d}_{direction}.npz"
@@ -118,9 +115,6 @@ def stacked_flow(
 
     Returns:
         Flow in pixels of the smaller images.
-
-    Raises:
-        DevrfError: what :func:`read_flow_file` raises.
     """
     start = time.perf_counter()
     width, height = size

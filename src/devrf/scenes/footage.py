@@ -135,7 +135,7 @@ def _frames(path: Path, video: cv2.VideoCapture) -> Iterator[tuple[float, Pictur
         found, image = video.read()
         if not found:
             break
-        # Telephones do not keep their rate; a file without times of its frames is taken as even.
+        # Phones do not keep their rate; a file without times of its frames is taken as even.
         time = float(video.get(cv2.CAP_PROP_POS_MSEC)) / 1000
         if not time > last:
             time = last + 1 / rate if position else 0.0

@@ -1,4 +1,4 @@
-"""Folders of images at several sizes: ``images``, ``images_4``, ``images_8``."""
+"""Folders of images: at several sizes, by which factor they are made smaller, what is absent."""
 
 from __future__ import annotations
 

@@ -144,9 +144,6 @@ def load_layout(
         root: the scene's folder.
         downscale: as :class:`devrf.scenes.reader.SceneReader` has it.
         masks: as for :func:`devrf.scenes.splits.load_views`.
-
-    Raises:
-        DevrfError: what :func:`devrf.scenes.splits.load_views` raises.
     """
     factor = whole_factor(downscale, partial(_shorter_side, layout.static_train))
     splits = (layout.static_train, layout.static_test, layout.dynamic_train, layout.dynamic_test)

@@ -116,7 +116,7 @@ KEYS = set(CameraKeys.model_fields)
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """A camera's inner numbers, for images of any size where an angle gives them.
+    """A camera's intrinsics, for images of any size where an angle gives them.
 
     Attributes:
         angle_x: horizontal field of view in radians, or None when ``focal`` is given.
@@ -192,11 +192,7 @@ def intrinsics_of(camera: CameraKeys, where: object) -> Intrinsics:
 
 
 def frame_intrinsics(shared: CameraKeys, frame: CameraKeys, where: object) -> Intrinsics | None:
-    """The intrinsics of a frame that brings its own, over the shared ones; None: it brings none.
-
-    Raises:
-        DevrfError: what :func:`intrinsics_of` raises.
-    """
+    """The intrinsics of a frame that brings its own, over the shared ones; else None."""
     own = frame.model_dump(include=KEYS, exclude_unset=True)
     if not own:
         return None

@@ -23,8 +23,8 @@ from devrf.scenes.validation import check_memory, scene_error
 
 log = logging.getLogger(__name__)
 
-# ignore: pixels left out are neither learned from nor scored; matte: they are background.
-Masks = Literal["ignore", "matte", "none"]
+# ignore: pixels left out are neither learned from nor scored; alpha: they are background.
+Masks = Literal["ignore", "alpha", "none"]
 
 Grey = npt.NDArray[np.uint8]
 
@@ -101,7 +101,7 @@ def cutting_out(
     if len(masks) < len(paths):
         raise scene_error(
             names[list(paths).index(None)],
-            "has no mask_path although others have; with data.masks=matte give every image a mask",
+            "has no mask_path although others have; with data.masks=alpha give every image a mask",
         )
     log.info("masks of %d images are their alpha masks", len(masks))
 

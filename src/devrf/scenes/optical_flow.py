@@ -1,4 +1,4 @@
-"""Two ways to estimate the optical flow between two images: DIS (OpenCV), RAFT (torchvision)."""
+"""Optical flow where a scene brings none: estimated once, by DIS (OpenCV) or RAFT (torchvision)."""
 
 from __future__ import annotations
 

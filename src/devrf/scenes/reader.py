@@ -15,7 +15,7 @@ from devrf.geometry.clock import FrameClock
 from devrf.scenes.files import Number
 from devrf.scenes.image_folders import Downscale, Missing
 from devrf.scenes.scene import Background, Capture, OpticalFlow, Scene, Views
-from devrf.scenes.space import SpaceChoice, centred, inward_space, one_sided_scene
+from devrf.scenes.space import SpaceChoice, centred, forward_facing_scene, inward_space
 from devrf.scenes.transforms import SceneBounds
 from devrf.scenes.validation import LARGEST, checked_box, first_error, scene_error
 
@@ -126,9 +126,9 @@ class InwardReader(SceneReader):
         far: distance in world units behind which nothing is; None: from the cameras.
         box: [[x, y, z], [x, y, z]] in world units, enlarged only for silhouettes that move
             beyond it, or by a ``bound_scale``; None: from the cameras.
-        space: ``world``: the scene is in the box, and nothing is around it; ``contracted``: it has
-            no end, and the box is what is looked at; ``auto``: contracted if the images have no
-            mattes and no box is given.
+        space: ``world``: the scene is in the box, and nothing is around it; ``contracted``: it is
+            unbounded, and the box is what is looked at; ``auto``: contracted if the images have no
+            alpha masks and no box is given.
         missing: whether listed images that are absent are an ``error``, or left out (``skip``).
     """
 
@@ -141,11 +141,7 @@ class InwardReader(SceneReader):
     space: SpaceChoice = "auto"
 
     def scene(self, folder: Path, static: Capture, dynamic: Capture) -> Scene:
-        """The scene of two captures that were read from ``folder``, its bounds found.
-
-        Raises:
-            DevrfError: what :func:`devrf.scenes.space.inward_space` raises.
-        """
+        """The scene of two captures that were read from ``folder``, its bounds found."""
         space, bounds = inward_space(
             self.space,
             static.train,
@@ -209,7 +205,7 @@ class PosedReader(InwardReader):
                 "units, a little less than the depth of what is nearest",
             )
         name, captures = self.name_of(folder), centred(static, dynamic)
-        return one_sided_scene(name, *captures, reader.near, self.background)
+        return forward_facing_scene(name, *captures, reader.near, self.background)
 
 
 def _with_bounds(options: PosedReader, stated: SceneBounds | None) -> PosedReader:

@@ -1,4 +1,4 @@
-"""Images and optical flow on another raster: area averages, bilinear look-up."""
+"""Images and optical flow on another raster: made smaller, looked up, undistorted."""
 
 from __future__ import annotations
 

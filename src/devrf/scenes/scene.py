@@ -85,12 +85,12 @@ class Views:
 
     @property
     def has_alpha(self) -> bool:
-        """Whether the images carry a matte."""
+        """Whether the images carry an alpha mask."""
         return self.pixels.shape[3] == 4
 
     @property
     def cut_out(self) -> bool:
-        """Whether something is left out by the mattes: an opaque one says nothing."""
+        """Whether something is left out by the alpha masks: an opaque one says nothing."""
         return self.has_alpha and bool((self.pixels[..., 3] < 255).any())
 
     @property
@@ -183,7 +183,7 @@ class Scene:
         dynamic: a few fixed views of the scene as it deforms; of a scene that is always at rest the
             static capture itself.
         bounds: where the scene is.
-        background: what is behind the matte.
+        background: what is behind the alpha mask.
         space: the space that the fields live in, and in which ``bounds`` are given.
     """
 

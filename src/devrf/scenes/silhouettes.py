@@ -1,4 +1,4 @@
-"""The box of everything that moves, carved from the dynamic views' alpha masks (visual hulls).
+"""Visual hulls of alpha masks: the box of everything that moves, and of one state a grid.
 
 A hull from a few views holds the object and more: the box is an outer bound.
 """
@@ -105,15 +105,15 @@ def _silhouettes(views: Views, reach: int) -> Array:
     Pixels that are not valid are UNSEEN. The last entry stands for all that is beyond the image:
     OUTSIDE, or UNSEEN where the image's border cuts the silhouette or the whole object off.
     """
-    matte = views.pixels[..., 3].cpu().numpy() > ALPHA_THRESHOLD
-    count, height, width = matte.shape
-    unknown = np.zeros_like(matte) if views.valid_mask is None else ~views.valid_mask.cpu().numpy()
-    matte &= ~unknown
-    perhaps = matte | unknown
+    solid = views.pixels[..., 3].cpu().numpy() > ALPHA_THRESHOLD
+    count, height, width = solid.shape
+    unknown = np.zeros_like(solid) if views.valid_mask is None else ~views.valid_mask.cpu().numpy()
+    solid &= ~unknown
+    perhaps = solid | unknown
     at_border = perhaps[:, [0, -1]].any(axis=(1, 2)) | perhaps[:, :, [0, -1]].any(axis=(1, 2))
-    cut_off = at_border | ~matte.any(axis=(1, 2))
+    cut_off = at_border | ~solid.any(axis=(1, 2))
     codes = np.empty((count, height * width + 1), dtype=np.uint8)
-    codes[:, :-1] = _dilated(matte, reach).reshape(count, -1)
+    codes[:, :-1] = _dilated(solid, reach).reshape(count, -1)
     codes[:, :-1][unknown.reshape(count, -1)] = UNSEEN
     codes[:, -1] = np.where(cut_off, UNSEEN, OUTSIDE)
     return codes
@@ -161,11 +161,11 @@ def visual_hull(
         left = held.nonzero()[:, 0]
         pixel, depth = cameras.project_into(k, points[left])
         reach = _cell_reach(views, k, cell, box)
-        matte = views.pixels[k, :, :, 3][None].float()
+        solid = views.pixels[k, :, :, 3][None].float()
         if views.valid_mask is not None:
-            matte = matte.masked_fill(~views.valid_mask[k], 255.0)
-        matte = matte.to(points.device)
-        grown = torch.nn.functional.max_pool2d(matte, 2 * reach + 1, 1, reach)[0]
+            solid = solid.masked_fill(~views.valid_mask[k], 255.0)
+        solid = solid.to(points.device)
+        grown = torch.nn.functional.max_pool2d(solid, 2 * reach + 1, 1, reach)[0]
         x, y = pixel.floor().long().unbind(-1)
         seen = (depth > 0) & (x >= 0) & (x < views.width) & (y >= 0) & (y < views.height)
         row = torch.where(seen, y * views.width + x, 0)

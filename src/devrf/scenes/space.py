@@ -1,4 +1,4 @@
-"""Which space an inward-facing scene is learned in, and where it is there."""
+"""Which space a scene is learned in (world, contracted, NDC), and where it is there."""
 
 from __future__ import annotations
 
@@ -52,26 +52,26 @@ def inward_space(
     """The space of a scene that its cameras look in at, and its bounds there.
 
     Args:
-        choice: the space, or ``auto``: contracted without mattes and ``box``, else the world.
+        choice: the space, or ``auto``: contracted without alpha masks and ``box``, else the world.
         static: training views at rest, whose cameras give the box.
         dynamic: training views in motion; None: the scene is at rest.
         everyone: all views, test included.
         bound_scale: as for :func:`~devrf.scenes.bounds.inward_bounds`; a number makes the inner
             box of contracted space so much larger, unless it is given.
         near: distance in world units, or None for the cameras to say.
-        far: distance in world units, or None; contracted space has no end.
+        far: distance in world units, or None; contracted space is unbounded.
         box: the scene's box, or None.
 
     Raises:
         DevrfError: the cameras do not say where the scene is, or near is not before far.
     """
     given = "data.box is given" if box else ""
-    mattes = "the images have mattes" if static.cut_out else "the images have no mattes"
+    masks = "the images have alpha masks" if static.cut_out else "the images have no alpha masks"
     if choice == "world" or (choice == "auto" and (static.cut_out or box)):
         bounds = inward_bounds(
             static, dynamic, everyone, bound_scale=bound_scale, near=near, far=far, box=box
         )
-        why = "data.space=world" if choice == "world" else given or mattes
+        why = "data.space=world" if choice == "world" else given or masks
         where = given or "what the static cameras all see"
         return WORLD, _because(bounds, why, where)
     inner, where = box or box_from_cameras(static.cameras), given
@@ -90,7 +90,7 @@ def inward_space(
     if not 0 <= near < math.inf:
         raise scene_error("data.near", f"expected a distance of 0 or more, not {near:g}")
     bounds = Bounds(space.box, near, math.inf, None, 1.0, "the box")
-    why = "data.space=contracted" if choice == "contracted" else f"{mattes}, data.box is not given"
+    why = "data.space=contracted" if choice == "contracted" else f"{masks}, data.box is not given"
     return space, _because(bounds, why, where)
 
 
@@ -102,7 +102,7 @@ def _because(bounds: Bounds, why: str, where: str) -> Bounds:
 SEEN = "all that the cameras see (forward-facing)"
 
 
-def one_sided_scene(
+def forward_facing_scene(
     name: str, static: Capture, dynamic: Capture, near: float, background: Background
 ) -> Scene:
     """The scene of two captures whose static cameras have the identity as their average pose.

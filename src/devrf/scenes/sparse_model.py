@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from devrf.geometry.cameras import Distortion
 from devrf.geometry.poses import average_pose, relative_to
+from devrf.scenes.bounds import nearest_point
 from devrf.scenes.files import decoding
-from devrf.scenes.lens import Intrinsics
+from devrf.scenes.lens import CameraKeys, Intrinsics, intrinsics_of
 from devrf.scenes.validation import FARTHEST, in_reach, scene_error
 
 # Parameters of each camera model that can be read, in COLMAP's order.
@@ -58,17 +58,7 @@ class ModelCamera:
     @property
     def intrinsics(self) -> Intrinsics:
         """The camera as the readers have it."""
-        keys = self.keys
-        return Intrinsics(
-            None,
-            (keys["fl_x"], keys["fl_y"]),
-            (keys["cx"], keys["cy"]),
-            (float(self.size[0]), float(self.size[1])),
-            Distortion(
-                (keys.get("k1", 0.0), keys.get("k2", 0.0), 0.0, 0.0),
-                (keys.get("p1", 0.0), keys.get("p2", 0.0)),
-            ),
-        )
+        return intrinsics_of(CameraKeys.model_construct(None, **self.keys), self.model)
 
 
 @dataclass(frozen=True)
@@ -291,7 +281,7 @@ def _forward(poses: Tensor, points: Tensor, near: float, far: float) -> World:
 
 
 def _inward(poses: Tensor, points: Tensor, near: float, far: float) -> World:
-    met = _axes_meet(poses)
+    met = nearest_point(poses[:, :, 3], poses[:, :, 2], 1e-2)
     middle = points.median(dim=0).values if met is None else met
     # z up, as far as the cameras were held upright.
     up = normalize(poses[:, :, 1].sum(dim=0), dim=0)
@@ -321,16 +311,6 @@ def _inward(poses: Tensor, points: Tensor, near: float, far: float) -> World:
 def _corner(values: npt.NDArray[np.float64]) -> Corner:
     x, y, z = values.tolist()
     return x, y, z
-
-
-def _axes_meet(poses: Tensor) -> Tensor | None:
-    """The point (3,) nearest to all axes; None where they hardly meet."""
-    across = torch.eye(3, dtype=poses.dtype) - poses[:, :, 2:3] * poses[:, :, 2].unsqueeze(1)
-    whole = across.mean(dim=0)
-    if float(torch.linalg.eigvalsh(whole)[0]) < 1e-2:
-        return None
-    found: Tensor = torch.linalg.solve(whole, (across @ poses[:, :, 3:])[..., 0].mean(dim=0))
-    return found
 
 
 def _moved(poses: Tensor, points: Tensor, frame: Tensor, scale: float) -> tuple[Tensor, Tensor]:

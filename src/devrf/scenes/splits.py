@@ -1,9 +1,8 @@
-"""Which images of a capture are held out where no list says so."""
+"""Which images are held out, and which camera and time each belongs to, by poses and times."""
 
 from __future__ import annotations
 
 import logging
-from bisect import bisect_left, bisect_right, insort
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -81,24 +80,15 @@ def distinct_poses(poses: Tensor) -> Tensor:
     """(N,) int64: which of the distinct poses each of (N, 3, 4) is, in order of appearance."""
     near = SAME_POSE * (1 + float(poses[:, :, 3].norm(dim=1).median()))
     entries = poses.flatten(1).double().numpy()
-    # Poses that are near are near in the sum of their entries too: few are left to compare with,
-    # however many images a moving camera took.
-    sums, reach = entries.sum(axis=1).tolist(), 1.01 * near * entries.shape[1]
     first: list[int] = []  # of each distinct pose
-    known: list[tuple[float, int]] = []  # its sum and number, by sum
     numbers = []
-    for row, total in enumerate(sums):
-        low = bisect_left(known, total - reach, key=lambda pair: pair[0])
-        high = bisect_right(known, total + reach, key=lambda pair: pair[0])
-        candidates = sorted(number for _, number in known[low:high])
-        apart = np.abs(entries[[first[c] for c in candidates]] - entries[row]).max(axis=1)
-        same = np.flatnonzero(apart <= near)
+    for row, entry in enumerate(entries):
+        same = np.flatnonzero(np.abs(entries[first] - entry).max(axis=1) <= near)
         if len(same) == 0:
-            insort(known, (total, len(first)))
             numbers.append(len(first))
             first.append(row)
         else:
-            numbers.append(candidates[same[0]])
+            numbers.append(int(same[0]))
     return torch.tensor(numbers, dtype=torch.int64)
 
 
@@ -218,7 +208,7 @@ def load_views(split: Split, root: Path, downscale: int, masks: Masks = "none") 
     known = [split.transforms.intrinsics[i] for i in used.tolist()]
     sizes = [inner.size for inner in known]
     listed = [split.transforms.masks[i] for i in used.tolist()] if split.transforms.masks else []
-    finish = cutting_out(listed, sizes, files) if masks == "matte" else None
+    finish = cutting_out(listed, sizes, files) if masks == "alpha" else None
     loaded = load_images(files, downscale, sizes, finish)
     height, width = loaded.pixels.shape[1:3]
     distorted = [

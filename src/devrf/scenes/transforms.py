@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -115,15 +115,13 @@ class Transforms:
 
     def __getitem__(self, index: Sequence[int]) -> Transforms:
         """The images at the positions ``index``, at least one, in that order."""
-        return Transforms(
-            self.file,
-            tuple(self.intrinsics[i] for i in index),
-            tuple(self.images[i] for i in index),
-            self.poses[list(index)],
-            None if self.times is None else tuple(self.times[i] for i in index),
-            None if self.masks is None else tuple(self.masks[i] for i in index),
-            self.skipped,
-            self.bounds,
+        return replace(
+            self,
+            intrinsics=tuple(self.intrinsics[i] for i in index),
+            images=tuple(self.images[i] for i in index),
+            poses=self.poses[list(index)],
+            times=self.times and tuple(self.times[i] for i in index),
+            masks=self.masks and tuple(self.masks[i] for i in index),
         )
 
 

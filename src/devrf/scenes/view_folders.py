@@ -1,4 +1,4 @@
-"""Which of a scene's folders holds the capture of the moving scene."""
+"""Folders of a moving capture: ``dynamic_<V>views``, ``view1`` … ``viewV``, and their flow."""
 
 from __future__ import annotations
 

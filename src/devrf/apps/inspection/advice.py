@@ -252,7 +252,7 @@ def _masks(scene: Scene) -> Iterator[Advice]:
             listed(list(much), 4),
             f"masks leave out up to {100 * max(much.values()):.0f} % of the pixels, of which "
             "nothing is learned",
-            "if they cut out the subject, set data.masks=matte: "
+            "if they cut out the subject, set data.masks=alpha: "
             "what they leave out is background then",
         )
 

@@ -1,4 +1,4 @@
-"""The images that a sparse model poses: which are there, and with which cameras."""
+"""Scenes as COLMAP leaves them: a sparse model, and the images that it poses."""
 
 from __future__ import annotations
 
@@ -62,11 +62,7 @@ def images_of(model: SparseModel, root: Path, factor: int) -> ImageFolder:
 
 
 def present_of(model: SparseModel, folder: Path, root: Path, missing: Missing) -> dict[int, Path]:
-    """The images that are in ``folder``, by their positions in the model.
-
-    Raises:
-        DevrfError: what :func:`devrf.scenes.image_folders.present_images` raises.
-    """
+    """The images that are in ``folder``, by their positions in the model."""
     file = model.folder / f"images{suffix_of(model.folder)}"
     from_file = os.path.relpath(folder, model.folder)
     names = [f"{from_file}/{image.name}" for image in model.images]
@@ -189,7 +185,7 @@ class ColmapReader(PosedReader):
         train_views: train on the first so many of the views that are not held out; None: all.
         holdout: one of so many static images is held out, in the order of their names, the first
             included.
-        space: as of :class:`~devrf.scenes.reader.PosedReader`; with mattes ``auto`` is
+        space: as of :class:`~devrf.scenes.reader.PosedReader`; with alpha masks ``auto`` is
             ``world`` instead of ``contracted``.
     """
 
@@ -249,10 +245,10 @@ def _facing(space: str) -> Facing:
     return "forward" if space == "ndc" else "inward"
 
 
-def _bounds(world: World, mattes: bool) -> SceneBounds:
+def _bounds(world: World, cut_out: bool) -> SceneBounds:
     """What the sparse points say of where the scene is."""
     if world.space == "ndc":
         return SceneBounds(space="ndc", near=world.near)
-    if mattes:  # then nothing is around it, whatever points lie there
+    if cut_out:  # then nothing is around it, whatever points lie there
         return SceneBounds(space="world", box=world.box)
     return SceneBounds(space="contracted", near=world.near, far=world.far, box=world.box)

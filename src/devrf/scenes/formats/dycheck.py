@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import os
-from dataclasses import KW_ONLY, replace
+from dataclasses import KW_ONLY
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -12,18 +13,10 @@ from pydantic import BaseModel, Field, TypeAdapter
 from pydantic.dataclasses import dataclass
 
 from devrf.scenes.files import Ids, Number, inside, read_json, scene_folder
-from devrf.scenes.formats.nerfies import (
-    images_at,
-    list_items,
-    motion_layout,
-    placed,
-    posed_items,
-    read_world,
-)
+from devrf.scenes.formats.nerfies import ItemsReader, read_items
 from devrf.scenes.image_folders import Downscale, ImageFolder
 from devrf.scenes.images import image_at
-from devrf.scenes.layout import fewer, load_layout
-from devrf.scenes.reader import EstimatedFlow, Holdout, InwardReader, Time
+from devrf.scenes.reader import Holdout
 from devrf.scenes.scene import Scene
 from devrf.scenes.splits import every_nth
 from devrf.scenes.validation import abbreviated, scene_error
@@ -46,44 +39,33 @@ _SPLIT = TypeAdapter(_Split)
 
 
 @dataclass(frozen=True)
-class DycheckReader(InwardReader):
+class DycheckReader(ItemsReader):
     """Reads ``splits/train.json``, ``splits/val.json``, ``scene.json``, ``camera/``, ``rgb/<n>x/``.
 
     One moving camera is learned from, others are held out. Times are the ``time_ids`` of the
     splits, brought to [0, 1]; there is no static set. World, near and far are those of
     ``scene.json``; images come from ``rgb/<downscale>x``, or from a larger folder and are made
-    smaller. Without alpha masks the scene has no end, or, where the cameras look in nearly one
+    smaller. Without alpha masks the scene is unbounded, or, where the cameras look in nearly one
     direction, the box is all that they see between near and far. Depth is left alone.
 
     Attributes:
         holdout: where ``val.json`` lists no image, one of so many training images is held out.
-        static_until: the latest time of an image that counts as static.
         masks: ``ignore``: what ``covisible/`` says that training has hardly seen is not scored;
             ``none``: all of the held-out images is.
     """
 
     _: KW_ONLY
     downscale: Downscale = "up_to_2"
-    flow: EstimatedFlow = "auto"
     holdout: Holdout = 8
-    static_until: Time = 1.0
     masks: Literal["ignore", "none"] = "ignore"
 
     def read(self) -> Scene:
         """See :meth:`devrf.scenes.reader.SceneReader.read`."""
         folder = scene_folder(self.root)
-        world = read_world(folder)
-        moments, train, test = _splits(folder, self.holdout)
-        images = images_at(folder, self.downscale)
-        listed = list_items(folder, folder / SPLITS, list(moments), images, self.missing)
-        posed = posed_items(folder, listed, world, [moments[item] for item in listed.items])
-        if self.masks != "none":
-            posed = replace(posed, masks=_covisible(folder, listed.items, images))
-        train, test = listed.positions(train), listed.positions(test)
-        layout = motion_layout(posed, train, test, SPLITS, self.static_until)
-        layout, _ = fewer(layout, None, self.frames)
-        captures = load_layout(layout, folder, images.downscale, self.masks)
-        return placed(self, folder, world, *captures)
+        moments, *split = _splits(folder, self.holdout)
+        masks = None if self.masks == "none" else partial(_covisible, folder)
+        times = SPLITS, lambda items: [moments[item] for item in items]
+        return read_items(self, folder / SPLITS, list(moments), (split[0], split[1]), times, masks)
 
 
 def _splits(folder: Path, holdout: int) -> tuple[dict[str, float], list[int], list[int]]:

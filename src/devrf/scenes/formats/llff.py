@@ -22,7 +22,7 @@ from devrf.scenes.images import Size, image_size, load_images
 from devrf.scenes.layout import refuse_at_rest
 from devrf.scenes.reader import Count, Holdout, SceneReader, Time
 from devrf.scenes.scene import Capture, OpticalFlow, Scene, Views
-from devrf.scenes.space import one_sided_scene
+from devrf.scenes.space import forward_facing_scene
 from devrf.scenes.splits import evenly_spread, every_nth, first_of_every
 from devrf.scenes.validation import scene_error
 from devrf.scenes.view_folders import (
@@ -75,7 +75,7 @@ class LlffReader(SceneReader):
         folder = scene_folder(self.root)
         static, dynamic = self._captures(folder)
         name = self.name_of(folder)
-        return one_sided_scene(name, static, dynamic, self.near, self.background)
+        return forward_facing_scene(name, static, dynamic, self.near, self.background)
 
     def forward_flow(self, views: Views) -> OpticalFlow | None:
         """See :meth:`devrf.scenes.reader.SceneReader.forward_flow`."""

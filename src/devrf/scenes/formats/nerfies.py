@@ -1,16 +1,17 @@
-"""``scene.json`` of Nerfies' layout: the world, and where in it the scene is."""
+"""Scenes in the layout of Nerfies and HyperNeRF: a moving camera before a moving subject."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from dataclasses import KW_ONLY, dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import KW_ONLY, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-import pydantic
 import torch
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from devrf.geometry.cameras import Distortion
@@ -28,12 +29,11 @@ from devrf.scenes.files import (
 from devrf.scenes.image_folders import (
     Downscale,
     ImageFolder,
-    Missing,
     folder_factor,
     image_folder,
     present_images,
 )
-from devrf.scenes.layout import Layout, fewer, load_layout, static_alone, without_static_set
+from devrf.scenes.layout import fewer, load_layout, static_alone, without_static_set
 from devrf.scenes.lens import Intrinsics
 from devrf.scenes.reader import EstimatedFlow, Holdout, InwardReader, Time
 from devrf.scenes.scene import Capture, Scene
@@ -56,6 +56,19 @@ SCENE = "scene.json"
 Length = Annotated[Positive, Field(le=FARTHEST)]
 
 
+@dataclass(frozen=True)
+class ItemsReader(InwardReader):
+    """Options of layouts that keep a camera file for each image, and have no static set.
+
+    Attributes:
+        static_until: the latest time of an image that counts as static.
+    """
+
+    _: KW_ONLY
+    flow: EstimatedFlow = "auto"
+    static_until: Time = 1.0
+
+
 class World(BaseModel):
     """The frame of reference, (position − center) · scale.
 
@@ -75,23 +88,12 @@ class World(BaseModel):
 _WORLD = TypeAdapter(World)
 
 
-def read_world(folder: Path) -> World:
-    """The world of the scene in ``folder``.
-
-    Raises:
-        DevrfError: the file is missing or wrong.
-    """
-    return read_json(
-        folder / SCENE, _WORLD, "it says where the scene is; set data.root to its folder"
-    )
-
-
 def placed(
     reader: InwardReader, folder: Path, world: World, static: Capture, dynamic: Capture
 ) -> Scene:
     """The scene of two captures, near and far as the options or else the world have them.
 
-    Without alpha masks the scene has no end, or, where the cameras look in nearly one direction,
+    Without alpha masks the scene is unbounded, or, where the cameras look in nearly one direction,
     the box is all that they see between near and far.
 
     Args:
@@ -100,9 +102,6 @@ def placed(
         world: what ``scene.json`` says.
         static: the scene at rest.
         dynamic: the scene in motion.
-
-    Raises:
-        DevrfError: what :meth:`devrf.scenes.reader.InwardReader.scene` raises.
     """
     near = world.near if reader.near is None else reader.near
     far = world.far if reader.far is None else reader.far
@@ -110,7 +109,7 @@ def placed(
     wide = reader.box is None and not static.train.cut_out and 0 <= near < far
     if not wide or (reader.space != "world" and axes_do_meet(cameras)):
         return options.scene(folder, static, dynamic)
-    # Without mattes the backdrop is to be learned too.
+    # Without alpha masks the backdrop is to be learned too.
     seen = box_of_frusta(cameras, near, far)
     scale = FALLBACK_BOUND_SCALE if reader.bound_scale == "auto" else reader.bound_scale
     box = [seen.low, seen.high]
@@ -202,106 +201,66 @@ def _pose(camera: Camera, file: Path, center: tuple[float, float, float], scale:
     return torch.cat([axes, where[:, None]], dim=1).float()
 
 
-@dataclass(frozen=True)
-class ListedItems:
-    """The images of a list that are there.
-
-    Attributes:
-        file: the list.
-        items: N ids, in its order.
-        images: N existing files.
-        place: what place among these an image has, by its position in the list.
-    """
-
-    file: Path
-    items: tuple[str, ...]
-    images: tuple[Path, ...]
-    place: dict[int, int]
-
-    def positions(self, wanted: Sequence[int]) -> list[int]:
-        """Those of the positions in the list that are there, among the N; else DevrfError."""
-        kept = [self.place[position] for position in wanted if position in self.place]
-        if not kept:
-            raise scene_error(
-                self.file,
-                "all images to learn from, or all that are held out, are absent; add them",
-            )
-        return kept
+Masks = Callable[[tuple[str, ...], ImageFolder], tuple[Path | None, ...]]
 
 
-def images_at(folder: Path, downscale: int | str) -> ImageFolder:
-    """The folder ``rgb/<n>x`` to read from, and by how much its images are to be made smaller."""
-    names = {"full": "1x", "reduced": "{}x"}
-    return image_folder(folder / "rgb", folder_factor(folder / "rgb", downscale, **names), **names)
-
-
-def list_items(
-    folder: Path, file: Path, items: Sequence[str], images: ImageFolder, missing: Missing
-) -> ListedItems:
-    """The images that are there.
+def read_items(
+    reader: ItemsReader,
+    listing: Path,
+    items: Sequence[str],
+    split: tuple[list[int], list[int]],
+    times: tuple[str, Callable[[tuple[str, ...]], Sequence[float]]],
+    masks: Masks | None = None,
+) -> Scene:
+    """The scene of listed images, with a camera file each.
 
     Args:
-        folder: the scene's folder.
-        file: what lists the images, in the scene's folder.
-        items: their ids.
-        images: the folder that they are in.
-        missing: as for :func:`devrf.scenes.image_folders.present_images`.
+        reader: the options.
+        listing: what lists the images, in the scene's folder.
+        items: N ids.
+        split: positions of those to learn from, and of those held out.
+        times: the file that says when each was taken, for the log, and what gives the times of
+            ids on some scale: the first becomes 0, the last 1.
+        masks: gives the mask of each id; what it leaves out is ignored. None: no masks.
 
     Raises:
-        DevrfError: what :func:`devrf.scenes.image_folders.present_images` raises.
+        DevrfError: an image, its camera, or ``scene.json`` is missing or wrong.
     """
-    names = [f"rgb/{images.path.name}/{item}" for item in items]
-    present = present_images(names, file, folder, missing)
-    place = {position: k for k, position in enumerate(present)}
-    return ListedItems(
-        file, tuple(items[position] for position in present), tuple(present.values()), place
+    folder = scene_folder(reader.root)
+    world = read_json(
+        folder / SCENE, _WORLD, "it says where the scene is; set data.root to its folder"
     )
-
-
-def posed_items(
-    folder: Path, listed: ListedItems, world: World, moments: Sequence[float]
-) -> Transforms:
-    """The images with cameras and times.
-
-    Args:
-        folder: the scene's folder.
-        listed: N images.
-        world: the frame of reference.
-        moments: when each was taken, on some scale; the first becomes 0, the last 1.
-
-    Raises:
-        DevrfError: a camera is missing or wrong.
-    """
-    cameras = [read_camera(folder, item, world.center, world.scale) for item in listed.items]
+    names = {"full": "1x", "reduced": "{}x"}
+    factor = folder_factor(folder / "rgb", reader.downscale, **names)
+    images = image_folder(folder / "rgb", factor, **names)
+    files = [f"rgb/{images.path.name}/{item}" for item in items]
+    present = present_images(files, listing, folder, reader.missing)
+    ids = tuple(items[position] for position in present)
+    place = {position: k for k, position in enumerate(present)}
+    train, test = ([place[p] for p in part if p in place] for part in split)
+    if not train or not test:
+        raise scene_error(
+            listing, "all images to learn from, or all that are held out, are absent; add them"
+        )
+    cameras = [read_camera(folder, item, world.center, world.scale) for item in ids]
+    source, moments = times[0], times[1](ids)
     first, span = min(moments), (max(moments) - min(moments)) or 1.0
-    return Transforms(
-        listed.file,
+    posed = Transforms(
+        listing,
         tuple(intrinsics for _, intrinsics in cameras),
-        listed.images,
+        tuple(present.values()),
         torch.stack([pose for pose, _ in cameras]),
         tuple((moment - first) / span for moment in moments),
+        None if masks is None else masks(ids, images),
     )
-
-
-def motion_layout(
-    transforms: Transforms, train: list[int], test: list[int], source: str, until: float
-) -> Layout:
-    """The layout of one capture without a static set, or of one moment.
-
-    Args:
-        transforms: all images.
-        train: positions of those to learn from.
-        test: positions of those held out.
-        source: the file that says the times, for the log.
-        until: the latest time of an image that counts as static.
-
-    Raises:
-        DevrfError: what :func:`devrf.scenes.layout.without_static_set` raises.
-    """
-    if not one_moment(transforms):
-        return without_static_set(in_motion(transforms[train]), in_motion(transforms[test]), until)
-    why = f"all images have one time in {source}"
-    return static_alone(transforms[train], transforms[test], why)
+    sets = posed[train], posed[test]
+    if one_moment(posed):
+        layout = static_alone(*sets, f"all images have one time in {source}")
+    else:
+        layout = without_static_set(in_motion(sets[0]), in_motion(sets[1]), reader.static_until)
+    layout, _ = fewer(layout, None, reader.frames)
+    captures = load_layout(layout, folder, images.downscale, "none" if masks is None else "ignore")
+    return placed(reader, folder, world, *captures)
 
 
 DATASET, METADATA = "dataset.json", "metadata.json"
@@ -329,41 +288,31 @@ _DATASET = TypeAdapter(_Dataset)
 _ENTRIES: TypeAdapter[dict[str, Any]] = TypeAdapter(dict[str, Any])
 
 
-@pydantic.dataclasses.dataclass(frozen=True)
-class NerfiesReader(InwardReader):
+@dataclass(frozen=True)
+class NerfiesReader(ItemsReader):
     """Reads ``dataset.json``, ``metadata.json``, ``scene.json``, ``camera/`` and ``rgb/<n>x/``.
 
     World units are those of ``scene.json``: (position − center) · scale; it gives near and far,
     too. The time of an image is its ``time_id`` (HyperNeRF), else its ``warp_id``, brought to
     [0, 1]. Images come from ``rgb/<downscale>x``, or from a larger folder and are made smaller;
     they are undistorted. With one time for all of them the scene is at rest.
-    Without alpha masks the scene has no end, or, where the cameras look in
+    Without alpha masks the scene is unbounded, or, where the cameras look in
     nearly one direction, the box is all that they see between near and far.
 
     Attributes:
         holdout: without ``val_ids``, one of so many images is held out.
-        static_until: the latest time of an image that counts as static: there is no static set.
     """
 
     _: KW_ONLY
     downscale: Downscale = "up_to_4"
-    flow: EstimatedFlow = "auto"
     holdout: Holdout = 8
-    static_until: Time = 1.0
 
     def read(self) -> Scene:
         """See :meth:`devrf.scenes.reader.SceneReader.read`."""
         folder = scene_folder(self.root)
-        world = read_world(folder)
-        items, train, test = _items(folder / DATASET, self.holdout)
-        images = images_at(folder, self.downscale)
-        listed = list_items(folder, folder / DATASET, items, images, self.missing)
-        times = _times(folder / METADATA, listed.items)
-        transforms = posed_items(folder, listed, world, times)
-        train, test = listed.positions(train), listed.positions(test)
-        layout = motion_layout(transforms, train, test, METADATA, self.static_until)
-        layout, _ = fewer(layout, None, self.frames)
-        return placed(self, folder, world, *load_layout(layout, folder, images.downscale))
+        items, *split = _items(folder / DATASET, self.holdout)
+        times = METADATA, partial(_times, folder / METADATA)
+        return read_items(self, folder / DATASET, items, (split[0], split[1]), times)
 
 
 def _items(file: Path, holdout: int) -> tuple[list[str], list[int], list[int]]:

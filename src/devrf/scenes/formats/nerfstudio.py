@@ -50,7 +50,7 @@ class NerfstudioReader(PosedReader):
     A frame's ``mask_path`` is a grey image of the size of the image or of its camera, black
     where pixels are left out. In nerfstudio's meaning these pixels say nothing (people who walk
     by): ``ignore`` neither learns from them nor scores them, and the fields show there what
-    other images say. ``matte`` takes them for background (a person who was cut out), as an
+    other images say. ``alpha`` takes them for background (a person who was cut out), as an
     alpha channel would be taken: that also shows where the scene is and where it moves.
 
     Attributes:

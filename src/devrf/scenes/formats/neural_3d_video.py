@@ -1,4 +1,4 @@
-"""``cam00.mp4``, ``cam01.mp4`` …: synchronised videos by cameras that stand still."""
+"""Scenes of Neural 3D Video: synchronised videos by cameras that face a scene from one side."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from devrf.scenes.images import in_threads
 from devrf.scenes.reader import Count, EstimatedFlow, SceneReader, SeveralFrames
 from devrf.scenes.resampling import shrink_pixels
 from devrf.scenes.scene import Capture, Scene, Views
-from devrf.scenes.space import one_sided_scene
+from devrf.scenes.space import forward_facing_scene
 from devrf.scenes.validation import check_memory, reduced_size, scene_error
 
 log = logging.getLogger(__name__)
@@ -177,7 +177,7 @@ class Neural3DVideoReader(SceneReader):
             *(_views(videos, posed, chosen, frames, times, factor) for chosen in (train, [test]))
         )
         still = Capture(_at_rest(moving.train), _at_rest(moving.test))
-        return one_sided_scene(self.name_of(folder), still, moving, self.near, self.background)
+        return forward_facing_scene(self.name_of(folder), still, moving, self.near, self.background)
 
     def _split(self, videos: CameraVideos) -> tuple[int, list[int]]:
         """Positions of the held-out video and of those to learn from."""

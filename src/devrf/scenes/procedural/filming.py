@@ -1,4 +1,4 @@
-"""The colours of a shape's surface: its paint under ambient light and a fixed lamp."""
+"""A moving shape filmed: posed images at rest and in motion, with exact depth and flow."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The plush toy's body as data: rounded boxes, relative to its base, in world units."""
+"""The plush: a soft toy that squashes, stretches, bends and twists (non-rigid motion)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The numbers that every procedural scene is made from, and the checks of them."""
+"""The procedural scenes: the numbers that each is made from, checked, and how it is rendered."""
 
 from __future__ import annotations
 
@@ -153,8 +153,8 @@ class ProceduralScene(Recipe):
     Attributes:
         shape: ``robot`` (rigid parts, large fast motion) or ``flower`` (non-rigid).
         static_test_views: held-out views of the scene at rest.
-        surroundings: ``none``: the images have mattes; ``room``: the object stands in a furnished
-            room, filmed from inside it, and the images have none.
+        surroundings: ``none``: the images have alpha masks; ``room``: the object stands in a
+            furnished room, filmed from inside it, and the images have none.
         texture: how the room is painted: ``soft``, or ``fine`` for images of about 240 pixels or
             more, in which no place looks like another.
     """

@@ -1,4 +1,4 @@
-"""Camera rigs around the origin: many for the scene at rest, a few that watch it move."""
+"""Camera rigs, around the origin or facing one side: many at rest, a few that watch it move."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Rig:
 
 # As in NeRF's synthetic scenes.
 STUDIO = Rig(distance=4.0, field_of_view=0.69, lowest=-0.3, highest=0.95)
-# A telephone in the hand of someone who walks around: above the floor, and a wider lens.
+# A phone in the hand of someone who walks around: above the floor, and a wider lens.
 HAND_HELD = Rig(distance=3.4, field_of_view=0.96, lowest=0.05, highest=0.75)
 _FIRST_AZIMUTH = math.radians(-60)
 _ELEVATIONS = (math.radians(22), math.radians(34))

@@ -1,4 +1,4 @@
-"""The robot's body as data: its joints, and the rounded boxes that hang on them.
+"""The robot: rigid parts on joints that turn far and fast (articulated motion).
 
 At rest it stands with its arms stretched out, faces −y and has its left hand at +x. Lengths in
 world units, angles in radians.

@@ -1,4 +1,4 @@
-"""What a moving shape can be asked: all of it exact, at any time in [0, 1]."""
+"""What a shape can be asked, signed distances, solid textures, and painted rounded boxes."""
 
 from __future__ import annotations
 
