@@ -62,6 +62,23 @@ class SeenEarlier(NamedTuple):
     center: Tensor
 
 
+def cycle_error(points: Tensor, returned: Tensor) -> Tensor:
+    """½ |x − (q + Δ_f(q))|² (K,) of samples x (K, 3) and of where they return to (K, 3)."""
+    return 0.5 * (points - returned).square().sum(dim=1)
+
+
+def flow_error(weight: Tensor, induced: Tensor, observed: Tensor, count: Tensor) -> Tensor:
+    """(1/M) Σ_i w_i |φ_i − φ|₁ ().
+
+    Args:
+        weight: (K,) w of the samples on rays with flow, 0 in padding.
+        induced: (K, 2) φ_i in pixels.
+        observed: (K, 2) φ of their rays.
+        count: () M.
+    """
+    return (weight * (induced - observed).abs().sum(dim=1)).sum() / count.clamp(min=1)
+
+
 class MotionSum(NamedTuple):
     """What the motion of listed samples lacks.
 
@@ -113,8 +130,8 @@ def motion_sum(
         )
     points, q, weight, ray, present = samples
     coords = to_grid(q, box, shape_of(forward))
-    missed = points.detach() - q - interpolate(forward, coords, gradient=kept_gradient(forward))
-    missed = torch.where(present, 0.5 * missed.square().sum(dim=1), 0.0)
+    returned = q + interpolate(forward, coords, gradient=kept_gradient(forward))
+    missed = torch.where(present, cycle_error(points.detach(), returned), 0.0)
     cycle = missed.sum() / present.sum().clamp(min=1)
     flow = cycle.new_zeros(())
     if seen is not None:
@@ -122,9 +139,9 @@ def motion_sum(
         q = torch.where(kept[:, None], q, 0.0)
         moved = q + interpolate(before.detach(), to_grid(q, box, shape_of(before)))
         found = _project(_to_world(moved, ndc), seen, seen.previous[seen.image[ray]])
-        error = (found - seen.pixel[ray] - seen.vectors[ray]).abs().sum(dim=1)
         count = 2 * kept.sum() if over_samples else seen.valid.sum()
-        flow = (torch.where(kept, weight, 0.0) * error).sum() / count.clamp(min=1)
+        induced, counted = found - seen.pixel[ray], torch.where(kept, weight, 0.0)
+        flow = flow_error(counted, induced, seen.vectors[ray], count)
     total = weights[0] * cycle + weights[1] * flow
     return MotionSum(total, torch.stack([cycle, flow]).detach())
 

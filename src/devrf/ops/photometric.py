@@ -11,13 +11,43 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from devrf.ops.compositing import sum_segments
 from devrf.ops.dispatch import accelerated
 
 # The order of terms and of their weights.
 TERMS = ("color", "per_sample_color", "entropy", "alpha_mask")
 # A transmittance is at least so far from 0 and 1 in the entropy.
 NEAREST = 1e-6
+
+
+def color_error(image: Tensor, truth: Tensor) -> Tensor:
+    """Mean |Ĉ − C|² over rays and channels, of Ĉ and C (R, 3)."""
+    return torch.nn.functional.mse_loss(image, truth)
+
+
+def per_sample_color(weight: Tensor, color: Tensor, ray: Tensor, truth: Tensor) -> Tensor:
+    """(1/R) Σ_i sg(w_i) |c_i − C|²: each sample by itself should have the pixel's colour.
+
+    Args:
+        weight: (K,) w of the samples, 0 in padding; it gets no gradient.
+        color: (K, 3) c of the samples.
+        ray: (K,) int64, their rays.
+        truth: (R, 3) C.
+    """
+    error = (color - truth.index_select(0, ray)).square().sum(dim=1)
+    return (weight.detach() * error).sum() / len(truth)
+
+
+def background_entropy(transmittance: Tensor) -> Tensor:
+    """Mean −(p log p + (1 − p) log(1 − p)), p = T_end (R,): a ray hits something or nothing."""
+    p = transmittance.clamp(NEAREST, 1 - NEAREST)
+    return -(p * p.log() + (1 - p) * torch.log1p(-p)).mean()
+
+
+def alpha_mask_error(transmittance: Tensor, alpha: Tensor | None) -> Tensor:
+    """Mean (T_end − (1 − A))² of T_end and A (R,); 0 without A."""
+    if alpha is None:
+        return transmittance.new_zeros(())
+    return (transmittance - (1 - alpha)).square().mean()
 
 
 class PhotometricSum(NamedTuple):
@@ -46,10 +76,7 @@ def photometric_sum(
     alpha: Tensor | None,
     weights: Sequence[float],
 ) -> PhotometricSum:
-    """Four terms of R rays, each a mean over rays, and Σ weight · term.
-
-    ``mean |Ĉ − C|²`` over rays and channels; ``(1/R) Σ_i w_i |c_i − C|²``; the mean entropy
-    ``−(p log p + (1 − p) log(1 − p))`` of p = T_end; the mean ``(T_end − (1 − A))²``, 0 without A.
+    """The four terms of R rays, and Σ weight · term.
 
     Args:
         image: (R, 3) Ĉ.
@@ -65,18 +92,15 @@ def photometric_sum(
     if kernels := accelerated("photometric", *floats, truth):
         total, terms, seen = kernels.photometric_sum(*floats, first, truth, alpha, weights)
         return PhotometricSum(total, terms, seen[0], None if alpha is None else seen[1])
-    rays = len(image)
     place = torch.arange(len(sample_weight), device=first.device)
-    ray = torch.searchsorted(first[1:].contiguous(), place, right=True).clamp(max=rays - 1)
-    missed = (sample_color - truth.index_select(0, ray)).square().sum(dim=1, keepdim=True)
-    p = transmittance.clamp(NEAREST, 1 - NEAREST)
-    matte = p.new_zeros(()) if alpha is None else (transmittance - (1 - alpha)).square().mean()
+    ray = torch.searchsorted(first[1:].contiguous(), place, right=True).clamp(max=len(image) - 1)
+    present = torch.where(place < first[-1], sample_weight, 0.0)
     terms = torch.stack(
         [
-            (image - truth).square().mean(),
-            sum_segments(sample_weight.detach(), missed, first).sum() / rays,
-            -(p * p.log() + (1 - p) * torch.log1p(-p)).mean(),
-            matte,
+            color_error(image, truth),
+            per_sample_color(present, sample_color, ray, truth),
+            background_entropy(transmittance),
+            alpha_mask_error(transmittance, alpha),
         ]
     )
     total = sum(weight * term for weight, term in zip(weights, terms.unbind(), strict=True))

@@ -15,10 +15,6 @@ from devrf.geometry.rays import Rays
 from devrf.methods.devrf.losses import (
     PHOTOMETRIC_TERMS,
     Prediction,
-    alpha_mask,
-    background_entropy,
-    color_error,
-    per_sample_color,
 )
 from devrf.methods.devrf.weighted_loss import weighted_loss
 from devrf.methods.weighted_loss import counted_weights
@@ -53,17 +49,17 @@ def prediction(ray_batch: Callable[..., RayBatch]) -> Prediction:
 
 
 def test_color_is_the_mean_square_over_rays_and_channels(prediction: Prediction) -> None:
-    assert color_error(prediction).item() == pytest.approx((0.25 + 0.36 + 0.09) / 9)
+    assert PHOTOMETRIC_TERMS["color"](prediction).item() == pytest.approx((0.25 + 0.36 + 0.09) / 9)
 
 
 def test_per_sample_color_by_hand(prediction: Prediction) -> None:
     # |c − C|²: (0, .25, 0)² = .0625; (1, .75, 0)² = 1.5625; (.1, .1, .4)² = .18; three rays.
     expected = (0.5 * 0.0625 + 0.25 * 1.5625 + 0.8 * 0.18) / 3
-    assert per_sample_color(prediction).item() == pytest.approx(expected)
+    assert PHOTOMETRIC_TERMS["per_sample_color"](prediction).item() == pytest.approx(expected)
 
 
 def test_per_sample_color_stops_at_the_weights(prediction: Prediction) -> None:
-    per_sample_color(prediction).backward()
+    PHOTOMETRIC_TERMS["per_sample_color"](prediction).backward()
     assert prediction.output.weight.grad is None
     # 2 · w · (c − C) / R of the first sample's green.
     assert prediction.output.sample_color.grad is not None
@@ -75,22 +71,22 @@ def test_entropy_by_hand(prediction: Prediction) -> None:
         return -(p * math.log(p) + (1 - p) * math.log(1 - p))
 
     expected = (entropy(0.25) + 0 + entropy(0.2)) / 3
-    assert background_entropy(prediction).item() == pytest.approx(expected, abs=1e-5)
+    assert PHOTOMETRIC_TERMS["entropy"](prediction).item() == pytest.approx(expected, abs=1e-5)
 
 
 @pytest.mark.parametrize("p", [0.0, 1.0])
 def test_entropy_has_finite_gradients_at_its_ends(prediction: Prediction, p: float) -> None:
     end = torch.full((3,), p, requires_grad=True)
     output = replace(prediction.output, transmittance=end)
-    background_entropy(replace(prediction, output=output)).backward()
+    PHOTOMETRIC_TERMS["entropy"](replace(prediction, output=output)).backward()
     assert end.grad is not None and end.grad.isfinite().all()
 
 
 def test_alpha_mask_by_hand_and_without_one(prediction: Prediction) -> None:
     # T − (1 − alpha) = 0.25, 0, −0.3.
-    assert alpha_mask(prediction).item() == pytest.approx((0.0625 + 0.09) / 3)
+    assert PHOTOMETRIC_TERMS["alpha_mask"](prediction).item() == pytest.approx((0.0625 + 0.09) / 3)
     without = replace(prediction, batch=replace(prediction.batch, alpha=None))
-    assert alpha_mask(without).item() == 0
+    assert PHOTOMETRIC_TERMS["alpha_mask"](without).item() == 0
 
 
 def test_the_loss_weighs_what_counts_and_reports_it_unweighted(prediction: Prediction) -> None:

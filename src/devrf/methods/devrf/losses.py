@@ -9,7 +9,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-import torch
 from torch import Tensor
 
 from devrf.data.batch import RayBatch
@@ -17,6 +16,13 @@ from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.space import WORLD, Space
 from devrf.methods.devrf.volume_rendering import Warp
+from devrf.ops.motion import cycle_error, flow_error
+from devrf.ops.photometric import (
+    alpha_mask_error,
+    background_entropy,
+    color_error,
+    per_sample_color,
+)
 from devrf.rendering.output import VoxelOutput
 
 # What the flow loss is a mean over.
@@ -31,38 +37,14 @@ class Prediction:
     batch: RayBatch
 
 
-def color_error(prediction: Prediction) -> Tensor:
-    """Mean |Ĉ − C|² over rays and channels."""
-    return torch.nn.functional.mse_loss(prediction.output.color, prediction.batch.color)
-
-
-def per_sample_color(prediction: Prediction) -> Tensor:
-    """(1/R) Σ_i sg(w_i) |c_i − C|²: each sample by itself should have the pixel's colour."""
-    output = prediction.output
-    truth = prediction.batch.color.index_select(0, output.samples.ray)
-    error = (output.sample_color - truth).square().sum(dim=1)
-    return (output.weight.detach() * error).sum() / len(prediction.batch.rays)
-
-
-def background_entropy(prediction: Prediction) -> Tensor:
-    """Mean −(p log p + (1 − p) log(1 − p)), p = T_end: a ray hits something or nothing."""
-    p = prediction.output.transmittance.clamp(1e-6, 1 - 1e-6)
-    return -(p * p.log() + (1 - p) * torch.log1p(-p)).mean()
-
-
-def alpha_mask(prediction: Prediction) -> Tensor:
-    """Mean (T_end − (1 − A))², A the images' alpha channel; 0 without one."""
-    alpha = prediction.batch.alpha
-    if alpha is None:
-        return prediction.output.transmittance.new_zeros(())
-    return (prediction.output.transmittance - (1 - alpha)).square().mean()
-
-
-PHOTOMETRIC_TERMS = {
-    "color": color_error,
-    "per_sample_color": per_sample_color,
-    "entropy": background_entropy,
-    "alpha_mask": alpha_mask,
+# What compares rays with images; the equations are in devrf.ops.photometric.
+PHOTOMETRIC_TERMS: dict[str, Callable[[Prediction], Tensor]] = {
+    "color": lambda seen: color_error(seen.output.color, seen.batch.color),
+    "per_sample_color": lambda seen: per_sample_color(
+        seen.output.weight, seen.output.sample_color, seen.output.samples.ray, seen.batch.color
+    ),
+    "entropy": lambda seen: background_entropy(seen.output.transmittance),
+    "alpha_mask": lambda seen: alpha_mask_error(seen.output.transmittance, seen.batch.alpha),
 }
 
 
@@ -96,8 +78,7 @@ def cycle(prediction: MotionPrediction) -> Tensor:
     """L_cycle = mean_i ½ |x_i − (q_i + Δ_f(q_i, t))|² (docs/method.md#cycle)."""
     output = prediction.output
     returned = prediction.unwarp(output.canonical)
-    missed = 0.5 * (output.samples.points - returned).square().sum(dim=1)
-    return output.mean_over_samples(missed)
+    return output.mean_over_samples(cycle_error(output.samples.points, returned))
 
 
 def flow(prediction: MotionPrediction) -> Tensor:
@@ -118,11 +99,9 @@ def flow(prediction: MotionPrediction) -> Tensor:
         batch.pixel[ray],
         prediction.space,
     )
-    error = (induced - batch.flow[ray]).abs().sum(dim=1)
-    total = (weight * error).sum()
-    if prediction.flow_mean == "rays":
-        return total / batch.flow_valid.sum().clamp(min=1)
-    return total / (2 * output.count_on(batch.flow_valid)).clamp(min=1)
+    over_rays, valid = prediction.flow_mean == "rays", batch.flow_valid
+    count = valid.sum() if over_rays else 2 * output.count_on(valid)
+    return flow_error(weight, induced, batch.flow[ray], count)
 
 
 def induced_flow(
