@@ -146,11 +146,8 @@ class SmallScene:
                 decay_iterations=self.iterations,
                 rays=self.rays,
             )
-            architecture, sampling = (
-                Architecture(width=self.decoder),
-                Sampling(alpha_threshold=3e-3),
-            )
-            return CanonicalStage(schedule, architecture, sampling=sampling, **common)
+            network, sampling = Architecture(width=self.decoder), Sampling(alpha_threshold=3e-3)
+            return CanonicalStage(schedule, network, sampling=sampling, **common)
         # The first frame of the first level takes twice as many; the second level's are parallel.
         coarse, fine = self.sides
         first = Level(coarse, max(1, self.iterations * 3 // 4 // self.frames))
