@@ -22,9 +22,9 @@ STYLE = """
 Edges = dict[str, set[str]]
 
 
-def on_page_markdown(markdown: str, **kwargs: Any) -> str:
+def on_page_content(page_html: str, **kwargs: Any) -> str:
     """Put the picture where a page asks for it."""
-    return markdown.replace(MARKER, picture(imports())) if MARKER in markdown else markdown
+    return page_html.replace(MARKER, picture(imports())) if MARKER in page_html else page_html
 
 
 def imports() -> Edges:
