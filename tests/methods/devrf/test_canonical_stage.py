@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 from lightning import Callback, Trainer
+from lightning.pytorch.callbacks import LambdaCallback
 
 from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
@@ -33,7 +34,7 @@ CARVED = CanonicalSchedule(
     rays=256,
 )
 SEARCHED = CanonicalSchedule(
-    search_iterations=300, search_side=12, iterations=20, side=16, upsample_at=(), rays=256
+    search_iterations=200, search_side=12, iterations=20, side=16, upsample_at=(), rays=256
 )
 
 
@@ -55,7 +56,6 @@ class Watch(Callback):
     [
         ("auto", True, torch.bfloat16),
         ("auto", False, torch.float32),
-        ("float32", True, torch.float32),
         ("bfloat16", False, torch.bfloat16),
     ],
 )
@@ -112,8 +112,8 @@ def test_the_search_hands_over_to_a_radiance_field_with_room_for_motion(
     watch, stage = Watch(), CanonicalStage(SEARCHED, SMALL)
     trainer(watch, max_epochs=1).fit(stage, datamodule=datamodule)
     kinds = [(kind, decoder) for kind, _, decoder in watch.seen]
-    assert kinds == [("search", SigmoidColor.__name__)] * 30 + [("fine", ColorDecoder.__name__)] * 2
-    assert watch.loss[29] < 0.6 * watch.loss[0]
+    assert kinds == [("search", SigmoidColor.__name__)] * 20 + [("fine", ColorDecoder.__name__)] * 2
+    assert watch.loss[19] < 0.6 * watch.loss[0]
     motion, box = tiny_scene.bounds.motion, stage.scene_model.canonical.box
     assert motion is not None and box.union(motion) == box
     # The search's box was the whole rest box: it has been tightened.
@@ -135,18 +135,6 @@ def test_afterwards_what_is_not_occupied_is_empty(learned: tuple[CanonicalStage,
     assert alpha[~model.occupancy.mask].max() < 1.1e-6
     assert alpha[model.occupancy.mask].max() > 0.1
     assert 0.01 < model.occupancy.share < 0.6
-
-
-def test_held_out_views_are_seen_and_scored(
-    learned: tuple[CanonicalStage, Trainer],
-    datamodule: SceneDataModule,
-    trainer: Callable[..., Trainer],
-) -> None:
-    stage = learned[0]
-    (scores,) = trainer().test(stage, datamodule=datamodule, verbose=False)
-    # An all-white guess reaches about 10 dB here.
-    assert scores["test/static/psnr"] > 14
-    assert 0 < scores["test/static/ssim"] < 1
 
 
 def test_share_of_views_by_hand() -> None:
@@ -194,15 +182,11 @@ def test_the_total_variation_reaches_all_voxels_until_the_schedule_says_so(
 ) -> None:
     schedule = CanonicalSchedule(0, 8, True, 40, 8, (), rays=16, dense_tv_iterations=20)
     stage = CanonicalStage(schedule, SMALL, fine_loss={"color": 1.0, "tv": 1e-3})
-    touched: list[bool] = []
-
-    class Recorder(Callback):
-        def on_train_batch_end(self, *_: Any) -> None:
-            groups = stage.optimizer.param_groups
-            touched.append(groups[0]["touched_only"])
-            assert groups[1]["touched_only"] == touched[-1]
-
-    watched = trainer(max_epochs=1)
-    watched.callbacks.append(Recorder())  # type: ignore[attr-defined]
-    watched.fit(stage, datamodule=datamodule)
-    assert touched == [False, False, True, True]
+    touched: list[list[bool]] = []
+    watch = LambdaCallback(
+        on_train_batch_end=lambda *_: touched.append(
+            [group["touched_only"] for group in stage.optimizer.param_groups[:2]]
+        )
+    )
+    trainer(watch, max_epochs=1).fit(stage, datamodule=datamodule)
+    assert touched == [[False] * 2] * 2 + [[True] * 2] * 2

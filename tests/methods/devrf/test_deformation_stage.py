@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 from lightning import Callback, Trainer
+from lightning.pytorch.callbacks import LambdaCallback
 from torch import Tensor
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
@@ -108,21 +109,6 @@ def test_total_variation_alone_smooths_both_directions(
     torch.testing.assert_close(peak.mean, expected)
 
 
-class Seen(Callback):
-    """Notes weights, total variation and rate after each step, level by level."""
-
-    def __init__(self) -> None:
-        self.elastic: dict[int, float] = {}
-        self.smoothing: dict[int, float] = {}
-        self.rates: dict[int, list[float]] = {}
-
-    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, *args: Any) -> None:
-        level, group = pl_module.phase.level, pl_module.optimizer.param_groups[0]
-        self.elastic[level] = pl_module.weights.get("elastic", 0.0)
-        self.smoothing[level] = group["smoothing"]
-        self.rates.setdefault(level, []).append(group["lr"])
-
-
 def test_each_level_has_its_weights_and_rates(
     rest: LoadedCheckpoint, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
 ) -> None:
@@ -135,14 +121,21 @@ def test_each_level_has_its_weights_and_rates(
     stage = DeformationStage(
         rest, schedule, motion, loss, extensions={"e": Elastic()}, iterations_per_step=1
     )
-    seen = Seen()
-    trainer(seen, max_epochs=1).fit(stage, datamodule=datamodule)
-    assert seen.elastic == {0: 0.0, 1: pytest.approx(0.6)}
-    assert seen.smoothing[0] > 0 and seen.smoothing[1] == 0
-    assert set(seen.rates[0]) == {0.01}
+    elastic, smoothing, rates = {}, {}, {0: [], 1: []}
+
+    def note(trainer: Trainer, stage: DeformationStage, *_: Any) -> None:
+        level, group = stage.phase.level, stage.optimizer.param_groups[0]
+        elastic[level], smoothing[level] = stage.weights.get("elastic", 0.0), group["smoothing"]
+        rates[level].append(group["lr"])
+
+    watch = LambdaCallback(on_train_batch_end=note)
+    trainer(watch, max_epochs=1).fit(stage, datamodule=datamodule)
+    assert elastic == {0: 0.0, 1: pytest.approx(0.6)}
+    assert smoothing[0] > 0 and smoothing[1] == 0
+    assert set(rates[0]) == {0.01}
     # Frame 1 has four iterations, frame 2 two; within each the rate falls towards a hundredth.
     falls = [0.005 * 0.01**share for share in (0, 1 / 4, 1 / 2, 3 / 4, 0, 1 / 2)]
-    assert seen.rates[1] == pytest.approx(falls)
+    assert rates[1] == pytest.approx(falls)
 
 
 def test_factors_are_those_of_terms(rest: LoadedCheckpoint) -> None:
@@ -177,45 +170,34 @@ def test_the_flow_of_a_moving_camera_neither_starts_nor_teaches_a_frame(
     assert sum("the camera moves" in line for line in caplog.messages) == moving
 
 
-class Look(Callback):
-    """Notes the active frame's slices, and what others see of them while it is learned."""
-
-    def __init__(self) -> None:
-        self.seen: list[tuple[Tensor, Tensor, Tensor]] = []
-
-    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, *args: Any) -> None:
-        name = "scene_model.deformation.frames.to_time"
-        frame, learned = pl_module.active[0].number, pl_module.active[0].forward.detach().clone()
-        stored = pl_module.state_dict()[name][frame].clone()
-        field = pl_module.current_model().deformation
-        self.seen.append((learned, stored, field.to_time[frame].clone()))
-
-
 def test_state_and_model_hold_what_an_active_frame_has_learned(
     rest: LoadedCheckpoint, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
 ) -> None:
-    stage, look = DeformationStage(rest, SHORT, FAST, iterations_per_step=7), Look()
-    trainer(look, max_steps=50).fit(stage, datamodule=datamodule)
-    assert len(look.seen) > 6
-    for learned, stored, seen in look.seen:
-        assert learned.any()
-        assert torch.equal(stored, learned) and torch.equal(seen, learned)
+    stage, last = DeformationStage(rest, SHORT, FAST, iterations_per_step=7), []
+
+    def look(trainer: Trainer, stage: DeformationStage, *_: Any) -> None:
+        frame, learned = stage.active[0].number, stage.active[0].forward.detach().clone()
+        stored = stage.state_dict()["scene_model.deformation.frames.to_time"][frame]
+        assert learned.any() and torch.equal(stored, learned)
+        assert torch.equal(stage.current_model().deformation.to_time[frame], learned)
+        last[:] = [learned]
+
+    watch = LambdaCallback(on_train_batch_end=look)
+    trainer(watch, max_steps=50).fit(stage, datamodule=datamodule)
     # The last frame was written back; the field is no longer tied to it.
-    assert torch.equal(stage.field.to_time[2], look.seen[-1][0])
+    assert torch.equal(stage.field.to_time[2], last[0])
     stage.field.to_time[2] += 1
-    assert torch.equal(stage.scene_model.deformation.to_time[2], look.seen[-1][0] + 1)
+    assert torch.equal(stage.scene_model.deformation.to_time[2], last[0] + 1)
 
 
-@pytest.mark.parametrize("half", [False, True])
 def test_where_the_field_rests_changes_what_is_learned_by_its_rounding_alone(
     rest: LoadedCheckpoint,
     datamodule: SceneDataModule,
     trainer: Callable[..., Trainer],
-    half: bool,
     tiny_scene: Scene,
 ) -> None:
     fields = []
-    for store, rounded in (("device", False), ("host", half)):
+    for store, rounded in (("device", False), ("host", False), ("host", True)):
         torch.manual_seed(0)
         motion = replace(FAST, store=store, store_half=rounded)
         stage = DeformationStage(rest, SHORT, motion)
@@ -226,36 +208,9 @@ def test_where_the_field_rests_changes_what_is_learned_by_its_rounding_alone(
         state = expanded_state(stage.scene_model.stored_state())
         assert state["deformation.frames.to_time"].dtype == torch.float32
         assert score(Renderer(stage.scene_model), tiny_scene.dynamic.train, 5, "white").psnr > 10
-    if half:
-        assert not torch.equal(*fields)
-        torch.testing.assert_close(*fields, atol=0.05, rtol=0)
-    else:
-        assert torch.equal(*fields)
-
-
-def test_stages_built_on_one_rest_do_not_meet(
-    rest: LoadedCheckpoint, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
-) -> None:
-    # An ablation in a notebook: the same canonical scene, two deformations.
-    first = DeformationStage(rest, SHORT)
-    trainer(max_steps=2).fit(first, datamodule=datamodule)
-    second = DeformationStage(rest, SHORT)
-    trainer(max_steps=1).fit(second, datamodule=datamodule)
-    assert first.field is not second.field
-    assert not second.field.to_time[2].any()
-    assert first.field.to_canonical[1].abs().max() > 1e-3
-
-
-class StepCounts(Callback):
-    """Adam's count of steps on the motion after each step, level by level."""
-
-    def __init__(self) -> None:
-        self.levels: dict[int, list[int]] = {}
-
-    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, *args: Any) -> None:
-        optimizer = pl_module.optimizer
-        steps = optimizer.state[optimizer.param_groups[0]["params"][0]]["steps"]
-        self.levels.setdefault(pl_module.phase.level, []).append(int(steps))
+    exact, on_host, in_half = fields
+    assert torch.equal(exact, on_host) and not torch.equal(exact, in_half)
+    torch.testing.assert_close(exact, in_half, atol=0.05, rtol=0)
 
 
 @pytest.mark.parametrize(
@@ -271,6 +226,13 @@ def test_adam_begins_anew_at_each_visit_or_goes_on_above_the_coarsest_level(
     # Three frames; frame 1 gets the share of frame 0 as well.
     schedule = DeformationSchedule(levels=(Level(4, 2), Level(6, 2)), rays=16)
     motion = replace(FAST, adam_state=moments)
-    stage, counts = DeformationStage(rest, schedule, motion, iterations_per_step=1), StepCounts()
-    trainer(counts, max_epochs=1).fit(stage, datamodule=datamodule)
-    assert counts.levels == {0: [1, 2, 3, 4, 1, 2], 1: fine}
+    stage = DeformationStage(rest, schedule, motion, iterations_per_step=1)
+    steps: dict[int, list[int]] = {0: [], 1: []}
+
+    def count(trainer: Trainer, stage: DeformationStage, *_: Any) -> None:
+        state = stage.optimizer.state[stage.optimizer.param_groups[0]["params"][0]]
+        steps[stage.phase.level].append(int(state["steps"]))
+
+    watch = LambdaCallback(on_train_batch_end=count)
+    trainer(watch, max_epochs=1).fit(stage, datamodule=datamodule)
+    assert steps == {0: [1, 2, 3, 4, 1, 2], 1: fine}

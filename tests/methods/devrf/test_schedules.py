@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -27,23 +28,22 @@ def with_level(number: int, **other: Any) -> list[Level]:
     return levels
 
 
-def canonical_phases(schedule: CanonicalSchedule) -> list[CanonicalPhase]:
+def in_order(phase: Callable[[int], Any], total: int) -> list[Any]:
     """The phases in order, found as a stage finds them: each at the end of the one before."""
     phases, at = [], 0
-    while at < schedule.total:
-        phases.append(schedule.phase(at))
+    while at < total:
+        phases.append(phase(at))
         assert phases[-1].stop > at
         at = phases[-1].stop
     return phases
+
+
+def canonical_phases(schedule: CanonicalSchedule) -> list[CanonicalPhase]:
+    return in_order(schedule.phase, schedule.total)
 
 
 def deformation_phases(schedule: DeformationSchedule, frames: int) -> list[DeformationPhase]:
-    phases, at = [], 0
-    while at < schedule.total(frames):
-        phases.append(schedule.phase(at, frames))
-        assert phases[-1].stop > at
-        at = phases[-1].stop
-    return phases
+    return in_order(lambda at: schedule.phase(at, frames), schedule.total(frames))
 
 
 def test_canonical_defaults_are_the_papers() -> None:
@@ -87,13 +87,11 @@ def test_deformation_defaults_are_the_papers_inward() -> None:
     assert schedule.rays == 8192
 
 
-def test_deformation_forward_facing_is_the_papers() -> None:
-    schedule = DeformationSchedule(with_level(2, iterations=200), rays=4096)
-    assert schedule.total(40) == 24000
-    assert schedule.growths(40) == [8000, 16000, 20000, 22000]
-
-
-def test_without_coarse_to_fine_every_share_goes_to_the_finest_grid() -> None:
+def test_forward_facing_and_without_coarse_to_fine() -> None:
+    forward = DeformationSchedule(with_level(2, iterations=200), rays=4096)
+    assert forward.total(40) == 24000
+    assert forward.growths(40) == [8000, 16000, 20000, 22000]
+    # Every share goes to the finest grid.
     schedule = DeformationSchedule(coarse_to_fine=False)
     phases = deformation_phases(schedule, 50)
     assert schedule.total(50) == 25000 and schedule.growths(50) == []
@@ -114,12 +112,7 @@ def test_frames_of_two_stretches_are_visited_together() -> None:
         (0, (1,), 0, 12),
         *((0, (k,), 6 * k, 6 * k + 6) for k in range(2, 14)),
         (1, (7,), 84, 88),
-        (1, (1, 8), 88, 92),
-        (1, (2, 9), 92, 96),
-        (1, (3, 10), 96, 100),
-        (1, (4, 11), 100, 104),
-        (1, (5, 12), 104, 108),
-        (1, (6, 13), 108, 112),
+        *((1, (k, k + 7), 84 + 4 * k, 88 + 4 * k) for k in range(1, 7)),
     ]
     assert schedule.total(14) == 112 and schedule.growths(14) == [84]
     phases = deformation_phases(schedule, 14)
@@ -152,9 +145,6 @@ def test_a_further_level_goes_backward_through_the_frames() -> None:
         (2, (3,), 54, 56),
     ]
     phases = deformation_phases(schedule, 5)
-    # The rate falls where the grid grows.
-    factors = [p.learning_rate_factor for p in phases]
-    assert factors == [1.0] * 4 + [10 ** (-1 / 4)] * 7
     assert not any(p.has_previous for p in phases[4:])
 
 
@@ -164,11 +154,8 @@ def test_a_further_level_goes_backward_through_the_frames() -> None:
         (5, 4, [(2, 4), (1, 3)]),  # two frames a stretch: three are enough
         (6, 4, [(2, 4), (1, 3, 5)]),
         (7, 3, [(3, 6), (1, 4), (2, 5)]),  # the last stretch is frame 6 alone
-        (4, 4, [(2,), (1, 3)]),  # never neighbours
-        (4, 9, [(2,), (1, 3)]),
-        (3, 2, [(2,), (1,)]),
+        (4, 9, [(2,), (1, 3)]),  # never neighbours
         (2, 2, [(1,)]),  # one stretch, in which frame 0 idles
-        (2, 1, [(1,)]),
     ],
 )
 def test_stretches_of_all_kinds(frames: int, at_once: int, visits: list[tuple[int, ...]]) -> None:
@@ -185,8 +172,6 @@ def test_without_coarse_to_fine_the_finest_level_says_how_many() -> None:
     )
     assert course(schedule, 4) == [(0, (2,), 0, 3), (0, (1, 3), 3, 6)]
     assert not any(phase.init_from_previous for phase in deformation_phases(schedule, 4))
-    # From rest, several may begin at once.
-    assert replace(schedule, rays=9).levels == (Level(6, 3, parallel_frames=2),)
 
 
 @given(
@@ -248,16 +233,9 @@ def test_deformation_phases_tile_every_schedule(
     "wrong",
     [
         {"upsample_at": (1000, 1000)},
-        {"upsample_at": (2000, 1000)},
-        {"upsample_at": (0, 1000)},
         {"upsample_at": (1000, 30000)},
-        {"iterations": 0, "upsample_at": ()},
-        {"search_iterations": -1},
         {"side": 2},  # 8 voxels cannot be halved four times
-        {"decay_iterations": 0},
         {"rays": 0},
-        {"view_dependence_start": -1},
-        {"unbounded_initial_side": 1},
     ],
     ids=str,
 )
@@ -270,16 +248,10 @@ def test_a_wrong_canonical_schedule_is_an_error(wrong: dict[str, Any]) -> None:
     ("wrong", "key"),
     [
         ({"levels": ()}, "levels: expected at least one"),
-        ({"decay": 0.0}, "decay"),
         ({"rays": 0}, "rays"),
         ({"levels": with_level(5, iterations=0)}, "levels.5.iterations"),
-        ({"levels": with_level(5, side=1)}, "levels.5.side"),
-        ({"levels": with_level(5, parallel_frames=0)}, "levels.5.parallel_frames"),
         ({"levels": with_level(1, parallel_frames=2)}, "levels.1.parallel_frames"),
-        ({"levels": with_level(1, order="backward")}, "levels.1.order"),
         ({"levels": with_level(2, order="sideways")}, "levels.2.order"),
-        ({"levels": with_level(5, lr_factor=0.0)}, "levels.5.lr_factor"),
-        ({"levels": with_level(5, lr_final_factor=-0.1)}, "levels.5.lr_final_factor"),
         ({"levels": with_level(2, weight_factors={"tv": -1})}, "levels.2.weight_factors.tv"),
     ],
     ids=str,
@@ -310,6 +282,3 @@ def test_a_level_may_have_a_rate_and_weights_of_its_own() -> None:
     assert rates == [(1, 1), (0.5, 1), (0.3, 0.1)]
     assert [schedule.weight_factor("tv", level) for level in range(3)] == [1, 1, 0]
     assert schedule.weight_factor("flow", 2) == 1
-    finest = replace(schedule, coarse_to_fine=False)
-    assert finest.phase(0, frames=2).learning_rate_factor == 1  # the base rate
-    assert finest.phase(0, frames=2).lr_final_factor == 0.1 and finest.weight_factor("tv", 0) == 0

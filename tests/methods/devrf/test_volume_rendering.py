@@ -67,14 +67,6 @@ def test_a_slab_by_its_geometric_series(cube: Box) -> None:
     assert out.depth[1].item() == 0
 
 
-def test_an_opaque_slab_shows_its_face_alone(cube: Box) -> None:
-    out = render(along_x(0.0), fog(cube, 0.99999), slab(cube), settings(1e-4), torch.zeros(3))
-    torch.testing.assert_close(out.color[0], GREEN, atol=1e-4, rtol=0)
-    assert out.depth.item() == pytest.approx(2 + FIRST * STEP, abs=1e-4)
-    assert out.transmittance.item() < 1e-4
-    assert len(out.weight) == 1
-
-
 def test_samples_too_faint_are_not_there_at_all(cube: Box) -> None:
     out = render(along_x(0.0), fog(cube, 0.1), slab(cube), settings(0.11), WHITE / 2)
     assert len(out.samples) == len(out.weight) == len(out.sample_color) == 0
@@ -87,14 +79,6 @@ def test_samples_of_too_little_weight_shade_but_have_no_colour(cube: Box) -> Non
     torch.testing.assert_close(out.weight, torch.tensor([0.5, 0.25]))
     torch.testing.assert_close(out.color[0], 0.75 * GREEN)
     assert out.transmittance.item() == pytest.approx(0.5**COUNT, rel=1e-4)
-
-
-def test_near_and_far_cut_the_slab(cube: Box) -> None:
-    half, end = fog(cube, 0.1), 2 + (FIRST + 4.5) * STEP
-    before = render(along_x(0.0), half, slab(cube), settings(far=end), WHITE)
-    assert before.transmittance.item() == pytest.approx(0.9**5, rel=1e-5)
-    behind = render(along_x(0.0), half, slab(cube), settings(near=end), WHITE)
-    assert behind.samples.distance.min().item() >= end - 1e-6
 
 
 def test_each_ray_has_its_own_background(cube: Box) -> None:

@@ -59,7 +59,6 @@ def test_the_field_learns_and_the_motion_stays(
     assert better > worse
 
 
-@pytest.mark.parametrize("wrong", [{"iterations": 0}, {"static_share": 1.0}, {"decay": 0.0}])
-def test_wrong_settings_are_told(wrong: dict[str, float]) -> None:
+def test_wrong_settings_are_told() -> None:
     with pytest.raises(DevrfError, match="refinement.schedule"):
-        RefinementSchedule(**wrong)  # type: ignore[arg-type]
+        RefinementSchedule(static_share=1.0)

@@ -1,4 +1,4 @@
-"""How fine a forward-facing grid is, by hand."""
+"""Sizes of fields: how fine the grid of a forward-facing scene is, by hand."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ SPACE = NormalizedDevice(200, 100, (150.0, 120.0), near=1.0)
     ("apart", "near", "planes"),
     [
         (1.6, 1.0, 61),  # 150 · 1.6 / 1 = 240 pixels, 4 to each of 60 steps
-        (1.6, 0.5, 121),
         (0.01, 1.0, 32),  # hardly any parallax
         (50.0, 1.0, 256),
     ],

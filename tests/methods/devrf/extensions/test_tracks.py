@@ -1,18 +1,22 @@
-"""Following pixels back along the flow, in a scene of three coloured bands before one camera."""
+"""Tracks along the flow: followed back in a scene of three bands, and fitted by a frame."""
 
 from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
 
 from devrf.data.batch import PixelPool, all_pixels
 from devrf.data.flow import previous_images
+from devrf.engine.graphs import Work
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.deformation_field import DeformationField
-from devrf.methods.devrf.extensions.tracks import FlowTracks, Tracks
+from devrf.methods.devrf.extensions.tracks import FlowTracks, Tracks, start_from_tracks
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.sampling import RenderSettings
@@ -98,13 +102,6 @@ def test_a_pixel_ends_where_its_color_is_met(model: DeVRFModel, views: Views) ->
     assert nearest.canonical[:, 0].tolist() == pytest.approx([x_of(RIGHT)], abs=0.02)
 
 
-def test_a_pixel_whose_color_is_right_goes_one_frame_back(model: DeVRFModel, views: Views) -> None:
-    views.pixels[3, ROW, MIDDLE] = torch.tensor(GREEN)
-    leads(views, 2, MIDDLE, MIDDLE + 3)
-    met = followed(model, views, MIDDLE, by_color=True)
-    assert met.canonical[:, 0].tolist() == pytest.approx([x_of(MIDDLE)], abs=0.02)
-
-
 def test_what_is_met_nowhere_or_cannot_be_followed_is_no_track(
     model: DeVRFModel, views: Views
 ) -> None:
@@ -139,3 +136,70 @@ def test_no_more_than_most_are_followed(model: DeVRFModel, views: Views) -> None
     pool = all_pixels(views, torch.tensor([3]))
     met = tracks.follow(3, pool, torch.Generator().manual_seed(0), learned=1, most=40)
     assert len(met) == 40
+
+
+BOX = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+SHIFT = torch.tensor([0.3, -0.2, 0.1])
+
+
+def three_cameras() -> Cameras:
+    positions = torch.tensor([[4.0, 0.0, 1.0], [0.0, 4.0, 1.0], [-3.0, -2.5, 1.5]])
+    return Cameras.looking_at(positions, torch.zeros(3, 3), focal=120.0, width=100, height=80)
+
+
+def shifted_ball(cameras: Cameras, radius: float = 0.4, count: int = 900) -> Tracks:
+    """Points of a ball at rest, each seen by one camera once the ball has moved by SHIFT."""
+    generator = torch.Generator().manual_seed(0)
+    points = torch.randn(count, 3, generator=generator)
+    points = radius * torch.nn.functional.normalize(points, dim=1)
+    camera = torch.arange(count) % len(cameras)
+    pixel, _ = cameras.project(camera, points + SHIFT)
+    return Tracks(points, camera, pixel)
+
+
+def test_three_views_of_a_shift_give_the_shift_and_the_way_back() -> None:
+    field = DeformationField(BOX, FrameClock((0.0, 0.5, 1.0)), voxels=10**3)
+    cameras = three_cameras()
+    tracks = shifted_ball(cameras)
+    tracks.pixel[::50] += 40.0  # the wrong flow of a few pixels is outvoted
+    start_from_tracks(field, 2, tracks, cameras, steps=200)
+    moved = field.unwarp(tracks.canonical, 1.0)
+    # The shift is more than the ball's radius: no rendered overlap could have shown it.
+    assert (moved - tracks.canonical - SHIFT).norm(dim=1).median() < 0.02
+    assert not field.to_canonical[:2].any() and not field.to_time[:2].any()
+    back = field.warp(tracks.canonical + SHIFT, 1.0)
+    assert (back - tracks.canonical).norm(dim=1).median() < 0.03
+
+
+def test_steps_of_a_fit_can_be_replayed_and_give_the_same() -> None:
+    cameras, fields, done = three_cameras(), [], []
+
+    class Replaying:
+        """Runs the work again, as a graph does: on the same memory."""
+
+        def warm_up(self, work: Work) -> None:
+            done.append("warm")
+            work()
+
+        def capture(self, work: Work) -> Any:
+            done.append("captured")
+            return SimpleNamespace(replay=work)
+
+    capturer: Any = Replaying()
+    for each in (None, capturer):
+        fields.append(DeformationField(BOX, FrameClock((0.0, 1.0)), voxels=6**3))
+        start_from_tracks(fields[-1], 1, shifted_ball(cameras), cameras, steps=20, capturer=each)
+    assert done == ["warm", "warm", "warm", "captured"] * 2
+    for name in ("to_canonical", "to_time"):
+        found, expected = (getattr(field, name) for field in fields[::-1])
+        assert expected.abs().amax() > 0.05
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_without_tracks_the_frame_stays_where_the_one_before_is() -> None:
+    field = DeformationField(BOX, FrameClock((0.0, 0.5, 1.0)), voxels=4**3)
+    field.to_canonical[1] = 0.25
+    field.frames.copy_previous(2)
+    nothing = Tracks(torch.zeros(0, 3), torch.zeros(0, dtype=torch.long), torch.zeros(0, 2))
+    start_from_tracks(field, 2, nothing, three_cameras())
+    assert torch.equal(field.to_canonical[2], field.to_canonical[1])

@@ -1,6 +1,9 @@
-"""Lists of fixed length see and learn what exact lists do: colours, losses, gradients."""
+"""Lists of fixed length: they learn what exact lists do, and show what the renderer shows."""
 
 from __future__ import annotations
+
+import os
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -12,18 +15,23 @@ from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.deformation_field import GridWarp
 from devrf.methods.devrf.extensions.color_residual import ResidualGrid
+from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.volume_rendering import render
-from devrf.ops.dispatch import Kind, using
-from devrf.rendering.list_rendering import render_static
+from devrf.ops.dispatch import using
+from devrf.rendering import list_rendering as module
+from devrf.rendering.list_rendering import ListRenderer, render_static
 from devrf.rendering.occupancy import Occupancy
-from devrf.rendering.output import VoxelOutput
+from devrf.rendering.output import RenderedImage, VoxelOutput
+from devrf.rendering.renderer import Renderer
 from devrf.rendering.sample_capacity import SampleCapacity
 from devrf.rendering.sampling import RenderSettings, most_steps, steps_through
+from devrf.scenes.scene import Scene
 
 RAYS = 24
 SETTINGS = RenderSettings(step=0.5, alpha_threshold=0.02, near=0.2, far=9.0)
-# How many slices the warp has: at rest, at a frame, between two.
-MOMENTS = (0, 1, 2)
+WHITE = torch.ones(3)
+Same = Callable[[RenderedImage, RenderedImage], None]
+Picture = Callable[[DeVRFModel, Rays, float, torch.Tensor], RenderedImage]
 
 
 class World:
@@ -115,8 +123,8 @@ def kept(output: VoxelOutput) -> slice | Tensor:
     return slice(None) if present is None else present.nonzero()[:, 0]
 
 
-@pytest.mark.parametrize("frames", MOMENTS)
-@pytest.mark.parametrize("planes", [None, 9])
+# How many slices the warp has: at rest, at a frame, between two.
+@pytest.mark.parametrize(("frames", "planes"), [(0, None), (1, 9), (2, None)])
 def test_lists_of_fixed_length_see_and_learn_the_same(frames: int, planes: int | None) -> None:
     world = World(torch.float64, frames, planes)
     with using("torch"):
@@ -135,7 +143,7 @@ def test_lists_of_fixed_length_see_and_learn_the_same(frames: int, planes: int |
         torch.testing.assert_close(ours, theirs, **close)
 
 
-@pytest.mark.parametrize("frames", MOMENTS)
+@pytest.mark.parametrize("frames", [0, 2])
 def test_the_kernels_see_and_learn_the_same(frames: int) -> None:
     pytest.importorskip("triton")
     world = World(torch.float32, frames)
@@ -150,11 +158,10 @@ def test_the_kernels_see_and_learn_the_same(frames: int) -> None:
         torch.testing.assert_close(ours, theirs, atol=1e-5, rtol=1e-4)
 
 
-@pytest.mark.parametrize("kind", ["torch", "triton"])
-def test_gradients_that_are_there_are_added_to_in_place(kind: Kind) -> None:
+def test_gradients_that_are_there_are_added_to_in_place() -> None:
     pytest.importorskip("triton")
     world = World(torch.float32, 1)
-    with using(kind):
+    with using("triton"):
         expected = learn(world.listed(fitting()), world.leaves)
         for leaf in world.leaves:
             leaf.grad = torch.ones_like(leaf)
@@ -205,9 +212,8 @@ def test_lists_that_are_too_short_lose_the_last_rays_alone_and_grow(
     assert sum("lists grow" in line for line in caplog.messages) == 1
 
 
-@pytest.mark.parametrize("planes", [None, 9])
-def test_no_ray_has_more_samples_than_is_said(planes: int | None) -> None:
-    field: CanonicalField = World(torch.float64, 0, planes).field
+def test_no_ray_has_more_samples_than_is_said() -> None:
+    field: CanonicalField = World(torch.float64, 0).field
     rng = torch.Generator().manual_seed(0)
     directions = torch.nn.functional.normalize(torch.randn(500, 3, generator=rng), dim=1)
     low, high = field.box.corners(directions)
@@ -222,3 +228,64 @@ def test_no_ray_has_more_samples_than_is_said(planes: int | None) -> None:
     through = Rays(low[None], (high - low)[None] / (high - low).norm(), directions[:1])
     _, count = steps_through(through, field.box, step=0.01, near=0.0, far=9.0)
     assert longest(0.01) - 2 <= int(count) <= longest(0.01)
+
+
+@pytest.fixture
+def searches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The capacity of each search for samples."""
+    capacities: list[int] = []
+    inner: Callable[..., object] = module.search
+
+    def counted(*arguments: object, capacity: int, **named: object) -> object:
+        capacities.append(capacity)
+        return inner(*arguments, capacity=capacity, **named)
+
+    monkeypatch.setattr(module, "search", counted)
+    return capacities
+
+
+@pytest.mark.parametrize("time", [0.0, 0.7])
+def test_what_the_renderer_shows(
+    moving: DeVRFModel, tiny_scene: Scene, time: float, same: Same, reference: Picture
+) -> None:
+    rays, view = tiny_scene.dynamic.test.cameras.image_rays(0), moving.at(time)
+    renderer = ListRenderer(moving.canonical, moving.settings, half=True)  # not on a CPU
+    colors = moving.color_change(time)
+    seen = renderer.picture(rays, view.occupancy, view.displacement, WHITE, colors)
+    same(seen, reference(moving, rays, time, WHITE))
+    assert int((seen.opacity > 0.5).sum()) > 20
+
+
+def test_lists_grow_once_and_stay(
+    moving: DeVRFModel, tiny_scene: Scene, searches: list[int], same: Same
+) -> None:
+    rays = tiny_scene.dynamic.test.cameras.image_rays(0)
+    renderer = ListRenderer(moving.canonical, moving.settings)
+    first = renderer.picture(rays, moving.occupancy, None, WHITE)
+    assert searches[0] == 0 and searches[1] > 0 and len(searches) == 2
+    same(renderer.picture(rays, moving.occupancy, None, WHITE), first)
+    assert searches[2:] == searches[1:2]
+
+
+def test_rays_that_meet_nothing(moving: DeVRFModel) -> None:
+    up = torch.tensor([[0.0, 0.0, 1.0]]).expand(3, 3)
+    rays = Rays(torch.tensor([[50.0, 0.0, 0.0]]).expand(3, 3), up, up)
+    renderer = ListRenderer(moving.canonical, moving.settings)
+    for some in (rays, rays[:0]):
+        seen = renderer.picture(some, moving.occupancy, None, WHITE)
+        assert torch.equal(seen.color, torch.ones(len(some), 3))
+        assert not seen.depth.any() and not seen.opacity.any()
+
+
+@pytest.mark.skipif(os.environ["TRITON_INTERPRET"] != "1", reason="needs Triton's interpreter")
+def test_the_renderer_shows_the_same_with_triton(
+    moving: DeVRFModel, tiny_scene: Scene, searches: list[int], same: Same
+) -> None:
+    pytest.importorskip("triton")
+    renderer, cameras = Renderer(moving), tiny_scene.dynamic.test.cameras.resized(5, 4)
+    with using("torch"):
+        plain = renderer.view(cameras, 0, 0.7, 1.0)
+    assert not searches
+    with using("triton"):
+        same(renderer.view(cameras, 0, 0.7, 1.0), plain)
+    assert searches and (plain.opacity > 0.5).any()
