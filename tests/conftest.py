@@ -10,11 +10,9 @@ import os
 import re
 import signal
 import sys
-import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +44,6 @@ from devrf.engine.stage import ScheduledStage
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
-from devrf.geometry.rays import Rays
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
@@ -54,8 +51,6 @@ from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.extensions.color_residual import ResidualField
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import CanonicalRates
-from devrf.methods.devrf.volume_rendering import render
-from devrf.rendering.output import RenderedImage
 from devrf.scenes.procedural import ProceduralScene
 from devrf.scenes.scene import Scene
 
@@ -201,7 +196,7 @@ def tiny_room_recipe(tiny_recipe: ProceduralScene) -> ProceduralScene:
 
 @pytest.fixture(scope="session")
 def tiny_room(tiny_room_recipe: ProceduralScene) -> Scene:
-    """The tiny scene in a room: images without mattes, a scene without end."""
+    """The tiny scene in a room: an unbounded scene whose images have no alpha masks."""
     return tiny_room_recipe()
 
 
@@ -236,12 +231,6 @@ def sparse_model(
     (folder / "points3D.txt").write_text("\n".join(rows) + "\n")
 
 
-@pytest.fixture(scope="session")
-def write_sparse() -> Callable[..., None]:
-    """The function :func:`sparse_model`."""
-    return sparse_model
-
-
 def rig_of_videos(
     root: Path, films: Mapping[str, Iterable[np.ndarray]], cameras: Cameras, near: float, far: float
 ) -> None:
@@ -258,6 +247,12 @@ def rig_of_videos(
     rows = torch.stack([-up, right, back, position, column], dim=2).reshape(-1, 15)
     depths = torch.tensor([[near, far]], dtype=torch.float64).expand(len(cameras), 2)
     np.save(root / "poses_bounds.npy", torch.cat([rows, depths], dim=1).numpy())
+
+
+@pytest.fixture(scope="session")
+def write_sparse() -> Callable[..., None]:
+    """The function :func:`sparse_model`."""
+    return sparse_model
 
 
 @pytest.fixture(scope="session")
@@ -424,98 +419,3 @@ def moving(learned: tuple[CanonicalStage, Trainer], rng: torch.Generator) -> DeV
     shape = model.color_residual.values[1:].shape
     model.color_residual.values[1:] = 2 * torch.rand(shape, generator=rng) - 1
     return model
-
-
-def plain_picture(
-    model: DeVRFModel, rays: Rays, time: float, background: torch.Tensor
-) -> RenderedImage:
-    """What rays in the fields' space see of a model at ``time``, by the plain renderer."""
-    scene = model.canonical, model.occupancy_at(time), model.settings
-    with torch.no_grad():
-        warp, colors = model.warp(time), model.color_change(time)
-        return RenderedImage.of(render(rays, *scene, background, warp, color_change=colors))
-
-
-@pytest.fixture
-def reference() -> Callable[[DeVRFModel, Rays, float, torch.Tensor], RenderedImage]:
-    """The function :func:`plain_picture`."""
-    return plain_picture
-
-
-@pytest.fixture
-def same() -> Callable[[RenderedImage, RenderedImage], None]:
-    """Fails unless two pictures show the same, up to 1e-5."""
-
-    def compare(one: RenderedImage, other: RenderedImage) -> None:
-        for name in ("color", "depth", "opacity"):
-            torch.testing.assert_close(
-                getattr(one, name), getattr(other, name), atol=1e-5, rtol=1e-5
-            )
-
-    return compare
-
-
-@dataclass
-class Web:
-    """A server on this machine.
-
-    Attributes:
-        address: of the server, without a slash at the end.
-        files: what it serves, by path; a change gives a file another version.
-        cuts: after how many bytes the connection breaks, for each request in turn, by path.
-        asked: (method, path, Range) of each request.
-        remembers: whether it knows versions of its files, and gives parts of them.
-    """
-
-    address: str = ""
-    files: dict[str, bytes] = field(default_factory=dict)
-    cuts: dict[str, list[int]] = field(default_factory=dict)
-    asked: list[tuple[str, str, str | None]] = field(default_factory=list)
-    remembers: bool = True
-
-
-def handler_of(web: Web) -> type[BaseHTTPRequestHandler]:
-    """Answers requests for the files of ``web``."""
-
-    class Handler(BaseHTTPRequestHandler):
-        def do_HEAD(self) -> None:  # noqa: N802
-            self.answer()
-
-        def do_GET(self) -> None:  # noqa: N802
-            content = self.answer()
-            cuts = web.cuts.get(self.path, [])
-            self.wfile.write(content[: cuts.pop(0)] if cuts else content)
-
-        def answer(self) -> bytes:
-            asked = self.headers.get("Range")
-            web.asked.append((self.command, self.path, asked))
-            if self.path not in web.files:
-                self.send_error(404)
-                return b""
-            content = web.files[self.path]
-            version = f'"{hash(content)}"'
-            partial = web.remembers and asked and self.headers.get("If-Range") == version
-            if partial:
-                content = content[int(asked.removeprefix("bytes=").removesuffix("-")) :]
-            self.send_response(206 if partial else 200)
-            self.send_header("Content-Length", str(len(content)))
-            if web.remembers:
-                self.send_header("ETag", version)
-            self.end_headers()
-            return content
-
-        def log_message(self, *_: object) -> None:
-            pass
-
-    return Handler
-
-
-@pytest.fixture
-def web() -> Iterator[Web]:
-    """A server of a test's own files."""
-    served = Web()
-    with ThreadingHTTPServer(("127.0.0.1", 0), handler_of(served)) as server:
-        served.address = f"http://127.0.0.1:{server.server_port}"
-        threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
-        yield served
-        server.shutdown()

@@ -1,0 +1,42 @@
+"""Pictures by the plain renderer, and their comparison."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+
+from devrf.geometry.rays import Rays
+from devrf.methods.devrf.model import DeVRFModel
+from devrf.methods.devrf.volume_rendering import render
+from devrf.rendering.output import RenderedImage
+
+
+def plain_picture(
+    model: DeVRFModel, rays: Rays, time: float, background: torch.Tensor
+) -> RenderedImage:
+    """What rays in the fields' space see of a model at ``time``, by the plain renderer."""
+    scene = model.canonical, model.occupancy_at(time), model.settings
+    with torch.no_grad():
+        warp, colors = model.warp(time), model.color_change(time)
+        return RenderedImage.of(render(rays, *scene, background, warp, color_change=colors))
+
+
+@pytest.fixture
+def reference() -> Callable[[DeVRFModel, Rays, float, torch.Tensor], RenderedImage]:
+    """The function :func:`plain_picture`."""
+    return plain_picture
+
+
+@pytest.fixture
+def same() -> Callable[[RenderedImage, RenderedImage], None]:
+    """Fails unless two pictures show the same, up to 1e-5."""
+
+    def compare(one: RenderedImage, other: RenderedImage) -> None:
+        for name in ("color", "depth", "opacity"):
+            torch.testing.assert_close(
+                getattr(one, name), getattr(other, name), atol=1e-5, rtol=1e-5
+            )
+
+    return compare
