@@ -25,11 +25,11 @@ import torch
 from lightning import Callback, Trainer, seed_everything
 from lightning.pytorch.callbacks import LambdaCallback
 
+from devrf.accel.graphs import CudaGraphCapture, Graphs, Work
 from devrf.callbacks import GridUpscaling, LearningRateDecay, PeriodicCheckpoint, StopOnSignal
 from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, LoadedCheckpoint
 from devrf.checkpoints.progress import progress_files
 from devrf.data.rendered import ProceduralDataModule
-from devrf.engine.graphs import CudaGraphCapture, Graphs, Work
 from devrf.engine.stage import ScheduledStage
 from devrf.errors import DevrfError, did_you_mean
 from devrf.evaluation.held_out import background_value

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from devrf import selfcheck
-from devrf.engine.graphs import CudaGraphCapture, Work
+from devrf.accel.graphs import CudaGraphCapture, Work
 from devrf.engine.loop import Loop
 from devrf.engine.micro_batching import MicroBatching
 from devrf.errors import DevrfError

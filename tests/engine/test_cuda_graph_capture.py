@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from devrf.engine.graphs import CudaGraphCapture, GraphedStep
+from devrf.accel.graphs import CudaGraphCapture, GraphedStep
 
 
 class Stream:

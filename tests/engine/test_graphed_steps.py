@@ -21,9 +21,9 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from devrf.accel import blocks
+from devrf.accel.graphs import GraphedStep, Work
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
-from devrf.engine.graphs import GraphedStep, Work
 from devrf.engine.stage import ScheduledStage
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule

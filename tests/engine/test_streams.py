@@ -13,11 +13,11 @@ import torch
 from lightning import Callback, Trainer
 from torch.profiler import ProfilerActivity, profile
 
+from devrf.accel.streams import StreamParallel
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import Pixels
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.loop import ParallelBatch
-from devrf.engine.streams import StreamParallel
 from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.extensions.tracks import StartAlongFlow

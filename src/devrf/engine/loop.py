@@ -11,11 +11,11 @@ import torch
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
 
+from devrf.accel.graphs import CudaGraphCapture, GraphedStep, Graphs
+from devrf.accel.streams import StreamParallel
 from devrf.data.batch import Pixels
 from devrf.engine.ddp import average, average_gradients, rays_per_rank, world_size
-from devrf.engine.graphs import CudaGraphCapture, GraphedStep, Graphs
 from devrf.engine.micro_batching import MicroBatching
-from devrf.engine.streams import StreamParallel
 from devrf.ops.adam import GridAdam
 from devrf.rendering.sample_capacity import SampleCapacity
 from devrf.system.device import wait
@@ -132,13 +132,18 @@ class Loop:
         self.micro_batching = MicroBatching()
         self.metrics = MetricAccumulator()
         self.num_captures = self.num_short_lists = 0
-        self._rays = 0
+        self._rays, self._processes = 0, 1
         self._device = torch.device("cpu")
         # What losses are scaled by in the backward pass, which would fill one each time.
         self._one = torch.ones(())
         self._streams = StreamParallel()
         self._graphed: GraphedStep | None = None
         self._capture: CudaGraphCapture | None = None
+
+    @property
+    def rays(self) -> int:
+        """Rays of a batch in this process."""
+        return self._rays
 
     @property
     def capacities(self) -> list[SampleCapacity]:
@@ -162,7 +167,8 @@ class Loop:
             static_shape: whether all shapes must be independent of data.
         """
         self.release()
-        self._rays, self._device = rays, parameters[0][0].device
+        self._rays, self._device = rays_per_rank(rays), parameters[0][0].device
+        self._processes = world_size()
         self._one = self._one.to(self._device)
         self.batches = [ParallelBatch(k, learned) for k, learned in enumerate(parameters)]
         if static_shape:
@@ -211,7 +217,7 @@ class Loop:
         self.num_short_lists += sum(capacity.num_short for capacity in self.capacities) - before
 
     def _make_capacities(self) -> None:
-        rays = -(-rays_per_rank(self._rays) // self.micro_batching.count)
+        rays = -(-self._rays // self.micro_batching.count)
         for batch in self.batches:
             batch.capacity = SampleCapacity(rays, self._device)
 
@@ -222,8 +228,9 @@ class Loop:
         else:
             pieces = [partial(self._gradients, batch, stage, views) for batch in self.batches]
             found = self._streams(pieces, self._device)
-        groups = stage.optimizer.param_groups
-        average_gradients(p for group in groups for p in group["params"])
+        if self._processes > 1:
+            groups = stage.optimizer.param_groups
+            average_gradients(p for group in groups for p in group["params"])
         self.metrics.add(found)
 
     def _gradients(self, batch: ParallelBatch, stage: Learner, views: Any) -> dict[str, Tensor]:
@@ -280,7 +287,7 @@ class Loop:
             not self.capacities
             or self.graphs != "auto"
             or self._device.type != "cuda"
-            or world_size() > 1
+            or self._processes > 1
         ):
             return None
         if self._capture is None or self._capture.device != self._device:

@@ -19,6 +19,7 @@ from lightning import LightningModule
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
 
+from devrf.accel.graphs import Graphs
 from devrf.checkpoints.checkpoint import (
     MODEL,
     CheckpointMetadata,
@@ -30,7 +31,6 @@ from devrf.checkpoints.checkpoint import (
 from devrf.checkpoints.progress import rng_state, set_rng_state
 from devrf.data.batch import Pixels, background_color
 from devrf.engine.ddp import assert_replicas_equal, broadcast, check_strategy, rank
-from devrf.engine.graphs import Graphs
 from devrf.engine.loop import Loop, ParallelBatch
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import score

@@ -11,8 +11,13 @@ from torch import Tensor
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
 from devrf.methods.devrf.architecture import Architecture
-from devrf.methods.devrf.canonical_field import CanonicalField, VoxelGrid, resample
-from devrf.methods.devrf.color_decoder import ColorDecoder, SigmoidColor
+from devrf.methods.devrf.canonical_field import (
+    CanonicalField,
+    ColorDecoder,
+    SigmoidColor,
+    VoxelGrid,
+    resample,
+)
 from devrf.ops.compositing import composite
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.sampling import march

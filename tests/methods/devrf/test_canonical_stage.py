@@ -16,9 +16,9 @@ from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.methods.devrf.architecture import Architecture
+from devrf.methods.devrf.canonical_field import ColorDecoder, SigmoidColor
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
-from devrf.methods.devrf.color_decoder import ColorDecoder, SigmoidColor
 from devrf.methods.devrf.free_space import possible_matter, view_count, view_count_weight
 from devrf.methods.devrf.settings import Precision
 from devrf.scenes.scene import Scene

@@ -25,7 +25,7 @@ from devrf.methods.devrf.losses import (
     flow,
     induced_flow,
 )
-from devrf.methods.devrf.weighted_loss import weighted_loss
+from devrf.methods.devrf.voxel_stage import weighted_loss
 from devrf.methods.weighted_loss import counted_weights
 from devrf.rendering.output import VoxelOutput
 from devrf.rendering.sampling import Samples

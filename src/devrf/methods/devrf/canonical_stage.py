@@ -10,11 +10,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from devrf.accel.graphs import Graphs
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.checkpoints.stored_grids import pack_bits, unpack_bits
 from devrf.data.batch import PixelPool, Pixels
 from devrf.engine.batches import static_pool
-from devrf.engine.graphs import Graphs
 from devrf.engine.loop import ParallelBatch
 from devrf.errors import DevrfError
 from devrf.methods.devrf.architecture import Architecture, fitted_to
@@ -29,8 +29,7 @@ from devrf.methods.devrf.losses import (
 )
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import FINE_LOSS, SEARCH_LOSS, CanonicalRates, Precision, Sampling
-from devrf.methods.devrf.voxel_stage import VoxelStage
-from devrf.methods.devrf.weighted_loss import weighted_loss
+from devrf.methods.devrf.voxel_stage import VoxelStage, weighted_loss
 from devrf.methods.weighted_loss import counted_weights
 from devrf.ops.adam import GridAdam
 from devrf.rendering.occupancy import Occupancy, bounding_box, dilate

@@ -11,12 +11,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from devrf.accel.graphs import Graphs
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import Pixels
 from devrf.data.flow import previous_images
-from devrf.engine.active_frames import ActiveFrames
+from devrf.engine.active_frames import ActiveFrame, ActiveFrames
 from devrf.engine.convergence import Convergence
-from devrf.engine.graphs import Graphs
 from devrf.engine.loop import ParallelBatch
 from devrf.errors import DevrfError
 from devrf.methods.devrf.deformation_field import DeformationField, deformed_occupancy
@@ -26,8 +26,9 @@ from devrf.methods.devrf.losses import FlowMean, MotionPrediction
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.motion_loss import MotionLoss
 from devrf.methods.devrf.settings import DEFORMATION_LOSS, MotionSettings, Precision
-from devrf.methods.devrf.voxel_stage import VoxelStage
+from devrf.methods.devrf.voxel_stage import VoxelStage, weighted_loss
 from devrf.ops.adam import GridAdam
+from devrf.rendering.output import ColorChange
 from devrf.scenes.scene import CaptureName, Views
 from devrf.system.profiling import span
 
@@ -46,7 +47,6 @@ class DeformationStage(VoxelStage):
     phase: DeformationPhase | None
     name = "deformation"
     capture: CaptureName = "dynamic"
-    memory_keys = ("schedule.deformation.levels", "schedule.deformation.rays")
     rate_keys = "schedule.motion.learning_rate or the weights of loss.deformation"
 
     def __init__(
@@ -96,6 +96,7 @@ class DeformationStage(VoxelStage):
         )
         self.active = ActiveFrames(self)
         self._convergence = Convergence()
+        self._color_changes: list[ColorChange | None] = []
 
     @classmethod
     def check_settings(cls, **settings: Any) -> None:
@@ -230,10 +231,16 @@ class DeformationStage(VoxelStage):
         self._optimizer.replace(0, learned, smoothing=smoothing)
         for extension in self.extensions:
             extension.begin_level(self, level)
+        self._color_changes = [self._color_change(frame) for frame in self.active]
         if len(self.active):
             static_shape = self.static_shape(self.scene_model.canonical.density.values)
             parameters = [frame.learned for frame in self.active]
             self.bind(self.schedule.rays, parameters, static_shape=static_shape)
+
+    def _color_change(self, frame: ActiveFrame) -> ColorChange | None:
+        """What an extension adds to the colours' logits of a frame, if any does."""
+        changes = (extension.color_change(frame) for extension in self.extensions)
+        return next((change for change in changes if change is not None), None)
 
     def _prefetch_after(self, phase: DeformationPhase) -> None:
         """Begin to fetch the next phase's frames, unless they change before it begins."""
@@ -296,8 +303,7 @@ class DeformationStage(VoxelStage):
         frame, capacity, field = self.active[batch.number], batch.capacity, self.field
         # Before frame 1 nothing has moved; lists of fixed length take the same work each time.
         before = [frame.before] if capacity is not None or frame.number > 1 else []
-        changes = (extension.color_change(frame) for extension in self.extensions)
-        color_change = next((change for change in changes if change is not None), None)
+        color_change = self._color_changes[batch.number]
         warp = field.warp_by(frame.backward)
         prediction = MotionPrediction(
             *self.render_pixels(views, pixels, frame.occupancy, capacity, warp, color_change),
@@ -311,7 +317,7 @@ class DeformationStage(VoxelStage):
             self.flow_mean,
         )
         with span("losses"):
-            return self.motion_loss(prediction)
+            return weighted_loss(prediction, self.motion_loss.terms, self.weights)
 
     def converged(self, losses: Tensor) -> bool:
         """Whether each active frame's loss has stopped falling, if the schedule asks for that."""
@@ -323,6 +329,13 @@ class DeformationStage(VoxelStage):
         super().rollback(iteration, lr_scale)
         self._convergence.reset()
         self._update_occupancy()
+
+    @property
+    def memory_keys(self) -> tuple[str, ...]:  # type: ignore[override]
+        """The level's grids and rays; how many frames are learned together, if several are."""
+        level = f"schedule.deformation.levels.{1 if self.phase is None else self.phase.level + 1}"
+        keys = (f"{level}.side", "schedule.deformation.rays")
+        return (*keys, f"{level}.parallel_frames") if len(self.active) > 1 else keys
 
     def phase_state(self) -> dict[str, Any]:
         """The state of each active frame, and its losses so far."""

@@ -112,5 +112,8 @@ class Extension:
         """Give one of the phase's frames its first values, in the fields, before a visit."""
 
     def color_change(self, frame: ActiveFrame) -> ColorChange | None:
-        """What is added to the colours' logits of an active frame; None: nothing."""
+        """What is added to the colours' logits of an active frame; None: nothing.
+
+        Asked once a level: it reads the frame's present values whenever it is called.
+        """
         return None

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from torch import Tensor
-
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.extension import Extension, MotionTerm
-from devrf.methods.devrf.losses import MOTION_TERMS, MotionPrediction, total_variation_weight
-from devrf.methods.devrf.weighted_loss import weighted_loss
+from devrf.methods.devrf.losses import (
+    MOTION_TERMS,
+    total_variation_weight,
+)
 from devrf.methods.weighted_loss import counted_weights
 
 
@@ -18,6 +18,7 @@ class MotionLoss:
     """Σ weight · factor · term, the factors being those of the present level.
 
     Attributes:
+        terms: what can be computed, by name.
         weights: of the terms that count at the present level.
     """
 
@@ -37,13 +38,13 @@ class MotionLoss:
         Raises:
             DevrfError: a weight, or a factor of the schedule, is of no term.
         """
-        self._terms: dict[str, MotionTerm] = dict(MOTION_TERMS)
+        self.terms: dict[str, MotionTerm] = dict(MOTION_TERMS)
         weights = {name: weight for name, weight in loss.items() if name != "tv"}
         for extension in extensions:
-            self._terms |= extension.terms
+            self.terms |= extension.terms
             weights |= extension.weights
-        schedule.check_terms({*self._terms, "tv"})
-        self._whole = counted_weights(weights, self._terms, "loss.deformation")
+        schedule.check_terms({*self.terms, "tv"})
+        self._whole = counted_weights(weights, self.terms, "loss.deformation")
         self._tv = loss.get("tv", 0.0)
         self._extensions, self._schedule = extensions, schedule
         self.weights: Mapping[str, float] = self._whole
@@ -65,7 +66,3 @@ class MotionLoss:
         """The optimiser's weight of the total variation of grids of ``shape`` at ``level``."""
         weight = self._tv * self._schedule.weight_factor("tv", level)
         return total_variation_weight(weight, max(shape), self._schedule.rays)
-
-    def __call__(self, prediction: MotionPrediction) -> tuple[Tensor, dict[str, Tensor]]:
-        """The loss () of a batch; each term's value and how much rays hit, detached, by name."""
-        return weighted_loss(prediction, self._terms, self.weights)

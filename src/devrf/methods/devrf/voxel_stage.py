@@ -1,21 +1,24 @@
-"""What both stages share: how a batch is drawn and rendered."""
+"""What the stages share: how a batch is drawn and rendered, and how its loss terms are weighed."""
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Callable, Mapping
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
+from devrf.accel.graphs import Graphs
 from devrf.data.batch import PixelPool, Pixels, RayBatch
 from devrf.engine.batches import gather_batch
-from devrf.engine.ddp import rays_per_rank
-from devrf.engine.graphs import Graphs
 from devrf.engine.stage import ScheduledStage
 from devrf.methods.devrf.deformation_field import GridWarp
+from devrf.methods.devrf.fused_losses import Weighted, fused_losses
+from devrf.methods.devrf.losses import Prediction
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import Precision
 from devrf.methods.devrf.volume_rendering import render
+from devrf.methods.weighted_loss import visibility, weighted_sum
 from devrf.ops.dispatch import triton_runs
 from devrf.rendering.list_rendering import render_static
 from devrf.rendering.occupancy import Occupancy
@@ -25,14 +28,7 @@ from devrf.scenes.scene import Views
 from devrf.system.device import multiplies_bfloat16
 from devrf.system.profiling import span
 
-
-class RayCount(Protocol):
-    """What a schedule says of batches."""
-
-    @property
-    def rays(self) -> int:
-        """Of a batch."""
-        ...
+Predicted = TypeVar("Predicted", bound=Prediction)
 
 
 class VoxelStage(ScheduledStage):
@@ -40,12 +36,10 @@ class VoxelStage(ScheduledStage):
 
     Attributes:
         scene_model: the canonical field, its occupancy, and how it deforms.
-        schedule: resolutions, iterations and rays.
         decoder_precision: what the colour network computes in while it learns.
     """
 
     scene_model: DeVRFModel
-    schedule: RayCount
 
     def __init__(
         self,
@@ -63,7 +57,7 @@ class VoxelStage(ScheduledStage):
     def draw_pixels(self, pool: PixelPool) -> Pixels:
         """A batch of random pixels of a pool."""
         with span("batch"):
-            image, flat = pool.draw(rays_per_rank(self.schedule.rays), self.generator)
+            image, flat = pool.draw(self.loop.rays, self.generator)
             return Pixels(image, flat, self.background(image))
 
     def render_pixels(
@@ -99,3 +93,31 @@ class VoxelStage(ScheduledStage):
         chosen = self.decoder_precision
         reduced = multiplies_bfloat16(self.device) if chosen == "auto" else chosen == "bfloat16"
         return torch.bfloat16 if reduced else torch.float32
+
+
+def weighted_loss(
+    prediction: Predicted,
+    terms: Mapping[str, Callable[[Predicted], Tensor]],
+    weights: Mapping[str, float],
+) -> Weighted:
+    """Σ weight · term (); each term's value and how much rays hit, detached, by name.
+
+    Args:
+        prediction: what a batch's rays see, and the truth.
+        terms: what can be computed, by name.
+        weights: of the terms that count.
+    """
+    parts: list[Weighted] = []
+    output = prediction.output
+    if output.first is not None and triton_runs(output.color, output.sample_color):
+        parts = fused_losses(prediction, output.first, weights)
+    known = {name for _, values in parts for name in values}
+    others = {name: terms[name](prediction) for name in weights if name not in known}
+    if others:
+        parts.append(weighted_sum(others, weights))
+    total, values = parts[0]
+    for part, further in parts[1:]:
+        total, values = total + part, values | further
+    if "opacity" not in values:
+        values |= visibility(prediction.output.transmittance, prediction.batch.alpha)
+    return total, values

@@ -13,10 +13,9 @@ from devrf.data.datamodule import SceneDataModule
 from devrf.engine.batches import gather_batch
 from devrf.geometry.box import Box
 from devrf.methods.devrf.architecture import Architecture
-from devrf.methods.devrf.canonical_field import CanonicalField
+from devrf.methods.devrf.canonical_field import CanonicalField, SigmoidColor
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
-from devrf.methods.devrf.color_decoder import SigmoidColor
 from devrf.methods.devrf.extensions import depth_crop
 from devrf.methods.devrf.extensions.depth_crop import crop_to_visible, visible_depths, with_room
 from devrf.methods.devrf.model import DeVRFModel

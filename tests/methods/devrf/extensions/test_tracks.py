@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 import torch
 
+from devrf.accel.graphs import Work
 from devrf.data.batch import PixelPool, all_pixels
 from devrf.data.flow import previous_images
-from devrf.engine.graphs import Work
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock

@@ -20,8 +20,7 @@ from devrf.engine.stage import Phase
 from devrf.errors import DevrfError
 from devrf.methods.devrf.losses import PHOTOMETRIC_TERMS, Prediction
 from devrf.methods.devrf.settings import FINE_LOSS, CanonicalRates, Precision
-from devrf.methods.devrf.voxel_stage import VoxelStage
-from devrf.methods.devrf.weighted_loss import weighted_loss
+from devrf.methods.devrf.voxel_stage import VoxelStage, weighted_loss
 from devrf.methods.weighted_loss import counted_weights
 from devrf.ops.adam import GridAdam
 from devrf.rendering.occupancy import Occupancy, dilate

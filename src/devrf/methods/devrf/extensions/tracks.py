@@ -14,10 +14,10 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from devrf.accel.graphs import CudaGraphCapture, GraphedStep
 from devrf.data.batch import PixelPool, all_pixels
 from devrf.engine.batches import gather_batch, images_of
 from devrf.engine.ddp import broadcast
-from devrf.engine.graphs import CudaGraphCapture, GraphedStep
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.space import WORLD, Space
 from devrf.methods.devrf.deformation_field import DeformationField

@@ -1,12 +1,9 @@
-"""The weighted sum of loss terms; where Triton runs, kernels compute several terms together.
-
-What the terms are is said in :mod:`devrf.methods.devrf.losses`.
-"""
+"""Loss terms that a kernel computes together, where Triton runs; ``losses`` says what they are."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import TypeGuard, TypeVar
+from collections.abc import Mapping
+from typing import TypeGuard
 
 from torch import Tensor
 
@@ -15,47 +12,25 @@ from devrf.geometry.space import WORLD
 from devrf.methods.devrf.deformation_field import GridWarp
 from devrf.methods.devrf.losses import MotionPrediction, Prediction
 from devrf.methods.devrf.volume_rendering import Warp
-from devrf.methods.weighted_loss import visibility, weighted_sum
 from devrf.ops.dispatch import triton_runs
 from devrf.ops.motion import ListedSamples, SeenEarlier, motion_sum
 from devrf.ops.photometric import TERMS, photometric_sum
 
-Predicted = TypeVar("Predicted", bound=Prediction)
 # Σ weight · term (), and each term's value, by name.
 Weighted = tuple[Tensor, dict[str, Tensor]]
 
 
-def weighted_loss(
-    prediction: Predicted,
-    terms: Mapping[str, Callable[[Predicted], Tensor]],
-    weights: Mapping[str, float],
-) -> Weighted:
-    """Σ weight · term (); each term's value and how much rays hit, detached, by name.
+def fused_losses(
+    prediction: Prediction, first: Tensor, weights: Mapping[str, float]
+) -> list[Weighted]:
+    """The weighted sums of the terms that kernels compute, of those that ``weights`` names.
 
     Args:
-        prediction: what a batch's rays see, and the truth.
-        terms: what can be computed, by name.
+        prediction: what a batch's rays see, in lists of fixed length.
+        first: (R + 1,) where each ray's samples begin.
         weights: of the terms that count.
     """
-    parts = _fused(prediction, weights)
-    known = {name for _, values in parts for name in values}
-    others = {name: terms[name](prediction) for name in weights if name not in known}
-    if others:
-        parts.append(weighted_sum(others, weights))
-    total, values = parts[0]
-    for part, further in parts[1:]:
-        total, values = total + part, values | further
-    if "opacity" not in values:
-        values |= visibility(prediction.output.transmittance, prediction.batch.alpha)
-    return total, values
-
-
-def _fused(prediction: Prediction, weights: Mapping[str, float]) -> list[Weighted]:
-    """The terms that kernels compute, of those that ``weights`` names."""
-    output = prediction.output
-    if output.first is None or not triton_runs(output.color, output.sample_color):
-        return []
-    parts = [_photometric(prediction, output.first, weights)]
+    parts = [_photometric(prediction, first, weights)]
     if isinstance(prediction, MotionPrediction) and not {"cycle", "flow"}.isdisjoint(weights):
         motion = _motion(prediction, weights)
         parts += [] if motion is None else [motion]
