@@ -1,15 +1,13 @@
 """DeVRF, in modules that follow the paper and docs/method.md.
 
-1. Canonical field: ``architecture``, ``voxel_grid``, ``canonical_field``, ``color_decoder``.
+1. Canonical field: ``canonical_field``; its sizes, ``architecture``.
 2. Rays, samples, compositing: ``volume_rendering``; then ``losses``.
-3. Canonical stage: ``canonical_schedule``, ``grid_resolution``, ``free_space``, ``depth_crop``,
-   ``canonical_stage``.
-4. Deformation field: ``deformation_field``, ``grid_warp``, ``deformed_occupancy``.
-5. Deformation stage: ``deformation_schedule``, ``deformation_stage``; beyond the paper
-   ``flow_tracks``, ``flow_initialisation`` and ``convergence``.
+3. Canonical stage: ``canonical_schedule``, ``free_space``, ``canonical_stage``.
+4. Deformation field and warp: ``deformation_field``.
+5. Deformation stage: ``deformation_schedule``, ``motion_loss``, ``deformation_stage``.
 
-``settings`` has the defaults of both stages and ``voxel_stage`` what they share; ``model`` and
-``view`` are the learned scene. Memory and files: ``active_frame``, ``frame_memory``,
-``pixel_selection``, ``compact_state``. ``static_shape`` renders the same where shapes must not
-depend on data, for CUDA graphs and Triton.
+``settings`` has the defaults of the stages and ``voxel_stage`` what they share; ``model`` and
+``view`` are the learned scene, ``compact_state`` is how a checkpoint holds it. ``extension`` says
+what may be added to the deformation stage, ``extensions`` has what is. ``fused_losses`` computes
+terms together where Triton runs.
 """
