@@ -81,7 +81,7 @@ def test_rays_belong_to_the_cameras_of_their_images():
 @pytest.mark.parametrize(
     "background", [torch.tensor([1.0, 1.0, 1.0]), torch.tensor([[1.0, 0.0, 0.5], [0.2, 0.4, 0.6]])]
 )
-def test_mattes_are_composited_on_one_background_or_one_a_ray(background):
+def test_alpha_masks_are_composited_on_one_background_or_one_a_ray(background):
     batch = gather_batch(views(), IMAGE, FLAT, background)
     rgb = torch.tensor([[121 / 255, 0.0, 1.0], [3 / 255, 0.0, 1.0]])
     torch.testing.assert_close(batch.color, 0.2 * rgb + 0.8 * background)
@@ -89,7 +89,7 @@ def test_mattes_are_composited_on_one_background_or_one_a_ray(background):
     torch.testing.assert_close(batch.alpha, torch.tensor([0.2, 0.2]))
 
 
-def test_images_without_matte_or_flow():
+def test_images_without_alpha_or_flow():
     batch = gather_batch(views(channels=3, flow=False), IMAGE, FLAT, torch.zeros(3))
     assert batch.alpha is None and batch.flow is None and batch.flow_valid is None
     torch.testing.assert_close(batch.color[0], torch.tensor([121 / 255, 0.0, 1.0]))

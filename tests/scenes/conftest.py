@@ -136,7 +136,7 @@ def single_folder(tmp_path) -> Path:
 
 @pytest.fixture
 def ball_views() -> Callable[..., Views]:
-    """A function that makes mattes of a ball at given places (T, 3), seen by a ring of cameras."""
+    """A function that makes alpha masks of a ball at places (T, 3), seen by a ring of cameras."""
 
     def make(places: torch.Tensor, radius: float, count: int = 4, channels: int = 4) -> Views:
         cameras = ring(count, width=96, height=80, angle=0.9)

@@ -88,14 +88,6 @@ def test_a_lens_is_undistorted_and_its_flow_files_are_left_out(scene_folder, cap
     assert float(train.cameras.focal[0, 0]) > 16 / math.tan(0.4) + 0.5
 
 
-def test_times_come_from_the_order_where_the_file_gives_none(scene_folder):
-    scene_folder.edit(scene_folder.dynamic / "transforms_train.json", drop_times)
-    scene_folder.edit(scene_folder.dynamic / "transforms_test.json", drop_times)
-    scene = BlenderReader(scene_folder.root).read()
-    assert scene.dynamic.train.times.tolist() == [0, 0, 0.5, 0.5, 1, 1]
-    assert scene.dynamic.test.times.tolist() == [0, 0.5, 1]
-
-
 def test_train_views_keeps_the_first_views(scene_folder):
     train = BlenderReader(scene_folder.root, train_views=1).read().dynamic.train
     assert train.view.tolist() == [0, 0, 0] and train.times.tolist() == [0, 0.5, 1]
@@ -268,21 +260,6 @@ def test_links_that_lie_in_the_scene_are_followed(scene_folder, tmp_path):
     assert BlenderReader(tmp_path / "link").read().static.train.names[0] == "static/train/r_000.png"
 
 
-def test_a_scene_beside_the_current_folder(scene_folder, monkeypatch):
-    monkeypatch.chdir(scene_folder.static)
-    assert BlenderReader("..").read().static.train.names[0] == "static/train/r_000.png"
-    inner = str(scene_folder.static / "train/r_001.png")
-    scene_folder.edit(scene_folder.root / TRAIN, in_first_frame("file_path", inner))
-    assert BlenderReader(Path("..")).read().static.train.names[0] == "static/train/r_001.png"
-
-
-@pytest.mark.parametrize("keep", [0, 20, 60])
-def test_a_damaged_image(scene_folder, keep, message_of):
-    path = scene_folder.static / "train/r_001.png"
-    path.write_bytes(path.read_bytes()[:keep])
-    assert f"{path}: not a readable image" in message_of(scene_folder.root)
-
-
 def test_sixteen_bit_images(scene_folder, message_of):
     path = scene_folder.static / "test/r_000.png"
     iio.imwrite(path, np.zeros((24, 32), dtype=np.uint16))
@@ -313,17 +290,6 @@ def test_fixed_views_without_times_have_to_take_turns(scene_folder, message_of):
 def test_views_that_are_not_there(scene_folder, single_folder, message_of):
     assert "the set has 2 views" in message_of(scene_folder.root, train_views=3)
     assert "needs fixed cameras" in message_of(single_folder, train_views=1)
-
-
-def test_no_image_early_enough_for_the_static_scene(scene_folder, single_folder, message_of):
-    def later(content: dict[str, Any]) -> None:
-        for frame in content["frames"]:
-            frame["time"] = 0.5 + frame["time"] / 2
-
-    scene_folder.edit(single_folder / "transforms_train.json", later)
-    message = message_of(single_folder, static_until=0.1)
-    assert str(single_folder / "transforms_train.json") in message
-    assert "data.static_until=0.1" in message
 
 
 @pytest.mark.parametrize(

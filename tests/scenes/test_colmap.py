@@ -74,7 +74,7 @@ def test_every_eighth_image_is_held_out_and_nothing_moves(folder, message_of):
 def test_the_world_is_upright_around_what_is_looked_at(folder):
     """The ring is level, at a distance of 4 already: turned about z at most."""
     scene = ColmapReader(folder, downscale=1).read()
-    assert scene.kind == "inward" and scene.space.is_linear  # balls that are cut out: mattes
+    assert scene.kind == "inward" and scene.space.is_linear  # balls that are cut out
     cameras = scene.static.train.cameras
     torch.testing.assert_close(cameras.positions.norm(dim=1), torch.full((14,), 4.0))
     torch.testing.assert_close(cameras.positions[:, 2], torch.full((14,), 1.2), atol=1e-4, rtol=0)
@@ -82,13 +82,13 @@ def test_the_world_is_upright_around_what_is_looked_at(folder):
     assert (low < -0.9).all() and (high > 0.9).all() and (high - low < 3.2).all()
 
 
-def without_mattes(folder: Path) -> None:
+def opaque(folder: Path) -> None:
     for path in (folder / "images/round").iterdir():
         iio.imwrite(path, iio.imread(path)[..., :3])
 
 
 def test_photographs_are_of_a_scene_without_end(folder):
-    without_mattes(folder)
+    opaque(folder)
     scene = ColmapReader(folder, downscale=1).read()
     assert not scene.space.is_linear
     assert scene.bounds.reason == "the sparse model"

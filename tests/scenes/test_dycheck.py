@@ -79,12 +79,6 @@ def test_one_camera_is_learned_from_and_the_others_are_held_out(
     assert scene.static.train is train and test.valid_mask is None
 
 
-def test_fewer_moments_and_a_stand_in_for_the_static_set(folder):
-    scene = DycheckReader(folder, downscale=1, frames=3, static_until=0.25).read()
-    assert scene.dynamic.train.times.tolist() == [0.0, 0.5, 1.0]
-    assert scene.static.train.times.tolist() == [0.0, 0.125, 0.25]
-
-
 @pytest.mark.parametrize(("size", "white"), [("1x", 255), ("2x", 1)])
 def test_what_training_has_hardly_seen_is_not_scored(folder, size, white):
     factor = int(size[0])

@@ -56,11 +56,6 @@ def test_an_image_is_turned_where_only_so_it_fits_its_camera(tmp_path, orientati
         assert read_header(path, unknown).ambiguous_orientation == (orientation != 1)
 
 
-def test_of_a_square_nobody_can_tell(tmp_path):
-    header = read_header(photo(tmp_path / "a.jpg", 6, (16, 16)), (16, 16))
-    assert (header.turn, header.ambiguous_orientation) == (1, True)
-
-
 def test_a_set_is_of_one_size_once_it_is_turned(tmp_path, caplog):
     paths = [photo(tmp_path / "0.jpg", 1), photo(tmp_path / "1.jpg", 6, HIGH)]
     with caplog.at_level(logging.INFO):

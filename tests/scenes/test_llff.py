@@ -244,60 +244,6 @@ def test_wrong_numbers(llff_folder, file, where, value, said, message_of):
     assert str(path) in message and said in message
 
 
-@pytest.mark.parametrize(
-    "file",
-    [
-        STATIC,
-    ],
-)
-def test_arrays_of_something_else(llff_folder, file, message_of):
-    path = llff_folder.save(file, np.array(["a", "b"]))
-    assert f"{path}: holds values of type" in message_of(llff_folder.root)
-    llff_folder.save(file, np.array([{"a": 1}], dtype=object))
-    assert f"{path}: not a readable npy file" in message_of(llff_folder.root)
-    for shape in ((), (4,), (4, 7), (0, 17), (0, 3, 5), (3, 17, 1)):
-        llff_folder.save(file, np.ones(shape))
-        message = message_of(llff_folder.root)
-        assert f"{path}: has shape" in message and "expected" in message
-    with path.open("wb") as archive:
-        np.savez(archive, poses=np.ones(3))
-    assert f"{path}: not a readable npy file" in message_of(llff_folder.root)
-
-
-def test_poses_without_intrinsics(llff_folder, message_of):
-    rows = stored(llff_folder, STATIC)
-    llff_folder.save(STATIC, np.delete(rows, [4, 9, 14], axis=1))
-    path = llff_folder.static / "hwf_cxcy.npy"
-    assert f"{path}: no such file" in message_of(llff_folder.root)
-    for values, said in (
-        (np.ones(4), "holds 4 numbers"),
-        (np.array([64, 96, 0, 48, 32.0]), "the focal length"),
-        (np.array([64, 96, np.nan, 48, 32.0]), "NaN"),
-        (np.array([96, 64, 80, 48, 32.0]), "another shape"),
-    ):
-        np.save(path, values)
-        message = message_of(llff_folder.root)
-        assert said in message and "static" in message
-
-
-def test_missing_folders(llff_folder, tmp_path, message_of):
-    root = llff_folder.root
-    assert "nowhere: no such folder" in message_of(tmp_path / "nowhere")
-    (llff_folder.dynamic / "view1").rename(llff_folder.dynamic / "view0")
-    assert f"{llff_folder.dynamic}/view0: views are numbered view1, view2" in message_of(root)
-    (llff_folder.dynamic / "view0").rename(llff_folder.dynamic / "view1")
-    (llff_folder.dynamic / "view2").rename(llff_folder.dynamic / "other")
-    assert f"{llff_folder.dynamic}: no folder view2 although there is view3" in message_of(root)
-    for view in ("view1", "view3"):
-        shutil.rmtree(llff_folder.dynamic / view)
-    assert f"{llff_folder.dynamic}: no folders view1" in message_of(root)
-    shutil.rmtree(llff_folder.dynamic)
-    message = message_of(root, dynamic="dynamic_3views")
-    assert f"{root}: no folder 'dynamic_3views' (found: none)" in message
-    shutil.rmtree(llff_folder.static)
-    assert f"{llff_folder.static}: no such folder" in message_of(root)
-
-
 def test_missing_images(llff_folder, message_of):
     message = message_of(llff_folder.root, downscale=2)
     assert "no folder images_2 or images (found: images_4)" in message

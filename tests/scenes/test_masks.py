@@ -1,4 +1,4 @@
-"""Masks of nerfstudio's frames: pixels that are ignored, or mattes."""
+"""Masks of nerfstudio's frames: pixels that are ignored, or background."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def plain(root: Path, masks: list[np.ndarray] | None = None) -> None:
 
 
 @pytest.mark.parametrize("downscale", [1, 2, 3])
-def test_mattes_are_those_of_images_that_were_cut_out(root, downscale):
+def test_alpha_masks_are_those_of_images_that_were_cut_out(root, downscale):
     ours = NerfstudioReader(root, downscale=downscale, masks="alpha").read().dynamic.train
     edit(root, lambda c: [f.update(file_path=f"cut_{f['file_path']}") for f in c["frames"]])
     theirs = NerfstudioReader(root, downscale=downscale, masks="none").read().dynamic.train
@@ -80,8 +80,8 @@ def test_a_pixel_is_valid_if_all_that_it_is_made_of_is(root, downscale):
         paint(root, k, sharp)
     valid_mask = NerfstudioReader(root, downscale=downscale).read().dynamic.train.valid_mask
     # Downscaling and undistortion blur the matte as they blur the picture.
-    mattes = NerfstudioReader(root, downscale=downscale, masks="alpha").read().dynamic.train
-    assert valid_mask is not None and torch.equal(valid_mask, mattes.pixels[..., 3] == 255)
+    cut_out = NerfstudioReader(root, downscale=downscale, masks="alpha").read().dynamic.train
+    assert valid_mask is not None and torch.equal(valid_mask, cut_out.pixels[..., 3] == 255)
     assert 0 < int(valid_mask.sum()) < valid_mask.numel()
 
 

@@ -139,21 +139,22 @@ def test_splits_times_and_the_stand_in_for_a_static_set(folder, caplog):
     assert len(NerfiesReader(folder.root, downscale=1, frames=3).read().dynamic.train) == 3
 
 
-def test_without_mattes_the_box_holds_the_backdrop(folder):
+def test_without_alpha_masks_the_box_holds_the_backdrop(folder):
     folder.edit("scene.json", lambda c: c.update(far=6.0))
-    with_mattes = NerfiesReader(folder.root, downscale=1).read().bounds.box
+    cut_out = NerfiesReader(folder.root, downscale=1).read().bounds.box
     for item in IDS:
         image = iio.imread(folder.root / f"rgb/1x/{item}.png")
         iio.imwrite(folder.root / f"rgb/1x/{item}.png", image[..., :3])
-    endless = NerfiesReader(folder.root, downscale=1).read()
-    assert not endless.space.is_linear and endless.bounds.reason.startswith("the images have no")
+    unbounded = NerfiesReader(folder.root, downscale=1).read()
+    assert not unbounded.space.is_linear
+    assert unbounded.bounds.reason.startswith("the images have no")
     scene = NerfiesReader(folder.root, downscale=1, space="world").read()
     cameras, box = scene.static.train.cameras, scene.bounds.box
     for camera in range(len(cameras)):
         rays = cameras.image_rays(camera)
         for distance in (0.5, 3.0, 6.0):
             assert box.scaled(1.001).contains(rays.origins + distance * rays.directions).all()
-    assert box.volume > with_mattes.volume
+    assert box.volume > cut_out.volume
     assert NerfiesReader(
         folder.root, downscale=1, box=[[-1, -1, -1], [1, 1, 1]]
     ).read().bounds.box.size == (2, 2, 2)

@@ -7,7 +7,6 @@ import logging
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -74,17 +73,6 @@ def test_an_angle_stands_in_for_a_focal_length(tmp_path, balls, balls_are_where_
     train = NerfstudioReader(tmp_path / "scene").read().dynamic.train
     balls_are_where_they_project(train)
     torch.testing.assert_close(train.cameras.focal[0], torch.tensor([90.0, 90.0]))
-
-
-def test_pixels_are_those_of_the_size_that_the_file_gives(
-    moving, balls_are_where_they_project, balls
-):
-    def twice(content: dict[str, Any]) -> None:
-        for key in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
-            content[key] *= 2
-
-    balls.edit(moving, twice)
-    balls_are_where_they_project(NerfstudioReader(moving).read().dynamic.train)
 
 
 def test_a_moving_camera_without_a_static_set(moving, caplog):

@@ -146,9 +146,3 @@ def test_a_missing_library_names_the_extra(monkeypatch):
     with pytest.raises(DevrfError) as caught:
         estimate_flow(shifting(16, 24), "raft")
     assert 'pip install "devrf[raft]"' in str(caught.value) and "\n" not in str(caught.value)
-
-
-def test_images_of_one_time_have_no_flow():
-    views = views_of(torch.zeros((2, 8, 8, 3), dtype=torch.uint8), [0.0, 0.0], [0, 1])
-    with pytest.raises(DevrfError, match="no view has two consecutive frames"):
-        estimate_flow(views, "dis")

@@ -1,4 +1,4 @@
-"""Images through a lens become images of a pinhole camera: geometry, mattes, borders."""
+"""Images through a lens become images of a pinhole camera: geometry, alpha masks, borders."""
 
 from __future__ import annotations
 

@@ -64,14 +64,7 @@ def test_what_does_not_count_rules_nothing_out(ball_views, unit_box):
     assert motion_box(replace(views, valid_mask=valid_mask), unit_box) is None
 
 
-def test_nothing_is_imagined_beyond_images_that_hold_the_ball_whole(ball_views, unit_box):
-    # Opposite cameras both see the ball along x; the two others see no farther than 1.93.
-    views = ball_views(torch.tensor([[0.0, 0, 0], [0.05, 0, 0]]), 0.8)
-    box = motion_box(views, unit_box.scaled(2.0))
-    assert box is not None and max(box.high[:2]) < 1.3 and min(box.low[:2]) > -1.3
-
-
-def test_no_box_without_mattes_or_without_two_cameras_at_every_time(ball_views, unit_box):
+def test_no_box_without_alpha_masks_or_without_two_cameras_at_every_time(ball_views, unit_box):
     assert motion_box(ball_views(PLACES, RADIUS, channels=3), unit_box) is None
     assert motion_box(ball_views(PLACES, RADIUS, count=1), unit_box) is None
     whole = ball_views(PLACES, RADIUS)
@@ -84,8 +77,8 @@ CENTER = torch.tensor([0.2, -0.1, 0.15])
 BALL = 0.4
 
 
-def mattes_of_a_ball(width: int = 72, height: int = 56) -> Views:
-    """Exact mattes of a ball from twelve directions, non-square."""
+def masks_of_a_ball(width: int = 72, height: int = 56) -> Views:
+    """Exact alpha masks of a ball from twelve directions, non-square."""
     angle = torch.arange(12) * (2 * torch.pi / 12)
     height_of = 1.5 * torch.sin(3 * angle)
     positions = torch.stack([4 * angle.cos(), 4 * angle.sin(), height_of], dim=1)
@@ -104,7 +97,7 @@ def mattes_of_a_ball(width: int = 72, height: int = 56) -> Views:
 
 def test_hull_holds_the_ball_and_little_more():
     shape = (33, 33, 33)
-    hull = visual_hull(mattes_of_a_ball(), BOX, shape)
+    hull = visual_hull(masks_of_a_ball(), BOX, shape)
     distance = (BOX.grid_points(shape, torch.zeros(1)) - CENTER).norm(dim=-1)
     assert hull[distance < BALL].all()
     # A pixel is 0.06 wide here, a cell 0.06: no more than a few of both may be added.
@@ -112,7 +105,7 @@ def test_hull_holds_the_ball_and_little_more():
 
 
 def test_points_that_no_view_has_in_the_picture_stay():
-    views = mattes_of_a_ball()
+    views = masks_of_a_ball()
     away = Cameras.looking_at(
         views.cameras.positions,
         2 * views.cameras.positions,

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -24,11 +22,8 @@ from devrf.scenes.bounds import (
     inward_bounds,
     seen_radius,
 )
-from devrf.scenes.export import export
-from devrf.scenes.formats.blender import BlenderReader
-from devrf.scenes.procedural import ProceduralScene
 from devrf.scenes.scene import Bounds, Scene, Views
-from devrf.scenes.space import NEAR_SHARE, SHELL, dynamic_only, inward_space
+from devrf.scenes.space import NEAR_SHARE, SHELL, inward_space
 
 RingCameras = Callable[..., Cameras]
 
@@ -115,7 +110,7 @@ def chosen(views: Views, choice: Any = "auto", **options: Any) -> tuple[Space, B
     return inward_space(choice, views, views, [views], **options)
 
 
-def test_mattes_and_a_given_box_mean_the_world(ball_views: Callable[..., Views]) -> None:
+def test_alpha_masks_and_a_given_box_mean_the_world(ball_views: Callable[..., Views]) -> None:
     space, bounds = chosen(ball_views(PLACES, 0.4))
     assert space == WORLD and bounds.reason == "the images have alpha masks" and not bounds.limited
     space, bounds = chosen(ball_views(PLACES, 0.4, channels=3), box=BOX)
@@ -123,7 +118,7 @@ def test_mattes_and_a_given_box_mean_the_world(ball_views: Callable[..., Views])
     assert bounds.box == BOX and bounds.limited and "data.box" in bounds.source
 
 
-def test_without_mattes_the_scene_has_no_end(ball_views: Callable[..., Views]) -> None:
+def test_without_alpha_masks_the_scene_is_unbounded(ball_views: Callable[..., Views]) -> None:
     views = ball_views(PLACES, 0.4, channels=3)
     space, bounds = chosen(views)
     assert isinstance(space, ContractedSpace) and space.shell == SHELL
@@ -158,29 +153,3 @@ def test_in_a_room_every_ray_meets_something(tiny_room: Scene) -> None:
     assert flow is not None and bool(flow.valid[2:].all()) and not bool(flow.valid[:2].any())
     still = (flow.vectors[2:].norm(dim=-1) < 1e-3).float().mean()
     assert 0.5 < float(still) < 1
-
-
-def test_a_room_reads_back_as_it_was_written(tiny_room: Scene, tmp_path: Path) -> None:
-    export(tiny_room, tmp_path / "room")
-    again = BlenderReader(tmp_path / "room").read()
-    assert torch.equal(again.static.train.pixels, tiny_room.static.train.pixels)
-    assert again.bounds.reason == tiny_room.bounds.reason
-    inner, known = again.space.inner(again.bounds.box), tiny_room.space.inner(tiny_room.bounds.box)
-    torch.testing.assert_close(torch.tensor(inner.low), torch.tensor(known.low))
-
-
-def test_methods_that_see_the_moving_views_alone_stay_endless(tiny_room: Scene) -> None:
-    assert not dynamic_only(tiny_room).space.is_linear
-
-
-def test_fine_paint_has_smaller_patterns(tiny_room_recipe: ProceduralScene) -> None:
-    with pytest.raises(DevrfError, match=r"data\.texture: expected one of soft, fine"):
-        replace(tiny_room_recipe, texture="coarse")()
-    room = tiny_room_recipe.filmed()
-    fine = replace(tiny_room_recipe, texture="fine").filmed()
-    # Half a wavelength of the finest wave along a wall changes the fine paint a lot.
-    wall = torch.tensor([[-6.0, 0.3, 1.0], [-6.0, 0.3 + 0.14, 1.0]])
-    changes = [
-        shape.color(shape.material(wall, 0.0)).diff(dim=0).abs().max() for shape in (room, fine)
-    ]
-    assert changes[1] > 2 * changes[0]
