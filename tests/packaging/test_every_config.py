@@ -11,7 +11,7 @@ from hydra.utils import get_class, instantiate
 from omegaconf import OmegaConf
 
 from devrf.apps.report.labels import ABLATIONS
-from devrf.cli.config import config_folder, small_experiments
+from devrf.cli.config import group_choices
 from devrf.cli.config_check import check_config
 from devrf.cli.context import RunContext
 from devrf.data.datamodule import SceneDataModule
@@ -22,10 +22,8 @@ from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.scenes.fetch import catalogue
 
-GROUPS = sorted({path.name for path in config_folder().iterdir() if path.is_dir()} - {"hydra"})
-NAMES = {g: sorted(p.stem for p in (config_folder() / g).glob("*.yaml")) for g in GROUPS}
-FILES = [f"{group}={name}" for group in GROUPS for name in NAMES[group]]
-SMALL = [f"experiment={name}" for name in small_experiments()]
+NAMES = group_choices()
+CHOICES = [f"{group}={name}" for group, names in NAMES.items() for name in names]
 NEEDS = {
     "logger=tensorboard": "tensorboard",
     "hparams_search=loss_weights": "hydra_plugins.hydra_optuna_sweeper",
@@ -42,11 +40,11 @@ def rooted(composed, folder, *overrides):
     return composed(*overrides, f"data.root={folder}/scene")
 
 
-# What is learned is not DeVRF's two stages.
-OTHER_METHODS = ("method=", "comparison=")
+# What is learned is not DeVRF's two stages; or it is no choice by itself.
+OTHERS = ("method", "comparison=", "hydra/", "schedule/")
 
 
-@pytest.mark.parametrize("choice", [n for n in FILES + SMALL if not n.startswith(OTHER_METHODS)])
+@pytest.mark.parametrize("choice", [name for name in CHOICES if not name.startswith(OTHERS)])
 def test_it_composes_and_builds(composed, tmp_path, choice):
     needed = NEEDS.get(choice)
     if needed and importlib.util.find_spec(needed) is None:
@@ -109,10 +107,7 @@ def test_a_table_compares_rows_that_there_are(composed, table):
     assert {*swept.get("data", "procedural").split(",")} <= {*NAMES["data"]}
 
 
-PROFILES = sorted(path.stem for path in (config_folder() / "method/profile").glob("*.yaml"))
-
-
-@pytest.mark.parametrize("name", PROFILES)
+@pytest.mark.parametrize("name", NAMES["method/profile"])
 def test_a_method_is_built_in_each_of_its_sizes(composed, tmp_path, name):
     method, _, profile = name.rpartition("_")
     config = composed(f"method={method}", "protocol=joint", f"profile={profile}")
@@ -125,12 +120,6 @@ def test_what_to_try_with_a_public_scene_composes(composed, page):
     collection = next(s.collection for s in catalogue() if s.collection.page == page)
     given = (f"data={collection.data}", "data.root=scene")
     check_config(composed(*collection.learn.split(), *given))
-
-
-@pytest.mark.parametrize("choice", FILES)
-def test_its_header_describes_it(choice):
-    lines = (config_folder() / f"{choice.replace('=', '/')}.yaml").read_text().splitlines()
-    assert [line for line in lines[:2] if line.startswith("# ") and "@package" not in line]
 
 
 def test_building_writes_nothing(composed, tmp_path, monkeypatch):
@@ -177,45 +166,29 @@ def test_every_ablation_is_in_a_table_of_both_embedded_scenes(composed):
         assert hydra.mode.name == "MULTIRUN"
         assert scenes in hydra.sweeper.params.items()
         rows += hydra.sweeper.params["ablation"].split(",")
-    assert sorted(rows) == sorted(path.stem for path in (config_folder() / "ablation").glob("*"))
+    assert sorted(rows) == sorted(NAMES["ablation"])
     assert rows == list(ABLATIONS)  # a report has a name for each, in this order
 
 
-STEPS = (
-    "paper_terms",
-    "along_flow",
-    "changing_colors",
-    "elastic",
-    "more_sweeps",
-    "finishing",
-    "refinement",
-    "shading",
-    "tracks",
-)
+# What each row of the quality table changes of the row above it.
+ADDED = {
+    "along_flow": {"extensions"},
+    "changing_colors": {"extensions"},
+    "elastic": {"deformation", "loss"},
+    "more_sweeps": {"deformation"},
+    "finishing": {"deformation", "motion"},
+    "refinement": {"refinement"},
+    "shading": {"extensions"},
+    "tracks": {"deformation", "extensions"},
+    "best": {"canonical", "rates", "deformation", "refinement", "loss", "sampling", "field"},
+}
 
 
-@pytest.mark.parametrize(
-    ("before", "after", "changed"),
-    [
-        (STEPS[0], STEPS[1], {"motion"}),
-        (STEPS[1], STEPS[2], {"appearance"}),
-        (STEPS[2], STEPS[3], {"deformation", "loss"}),
-        (STEPS[3], STEPS[4], {"deformation"}),
-        (STEPS[4], STEPS[5], {"deformation", "motion"}),
-        (STEPS[5], STEPS[6], {"refinement"}),
-        (STEPS[6], STEPS[7], {"appearance"}),
-        (STEPS[7], STEPS[8], {"deformation", "motion"}),
-        (
-            STEPS[8],
-            "best",
-            {"canonical", "rates", "deformation", "refinement", "loss", "sampling", "field"},
-        ),
-    ],
-)
-def test_each_row_of_the_quality_table_adds_one_thing(composed, before, after, changed):
-    found = {}
-    for row in (before, after):
+def test_each_row_of_the_quality_table_adds_one_thing(composed):
+    rows = []
+    for row in ("paper_terms", *ADDED):
         config = composed("experiment=quickstart", f"ablation={row}")
         beside = {part: config[part] for part in ("loss", "sampling", "field")}
-        found[row] = {**config.schedule, **beside}
-    assert {key for key in found[before] if found[before][key] != found[after][key]} == changed
+        rows.append({**config.schedule, **beside})
+    for name, before, after in zip(ADDED, rows, rows[1:], strict=False):
+        assert {key for key in before if before[key] != after[key]} == ADDED[name], name

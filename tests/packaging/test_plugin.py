@@ -33,6 +33,7 @@ defaults:
   - _self_
   - data@scene: procedural
   - schedule: paper_inward
+  - loss: best
   - local: mine
 run: ${devrf.run_name:${local.name},base}
 label: ${devrf.scene_name:${scene}}
@@ -73,6 +74,7 @@ def test_groups_resolvers_and_choices_are_there(application):
     config = application()
     assert config["scene"]["_target_"] == "devrf.data.rendered.ProceduralDataModule"
     assert config["schedule"]["canonical"]["side"] == 160
+    assert config["loss"]["deformation"]["elastic"] == 0.05  # a row, not a file
     assert (config["run"], config["label"]) == ("theirs-base", "robot")
     config = application("data@scene=inward", "scene.root=/scenes/suzanne", "schedule=quick")
     assert config["scene"]["_target_"] == "devrf.data.recorded.InwardFacingDataModule"

@@ -23,7 +23,7 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
-from devrf.cli.config import OF_A_CHECKPOINT, config_folder, scene_folder_name, small_experiments
+from devrf.cli.config import OF_A_CHECKPOINT, config_folder, rows, scene_folder_name
 from devrf.cli.messages import in_quotes
 from devrf.errors import DevrfError
 
@@ -297,7 +297,7 @@ def _in_form(texts: list[str], before: Sequence[str]) -> list[str]:
     both = parsed([*before, *texts])
     names = values(both, "experiment")
     known = {path.stem for path in (config_folder() / "experiment").glob("*.yaml")}
-    known |= {str(name) for name in small_experiments()}
+    known |= {str(name) for name in rows("experiment")}
     if not any(other.startswith(f"{name}_") for name in names for other in known):
         return texts
     scenes: list[str | None] = [*values(both, "data")]
@@ -340,7 +340,7 @@ def _reader(option: str) -> str:
 def _reads_files(experiment: str) -> bool:
     """Whether an experiment chooses a reader of files itself."""
     path = config_folder() / "experiment" / f"{experiment}.yaml"
-    content: Any = OmegaConf.load(path) if path.is_file() else small_experiments().get(experiment)
+    content: Any = OmegaConf.load(path) if path.is_file() else rows("experiment").get(experiment)
     defaults = [] if content is None else content.get("defaults", [])
     for entry in defaults:
         if not isinstance(entry, str) and "override /data" in entry:

@@ -1,4 +1,4 @@
-"""The configuration: its folder, its resolvers, the stages' names, and the present Hydra job."""
+"""The configuration: folder, rows and resolvers, the stages' names, and the present Hydra job."""
 
 from __future__ import annotations
 
@@ -46,11 +46,38 @@ def config_folder() -> Path:
     return installed if installed.is_dir() else Path(__file__).resolve().parents[3] / "conf"
 
 
-def small_experiments() -> DictConfig:
-    """The experiments of ``conf/experiments.yaml``, by name."""
-    experiments = OmegaConf.load(config_folder() / "experiments.yaml")
-    assert isinstance(experiments, DictConfig)
-    return experiments
+def rows(group: str) -> DictConfig:
+    """The choices of a group that are rows of one file, ``conf/rows/GROUP.yaml``, by name."""
+    path = config_folder() / "rows" / f"{group}.yaml"
+    return OmegaConf.load(path) if path.is_file() else OmegaConf.create()  # type: ignore[return-value]
+
+
+def group_choices() -> dict[str, list[str]]:
+    """The names that each ``group=NAME`` takes: its files, and its rows."""
+    names: dict[str, list[str]] = {}
+    for path in sorted(config_folder().glob("*/**/*.yaml")):
+        group = path.relative_to(config_folder()).parent.as_posix()
+        if group.startswith("rows"):
+            group = path.relative_to(config_folder() / "rows").with_suffix("").as_posix()
+            names.setdefault(group, []).extend(map(str, rows(group)))
+        else:
+            names.setdefault(group, []).append(path.stem)
+    return names
+
+
+def register_rows() -> None:
+    """Make each row of a file in ``conf/rows`` a choice of the group that the file is named after.
+
+    A group whose choices take a few lines each is one such table in place of a folder of files.
+    """
+    folder, store = config_folder() / "rows", ConfigStore.instance()
+    for path in sorted(folder.rglob("*.yaml")):
+        group = path.relative_to(folder).with_suffix("").as_posix()
+        at_root = path.read_text("utf-8").startswith("# @package _global_")
+        for name, row in rows(group).items():
+            store.store(
+                str(name), row, group, "_global_" if at_root else "_group_", provider="devrf"
+            )
 
 
 def known_stages() -> list[str]:
@@ -137,11 +164,10 @@ def _of_sweep(mode: Any) -> bool:
 
 
 def register_config() -> None:
-    """Make the resolvers ``${devrf.scene_name:…}`` … and the small experiments known to Hydra."""
+    """Make the resolvers ``${devrf.scene_name:…}`` … and the rows known to Hydra."""
     for word in (scene_name, run_name, run_folder, config_record, tracked_name, tracked_group):
         OmegaConf.register_new_resolver(f"devrf.{word.__name__}", word, replace=True)
-    for name, experiment in small_experiments().items():
-        ConfigStore.instance().store(str(name), experiment, "experiment", "_global_", "devrf")
+    register_rows()
 
 
 def choices() -> dict[str, str | None]:

@@ -14,7 +14,7 @@ from pathlib import Path
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf.errors import OmegaConfBaseException
 
-from devrf.cli.config import config_folder, meant_stage
+from devrf.cli.config import group_choices, meant_stage
 from devrf.cli.config_check import unknown_key
 from devrf.errors import DevrfError, did_you_mean
 
@@ -94,9 +94,8 @@ def _not_understood(argument: str) -> str:
     if is_set:
         as_text = shlex.quote(f"{key}={in_quotes(value)}")
         return f"{argument}: not understood; as text write {as_text}, else see that brackets close"
-    groups = sorted(path for path in config_folder().iterdir() if path.is_dir())
     options = [
-        f"{group.name}={argument}" for group in groups if (group / f"{argument}.yaml").is_file()
+        f"{group}={argument}" for group, names in group_choices().items() if argument in names
     ]
     if options:
         return f"{argument}: not understood; did you mean {' or '.join(options)}?"
