@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from devrf.methods.nerf.codes import TimeCodes
+from devrf.methods.nerf.networks import TimeCodes
 
 
 def test_a_frame_has_its_own_code_and_a_time_between_two_a_mixture() -> None:

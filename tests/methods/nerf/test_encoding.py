@@ -6,7 +6,7 @@ import math
 
 import torch
 
-from devrf.methods.nerf.encoding import SinusoidalEncoding, octave_window
+from devrf.methods.nerf.networks import SinusoidalEncoding, octave_window
 
 
 def test_two_octaves_of_a_number() -> None:

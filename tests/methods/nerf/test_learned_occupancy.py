@@ -12,8 +12,7 @@ from torch import Tensor
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
 from devrf.methods.dnerf.model import DNeRF, DNeRFSettings
-from devrf.methods.nerf.learned_occupancy import DECAY, EVERY, LEAST, LearnedOccupancy
-from devrf.methods.nerf.occupancy_frames import OccupancyFrames
+from devrf.methods.nerf.occupancy import DECAY, EVERY, LEAST, LearnedOccupancy, OccupancyFrames
 from devrf.methods.nsff.model import NSFF
 from devrf.methods.nsff.settings import NSFFSettings
 from devrf.scenes.scene import Scene
@@ -119,7 +118,7 @@ def test_opacity_is_that_of_a_sample(tiny_scene: Scene) -> None:
     rays = Rays(middle - sum(model.depth_limits) / 2 * x, x, x)
     seen = model.eval().render_rays(rays, torch.tensor([0.5]), torch.ones(3))
     first = model.placement.fields(seen.extras["points"][:1])
-    opacity = model._opacity(first, torch.tensor([0.5]))
+    opacity = model.opacity(first, torch.tensor([0.5]))
     # Nothing is in front of the first sample of a ray: its weight is its opacity.
     torch.testing.assert_close(opacity, seen.extras["weight"][:1])
 
@@ -138,7 +137,7 @@ def test_the_denser_of_two_fields_counts(tiny_scene: Scene) -> None:
         for field, bias in ((model.fields.static, still), (model.fields.dynamic, moving)):
             torch.nn.init.zeros_(field.density.weight)
             torch.nn.init.constant_(field.density.bias, bias)
-        found.append(model._opacity(points, time))
+        found.append(model.opacity(points, time))
     step = model.box.diagonal / 16 / model.placement.half_edge
     depth = 10 * math.log1p(math.exp(3.0)) * step
     torch.testing.assert_close(found[0], torch.full((2,), 1 - math.exp(-depth)))

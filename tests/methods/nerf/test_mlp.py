@@ -6,7 +6,7 @@ import math
 
 import torch
 
-from devrf.methods.nerf.mlp import Trunk, initialise
+from devrf.methods.nerf.networks import Trunk, initialise
 
 
 def test_the_input_enters_the_layer_that_was_asked_for() -> None:

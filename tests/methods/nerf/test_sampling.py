@@ -9,9 +9,15 @@ import torch
 
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
-from devrf.methods.nerf.hierarchical import flattened, importance, limits, stratified
-from devrf.methods.nerf.occupancy_frames import OccupancyFrames
-from devrf.methods.nerf.ray_samples import RaySamples, volume_render
+from devrf.methods.nerf.occupancy import OccupancyFrames
+from devrf.methods.nerf.samples import (
+    RaySamples,
+    flattened,
+    importance,
+    limits,
+    stratified,
+    volume_render,
+)
 from devrf.scenes.scene import Scene
 
 

@@ -9,21 +9,23 @@ import pytest
 import torch
 
 from devrf.errors import DevrfError
-from devrf.methods.neural_volumes.encoder import TimeEncoder, cameras_of_every_frame
-from devrf.methods.neural_volumes.layers import doubling
-from devrf.methods.neural_volumes.losses import (
+from devrf.methods.neural_volumes.capture import cameras_of_every_frame
+from devrf.methods.neural_volumes.model import NeuralVolumes
+from devrf.methods.neural_volumes.networks import (
+    AffineWarp,
+    ConvWarp,
+    TimeEncoder,
+    doubling,
+    identity_grid,
+    rotation_matrices,
+)
+from devrf.methods.neural_volumes.settings import NeuralVolumesSettings
+from devrf.methods.neural_volumes.volumes import (
+    Volumes,
+    added_opacity,
     code_divergence,
     log_total_variation,
     opacity_prior,
-)
-from devrf.methods.neural_volumes.model import NeuralVolumes
-from devrf.methods.neural_volumes.settings import NeuralVolumesSettings
-from devrf.methods.neural_volumes.volumes import Volumes, added_opacity
-from devrf.methods.neural_volumes.warp import (
-    AffineWarp,
-    ConvWarp,
-    identity_grid,
-    rotation_matrices,
 )
 from devrf.scenes.scene import Scene
 

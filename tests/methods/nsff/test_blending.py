@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from devrf.methods.nsff.blending import blended, closed, shared
+from devrf.methods.nsff.fields import blended, closed, shared
 from devrf.ops.compositing import composite, sum_by_ray
 
 RAY = torch.tensor([0, 0, 0, 1, 1])

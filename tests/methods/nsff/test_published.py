@@ -12,7 +12,7 @@ from devrf.errors import DevrfError
 from devrf.methods.nsff.model import NSFF
 from devrf.methods.nsff.settings import NSFFSettings, Warmup
 
-CONF = Path(__file__).parents[3] / "conf/method"
+CONF = Path(__file__).parents[3] / "conf"
 
 # Li et al., CVPR 2021, and the main branch of their release.
 TRUNK = {"width": 256, "depth": 8, "skip": 5, "bands": 10, "direction_bands": 4}
@@ -27,8 +27,9 @@ WARMUP = {"steps_per_frame": 1000, "max_frames": 250, "chained_from": 2, "prior_
 
 def profile(*names: str) -> Any:
     """The method's config, with those of some profiles over it."""
-    files = [CONF / "nsff.yaml", *(CONF / "profile" / f"nsff_{name}.yaml" for name in names)]
-    return OmegaConf.merge(*map(OmegaConf.load, files)).ray_stage
+    sizes: Any = OmegaConf.load(CONF / "rows/method/profile.yaml")
+    rows = [sizes[f"nsff_{name}"] for name in names]
+    return OmegaConf.merge(OmegaConf.load(CONF / "method/nsff.yaml"), *rows).ray_stage
 
 
 @pytest.mark.parametrize(

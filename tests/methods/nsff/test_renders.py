@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from devrf.data.batch import RayBatch
-from devrf.methods.nerf.ray_samples import RaySamples, volume_render
+from devrf.methods.nerf.samples import RaySamples, volume_render
 from devrf.methods.nsff.fields import BACKWARD, FORWARD
 from devrf.methods.nsff.model import NSFF
 from devrf.methods.nsff.renders import BlendedOutput, Renders

@@ -3,46 +3,41 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict
-from typing import Any, ClassVar, Self
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from devrf.data.batch import RayBatch
-from devrf.geometry.box import Box
-from devrf.geometry.clock import FrameClock
 from devrf.geometry.rays import Rays
-from devrf.geometry.space import WORLD, Space, space_config, space_from
-from devrf.methods.base import RayTrainable
-from devrf.methods.nerf.hierarchical import flattened, importance, limits, stratified
-from devrf.methods.nerf.occupancy_frames import OccupancyFrames, diagonal_step
-from devrf.methods.nerf.placement import Placement
-from devrf.methods.nerf.radiance_field import RadianceField
-from devrf.methods.nerf.ray_samples import RaySamples, volume_render
-from devrf.methods.nerf.ray_view import RayView
+from devrf.methods.nerf.networks import RadianceField
+from devrf.methods.nerf.placed_model import PlacedModel
+from devrf.methods.nerf.samples import (
+    RaySamples,
+    flattened,
+    importance,
+    limits,
+    stratified,
+    volume_render,
+)
 from devrf.methods.nerf.settings import FieldSettings
 from devrf.ops.compositing import composite
 from devrf.rendering.output import RenderOutput
-from devrf.scenes.scene import Scene
 from devrf.system.device import multiplies_bfloat16
 
 
-class DeformableField(RayTrainable):
+class DeformableField(PlacedModel):
     """(σ, c) = T(x′, w, d), where a deformation leads a point x at time t to x′ and w.
 
-    A method says what the deformation is (:meth:`deform`). T lives in normalised space: the box
-    that holds the scene, in world units, NDC or contracted, its longest edge being 2.
+    A method says what the deformation is (:meth:`deform`). T lives in normalised space.
 
     Attributes:
         settings: sizes and sampling.
         ambient: length of w as it enters T; 0: there is none.
         canonical: T.
         coarse: a T of its own for the coarse samples, if the settings ask for one.
-        occupancy: where something may be at each frame, with ``sampling=occupancy``.
-        clock: the frames' times.
     """
 
     settings_class: ClassVar[type[FieldSettings]]
@@ -59,9 +54,7 @@ class DeformableField(RayTrainable):
         self.settings, self.ambient = settings, ambient
         self.canonical = settings.radiance_field(ambient)
         self.coarse = settings.radiance_field(ambient) if settings.separate_coarse else None
-        self.occupancy = OccupancyFrames(1, (2, 2, 2))
-        self._place(Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)), WORLD, (0.0, 1.0))
-        self.set_times((0.0, 1.0))
+        self.place()
 
     @abstractmethod
     def deform(self, points: Tensor, time: Tensor) -> tuple[Tensor, Tensor | None]:
@@ -82,73 +75,18 @@ class DeformableField(RayTrainable):
         beside = [one for field in fields for one in field.ambient_parameters()]
         return {"canonical": own, "canonical_ambient": beside} if beside else {"canonical": own}
 
-    def set_times(self, times: tuple[float, ...]) -> None:
-        """Take the frames' times; a method with codes for them makes these here."""
-        self.clock = FrameClock(times)
-
-    def _place(self, box: Box, space: Space, depths: tuple[float, float]) -> None:
-        self.box, self.space, self.depth_limits = box, space, depths
-        self.placement = Placement(box, space)
-
-    def setup(self, scene: Scene) -> None:
-        """Take the scene's bounds and times; carve the frames' occupancy from their mattes."""
-        bounds, s = scene.bounds, self.settings
-        box = bounds.whole
-        self._place(box, scene.space, (bounds.near, bounds.far))
-        self.set_times(scene.clock.times)
-        if s.sampling == "occupancy":
-            self.occupancy = OccupancyFrames.of(
-                scene, box, s.occupancy_side, self.device, hull=s.hull, empty_from=s.empty_from
-            )
-
-    @property
-    def has_hull(self) -> bool:
-        """Whether the occupancy was carved from mattes."""
-        return self.occupancy.has_hull
-
-    def config(self) -> dict[str, Any]:
-        """Settings, and where and when the scene is."""
-        return {
-            "settings": asdict(self.settings),
-            "box": [list(self.box.low), list(self.box.high)],
-            "space": space_config(self.space),
-            "limits": list(self.depth_limits),
-            "times": list(self.clock.times),
-        }
-
-    @classmethod
-    def from_config(cls, config: Mapping[str, Any]) -> Self:
-        """Networks of the same sizes in the same place."""
-        model = cls(cls.settings_class(**config["settings"]))
-        low, high = config["box"]
-        near, far = config["limits"]
-        model._place(Box.of(low, high), space_from(config["space"]), (near, far))
-        model.set_times(tuple(config["times"]))
-        return model
-
-    def forward(self, batch: RayBatch) -> RenderOutput:
-        """Render rays, each at its own time."""
-        return self.render_rays(batch.rays, batch.time, batch.background, jitter=self.training)
-
     def render_rays(
         self, rays: Rays, time: Tensor, background: Tensor, *, jitter: bool = False
     ) -> RenderOutput:
-        """What R rays in the fields' space see at ``time`` (R,).
+        """What rays see, and samples.
 
-        Args:
-            rays: R rays.
-            time: (R,) in [0, 1].
-            background: (3,) or (R, 3) RGB.
-            jitter: sample at random places, to learn from them.
-
-        Returns:
-            ``extras`` has of the S samples ``points`` (S, 3) x in normalised space, ``time``,
-            ``ray`` and ``weight`` (S,); and if a coarse field learns, ``coarse_color`` (R, 3) and
-            the others with ``coarse_`` before their names.
+        ``extras`` has of the S samples ``points`` (S, 3) x in normalised space, ``time``, ``ray``
+        and ``weight`` (S,); and if a coarse field learns, ``coarse_color`` (R, 3) and the others
+        with ``coarse_`` before their names.
         """
         first = None
         if self.settings.sampling == "occupancy":
-            samples = self._march(rays, time, jitter=jitter)
+            samples = self.march(rays, time, jitter=jitter)
         else:
             samples, first = self._by_weight(rays, time, background, jitter=jitter)
         seen = self._seen(self.canonical, samples, rays, time, background)
@@ -213,20 +151,7 @@ class DeformableField(RayTrainable):
         weight, _ = composite(density.float() * length, samples.ray, samples.rays)
         return weight
 
-    def _march(self, rays: Rays, time: Tensor, *, jitter: bool) -> RaySamples:
-        """Even steps where something may be at the frames around each ray's time."""
-        before, after, _ = self.clock.between(time)
-        step = diagonal_step(self.box, rays, self.settings.steps)
-        return self.occupancy.march(
-            rays, (before, after), self.box, self.depth_limits, step, jitter=jitter
-        )
-
-    def on_iteration(self, step: int, total: int) -> None:
-        """Look where the field is empty."""
-        share = self.settings.empty_from
-        self.occupancy.learned.follow(step, total, share, self.box, self._opacity)
-
-    def _opacity(self, points: Tensor, time: Tensor) -> Tensor:
+    def opacity(self, points: Tensor, time: Tensor) -> Tensor:
         """Opacity (S,) of a step at points (S, 3) of the fields' space and times (S,)."""
         points = self.placement.normalised(points)
         step = self.box.diagonal / self.settings.steps / self.placement.half_edge
@@ -253,8 +178,3 @@ class DeformableField(RayTrainable):
         if coarse is not None:
             terms["color"] = terms["color"] + nn.functional.mse_loss(coarse, batch.color)
         return terms
-
-    def at(self, time: float, *, half: bool = False) -> RayView:
-        """The scene at ``time``."""
-        at_rest = self.clock.at(time).after == 0
-        return RayView(self, time, self.device, at_rest=at_rest, half=half)

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from devrf.errors import DevrfError
-from devrf.methods.nerf.mlp import Initialisation
-from devrf.methods.nerf.radiance_field import RadianceField
+from devrf.methods.nerf.networks import Initialisation, RadianceField
 
 Sampling = Literal["hierarchical", "occupancy"]
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from torch import Tensor
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
 
 from devrf.errors import DevrfError
-from devrf.methods.neural_volumes.encoder import cameras_of_every_frame, moment_images
 from devrf.methods.neural_volumes.settings import KEY, NeuralVolumesSettings
-from devrf.scenes.scene import Scene
+from devrf.scenes.scene import Scene, Views
 
 
 def check_scene(scene: Scene) -> None:
@@ -51,3 +53,51 @@ def encoder_images(scene: Scene, settings: NeuralVolumesSettings) -> Tensor:
     chosen = [cameras[k * (len(cameras) - 1) // last] for k in range(wanted)]
     behind = 0.0 if scene.background == "black" else 1.0
     return moment_images(views, chosen, len(scene.clock), settings.encoder_size, behind)
+
+
+def cameras_of_every_frame(views: Views) -> list[int]:
+    """The fixed cameras that have an image of each frame that any camera has."""
+    assert views.frames is not None
+    seen: dict[int, set[int]] = {}
+    for camera, frame in zip(views.view.tolist(), views.frames.tolist(), strict=True):
+        seen.setdefault(camera, set()).add(frame)
+    everything = set().union(*seen.values())
+    return sorted(camera for camera, frames in seen.items() if frames == everything)
+
+
+def moment_images(
+    views: Views, cameras: Sequence[int], frames: int, size: Sequence[int], background: float
+) -> Tensor:
+    """What the encoder reads of each frame: (T, K, 3, h, w) uint8, on the host.
+
+    Images larger than ``size`` are made smaller; what is left around them is the background. A
+    frame that no camera has (time 0 of a capture that begins later) has the images of the next.
+
+    Args:
+        views: images with mattes.
+        cameras: K numbers of fixed cameras.
+        frames: T.
+        size: height and width (h, w).
+        background: grey level in [0, 1] behind the mattes.
+    """
+    assert views.frames is not None
+    height, width = size
+    scale = min(1.0, height / views.height, width / views.width)
+    rows, columns = round(views.height * scale), round(views.width * scale)
+    top, left = (height - rows) // 2, (width - columns) // 2
+    images = torch.full(
+        (frames, len(cameras), 3, height, width), round(255 * background), dtype=torch.uint8
+    )
+    first = int(views.frames.min())
+    for k, camera in enumerate(cameras):
+        for place in (views.view == camera).nonzero()[:, 0].tolist():
+            pixels = views.pixels[place].permute(2, 0, 1).float() / 255
+            color = background + pixels[3:] * (pixels[:3] - background)
+            if scale < 1:
+                color = nn.functional.interpolate(
+                    color[None], (rows, columns), mode="bilinear", antialias=True
+                )[0]
+            own = images[int(views.frames[place]), k, :, top : top + rows, left : left + columns]
+            own.copy_((255 * color).round().clamp(0, 255))
+    images[:first] = images[first]
+    return images

@@ -16,20 +16,19 @@ from devrf.geometry.clock import FrameClock
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import WORLD
 from devrf.methods.base import RayTrainable
-from devrf.methods.nerf.occupancy_frames import OccupancyFrames
-from devrf.methods.nerf.ray_samples import RaySamples
+from devrf.methods.nerf.occupancy import OccupancyFrames
 from devrf.methods.nerf.ray_view import RayView
+from devrf.methods.nerf.samples import RaySamples
 from devrf.methods.neural_volumes.capture import check_scene, encoder_images
-from devrf.methods.neural_volumes.encoder import TimeEncoder
-from devrf.methods.neural_volumes.layers import VolumeDecoder
-from devrf.methods.neural_volumes.losses import (
+from devrf.methods.neural_volumes.networks import AffineWarp, ConvWarp, TimeEncoder, VolumeDecoder
+from devrf.methods.neural_volumes.settings import NeuralVolumesSettings
+from devrf.methods.neural_volumes.volumes import (
+    Volumes,
     code_divergence,
     log_total_variation,
     opacity_prior,
+    seen,
 )
-from devrf.methods.neural_volumes.settings import NeuralVolumesSettings
-from devrf.methods.neural_volumes.volumes import Volumes, seen
-from devrf.methods.neural_volumes.warp import AffineWarp, ConvWarp
 from devrf.rendering.output import RenderOutput
 from devrf.scenes.scene import Scene
 

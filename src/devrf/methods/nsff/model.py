@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import asdict
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
@@ -14,21 +13,16 @@ from devrf.data.batch import RayBatch
 from devrf.engine.ddp import rays_per_rank
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
-from devrf.geometry.clock import FrameClock
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.rays import Rays
-from devrf.geometry.space import WORLD, Space, space_config, space_from
-from devrf.methods.base import RayTrainable
-from devrf.methods.nerf.occupancy_frames import OccupancyFrames, diagonal_step
-from devrf.methods.nerf.placement import Placement
-from devrf.methods.nerf.ray_samples import RaySamples
-from devrf.methods.nerf.ray_view import RayView
+from devrf.geometry.space import Space
+from devrf.methods.nerf.placed_model import PlacedModel
+from devrf.methods.nerf.samples import RaySamples, evenly
 from devrf.methods.nsff.fields import TwoFields
 from devrf.methods.nsff.losses import TERMS, LossInput, missing_terms
 from devrf.methods.nsff.priors import ImagePriors
 from devrf.methods.nsff.renders import BlendedOutput, Renders
-from devrf.methods.nsff.sampling import evenly
-from devrf.methods.nsff.settings import NSFFSettings
+from devrf.methods.nsff.settings import NSFFSettings, Warmup
 from devrf.ops.compositing import color_and_depth, sum_by_ray
 from devrf.rendering.output import RenderOutput
 from devrf.scenes.scene import Scene, Views
@@ -39,13 +33,15 @@ log = logging.getLogger(__name__)
 REACH_IN_NDC, REACH_IN_A_BOX = 1.0, 0.2
 
 
-class NSFF(RayTrainable):
+class NSFF(PlacedModel):
     """S(x, d) → σ_s, c_s, v and D(x, t, d) → σ_d, c_d, f±, o±, composited in one pass."""
 
     name: ClassVar[str] = "nsff"
     losses: ClassVar[tuple[str, ...]] = tuple(TERMS)
     protocols: ClassVar[tuple[str, ...]] = ("joint", "dynamic")
     priors: ClassVar[tuple[str, ...]] = ("forward_flow",)
+    settings_class = NSFFSettings
+    settings: NSFFSettings
 
     times: Tensor
 
@@ -58,68 +54,37 @@ class NSFF(RayTrainable):
         super().__init__()
         self.settings = settings or NSFFSettings()
         self.fields = TwoFields(self.settings)
-        self.occupancy = OccupancyFrames(1, (2, 2, 2))
-        self._step, self._absent = 0, frozenset[str]()
+        self._step, self._absent, self._cut_out = 0, frozenset[str](), True
         self._images: ImagePriors | None = None
-        box = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
-        self._place(box, WORLD, (0.0, 1.0), (0.0, 1.0), cut_out=True)
+        self.place()
 
-    def _place(
-        self,
-        box: Box,
-        space: Space,
-        limits: tuple[float, float],
-        times: tuple[float, ...],
-        *,
-        cut_out: bool,
-    ) -> None:
-        self.box, self.space, self.depth_limits = box, space, limits
-        self.clock, self._cut_out = FrameClock(times), cut_out
-        self.register_buffer("times", torch.tensor(times, device=self.device), persistent=False)
-        self.placement = Placement(box, space)
+    def set_place(self, box: Box, space: Space, depths: tuple[float, float]) -> None:
+        """As of every method; in NDC points may move further."""
+        super().set_place(box, space, depths)
         reach = REACH_IN_NDC if isinstance(space, NormalizedDevice) else REACH_IN_A_BOX
         self.fields.dynamic.reach = self.settings.flow_reach or reach
 
-    def setup(self, scene: Scene) -> None:
-        """Take the scene's bounds and times; carve the frames' occupancy from their mattes."""
-        bounds, s = scene.bounds, self.settings
-        box = bounds.whole
-        limits, times = (bounds.near, bounds.far), scene.clock.times
-        cut_out = scene.static.train.cut_out or scene.dynamic.train.cut_out
-        self._place(box, scene.space, limits, times, cut_out=cut_out)
-        if s.sampling == "occupancy":
-            self.occupancy = OccupancyFrames.of(
-                scene, box, s.occupancy_side, self.device, hull=s.hull, empty_from=s.empty_from
-            )
+    def set_times(self, times: tuple[float, ...]) -> None:
+        """Take the frames' times."""
+        super().set_times(times)
+        self.register_buffer("times", torch.tensor(times, device=self.device), persistent=False)
 
-    @property
-    def has_hull(self) -> bool:
-        """Whether the occupancy was carved from mattes."""
-        return self.occupancy.has_hull
+    def setup(self, scene: Scene) -> None:
+        """As of every method, and whether alpha masks cut the scene out."""
+        super().setup(scene)
+        self._cut_out = scene.static.train.cut_out or scene.dynamic.train.cut_out
 
     def config(self) -> dict[str, Any]:
-        """Settings, and where and when the scene is."""
-        return {
-            "settings": asdict(self.settings),
-            "box": [list(self.box.low), list(self.box.high)],
-            "space": space_config(self.space),
-            "limits": list(self.depth_limits),
-            "times": list(self.clock.times),
-            "cut_out": self._cut_out,
-        }
+        """As for all, and whether alpha masks cut the scene out."""
+        return {**super().config(), "cut_out": self._cut_out}
 
     @classmethod
-    def from_config(cls, config: Mapping[str, Any]) -> NSFF:
+    def from_config(cls, config: Mapping[str, Any]) -> Self:
         """Networks of the same sizes in the same place."""
-        model = cls(NSFFSettings.of(config["settings"]))
-        near, far = config["limits"]
-        model._place(
-            Box.of(*config["box"]),
-            space_from(config["space"]),
-            (near, far),
-            tuple(config["times"]),
-            cut_out=config["cut_out"],
-        )
+        settings = config["settings"]
+        warmup = Warmup(**settings["warmup"])
+        model = super().from_config({**config, "settings": {**settings, "warmup": warmup}})
+        model._cut_out = config["cut_out"]
         return model
 
     def parts(self) -> dict[str, Iterable[nn.Parameter]]:
@@ -130,10 +95,9 @@ class NSFF(RayTrainable):
     def on_iteration(self, step: int, total: int) -> None:
         """Remember the iteration: weights change every N₀. Look where the fields are empty."""
         self._step = step
-        share = self.settings.empty_from
-        self.occupancy.learned.follow(step, total, share, self.box, self._opacity)
+        super().on_iteration(step, total)
 
-    def _opacity(self, points: Tensor, time: Tensor) -> Tensor:
+    def opacity(self, points: Tensor, time: Tensor) -> Tensor:
         """Opacity (S,) of a step at points (S, 3) and times (S,), of the denser field."""
         points, step = self.placement.normalised(points), self.box.diagonal / self.settings.steps
         still = self.fields.static.density_alone(points)
@@ -177,21 +141,10 @@ class NSFF(RayTrainable):
             return None
         return images.moving.draw(count, generator)
 
-    def forward(self, batch: RayBatch) -> BlendedOutput:
-        """Render rays, each at its own time."""
-        return self.render_rays(batch.rays, batch.time, batch.background, jitter=self.training)
-
     def render_rays(
         self, rays: Rays, time: Tensor, background: Tensor, *, jitter: bool = False
     ) -> BlendedOutput:
-        """What R rays in the fields' space see at ``time`` (R,).
-
-        Args:
-            rays: R rays.
-            time: (R,) in [0, 1].
-            background: (3,) or (R, 3) RGB.
-            jitter: sample at random places, to learn from them.
-        """
+        """As of every method, and what it was made of."""
         samples = self._samples(rays, time, jitter=jitter)
         ray, fields = samples.ray, self.fields
         points = self.placement.normalised(samples.points)
@@ -226,11 +179,7 @@ class NSFF(RayTrainable):
         """Samples, their lengths in normalised units; without mattes the last one is endless."""
         s = self.settings
         if s.sampling == "occupancy":
-            before, after, _ = self.clock.between(time)
-            step = diagonal_step(self.box, rays, s.steps)
-            samples = self.occupancy.march(
-                rays, (before, after), self.box, self.depth_limits, step, jitter=jitter
-            )
+            samples = self.march(rays, time, jitter=jitter)
         else:
             samples = evenly(rays, self.box, self.depth_limits, s.samples, jitter=jitter)
         if self._endless:
@@ -277,8 +226,3 @@ class NSFF(RayTrainable):
         count = s.samples if s.sampling == "stratified" else s.steps
         every = super().batch_bytes(rays + s.hard_rays) // 128
         return count * (every + 12 * (rays + s.hard_rays) * more)
-
-    def at(self, time: float, *, half: bool = False) -> RayView:
-        """The scene at ``time``."""
-        at_rest = self.clock.at(time).after == 0
-        return RayView(self, time, self.device, at_rest=at_rest, half=half)

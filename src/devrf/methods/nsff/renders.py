@@ -9,9 +9,15 @@ import torch
 from torch import Tensor
 
 from devrf.data.batch import RayBatch
-from devrf.methods.nerf.ray_samples import RaySamples
-from devrf.methods.nsff.blending import Blend
-from devrf.methods.nsff.fields import BACKWARD, FORWARD, DynamicSamples, StaticSamples, TwoFields
+from devrf.methods.nerf.samples import RaySamples
+from devrf.methods.nsff.fields import (
+    BACKWARD,
+    FORWARD,
+    Blend,
+    DynamicSamples,
+    StaticSamples,
+    TwoFields,
+)
 from devrf.ops.compositing import composite, sum_by_ray
 from devrf.rendering.output import RenderOutput
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 from devrf.errors import DevrfError
 from devrf.methods.nerf.settings import check_empty_from
@@ -115,8 +114,3 @@ class NSFFSettings:
         check_empty_from(key, self.empty_from)
         if self.flow_reach is not None and self.flow_reach <= 0:
             raise DevrfError(f"{key}.flow_reach: expected more than 0, not {self.flow_reach}")
-
-    @staticmethod
-    def of(config: Mapping[str, Any]) -> NSFFSettings:
-        """The settings that :func:`dataclasses.asdict` gave."""
-        return NSFFSettings(**{**config, "warmup": Warmup(**config["warmup"])})

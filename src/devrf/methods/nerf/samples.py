@@ -1,0 +1,156 @@
+"""Samples along rays: where they are drawn, and what they come to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from devrf.geometry.box import Box
+from devrf.geometry.rays import Rays
+from devrf.ops.compositing import color_and_depth, composite, sum_by_ray
+from devrf.rendering.output import RenderOutput
+
+# Opaque at any density that a softplus gives.
+ENDLESS = 1e10
+
+
+@dataclass(frozen=True)
+class RaySamples:
+    """S samples of R rays: ascending by ray, then front to back.
+
+    Attributes:
+        ray: (S,) int64, the ray of each sample.
+        distance: (S,) along the ray, in units of its direction.
+        length: (S,) of the stretch that each sample stands for, in units of the box.
+        points: (S, 3) positions in the fields' space.
+        rays: R.
+    """
+
+    ray: Tensor
+    distance: Tensor
+    length: Tensor
+    points: Tensor
+    rays: int
+
+    @staticmethod
+    def at(rays: Rays, ray: Tensor, distance: Tensor, stretch: Tensor | float) -> RaySamples:
+        """Samples at ``distance`` (S,) along the rays ``ray`` (S,).
+
+        Args:
+            rays: R rays.
+            ray: (S,) int64.
+            distance: (S,) in units of the rays' directions.
+            stretch: (S,) or a number, what each stands for, in these units.
+        """
+        unit = rays.directions.norm(dim=1).index_select(0, ray)
+        return RaySamples(ray, distance, unit * stretch, rays.at(ray, distance), len(rays))
+
+    def scaled(self, unit: float) -> RaySamples:
+        """The same samples, their lengths in units of ``unit`` (of the fields' space)."""
+        return replace(self, length=self.length / unit)
+
+    def endless(self) -> RaySamples:
+        """The same samples, the last of each ray standing for all that is behind it."""
+        following = torch.cat([self.ray[1:], self.ray.new_full((1,), -1)])[: len(self.ray)]
+        length = torch.where(self.ray != following, ENDLESS, self.length)
+        return replace(self, length=length)
+
+
+def volume_render(
+    samples: RaySamples, density: Tensor, color: Tensor, background: Tensor
+) -> RenderOutput:
+    """C = Σ w_i c_i + T_end · background with α_i = 1 − exp(−σ_i δ_i).
+
+    Args:
+        samples: S samples of R rays.
+        density: (S,) σ per unit of the samples' lengths.
+        color: (S, 3) RGB.
+        background: (3,) or (R, 3) RGB.
+
+    Returns:
+        ``extras`` has the ``weight`` (S,) and the ``ray`` (S,) of the samples.
+    """
+    ray, rays = samples.ray, samples.rays
+    weight, transmittance = composite(density * samples.length, ray, rays)
+    seen = sum_by_ray(weight[:, None] * color, ray, rays)
+    with torch.no_grad():
+        mass = sum_by_ray(weight, ray, rays)
+        reached = sum_by_ray(weight * samples.distance, ray, rays)
+    image, depth = color_and_depth(seen, reached, mass, transmittance, background)
+    return RenderOutput(
+        color=image,
+        depth=depth,
+        transmittance=transmittance,
+        extras={"weight": weight, "ray": ray},
+    )
+
+
+def limits(rays: Rays, box: Box, depths: tuple[float, float]) -> tuple[Tensor, Tensor]:
+    """Distances (R,) between which R rays are sampled: inside the box, from near to far.
+
+    A ray that misses the box is sampled in a stretch of no length.
+    """
+    entry, leave = box.crossing(rays, *depths)
+    near = entry.clamp(max=depths[1])
+    return near, torch.maximum(leave, near)
+
+
+def stratified(near: Tensor, far: Tensor, count: int, *, jitter: bool) -> Tensor:
+    """Distances (R, count), one in each of as many equal stretches.
+
+    Args:
+        near: (R,) where the first stretch begins.
+        far: (R,) where the last one ends.
+        count: how many stretches.
+        jitter: a random place in each stretch; else its middle.
+    """
+    place = torch.arange(count, device=near.device).expand(len(near), count)
+    offset = torch.rand_like(near[:, None].expand(-1, count)) if jitter else 0.5
+    return near[:, None] + (far - near)[:, None] * (place + offset) / count
+
+
+def importance(
+    distance: Tensor, weight: Tensor, near: Tensor, far: Tensor, count: int, *, jitter: bool
+) -> Tensor:
+    """Distances (R, count) drawn in proportion to the weights of coarse samples.
+
+    The stretches end half-way between the coarse samples; each is as likely as its weight says,
+    and a place within it is drawn evenly (inverse transform sampling).
+
+    Args:
+        distance: (R, N) of the coarse samples, ascending.
+        weight: (R, N) theirs.
+        near: (R,) where the first stretch begins.
+        far: (R,) where the last one ends.
+        count: how many to draw.
+        jitter: random numbers; else evenly spread ones.
+    """
+    middle = (distance[:, 1:] + distance[:, :-1]) / 2
+    edge = torch.cat([near[:, None], middle, far[:, None]], dim=1)
+    share = weight + 1e-5
+    reached = torch.cumsum(share / share.sum(dim=1, keepdim=True), dim=1)
+    reached = torch.cat([torch.zeros_like(reached[:, :1]), reached], dim=1)
+    wanted = stratified(torch.zeros_like(near), torch.ones_like(far), count, jitter=jitter)
+    above = torch.searchsorted(reached, wanted.contiguous(), right=True)
+    above = above.clamp(min=1, max=edge.shape[1] - 1)
+    low, high = reached.gather(1, above - 1), reached.gather(1, above)
+    within = ((wanted - low) / (high - low).clamp(min=1e-8)).clamp(0, 1)
+    start, stop = edge.gather(1, above - 1), edge.gather(1, above)
+    return start + within * (stop - start)
+
+
+def flattened(rays: Rays, distance: Tensor, far: Tensor) -> RaySamples:
+    """Samples at distances (R, N), ascending: each stands for the stretch up to the next."""
+    stretch = torch.cat([distance[:, 1:], far[:, None]], dim=1) - distance
+    ray = torch.arange(len(rays), device=distance.device).repeat_interleave(distance.shape[1])
+    return RaySamples.at(rays, ray, distance.reshape(-1), stretch.reshape(-1).clamp(min=0))
+
+
+def evenly(
+    rays: Rays, box: Box, depths: tuple[float, float], count: int, *, jitter: bool
+) -> RaySamples:
+    """``count`` samples of each ray, one in each of equal stretches of its way through a box."""
+    near, far = limits(rays, box, depths)
+    return flattened(rays, stratified(near, far, count, jitter=jitter), far)

@@ -1,0 +1,210 @@
+"""What Neural Volumes learns: an encoder of images, decoders of volumes, and warps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+LEAK = 0.2
+
+
+def linear(inputs: int, outputs: int, leak: float = LEAK) -> nn.Linear:
+    """A linear layer with Xavier's uniform weights; ``leak`` 1 for one without activation."""
+    layer = nn.Linear(inputs, outputs)
+    nn.init.xavier_uniform_(layer.weight, nn.init.calculate_gain("leaky_relu", leak))
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
+def halving(inputs: int, outputs: int) -> nn.Conv2d:
+    """A convolution that halves an image (4×4, stride 2)."""
+    layer = nn.Conv2d(inputs, outputs, 4, 2, 1)
+    nn.init.xavier_uniform_(layer.weight, nn.init.calculate_gain("leaky_relu", LEAK))
+    assert layer.bias is not None
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
+def doubling(inputs: int, outputs: int, leak: float = LEAK) -> nn.ConvTranspose3d:
+    """A transposed convolution that doubles a volume (4³, stride 2).
+
+    Two of the four taps along an axis meet each voxel. Both pairs begin alike, so that all eight
+    voxels that come of one are the same at first, without a checkerboard.
+    """
+    layer = nn.ConvTranspose3d(inputs, outputs, 4, 2, 1)
+    bound = nn.init.calculate_gain("leaky_relu", leak) * (6 / (8 * (inputs + outputs))) ** 0.5
+    with torch.no_grad():
+        first = torch.empty(inputs, outputs, 2, 2, 2).uniform_(-bound, bound)
+        for axis in (2, 3, 4):
+            first = first.repeat_interleave(2, dim=axis)
+        layer.weight.copy_(first)
+        assert layer.bias is not None
+        layer.bias.zero_()
+    return layer
+
+
+class VolumeDecoder(nn.Module):
+    """A code → a volume, doubled level by level from 1³ (docs/methods/neural_volumes.md#decoder).
+
+    Attributes:
+        side: voxels along an edge of the volume.
+    """
+
+    def __init__(self, code: int, channels: Sequence[int], outputs: int) -> None:
+        """Build the levels.
+
+        Args:
+            code: numbers in a code.
+            channels: that each level reads, from 1³ on.
+            outputs: values of a voxel.
+        """
+        super().__init__()
+        levels: list[nn.Module] = [nn.LeakyReLU(LEAK)]
+        for read, made in zip(channels, channels[1:], strict=False):
+            levels += [doubling(read, made), nn.LeakyReLU(LEAK)]
+        self.first, self.levels = linear(code, channels[0]), nn.Sequential(*levels)
+        self.output = doubling(channels[-1], outputs, 1.0)
+        self.side = 2 ** len(channels)
+
+    def forward(self, code: Tensor) -> Tensor:
+        """Volumes (M, outputs, side, side, side), the axes z, y, x, of codes (M, code)."""
+        volume: Tensor = self.output(self.levels(self.first(code)[:, :, None, None, None]))
+        return volume
+
+
+# Colours are standardised as published: mean 100 and deviation 25 of 255.
+MEAN, DEVIATION = 100 / 255, 25 / 255
+
+
+class TimeEncoder(nn.Module):
+    """K images of a moment → μ and log s of its code (docs/methods/neural_volumes.md#encoder)."""
+
+    def __init__(
+        self, views: int, size: Sequence[int], channels: Sequence[int], width: int, code: int
+    ) -> None:
+        """Build a stack of convolutions for each camera, and the layers that join them.
+
+        Args:
+            views: K cameras.
+            size: height and width of an image.
+            channels: of each convolution.
+            width: units of the joining layer.
+            code: numbers in a code.
+        """
+        super().__init__()
+        stack = [3, *channels]
+        self.cameras = nn.ModuleList()
+        for _ in range(views):
+            layers: list[nn.Module] = []
+            for read, made in zip(stack, stack[1:], strict=False):
+                layers += [halving(read, made), nn.LeakyReLU(LEAK)]
+            self.cameras.append(nn.Sequential(*layers, nn.Flatten()))
+        cells = (size[0] >> len(channels)) * (size[1] >> len(channels))
+        joined = linear(views * channels[-1] * cells, width)
+        self.joined = nn.Sequential(joined, nn.LeakyReLU(LEAK))
+        self.mean, self.log_deviation = linear(width, code, 1.0), linear(width, code, 1.0)
+
+    def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """μ and log s, (M, code) each.
+
+        Args:
+            images: (M, K, 3, H, W) RGB in [0, 1].
+        """
+        standard = (images - MEAN) / DEVIATION
+        seen = [camera(standard[:, k]) for k, camera in enumerate(self.cameras)]
+        joined = self.joined(torch.cat(seen, dim=1))
+        return 0.1 * self.mean(joined), 0.01 * self.log_deviation(joined)
+
+
+# A quaternion of this length or less counts as shorter than one: 0 is no rotation.
+LEAST_NORM = 1e-5**0.5
+# So small are the last layers of the affine maps at first: next to the identity.
+SMALL = 1e-5
+
+
+def identity_grid(side: int) -> Tensor:
+    """(3, side, side, side): x, y, z of a grid over the cube [−1, 1]³, its axes z, y, x."""
+    axis = torch.linspace(-1, 1, side)
+    z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
+    return torch.stack([x, y, z])
+
+
+class ConvWarp(nn.Module):
+    """x + d(x), d decoded by transposed convolutions (docs/methods/neural_volumes.md#warp)."""
+
+    grid: Tensor
+
+    def __init__(self, code: int, channels: list[int], scale: float) -> None:
+        """Build the decoder of displacements.
+
+        Args:
+            code: numbers in a code.
+            channels: as of :class:`VolumeDecoder`.
+            scale: displacement for an output of 1; the cube's edge is 2.
+        """
+        super().__init__()
+        self.scale = scale
+        self.decoder = VolumeDecoder(code, channels, 3)
+        self.register_buffer("grid", identity_grid(self.decoder.side), persistent=False)
+
+    def forward(self, code: Tensor) -> Tensor:
+        """Positions (M, 3, side, side, side) in the template, for codes (M, code)."""
+        found: Tensor = self.grid + self.scale * self.decoder(code)
+        return found
+
+
+class AffineWarp(nn.Module):
+    """A mixture of affine maps A_k(x) = s_k ⊙ R(q_k)(x − 0.1 t_k).
+
+    The field is Σ w_k(A_k x) A_k x / Σ w_k(A_k x), with the weights w_k on a grid
+    (docs/methods/neural_volumes.md#warp). s_k = 1 + the network's output.
+    """
+
+    grid: Tensor
+
+    def __init__(self, code: int, side: int, maps: int) -> None:
+        """Build the networks of the maps and of their weights."""
+        super().__init__()
+        self.side, self.maps = side, maps
+        self.scale, self.rotation, self.shift = (
+            _small_network(code, 128, outputs * maps) for outputs in (3, 4, 3)
+        )
+        self.weight = nn.Sequential(
+            linear(code, 64), nn.LeakyReLU(LEAK), linear(64, maps * side**3, 1.0)
+        )
+        self.register_buffer("grid", identity_grid(side), persistent=False)
+
+    def forward(self, code: Tensor) -> Tensor:
+        """Positions (M, 3, side, side, side) in the template, for codes (M, code)."""
+        count, side = len(code), self.side
+        scale = 1 + self.scale(code).view(count, self.maps, 3, 1)
+        rotation = rotation_matrices(self.rotation(code).view(count, self.maps, 4))
+        shift = 0.1 * self.shift(code).view(count, self.maps, 3, 1)
+        moved = scale * (rotation @ (self.grid.flatten(1) - shift))  # (M, K, 3, side³)
+        weight = self.weight(code).exp().view(count * self.maps, 1, side, side, side)
+        place = moved.transpose(2, 3).reshape(count * self.maps, side, side, side, 3)
+        there = nn.functional.grid_sample(weight, place, align_corners=True)
+        there = there.view(count, self.maps, 1, -1)
+        mixed: Tensor = (there * moved).sum(dim=1) / there.sum(dim=1).clamp(min=1e-3)
+        return mixed.view(count, 3, side, side, side)
+
+
+def rotation_matrices(quaternion: Tensor) -> Tensor:
+    """Rotations (..., 3, 3) of quaternions (..., 4), w first, of any length; 0 is no rotation."""
+    length = quaternion.square().sum(dim=-1, keepdim=True).clamp(min=LEAST_NORM**2).sqrt()
+    w, x, y, z = (quaternion / length).unbind(-1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+
+
+def _small_network(code: int, width: int, outputs: int) -> nn.Sequential:
+    last = nn.Linear(width, outputs)
+    nn.init.uniform_(last.weight, -SMALL, SMALL)
+    nn.init.zeros_(last.bias)
+    return nn.Sequential(linear(code, width), nn.LeakyReLU(LEAK), last)
