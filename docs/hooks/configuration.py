@@ -69,11 +69,12 @@ def keys_of_a_run(config: str) -> str:
 def section(group: str, default: str) -> str:
     """One group: a row for each choice, then its files as they are."""
     table = ROWS / f"{group}.yaml"
-    files = [table] if table.is_file() else sorted((CONF / group).glob("*.yaml"))
+    files = sorted((CONF / group).glob("*.yaml"))
     choices = {path.stem: header(path) for path in files}
     if table.is_file():
+        files.append(table)
         rows = ROW.findall(table.read_text().partition("\n\n")[2])
-        choices = {name: words(comment.splitlines()) for comment, name in rows}
+        choices |= {name: words(comment.splitlines()) for comment, name in rows}
     lines = [
         f"## {group} {{ #{group.replace('/', '-')} }}",
         "",

@@ -23,7 +23,7 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
-from devrf.cli.config import OF_A_CHECKPOINT, config_folder, rows, scene_folder_name
+from devrf.cli.config import OF_A_CHECKPOINT, config_folder, group_choices, rows, scene_folder_name
 from devrf.cli.messages import in_quotes
 from devrf.errors import DevrfError
 
@@ -296,8 +296,7 @@ def _in_form(texts: list[str], before: Sequence[str]) -> list[str]:
     """
     both = parsed([*before, *texts])
     names = values(both, "experiment")
-    known = {path.stem for path in (config_folder() / "experiment").glob("*.yaml")}
-    known |= {str(name) for name in rows("experiment")}
+    known = group_choices()["experiment"]
     if not any(other.startswith(f"{name}_") for name in names for other in known):
         return texts
     scenes: list[str | None] = [*values(both, "data")]

@@ -74,10 +74,9 @@ def register_rows() -> None:
     for path in sorted(folder.rglob("*.yaml")):
         group = path.relative_to(folder).with_suffix("").as_posix()
         at_root = path.read_text("utf-8").startswith("# @package _global_")
+        package = "_global_" if at_root else None
         for name, row in rows(group).items():
-            store.store(
-                str(name), row, group, "_global_" if at_root else "_group_", provider="devrf"
-            )
+            store.store(str(name), row, group, package, "devrf")
 
 
 def known_stages() -> list[str]:
