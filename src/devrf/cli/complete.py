@@ -296,7 +296,7 @@ def _in_form(texts: list[str], before: Sequence[str]) -> list[str]:
     """
     both = parsed([*before, *texts])
     names = values(both, "experiment")
-    known = group_choices()["experiment"]
+    known = set(group_choices()["experiment"])
     if not any(other.startswith(f"{name}_") for name in names for other in known):
         return texts
     scenes: list[str | None] = [*values(both, "data")]
