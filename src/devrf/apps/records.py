@@ -47,12 +47,12 @@ def dynamic_scores(views: Sequence[HeldOutView], clock: FrameClock) -> dict[str,
     """
     novel = [view for view in views if not clock.knows(view.time)]
     known = [view for view in views if clock.knows(view.time)]
-    found: dict[str, Any] = _with_rest_pose(views)
+    scores: dict[str, Any] = _with_rest_pose(views)
     if novel and known:
-        found["training_times"] = {**_with_rest_pose(known), "images": len(known)}
+        scores["training_times"] = {**_with_rest_pose(known), "images": len(known)}
     if novel:
-        found["novel_times"] = {**_with_rest_pose(novel), "images": len(novel)}
-    return found
+        scores["novel_times"] = {**_with_rest_pose(novel), "images": len(novel)}
+    return scores
 
 
 def _with_rest_pose(views: Sequence[HeldOutView]) -> dict[str, float | None]:

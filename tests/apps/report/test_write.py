@@ -34,7 +34,7 @@ def test_a_report_is_written_beside_the_runs_and_not_taken_for_one(runs, ran):
     }
     for plot in plots:
         assert f"(<{plot}.png>)" in written.path.read_text(encoding="utf-8")
-    again = write_report(ReportSettings(runs)).table.found
+    again = write_report(ReportSettings(runs)).table.collection
     assert len(again.runs) == len(collect(runs).runs) == 1 and not again.skipped
 
 

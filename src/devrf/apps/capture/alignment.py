@@ -84,7 +84,7 @@ def timeline(
             "videos of different lengths: %.2f to %.2f s; the %.2f s that all show are used",
             *(shortest, longest, end - start),
         )
-    slowest = int(np.argmin([one.rate for one in surveys]))
+    slowest = int(np.argmin([survey.rate for survey in surveys]))
     slack = 0.5 / surveys[slowest].rate
     clock = np.array(surveys[slowest].times) + begun[slowest]
     usable = np.flatnonzero((clock >= start - slack) & (clock <= end + slack))
@@ -109,12 +109,12 @@ def offsets_found(paths: Sequence[Path], surveys: Sequence[Survey]) -> list[floa
     Raises:
         DevrfError: nothing moves in a video, or it moves unlike in the first.
     """
-    for path, one in zip(paths, surveys, strict=True):
-        if max(one.motion) == 0:
+    for path, survey in zip(paths, surveys, strict=True):
+        if max(survey.motion) == 0:
             raise DevrfError(f"{path}: nothing moves in it; {_BY_HAND}")
     found = [0.0]
-    for path, one in zip(paths[1:], surveys[1:], strict=True):
-        offset, correlation = offset_between(surveys[0], one)
+    for path, survey in zip(paths[1:], surveys[1:], strict=True):
+        offset, correlation = offset_between(surveys[0], survey)
         log.info(
             "%s: began %+.3f s after %s (correlation %.2f)", path, offset, paths[0], correlation
         )
@@ -148,11 +148,11 @@ def offset_between(first: Survey, second: Survey) -> tuple[float, float]:
     return lag * step + a_start - b_start, float(values[best])
 
 
-def _sampled(one: Survey, step: float) -> tuple[Signal, float]:
+def _sampled(survey: Survey, step: float) -> tuple[Signal, float]:
     """Motion a second, square root, every ``step`` seconds, and the time of its first sample."""
-    times = np.array(one.times)
+    times = np.array(survey.times)
     middles = (times[1:] + times[:-1]) / 2
-    speed = np.sqrt(np.array(one.motion[1:]) / np.diff(times))
+    speed = np.sqrt(np.array(survey.motion[1:]) / np.diff(times))
     count = max(2, int((middles[-1] - middles[0]) / step) + 1)
     clock = middles[0] + step * np.arange(count)
     return np.interp(clock, middles, speed), float(middles[0])
@@ -161,10 +161,10 @@ def _sampled(one: Survey, step: float) -> tuple[Signal, float]:
 def _correlation(a: Signal, b: Signal, lag: int) -> float:
     """Of the parts of two signals that overlap when the second is moved by ``lag`` samples."""
     low, high = max(0, lag), min(len(a), len(b) + lag)
-    one, other = a[low:high], b[low - lag : high - lag]
-    one, other = one - one.mean(), other - other.mean()
-    norm = float(np.sqrt((one**2).sum() * (other**2).sum()))
-    return float((one * other).sum()) / norm if norm > 0 else -1.0
+    a, b = a[low:high], b[low - lag : high - lag]
+    a, b = a - a.mean(), b - b.mean()
+    norm = float(np.sqrt((a**2).sum() * (b**2).sum()))
+    return float((a * b).sum()) / norm if norm > 0 else -1.0
 
 
 def _nearest(clock: Signal, instants: Signal) -> tuple[int, ...]:

@@ -173,7 +173,7 @@ def chosen_masks(
     if is_folder(masks):
         files = listed_images(masks)
         if is_folder(footage):
-            files = [_of_photograph(masks, one) for one in listed_images(footage)]
+            files = [_of_photograph(masks, photograph) for photograph in listed_images(footage)]
         for position in positions:
             yield position, read_mask(files[position], size, None, footage)
         return
@@ -189,9 +189,9 @@ def chosen_masks(
 
 
 def _of_photograph(masks: Path, photograph: Path) -> Path:
-    for one in listed_images(masks):
-        if one.stem == photograph.stem:
-            return one
+    for mask in listed_images(masks):
+        if mask.stem == photograph.stem:
+            return mask
     raise DevrfError(
         f"{masks / photograph.stem}.png: no such alpha mask, of {photograph}; give each photograph "
         "one of its name"
@@ -227,7 +227,9 @@ def silhouettes(pictures: Sequence[Picture]) -> list[Mask]:
     for picture in pictures:
         # Of equal weight, whatever their order.
         model.apply(picture, learningRate=1 / len(pictures))
-    return [_cleaned(np.asarray(model.apply(one, learningRate=0), np.uint8)) for one in pictures]
+    return [
+        _cleaned(np.asarray(model.apply(frame, learningRate=0), np.uint8)) for frame in pictures
+    ]
 
 
 def _cleaned(mask: Mask) -> Mask:
@@ -260,8 +262,8 @@ def box_of_motion(
         DevrfError: nothing moves in what two views see.
     """
     shown: list[Mask] = []
-    for one in names:
-        shown += silhouettes([_small(images / name) for name in one])
+    for view_names in names:
+        shown += silhouettes([_small(images / name) for name in view_names])
     count = len(names[0])
     height, width = shown[0].shape
     shares = [width / lens["w"] for lens in lenses]
@@ -279,7 +281,7 @@ def box_of_motion(
         Cameras(poses.float(), focal, center, width, height)[view],
         torch.linspace(0, 1, count).repeat(len(names)),
         view,
-        tuple(name for one in names for name in one),
+        tuple(name for view_names in names for name in view_names),
     )
     # Coarsely where it is, then with a finer grid.
     coarse = motion_box(views, around)

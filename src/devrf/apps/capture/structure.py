@@ -147,7 +147,7 @@ def checked_model(folder: Path, moving: Chosen, fixed: dict[str, Path]) -> Spars
             its cameras jump from frame to frame of a video.
     """
     model = read_model(folder)
-    placed = {one.name for one in model.images}
+    placed = {image.name for image in model.images}
     known = [name for name in moving.names if name in placed]
     if len(known) < max(3, LEAST_SHARE * len(moving.names)):
         raise DevrfError(
@@ -172,7 +172,7 @@ def checked_model(folder: Path, moving: Chosen, fixed: dict[str, Path]) -> Spars
 
 
 def _check_turns(model: SparseModel, moving: Chosen, known: Sequence[str]) -> None:
-    place = {one.name: k for k, one in enumerate(model.images)}
+    place = {image.name: k for k, image in enumerate(model.images)}
     turns = model.poses[[place[name] for name in known], :, :3]
     trace = (turns[1:] * turns[:-1]).sum(dim=(1, 2))
     degrees = torch.rad2deg(((trace - 1) / 2).clamp(-1, 1).acos())

@@ -93,12 +93,12 @@ def write_gltf(
         whole["animations"] = [_animation(content, mesh.times, seconds)]
     if cameras:
         whole["cameras"] = [
-            {"name": name, "type": "perspective", "perspective": _lens(one, NEAREST * size)}
-            for name, one in cameras.items()
+            {"name": name, "type": "perspective", "perspective": _lens(camera, NEAREST * size)}
+            for name, camera in cameras.items()
         ]
-        for index, (name, one) in enumerate(cameras.items()):
+        for index, (name, camera) in enumerate(cameras.items()):
             pose = torch.eye(4, dtype=torch.float64)
-            pose[:3] = frame.cameras(one).camera_to_world[0]
+            pose[:3] = frame.cameras(camera).camera_to_world[0]
             # The standard has columns one after another.
             matrix = pose.T.reshape(-1).tolist()
             nodes.append({"name": name, "camera": index, "matrix": matrix})

@@ -58,9 +58,9 @@ def write_sequence(
         seconds: how long time 0 to 1 takes, for the index.
     """
     names = [f"frame_{number:04d}.{format}" for number in range(len(times))]
-    for name, one in zip(names, drawn, strict=True):
+    for name, geometry in zip(names, drawn, strict=True):
         with atomic_write(folder / name) as partial:
-            one.export(str(partial), file_type=format)
+            geometry.export(str(partial), file_type=format)
     frames = [
         {"file": name, "time": time, "seconds": time * seconds}
         for name, time in zip(names, times, strict=True)

@@ -55,15 +55,15 @@ def write_usd(
         placed = Vt.Vec3fArray.FromNumpy(vertices.contiguous().numpy())
         points.Set(placed, code)
         extent.Set(UsdGeom.PointBased.ComputeExtent(placed), code)
-    for name, one in cameras.items():
+    for name, camera in cameras.items():
         lens = UsdGeom.Camera.Define(stage, Sdf.Path(f"/scene/cameras/{name}"))
-        fx, fy = one.focal[0].tolist()
-        focal = FILM * fx / one.width
+        fx, fy = camera.focal[0].tolist()
+        focal = FILM * fx / camera.width
         lens.CreateHorizontalApertureAttr(FILM)
-        lens.CreateVerticalApertureAttr(focal * one.height / fy)
+        lens.CreateVerticalApertureAttr(focal * camera.height / fy)
         lens.CreateFocalLengthAttr(focal)
         pose = torch.eye(4, dtype=torch.float64)
-        pose[:3] = frame.cameras(one).camera_to_world[0]
+        pose[:3] = frame.cameras(camera).camera_to_world[0]
         # Gf multiplies rows from the left.
         lens.AddTransformOp().Set(Gf.Matrix4d(pose.T.tolist()))
     with atomic_write(path) as partial:

@@ -162,9 +162,8 @@ def _box_unknown(scene: Scene) -> Iterator[Advice]:
 
 
 def _one_side(scene: Scene) -> Iterator[Advice]:
-    if scene.kind != "inward":
-        return
-    gap = widest_gap(scene.static.train.cameras, box_middle(scene))
+    inward, cameras = scene.kind == "inward", scene.static.train.cameras
+    gap = widest_gap(cameras, box_middle(scene)) if inward else None
     if gap is not None and gap > WIDEST_GAP:
         yield Advice(
             "static training set",

@@ -135,7 +135,7 @@ class Table:
     """The contents of a report.
 
     Attributes:
-        found: the runs and failures that it is about.
+        collection: the runs and failures that it is about.
         columns: those of its rows.
         runs: the runs whose dynamic capture was scored, or of a scene at rest the static one;
             labelled.
@@ -146,7 +146,7 @@ class Table:
         notes: remarks on columns and rows, a sentence each.
     """
 
-    found: Collection
+    collection: Collection
     columns: tuple[Column, ...]
     runs: pd.DataFrame
     rows: pd.DataFrame
@@ -159,17 +159,17 @@ class Table:
         return any(len(block.published) for block in self.blocks)
 
 
-def tabulate(found: Collection, published_scenes: PublishedScenes = "matching") -> Table:
+def tabulate(collection: Collection, published_scenes: PublishedScenes = "matching") -> Table:
     """Make the tables of a collection.
 
     Args:
-        found: finished runs and failures.
+        collection: finished runs and failures.
         published_scenes: which of the paper's rows to show: of the scenes that were run, all, or
             none.
     """
-    scored = _values(found.runs, PSNR).notna()
-    again = _scored_again(found.runs[scored])
-    runs = labelled(found.runs[scored].drop(index=again.index))
+    scored = _values(collection.runs, PSNR).notna()
+    again = _scored_again(collection.runs[scored])
+    runs = labelled(collection.runs[scored].drop(index=again.index))
     columns = _columns(runs)
     titles = [column.title for column in columns]
     for column in columns:
@@ -186,7 +186,7 @@ def tabulate(found: Collection, published_scenes: PublishedScenes = "matching") 
     blocks: list[Block] = []
     for scene in dict.fromkeys([*ours, *theirs]):
         measured = _cells(
-            _of(rows, [scene]).assign(counts=lambda found: found["count"].map(lambda n: {n})),
+            _of(rows, [scene]).assign(counts=lambda row: row["count"].map(lambda n: {n})),
             _of(spread, [scene]),
             columns,
             runs.loc[runs["scene"] == scene, "run.device"],
@@ -198,13 +198,13 @@ def tabulate(found: Collection, published_scenes: PublishedScenes = "matching") 
             title, _average(runs, rows, ours, columns), _published(ours, theirs, columns)
         )
         blocks += [average] if len(average.measured) else []
-    notes = _notes(runs, found.runs.loc[~scored, "folder"], again)
-    return Table(found, columns, runs, rows, tuple(blocks), tuple(notes))
+    notes = _notes(runs, collection.runs.loc[~scored, "folder"], again)
+    return Table(collection, columns, runs, rows, tuple(blocks), tuple(notes))
 
 
 def _columns(runs: pd.DataFrame) -> tuple[Column, ...]:
     """The paper's columns, and those of training and novel times that a run has."""
-    known = [one for one in OF_TIMES if one.key in runs and _values(runs, one).notna().any()]
+    known = [c for c in OF_TIMES if c.key in runs and _values(runs, c).notna().any()]
     return (*COLUMNS[:1], *known, *COLUMNS[1:])
 
 
@@ -324,7 +324,7 @@ def _sampled(runs: pd.DataFrame) -> list[str]:
     way = kind.where(kind.notna() | hull.isna(), "even steps")
     way = way.where(~carved, way.astype(str) + " within hulls of alpha masks")
     names = runs["name"].groupby(way, sort=False).unique()
-    return [f"Samples by {one}: {', '.join(found)}." for one, found in names.items()]
+    return [f"Samples by {kind}: {', '.join(methods)}." for kind, methods in names.items()]
 
 
 def _notes(runs: pd.DataFrame, at_rest: pd.Series, again: pd.Series) -> list[str]:

@@ -101,13 +101,13 @@ def credit() -> str:
     )
 
 
-def reasons(found: Collection) -> list[str]:
+def reasons(collection: Collection) -> list[str]:
     """Which runs failed, and why, a line each; overrides that all runs share are left out."""
-    overrides = pd.concat([found.runs["run.overrides"], found.failures["run.overrides"]])
+    overrides = pd.concat([collection.runs["run.overrides"], collection.failures["run.overrides"]])
     typed = [set(own) for own in overrides]
     shared = set.intersection(*typed) if len(typed) > 1 else set()
     lines: list[str] = []
-    for failure in found.failures.to_dict("records"):
+    for failure in collection.failures.to_dict("records"):
         own = [text for text in failure["run.overrides"] if text not in shared]
         what = " ".join([failure["scene"] or "unknown scene", *own])
         bug = " (a fault of the program: see its run.log)" * (failure["mistake"] is False)
@@ -125,15 +125,15 @@ PLAIN = Style(str, ("{} ", "{}¹", "{}²", "{}³"))
 
 
 def markdown(
-    table: Table, figures: Mapping[str, str], films: Mapping[str, str] | None = None
+    table: Table, figures: Mapping[str, str], videos: Mapping[str, str] | None = None
 ) -> str:
-    """The whole report, with links to ``figures`` and ``films``, by what they show."""
-    found = table.found
-    failed = f", {len(found.failures)} failed" if len(found.failures) else ""
-    count = len(found.runs)
+    """The whole report, with links to ``figures`` and ``videos``, by what they show."""
+    collection = table.collection
+    failed = f", {len(collection.failures)} failed" if len(collection.failures) else ""
+    count = len(collection.runs)
     parts = [
         "# Runs compared",
-        f"{count} finished run{'s' * (count != 1)} below `{found.folder}`{failed}.",
+        f"{count} finished run{'s' * (count != 1)} below `{collection.folder}`{failed}.",
         f"{markdown_escaped(caption(table))} **Best**, <ins>second</ins>, *third*.",
     ]
     if table.shows_published:
@@ -142,18 +142,18 @@ def markdown(
         parts += [f"## {markdown_escaped(block.title)}", _block(table, block)]
     for heading, lines in (
         ("", table.notes),
-        ("## Failed", reasons(found)),
-        ("## Skipped", found.skipped),
+        ("## Failed", reasons(collection)),
+        ("## Skipped", collection.skipped),
     ):
         if lines:
             parts += [heading, "\n".join(f"- {markdown_escaped(line)}" for line in lines)]
     if figures:
         parts.append("## Plots")
         parts += [f"![{markdown_escaped(shows)}](<{link}>)" for shows, link in figures.items()]
-    if films:
+    if videos:
         parts.append("## Videos")
         parts.append(
-            "\n".join(f"- [{markdown_escaped(show)}](<{link}>)" for show, link in films.items())
+            "\n".join(f"- [{markdown_escaped(show)}](<{link}>)" for show, link in videos.items())
         )
     return "\n\n".join(filter(None, parts)) + "\n"
 
@@ -161,8 +161,8 @@ def markdown(
 def plain(table: Table) -> str:
     """The tables, notes and failures, for a terminal; ¹ ² ³ mark the best."""
     parts = [_plain_block(table, block) + "\n" for block in table.blocks]
-    failed = [f"failed: {why}" for why in reasons(table.found)]
-    return "\n".join([*parts, *table.notes, *failed, *table.found.skipped]).rstrip()
+    failed = [f"failed: {why}" for why in reasons(table.collection)]
+    return "\n".join([*parts, *table.notes, *failed, *table.collection.skipped]).rstrip()
 
 
 def _block(table: Table, block: Block) -> str:
@@ -227,7 +227,7 @@ def latex(table: Table) -> str:
             _tables(table, table.blocks[start : start + SIDE_BY_SIDE], latex_escaped(words))
         )
         words = "Continued."
-    lines = [*table.notes, *(f"failed: {why}" for why in reasons(table.found))]
+    lines = [*table.notes, *(f"failed: {why}" for why in reasons(table.collection))]
     parts.append("".join(f"% {' '.join(line.split())}\n" for line in lines))
     return "\n".join(filter(None, parts))
 

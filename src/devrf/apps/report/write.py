@@ -40,16 +40,16 @@ def write_report(settings: ReportSettings) -> Report:
     Raises:
         DevrfError: no such folder, or nothing below it that a run left; nothing is written.
     """
-    found, folder = collect(Path(settings.runs)), settings.folder
-    if found.runs.empty and found.failures.empty:
-        why = f" ({found.skipped[0]})" if found.skipped else ""
+    collection, folder = collect(Path(settings.runs)), settings.folder
+    if collection.runs.empty and collection.failures.empty:
+        why = f" ({collection.skipped[0]})" if collection.skipped else ""
         raise DevrfError(
             f"report.runs: no finished run below {settings.runs}{why}; give the folder of runs "
             "that were scored (stage=pipeline or stage=evaluate)"
         )
-    table = tabulate(found, settings.published)
-    figures, films = _write_plots(table, folder), _write_films(table, folder)
-    _write(folder / "report.md", markdown(table, figures, films))
+    table = tabulate(collection, settings.published)
+    figures, videos = _write_plots(table, folder), _write_videos(table, folder)
+    _write(folder / "report.md", markdown(table, figures, videos))
     _write(folder / "report.tex", latex(table))
     _write(folder / "report.csv", csv(table))
     return Report(table, plain(table), folder / "report.md")
@@ -61,9 +61,9 @@ def csv(table: Table) -> str:
     ``train_seconds`` and ``peak_gpu_gb`` are the tables' Time and GPU; further columns are those
     of ``metrics.json``, by dotted name. Unknown values are empty.
     """
-    runs = table.found.runs.drop(columns="path").copy()  # in one piece
+    runs = table.collection.runs.drop(columns="path").copy()  # in one piece
     runs.insert(3, "row", table.runs["label"])
-    failures = table.found.failures.drop(columns="path")
+    failures = table.collection.failures.drop(columns="path")
     rows = pd.concat([runs, failures], ignore_index=True)
     return str(rows.map(_csv_cell).to_csv(index=False, lineterminator="\n"))
 
@@ -88,11 +88,11 @@ def _write_plots(table: Table, folder: Path) -> dict[str, str]:
     return links
 
 
-def _write_films(table: Table, folder: Path) -> dict[str, str]:
+def _write_videos(table: Table, folder: Path) -> dict[str, str]:
     """Write a video of all rows for each scene that has several; links as of the plots."""
     links: dict[str, str] = {}
     for scene in table.runs["scene"].unique():
-        pictures = scene_film(table, scene)
+        pictures = scene_video(table, scene)
         if pictures is not None:
             name = f"{file_name(f'side_by_side_{scene}')}.mp4"
             write_pictures(folder / "videos" / name, pictures, FPS)
@@ -111,7 +111,7 @@ BAND, MARGIN = 22, 4  # pixels: above each picture for its label, and between th
 Frames = list[np.ndarray]
 
 
-def scene_film(table: Table, scene: str) -> Iterator[np.ndarray] | None:
+def scene_video(table: Table, scene: str) -> Iterator[np.ndarray] | None:
     """Pictures (H, W, 3) uint8 of the truth and of each row's rendering while time runs.
 
     The first run of a row that has a video stands for it. Pictures have the size of the first
@@ -132,21 +132,21 @@ def _video(runs: pd.DataFrame) -> Path | None:
     return next((path for path in paths if path.is_file()), None)
 
 
-def _pictures(videos: Mapping[str, Path]) -> Iterator[np.ndarray]:
-    films = {label: list(iio.imiter(path)) for label, path in videos.items()}
-    count = min(map(len, films.values()))
-    first = next(iter(films.values()))
+def _pictures(paths: Mapping[str, Path]) -> Iterator[np.ndarray]:
+    videos = {label: list(iio.imiter(path)) for label, path in paths.items()}
+    count = min(map(len, videos.values()))
+    first = next(iter(videos.values()))
     size = _column(first[0], RENDERED).size
     for index in range(count):
         tiles = {"truth": _column(_at(first, index, count), TRUTH)}
-        for label, film in films.items():
-            tiles[label] = _column(_at(film, index, count), RENDERED).resize(size)
+        for label, frames in videos.items():
+            tiles[label] = _column(_at(frames, index, count), RENDERED).resize(size)
         yield _page(tiles)
 
 
-def _at(film: Frames, index: int, count: int) -> np.ndarray:
-    """The picture of a film at the time of picture ``index`` of ``count``."""
-    return film[round(index * (len(film) - 1) / max(count - 1, 1))]
+def _at(frames: Frames, index: int, count: int) -> np.ndarray:
+    """The frame of a video at the time of frame ``index`` of ``count``."""
+    return frames[round(index * (len(frames) - 1) / max(count - 1, 1))]
 
 
 def _column(picture: np.ndarray, column: int) -> Image.Image:
