@@ -1,1 +1,1 @@
-"""A learned scene in a browser: orbit, fly, run time, collect keyframes of a film."""
+"""A learned scene in a browser: orbit, fly, run time, collect keyframes of a video."""

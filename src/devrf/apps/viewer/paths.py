@@ -117,7 +117,7 @@ class PathPanel:
         self._presets, self._time, self._fly, self._changed = presets, time, fly, changed
         self._line: viser.LineSegmentsHandle | None = None
         gui = server.gui
-        with gui.add_folder("Film", expand_by_default=False):
+        with gui.add_folder("Video", expand_by_default=False):
             self._count = gui.add_markdown("")
             self._on(gui.add_button("Add keyframe", icon=viser.Icon.PLUS), self._add)
             self._on(gui.add_button("Remove the last"), lambda _: self._take(self.keyframes[:-1]))
@@ -125,7 +125,7 @@ class PathPanel:
             self._gap = gui.add_number("seconds to it", 2.0, min=0.05, max=600.0, step=0.05)
             self._fps = gui.add_number("pictures/s", 24.0, min=1.0, max=120.0, step=1.0)
             self._aspect = gui.add_number(
-                "width/height", 1.5, min=0.1, max=10.0, step=0.01, hint="of the film"
+                "width/height", 1.5, min=0.1, max=10.0, step=0.01, hint="of the video"
             )
             self._preset = gui.add_dropdown("path", tuple(presets), hint="a path that is known")
             self._on(
@@ -218,7 +218,7 @@ class PathPanel:
         shown = CameraPath(self.keyframes, 1.0, 1.0).sampled(POINTS)
         points = torch.stack([keyframe.camera_to_world[:, 3] for keyframe in shown]).numpy()
         self._line = self._server.scene.add_line_segments(
-            "/film",
+            "/video",
             np.stack([points[:-1], points[1:]], axis=1),
             colors=(200, 60, 40),
             thickness=2.0,
