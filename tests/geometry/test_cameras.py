@@ -14,9 +14,9 @@ from devrf.geometry.cameras import Cameras, Distortion
 IDENTITY = torch.eye(3, 4)[None]
 
 
-def plain(width: int = 8, height: int = 6) -> Cameras:
+def plain() -> Cameras:
     """A camera at the origin that looks along −z, with unequal focal lengths."""
-    return Cameras(IDENTITY, torch.tensor([[10.0, 5.0]]), torch.tensor([[4.0, 3.0]]), width, height)
+    return Cameras(IDENTITY, torch.tensor([[10.0, 5.0]]), torch.tensor([[4.0, 3.0]]), 8, 6)
 
 
 @pytest.fixture
@@ -65,15 +65,11 @@ def test_projection_undoes_rays(scattered: Cameras, rng: torch.Generator) -> Non
     torch.testing.assert_close(depth, along, atol=1e-5, rtol=1e-5)
 
 
-def test_pixel_grid_is_row_major_with_x_first() -> None:
-    grid = plain(width=3, height=2).pixel_grid()
-    expected = [[0.5, 0.5], [1.5, 0.5], [2.5, 0.5], [0.5, 1.5], [1.5, 1.5], [2.5, 1.5]]
-    assert grid.tolist() == expected
-
-
 def test_image_rays_go_through_the_pixel_grid_and_project_into_undoes_them(
     scattered: Cameras,
 ) -> None:
+    # Row by row, x first.
+    assert scattered.pixel_grid()[[0, 1, 30]].tolist() == [[0.5, 0.5], [1.5, 0.5], [0.5, 1.5]]
     rays = scattered.image_rays(3)
     pixel, depth = scattered.project_into(3, rays.origins + 2 * rays.directions)
     torch.testing.assert_close(pixel, scattered.pixel_grid(), atol=1e-4, rtol=0)
@@ -112,7 +108,7 @@ def test_looking_at_gives_right_handed_rigid_poses_even_straight_down() -> None:
     torch.testing.assert_close(torch.linalg.det(turn), torch.ones(3))
 
 
-@pytest.mark.parametrize(("height", "width"), [(40, 60), (5, 8), (1, 2)])
+@pytest.mark.parametrize(("height", "width"), [(40, 60), (5, 8)])
 def test_another_height_keeps_the_proportions(scattered: Cameras, height: int, width: int) -> None:
     # The cameras have 30 x 20 pixels; a width of 7.5 is rounded to even.
     sized = scattered.of_height(height)
@@ -120,26 +116,12 @@ def test_another_height_keeps_the_proportions(scattered: Cameras, height: int, w
     assert torch.equal(sized.focal[:, 1], scattered.focal[:, 1] * (height / 20))
 
 
-PHONE = Distortion((0.1004, -0.209, 0.05, -0.01), (0.0011, -0.0026))
-BARREL = Distortion((-0.28, 0.07, 0.0, 0.0), (-0.001, 0.002))
-
-
-def square(side: float = 0.7, count: int = 15) -> torch.Tensor:
-    """Points of a square around the axis, all its corners included."""
-    axis = torch.linspace(-side, side, count, dtype=torch.float64)
-    return torch.stack(torch.meshgrid(axis, axis * 0.75, indexing="xy"), dim=-1)
-
-
-def test_a_point_by_hand() -> None:
-    lens = Distortion((0.1, 0.2, 0.3, 0.4), (0.01, 0.02))
-    # r² = 5: g = 1 + 0.5 + 5 + 37.5 + 250 = 294; 2xy = 4.
-    found = lens.distort(torch.tensor([1.0, 2.0]))
-    expected = [294 + 0.04 + 0.02 * 7, 588 + 0.01 * 13 + 0.08]
-    torch.testing.assert_close(found, torch.tensor(expected))
+BARREL = Distortion((-0.28, 0.07, 0.05, 0.0), (-0.001, 0.002))
 
 
 def test_opencv_puts_points_in_the_same_places() -> None:
-    points = square().reshape(-1, 2)
+    axis = torch.linspace(-0.7, 0.7, 15, dtype=torch.float64)
+    points = torch.cartesian_prod(axis, 0.75 * axis)
     (k1, k2, k3, _), tangential = BARREL.radial, BARREL.tangential
     ahead = torch.cat([points, torch.ones(len(points), 1)], dim=1).numpy()
     origin = np.zeros(3)

@@ -47,10 +47,7 @@ def test_there_and_back(rng: torch.Generator) -> None:
         contracted = space.from_world(points)
         assert bool(space.box.contains(contracted).all())
         torch.testing.assert_close(space.to_world(contracted), points)
-
-
-def test_infinity_stays_finite() -> None:
-    corner = torch.tensor([[1.5, 1.5, -1.5]])
+    corner = torch.tensor([[1.5, 1.5, -1.5]])  # infinity stays finite
     assert bool(CUBE.to_world(corner).isfinite().all())
     assert float(CUBE.to_world(corner).amax()) > 1e5
 
@@ -59,15 +56,6 @@ def _rays(rng: torch.Generator, count: int, scale: float) -> Rays:
     directions = torch.randn(count, 3, generator=rng)
     directions = torch.nn.functional.normalize(directions, dim=1)
     return Rays(scale * torch.randn(count, 3, generator=rng), directions, directions)
-
-
-def test_rays_in_the_inner_box_are_those_of_the_world(rng: torch.Generator) -> None:
-    world = _rays(rng, 400, 0.2)
-    every, distance = torch.arange(400), 0.4 * torch.rand(400, generator=rng)
-    straight = world.at(every, distance)
-    inside = CUBE.inner().contains(straight)
-    assert int(inside.sum()) > 300
-    assert torch.equal(CUBE.rays(world).at(every, distance)[inside], straight[inside])
 
 
 def test_samples_are_evenly_spaced_in_disparity_along_a_ray() -> None:
@@ -84,7 +72,7 @@ def test_samples_are_evenly_spaced_in_disparity_along_a_ray() -> None:
     torch.testing.assert_close(rays.ends(), 1.5 * x)
 
 
-@pytest.mark.parametrize("scale", [0.3, 2.0, 6.0])
+@pytest.mark.parametrize("scale", [0.3, 6.0])
 def test_a_step_is_never_much_longer_in_contracted_space(
     rng: torch.Generator, scale: float
 ) -> None:
@@ -124,15 +112,6 @@ def test_ndc_points_by_hand(
 ) -> None:
     torch.testing.assert_close(NDC.from_world(torch.tensor([world])), torch.tensor([device]))
     torch.testing.assert_close(NDC.to_world(torch.tensor([device])), torch.tensor([world]))
-
-
-def test_an_ndc_ray_by_hand() -> None:
-    d = torch.tensor([[0.6, 0.0, -0.8]])
-    rays = NDC.rays(Rays(torch.tensor([[0.0, 0.0, 1.0]]), d, d))
-    # It meets z = −1 at (1.5, 0, −1) → (1.5, 0, −1), and infinity at x' = 0.75.
-    torch.testing.assert_close(rays.origins, torch.tensor([[1.5, 0.0, -1.0]]))
-    torch.testing.assert_close(rays.directions, torch.tensor([[-0.75, 0.0, 2.0]]))
-    assert torch.equal(rays.viewdirs, d)
 
 
 def test_points_of_a_world_ray_lie_on_its_ndc_ray(rng: torch.Generator) -> None:

@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from devrf.accel import blocks
-from devrf.accel.graphs import GraphedStep, Work
+from devrf.accel.graphs import CudaGraphCapture, GraphedStep, Work
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.stage import ScheduledStage
