@@ -22,31 +22,26 @@ SCHEDULE = DeformationSchedule(levels=(Level(4, 12), Level(6, 8)), rays=64)
 @pytest.mark.parametrize(
     ("losses", "done"),
     [
-        ([1.0], False),
         ([1.0, 1.0], False),  # too few to tell
         ([1.0, 0.99, 0.985], True),
         ([1.0, 0.99, 0.9], False),  # the last has gained a tenth
         ([1.0, 0.9, 1.2], False),  # dear pixels, but the one before has gained
-        ([1.0, 0.5, 0.51, 0.505], True),
     ],
 )
 def test_by_hand(losses: list[float], done: bool) -> None:
     assert converged(losses, min_rel_improvement=0.02) is done
 
 
-@pytest.mark.parametrize(("gain", "iterations"), [(None, 60), (1.0, 2 * 2 * 3 * 2)])
 def test_a_frame_that_has_converged_is_left_if_asked(
     rest: LoadedCheckpoint,
     datamodule: SceneDataModule,
     trainer: Callable[..., Trainer],
-    gain: float | None,
-    iterations: int,
 ) -> None:
-    motion = MotionSettings(min_rel_improvement=gain)
+    motion = MotionSettings(min_rel_improvement=1.0)
     stage = DeformationStage(rest, SCHEDULE, motion, iterations_per_step=2)
     trainer(max_epochs=1).fit(stage, datamodule=datamodule)
     # No step takes off all of the loss: each visit ends after the three steps that tell.
-    assert stage.iteration - stage.skipped == iterations
+    assert stage.iteration - stage.skipped == 2 * 2 * 3 * 2
     assert stage.iteration == stage.total_iterations == 60
 
 
@@ -62,12 +57,8 @@ def test_each_call_hands_over_what_the_one_before_was_given() -> None:
     assert late.waiting == [1.0, 2.0]
     assert late.exchange(values) == [1.0, 2.0]
     assert late.exchange(values) == [3.0, 3.0]
-
-
-def test_what_waits_can_be_kept_and_forgotten() -> None:
-    late, again = LateReading(), LateReading()
-    late.exchange(torch.tensor([0.25]))
+    again = LateReading()
     again.reset(late.waiting)
-    assert again.exchange(torch.tensor([9.0])) == [0.25]
+    assert again.exchange(values) == [3.0, 3.0]
     again.reset()
-    assert again.exchange(torch.tensor([1.0])) is None
+    assert again.exchange(values) is None

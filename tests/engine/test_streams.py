@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
 import pytest
 import torch
-from lightning import Callback, Trainer
+from lightning import Trainer
+from lightning.pytorch.callbacks import LambdaCallback
 from torch.profiler import ProfilerActivity, profile
 
 from devrf.accel.streams import StreamParallel
@@ -89,34 +90,14 @@ def test_streams_fork_before_the_first_piece_and_join_after_the_last(streams: St
     assert streams.noted == 2 * expected and streams.made == 2
 
 
-def test_streams_join_after_a_piece_has_failed(streams: Streams) -> None:
-    def failing() -> str:
-        raise ZeroDivisionError
+def test_on_a_cpu_and_under_a_profiler_pieces_run_one_by_one(streams: Streams) -> None:
+    def pieces(count: int) -> list[Callable[[], str]]:
+        return [streams.piece(str(k)) for k in range(count)]
 
-    with pytest.raises(ZeroDivisionError):
-        StreamParallel()([streams.piece("a"), failing, streams.piece("c")], GPU)
-    assert streams.noted[2:] == [
-        "a on present",
-        "present waits for stream 1",
-        "present waits for stream 2",
-    ]
-
-
-@pytest.mark.parametrize(
-    ("count", "device", "context"),
-    [
-        (1, GPU, nullcontext()),
-        (3, CPU, nullcontext()),
-        (2, GPU, profile(activities=[ProfilerActivity.CPU])),
-    ],
-    ids=["a single piece", "on a CPU", "under a profiler"],
-)
-def test_pieces_that_run_one_by_one(
-    streams: Streams, count: int, device: torch.device, context: AbstractContextManager[Any]
-) -> None:
-    with context:
-        StreamParallel()([streams.piece(str(k)) for k in range(count)], device)
-    assert streams.noted == [f"{k} on present" for k in range(count)]
+    StreamParallel()(pieces(3), CPU)
+    with profile(activities=[ProfilerActivity.CPU]):
+        StreamParallel()(pieces(2), GPU)
+    assert streams.noted == [f"{k} on present" for k in (0, 1, 2, 0, 1)]
 
 
 @dataclass(frozen=True)
@@ -134,20 +115,14 @@ class Alone(DeformationSchedule):
 TOGETHER = Alone(levels=(Level(5, 8, parallel_frames=2),), rays=64, coarse_to_fine=False)
 
 
-@pytest.mark.parametrize(
-    "motion",
-    [
-        MotionSettings(occupancy_every=3),
-        MotionSettings(learning_rate=3e-3, unit="box", views="all", pixels="occupied"),
-    ],
-    ids=["views by turns", "useful pixels"],
-)
 def test_a_frame_learns_in_parallel_what_it_learns_alone(
     rest: LoadedCheckpoint,
     four_frames: SceneDataModule,
     trainer: Callable[..., Trainer],
-    motion: MotionSettings,
 ) -> None:
+    motion = MotionSettings(
+        learning_rate=3e-3, unit="box", views="all", pixels="occupied", occupancy_every=3
+    )
     drawn: dict[tuple[int, int], Pixels] = {}
 
     def learn(schedule: Alone) -> DeformationStage:
@@ -174,30 +149,25 @@ def test_a_frame_learns_in_parallel_what_it_learns_alone(
             assert not expected[other].any()
 
 
-class Before(Callback):
-    """Records level and frames of each phase; checks each frame's copy of the frame before."""
-
-    def __init__(self) -> None:
-        self.visited: list[tuple[int, ...]] = []
-
-    def on_train_batch_start(self, trainer: Trainer, pl_module: Any, *_: Any) -> None:
-        visit = (pl_module.phase.level, *(frame.number for frame in pl_module.active))
-        if self.visited[-1:] != [visit]:
-            self.visited.append(visit)
-        for frame in pl_module.active:
-            neighbour = pl_module.field.to_time[frame.number - 1]
-            assert torch.equal(frame.before, neighbour)
-            assert bool(neighbour.any()) == (frame.number > 1)
-
-
 def test_each_frame_has_a_copy_of_the_frame_before_it(
     rest: LoadedCheckpoint, four_frames: SceneDataModule, trainer: Callable[..., Trainer]
 ) -> None:
     schedule = DeformationSchedule(levels=(Level(4, 3), Level(5, 2, parallel_frames=2)), rays=64)
-    stage, before = DeformationStage(rest, schedule), Before()
-    trainer(before, max_epochs=1).fit(stage, datamodule=four_frames)
+    stage, visited = DeformationStage(rest, schedule), []
+
+    def look(trainer: Trainer, stage: DeformationStage, *_: Any) -> None:
+        visit = (stage.phase.level, *(frame.number for frame in stage.active))
+        if visited[-1:] != [visit]:
+            visited.append(visit)
+        for frame in stage.active:
+            neighbour = stage.field.to_time[frame.number - 1]
+            assert torch.equal(frame.before, neighbour)
+            assert bool(neighbour.any()) == (frame.number > 1)
+
+    watch = LambdaCallback(on_train_batch_start=look)
+    trainer(watch, max_epochs=1).fit(stage, datamodule=four_frames)
     # One by one; then in two phases: frame 2 alone, frames 1 and 3 in parallel.
-    assert before.visited == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 1, 3)]
+    assert visited == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 1, 3)]
     assert stage.iteration == stage.total_iterations == 12 + 4
 
 
