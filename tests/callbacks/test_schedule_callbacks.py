@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from lightning import Callback, Trainer
+from lightning.pytorch.callbacks import LambdaCallback
 from torch.optim import Optimizer
 
 from devrf.callbacks import Meter, Progress, TrainingRecord
@@ -23,24 +24,20 @@ from devrf.methods.devrf.settings import MotionSettings
 DEFORMATION = DeformationSchedule(levels=(Level(4, 3), Level(6, 2)), rays=64)
 
 
-class Watch(Callback):
+def watched(steps: list[tuple[int, Any, list[float]]]) -> Callback:
     """Notes iteration, phase and rates at each optimiser step, after the other callbacks."""
 
-    def __init__(self) -> None:
-        self.steps: list[tuple[int, Any, list[float]]] = []
-
-    def on_before_optimizer_step(
-        self, trainer: Trainer, pl_module: Any, optimizer: Optimizer
-    ) -> None:
+    def note(trainer: Trainer, stage: Any, optimizer: Optimizer) -> None:
         rates = [group["lr"] for group in optimizer.param_groups]
-        self.steps.append((pl_module.iteration, pl_module.phase, rates))
+        steps.append((stage.iteration, stage.phase, rates))
+
+    return LambdaCallback(on_before_optimizer_step=note)
 
 
 def test_canonical_rates_and_phases_are_the_schedules_at_every_step(fit, canonical) -> None:
-    watch = Watch()
-    stage = fit(canonical(iterations_per_step=10), watch)
-    assert [step for step, _, _ in watch.steps] == list(range(12))
-    for step, phase, rates in watch.steps:
+    stage = fit(canonical(iterations_per_step=10), watched(steps := []))
+    assert [step for step, _, _ in steps] == list(range(12))
+    for step, phase, rates in steps:
         assert phase == stage.schedule.phase(step)
         factor = 0.1 ** (step / 6)
         assert rates == pytest.approx([0.1 * factor, 0.1 * factor, 1e-3 * factor])
@@ -49,14 +46,14 @@ def test_canonical_rates_and_phases_are_the_schedules_at_every_step(fit, canonic
 def test_deformation_rates_and_phases_are_the_schedules_at_every_step(
     fit, rest: LoadedCheckpoint
 ) -> None:
-    watch, motion = Watch(), MotionSettings(learning_rate=2e-3, unit="box")
-    stage = fit(DeformationStage(rest, DEFORMATION, motion), watch)
-    assert [step for step, _, _ in watch.steps] == list(range(15))
+    motion = MotionSettings(learning_rate=2e-3, unit="box")
+    stage = fit(DeformationStage(rest, DEFORMATION, motion), watched(steps := []))
+    assert [step for step, _, _ in steps] == list(range(15))
     # Three frames, shares of 3 and 2; frame 1 has two shares.
-    visits = [(phase.level, *phase.frames) for _, phase, _ in watch.steps]
+    visits = [(phase.level, *phase.frames) for _, phase, _ in steps]
     assert visits == [(0, 1)] * 6 + [(0, 2)] * 3 + [(1, 1)] * 4 + [(1, 2)] * 2
     scale = stage.field.box.longest
-    for _, phase, rates in watch.steps:
+    for _, phase, rates in steps:
         assert rates == pytest.approx([2e-3 * scale * 10 ** (-phase.level / 4)])
     assert stage.resolution == stage.field.box.grid_shape(6**3)
 

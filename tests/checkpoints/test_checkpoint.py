@@ -100,15 +100,10 @@ def test_another_scene_is_refused(canonical: Path, tiny_scene: Scene) -> None:
     assert load_checkpoint(canonical, None).metadata.scene == "robot"
 
 
-def test_a_missing_file_says_which_stage_to_run(tmp_path: Path) -> None:
-    assert "no such checkpoint" in refusal(tmp_path / "nothing.ckpt")
-    assert "no such checkpoint" in refusal(tmp_path)
-
-
-@pytest.mark.parametrize("foreign", [{"state_dict": {}}, {"devrf": "yes", "state_dict": {}}])
-def test_checkpoints_of_others_are_refused(tmp_path: Path, foreign: dict[str, Any]) -> None:
+def test_checkpoints_of_others_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "foreign.ckpt"
-    write_checkpoint_file(path, foreign)
+    assert "no such checkpoint" in refusal(path)
+    write_checkpoint_file(path, {"devrf": "yes", "state_dict": {}})
     assert "not a devrf checkpoint" in refusal(path)
 
 
@@ -116,7 +111,6 @@ MASK, SIZES = "scene_model.occupancy.mask", "scene_model.canonical._extra_state"
 CONTRADICTIONS: dict[str, Callable[[dict[str, Any]], object]] = {
     "no scene": lambda data: data["devrf"].pop("scene"),
     "other size": lambda data: data["devrf"]["model"]["architecture"].update(channels=5),
-    "no state": lambda data: data.pop("state_dict"),
     "text for mask": lambda data: data["state_dict"].update({MASK: "all"}),
     "no box": lambda data: data["state_dict"][SIZES].update(low=[9, 9, 9]),
 }
@@ -129,10 +123,6 @@ def test_a_checkpoint_that_contradicts_itself_is_refused(
     refusal(edit(canonical, change))
 
 
-FOREIGN = ["os.system", "devrf.methods.devrf.model.Architecture", None]
-
-
-@pytest.mark.parametrize("target", FOREIGN)
-def test_a_file_may_not_choose_which_code_is_run(canonical: Path, target: str | None) -> None:
-    path = edit(canonical, lambda data: data["devrf"]["model"].update(_target_=target))
+def test_a_file_may_not_choose_which_code_is_run(canonical: Path) -> None:
+    path = edit(canonical, lambda data: data["devrf"]["model"].update(_target_="os.system"))
     assert "which is not known here" in refusal(path)

@@ -46,12 +46,13 @@ def refusal(path: Path, data: bytes | None = None) -> str:
 
 def test_plain_values_come_back_as_they_were(path: Path) -> None:
     assert repr(read_checkpoint_file(path)["plain"]) == repr(PLAIN)
+    assert torch.equal(load_file(path)["/fields/density"], GRID)  # safetensors reads it, too
     assert [p.name for p in path.parent.iterdir()] == ["some.ckpt"]
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_tensors_of_every_type_come_back_bit_for_bit(path: Path, dtype: torch.dtype) -> None:
-    tensors = [torch.tensor([[0, 1, 3], [1, 0, 2]]).to(dtype), torch.tensor(1).to(dtype)]
+def test_tensors_of_every_type_come_back_bit_for_bit(path: Path) -> None:
+    plain = torch.tensor([[0, 1, 3], [1, 0, 2]]), torch.tensor(1)
+    tensors = [tensor.to(dtype) for dtype in DTYPES for tensor in plain]
     write_checkpoint_file(path, {"odd": torch.ones(3, dtype=torch.bool), "all": tensors})
     torch.testing.assert_close(read_checkpoint_file(path)["all"], tensors, rtol=0, atol=0)
 
@@ -67,12 +68,6 @@ def test_a_tensor_is_stored_by_its_elements(path: Path, tensor: torch.Tensor) ->
     assert path.stat().st_size < 1000 + 2 * tensor.nbytes
     torch.testing.assert_close([back[1], back["1"]], [tensor.detach()] * 2, rtol=0, atol=0)
     assert not back[1].requires_grad
-
-
-def test_safetensors_reads_it_too(path: Path) -> None:
-    tensors = load_file(path)
-    assert set(tensors) == {"/fields/density", "/fields/mask"}
-    assert torch.equal(tensors["/fields/density"], GRID)
 
 
 def test_what_cannot_be_stored_is_named(path: Path) -> None:
@@ -129,24 +124,17 @@ def test_files_of_others_are_refused(tmp_path: Path) -> None:
     assert "not a devrf" in refusal(path, len(header).to_bytes(8, "little") + header + bytes(40))
 
 
-def test_another_format_is_named(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "FORMAT", "99")
-    assert "has format 4, this version of devrf reads 99" in refusal(path)
-
-
-@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
 def test_a_failed_write_leaves_the_file_of_before(
-    path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+    path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = path.read_bytes()
 
     def fail(tensor: torch.Tensor) -> memoryview:
-        raise error
+        raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(module, "_data", fail)
-    with pytest.raises(type(error)) as caught:
+    with pytest.raises(OSError) as caught:
         write_checkpoint_file(path, CONTENT)
-    if isinstance(caught.value, OSError):
-        assert (caught.value.errno, caught.value.filename) == (28, str(path))
+    assert (caught.value.errno, caught.value.filename) == (28, str(path))
     assert path.read_bytes() == before
     assert [p.name for p in path.parent.iterdir()] == ["some.ckpt"]

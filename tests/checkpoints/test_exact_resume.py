@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from lightning import Callback, Trainer
+from lightning.pytorch.callbacks import LambdaCallback
 
 from devrf.checkpoints.checkpoint import (
     ChecksummedCheckpointIO,
@@ -54,13 +55,7 @@ SEARCHING = CanonicalSchedule(
 # Three frames. Level 0: frame 1 in 0–11, frame 2 in 12–17; level 1: 18–25 and 26–29.
 MOVING = DeformationSchedule(levels=(Level(4, 6), Level(6, 4)), rays=64)
 # The occupancy is looked up anew in iterations 3, 6, 9 of a visit; frames start along tracks.
-OFTEN = MotionSettings(
-    learning_rate=2e-3,
-    unit="box",
-    views="all",
-    pixels="occupied",
-    occupancy_every=3,
-)
+OFTEN = MotionSettings(2e-3, unit="box", views="all", pixels="occupied", occupancy_every=3)
 # Four frames. Level 0 in 0–15; level 1: frame 2 in 16–21, frames 1 and 3 in 22–27.
 TOGETHER = DeformationSchedule(levels=(Level(4, 4), Level(6, 6, parallel_frames=2)), rays=64)
 # Then once more, backward: frames 1 and 3 in 28–31, frame 2 in 32–35.
@@ -74,36 +69,20 @@ BACKWARD = replace(
 )
 
 
-def along_tracks() -> dict[str, Extension]:
-    return {"tracks": StartAlongFlow("tracks")}
-
-
-def elastic() -> dict[str, Extension]:
-    return {"elastic": Elastic()}
-
-
-def colors(start_level: int = 2) -> dict[str, Extension]:
-    return {"color_residual": ColorResidual("always", side=5, start_level=start_level)}
-
-
 PRIORS = {"render": 1.0, "cycle": 100.0, "tv": 1.0, "elastic": 0.1}
 # The field would not keep exactly what a visit has learned.
 ROUNDED = MotionSettings(occupancy_every=3, store="host", store_half=True)
 
 
-class Leave(Callback):
+def leave(path: Path, iteration: int) -> Callback:
     """Leaves the run after an iteration, with a file to go on from."""
 
-    def __init__(self, path: Path, iteration: int) -> None:
-        self.path = path
-        self.iteration = iteration
-
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
-        if pl_module.iteration == self.iteration:
-            save_checkpoint(trainer, self.path, weights_only=False)
+    def act(trainer: Trainer, stage: Any, *_: Any) -> None:
+        if stage.iteration == iteration:
+            save_checkpoint(trainer, path, weights_only=False)
             trainer.should_stop = True
+
+    return LambdaCallback(on_train_batch_end=act)
 
 
 def canonical() -> ScheduledStage:
@@ -157,7 +136,7 @@ def learn(
         left: str | None = None
         for at in [*leaves, None]:
             stage, path = build(), tmp_path / f"{at}.ckpt"
-            fit = trainer(*([] if at is None else [Leave(path, at)]), max_epochs=1)
+            fit = trainer(*([] if at is None else [leave(path, at)]), max_epochs=1)
             fit.strategy.checkpoint_io = ChecksummedCheckpointIO()
             fit.fit(stage, datamodule=data, ckpt_path=left)
             if at is not None:
@@ -176,63 +155,60 @@ def test_the_canonical_stage_goes_on_exactly(learn) -> None:
     assert_same(learn(canonical, *leaves), learn(canonical))
 
 
-@pytest.mark.parametrize("motion", [OFTEN, ROUNDED], ids=["all views", "in half precision"])
-def test_the_deformation_stage_goes_on_exactly(
-    learn, rest: LoadedCheckpoint, motion: MotionSettings
-) -> None:
-    def build() -> ScheduledStage:
-        return DeformationStage(
-            copy.deepcopy(rest), MOVING, motion, iterations_per_step=1, extensions=along_tracks()
-        )
-
-    # Mid-frame, around a look at the occupancy, around a frame's end, around a level's, at last.
-    leaves = (2, 3, 4, 12, 13, 18, 26, 29)
-    assert_same(learn(build, *leaves), learn(build))
+def deformation(
+    rest: LoadedCheckpoint, *arguments: Any, each: int = 1, **extensions: Extension
+) -> Callable[[], ScheduledStage]:
+    """Makes a deformation stage of ``each`` iterations a step."""
+    return lambda: DeformationStage(
+        copy.deepcopy(rest), *arguments, iterations_per_step=each, extensions=extensions
+    )
 
 
 @pytest.mark.parametrize(
-    ("motion", "leaves"),
+    ("each", "leaves"),
     [
-        # Around each visit of level 1, and mid-visit.
-        (OFTEN, (16, 17, 22, 24)),
-        # A visit ends after three steps, as their losses tell.
-        (replace(ROUNDED, min_rel_improvement=1.0), (16, 17, 18, 23)),
+        # Mid-frame, around a look at the occupancy, around a frame's end, a level's, at last.
+        (1, (2, 3, 4, 12, 13, 18, 26, 29)),
+        (4, (4, 16, 26)),
     ],
-    ids=["all views", "in half precision"],
 )
-def test_frames_that_are_visited_together_go_on_exactly(
-    learn,
-    rest: LoadedCheckpoint,
-    motion: MotionSettings,
-    leaves: tuple[int, ...],
-    four_frames: SceneDataModule,
+def test_the_deformation_stage_goes_on_exactly(
+    learn, rest: LoadedCheckpoint, each: int, leaves: tuple[int, ...]
 ) -> None:
-    def build() -> ScheduledStage:
-        return DeformationStage(
-            copy.deepcopy(rest), TOGETHER, motion, iterations_per_step=1, extensions=along_tracks()
-        )
+    build = deformation(rest, MOVING, OFTEN, each=each, tracks=StartAlongFlow("tracks"))
+    assert_same(learn(build, *leaves), learn(build))
 
+
+# A visit ends after three steps, as their losses tell.
+@pytest.mark.parametrize("motion", [OFTEN, replace(ROUNDED, min_rel_improvement=1.0)])
+def test_frames_that_are_visited_together_go_on_exactly(
+    learn, rest: LoadedCheckpoint, four_frames: SceneDataModule, motion: MotionSettings
+) -> None:
+    build = deformation(rest, TOGETHER, motion, tracks=StartAlongFlow("tracks"))
     whole = learn(build, data=four_frames)
-    assert_same(learn(build, *leaves, data=four_frames), whole)
+    # Around a visit of level 1, and mid-visit.
+    assert_same(learn(build, 16, 17, 18, 23, data=four_frames), whole)
     assert len(whole["optimizer"]["param_groups"][0]["params"]) == 4
 
 
 def test_colours_that_change_go_on_exactly(
     learn, rest: LoadedCheckpoint, four_frames: SceneDataModule
 ) -> None:
-    def build() -> ScheduledStage:
-        return DeformationStage(
-            copy.deepcopy(rest),
-            TOGETHER,
-            ROUNDED,
-            iterations_per_step=1,
-            extensions=colors(),
-        )
-
+    colors = ColorResidual("always", side=5, start_level=2)
+    build = deformation(rest, TOGETHER, ROUNDED, color_residual=colors)
     # Mid-visit at both levels, around a frame's end, around the level's.
     whole = learn(build, data=four_frames)
     assert_same(learn(build, 3, 16, 18, 25, data=four_frames), whole)
     assert len(whole["optimizer"]["param_groups"][1]["params"]) == 2
+
+
+def test_a_second_sweep_with_the_elastic_prior_goes_on_exactly(
+    learn, rest: LoadedCheckpoint, four_frames: SceneDataModule
+) -> None:
+    build = deformation(rest, BACKWARD, ROUNDED, PRIORS, elastic=Elastic())
+    # Mid-visit, around a look at the occupancy, around visits and levels.
+    whole = learn(build, data=four_frames)
+    assert_same(learn(build, 13, 20, 28, 31, 34, data=four_frames), whole)
 
 
 def test_the_refinement_goes_on_exactly(learn, rest: LoadedCheckpoint) -> None:
@@ -249,35 +225,11 @@ def test_the_refinement_goes_on_exactly(learn, rest: LoadedCheckpoint) -> None:
     assert whole["iteration"] == 6
 
 
-def test_a_second_sweep_with_the_elastic_prior_goes_on_exactly(
-    learn, rest: LoadedCheckpoint, four_frames: SceneDataModule
-) -> None:
-    def build() -> ScheduledStage:
-        stage = copy.deepcopy(rest)
-        return DeformationStage(
-            stage, BACKWARD, ROUNDED, PRIORS, extensions=elastic(), iterations_per_step=1
-        )
-
-    # Mid-visit, around a look at the occupancy, around visits and levels.
-    leaves = (13, 20, 28, 31, 34)
-    whole = learn(build, data=four_frames)
-    assert_same(learn(build, *leaves, data=four_frames), whole)
-
-
-def test_a_step_of_many_iterations_goes_on_exactly(learn, rest: LoadedCheckpoint) -> None:
-    def build() -> ScheduledStage:
-        return DeformationStage(
-            copy.deepcopy(rest), MOVING, OFTEN, iterations_per_step=4, extensions=along_tracks()
-        )
-
-    assert_same(learn(build, 4, 16, 26), learn(build))
-
-
 def test_only_what_is_to_be_gone_on_from_holds_the_way_there(
     datamodule: SceneDataModule, trainer: Callable[..., Trainer], tmp_path: Path, tiny_scene: Scene
 ) -> None:
     stage, path = canonical(), tmp_path / "left.ckpt"
-    fit = trainer(Leave(path, 10), max_epochs=1)
+    fit = trainer(leave(path, 10), max_epochs=1)
     fit.fit(stage, datamodule=datamodule)
     save_checkpoint(fit, tmp_path / "shown.ckpt")
     assert read_checkpoint_file(path)["progress"]["iteration"] == 10
@@ -290,7 +242,7 @@ def test_another_schedule_is_refused(
     datamodule: SceneDataModule, trainer: Callable[..., Trainer], tmp_path: Path
 ) -> None:
     path, longer = tmp_path / "left.ckpt", CanonicalStage(replace(SEARCHING, iterations=13), SMALL)
-    trainer(Leave(path, 2), max_epochs=1).fit(canonical(), datamodule=datamodule)
+    trainer(leave(path, 2), max_epochs=1).fit(canonical(), datamodule=datamodule)
     fit = trainer(max_epochs=1)
     fit.strategy.checkpoint_io = ChecksummedCheckpointIO()
     with pytest.raises(DevrfError, match=f"^{path}.*a schedule of 20 iterations, .* one of 21"):

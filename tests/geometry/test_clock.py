@@ -60,10 +60,10 @@ def test_frames_of_gives_the_nearest_frame_in_any_shape() -> None:
     assert UNEVEN.frames_of(torch.tensor([-0.1, 1.7])).tolist() == [0, len(UNEVEN) - 1]
 
 
-@pytest.mark.parametrize("times", [(0.1, 0.2), (0.0, 0.6, 0.5)])
-def test_a_clock_without_rest_or_out_of_order_is_an_error(times: tuple[float, ...]) -> None:
-    with pytest.raises(ValueError, match="frame clock"):
-        FrameClock(times)
+def test_a_clock_without_rest_or_out_of_order_is_an_error() -> None:
+    for times in ((0.1, 0.2), (0.0, 0.6, 0.5)):
+        with pytest.raises(ValueError, match="frame clock"):
+            FrameClock(times)
 
 
 def test_a_clock_knows_the_times_of_its_frames_up_to_rounding() -> None:

@@ -9,7 +9,6 @@ from torch import Tensor
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.methods.devrf.deformation_field import DeformationField
-from devrf.ops.trilinear import interpolate
 from devrf.scenes.procedural.robot import solid_motions
 
 CLOCK = FrameClock((0.0, 0.2, 0.6, 1.0))
@@ -48,16 +47,6 @@ def test_between_frames_by_hand(cube: Box) -> None:
     # Between rest and frame 1, half of frame 1.
     torch.testing.assert_close(field.warp(x, 0.1), (x + on_frame) / 2)
     torch.testing.assert_close(field.unwarp(x, 0.3), x)
-
-
-def test_one_grid_stands_for_the_two_frames_around_a_time(
-    field: DeformationField, rng: torch.Generator
-) -> None:
-    x = points(100, rng)
-    for time in (0.0, 0.1, 0.3, 1.0):
-        found = x + interpolate(field.blended(time), field.box.to_grid(x, field.shape))
-        torch.testing.assert_close(found, field.warp(x, time))
-    assert field.blended(0.6).data_ptr() == field.to_canonical[2].data_ptr()
 
 
 def test_resizing_keeps_a_linear_motion_exactly_and_frames_never_trained_zero(

@@ -233,7 +233,6 @@ def test_deformation_phases_tile_every_schedule(
     "wrong",
     [
         {"upsample_at": (1000, 1000)},
-        {"upsample_at": (1000, 30000)},
         {"side": 2},  # 8 voxels cannot be halved four times
         {"rays": 0},
     ],
@@ -251,7 +250,6 @@ def test_a_wrong_canonical_schedule_is_an_error(wrong: dict[str, Any]) -> None:
         ({"rays": 0}, "rays"),
         ({"levels": with_level(5, iterations=0)}, "levels.5.iterations"),
         ({"levels": with_level(1, parallel_frames=2)}, "levels.1.parallel_frames"),
-        ({"levels": with_level(2, order="sideways")}, "levels.2.order"),
         ({"levels": with_level(2, weight_factors={"tv": -1})}, "levels.2.weight_factors.tv"),
     ],
     ids=str,

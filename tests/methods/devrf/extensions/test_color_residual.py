@@ -53,15 +53,6 @@ def test_the_residual_is_blended_between_frames_and_absent_at_rest(field: Residu
         torch.testing.assert_close(residual(point), torch.tensor([[red, 0.0, 0.0]]))
 
 
-def test_a_frame_starts_from_the_one_before_it_or_after_it(field: ResidualField) -> None:
-    field.copy_neighbours([2])
-    assert torch.equal(field.values[2], field.values[1])
-    field.copy_neighbours([1])
-    assert not field.values[1].any() and field.values[2].any()
-    field.copy_neighbours([1, 2], after=True)
-    assert torch.equal(field.values[1], field.values[2]) and field.values[2].any()
-
-
 def test_the_residual_is_interpolated_in_space(cube: Box) -> None:
     grid = torch.zeros(3, 3, 3, 3)
     grid[1, 1, 1, 2] = 8.0
@@ -166,17 +157,14 @@ def test_auto_learns_colours_that_drift_early_and_others_late(
     assert [seen[0], seen[-1]] == [first is not None and level >= first for level in (0, 1)]
 
 
-@pytest.mark.parametrize(("drift", "last"), [(0.1, 0.5), (0.01, 2.0)])
 def test_terms_count_less_at_levels_that_learn_colours_that_drift(
     rest: LoadedCheckpoint,
     datamodule: SceneDataModule,
     trainer: Callable[..., Trainer],
     monkeypatch: pytest.MonkeyPatch,
-    drift: float,
-    last: float,
 ) -> None:
     monkeypatch.setattr(
-        "devrf.methods.devrf.extensions.color_residual.color_drift", lambda views: drift
+        "devrf.methods.devrf.extensions.color_residual.color_drift", lambda views: 0.1
     )
     chosen = ColorResidual(
         "auto", side=6, start_level_static_color=2, loss_scale_if_color_drift={"cycle": 0.25}
@@ -191,7 +179,7 @@ def test_terms_count_less_at_levels_that_learn_colours_that_drift(
         extensions={NAME: chosen},
     )
     seen = noted(trainer, stage, datamodule, lambda: stage.weights["cycle"])
-    assert (seen[0], seen[-1]) == (1.0, last)
+    assert (seen[0], seen[-1]) == (1.0, 0.5)
 
 
 def test_its_rate_is_its_own_at_every_level(

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from devrf.accel.graphs import Work
-from devrf.data.batch import PixelPool, all_pixels
+from devrf.data.batch import PixelPool
 from devrf.data.flow import previous_images
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
@@ -129,13 +129,6 @@ def test_points_are_those_that_had_moved_there(model: DeVRFModel, views: Views) 
     model.deformation.to_canonical[2, ..., 0] = -0.2
     met = followed(model, views, MIDDLE, by_color=False)
     assert met.canonical[:, 0].tolist() == pytest.approx([x_of(MIDDLE) - 0.2], abs=0.02)
-
-
-def test_no_more_than_most_are_followed(model: DeVRFModel, views: Views) -> None:
-    tracks = FlowTracks(model, views, previous_images(views), by_color=False)
-    pool = all_pixels(views, torch.tensor([3]))
-    met = tracks.follow(3, pool, torch.Generator().manual_seed(0), learned=1, most=40)
-    assert len(met) == 40
 
 
 BOX = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
