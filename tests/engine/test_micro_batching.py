@@ -126,7 +126,7 @@ def test_a_frame_that_never_fits_ends_the_stage(
     stage = moving(rest, TOGETHER)
     with pytest.raises(DevrfError, match=r"at iteration 5 of 8 \(frames 1, 3, ") as caught:
         learn(stage, data=four_frames)
-    assert "lower schedule.deformation.levels or schedule.deformation.rays, or" in str(caught.value)
+    assert "rays or schedule.deformation.levels.1.parallel_frames, or" in str(caught.value)
     # The gradients of the first frame's batch are dropped with the other's.
     gradients = [p.grad for group in stage.optimizer.param_groups for p in group["params"]]
     assert gradients == [None] * 4 and stage.iteration == 5
