@@ -15,10 +15,11 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from devrf.checkpoints.checkpoint_file import read_checkpoint_file, write_checkpoint_file
-from devrf.cli.complete import PATHS, completed, recorded
+from devrf.cli.complete import PATHS, completed
 from devrf.cli.config import config_folder
 from devrf.cli.main import candidates
 from devrf.cli.messages import in_quotes
+from devrf.cli.restore_config import recorded
 from devrf.scenes.export import export
 from devrf.scenes.formats import LAYOUTS
 from devrf.scenes.procedural import ProceduralForwardScene, ProceduralScene

@@ -104,25 +104,9 @@ def _tell(
     shown = {name: plain[name] for name in frames} | of_times
     for name, values in shown.items():
         log.info("%s: %s", name.replace("_", " "), in_words(values))
-    _track(run, plain | shown, shown, frames)
-
-
-def _track(
-    run: RunContext,
-    scores: Mapping[str, Mapping[str, float | None]],
-    shown: Mapping[str, Mapping[str, float | None]],
-    frames: Mapping[str, Sequence[HeldOutView]],
-) -> None:
-    """Give the trackers scores and tables."""
+    scores = {f"{s}/{name}": v for s, own in (plain | shown).items() for name, v in own.items()}
     for tracker in run.trackers:
-        tracker.conclude(
-            {
-                f"{section}/{name}": value
-                for section, values in scores.items()
-                for name, value in values.items()
-                if value is not None
-            }
-        )
+        tracker.conclude({name: score for name, score in scores.items() if score is not None})
         tracker.show_table("metrics", [{"section": name, **own} for name, own in shown.items()])
         tracker.show_table("frames", frame_rows(frames))
 

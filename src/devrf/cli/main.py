@@ -15,10 +15,11 @@ from hydra.plugins.completion_plugin import DefaultCompletionPlugin
 from omegaconf import DictConfig
 
 import devrf
-from devrf.cli.complete import completed, log_source, with_recognised_data
+from devrf.cli.complete import completed, with_recognised_data
 from devrf.cli.config import config_folder, in_sweep, known_stages, register_config
 from devrf.cli.config_check import ROOT, check_config, check_extras, choices_of
 from devrf.cli.messages import report_user_errors
+from devrf.cli.restore_config import log_source
 from devrf.cli.run_folder import working_in
 from devrf.cli.sweep import forget_failure, name_failures, run_job
 from devrf.scenes.fetch import catalogue

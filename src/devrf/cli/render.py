@@ -33,8 +33,8 @@ from devrf.apps.video import (
     write_video,
 )
 from devrf.checkpoints.checkpoint import CheckpointMetadata, Viewpoints, check_scene
-from devrf.cli.complete import parsed, value
 from devrf.cli.context import RunContext
+from devrf.cli.restore_config import parsed, value
 from devrf.cli.resume import deciding_settings
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value

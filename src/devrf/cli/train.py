@@ -15,9 +15,9 @@ from devrf.callbacks import PeriodicCheckpoint, StopOnSignal, TrainingRecord
 from devrf.callbacks.csv_logger import ResumableCSVLogger
 from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, save_checkpoint
 from devrf.checkpoints.progress import progress_files
-from devrf.cli.complete import recorded
 from devrf.cli.config import overrides
 from devrf.cli.context import RunContext
+from devrf.cli.restore_config import recorded
 from devrf.cli.resume import ResumePoint, beginning, remove_progress
 from devrf.engine.stage import ScheduledStage
 from devrf.errors import DevrfError
