@@ -73,36 +73,3 @@ def test_the_second_time_the_run_ends_in_its_last_good_state(
 
 def test_no_alarm_where_all_is_well(trained) -> None:
     assert not [line for line in trained[1].out.splitlines() if any(a in line for a in ALARMS)]
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ("data.shape=flower", "ablation=base"),
-        (
-            "data=procedural_forward",
-            "field=forward_small",
-            "schedule=quick_forward",
-            "loss=forward",
-            "data.height=18",
-        ),
-    ],
-    ids=["flower", "forward"],
-)
-def test_no_alarm_in_other_scenes(devrf, tiny, arguments) -> None:
-    more = (
-        "schedule.canonical.iterations=60",
-        "schedule.deformation.levels.1.iterations=20",
-        "schedule.deformation.levels.2.iterations=4",
-        "data.frames=6",
-        "evaluation.metrics=[]",
-        "video.frames=1",
-        "video.height=40",
-    )
-    own = ("field=", "data.height", "data.static_test_views")
-    overrides = [one for one in tiny if not one.startswith(own)]
-    outcome = devrf(*arguments, *overrides, *more)
-    assert (outcome.status, outcome.err) == (0, "")
-    assert not [line for line in outcome.out.splitlines() if any(a in line for a in ALARMS)]
-    # What was watched did learn something.
-    assert "dynamic: psnr" in outcome.out

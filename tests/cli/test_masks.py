@@ -94,11 +94,3 @@ def test_inspect_says_what_masks_leave_out(devrf, recorded, more, words):
     outcome = devrf("stage=inspect", *LAYOUT, f"data.root={recorded('a', 0)}", *more)
     assert outcome.status == 0
     assert words in next(line for line in outcome.out.splitlines() if "static train" in line)
-
-
-def test_a_missing_mask_is_an_error(devrf, recorded, tmp_path):
-    (recorded("a", 0) / "mask.png").unlink()
-    outcome = devrf("stage=canonical", *LAYOUT, "data.root=a")
-    expected = "a/mask.png: no such mask; correct mask_path, or set data.masks=none"
-    assert (outcome.status, outcome.err) == (2, f"devrf: {expected}\n")
-    assert [path.name for path in tmp_path.iterdir()] == ["a"]

@@ -84,7 +84,7 @@ def test_sizes_for_a_gpu_take_two_steps_on_a_cpu(devrf, tmp_path, tiny_data, met
     ("method", "asked", "said"),
     [
         ("dnerf", ["stage=canonical"], "stage: expected one of pipeline, joint,"),
-        ("dnerf", ["+ray_stage.loss.elastic=1"], "ray_stage.loss: dnerf has no term 'elastic'"),
+        ("dnerf", ["+ray_stage.loss.elastic=1"], "ray_stage.loss: unknown term 'elastic'"),
         ("nerfies", ["ray_stage.loss.temporal=1"], "no such key"),
         ("nerfies", [f"{SETTINGS}.separate_coarse=true"], "sampling=occupancy has no"),
         ("hypernerf", [f"{SETTINGS}.slicing=line"], "expected 'surface' or 'plane'"),

@@ -185,9 +185,14 @@ def test_nothing_is_guessed_from_afar(devrf, argument):
 
 def test_the_stages_named_are_those_there_are():
     assert set(STEPS) == set(TAKEN)
-    assert set(known_stages()) == {"pipeline", "canonical", "deformation", "joint", "dynamic"} | {
-        *TAKEN
-    }
+    assert set(known_stages()) == {
+        "pipeline",
+        "canonical",
+        "deformation",
+        "refinement",
+        "joint",
+        "dynamic",
+    } | {*TAKEN}
 
 
 def test_the_version_is_devrfs(devrf):

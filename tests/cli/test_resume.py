@@ -116,20 +116,6 @@ def test_a_deformation_learned_afresh_keeps_its_canonical_field(again, run):
     assert now["deformation.ckpt"] != before["deformation.ckpt"]
 
 
-@pytest.mark.parametrize(
-    ("argument", "status"),
-    [
-        ("stage=evaluate", 0),
-        ("stage=render", 0),
-        ("loss.deformation.cycle=high", 2),
-        ("schedule.canonical.upsample_at=[9]", 2),
-    ],
-)
-def test_where_nothing_is_learned_nothing_is_archived(again, run, argument, status):
-    assert again("resume=false", argument).status == status
-    assert not (run / "previous-1").exists()
-
-
 def learned_another_day(path: Path, to: Path) -> None:
     """Write the same fields with another digest."""
     content = read_checkpoint_file(path)

@@ -12,7 +12,7 @@ import imageio.v3 as iio
 import pytest
 
 from devrf import selfcheck
-from devrf.cli.evaluate import check_objective, objective
+from devrf.cli.run import check_objective, objective
 from devrf.errors import DevrfError
 from devrf.scenes.export import export
 from devrf.scenes.procedural import ProceduralScene

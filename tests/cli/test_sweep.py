@@ -88,16 +88,6 @@ def test_a_later_success_in_the_folder_removes_the_record(devrf, tmp_path, tiny,
     assert not (other / "failure.json").exists()
 
 
-def test_an_interruption_ends_the_sweep(devrf, tmp_path, tiny, steps):
-    def interrupted(run: RunContext) -> None:
-        raise KeyboardInterrupt
-
-    steps(interrupted)
-    outcome = devrf("-m", *tiny, *LEARN, "seed=0,1")
-    assert (outcome.status, outcome.err) == (130, "devrf: interrupted\n")
-    assert not (tmp_path / "sweep" / "1_robot").exists()
-
-
 @pytest.mark.parametrize("wrong", ["data.widht=3,4", "ablation=base,nonsense"])
 def test_an_error_before_the_first_job_ends_the_sweep_at_once(devrf, tmp_path, tiny, wrong):
     outcome = devrf("-m", *tiny, wrong)
@@ -123,13 +113,6 @@ def test_a_plugin_that_is_missing_is_named_with_the_remedy(
     expected = f'devrf: hydra/{group}={name}: not installed; pip install "devrf[sweeps]"\n'
     assert (outcome.status, outcome.err) == (2, expected)
     assert not list(tmp_path.iterdir())
-
-
-@installed("hydra_submitit_launcher")
-def test_a_slurm_job_has_a_gpu(devrf, tiny):
-    outcome = devrf("hydra/launcher=slurm", "--cfg", "hydra")
-    launcher = yaml.safe_load(outcome.out)["hydra"]["launcher"]
-    assert launcher["_target_"].endswith("SlurmLauncher") and launcher["gpus_per_node"] == 1
 
 
 @installed("hydra_joblib_launcher")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import socket
@@ -190,17 +189,6 @@ def test_jobs_of_a_sweep_are_grouped_and_named(devrf, tmp_path, tiny, monkeypatc
         assert run.display_name.startswith(f"{job} data.frames=3,data.height=20")
 
 
-def test_resume_false_starts_another_tracked_run(devrf, tmp_path, tiny):
-    pytest.importorskip("wandb")
-    arguments = ("stage=canonical", "logger=wandb", "hydra.run.dir=run")
-    for resume in ("true", "false"):
-        assert devrf(*tiny, *arguments, f"resume={resume}").status == 0
-    (first,), (second,) = (
-        offline_runs(folder) for folder in (tmp_path / "run" / "previous-1", tmp_path / "run")
-    )
-    assert first.run.run_id != second.run.run_id
-
-
 def test_tensorboard_holds_both_stages_and_the_scores(devrf, tmp_path, tiny):
     pytest.importorskip("tensorboard")
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -224,13 +212,3 @@ def test_tensorboard_holds_both_stages_and_the_scores(devrf, tmp_path, tiny):
     events = read()
     assert [event.step for event in events.Scalars("static/color")][-1] == 6
     assert "dynamic/lr/motion" not in events.Tags()["scalars"]
-
-
-def test_csv_holds_the_curves_of_both_stages(trained):
-    with (trained[0] / "logs" / "pipeline" / "metrics.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    for stage, last in (("static", 6), ("dynamic", 12)):
-        own = [row for row in rows if row[f"{stage}/loss"]]
-        assert int(own[-1]["step"]) == last
-        assert float(own[-1][f"{stage}/iterations_per_second"]) > 0
-    assert float(own[-1]["dynamic/lr/motion"]) > 0

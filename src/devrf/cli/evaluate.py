@@ -1,4 +1,4 @@
-"""``stage=evaluate``: scores on held-out views, and the one number that a run is judged by."""
+"""``stage=evaluate``: scores on held-out views."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ from devrf.checkpoints.checkpoint import CheckpointMetadata, TrainingFigures
 from devrf.checkpoints.checkpoint_file import digest_of
 from devrf.cli.config import choices, overrides
 from devrf.cli.context import GIVEN_REST, OWN_REST, RunContext
-from devrf.errors import DevrfError, did_you_mean
 from devrf.evaluation.held_out import HeldOutView, score
 from devrf.evaluation.suite import MetricSuite
 from devrf.methods.base import Renderable
@@ -36,12 +35,6 @@ OF_TIMES = ("training_times", "novel_times")
 TRAINING = ("seconds", "iterations", "iterations_per_second", "peak_gpu_gb", "num_rollbacks")
 # How iterations were carried out: which kernels and graphs really ran.
 EXECUTION = ("kernels", "startup_seconds", "graph_captures", "short_lists", "peak_reserved_gb")
-
-
-OF_BOTH = ("psnr", "ssim", *TRAINING, "checkpoint_mb")
-OF_MOTION = ("rest_pose_psnr",)
-# The two sections of metrics.json, and their names after DeVRF's stages.
-STATIC, DYNAMIC = ("static", "canonical"), ("dynamic", "deformation")
 
 
 def evaluate(run: RunContext) -> list[Path]:
@@ -162,35 +155,3 @@ def _score(
     for tracker in run.trackers:
         tracker.show_image(f"held_out/{capture}", sheet)
     return scored
-
-
-def check_objective(key: str, metrics: Sequence[str]) -> None:
-    """Check that metrics.json will have ``key``.
-
-    Args:
-        key: ``SECTION.NAME``, such as ``dynamic.psnr``.
-        metrics: ``evaluation.metrics``.
-
-    Raises:
-        DevrfError: it will not.
-    """
-    section, _, name = key.partition(".")
-    if section not in (*STATIC, *DYNAMIC):
-        raise DevrfError(f"objective: expected static.NAME or dynamic.NAME, not {key!r}")
-    known = [*OF_BOTH, *metrics, *(OF_MOTION if section in DYNAMIC else ())]
-    if name not in known:
-        raise DevrfError(
-            f"objective: {section} has no {name!r}; choose from {', '.join(known)}"
-            f"{did_you_mean(name, known, f'objective={section}.')}"
-        )
-
-
-def objective(key: str, found: Mapping[str, Any]) -> float | None:
-    """The number ``key`` of metrics.json; None where it could not be measured.
-
-    The static section stands in for a missing dynamic one.
-    """
-    section, _, name = key.partition(".")
-    section = "static" if section in STATIC else "dynamic"
-    value: float | None = found.get(section, found["static"]).get(name)
-    return value

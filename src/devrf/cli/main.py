@@ -80,7 +80,6 @@ def entry() -> None:
 def run(config: DictConfig) -> float | None:
     """Run ``stage=…`` in Hydra's output folder; return the objective, if measured."""
     folder = Path(HydraConfig.get().runtime.output_dir)
-    log_source()
     if in_sweep():
         return run_job(lambda: _run(config, folder, "hydra.sweep.dir"), config, folder)
     with report_user_errors():
@@ -91,6 +90,7 @@ def run(config: DictConfig) -> float | None:
 
 def _run(config: DictConfig, folder: Path, key: str) -> float | None:
     with working_in(folder, config, key):
+        log_source()
         config = with_recognised_data(config)
         check_config(config)
         check_extras(config)

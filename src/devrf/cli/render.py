@@ -92,16 +92,6 @@ def render(run: RunContext) -> list[Path]:
     return [held_out, _write(run, film, "spiral" if forward else "orbit", shown)]
 
 
-def check_path(film: VideoSettings) -> None:
-    """Check that ``video.path`` can be filmed, long before it is.
-
-    Raises:
-        DevrfError: it cannot.
-    """
-    if film.path not in (None, *PRESETS):
-        _ = read_path(Path(str(film.path))).frames
-
-
 def _within_limit(film: VideoSettings, renderer: Renderer, views: Views) -> VideoSettings:
     """The settings, with fewer frames where ``video.max_seconds`` would not suffice."""
     if film.max_seconds is None:

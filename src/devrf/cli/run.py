@@ -7,31 +7,34 @@ import json
 import logging
 import os
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from hydra.utils import instantiate
 from lightning import seed_everything
 from omegaconf import DictConfig
 
+from devrf.apps.keyframes import read_path
 from devrf.apps.settings import ViewerSettings
+from devrf.apps.video import VideoSettings
 from devrf.cli.config import OF_A_CHECKPOINT, in_search, in_sweep, meant_stage
 from devrf.cli.context import RunContext
-from devrf.cli.evaluate import check_objective, evaluate, objective
+from devrf.cli.evaluate import TRAINING, evaluate
 from devrf.cli.memory import check_memory, shortage_in_words
 from devrf.cli.preparation import capture, fetch, inspect, prepare, say_next, selfcheck
-from devrf.cli.render import check_path, export, picture, render, view
+from devrf.cli.render import PRESETS, export, picture, render, view
 from devrf.cli.resume import beginning, done, note_done
 from devrf.cli.run_folder import archive_previous
 from devrf.cli.sweep import report
 from devrf.cli.train import learn
 from devrf.cli.workers import launch_workers
 from devrf.engine.ddp import ManualDDP
-from devrf.errors import DevrfError
+from devrf.errors import DevrfError, did_you_mean
 from devrf.ops.dispatch import using
 
 log = logging.getLogger(__name__)
@@ -59,6 +62,12 @@ APART = {"report", "fetch", "capture", "selfcheck"}
 # What a run's folder may hold that a person looks at first, and what to try next.
 RESULTS = ("metrics.json", "images", "videos/orbit.mp4", "videos/spiral.mp4", "checkpoints")
 NEXT = ("stage=still still.time=0.35 still.height=400", "stage=render video.frames=120")
+
+# Numbers of both sections of metrics.json, and of the dynamic one. Their second names are those of
+# DeVRF's stages.
+OF_BOTH = ("psnr", "ssim", *TRAINING, "checkpoint_mb")
+OF_MOTION = ("rest_pose_psnr",)
+STATIC, DYNAMIC = ("static", "canonical"), ("dynamic", "deformation")
 
 # Lightning's messages on accelerators, tips and data loaders say nothing about this run.
 for _name in ("lightning.pytorch", "lightning.fabric"):
@@ -230,9 +239,43 @@ def _check(run: RunContext, asked: Plan) -> None:
         raise DevrfError(
             f"stage: a search needs the objective, which stage={config.stage} does not score"
         )
-    check_path(instantiate(config.video))
+    film: VideoSettings = instantiate(config.video)
+    if film.path not in (None, *PRESETS):
+        _ = read_path(Path(str(film.path))).frames
     instantiate(config.still)
     instantiate(config.export)
     viewer: ViewerSettings = instantiate(config.viewer)
     if run.leads and ("view" in asked.further or (viewer.training and asked.learning)):
         viewer.check_free()
+
+
+def check_objective(key: str, metrics: Sequence[str]) -> None:
+    """Check that metrics.json will have ``key``.
+
+    Args:
+        key: ``SECTION.NAME``, such as ``dynamic.psnr``.
+        metrics: ``evaluation.metrics``.
+
+    Raises:
+        DevrfError: it will not.
+    """
+    section, _, name = key.partition(".")
+    if section not in (*STATIC, *DYNAMIC):
+        raise DevrfError(f"objective: expected static.NAME or dynamic.NAME, not {key!r}")
+    known = [*OF_BOTH, *metrics, *(OF_MOTION if section in DYNAMIC else ())]
+    if name not in known:
+        raise DevrfError(
+            f"objective: {section} has no {name!r}; choose from {', '.join(known)}"
+            f"{did_you_mean(name, known, f'objective={section}.')}"
+        )
+
+
+def objective(key: str, found: Mapping[str, Any]) -> float | None:
+    """The number ``key`` of metrics.json; None where it could not be measured.
+
+    The static section stands in for a missing dynamic one.
+    """
+    section, _, name = key.partition(".")
+    section = "static" if section in STATIC else "dynamic"
+    value: float | None = found.get(section, found["static"]).get(name)
+    return value

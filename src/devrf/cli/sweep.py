@@ -124,7 +124,7 @@ class SweepMonitor(Callback):
         if failed:
             print(
                 f"devrf: jobs failed: {', '.join(failed)}; {FAILURE} in each folder below "
-                f" {self.folder} says why",
+                f"{self.folder} says why",
                 file=sys.stderr,
             )
         return bool(failed)
