@@ -1,6 +1,6 @@
 """What an extension of the deformation stage may add, and what it sees of the stage.
 
-An extension is one file of ``extensions/`` and one block of ``conf/extensions``; without both, all
+An extension is one file of ``extensions/`` and one block of ``schedule.extensions``; without both, all
 else runs as before.
 """
 
