@@ -121,11 +121,11 @@ def photometric_kernel(
     of_color,
     of_samples,
     of_entropy,
-    of_matte,
+    of_mask,
     rays,
     ALPHA: tl.constexpr,
 ):
-    """A ray's share of each term, of their weighted sum, and of mean opacity and matte."""
+    """A ray's share of each term, of their weighted sum, and of mean opacity and alpha mask."""
     ray = tl.program_id(0).to(tl.int64)
     red = tl.load(truth + ray * 3)
     green = tl.load(truth + ray * 3 + 1)
@@ -157,13 +157,13 @@ def photometric_kernel(
     if ALPHA:
         covered = tl.load(alpha + ray)
         bare = left - (1.0 - covered)
-    matte = share * bare * bare
+    mask_error = share * bare * bare
     part = parts + ray * 7
     tl.store(part, color)
     tl.store(part + 1, missed)
     tl.store(part + 2, unsure)
-    tl.store(part + 3, matte)
-    total = of_color * color + of_samples * missed + of_entropy * unsure + of_matte * matte
+    tl.store(part + 3, mask_error)
+    total = of_color * color + of_samples * missed + of_entropy * unsure + of_mask * mask_error
     tl.store(part + 4, total)
     tl.store(part + 5, share * (1.0 - left))
     tl.store(part + 6, share * covered)
@@ -185,7 +185,7 @@ def photometric_backward_kernel(
     of_color,
     of_samples,
     of_entropy,
-    of_matte,
+    of_mask,
     rays,
     places,
     ALPHA: tl.constexpr,
@@ -207,7 +207,7 @@ def photometric_backward_kernel(
         free = (left >= NEAREST) & (left <= 1.0 - NEAREST)
         change = tl.where(free, of_entropy * share * (tl.log(1.0 - p) - tl.log(p)), 0.0)
         if ALPHA:
-            change += of_matte * share * 2.0 * (left - (1.0 - tl.load(alpha + ray)))
+            change += of_mask * share * 2.0 * (left - (1.0 - tl.load(alpha + ray)))
         tl.store(into_transmittance + ray, change)
         start = tl.load(first + ray)
         stop = tl.load(first + ray + 1)

@@ -131,12 +131,12 @@ def gather_kernel(
     green = tl.load(pixels + row * CHANNELS + 1, mask=here, other=0).to(tl.float32) / 255.0
     blue = tl.load(pixels + row * CHANNELS + 2, mask=here, other=0).to(tl.float32) / 255.0
     if CHANNELS == 4:
-        matte = tl.load(pixels + row * CHANNELS + 3, mask=here, other=0).to(tl.float32) / 255.0
-        tl.store(alpha + ray, matte, mask=here)
+        alpha_mask = tl.load(pixels + row * CHANNELS + 3, mask=here, other=0).to(tl.float32) / 255.0
+        tl.store(alpha + ray, alpha_mask, mask=here)
         behind_red, behind_green, behind_blue = load_vectors(background, ray * apart, here)
-        red = on_background(red, behind_red, matte)
-        green = on_background(green, behind_green, matte)
-        blue = on_background(blue, behind_blue, matte)
+        red = on_background(red, behind_red, alpha_mask)
+        green = on_background(green, behind_green, alpha_mask)
+        blue = on_background(blue, behind_blue, alpha_mask)
     store_vectors(color, ray * 3, red, green, blue, here)
     middle_x = tl.load(center + shown * 2, mask=here, other=0.0)
     middle_y = tl.load(center + shown * 2 + 1, mask=here, other=0.0)

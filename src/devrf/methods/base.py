@@ -228,7 +228,7 @@ class RayTrainable(Renderable):
 
     @property
     def has_hull(self) -> bool:
-        """Whether the scene's mattes tell which space rays need not be sampled in."""
+        """Whether the scene's alpha masks tell which space rays need not be sampled in."""
         return False
 
     def batch_bytes(self, rays: int) -> int:

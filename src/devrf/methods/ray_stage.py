@@ -51,7 +51,7 @@ class RaySchedule:
     Attributes:
         iterations: of the whole protocol; each of its stages takes a share.
         rays: of a batch.
-        rays_without_hull: of a batch where no mattes tell which space is empty, so that a ray has
+        rays_without_hull: of a batch where no masks tell which space is empty, so that a ray has
             more samples; None: as many.
         learning_rate: of Adam at the first iteration of a stage.
         final_learning_rate: at its last; exponential in between.

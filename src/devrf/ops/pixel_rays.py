@@ -22,7 +22,7 @@ class GatheredPixels(NamedTuple):
         origins: (R, 3) the cameras' centres, world units.
         directions: (R, 3) unit directions in world space.
         color: (R, 3) RGB in [0, 1], composited on the background.
-        alpha: (R,) matte in [0, 1]; None for images without one.
+        alpha: (R,) alpha mask in [0, 1]; None for images without one.
         time: (R,) the images' times.
         frame: (R,) int64, the images' frames.
         pixel: (R, 2) x, y of the pixels' centres.

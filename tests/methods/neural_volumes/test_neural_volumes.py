@@ -143,7 +143,7 @@ def test_what_it_cannot_learn_from_is_refused(
         name="plush", width=16, height=16, static_views=4, train_views=2, frames=2, supersample=1
     )
     for scene, said in (
-        (tiny_room, "room has no end; give images with alpha masks"),
+        (tiny_room, "room is unbounded; give images with alpha masks"),
         (replace(tiny_scene, static=static), "static images of robot have no alpha masks"),
         (facing(), "plush is seen from one side"),
     ):

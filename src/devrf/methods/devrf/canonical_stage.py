@@ -202,7 +202,7 @@ class CanonicalStage(VoxelStage):
     def _radiance_field(self, occupancy: Occupancy, phase: CanonicalPhase) -> CanonicalField:
         """A new radiance field in the tight box around what is occupied, enlarged for motion.
 
-        Contracted space is not made tighter: it has no end.
+        Contracted space is not made tighter: it is unbounded.
         """
         tight = bounding_box(occupancy.mask, occupancy.box)
         if tight is None:

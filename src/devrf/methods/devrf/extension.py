@@ -1,7 +1,7 @@
 """What an extension of the deformation stage may add, and what it sees of the stage.
 
-An extension is one file of ``extensions/`` and one block of ``schedule.extensions``; without both, all
-else runs as before.
+An extension is one file of ``extensions/`` and one block of ``schedule.extensions``; without both,
+all else runs as before.
 """
 
 from __future__ import annotations

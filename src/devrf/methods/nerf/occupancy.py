@@ -114,7 +114,7 @@ class OccupancyFrames(StoredShape):
 
     Attributes:
         mask: (T, X, Y, Z) bool, True where something may be.
-        learned: what the field leaves empty at all times, where mattes do not tell.
+        learned: what the field leaves empty at all times, where alpha masks do not tell.
     """
 
     resizable = ("mask",)
@@ -128,7 +128,7 @@ class OccupancyFrames(StoredShape):
 
     @property
     def has_hull(self) -> bool:
-        """Whether mattes leave anything out."""
+        """Whether alpha masks leave anything out."""
         return not bool(self.mask.all())
 
     @classmethod
@@ -145,7 +145,7 @@ class OccupancyFrames(StoredShape):
         """Masks of each of the scene's frames over ``box``, of about ``side``³ cells.
 
         Args:
-            scene: seen from all around its mattes carve the masks; else the field itself has to
+            scene: seen from all around its alpha masks carve them; else the field itself has to
                 tell what is empty.
             box: in the fields' space.
             side: cells along an edge of a cube of the box's size.
@@ -163,7 +163,7 @@ class OccupancyFrames(StoredShape):
 
     @torch.no_grad()
     def carve(self, scene: Scene, box: Box) -> None:
-        """Take the visual hull of each frame's mattes, grown by a cell; nothing without mattes.
+        """Take the visual hull of each frame's alpha masks, grown by a cell; nothing without.
 
         Args:
             scene: its training views are looked at; static images show frame 0.

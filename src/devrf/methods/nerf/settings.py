@@ -43,7 +43,7 @@ class FieldSettings:
             other one (hierarchical).
         steps: samples along the box's diagonal (occupancy).
         occupancy_side: the masks have about side³ cells (occupancy).
-        hull: whether these are the visual hulls of each frame's mattes, where there are any, which
+        hull: whether these are the visual hulls of each frame's masks, where there are any, which
             the published methods never had (occupancy).
         empty_from: where there are no such hulls, space that the fields leave empty at all times
             is left out after this share of a stage; None: never (occupancy).

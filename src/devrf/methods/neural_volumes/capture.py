@@ -13,7 +13,7 @@ from devrf.scenes.scene import Scene, Views
 
 
 def check_scene(scene: Scene) -> None:
-    """Check that a scene is an object in a cube that cameras surround, cut out by mattes.
+    """Check that a scene is an object in a cube that cameras surround, cut out by alpha masks.
 
     Raises:
         DevrfError: it is not.
@@ -25,7 +25,7 @@ def check_scene(scene: Scene) -> None:
         )
     if not scene.space.is_linear:
         raise DevrfError(
-            f"method: neural_volumes needs a scene in a cube, and {scene.name} has no end; give "
+            f"method: neural_volumes needs a scene in a cube, and {scene.name} is unbounded; give "
             "images with alpha masks, or use another method"
         )
     for capture, views in (("static", scene.static.train), ("dynamic", scene.dynamic.train)):
@@ -74,11 +74,11 @@ def moment_images(
     frame that no camera has (time 0 of a capture that begins later) has the images of the next.
 
     Args:
-        views: images with mattes.
+        views: images with alpha masks.
         cameras: K numbers of fixed cameras.
         frames: T.
         size: height and width (h, w).
-        background: grey level in [0, 1] behind the mattes.
+        background: grey level in [0, 1] behind the alpha masks.
     """
     assert views.frames is not None
     height, width = size

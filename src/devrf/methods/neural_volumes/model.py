@@ -96,7 +96,7 @@ class NeuralVolumes(RayTrainable):
 
     @property
     def has_hull(self) -> bool:
-        """Whether the occupancy was carved from mattes."""
+        """Whether the occupancy was carved from alpha masks."""
         return self.occupancy.has_hull
 
     def config(self) -> dict[str, Any]:

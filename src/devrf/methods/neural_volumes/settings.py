@@ -29,7 +29,7 @@ class NeuralVolumesSettings:
         maps: how many affine maps are mixed (affine).
         density_scale: opacity per unit length of a softplus of 1, in the same unit.
         step: between samples, in the same unit.
-        hull: whether what is outside the visual hull of each frame's mattes is left out, which the
+        hull: whether what is outside the visual hull of each frame's masks is left out, which the
             published method never had; else the whole cube is sampled.
         occupancy_side: the hulls have about side³ cells.
     """

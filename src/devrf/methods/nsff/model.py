@@ -176,7 +176,7 @@ class NSFF(PlacedModel):
         )
 
     def _samples(self, rays: Rays, time: Tensor, *, jitter: bool) -> RaySamples:
-        """Samples, their lengths in normalised units; without mattes the last one is endless."""
+        """Samples, their lengths in normalised units; without masks the last one is endless."""
         s = self.settings
         if s.sampling == "occupancy":
             samples = self.march(rays, time, jitter=jitter)

@@ -1,1 +1,1 @@
-"""Beyond the paper: each file plugs in, and can be taken out with its block of schedule.extensions."""
+"""Beyond the paper: a file plugs in, and goes out with its block of schedule.extensions."""
