@@ -44,6 +44,7 @@ from devrf.engine.stage import ScheduledStage
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
+from devrf.geometry.rays import Rays
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
@@ -51,6 +52,8 @@ from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.extensions.color_residual import ResidualField
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import CanonicalRates
+from devrf.methods.devrf.volume_rendering import render
+from devrf.rendering.output import RenderedImage
 from devrf.scenes.procedural import ProceduralScene
 from devrf.scenes.scene import Scene
 
@@ -419,3 +422,32 @@ def moving(learned: tuple[CanonicalStage, Trainer], rng: torch.Generator) -> DeV
     shape = model.color_residual.values[1:].shape
     model.color_residual.values[1:] = 2 * torch.rand(shape, generator=rng) - 1
     return model
+
+
+def plain_picture(
+    model: DeVRFModel, rays: Rays, time: float, background: torch.Tensor
+) -> RenderedImage:
+    """What rays in the fields' space see of a model at ``time``, by the plain renderer."""
+    scene = model.canonical, model.occupancy_at(time), model.settings
+    with torch.no_grad():
+        warp, colors = model.warp(time), model.color_change(time)
+        return RenderedImage.of(render(rays, *scene, background, warp, color_change=colors))
+
+
+@pytest.fixture
+def reference() -> Callable[[DeVRFModel, Rays, float, torch.Tensor], RenderedImage]:
+    """The function :func:`plain_picture`."""
+    return plain_picture
+
+
+@pytest.fixture
+def same() -> Callable[[RenderedImage, RenderedImage], None]:
+    """Fails unless two pictures show the same, up to 1e-5."""
+
+    def compare(one: RenderedImage, other: RenderedImage) -> None:
+        for name in ("color", "depth", "opacity"):
+            torch.testing.assert_close(
+                getattr(one, name), getattr(other, name), atol=1e-5, rtol=1e-5
+            )
+
+    return compare

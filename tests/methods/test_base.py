@@ -11,12 +11,12 @@ from torch import nn
 
 from devrf.data.batch import RayBatch
 from devrf.errors import DevrfError
-from devrf.methods.base import Renderable
+from devrf.methods.base import RayTrainable
 from devrf.rendering.output import RenderOutput
 from devrf.rendering.view import View
 
 
-class Toy(Renderable):
+class Toy(RayTrainable):
     """Two parts of a few numbers."""
 
     name = "toy"
