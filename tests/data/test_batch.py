@@ -127,8 +127,6 @@ def test_all_pixels_of_some_images():
     assert len(pool) == 2 * WIDTH * HEIGHT
     assert pool.image.tolist() == [1] * 12 + [0] * 12
     assert pool.flat.tolist() == list(range(12)) * 2
-    kept = pool.of_images(torch.tensor([0]))
-    assert kept.image.unique().tolist() == [0] and kept.flat.tolist() == list(range(12))
 
 
 def test_draws_come_from_the_pool_and_reach_all_of_it(rng):
@@ -142,7 +140,7 @@ def test_draws_come_from_the_pool_and_reach_all_of_it(rng):
 def test_a_pool_is_told_by_its_mask():
     whole = all_pixels(views(), torch.arange(2))
     some = PixelPool(whole.pixels[:, 1::3])
-    of_second = some.of_images(torch.tensor([1]))
+    of_second = some[some.image == 1]
     for pool, images in ((some, torch.arange(2)), (of_second, torch.tensor([1]))):
         mask = pool.mask(images, WIDTH * HEIGHT)
         assert mask.sum() == len(pool)

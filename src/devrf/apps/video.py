@@ -136,15 +136,6 @@ def write_video(path: Path, images: Iterator[Tensor], fps: float) -> None:
     write_pictures(path, (to_bytes(image).numpy() for image in images), fps)
 
 
-def video_bytes(settings: VideoSettings, cameras: Cameras) -> int:
-    """Upper estimate of the size in bytes of both videos, for the captured cameras.
-
-    Two images a frame in one, three in the other, and labels above them.
-    """
-    shown = settings.sized(cameras)
-    return round(settings.frames * 5 * (1.1 * shown.height) * shown.width * PIXEL)
-
-
 # The cameras of a video of some settings, around a scene or before it.
 Ring = Callable[[VideoSettings], Cameras]
 # Cameras and as many times in [0, 1].

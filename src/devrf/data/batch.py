@@ -50,10 +50,6 @@ class PixelPool:
         image, flat = self.pixels.index_select(1, pick).long().unbind()
         return image, flat
 
-    def of_images(self, images: Tensor) -> PixelPool:
-        """The pixels that belong to ``images`` (K,)."""
-        return self[torch.isin(self.image, images.to(torch.int32))]
-
     def mask(self, images: Tensor, area: int) -> Tensor:
         """Which pixels of ``images`` (K,), ascending, are here: (K, ``area``) bool."""
         mask = torch.zeros(len(images), area, dtype=torch.bool, device=self.pixels.device)

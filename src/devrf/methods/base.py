@@ -230,11 +230,3 @@ class RayTrainable(Renderable):
     def has_hull(self) -> bool:
         """Whether the scene's alpha masks tell which space rays need not be sampled in."""
         return False
-
-    def batch_bytes(self, rays: int) -> int:
-        """About what learning from a batch of rays takes, the graph of its gradients included.
-
-        Three single-precision values are kept for each output of each layer, for 128 samples a ray.
-        """
-        layers = [module for module in self.modules() if isinstance(module, nn.Linear)]
-        return 128 * rays * 12 * sum(layer.out_features for layer in layers)

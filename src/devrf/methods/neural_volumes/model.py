@@ -216,13 +216,6 @@ class NeuralVolumes(RayTrainable):
         decoded = Decoded(self, self.decoded(self.code_at(time)), (moment.before, moment.after))
         return RayView(decoded, time, self.device, at_rest=moment.after == 0, half=half)
 
-    def batch_bytes(self, rays: int) -> int:
-        """Three values for each number of a published batch's volumes, and 64 numbers a sample."""
-        channels = [*self.settings.template_channels, 4]
-        voxels: int = sum(count * 8**level for level, count in enumerate(channels))
-        samples = rays * 2 / self.settings.step
-        return round(12 * MOMENTS * voxels + 256 * samples)
-
 
 class Decoded:
     """Neural Volumes at one time, decoded."""

@@ -216,13 +216,3 @@ class NSFF(PlacedModel):
         if not terms:
             raise DevrfError("ray_stage.loss: this scene has nothing for any of its terms")
         return terms
-
-    def batch_bytes(self, rays: int) -> int:
-        """As of every method; the dynamic field is evaluated for up to three more frames."""
-        s = self.settings
-        again = 3 if s.neighbours == "both" else 2
-        layers = [m for m in self.fields.dynamic.modules() if isinstance(m, nn.Linear)]
-        more = again * sum(layer.out_features for layer in layers)
-        count = s.samples if s.sampling == "stratified" else s.steps
-        every = super().batch_bytes(rays + s.hard_rays) // 128
-        return count * (every + 12 * (rays + s.hard_rays) * more)
