@@ -102,7 +102,10 @@ def test_the_code_defaults_to_the_paper(paper):
     assert instantiate(paper.schedule.motion) == MotionSettings(store="host")
     assert dict(paper.loss.search) == SEARCH_LOSS
     assert dict(paper.loss.fine) == FINE_LOSS
-    assert dict(paper.loss.deformation) == DEFORMATION_LOSS
+    # Weights of extensions' terms are beside them in conf alone; they are 0.
+    assert {k: v for k, v in paper.loss.deformation.items() if v} == {
+        k: v for k, v in DEFORMATION_LOSS.items() if v
+    }
 
 
 @pytest.mark.parametrize(
