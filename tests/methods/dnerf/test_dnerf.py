@@ -185,7 +185,7 @@ def test_a_batch_may_have_fewer_rays_where_no_mattes_tell_what_is_empty(
 def test_an_unknown_term_and_an_unknown_part_are_named(
     trainer: Trainers, datamodule: SceneDataModule
 ) -> None:
-    with pytest.raises(DevrfError, match=r"ray_stage.loss: dnerf has no term 'elastic'"):
+    with pytest.raises(DevrfError, match=r"ray_stage.loss: unknown term 'elastic'"):
         stage(loss={"elastic": 1.0})
     with pytest.raises(DevrfError, match=r"dnerf has no part 'codes'"):
         fit(stage(ProtocolStage("joint", "both", frozen=("codes",))), trainer, datamodule)

@@ -33,7 +33,7 @@ class RefinementSchedule:
     """How the canonical field learns from both captures.
 
     Attributes:
-        iterations: of the stage.
+        iterations: of the stage; 0: a protocol leaves it out.
         rays: of a batch.
         rates: learning rates at the first iteration.
         decay: factor of the rates from the first iteration to the last, exponential in between.
@@ -52,7 +52,7 @@ class RefinementSchedule:
     grow: int = 0
 
     def __post_init__(self) -> None:
-        for name, least in (("iterations", 1), ("rays", 1), ("grow", 0)):
+        for name, least in (("iterations", 0), ("rays", 1), ("grow", 0)):
             if (given := getattr(self, name)) < least:
                 raise DevrfError(
                     f"refinement.schedule.{name}: expected {least} or more, not {given}"
