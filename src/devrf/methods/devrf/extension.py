@@ -6,7 +6,7 @@ all else runs as before.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Protocol
 
 import torch
@@ -89,6 +89,11 @@ class Extension:
     def weights(self) -> Mapping[str, float]:
         """How much they count, where ``loss.deformation`` does not say."""
         return {}
+
+    @property
+    def scaled_terms(self) -> Collection[str]:
+        """The loss terms that :meth:`weight_factor` may change."""
+        return ()
 
     def setup(self, stage: MotionLearner) -> None:
         """Add fields to the model and groups to the optimiser, before learning starts."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
+from devrf.errors import DevrfError
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.extension import Extension, MotionTerm
 from devrf.methods.devrf.losses import (
@@ -36,7 +37,7 @@ class MotionLoss:
             schedule: has the levels' factors.
 
         Raises:
-            DevrfError: a weight, or a factor of the schedule, is of no term.
+            DevrfError: a weight, or a factor of the schedule or an extension, is of no term.
         """
         self.terms: dict[str, MotionTerm] = dict(MOTION_TERMS)
         weights = {name: weight for name, weight in loss.items() if name != "tv"}
@@ -44,6 +45,12 @@ class MotionLoss:
             self.terms |= extension.terms
             weights |= extension.weights
         schedule.check_terms({*self.terms, "tv"})
+        for name in (name for extension in extensions for name in extension.scaled_terms):
+            if name not in self.terms:
+                raise DevrfError(
+                    f"schedule.extensions: {name} is no term of loss.deformation; the terms are "
+                    f"{', '.join(sorted(self.terms))}"
+                )
         self._whole = counted_weights(weights, self.terms, "loss.deformation")
         self._tv = loss.get("tv", 0.0)
         self._extensions, self._schedule = extensions, schedule

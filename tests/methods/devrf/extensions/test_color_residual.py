@@ -223,3 +223,10 @@ def test_a_checkpoint_keeps_the_colours(
 def test_wrong_settings_are_told() -> None:
     with pytest.raises(DevrfError, match="color_residual"):
         ColorResidual(side=1)
+
+
+def test_a_wrong_factor_is_told(rest: LoadedCheckpoint) -> None:
+    with pytest.raises(DevrfError, match="flaw is no term of loss.deformation"):
+        stage_with(rest, loss_scale_if_color_drift={"flaw": 0.1})
+    with pytest.raises(DevrfError, match="loss_scale_if_color_drift.flow: expected at least 0"):
+        ColorResidual(loss_scale_if_color_drift={"flow": -1.0})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -130,6 +130,12 @@ class ColorResidual(Extension):
         self._learn, self._side, self._learning_rate = learn, side, learning_rate
         self._start, self._start_if_static = start_level, start_level_static_color
         self._scale_if_drift = loss_scale_if_color_drift or {}
+        for name, factor in self._scale_if_drift.items():
+            if factor < 0:
+                raise DevrfError(
+                    f"color_residual.loss_scale_if_color_drift.{name}: expected at least 0, "
+                    f"not {factor}"
+                )
         self._residual, self._tv = residual, tv
         # Once set up: the first level that learns it, from 0; factors of weights from it on.
         self._first: int | None = None
@@ -145,12 +151,13 @@ class ColorResidual(Extension):
         """Its weight; none where nothing can be learned."""
         return {} if self._learn == "never" else {"residual": self._residual}
 
-    def setup(self, stage: MotionLearner) -> None:
-        """Build the residuals, zero, and their parameter group, empty as yet, if they are learned.
+    @property
+    def scaled_terms(self) -> Collection[str]:
+        """Those that ``loss_scale_if_color_drift`` names."""
+        return self._scale_if_drift
 
-        Raises:
-            DevrfError: a factor is below 0, or of no term of the loss.
-        """
+    def setup(self, stage: MotionLearner) -> None:
+        """Build the residuals, zero, and their empty parameter group, if they are learned."""
         first, drifting = self._decide(stage.scene.dynamic.train)
         if first is None:
             return
