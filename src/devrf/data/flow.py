@@ -9,14 +9,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from devrf.scenes.optical_flow import FlowMethod, camera_turn, estimate_flow, frame_pairs
+from devrf.scenes.optical_flow import estimate_flow, frame_pairs
 from devrf.scenes.reader import FlowSource
 from devrf.scenes.scene import OpticalFlow, Scene, Views
+from devrf.scenes.validation import scene_error
 
 log = logging.getLogger(__name__)
-
-# Images taken in directions that differ by more show too little in common for optical flow.
-JUMP_DEGREES = 10.0
 
 
 def with_flow(scene: Scene, source: FlowSource, cache: Path | None) -> Scene:
@@ -26,29 +24,21 @@ def with_flow(scene: Scene, source: FlowSource, cache: Path | None) -> Scene:
 
     Args:
         scene: as its reader gave it, with flow from files or without.
-        source: ``dis`` and ``raft`` estimate; ``auto`` keeps what was read from files, else
-            estimates with DIS unless the cameras jump from frame to frame, no view has two frames
-            in a row, or the scene is at rest; the others change nothing.
+        source: ``dis`` and ``raft`` estimate; the others change nothing.
         cache: an ``.npz`` that keeps the estimate, or None.
+
+    Raises:
+        DevrfError: ``files`` of a scene in motion that has none.
     """
     train = scene.dynamic.train
-    method = source
-    if not scene.moves and method == "auto":
-        return scene
-    if method == "auto" and train.flow is None:
-        method, how = "dis", "estimated with DIS"
-        if not frame_pairs(train):
-            method, how = "none", "left out (no view has two frames in a row)"
-        elif camera_turn(train) > JUMP_DEGREES:
-            method, how = "none", "left out (the cameras jump from frame to frame)"
-        log.info("%s: no optical flow files; flow is %s", scene.name, how)
-    if method not in ("dis", "raft"):
-        return scene
-    flow = estimate_flow(train, method, cache)
-    if train.valid_mask is not None:
-        flow = replace(flow, valid=flow.valid & train.valid_mask)
-    dynamic = replace(scene.dynamic, train=replace(train, flow=flow))
-    return replace(scene, dynamic=dynamic)
+    if source in ("dis", "raft"):
+        flow = estimate_flow(train, source, cache)
+        return _replaced(scene, flow=_where_valid(flow, train))
+    if scene.moves and train.flow is None:
+        if source == "files":
+            raise scene_error("data.flow", "files: the scene has none; set data.flow=auto")
+        log.info("%s: learned without optical flow", scene.name)
+    return scene
 
 
 def with_forward_flow(
@@ -65,17 +55,26 @@ def with_forward_flow(
         files: what was read from files, if any.
     """
     train, flow = scene.dynamic.train, files
-    possible = bool(frame_pairs(train)) and camera_turn(train) <= JUMP_DEGREES
-    if flow is None and possible and source in ("auto", "dis", "raft"):
+    if flow is None and source in ("dis", "raft"):
         if cache is not None:
             cache = cache.with_name(f"{cache.stem}_forward{cache.suffix}")
-        method: FlowMethod = "raft" if source == "raft" else "dis"
-        flow = estimate_flow(train, method, cache, forward=True)
+        flow = estimate_flow(train, source, cache, forward=True)
     if flow is None:
         return scene
-    if train.valid_mask is not None:
-        flow = replace(flow, valid=flow.valid & train.valid_mask)
-    return replace(scene, dynamic=replace(scene.dynamic, train=replace(train, forward_flow=flow)))
+    return _replaced(scene, forward_flow=_where_valid(flow, train))
+
+
+def _where_valid(flow: OpticalFlow, views: Views) -> OpticalFlow:
+    """The flow without what the views' ``valid_mask`` leaves out."""
+    if views.valid_mask is None:
+        return flow
+    return replace(flow, valid=flow.valid & views.valid_mask)
+
+
+def _replaced(scene: Scene, **flow: OpticalFlow) -> Scene:
+    """The scene with other attributes of its moving training views."""
+    train = replace(scene.dynamic.train, **flow)  # type: ignore[arg-type]
+    return replace(scene, dynamic=replace(scene.dynamic, train=train))
 
 
 def previous_images(views: Views) -> Tensor:

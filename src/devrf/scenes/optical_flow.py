@@ -182,17 +182,6 @@ def frame_pairs(views: Views) -> list[tuple[int, int]]:
     return sorted((i, at[v, f - 1]) for (v, f), i in at.items() if (v, f - 1) in at)
 
 
-def camera_turn(views: Views) -> float:
-    """Median angle in degrees between the optical axes of an image and the one before it."""
-    pairs = frame_pairs(views)
-    if not pairs:
-        return 0.0
-    image, earlier = torch.tensor(pairs).unbind(dim=1)
-    axes = views.cameras.forwards
-    cosine = (axes[image] * axes[earlier]).sum(dim=1).clamp(-1, 1)
-    return float(torch.rad2deg(cosine.acos()).median())
-
-
 def consistent(backward: Tensor, forward: Tensor) -> Tensor:
     """Where two flows agree.
 

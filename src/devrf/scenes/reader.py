@@ -59,9 +59,8 @@ class SceneReader(ABC):
         downscale: integer factor ≥ 1 by which images and flow are made smaller; ``up_to_<factor>``:
             no further than to 64 pixels of the shorter side.
         background: what is behind the alpha masks of RGBA images; RGB images are used as they are.
-        flow: ``files`` reads the scene's backward flow where there is any, ``dis`` and ``raft``
-            estimate it, ``none`` does without; ``auto`` reads the files, else estimates with
-            DIS unless the cameras jump from frame to frame.
+        flow: ``auto`` reads the scene's backward flow where it has files of it, ``files`` insists
+            on them, ``dis`` and ``raft`` estimate it, ``none`` does without.
         flow_cache: an ``.npz`` that keeps estimated flow; None estimates it every time.
         frames: keep so many times, evenly spread, first and last included; None: all.
 
