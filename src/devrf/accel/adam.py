@@ -50,7 +50,6 @@ def adam_step(
     launch(
         adam_kernel,
         _programs(values, length),
-        values,
         *(values, into, gradient, mean, square, factors, rate, step),
         *(length, *shape, *decay, eps, smoothing),
         PER_VOXEL_LR=per_voxel_lr is not None,
@@ -80,7 +79,6 @@ def adam_steps(tensors: Sequence[Sequence[Tensor]], steps: Sequence[Tensor], rul
     launch(
         adam_several_kernel,
         len(pieces),
-        addresses,
         *(addresses, pieces, rule.rate),
         *(1 - beta1, 1 - beta2, -math.log(beta1), -math.log(beta2), rule.eps),
         BLOCK=LARGEST,
@@ -115,7 +113,6 @@ def add_total_variation_gradient(
     launch(
         total_variation_kernel,
         _programs(grid, length),
-        grid,
         *(grid, gradient, length, *grid.shape[:2], weight),
         TOUCHED_ONLY=touched_only,
         CHANNELS=grid.shape[3],

@@ -17,18 +17,17 @@ LANES: tl.constexpr = tl.constexpr(32)
 PADDING: tl.constexpr = tl.constexpr(128)
 
 
-def launch(kernel: Any, programs: int, on: Tensor, *args: Any, **constants: Any) -> None:
-    """Launch a kernel.
+def launch(kernel: Any, programs: int, *args: Any, **constants: Any) -> None:
+    """Launch a kernel on the device of its first argument, which need not be the current one.
 
     Args:
         kernel: a Triton kernel.
         programs: size of the grid; 0 launches nothing.
-        on: a tensor on the device to run on, which need not be the current one.
-        args: the kernel's arguments.
+        args: the kernel's arguments, a tensor first.
         constants: its constants, and Triton's options.
     """
     if programs:
-        with torch.cuda.device_of(on):
+        with torch.cuda.device_of(args[0]):
             run(kernel, programs, *args, **constants)
 
 
@@ -44,11 +43,26 @@ def blocks(count: int, size: int = BLOCK.value) -> int:
 
 
 def padding_programs(places: int) -> int:
-    """How many programs go over a list of ``places``.
-
-    They come behind the programs of the rays, and fill the list's padding in the same launch.
-    """
+    """How many programs fill the padding of a list of ``places``; they come behind the rays'."""
     return blocks(places, PADDING.value)
+
+
+def gradient_target(
+    leaf: Tensor, needed: bool, kept: Tensor | None
+) -> tuple[Tensor, Tensor | None, bool]:
+    """Where a kernel adds a leaf's gradient, what autograd is given of it, and whether it is added.
+
+    Args:
+        leaf: what the gradient belongs to; any pointer serves where none is added.
+        needed: whether autograd asks for it.
+        kept: the gradient that the leaf has already, which is added to in place; or None.
+    """
+    if kept is not None:
+        return kept, None, True
+    if not needed:
+        return leaf, None, False
+    own = torch.zeros_like(leaf)
+    return own, own, True
 
 
 @triton.jit

@@ -27,38 +27,18 @@ from devrf.accel.blocks import (
 )
 
 
-def composite_segments(depth: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
-    """As devrf.ops.compositing.composite_segments."""
-    weights, end = Composite.apply(depth.contiguous(), first.contiguous())
-    return weights, end
-
-
-def composite_colors(
-    weights: Tensor,
-    colors: Tensor,
-    distance: Tensor,
-    first: Tensor,
-    transmittance: Tensor,
-    background: Tensor,
-) -> tuple[Tensor, Tensor]:
-    """As devrf.ops.compositing.composite_colors."""
-    given = weights, colors, transmittance, distance, first, background
-    image, depth = CompositeColors.apply(*(tensor.contiguous() for tensor in given))
-    return image, depth
-
-
 class Composite(torch.autograd.Function):
     """As devrf.ops.compositing.composite_segments."""
 
     @staticmethod
     def forward(ctx: Any, depth: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
+        depth, first = depth.contiguous(), first.contiguous()
         rays, places = len(first) - 1, len(depth)
         weights, transmittance = torch.empty_like(depth), torch.empty_like(depth)
         end = depth.new_empty(rays)
         launch(
             composite_kernel,
             rays + padding_programs(places),
-            depth,
             *(depth, first, weights, transmittance, end, rays, places),
             num_warps=1,
         )
@@ -75,38 +55,27 @@ class Composite(torch.autograd.Function):
         launch(
             composite_backward_kernel,
             rays + padding_programs(places),
-            into,
             *(*known, *upstream, into, rays, places),
             num_warps=1,
         )
         return into, None
 
 
+composite_segments = Composite.apply
+
+
 class CompositeColors(torch.autograd.Function):
     """As devrf.ops.compositing.composite_colors."""
 
     @staticmethod
-    def forward(
-        ctx: Any,
-        weights: Tensor,
-        colors: Tensor,
-        transmittance: Tensor,
-        distance: Tensor,
-        first: Tensor,
-        background: Tensor,
-    ) -> tuple[Tensor, Tensor]:
-        rays, apart = len(first) - 1, 0 if background.dim() == 1 else 3
+    def forward(ctx: Any, *given: Tensor) -> tuple[Tensor, Tensor]:
+        given = tuple(tensor.contiguous() for tensor in given)
+        weights, colors, _, first, _, background = given
+        rays = len(first) - 1
+        ctx.apart = 0 if background.dim() == 1 else 3
         image, depth = colors.new_empty(rays, 3), colors.new_empty(rays)
-        launch(
-            colors_kernel,
-            rays,
-            colors,
-            *(weights, colors, transmittance, distance, first, background),
-            *(image, depth, apart),
-            num_warps=1,
-        )
+        launch(colors_kernel, rays, *given, image, depth, ctx.apart, num_warps=1)
         ctx.save_for_backward(weights, colors, first, background)
-        ctx.apart = apart
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(depth)
         return image, depth
@@ -116,16 +85,19 @@ class CompositeColors(torch.autograd.Function):
     def backward(ctx: Any, upstream: Tensor, _: None) -> tuple[Tensor | None, ...]:
         weights, colors, first, background = ctx.saved_tensors
         rays, places = len(first) - 1, len(weights)
-        into = torch.empty_like(weights), torch.empty_like(colors), colors.new_empty(rays)
+        to_weights, to_colors = torch.empty_like(weights), torch.empty_like(colors)
+        to_transmittance = colors.new_empty(rays)
         launch(
             colors_backward_kernel,
             rays + padding_programs(places),
-            colors,
-            *(weights, colors, first, background, upstream.contiguous(), *into),
-            *(rays, places, ctx.apart),
+            *(weights, colors, first, background, upstream.contiguous()),
+            *(to_weights, to_colors, to_transmittance, rays, places, ctx.apart),
             num_warps=1,
         )
-        return *into, None, None, None
+        return to_weights, to_colors, None, None, to_transmittance, None
+
+
+composite_colors = CompositeColors.apply
 
 
 @triton.jit(do_not_specialize=["rays", "places"])
@@ -184,7 +156,7 @@ def composite_backward_kernel(
 
 
 @triton.jit(do_not_specialize=["apart"])
-def colors_kernel(weights, colors, transmittance, distance, first, background, image, depth, apart):
+def colors_kernel(weights, colors, distance, first, transmittance, background, image, depth, apart):
     """Σ w_i·c_i + T_end·background and Σ w_i·z_i / Σ w_i of a ray.
 
     ``apart`` is 3 where each ray has a background of its own, else 0.

@@ -18,6 +18,7 @@ from devrf.accel.blocks import (
     corner_row,
     corner_slopes,
     displaced,
+    gradient_target,
     launch,
     load_vectors,
     pace,
@@ -32,51 +33,8 @@ NEAREST: tl.constexpr = tl.constexpr(1e-8)
 BEFORE_INFINITY: tl.constexpr = tl.constexpr(1e-6)
 
 
-def motion_sum(
-    samples: tuple[Tensor, ...],
-    forward: Tensor,
-    before: Tensor,
-    seen: tuple[Tensor, ...] | None,
-    weights: Sequence[float],
-    axes: Tensor,
-    over_samples: bool,
-    ndc: tuple[float, float, float] | None,
-    gradient: Tensor | None,
-) -> tuple[Tensor, Tensor]:
-    """As devrf.ops.motion.motion_sum: the weighted sum, and both terms.
-
-    Args:
-        samples: the fields of ``ListedSamples``.
-        forward: Δ_f of the frame.
-        before: Δ_f of the frame before.
-        seen: the fields of ``SeenEarlier``, or None.
-        weights: of cycle and flow.
-        axes: of both grids.
-        over_samples: whether flow is a mean over samples.
-        ndc: slopes and near plane, or None.
-        gradient: what ``forward`` has already, or None.
-    """
-    points, canonical, weight, ray, present = samples
-    known = [points.detach(), ray, present.view(torch.uint8), before.detach(), axes]
-    if seen is None:
-        known += [ray, ray, *[points] * 6]  # any pointers
-    else:
-        vectors, valid, pixel, image, *others = seen
-        known += [valid.view(torch.uint8), image, vectors, pixel, *others]
-    numbers = (1.0, 1.0, 1.0) if ndc is None else ndc
-    kinds = {"FLOW": seen is not None, "NDC": ndc is not None}
-    total, terms = Motion.apply(
-        canonical.contiguous(),
-        weight.contiguous(),
-        forward.contiguous(),
-        tuple(tensor.contiguous() for tensor in known),
-        *(numbers, kinds, weights, over_samples, gradient),
-    )
-    return total, terms
-
-
 class Motion(torch.autograd.Function):
-    """As devrf.ops.motion.motion_sum."""
+    """As devrf.ops.motion.motion_sum: the weighted sum, and both terms."""
 
     @staticmethod
     def forward(
@@ -85,27 +43,44 @@ class Motion(torch.autograd.Function):
         weight: Tensor,
         forward: Tensor,
         known: Sequence[Tensor],
-        numbers: tuple[float, float, float],
-        kinds: dict[str, Any],
+        seen: Sequence[Tensor] | None,
         weights: Sequence[float],
         over_samples: bool,
-        gradient: Tensor | None,
+        ndc: tuple[float, float, float] | None,
+        kept: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
-        count = len(canonical)
-        programs = blocks(count)
+        """The sum and the terms.
+
+        Args:
+            ctx: keeps what the backward pass needs.
+            canonical: (K, 3) q.
+            weight: (K,) w.
+            forward: Δ_f of the frame.
+            known: points, ray and present of the samples; Δ_f of the frame before; axes of both.
+            seen: the fields of ``SeenEarlier``, or None.
+            weights: of cycle and flow.
+            over_samples: whether flow is a mean over samples.
+            ndc: slopes and near plane, or None.
+            kept: the gradient that ``forward`` has already.
+        """
+        # Any pointers stand in for what was not seen.
+        valid = known[2] if seen is None else seen[1]
+        given = tuple(
+            (tensor.view(torch.uint8) if tensor.dtype == torch.bool else tensor).contiguous()
+            for tensor in (canonical, weight, forward, *known, *(seen or [valid] * 8))
+        )
+        ctx.kinds = {"FLOW": seen is not None, "NDC": ndc is not None}
+        ctx.numbers, ctx.weights, ctx.kept = ndc or (1.0, 1.0, 1.0), weights, kept
+        count, programs = len(canonical), blocks(len(canonical))
         parts, sums = canonical.new_empty(programs, 4), canonical.new_empty(5)
-        given = (canonical, weight, forward, *known)
-        launch(motion_kernel, programs, parts, *given, parts, count, *numbers, **kinds)
-        valid = known[5]
+        launch(motion_kernel, programs, *given, parts, count, *ctx.numbers, **ctx.kinds)
         launch(
             finish_motion_kernel,
             1,
-            parts,
-            *(parts, valid, sums, programs, len(valid), *weights),
-            OVER_RAYS=kinds["FLOW"] and not over_samples,
+            *(parts, valid.view(torch.uint8), sums, programs, len(valid), *weights),
+            OVER_RAYS=seen is not None and not over_samples,
         )
         ctx.save_for_backward(*given, sums)
-        ctx.numbers, ctx.kinds, ctx.weights, ctx.gradient = numbers, kinds, weights, gradient
         ctx.set_materialize_grads(False)
         terms = sums[:2]
         ctx.mark_non_differentiable(terms)
@@ -114,23 +89,21 @@ class Motion(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor, _: None) -> tuple[Tensor | None, ...]:
-        *given, sums = ctx.saved_tensors
-        canonical, weight, forward, *_known = given
-        asked, own = ctx.needs_input_grad[2], None
-        into = ctx.gradient
-        if into is None and asked:
-            into = own = torch.zeros_like(forward)
+        canonical, weight, forward, *_known, sums = given = ctx.saved_tensors
+        into, gradient, adds = gradient_target(forward, ctx.needs_input_grad[2], ctx.kept)
         moved, changed = torch.empty_like(canonical), torch.empty_like(weight)
         launch(
             motion_backward_kernel,
             blocks(len(canonical)),
-            canonical,
-            *(*given, sums, upstream.contiguous(), moved, changed),
-            *(forward if into is None else into, len(canonical), *ctx.numbers, *ctx.weights),
-            NEEDS_FORWARD=into is not None,
+            *(*given, upstream.contiguous(), moved, changed, into),
+            *(len(canonical), *ctx.numbers, *ctx.weights),
+            NEEDS_FORWARD=adds,
             **ctx.kinds,
         )
-        return moved, changed, own, None, None, None, None, None, None
+        return moved, changed, gradient, *[None] * 6
+
+
+motion_sum = Motion.apply
 
 
 @triton.jit
@@ -211,10 +184,10 @@ def motion_kernel(
     present,
     before,
     axes,
-    valid,
-    image,
     vectors,
+    valid,
     pixel,
+    image,
     previous,
     poses,
     focal,
@@ -303,10 +276,10 @@ def motion_backward_kernel(
     present,
     before,
     axes,
-    valid,
-    image,
     vectors,
+    valid,
     pixel,
+    image,
     previous,
     poses,
     focal,

@@ -25,60 +25,30 @@ from devrf.accel.blocks import (
 NEAREST: tl.constexpr = tl.constexpr(1e-6)
 
 
-def photometric_sum(
-    image: Tensor,
-    transmittance: Tensor,
-    sample_weight: Tensor,
-    sample_color: Tensor,
-    first: Tensor,
-    truth: Tensor,
-    alpha: Tensor | None,
-    weights: Sequence[float],
-) -> tuple[Tensor, Tensor, Tensor]:
-    """As devrf.ops.photometric.photometric_sum: total; terms; mean opacity and coverage."""
-    # The transmittance stands in for a missing alpha mask, which is not read.
-    given = sample_weight.detach(), first, truth, transmittance if alpha is None else alpha
-    learned = image, transmittance, sample_color
-    total, terms, seen = Photometric.apply(
-        *(tensor.contiguous() for tensor in (*learned, *given)), alpha is not None, weights
-    )
-    return total, terms, seen
-
-
 class Photometric(torch.autograd.Function):
-    """As devrf.ops.photometric.photometric_sum."""
+    """As devrf.ops.photometric.photometric_sum: total; terms; mean opacity and coverage."""
 
     @staticmethod
     def forward(
-        ctx: Any,
-        image: Tensor,
-        transmittance: Tensor,
-        sample_color: Tensor,
-        sample_weight: Tensor,
-        first: Tensor,
-        truth: Tensor,
-        alpha: Tensor,
-        has_alpha: bool,
-        weights: Sequence[float],
+        ctx: Any, alpha: Tensor | None, weights: Sequence[float], *given: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        rays = len(image)
-        known = image, transmittance, sample_color, sample_weight, first, truth, alpha
-        parts = image.new_empty(rays, 7)
+        """``given``: image, transmittance, weights and colours of samples, first, truth."""
+        given = tuple(tensor.contiguous() for tensor in given)
+        image, transmittance = given[:2]
+        rays, parts = len(image), image.new_empty(len(image), 7)
+        # The transmittance stands in for a missing alpha mask, which is not read.
+        known = *given, transmittance if alpha is None else alpha.contiguous()
+        ctx.weights, ctx.has_alpha = weights, alpha is not None
         launch(
             photometric_kernel,
             rays,
-            image,
-            *known,
-            parts,
-            *weights,
-            rays,
-            ALPHA=has_alpha,
+            *(*known, parts, *weights, rays),
+            ALPHA=ctx.has_alpha,
             num_warps=1,
         )
         sums = parts.sum(dim=0)
         total, terms, seen = sums[4], sums[:4], sums[5:]
         ctx.save_for_backward(*known)
-        ctx.weights, ctx.has_alpha = weights, has_alpha
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(terms, seen)
         return total, terms, seen
@@ -86,20 +56,22 @@ class Photometric(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor, *_: None) -> tuple[Tensor | None, ...]:
-        image, transmittance, sample_color, *_ = known = ctx.saved_tensors
-        into = torch.empty_like(image), torch.empty_like(transmittance)
-        colors = torch.empty_like(sample_color)
-        rays, places = len(image), len(sample_color)
+        image, transmittance, _, color, *_ = known = ctx.saved_tensors
+        to_image, to_transmittance = torch.empty_like(image), torch.empty_like(transmittance)
+        to_color = torch.empty_like(color)
+        rays, places = len(image), len(color)
         launch(
             photometric_backward_kernel,
             rays + padding_programs(places),
-            image,
-            *(*known, upstream.contiguous(), *into, colors),
+            *(*known, upstream.contiguous(), to_image, to_transmittance, to_color),
             *(*ctx.weights, rays, places),
             ALPHA=ctx.has_alpha,
             num_warps=1,
         )
-        return *into, colors, *[None] * 6
+        return None, None, to_image, to_transmittance, None, to_color, None, None
+
+
+photometric_sum = Photometric.apply
 
 
 @triton.jit
@@ -112,8 +84,8 @@ def entropy(p):
 def photometric_kernel(
     image,
     transmittance,
-    sample_color,
     sample_weight,
+    sample_color,
     first,
     truth,
     alpha,
@@ -173,8 +145,8 @@ def photometric_kernel(
 def photometric_backward_kernel(
     image,
     transmittance,
-    sample_color,
     sample_weight,
+    sample_color,
     first,
     truth,
     alpha,

@@ -39,7 +39,6 @@ def gather_pixels(
     launch(
         gather_kernel,
         blocks(rays),
-        poses,
         *(image.contiguous(), flat.contiguous(), pixels),
         *(poses.contiguous(), focal.contiguous(), center.contiguous(), background.contiguous()),
         *(times.contiguous(), frames.contiguous(), vectors, known),
@@ -64,7 +63,6 @@ def steps_in_box(
     launch(
         steps_kernel,
         blocks(rays),
-        origins,
         *(origins.contiguous(), directions.contiguous(), entry, count, rays),
         *(*corners[0], *corners[1], *map(float, limits)),
     )

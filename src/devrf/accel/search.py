@@ -69,7 +69,6 @@ def find_samples(
     launch(
         march_kernel,
         number,
-        origins,
         *(origins, directions, entry, counts),
         *(mask.contiguous().view(torch.uint8), density, before, after, *axes),
         *(marks, kept, reached, longest, stride, *numbers),
@@ -85,7 +84,6 @@ def find_samples(
         list_kernel,
         # One at least behind the rays, for the total.
         number + max(1, padding_programs(capacity)),
-        origins,
         *(origins, directions, entry, marks, reached, kept.cumsum(0)),
         *(ray, distance, points, significant, first, total, number, stride, capacity, numbers[0]),
         num_warps=1,
@@ -254,42 +252,32 @@ def list_kernel(
         tl.store(significant + place, nothing.to(tl.uint8), mask=empty)
 
 
-def select_listed(
-    listed: tuple[Tensor, ...], canonical: Tensor, weight: Tensor, capacity: int
-) -> tuple[Tensor, ...]:
-    """As devrf.ops.search.select_listed; ``listed``: ray, distance, points, significant, first."""
-    known = tuple(tensor.contiguous() for tensor in listed)
-    chosen: tuple[Tensor, ...] = SelectListed.apply(
-        canonical.contiguous(), weight.contiguous(), known, capacity
-    )
-    return chosen
-
-
 class SelectListed(torch.autograd.Function):
-    """As devrf.ops.search.select_listed."""
+    """As devrf.ops.search.select_listed; ``listed``: ray, distance, points, significant, first."""
 
     @staticmethod
     def forward(
-        ctx: Any, canonical: Tensor, weight: Tensor, listed: tuple[Tensor, ...], capacity: int
+        ctx: Any, canonical: Tensor, weight: Tensor, listed: Sequence[Tensor], capacity: int
     ) -> tuple[Tensor, ...]:
-        rays_of, reached, where, flags, begin = listed
-        places, rays, running = len(flags), len(begin) - 1, flags.cumsum(0)
-        first, ray = torch.empty_like(begin), rays_of.new_empty(capacity)
-        distance, points = weight.new_empty(capacity), canonical.new_empty(capacity, 3)
-        present = flags.new_empty(capacity)
-        into_canonical, into_weight = torch.empty_like(points), torch.empty_like(distance)
+        rays, distances, points, flags, begin = (tensor.contiguous() for tensor in listed)
+        canonical, weight = canonical.contiguous(), weight.contiguous()
+        running = flags.cumsum(0)
+        first, ray, present = (
+            torch.empty_like(begin),
+            *(t.new_empty(capacity) for t in (rays, flags)),
+        )
+        distance, where = weight.new_empty(capacity), points.new_empty(capacity, 3)
+        into_canonical, into_weight = torch.empty_like(where), torch.empty_like(distance)
         launch(
             select_kernel,
-            blocks(max(places, rays + 1)),
-            weight,
-            *(flags.view(torch.uint8), running, begin, rays_of, reached, where, canonical, weight),
-            *(first, ray, distance, points, present.view(torch.uint8), into_canonical, into_weight),
-            *(places, rays, capacity),
+            blocks(max(len(flags), len(begin))),
+            *(flags.view(torch.uint8), running, begin, rays, distances, points, canonical, weight),
+            *(first, ray, distance, where, present.view(torch.uint8), into_canonical, into_weight),
+            *(len(flags), len(begin) - 1, capacity),
         )
-        total = running[-1]
         ctx.save_for_backward(flags, running)
         ctx.set_materialize_grads(False)
-        known = (first, total, ray, distance, points, present)
+        known = (first, running[-1], ray, distance, where, present)
         moves = ctx.needs_input_grad[0]
         ctx.mark_non_differentiable(*known, *(() if moves else (into_canonical,)))
         return *known, into_canonical, into_weight
@@ -298,21 +286,22 @@ class SelectListed(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
         flags, running = ctx.saved_tensors
-        *_, to_canonical, to_weight = upstream
-        given = [None if up is None else up.contiguous() for up in (to_canonical, to_weight)]
+        given = [None if up is None else up.contiguous() for up in upstream[-2:]]
         into = [None if up is None else up.new_empty(len(flags), *up.shape[1:]) for up in given]
         launch(
             select_backward_kernel,
             blocks(len(flags)),
-            flags,
             *(flags.view(torch.uint8), running),
             # Any pointer where there is no gradient.
             *(running if tensor is None else tensor for tensor in (*given, *into)),
             *(len(flags), max(0 if up is None else len(up) for up in given)),
-            HAS_CANONICAL=to_canonical is not None,
-            HAS_WEIGHT=to_weight is not None,
+            HAS_CANONICAL=given[0] is not None,
+            HAS_WEIGHT=given[1] is not None,
         )
         return *into, None, None
+
+
+select_listed = SelectListed.apply
 
 
 @triton.jit(do_not_specialize=["places", "count", "capacity"])

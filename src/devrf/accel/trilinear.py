@@ -16,10 +16,12 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from devrf.accel.blocks import (
+    blocks,
     cell,
     corner_row,
     corner_slopes,
     corner_weight,
+    gradient_target,
     launch,
     load_vectors,
     pace,
@@ -29,51 +31,43 @@ from devrf.accel.blocks import (
 THREADS = 128
 
 
-def interpolate(grid: Tensor, coords: Tensor, axes: Tensor, gradient: Tensor | None) -> Tensor:
-    """As devrf.ops.trilinear.interpolate; ``axes`` are those of the grid in its own units."""
-    values: Tensor = Interpolate.apply(grid.contiguous(), coords.contiguous(), axes, gradient)
-    return values
-
-
 class Interpolate(torch.autograd.Function):
-    """As devrf.ops.trilinear.interpolate."""
+    """As devrf.ops.trilinear.interpolate; ``axes`` are those of the grid in its own units."""
 
     @staticmethod
     def forward(
-        ctx: Any, grid: Tensor, coords: Tensor, axes: Tensor, gradient: Tensor | None
+        ctx: Any, grid: Tensor, coords: Tensor, axes: Tensor, kept: Tensor | None
     ) -> Tensor:
-        ctx.save_for_backward(grid, coords)
-        ctx.axes, ctx.gradient = axes, gradient
+        grid, coords = grid.contiguous(), coords.contiguous()
+        ctx.save_for_backward(grid, coords, axes)
+        ctx.kept = kept
         count, tile = len(coords), _tile(grid.shape[3])
         out = grid.new_empty(count, grid.shape[3])
-        programs = triton.cdiv(count, tile["BLOCK"])
-        launch(interpolate_kernel, programs, grid, grid, axes, coords, out, count, **tile)
+        launch(
+            interpolate_kernel, blocks(count, tile["BLOCK"]), grid, axes, coords, out, count, **tile
+        )
         return out
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        grid, coords = ctx.saved_tensors
+        grid, coords, axes = ctx.saved_tensors
         needs_grid, needs_coords, *_ = ctx.needs_input_grad
-        needs_grid = needs_grid or ctx.gradient is not None
-        into = None
-        if needs_grid:
-            into = torch.zeros_like(grid) if ctx.gradient is None else ctx.gradient
-        coords_gradient = torch.empty_like(coords) if needs_coords else None
+        into, gradient, adds = gradient_target(grid, needs_grid, ctx.kept)
+        moved = torch.empty_like(coords)
         count, tile = len(coords), _tile(grid.shape[3])
         launch(
             interpolate_backward_kernel,
-            triton.cdiv(count, tile["BLOCK"]),
-            grid,
-            *(grid, ctx.axes, coords, upstream.contiguous()),
-            grid if into is None else into,
-            coords if coords_gradient is None else coords_gradient,
-            count,
-            NEEDS_GRID=needs_grid,
+            blocks(count, tile["BLOCK"]),
+            *(grid, axes, coords, upstream.contiguous(), into, moved, count),
+            NEEDS_GRID=adds,
             NEEDS_COORDS=needs_coords,
             **tile,
         )
-        return into if ctx.gradient is None else None, coords_gradient, None, None
+        return gradient, moved if needs_coords else None, None, None
+
+
+interpolate = Interpolate.apply
 
 
 def _tile(channels: int) -> dict[str, int]:

@@ -19,6 +19,7 @@ from devrf.accel.blocks import (
     BLOCK,
     blocks,
     displaced,
+    gradient_target,
     launch,
     load_vectors,
     scalar_and_slopes,
@@ -31,33 +32,6 @@ from devrf.accel.blocks import (
 )
 
 
-def warped_depth(
-    points: Tensor,
-    density: Tensor,
-    slices: Sequence[Tensor],
-    axes: tuple[Tensor, Tensor],
-    numbers: tuple[float, float, float],
-    buffers: Sequence[Tensor | None],
-) -> tuple[Tensor, Tensor]:
-    """As devrf.ops.warped_depth.warped_depth.
-
-    Args:
-        points: (M, 3).
-        density: raw densities.
-        slices: displacements.
-        axes: of the slices and of the density.
-        numbers: weight of the second slice, shift, delta.
-        buffers: gradients that the density and each slice have already, or None.
-    """
-    density = density.contiguous()
-    # The kernel takes two slices; the density stands in for missing ones, which are not read.
-    before, after = (frame.contiguous() for frame in ([*slices, density, density])[:2])
-    buffers = (*buffers, None, None)[:3]
-    given = (points.detach().contiguous(), density, before, after)
-    q, tau = WarpedDepth.apply(*given, len(slices), axes, numbers, buffers)
-    return q, tau
-
-
 class WarpedDepth(torch.autograd.Function):
     """As devrf.ops.warped_depth.warped_depth."""
 
@@ -65,65 +39,70 @@ class WarpedDepth(torch.autograd.Function):
     def forward(
         ctx: Any,
         points: Tensor,
-        density: Tensor,
-        before: Tensor,
-        after: Tensor,
-        slices: int,
         axes: tuple[Tensor, Tensor],
         numbers: tuple[float, float, float],
-        buffers: Sequence[Tensor | None],
+        kept: Sequence[Tensor | None],
+        density: Tensor,
+        *slices: Tensor,
     ) -> tuple[Tensor, Tensor]:
+        """Canonical positions (M, 3) and optical depths (M,).
+
+        Args:
+            ctx: keeps what the backward pass needs.
+            points: (M, 3).
+            axes: of the slices and of the density.
+            numbers: weight of the second slice, shift, delta.
+            kept: gradients that the density and each slice have already, or None.
+            density: raw densities.
+            slices: displacements.
+        """
+        points, grids = points.contiguous(), [grid.contiguous() for grid in (density, *slices)]
+        # The kernel takes two slices; the density stands in for missing ones, which are not read.
+        density, before, after = (*grids, *grids[:1] * 2)[:3]
         count = len(points)
         warped, tau = torch.empty_like(points), points.new_empty(count)
         launch(
             warped_depth_kernel,
             blocks(count),
-            points,
             *(points, density, before, after, *axes, warped, tau, count, *numbers),
-            SLICES=slices,
+            SLICES=len(slices),
         )
-        ctx.save_for_backward(points, density, before, after, warped)
-        ctx.slices, ctx.axes, ctx.numbers, ctx.buffers = slices, axes, numbers, buffers
+        ctx.save_for_backward(points, warped, *grids)
+        ctx.axes, ctx.numbers, ctx.kept = axes, numbers, kept
         ctx.set_materialize_grads(False)
-        if not any(ctx.needs_input_grad[2 : 2 + slices]):
+        if not any(ctx.needs_input_grad[5:]):
             # Points get no gradient: without slices nothing that is looked up at q need find one.
             ctx.mark_non_differentiable(warped)
         return warped, tau
 
     @staticmethod
     @once_differentiable
-    def backward(
-        ctx: Any, warped_gradient: Tensor | None, tau_gradient: Tensor | None
-    ) -> tuple[Any, ...]:
-        points, density, before, after, warped = ctx.saved_tensors
-        used = (True, ctx.slices > 0, ctx.slices > 1)
-        needs, gradients, into = [], [], []
-        for grid, asked, buffer, is_used in zip(
-            (density, before, after), ctx.needs_input_grad[1:4], ctx.buffers, used, strict=True
-        ):
-            need = is_used and (asked or buffer is not None)
-            own = torch.zeros_like(grid) if need and buffer is None else None
-            needs.append(need)
-            gradients.append(own)
-            # Any pointer where no gradient is needed.
-            into.append(grid if not need else buffer if own is None else own)
-        if tau_gradient is None:
-            tau_gradient = points.new_zeros(len(points))
-        if warped_gradient is None:
+    def backward(ctx: Any, to_warped: Tensor | None, to_tau: Tensor | None) -> tuple[Any, ...]:
+        points, warped, *grids = ctx.saved_tensors
+        targets = [
+            gradient_target(grid, need, kept)
+            for grid, need, kept in zip(grids, ctx.needs_input_grad[4:], ctx.kept, strict=True)
+        ]
+        into, gradients, adds = zip(*targets, *[(grids[0], None, False)] * 2, strict=False)
+        if to_tau is None:
+            to_tau = points.new_zeros(len(points))
+        if to_warped is None:
             # The kernel reads it for slices alone; any pointer serves where there are none.
-            warped_gradient = torch.zeros_like(points) if any(needs[1:]) else points
+            to_warped = torch.zeros_like(points) if any(adds[1:]) else points
         launch(
             warped_depth_backward_kernel,
             blocks(len(points)),
-            points,
-            *(points, density, warped, warped_gradient.contiguous(), tau_gradient.contiguous()),
-            *(*into, *ctx.axes, len(points), *ctx.numbers),
-            NEEDS_DENSITY=needs[0],
-            NEEDS_BEFORE=needs[1],
-            NEEDS_AFTER=needs[2],
-            TWO=ctx.slices > 1,
+            *(points, grids[0], warped, to_warped.contiguous(), to_tau.contiguous(), *into[:3]),
+            *(*ctx.axes, len(points), *ctx.numbers),
+            NEEDS_DENSITY=adds[0],
+            NEEDS_BEFORE=adds[1],
+            NEEDS_AFTER=adds[2],
+            TWO=len(grids) > 2,
         )
-        return None, *gradients, None, None, None, None
+        return None, None, None, None, *gradients[: len(grids)]
+
+
+warped_depth = WarpedDepth.apply
 
 
 @triton.jit(do_not_specialize=["count"])

@@ -71,14 +71,12 @@ def listed_colors(
     """
     # Triton's interpreter, the one that runs on a CPU, cannot multiply bfloat16.
     multiplied = precision != torch.bfloat16 or points.device.type != "cpu"
-    narrow = len(network.hidden_bias) <= WIDEST.get(precision, 0)
-    floats = grid, points, viewdirs, *network[:7]
-    if multiplied and narrow and (kernels := accelerated("color_network", *floats)):
-        known, axes = (viewdirs, ray, first), axes_of(box, grid)
-        buffers = [kept_gradient(tensor) for tensor in (grid, *network[:7])]
-        colors: Tensor = kernels.listed_colors(
-            grid, points, axes, known, network, precision, buffers
-        )
+    learned = grid, *network[:7]
+    suits = multiplied and len(network.hidden_bias) <= WIDEST.get(precision, 0)
+    if suits and (kernels := accelerated("color_network", points, viewdirs, *learned)):
+        known = points, grid, axes_of(box, grid), viewdirs, network.octaves, ray, first
+        kept = [kept_gradient(leaf) for leaf in learned]
+        colors: Tensor = kernels.listed_colors(*known, precision, kept, *network[:7])
         return colors
     coords = to_grid(points, box, shape_of(grid))
     features = interpolate(grid, coords, gradient=kept_gradient(grid))

@@ -122,12 +122,12 @@ def motion_sum(
     """
     floats = *samples[:3], forward, before, *(() if seen is None else (seen.vectors, seen.poses))
     if kernels := accelerated("motion", *floats):
-        axes, gradient = axes_of(box, forward), kept_gradient(forward)
-        return MotionSum(
-            *kernels.motion_sum(
-                samples, forward, before, seen, weights, axes, over_samples, ndc, gradient
-            )
+        total, terms = kernels.motion_sum(
+            *(samples.canonical, samples.weight, forward),
+            (samples.points, samples.ray, samples.present, before, axes_of(box, forward)),
+            *(seen, weights, over_samples, ndc, kept_gradient(forward)),
         )
+        return MotionSum(total, terms)
     points, q, weight, ray, present = samples
     coords = to_grid(q, box, shape_of(forward))
     returned = q + interpolate(forward, coords, gradient=kept_gradient(forward))

@@ -90,7 +90,7 @@ def photometric_sum(
     """
     floats = image, transmittance, sample_weight, sample_color
     if kernels := accelerated("photometric", *floats, truth):
-        total, terms, seen = kernels.photometric_sum(*floats, first, truth, alpha, weights)
+        total, terms, seen = kernels.photometric_sum(alpha, weights, *floats, first, truth)
         return PhotometricSum(total, terms, seen[0], None if alpha is None else seen[1])
     place = torch.arange(len(sample_weight), device=first.device)
     ray = torch.searchsorted(first[1:].contiguous(), place, right=True).clamp(max=len(image) - 1)

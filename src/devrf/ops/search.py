@@ -213,7 +213,7 @@ def select_listed(
     floats = found.distance, found.points, canonical, weight
     if capacity <= len(found.ray) and (kernels := accelerated("search", *floats)):
         listed = found.ray, found.distance, found.points, found.significant, found.first
-        return ListedSubset(*kernels.select_listed(listed, canonical, weight, capacity))
+        return ListedSubset(*kernels.select_listed(canonical, weight, listed, capacity))
     if capacity > len(found.ray):
         raise ValueError(f"{capacity} of {len(found.ray)} samples cannot be selected")
     flags, running = found.significant, pad(found.significant.cumsum(0), (1, 0))
