@@ -164,7 +164,7 @@ def rng() -> torch.Generator:
     return torch.Generator().manual_seed(1)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def cube() -> Box:
     """The cube from −1 to 1."""
     return Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,21 +12,18 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
-from lightning import Trainer
 from torch import Tensor
 
 from devrf.apps.images import (
     UNKNOWN,
     depth_colors,
-    error_colors,
     evenly,
     flow_colors,
-    image_grid,
     scaled,
     short_name,
     to_bytes,
 )
-from devrf.apps.still import StillSettings, still, write_contact_sheet
+from devrf.apps.still import StillSettings, write_contact_sheet
 from devrf.apps.video import (
     VideoSettings,
     bullet_time,
@@ -35,14 +32,13 @@ from devrf.apps.video import (
     orbit,
     orbit_pictures,
     time_freeze,
-    write_video,
 )
+from devrf.apps.video_file import write_pictures
 from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import HeldOutView, truth_image
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
-from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene
 
@@ -51,22 +47,11 @@ def flat(height: int, width: int, color: tuple[float, float, float]) -> Tensor:
     return torch.tensor(color).expand(height, width, 3)
 
 
-def test_bytes_are_rounded_and_clamped() -> None:
-    values = torch.tensor([-1.0, 0.0, 0.5, 1.0, 7.0, 0.9985])
-    assert to_bytes(values).tolist() == [0, 0, 128, 255, 255, 255]
-
-
 def test_depth_is_bright_near_dark_far_and_white_where_nothing_is() -> None:
     depth = torch.tensor([[1.0, 1.5, 2.0, 3.0, 0.0]])
     opacity = torch.tensor([[1.0, 1.0, 1.0, 1.0, 0.0]])
     light = depth_colors(depth, opacity, near=1.0, far=2.0)[0].mean(dim=1)
     assert light[4] == 1 > light[0] > light[1] > light[2] == light[3]
-
-
-def test_errors_are_black_to_white_up_to_a_quarter() -> None:
-    prediction = torch.tensor([0.0, 0.1, 0.25, 0.9])[None, :, None].expand(1, 4, 3)
-    light = error_colors(prediction, torch.zeros(1, 4, 3)).mean(dim=-1)[0]
-    assert light[0] < 0.05 < light[1] < 0.95 < light[2] == light[3]
 
 
 def test_flow_as_colours() -> None:
@@ -102,12 +87,11 @@ def view(number: int, height: int = 90, width: int = 120) -> HeldOutView:
     )
 
 
-@pytest.mark.parametrize(("count", "shades"), [(11, [0, 50, 100]), (1, [0])])
 def test_a_contact_sheet_shows_truth_rendering_error_and_depth_of_spread_views(
-    tmp_path: Path, count: int, shades: list[int]
+    tmp_path: Path,
 ) -> None:
-    path = tmp_path / "images" / "static.png"
-    shown = write_contact_sheet(path, [view(10 * k) for k in range(count)], rows=3)
+    path, shades = tmp_path / "images" / "static.png", [0, 50, 100]
+    shown = write_contact_sheet(path, [view(10 * k) for k in range(11)], rows=3)
     sheet = iio.imread(path)
     assert torch.equal(torch.from_numpy(sheet), to_bytes(shown))
     # Images are enlarged to 300 x 400 pixels, text is 15 pixels high, and 6 are between images.
@@ -135,28 +119,6 @@ def dark(area: np.ndarray) -> bool:
     return bool(ink.any()) and not (ink[0].any() or ink[-1].any() or ink[:, [0, -1]].any())
 
 
-def test_a_grid_fits_its_text_to_its_places() -> None:
-    image = flat(40, 30, (0.5, 0.5, 0.5))
-    long = "a heading far longer than its column is wide"
-    grid = to_bytes(image_grid([[image, image]] * 2, [long, "b"], [["x"], [long]])).numpy()
-    top, left = 18, grid.shape[1] - 2 * 30 - 4
-    assert grid.shape[0] == top + 2 * 40 + 4
-    assert (grid[top : top + 40, left : left + 30] == 128).all()
-    assert (grid[top + 44 :, left + 34 :] == 128).all()
-    # Labels have the room that they need; headings are made smaller.
-    assert left > 5 * len(long) * 0.8
-    assert (grid[:top, left : left + 30].min(axis=-1) < 200).any()
-    assert (grid[:top, left + 30 : left + 34] == 255).all() and (grid[:, 0] == 255)[:56].all()
-
-
-def test_images_are_scaled_smoothly() -> None:
-    steps = torch.tensor([0.0, 1.0])[None, :, None].expand(2, 2, 3)
-    larger = scaled(steps, 40)
-    assert larger.shape == (40, 40, 3) and scaled(steps, 4, 6).shape == (4, 6, 3)
-    assert len(larger[20, :, 0].unique()) > 5 and (larger[20].diff(dim=0) > -0.05).all()
-    assert scaled(steps, 2) is steps
-
-
 def test_names_and_positions() -> None:
     assert evenly(3, 6) == [0, 1, 2]
     assert evenly(50, 6) == [0, 10, 20, 29, 39, 49]
@@ -164,40 +126,40 @@ def test_names_and_positions() -> None:
     assert short_name(30 * "a" + "_000.png") == "…" + 21 * "a" + "_000.png"
 
 
-@pytest.mark.parametrize(("height", "width"), [(48, 96), (17, 75)])
-def test_a_video_has_even_sides_and_all_its_pictures(
-    tmp_path: Path, height: int, width: int
-) -> None:
+def test_a_video_has_even_sides_and_all_its_pictures(tmp_path: Path) -> None:
     path = tmp_path / "videos" / "orbit.mp4"
-    shades = (0.0, 0.5, 1.0, 0.25)
-    write_video(path, iter([flat(height, width, (s, s, s)) for s in shades]), fps=7.5)
+    shades = (0, 128, 255, 64)
+    write_pictures(path, iter([np.full((17, 75, 3), s, np.uint8) for s in shades]), fps=7.5)
     frames = iio.imread(path, plugin="FFMPEG")
-    assert frames.shape == (4, height + height % 2, width + width % 2, 3)
+    assert frames.shape == (4, 18, 76, 3)
     for frame, shade in zip(frames, shades, strict=True):
-        assert abs(float(frame.mean()) - 255 * shade) < 4
+        assert abs(float(frame.mean()) - shade) < 4
     assert iio.immeta(path, plugin="FFMPEG")["fps"] == 7.5
     assert [p.name for p in path.parent.iterdir()] == ["orbit.mp4"]
 
 
 def test_a_film_that_fails_leaves_nothing_behind(tmp_path: Path) -> None:
-    def broken() -> Iterator[Tensor]:
-        yield flat(240, 240, (0, 0, 0))
+    def broken() -> Iterator[np.ndarray]:
+        yield np.zeros((240, 240, 3), np.uint8)
         raise RuntimeError("out of memory")
 
     with pytest.raises(RuntimeError, match="out of memory"):
-        write_video(tmp_path / "film.mp4", broken(), fps=10)
+        write_pictures(tmp_path / "film.mp4", broken(), fps=10)
     assert list(tmp_path.iterdir()) == []
 
 
-def ring(count: int) -> Cameras:
-    angle = torch.arange(count) * (2 * math.pi / count)
-    positions = torch.stack([3 * angle.cos(), 3 * angle.sin(), 0 * angle + 1], dim=1)
-    return Cameras.looking_at(positions, torch.zeros(count, 3), focal=20.0, width=15, height=10)
+CAMERAS = Cameras.looking_at(
+    torch.tensor([[3.0, 0, 1], [0, 3, 1], [-3, 0, 1], [0, -3, 1]]),
+    torch.zeros(4, 3),
+    focal=20.0,
+    width=15,
+    height=10,
+)
 
 
 def test_an_orbit_circles_the_box_at_the_cameras_distance(cube: Box) -> None:
     settings = VideoSettings(frames=8, orbit_turns=2.0, orbit_elevation=30.0)
-    cameras = orbit(ring(6), cube, settings)
+    cameras = orbit(CAMERAS, cube, settings)
     assert len(cameras) == 8 and (cameras.width, cameras.height) == (15, 10)
     torch.testing.assert_close(cameras.positions.norm(dim=1), torch.full((8,), math.sqrt(10)))
     torch.testing.assert_close(cameras.positions[:, 2], torch.full((8,), math.sqrt(10) / 2))
@@ -209,7 +171,7 @@ def test_an_orbit_circles_the_box_at_the_cameras_distance(cube: Box) -> None:
 
 
 def test_an_orbit_shows_colour_beside_depth_while_time_runs(moving, reference) -> None:
-    camera = ring(1)
+    camera = CAMERAS[[0]]
     shown = list(orbit_pictures(Renderer(moving), camera[[0, 0, 0]], 1.0))
     # Images 10 x 15, a line of text 18 pixels high above them.
     assert [tuple(image.shape) for image in shown] == [(28, 34, 3)] * 3
@@ -262,19 +224,8 @@ def test_rendering_keeps_to_its_seconds() -> None:
     assert VideoSettings(frames=60).within_limit(100.0).frames == 60
 
 
-CAMERAS = Cameras.looking_at(
-    torch.tensor([[3.0, 0, 1], [0, 3, 1]]), torch.zeros(2, 3), focal=20, width=24, height=18
-)
-
-
 def circle(settings: VideoSettings) -> Cameras:
     return orbit(CAMERAS, Box((-1.0, -1, -1), (1.0, 1, 1)), settings)
-
-
-def test_in_bullet_time_the_camera_alone_moves():
-    cameras, times = bullet_time(circle, 0.3, VideoSettings(frames=8))
-    assert times == [0.3] * 8
-    torch.testing.assert_close(cameras.positions, circle(VideoSettings(frames=8)).positions)
 
 
 def test_in_a_time_freeze_time_runs_then_the_camera_then_time():
@@ -284,18 +235,10 @@ def test_in_a_time_freeze_time_runs_then_the_camera_then_time():
     for k in (1, 2, 6, 7, 8):
         torch.testing.assert_close(cameras.positions[k], start)
     torch.testing.assert_close(cameras.positions[3:6], around)
-
-
-@pytest.mark.parametrize("frames", [1, 2, 3, 4, 5, 100])
-def test_as_many_cameras_as_times_and_frames(frames):
-    for film in (bullet_time, time_freeze):
-        cameras, times = film(circle, 0.5, VideoSettings(frames=frames))
-        assert len(cameras) == len(times) == frames
-
-
-def test_time_stops_within_the_recording():
-    with pytest.raises(DevrfError, match=r"video.time: expected 0 to 1, not 1.5"):
-        VideoSettings(time=1.5)
+    # In bullet time the camera alone moves.
+    cameras, times = bullet_time(circle, 0.3, VideoSettings(frames=3))
+    assert times == [0.3] * 3
+    torch.testing.assert_close(cameras.positions, around)
 
 
 def test_the_camera_that_is_meant(tiny_scene: Scene) -> None:
@@ -311,31 +254,15 @@ def test_the_camera_that_is_meant(tiny_scene: Scene) -> None:
 @pytest.mark.parametrize(
     ("settings", "given", "expected"),
     [
-        (StillSettings, {"view": -1}, "still.view: expected held_out or 0 to 7, not -1"),
-        (StillSettings, {"height": 0}, "still.height: expected at least 1, not 0"),
-        (VideoSettings, {"height": 15}, "video.height: expected at least 16, not 15"),
-        (VideoSettings, {"max_seconds": 0}, "video.max_seconds: expected more than 0, not 0"),
+        (StillSettings, {"view": -1}, "still.view: "),
+        (StillSettings, {"height": 0}, "still.height: "),
+        (VideoSettings, {"height": 15}, "video.height: "),
+        (VideoSettings, {"max_seconds": 0}, "video.max_seconds: "),
+        (VideoSettings, {"time": 1.5}, "video.time: "),
     ],
 )
 def test_what_cannot_be_shown(
-    tiny_scene: Scene, settings: type[Any], given: dict[str, int], expected: str
+    tiny_scene: Scene, settings: type[Any], given: dict[str, float], expected: str
 ) -> None:
-    with pytest.raises(DevrfError) as caught:
+    with pytest.raises(DevrfError, match=expected):
         settings(**given).camera(Viewpoints.of(tiny_scene))
-    assert str(caught.value) == expected
-
-
-def test_colour_and_depth_of_any_size(
-    learned: tuple[CanonicalStage, Trainer], tiny_scene: Scene, reference: Callable[..., Any]
-) -> None:
-    model, camera = (
-        learned[0].scene_model,
-        StillSettings(view=2, height=31).camera(Viewpoints.of(tiny_scene)),
-    )
-    color, depth = still(Renderer(model), camera, 0.0, 0.0)
-    assert color.shape == depth.shape == (31, 41, 3)
-    seen = reference(model, camera.image_rays(0), 0.0, torch.zeros(3))
-    torch.testing.assert_close(color.view(-1, 3), seen.color.clamp(0, 1))
-    # Where nothing is, the colour is that of the background, and the depth is white.
-    nothing = seen.opacity.view(31, 41) == 0
-    assert nothing.any() and not color[nothing].any() and (depth[nothing] == 1).all()

@@ -13,8 +13,9 @@ import pytest
 import torch
 
 from devrf.apps.images import to_bytes
+from devrf.apps.keyframes import Keyframe, keyframes_of
 from devrf.apps.settings import ViewerSettings
-from devrf.apps.viewer.cameras import Pose, dynamic_frusta, static_frusta
+from devrf.apps.viewer.cameras import dynamic_frusta, from_browser, in_browser, static_frusta
 from devrf.apps.viewer.drawing import Drawing, Frame, RenderScheduler, Shot
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
@@ -27,28 +28,15 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-# Poses: OpenCV's axes in the browser, OpenGL's here.
-
-
-def test_a_camera_without_rotation_in_opencvs_axes():
+def test_a_camera_of_the_browser_by_hand_and_back():
     # OpenCV's camera that looks along z with y down is OpenGL's turned about x by half a turn.
-    pose = Pose((1.0, 0, 0, 0), (1.0, 2, 3), math.radians(90), 1.5)
-    assert pose.camera_to_world.tolist() == [[1, 0, 0, 1], [0, -1, 0, 2], [0, 0, -1, 3]]
-    camera = pose.camera(100)
-    assert (camera.width, camera.height) == (150, 100)
-    assert camera.focal.tolist() == [[pytest.approx(50.0)] * 2]
-    assert camera.forwards.tolist() == [[0, 0, 1]]
-
-
-def test_a_pose_there_and_back():
-    cameras = Cameras.looking_at(
-        torch.randn(5, 3) * 3, torch.randn(5, 3), focal=31.0, width=40, height=30
-    )
-    for k in range(5):
-        camera = Pose.of_cameras(cameras, k).camera(30)
-        torch.testing.assert_close(camera.camera_to_world[0], cameras.camera_to_world[k])
-        torch.testing.assert_close(camera.focal[0], cameras.focal[k])
-        assert (camera.width, camera.height) == (40, 30)
+    camera = SimpleNamespace(wxyz=(1.0, 0, 0, 0), position=(1.0, 2, 3), fov=math.pi / 2)
+    keyframe = from_browser(camera, 0.3, 2.0)
+    assert keyframe.camera_to_world.tolist() == [[1, 0, 0, 1], [0, -1, 0, 2], [0, 0, -1, 3]]
+    assert (keyframe.fov, keyframe.time, keyframe.seconds) == (pytest.approx(90.0), 0.3, 2.0)
+    wxyz, position, fov = in_browser(keyframe)
+    assert wxyz.tolist() == [1, 0, 0, 0] and position.tolist() == [1, 2, 3]
+    assert fov == pytest.approx(math.pi / 2)
 
 
 # Frames: as the renderer's images, in blocks.
@@ -67,14 +55,20 @@ def drawing(moving) -> Drawing:
 
 @pytest.fixture
 def shot(tiny_scene) -> Shot:
-    return Shot(Pose.of_cameras(tiny_scene.dynamic.test.cameras, 0), 0.7)
+    (keyframe,) = keyframes_of(tiny_scene.dynamic.test.cameras[[0]], [0.7], 0.0)
+    return Shot(keyframe, 24 / 18)
 
 
-def test_the_frame_is_the_renderers_in_blocks_of_any_size(drawing, shot, moving, monkeypatch):
+@pytest.fixture
+def seen(moving, tiny_scene):
+    """What the renderer shows of the shot."""
+    return Renderer(moving).view(tiny_scene.dynamic.test.cameras, 0, 0.7, 1.0)
+
+
+def test_the_frame_is_the_renderers_in_blocks_of_any_size(drawing, shot, seen, monkeypatch):
     frame = drawn(drawing, shot)
-    expected = to_bytes(Renderer(moving).view(shot.pose.camera(18), 0, 0.7, 1.0).color)
     assert frame.pixels.shape == (18, 24, 3) and frame.depth is None
-    difference = frame.pixels.int() - expected.view(18, 24, 3).int()
+    difference = frame.pixels.int() - to_bytes(seen.color).view(18, 24, 3).int()
     assert int(difference.abs().max()) <= 1 and len(torch.unique(frame.pixels)) > 20
     monkeypatch.setattr("devrf.apps.viewer.drawing.MIN_RAYS", 100)
     monkeypatch.setattr("devrf.apps.viewer.drawing.BLOCK_SECONDS", 0)
@@ -112,26 +106,18 @@ def test_each_channel_has_a_frame_of_its_own(drawing, shot):
 
 def test_the_rest_state_is_on_the_left(drawing, shot):
     beside = drawn(drawing, replace(shot, beside_rest=True)).pixels
-    half = replace(shot, pose=replace(shot.pose, aspect=shot.pose.aspect / 2))
-    assert torch.equal(beside[:, :12], drawn(drawing, replace(half, time=0.0)).pixels)
+    half = replace(shot, aspect=shot.aspect / 2)
+    rest = replace(half, keyframe=replace(shot.keyframe, time=0.0))
+    assert torch.equal(beside[:, :12], drawn(drawing, rest).pixels)
     assert torch.equal(beside[:, 12:], drawn(drawing, half).pixels)
 
 
-def test_depth_is_along_the_axis_and_far_where_nothing_is(drawing, shot, moving):
+def test_depth_is_along_the_axis_and_far_where_nothing_is(drawing, shot, seen):
     depth = drawn(drawing, replace(shot, with_depth=True)).depth
-    seen = Renderer(moving).view(shot.pose.camera(18), 0, 0.7, 1.0)
     solid = (seen.opacity > 0.5).view(18, 24)
     assert float(depth[~solid].min()) == 1000
     assert bool((depth[solid] < seen.depth.view(18, 24)[solid] + 1e-4).all())
     assert bool((depth[solid] > 0.9 * seen.depth.view(18, 24)[solid]).all())
-
-
-def test_a_frame_is_as_large_as_the_time_for_it_allows(drawing):
-    drawing._rays_per_second, drawing._overhead = 10_000.0, 0.0
-    assert drawing.height_within(1.0, 1.0, 480) == 100
-    assert drawing.height_within(1.0, 4.0, 480) == 50
-    assert drawing.height_within(100.0, 1.0, 480) == 480
-    assert drawing.height_within(1e-9, 1.0, 480) == 16
 
 
 def test_captured_cameras_have_their_images(tiny_scene):
@@ -143,14 +129,13 @@ def test_captured_cameras_have_their_images(tiny_scene):
     assert float((late[0].image.float() - expected).abs().max()) <= 1
     cameras = tiny_scene.static.train.cameras
     read, unread = static_frusta(cameras, tiny_scene), static_frusta(cameras, None)
-    assert [f.pose for f in read] == [f.pose for f in unread] and len(read) == 8
+    assert [f.name for f in read] == [f.name for f in unread] and len(read) == 8
     assert all(f.image is not None for f in read) and all(f.image is None for f in unread)
 
 
 # The scheduler: a coarse frame comes first; a finer one ends when its browser moves.
 
-POSE = Pose((1.0, 0, 0, 0), (0.0, 0, 0), 1.0, 1.0)
-FIRST, SECOND = Shot(POSE, 0.1), Shot(POSE, 0.2)
+FIRST, SECOND = (Shot(Keyframe(torch.eye(3, 4), 60.0, time, 0.0), 1.0) for time in (0.1, 0.2))
 
 
 class Screen:
@@ -171,7 +156,7 @@ class Screen:
         for _ in range(3):
             self.between(height)
             yield None
-        yield Frame(torch.full((height, 1, 3), shot.time), None, 0.1)
+        yield Frame(torch.full((height, 1, 3), shot.keyframe.time), None, 0.1)
 
     def show(self, key: object, frame: Frame) -> None:
         self.shown.append((key, round(float(frame.pixels[0, 0, 0]), 3), len(frame.pixels)))
@@ -268,6 +253,7 @@ def test_where_cameras_look():
 
 def test_keyframes_are_collected_saved_loaded_and_flown_through(moving, tiny_scene, tmp_path):
     pytest.importorskip("viser", reason="the viewer's extra is not installed")
+    from devrf.apps.viewer.paths import known_paths
     from devrf.apps.viewer.session import Session
     from devrf.checkpoints.checkpoint import Viewpoints
 
@@ -295,7 +281,7 @@ def test_keyframes_are_collected_saved_loaded_and_flown_through(moving, tiny_sce
         panel._upload = SimpleNamespace(value=SimpleNamespace(content=content, name="path.json"))
         panel._answer(panel._load)(event)
         assert [k.seconds for k in panel.keyframes] == [0, 2, 4]
-        for preset in panel._presets.values():
+        for preset in known_paths(tiny_scene.static.train.cameras, lambda: moving).values():
             panel._take(preset(0.5))
             assert panel.path().duration > 7
         session.controls.dynamic.value = session.controls.static.value = True
@@ -312,24 +298,21 @@ def test_keyframes_are_collected_saved_loaded_and_flown_through(moving, tiny_sce
 @pytest.mark.parametrize(
     ("keys", "expected"),
     [
-        ({"port": 70000}, "viewer.port: expected 1 to 65535, not 70000"),
-        ({"height": 3}, "viewer.height: expected 16 to 4096, not 3"),
-        ({"move_seconds": 0}, "viewer.move_seconds: "),
+        ({"port": 70000}, "viewer.port: "),
         ({"share": 2}, "viewer.share: "),
     ],
 )
 def test_settings_that_cannot_be(keys, expected):
-    with pytest.raises(DevrfError) as error:
+    with pytest.raises(DevrfError, match=expected):
         ViewerSettings(**keys)
-    assert str(error.value).startswith(expected)
 
 
 def test_an_address_that_cannot_be_listened_on():
     assert ViewerSettings().address == "http://127.0.0.1:8080"  # this machine alone
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
-        with pytest.raises(DevrfError, match=rf"^viewer\.port: {port} on 127\.0\.0\.1 is in use"):
+        with pytest.raises(DevrfError, match=rf"^viewer\.port: {port} on"):
             ViewerSettings(port=port).check_free()
     ViewerSettings(port=port).check_free()
-    with pytest.raises(DevrfError, match=r"^viewer\.host: cannot listen on"):
+    with pytest.raises(DevrfError, match=r"^viewer\.host: "):
         ViewerSettings(host="192.0.2.1").check_free()

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from devrf.apps.viewer.cameras import Pose
+from devrf.apps.keyframes import Keyframe, keyframes_of
 from devrf.apps.viewer.drawing import Drawing
 
 pytest.importorskip("viser", reason="the viewer's extra is not installed")
@@ -15,8 +15,8 @@ pytest.importorskip("viser", reason="the viewer's extra is not installed")
 class Page:
     """Stands for a session: draws one small picture in each step."""
 
-    def __init__(self, pose: Pose) -> None:
-        self.watched, self.pose, self.scheduler = True, pose, self
+    def __init__(self, keyframe: Keyframe) -> None:
+        self.watched, self.keyframe, self.scheduler = True, keyframe, self
         self.pictures = list[float]()
 
     def present(self, drawing: Drawing) -> None:
@@ -28,7 +28,7 @@ class Page:
     def step(self, timeout: float) -> bool:
         from devrf.apps.viewer.drawing import Shot
 
-        *_, picture = self.drawing.draw(Shot(self.pose, 0.0), 12)
+        *_, picture = self.drawing.draw(Shot(self.keyframe, 4 / 3), 12)
         self.pictures.append(picture.pixels.float().std().item())
         time.sleep(0.02)
         return True
@@ -41,7 +41,7 @@ def fitted(fit, canonical, tiny_scene, monkeypatch):
 
     def learn(share: float):
         monkeypatch.setattr(live_view, "PAUSE", 0.0)
-        page = Page(Pose.of_cameras(tiny_scene.dynamic.test.cameras, 0))
+        page = Page(*keyframes_of(tiny_scene.dynamic.test.cameras[[0]], [0.0], 0.0))
         live, began = live_view.LiveView(page, share), time.perf_counter()
         fit(canonical(iterations=20, upsample_at=()), live)
         return live, page, time.perf_counter() - began

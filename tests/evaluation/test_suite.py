@@ -170,7 +170,7 @@ def filmed_from_above(flow: tuple[float, float]) -> Views:
 def test_a_moving_block_by_hand(block: DeVRFModel) -> None:
     # The face is 4 away, the lens has 40 px: 0.3 units along x are 3 px, and came from the left.
     views = filmed_from_above((-3.0, 1.0))
-    seen = seen_flow(Renderer(block), views, 2, 1, torch.arange(64), chunk=10)
+    seen = seen_flow(Renderer(block), views, 2, 1, torch.arange(64))
     torch.testing.assert_close(seen, torch.tensor([-3.0, 0.0]).expand(64, 2), atol=0.015, rtol=0)
     assert flow_error(Renderer(block), views, 2) == pytest.approx(1.0, abs=0.015)
     # From rest to the first frame: 2 px.
@@ -195,5 +195,5 @@ def test_flow_without_flow_or_an_earlier_frame_it_is_unknown(block: DeVRFModel) 
     nowhere = OpticalFlow(views.flow.vectors, torch.zeros_like(views.flow.valid))
     assert flow_error(renderer, replace(views, flow=nowhere), 1) is None
     # A method whose views have no motion.
-    still: Any = SimpleNamespace(at=lambda time: SimpleNamespace(chunk=1, at_rest=False))
+    still: Any = SimpleNamespace(induced_flow=lambda *_: None)
     assert flow_error(still, views, 1) is None

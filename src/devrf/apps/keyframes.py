@@ -9,6 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import torch
 from kornia.geometry.conversions import (
     quaternion_to_rotation_matrix,
@@ -94,7 +95,7 @@ class CameraPath:
         position, fov, wxyz = values[:, :3], values[:, 3:4], values[:, 4:]
         rotation = quaternion_to_rotation_matrix(torch.nn.functional.normalize(wxyz, dim=1))
         path = torch.cat([rotation, position[:, :, None]], dim=2).float()
-        time = _linear(knots, times[:, None], seconds)
+        time = torch.from_numpy(np.interp(seconds, knots, times))[:, None]
         rows = torch.cat([fov.clamp(1, 179), time.clamp(0, 1), seconds[:, None]], dim=1).tolist()
         return [Keyframe(pose, *row) for pose, row in zip(path, rows, strict=True)]
 
@@ -128,19 +129,14 @@ def keyframes_of(cameras: Cameras, times: list[float], seconds: float) -> tuple[
 
 
 def hermite(knots: Tensor, values: Tensor, at: Tensor) -> Tensor:
-    """The cubic Hermite spline through ``values`` (K, C) at ascending ``knots`` (K,).
+    """The cubic Hermite spline (N, C) through ``values`` (K, C) at ascending ``knots`` (K,).
 
-    Args:
-        knots: where the values are.
-        values: what the spline goes through.
-        at: (N,) places between the first knot and the last.
-
-    Returns:
-        (N, C).
+    Evaluated ``at`` (N,) places between the first knot and the last.
     """
     if len(knots) == 1:
         return values.expand(len(at), -1)
-    before, u = _segments(knots, at)
+    before = torch.searchsorted(knots, at, right=True).clamp(1, len(knots) - 1) - 1
+    u = ((at - knots[before]) / (knots[before + 1] - knots[before]))[:, None]
     after, k = before + 1, torch.arange(len(knots))
     low, high = (k - 1).clamp(min=0), (k + 1).clamp(max=len(knots) - 1)
     slope = (values[high] - values[low]) / (knots[high] - knots[low])[:, None]
@@ -151,20 +147,6 @@ def hermite(knots: Tensor, values: Tensor, at: Tensor) -> Tensor:
         + u**2 * (3 - 2 * u) * values[after]
         + u**2 * (u - 1) * step * slope[after]
     )
-
-
-def _linear(knots: Tensor, values: Tensor, at: Tensor) -> Tensor:
-    """As :func:`hermite`, on straight lines from one value to the next."""
-    if len(knots) == 1:
-        return values.expand(len(at), -1)
-    before, u = _segments(knots, at)
-    return values[before] + u * (values[before + 1] - values[before])
-
-
-def _segments(knots: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
-    """The knot (N,) before each place, and the share (N, 1) of the way to the next."""
-    before = torch.searchsorted(knots, at, right=True).clamp(1, len(knots) - 1) - 1
-    return before, ((at - knots[before]) / (knots[before + 1] - knots[before]))[:, None]
 
 
 def _quaternions(rotations: Tensor) -> Tensor:
@@ -196,21 +178,18 @@ def _with_seconds(keyframes: Any) -> Any:
 
 
 Matrix = Annotated[list[Number], Field(min_length=16, max_length=16), AfterValidator(_rigid)]
-Angle = Annotated[Number, Field(gt=0, lt=180)]
 Time = Annotated[Number, Field(ge=0, le=1)]
 
 
 class _PathCamera(BaseModel):
-    camera_to_world: Matrix
-    fov: Angle
+    matrix: Matrix = Field(alias="camera_to_world")
+    fov: Annotated[Number, Field(gt=0, lt=180)]
     aspect: Positive = 1.0
     render_time: Time | None = None
 
 
-class _PathKeyframe(BaseModel):
+class _PathKeyframe(_PathCamera):
     matrix: Matrix
-    fov: Angle
-    aspect: Positive = 1.0
     render_time: Time
     seconds: Annotated[Number, Field(ge=0)]
 
@@ -241,11 +220,7 @@ def read_path(file: Path) -> CameraPath:
 
 
 def path_from(content: bytes, name: str) -> CameraPath:
-    """The camera path in the ``content`` of a file called ``name``.
-
-    Raises:
-        DevrfError: it is none.
-    """
+    """As :func:`read_path`, from the ``content`` of a file called ``name``."""
     try:
         return _path(_FILE.validate_json(content), name)
     except ValidationError as error:
@@ -274,12 +249,9 @@ def write_path(file: Path, path: CameraPath, height: int) -> None:
         "smoothness_value": 0.0,
         "default_fov": path.keyframes[0].fov,
         "keyframes": [
-            entry(keyframe, "matrix") | {"seconds": keyframe.seconds - first}
-            for keyframe in path.keyframes
+            {**entry(key, "matrix"), "seconds": key.seconds - first} for key in path.keyframes
         ],
-        "camera_path": [
-            entry(keyframe, "camera_to_world") for keyframe in path.sampled(path.frames)
-        ],
+        "camera_path": [entry(key, "camera_to_world") for key in path.sampled(path.frames)],
     }
     write_json(file, content)
 
@@ -289,15 +261,11 @@ def _path(content: _PathFile, where: object) -> CameraPath:
     keyframes = [
         Keyframe(_pose(own.matrix).float(), own.fov, own.render_time, own.seconds)
         for own in content.keyframes
-    ] or [
-        Keyframe(
-            _pose(camera.camera_to_world).float(),
-            camera.fov,
-            k / last if camera.render_time is None else camera.render_time,
-            k / content.fps,
-        )
-        for k, camera in enumerate(cameras)
     ]
+    for k, camera in enumerate(cameras if not keyframes else ()):
+        time = k / last if camera.render_time is None else camera.render_time
+        pose = _pose(camera.matrix).float()
+        keyframes.append(Keyframe(pose, camera.fov, time, k / content.fps))
     if not keyframes:
         raise scene_error(
             where, "holds no camera path; expected keyframes with seconds, or camera_path"

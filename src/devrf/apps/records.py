@@ -22,11 +22,9 @@ from devrf.system.files import atomic_write
 
 
 def mean_scores(views: Sequence[HeldOutView]) -> dict[str, float | None]:
-    """Means of each metric over held-out images, as in the paper's tables.
+    """Means of each metric over the held-out images that have it, to five digits; else None.
 
-    Returns:
-        Means over the images that have a value, None where no image has; rounded to five digits
-        after the point. Without ``rest_pose_psnr``, which is of the dynamic capture only.
+    Without ``rest_pose_psnr``, which is of the dynamic capture only.
     """
     means = pd.DataFrame([view.scores for view in views], dtype=float).mean().round(5)
     means = means.drop("rest_pose_psnr")
@@ -36,22 +34,15 @@ def mean_scores(views: Sequence[HeldOutView]) -> dict[str, float | None]:
 def dynamic_scores(views: Sequence[HeldOutView], clock: FrameClock) -> dict[str, Any]:
     """Means over held-out images in motion, ``rest_pose_psnr`` among them.
 
-    Args:
-        views: scored images.
-        clock: of the training views' times.
-
-    Returns:
-        Means over all images. ``novel_times``, only where there are such: means over the images
-        at times that no training view has, and how many ``images`` these are. ``training_times``,
-        then, too, and if there are any: the same over the others.
+    Where some are at times that no training view has (by its ``clock``), ``novel_times`` has the
+    means over these and how many ``images`` they are, ``training_times`` the same over the others.
     """
     novel = [view for view in views if not clock.knows(view.time)]
     known = [view for view in views if clock.knows(view.time)]
     scores: dict[str, Any] = _with_rest_pose(views)
-    if novel and known:
-        scores["training_times"] = {**_with_rest_pose(known), "images": len(known)}
-    if novel:
-        scores["novel_times"] = {**_with_rest_pose(novel), "images": len(novel)}
+    for name, some in (("training_times", known), ("novel_times", novel)):
+        if novel and some:
+            scores[name] = {**_with_rest_pose(some), "images": len(some)}
     return scores
 
 
@@ -69,11 +60,7 @@ def write_frames(path: Path, captures: Mapping[str, Sequence[HeldOutView]]) -> N
 def frame_rows(
     captures: Mapping[str, Sequence[HeldOutView]],
 ) -> list[dict[str, str | float | None]]:
-    """A row for each held-out image: capture, name, time, every metric.
-
-    Args:
-        captures: scored images, by the name of their capture.
-    """
+    """A row for each held-out image of each capture: capture, name, time, every metric."""
     return [
         {"capture": capture, "name": view.name, "time": view.time, **view.scores}
         for capture, group in captures.items()
@@ -82,15 +69,11 @@ def frame_rows(
 
 
 def provenance(size: int, device: torch.device) -> dict[str, Any]:
-    """How numbers were produced, beside the composed config, as plain data.
+    """How numbers were produced, as plain data: versions, device, memory in GiB, UTC date.
 
     Args:
         size: number of learned values.
         device: where they were learned.
-
-    Returns:
-        Versions, device, git revision, number of parameters, peak memory of this process in GiB,
-        UTC date.
     """
     return {
         "devrf": devrf.__version__,
@@ -119,8 +102,7 @@ def device_name(device: torch.device) -> str:
 def git_revision(root: Path | None = None) -> str | None:
     """The commit of a checkout, ``-dirty`` where files were changed; None outside one.
 
-    Args:
-        root: the checkout; None: the folder that holds ``src/devrf``.
+    ``root`` None: the folder that holds ``src/devrf``.
     """
     root = Path(devrf.__file__).resolve().parents[2] if root is None else root
     if not (root / ".git").exists():  # a folder above may be another project's checkout

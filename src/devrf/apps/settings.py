@@ -157,14 +157,11 @@ class ViewerSettings:
     share: float = 0.03
 
     def __post_init__(self) -> None:
-        if not 1 <= self.port <= 65535:
-            raise DevrfError(f"viewer.port: expected 1 to 65535, not {self.port}")
-        if not 16 <= self.height <= 4096:
-            raise DevrfError(f"viewer.height: expected 16 to 4096, not {self.height}")
-        if not 0 < self.move_seconds <= 10:
-            raise DevrfError(f"viewer.move_seconds: expected 0 to 10, not {self.move_seconds}")
-        if not 0 < self.share <= 1:
-            raise DevrfError(f"viewer.share: expected more than 0, at most 1, not {self.share}")
+        ranges = {"port": (1, 65535), "height": (16, 4096), "move_seconds": (0.01, 10)}
+        for key, (least, most) in {**ranges, "share": (1e-6, 1)}.items():
+            if not least <= getattr(self, key) <= most:
+                given = f"{least} to {most}, not {getattr(self, key)}"
+                raise DevrfError(f"viewer.{key}: expected {given}")
 
     @property
     def address(self) -> str:

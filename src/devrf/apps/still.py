@@ -95,15 +95,9 @@ def still(
     index: int = 0,
     crop: Box | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Colour (H, W, 3) and depth as colours (H, W, 3) of what a camera sees, in [0, 1].
+    """Colour (H, W, 3) and depth as colours (H, W, 3) of what camera ``index`` sees, in [0, 1].
 
-    Args:
-        renderer: of the learned scene.
-        cameras: of which camera ``index`` is used.
-        time: in [0, 1].
-        background: grey level.
-        index: which of the cameras.
-        crop: what is outside this box is left out.
+    ``background`` is a grey level; what is outside a ``crop`` is left out.
     """
     model, shape = renderer.model, (cameras.height, cameras.width)
     image = renderer.view(cameras, index, time, background, crop)
@@ -127,14 +121,7 @@ class Preview(NamedTuple):
 
 
 def preview(model: Viewable, views: Views, index: int, background: Background) -> Preview:
-    """Render a held-out view and compare it with the truth.
-
-    Args:
-        model: what has been learned so far.
-        views: the held-out views, on the host.
-        index: which of them.
-        background: what is behind the alpha mask.
-    """
+    """Render one of the held-out views, on the host, and compare it with the truth."""
     time, behind = float(views.times[index]), background_value(background)
     prediction, depth = still(Renderer(model, times=1), views.cameras, time, behind, index)
     truth = truth_image(views, index, background).cpu()
@@ -144,28 +131,17 @@ def preview(model: Viewable, views: Views, index: int, background: Background) -
 
 
 def write_contact_sheet(path: Path, views: Sequence[HeldOutView], rows: int = 6) -> Tensor:
-    """Write a PNG with ``rows`` of the views, evenly spread, each with name, time and scores.
-
-    Returns:
-        The sheet (H, W, 3) in [0, 1].
-    """
+    """Write a PNG of ``rows`` of the views with name, time and scores; the sheet (H, W, 3)."""
     shown = [views[k] for k in evenly(len(views), rows)]
     near, far = _depth_range(shown)
-    tiles = [
-        (
-            view.truth,
-            view.prediction,
-            error_colors(view.compared, view.truth),
-            depth_colors(view.depth, view.opacity, near, far),
-        )
-        for view in shown
-    ]
     height = min(max(shown[0].truth.shape[0], MIN_HEIGHT), MAX_HEIGHT)
-    sheet = image_grid(
-        [[scaled(tile, height) for tile in row] for row in tiles],
-        HEADINGS,
-        [_label(view) for view in shown],
-    )
+    rows_of_tiles = []
+    for view in shown:
+        error = error_colors(view.compared, view.truth)
+        depth = depth_colors(view.depth, view.opacity, near, far)
+        tiles = view.truth, view.prediction, error, depth
+        rows_of_tiles.append([scaled(tile, height) for tile in tiles])
+    sheet = image_grid(rows_of_tiles, HEADINGS, [_label(view) for view in shown])
     write_image(path, sheet)
     return sheet
 
@@ -178,10 +154,9 @@ def _label(view: HeldOutView) -> list[str]:
 
 def _depth_range(views: Sequence[HeldOutView]) -> tuple[float, float]:
     """The nearest and furthest depth of what is solid in the views, but for a hundredth each."""
-    depth = torch.cat([view.depth[view.opacity > 0.5] for view in views])
-    if len(depth) == 0:
+    order = torch.cat([view.depth[view.opacity > 0.5] for view in views]).sort().values
+    if len(order) == 0:
         return 0.0, 1.0
-    order = depth.sort().values
-    last = len(order) - 1
-    near, far = float(order[last // 100]), float(order[last - last // 100])
+    margin = (len(order) - 1) // 100
+    near, far = float(order[margin]), float(order[-1 - margin])
     return near, max(far, near + 1e-6)

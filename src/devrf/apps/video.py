@@ -5,20 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from devrf.apps.images import image_grid, scaled, to_bytes
+from devrf.apps.images import image_grid, scaled
 from devrf.apps.still import sized, still
-from devrf.apps.video_file import write_pictures
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value, truth_image
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
-from devrf.rendering.renderer import Renderer
+from devrf.rendering.renderer import Renderer, points_at_depth
 from devrf.scenes.scene import Background, Views
 
 # Upper bound of the bytes of a pixel in a video: measured on images of 400 pixels and less.
@@ -86,11 +84,8 @@ def orbit_pictures(
 ) -> Iterator[Tensor]:
     """Colour beside depth (H', W', 3) from each of N cameras.
 
-    Args:
-        renderer: of the learned scene.
-        cameras: N cameras.
-        background: grey level.
-        times: N times in [0, 1], of cameras that may be anywhere; None: time runs from 0 to 1.
+    ``background`` is a grey level. ``times`` are N times in [0, 1] of cameras that may be
+    anywhere; None: time runs from 0 to 1.
     """
     for index in range(len(cameras)):
         time = index / max(len(cameras) - 1, 1) if times is None else times[index]
@@ -108,13 +103,7 @@ def held_out_pictures(
 ) -> Iterator[Tensor]:
     """Truth, rendering and depth (H', W', 3) side by side, while time runs from 0 to 1.
 
-    Args:
-        renderer: of the learned scene.
-        views: the held-out views, on the host.
-        images: for each frame the held-out image to show, whose camera is used
-            (:func:`~devrf.apps.video.held_out_images`).
-        settings: the images' height.
-        background: what is behind the alpha mask.
+    ``images`` are those of the ``views`` to show, one a frame (:func:`held_out_images`).
     """
     cameras, behind = settings.sized(views.cameras), background_value(background)
     larger = ", enlarged" if cameras.height > views.height else ""
@@ -131,11 +120,6 @@ def held_out_pictures(
         yield image_grid([[truth, color, depth]], headings)
 
 
-def write_video(path: Path, images: Iterator[Tensor], fps: float) -> None:
-    """Write images (H, W, 3) in [0, 1] of one size as an mp4 (H.264), ``fps`` a second."""
-    write_pictures(path, (to_bytes(image).numpy() for image in images), fps)
-
-
 # The cameras of a video of some settings, around a scene or before it.
 Ring = Callable[[VideoSettings], Cameras]
 # Cameras and as many times in [0, 1].
@@ -145,10 +129,7 @@ Shots = tuple[Cameras, list[float]]
 def orbit(cameras: Cameras, box: Box, settings: VideoSettings) -> Cameras:
     """Cameras on a circle around a box, looking at its middle.
 
-    Args:
-        cameras: the captured cameras: the orbit has their mean distance, focal length and up.
-        box: what to look at.
-        settings: number of frames, elevation, turns.
+    They have the captured ``cameras``' mean distance, focal length and up.
     """
     middle = torch.tensor(box.middle)
     radius = float((cameras.positions - middle).norm(dim=1).mean())
@@ -162,12 +143,9 @@ def orbit(cameras: Cameras, box: Box, settings: VideoSettings) -> Cameras:
 
 
 def spiral(cameras: Cameras, focus: float, settings: VideoSettings) -> Cameras:
-    """Cameras on a small ring before a forward-facing scene, looking at one point in it.
+    """Cameras on a small ring among the captured ones, looking at a point before them.
 
-    Args:
-        cameras: the captured cameras: the ring lies among them and has their focal length.
-        focus: distance of the point they look at, world units.
-        settings: number of frames, turns.
+    ``focus`` is the distance of that point, world units.
     """
     pose = cameras.camera_to_world.mean(dim=0)
     right, up, back = normalize(pose[:, :3], dim=0).unbind(dim=1)
@@ -187,16 +165,12 @@ def time_freeze(ring: Ring, stop: float, settings: VideoSettings) -> Shots:
 
     Each takes a third of the frames.
     """
-    before = after = settings.frames // 3
-    around = settings.frames - before - after
+    third = settings.frames // 3
+    around = settings.frames - 2 * third
     cameras = ring(replace(settings, frames=around))
-    index = [0] * before + list(range(around)) + [0] * after
-    times = [
-        *torch.linspace(0, stop, before + 1)[:-1].tolist(),
-        *[stop] * around,
-        *torch.linspace(stop, 1, after).tolist(),
-    ]
-    return cameras[index], times
+    before, after = torch.linspace(0, stop, third + 1)[:-1], torch.linspace(stop, 1, third)
+    times = [*before.tolist(), *[stop] * around, *after.tolist()]
+    return cameras[[0] * third + list(range(around)) + [0] * third], times
 
 
 def held_out_images(views: Views, frames: int) -> list[int]:
@@ -204,10 +178,6 @@ def held_out_images(views: Views, frames: int) -> list[int]:
 
     Of a capture with fixed cameras these are images of the first one. Images at rest follow one
     another.
-
-    Args:
-        views: held-out views, at least one.
-        frames: number of times.
     """
     first = (views.view == views.view[0]).nonzero()[:, 0]
     own = first if len(first) > 1 else torch.arange(len(views))
@@ -216,8 +186,7 @@ def held_out_images(views: Views, frames: int) -> list[int]:
         times = torch.linspace(0, 1, len(own))
     wanted = torch.linspace(0, 1, frames)
     nearest = (times[None] - wanted[:, None]).abs().argmin(dim=1)
-    found: list[int] = own[nearest].tolist()
-    return found
+    return [int(image) for image in own[nearest]]
 
 
 def _ring(
@@ -243,12 +212,12 @@ def _ring(
 
 def focus_distance(renderer: Renderer, cameras: Cameras) -> float:
     """Median depth along the optical axis, world units, of what the first camera sees at rest."""
-    cameras, space = cameras.to(renderer.device), renderer.model.space
+    cameras = cameras.to(renderer.device)
     rays = cameras.image_rays(0)
     image = renderer.picture(rays, 0.0, 1.0)
     solid = (image.opacity > 0.5).nonzero()[:, 0]
     if len(solid) == 0:
         return float(cameras.positions.norm(dim=1).mean()) + 1.0
-    points = space.to_world(space.rays(rays).at(solid, image.depth[solid]))
+    points = points_at_depth(renderer.model.space, rays[solid], image.depth[solid])
     _, depth = cameras.project_into(0, points)
     return float(depth.median())

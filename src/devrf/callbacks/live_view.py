@@ -57,7 +57,7 @@ class LiveView(Callback):
             return
         if self.seconds > self.share * (now - self._began):
             return
-        self._drawing.set_renderer(_renderer(pl_module))
+        self._drawing.renderer = _renderer(pl_module)
         scheduler.again()
         self.session.step(0.0)
         self._last = time.perf_counter()

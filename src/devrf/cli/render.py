@@ -16,7 +16,7 @@ from torch import Tensor
 
 from devrf.apps.export.geometry import ExportSettings
 from devrf.apps.export.scene import export_scene
-from devrf.apps.images import write_image
+from devrf.apps.images import to_bytes, write_image
 from devrf.apps.keyframes import cameras_of, read_path
 from devrf.apps.settings import ViewerSettings
 from devrf.apps.still import StillSettings, still
@@ -30,8 +30,8 @@ from devrf.apps.video import (
     orbit_pictures,
     spiral,
     time_freeze,
-    write_video,
 )
+from devrf.apps.video_file import write_pictures
 from devrf.checkpoints.checkpoint import CheckpointMetadata, Viewpoints, check_scene
 from devrf.cli.context import RunContext
 from devrf.cli.restore_config import parsed, value
@@ -114,7 +114,8 @@ def _within_limit(film: VideoSettings, renderer: Renderer, views: Views) -> Vide
 
 def _write(run: RunContext, film: VideoSettings, name: str, images: Iterator[Tensor]) -> Path:
     path = run.folder / "videos" / f"{name}.mp4"
-    write_video(path, followed(images, film.frames, f"{name}.mp4"), film.fps)
+    pictures = (to_bytes(image).numpy() for image in images)
+    write_pictures(path, followed(pictures, film.frames, f"{name}.mp4"), film.fps)
     log.info("video written to %s", path)
     for tracker in run.trackers:
         tracker.show_video(f"videos/{name}", path)

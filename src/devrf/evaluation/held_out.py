@@ -10,7 +10,7 @@ from torch import Tensor
 from devrf.evaluation.suite import MetricInput, MetricSuite
 from devrf.metrics.image import psnr, psnr_masked, ssim, ssim_masked, ssim_within
 from devrf.rendering.output import RenderedImage
-from devrf.rendering.renderer import Renderer
+from devrf.rendering.renderer import Renderer, points_at_depth
 from devrf.rendering.view import Viewable
 from devrf.scenes.scene import Background, Views
 
@@ -20,12 +20,9 @@ class HeldOutView:
     """A held-out image, what the model renders there, and metrics over the valid pixels.
 
     Attributes:
-        name: the image's name.
-        time: its time in [0, 1].
         truth: (H, W, 3) RGB in [0, 1].
         prediction: (H, W, 3) RGB in [0, 1].
         psnr: dB.
-        ssim: in [−1, 1].
         rest_pose_psnr: PSNR in dB of the scene at rest, in place of the prediction.
         further: other metrics by name; None where there is nothing to compare with.
         compared: (H, W, 3) RGB in [0, 1], the prediction at valid pixels, else the truth.
@@ -66,13 +63,8 @@ def score(
     Only valid pixels are compared, for SSIM in windows of valid pixels alone. For other metrics
     over neighbourhoods the prediction at other pixels is the truth.
 
-    Args:
-        renderer: of the learned scene.
-        views: the held-out views, on the host.
-        index: which of them.
-        background: what is behind the alpha mask.
-        suite: metrics beside PSNR and SSIM.
-        time: the time to render, in [0, 1]; None: the image's own.
+    ``views`` are on the host. ``suite`` has metrics beside PSNR and SSIM. ``time`` in [0, 1] is
+    rendered; None: the image's own.
     """
     own_time = float(views.times[index])
     time = own_time if time is None else time
@@ -152,7 +144,6 @@ def _image(seen: RenderedImage, views: Views) -> Tensor:
 def _world_distance(model: Viewable, views: Views, index: int, seen: RenderedImage) -> Tensor:
     """Depths (H·W,) of an image as distances from the camera in world units."""
     rays = views.cameras.image_rays(index)
-    own = model.space.rays(rays)
-    points = model.space.to_world(own.at(torch.arange(len(own)), seen.depth.cpu()))
+    points = points_at_depth(model.space, rays, seen.depth.cpu())
     distance: Tensor = torch.linalg.vector_norm(points - rays.origins, dim=1)
     return distance

@@ -16,7 +16,6 @@ from devrf.metrics.geometric import SOLID, depth_error, end_point_error
 from devrf.metrics.image import ms_ssim, psnr_masked, ssim_masked
 from devrf.metrics.lpips import Lpips, Network, load_lpips
 from devrf.rendering.renderer import Renderer
-from devrf.rendering.view import MovingView
 from devrf.scenes.scene import Views
 
 
@@ -25,9 +24,6 @@ class MetricInput:
     """One held-out image, to be compared with the truth; on the host.
 
     Attributes:
-        renderer: of the learned scene.
-        views: the held-out views.
-        index: which of them.
         prediction: (H, W, 3) RGB in [0, 1]; the truth where pixels are not valid.
         truth: (H, W, 3) RGB in [0, 1].
         depth: (H, W) rendered distance along each pixel's ray, world units.
@@ -169,34 +165,19 @@ def flow_error(renderer: Renderer, views: Views, index: int) -> float | None:
     return end_point_error(seen, views.flow.vectors[index].view(-1, 2)[flat])
 
 
-@torch.no_grad()
 def seen_flow(
-    renderer: Renderer, views: Views, index: int, before: int, flat: Tensor, chunk: int = 16384
+    renderer: Renderer, views: Views, index: int, before: int, flat: Tensor
 ) -> Tensor | None:
     """The backward flow (P, 2) in pixels at some pixels of an image; 0 where opacity is below 0.5.
 
-    Args:
-        renderer: of the learned scene.
-        views: the views, on the host.
-        index: the image.
-        before: the same view's image one frame earlier.
-        flat: (P,) row-major numbers of the pixels.
-        chunk: rays rendered at once.
-
-    Returns:
-        None if the method's views have no motion.
+    ``before`` is the same view's image one frame earlier; ``flat`` (P,) are row-major numbers of
+    the pixels. None if the method's views have no motion.
     """
-    view = renderer.at(float(views.times[index]))
-    if not isinstance(view, MovingView):
-        return None
-    device, earlier = renderer.device, float(views.times[before])
     pixels = pixel_positions(flat, views.width)
-    rays = views.cameras.rays(torch.full_like(flat, index), pixels).to(device)
-    rays, pixels = renderer.model.space.rays(rays), pixels.to(device)
-    camera = views.cameras[[before]].to(device)
-    parts = []
-    for k in range(0, len(rays), chunk):
-        some = slice(k, k + chunk)
-        mean, mass = view.induced_flow(rays[some], pixels[some], camera, earlier)
-        parts.append(torch.where(mass[:, None] > SOLID, mean, torch.zeros_like(mean)))
-    return torch.cat(parts).cpu()
+    rays = views.cameras.rays(torch.full_like(flat, index), pixels)
+    time, earlier = float(views.times[index]), float(views.times[before])
+    flow = renderer.induced_flow(rays, pixels, views.cameras[[before]], time, earlier)
+    if flow is None:
+        return None
+    mean, mass = flow
+    return torch.where(mass[:, None] > SOLID, mean, torch.zeros_like(mean)).cpu()

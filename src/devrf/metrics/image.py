@@ -62,8 +62,7 @@ def psnr_masked(prediction: Tensor, truth: Tensor, mask: Tensor) -> float | None
 def ssim_masked(prediction: Tensor, truth: Tensor, mask: Tensor) -> float | None:
     """Mean SSIM of the windows of two (H, W, 3) images whose centres ``mask`` (H, W) holds.
 
-    The windows reach beyond the mask, as SSIM compares neighbourhoods. None where no window
-    that counts has its centre there.
+    The windows reach beyond the mask. None where none that counts has its centre there.
     """
     values = ssim_map(prediction, truth)
     edge = (mask.shape[0] - values.shape[0]) // 2

@@ -65,30 +65,19 @@ class Trunk:
 
 TRUNKS = {
     "vgg": Trunk(
-        layers=(
-            *[(64, 3, 1, 1)] * 2,
-            (2, 2),
-            *[(128, 3, 1, 1)] * 2,
-            (2, 2),
-            *[(256, 3, 1, 1)] * 3,
-            (2, 2),
-            *[(512, 3, 1, 1)] * 3,
-            (2, 2),
-            *[(512, 3, 1, 1)] * 3,
-        ),
+        layers=tuple(
+            layer
+            for width, depth in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3))
+            for layer in (*[(width, 3, 1, 1)] * depth, (2, 2))
+        )[:-1],
         taps=(3, 8, 15, 22, 29),
         smallest=16,
         file="vgg16-397923af.pth",
     ),
     "alex": Trunk(
         layers=(
-            (64, 11, 4, 2),
-            (3, 2),
-            (192, 5, 1, 2),
-            (3, 2),
-            (384, 3, 1, 1),
-            (256, 3, 1, 1),
-            (256, 3, 1, 1),
+            *((64, 11, 4, 2), (3, 2), (192, 5, 1, 2), (3, 2)),
+            *((384, 3, 1, 1), (256, 3, 1, 1), (256, 3, 1, 1)),
         ),
         taps=(1, 4, 7, 9, 11),
         smallest=31,
@@ -106,12 +95,9 @@ class Lpips(nn.Module):
     def __init__(
         self, trunk: Trunk, features: Mapping[str, Tensor], heads: Iterable[Tensor]
     ) -> None:
-        """Put a network and its heads together.
+        """Put a trunk with its weights, ``0.weight``, ``0.bias``, …, and its heads together.
 
-        Args:
-            trunk: the network.
-            features: its weights, ``0.weight``, ``0.bias``, …, of any floating type.
-            heads: weight of each channel, (1, C, 1, 1), for each tap.
+        Heads are weights of each channel, (1, C, 1, 1), for each tap.
 
         Raises:
             RuntimeError: the weights are not those of the trunk.
@@ -133,9 +119,8 @@ class Lpips(nn.Module):
     def inside(self, prediction: Tensor, truth: Tensor, mask: Tensor) -> float | None:
         """LPIPS of two (H, W, 3) images in [0, 1] where ``mask`` (H, W) is True.
 
-        Outside the mask the prediction is taken to be right; the layers' differences,
-        interpolated to the image's size, are averaged inside it. None where it is empty or the
-        images are too small.
+        Outside it the prediction is taken to be right; the layers' differences, interpolated to the
+        image's size, are averaged inside. None where it is empty or the images are too small.
         """
         if not bool(mask.any()):
             return None
@@ -197,14 +182,10 @@ def load_lpips(
                 cached,
             )
             return None
+        cached.parent.mkdir(parents=True, exist_ok=True)
         try:
-            torch.hub.load_state_dict_from_url(
-                f"{PUBLISHED_AT}/{file}",
-                map_location="cpu",
-                progress=False,
-                check_hash=True,
-                weights_only=True,
-            )
+            digest = cached.stem.rpartition("-")[2]
+            torch.hub.download_url_to_file(f"{PUBLISHED_AT}/{file}", str(cached), digest, False)
         except (OSError, RuntimeError) as error:  # no network; another file than expected
             log.info("LPIPS is null: %s/%s: %s", PUBLISHED_AT, file, error)
             return None
@@ -217,24 +198,17 @@ def read_lpips(network: Network, path: Path) -> Lpips:
     Raises:
         DevrfError: it holds something else, or is not there.
     """
-    heads = _heads(network)
+    shipped = files("torchmetrics.functional.image") / "lpips_models" / f"{network}.pth"
+    with as_file(shipped) as own:
+        linear = torch.load(own, map_location="cpu", weights_only=True)
+    heads = [linear[f"lin{number}.model.1.weight"] for number in range(5)]
     try:
         stored = torch.load(path, map_location="cpu", weights_only=True)
-        features = {
-            name.removeprefix("features."): value
-            for name, value in stored.items()
-            if name.startswith("features.")
-        }
+        start = "features."
+        features = {k.removeprefix(start): stored[k] for k in stored if k.startswith(start)}
         return Lpips(TRUNKS[network], features, heads)
     except Exception:  # a damaged file makes the unpickler raise any exception
         raise DevrfError(
             f"{path}: not the weights of {network}; expected torchvision's, with names like "
             "features.0.weight"
         ) from None
-
-
-def _heads(network: Network) -> list[Tensor]:
-    shipped = files("torchmetrics.functional.image") / "lpips_models" / f"{network}.pth"
-    with as_file(shipped) as path:
-        stored = torch.load(path, map_location="cpu", weights_only=True)
-    return [stored[f"lin{number}.model.1.weight"] for number in range(5)]

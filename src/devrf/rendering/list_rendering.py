@@ -35,25 +35,20 @@ class VoxelField(Protocol):
     @property
     def box(self) -> Box:
         """Where it lives."""
-        ...
 
     @property
     def raw_density(self) -> Tensor:
         """Raw densities v (X, Y, Z, 1), before the softplus."""
-        ...
 
     @property
     def shift(self) -> float:
         """What is added to a raw density before the softplus."""
-        ...
 
     def step_length(self, step: float) -> float:
         """Length of ``step`` voxels along a ray, in units of the ray's direction."""
-        ...
 
     def step_in_base_voxels(self, step: float) -> float:
         """δ, the length that opacities are taken over."""
-        ...
 
     def rgb(
         self,
@@ -65,7 +60,6 @@ class VoxelField(Protocol):
         first: Tensor | None = None,
     ) -> Tensor:
         """RGB (S, 3) at ``points`` (S, 3) on rays ``ray`` (S,) with ``viewdirs`` (R, 3)."""
-        ...
 
 
 def render_static(
@@ -83,6 +77,7 @@ def render_static(
     """What ``render`` gives for the same arguments, in lists of ``capacity.significant`` places.
 
     Gradients of grids that have one already (``grad``) are added to it in place.
+    ``samples.present`` tells samples from padding.
 
     Args:
         rays: R rays.
@@ -96,16 +91,11 @@ def render_static(
         capacity: how long the lists are; the lengths that were needed are noted in it.
         precision: what the colour network works in.
         color_change: q → A_t(q), added to the colours' logits; None: nothing is.
-
-    Returns:
-        What the rays see; ``samples.present`` tells samples from padding.
     """
     density = field.raw_density
     with span("sampling"):
-        moved = slices, slice_weight
-        found = search(
-            rays, field, occupancy, settings, *moved, capacity=capacity.visible, wait=False
-        )
+        scene = rays, field, occupancy, settings, slices, slice_weight
+        found = search(*scene, capacity=capacity.visible, wait=False)
     with span("density"):
         canonical, tau = warped_depth(
             found.points,
@@ -147,18 +137,13 @@ def render_static(
 
 
 class ListRenderer:
-    """Renders a field, moved or at rest; its lists grow to the length that pictures need.
+    """Renders a canonical field, moved or at rest; its lists grow to the length pictures need.
 
-    Attributes:
-        field: the canonical field.
-        settings: step length and thresholds.
-        half: whether the colour network works in half precision (CUDA only).
+    ``half``: the colour network works in half precision (CUDA only).
     """
 
     def __init__(self, field: VoxelField, settings: RenderSettings, *, half: bool = False) -> None:
-        self.field = field
-        self.settings = settings
-        self.half = half
+        self.field, self.settings, self.half = field, settings, half
         self._capacity = 0
 
     @torch.no_grad()
@@ -204,16 +189,9 @@ class ListRenderer:
 
     def _search(self, rays: Rays, occupancy: Occupancy, slices: Sequence[Tensor]) -> PackedSamples:
         """The samples that can be seen, in lists without padding."""
+        scene = rays, self.field, occupancy, self.settings, slices
         while True:
-            found = search(
-                rays,
-                self.field,
-                occupancy,
-                self.settings,
-                slices,
-                capacity=self._capacity,
-                wait=True,
-            )
+            found = search(*scene, capacity=self._capacity, wait=True)
             total = int(found.total)
             if total <= self._capacity:
                 return found.head(total)
@@ -233,16 +211,8 @@ def search(
 ) -> PackedSamples:
     """What of R rays can be seen, as :func:`~devrf.ops.search.find_samples` gives it.
 
-    Args:
-        rays: R rays in the field's space.
-        field: the canonical field.
-        occupancy: where something may be, in the space of the rays.
-        settings: step length and thresholds.
-        slices: displacements of the rays' points, as for :func:`render_static`.
-        slice_weight: likewise.
-        capacity: the length of the lists.
-        wait: count the samples of the longest ray, which waits for the device; False uses an
-            upper bound.
+    Arguments as for :func:`render_static`. The lists have ``capacity`` places. ``wait`` counts the
+    samples of the longest ray, which waits for the device; else an upper bound is used.
     """
     step = field.step_length(settings.step)
     limits = {"step": step, "near": settings.near, "far": settings.far}

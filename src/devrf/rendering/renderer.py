@@ -17,7 +17,7 @@ from devrf.geometry.cameras import Cameras
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import Space, WorldSpace
 from devrf.rendering.output import RenderedImage
-from devrf.rendering.view import Viewable
+from devrf.rendering.view import MovingView, Viewable
 from devrf.system.memory import free_cache, is_oom
 
 log = logging.getLogger(__name__)
@@ -29,23 +29,18 @@ MIN_CHUNK = 256
 
 
 class Renderer:
-    """Renders a learned scene of any method, without gradients.
+    """Renders a learned scene of any method, without gradients, on the scene's device.
 
     Views of the last few times are cached: changes of the model do not show at these times.
 
     Attributes:
-        model: the scene.
-        device: its device, on which images are rendered.
         at: time in [0, 1] → the :class:`~devrf.rendering.view.View` of that time, cached.
     """
 
     def __init__(self, model: Viewable, *, times: int = 4, half: bool = False) -> None:
-        """Prepare to render.
+        """Prepare to render a scene, which is not to be moved to another device afterwards.
 
-        Args:
-            model: a learned scene, not to be moved to another device afterwards.
-            times: number of cached times.
-            half: run networks in half precision, on a CUDA device only.
+        ``times`` are cached; ``half`` runs networks in half precision, on a CUDA device only.
         """
         self.model = model
         self.device = model.device
@@ -86,6 +81,29 @@ class Renderer:
         rays = cameras[[index]].to(self.device).image_rays(0)
         return self.picture(rays, time, background, crop)
 
+    @torch.no_grad()
+    def induced_flow(
+        self, rays: Rays, pixels: Tensor, camera: Cameras, time: float, other: float
+    ) -> tuple[Tensor, Tensor] | None:
+        """As :meth:`~devrf.rendering.view.MovingView.induced_flow`, of world rays, in chunks.
+
+        The flow at ``time`` from or to the time ``other``. None if views have no motion.
+        """
+        view = self.at(time)
+        if not isinstance(view, MovingView):
+            return None
+        rays, pixels, camera = rays.to(self.device), pixels.to(self.device), camera.to(self.device)
+        done = 0
+
+        def flow(part: Rays) -> tuple[Tensor, Tensor]:
+            nonlocal done
+            found = view.induced_flow(part, pixels[done : done + len(part)], camera, other)
+            done += len(part)
+            return found
+
+        parts = in_chunks(flow, self.model.space.rays(rays), view.chunk)
+        return torch.cat([mean for mean, _ in parts]), torch.cat([mass for _, mass in parts])
+
     def reach(self, position: Tensor) -> Box | None:
         """The scene's box, if a camera at ``position`` (3,) is so far off that it must be cropped.
 
@@ -98,6 +116,12 @@ class Renderer:
         low, high = box.corners(position)
         away = torch.maximum((position - low).abs(), (position - high).abs()).norm()
         return box if float(away) > far else None
+
+
+def points_at_depth(space: Space, rays: Rays, depth: Tensor) -> Tensor:
+    """World points (R, 3) at ``depth`` (R,), in the fields' space, along R world rays."""
+    own = space.rays(rays)
+    return space.to_world(own.at(torch.arange(len(own), device=depth.device), depth))
 
 
 def in_chunks(render: Callable[[Rays], Part], rays: Rays, chunk: int) -> list[Part]:
@@ -143,14 +167,10 @@ class CroppedRays:
 
     @staticmethod
     def of(rays: Rays, box: Box, space: Space, near: float) -> CroppedRays:
-        """Crop world rays.
+        """Crop R world rays to a box in the fields' space ``space``.
 
-        Args:
-            rays: R rays in world space.
-            box: in the fields' space; of a contracted scene in its inner box, where that is the
-                world.
-            space: the fields' space.
-            near: the distance before which a view samples nothing.
+        Of a contracted scene the box is in its inner box, where that space is the world. ``near``
+        is the distance before which a view samples nothing.
         """
         lines = space.rays(rays) if space.is_linear else rays
         entry, leave = lines.crossing(*box.corners(lines.origins), 0.0, math.inf)

@@ -70,10 +70,7 @@ class Samples:
 def steps_through(
     rays: Rays, box: Box, *, step: float, near: float, far: float
 ) -> tuple[Tensor, Tensor]:
-    """Distance (R,) of each ray's first sample, and number (R,) int64 of samples up to its exit.
-
-    Arguments as for :func:`march`.
-    """
+    """Distance (R,) of each ray's first sample, and number (R,) int64 of samples up to its exit."""
     entry, leave = box.crossing(rays, near, far)
     return entry, steps_between(entry, leave, step)
 
@@ -90,17 +87,8 @@ def march(
     """Samples every ``step`` along rays between their entry into the box and their exit.
 
     Empty space is skipped in two passes: first whole segments of a ray, then single samples.
-
-    Args:
-        rays: R rays.
-        box: the box that contains all samples.
-        occupancy: tells which cells are sampled.
-        step: distance between samples, in units of the rays' directions.
-        near: distance before which nothing is sampled.
-        far: distance behind which nothing is sampled.
-
-    Returns:
-        The samples in occupied cells; the k-th of a ray is at entry + k·step.
+    ``step`` is in units of the rays' directions; nothing is sampled before ``near`` or behind
+    ``far``. The samples in occupied cells are returned; the k-th of a ray is at entry + k·step.
     """
     entry, count = steps_through(rays, box, step=step, near=near, far=far)
     per_segment = max(1, int(2 * _reach(rays, occupancy) / step))
@@ -130,12 +118,8 @@ def hits(
     rays: Rays, box: Box, occupancy: Occupancy, *, near: float, far: float, chunk: int = 65536
 ) -> Tensor:
     """Mask (R,): which rays pass within reach of an occupied cell."""
-    return torch.cat(
-        [
-            _hits(rays[k : k + chunk], box, occupancy, near, far)
-            for k in range(0, max(len(rays), 1), chunk)
-        ]
-    )
+    parts = (rays[k : k + chunk] for k in range(0, max(len(rays), 1), chunk))
+    return torch.cat([_hits(part, box, occupancy, near, far) for part in parts])
 
 
 def _hits(rays: Rays, box: Box, occupancy: Occupancy, near: float, far: float) -> Tensor:

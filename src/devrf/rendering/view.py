@@ -20,21 +20,13 @@ class View(Protocol):
     @property
     def chunk(self) -> int:
         """The number of rays to render at once on the scene's device."""
-        ...
 
     @property
     def at_rest(self) -> bool:
         """Whether the scene is in its rest state, as at time 0."""
-        ...
 
     def render(self, rays: Rays, background: Tensor) -> RenderedImage:
-        """Render R rays without gradients.
-
-        Args:
-            rays: R rays in the space of the scene's fields, on its device.
-            background: (3,) RGB behind everything.
-        """
-        ...
+        """Render R rays in the fields' space without gradients, before a background (3,) RGB."""
 
 
 @runtime_checkable
@@ -56,7 +48,6 @@ class MovingView(View, Protocol):
             (R, 2) the mean over each ray of (pixel at ``time``) − (pixel now), weighted by the
             rendering weights; and (R,) the sum of these weights.
         """
-        ...
 
 
 class Viewable(Protocol):
@@ -65,31 +56,21 @@ class Viewable(Protocol):
     @property
     def box(self) -> Box:
         """The scene's bounds, in the space of its fields."""
-        ...
 
     @property
     def space(self) -> Space:
         """The space of its fields."""
-        ...
 
     @property
     def depth_limits(self) -> tuple[float, float]:
         """Distances before and behind which nothing is sampled, in the space of its fields."""
-        ...
 
     @property
     def device(self) -> torch.device:
         """The device of its tensors."""
-        ...
 
     def at(self, time: float, *, half: bool = False) -> View:
-        """The scene at ``time`` in [0, 1].
-
-        Args:
-            time: in [0, 1].
-            half: run networks in half precision where device and method allow it.
-        """
-        ...
+        """The scene at ``time`` in [0, 1]; ``half``: in half precision where that is possible."""
 
 
 class SurfaceField(Protocol):
@@ -98,25 +79,19 @@ class SurfaceField(Protocol):
     @property
     def box(self) -> Box:
         """What holds the scene at rest, in the fields' space."""
-        ...
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """Points along x, y, z of a grid over the box that is as fine as the field."""
-        ...
 
     def optical_depth(self, points: Tensor) -> Tensor:
         """τ (M,) of a way of one voxel at ``points`` (M, 3), so that its opacity is 1 − exp(−τ).
 
         0 where nothing is rendered.
         """
-        ...
 
     def color(self, points: Tensor, viewdirs: Tensor) -> Tensor:
         """RGB (M, 3) in [0, 1], as in the images, at ``points`` (M, 3).
 
-        Args:
-            points: in the fields' space.
-            viewdirs: (M, 3) unit viewing directions in world space, from the eye to the points.
+        ``viewdirs`` (M, 3) are unit directions in world space, from the eye to the points.
         """
-        ...

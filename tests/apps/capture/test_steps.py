@@ -16,7 +16,6 @@ from devrf.apps.capture.images import (
     box_of_motion,
     common_size,
     fitted,
-    silhouettes,
     write_frames,
 )
 from devrf.apps.capture.structure import checked_model, pairs
@@ -52,7 +51,7 @@ def test_motion_is_what_exceeds_noise_and_changes_of_all_pixels():
 def test_the_sharpest_of_each_stretch_is_picked_and_blurred_footage_refused():
     assert sharpest([0.1, 0.9, 0.2, 0.8, 0.3, 0.4], 3) == [1, 3, 5]
     assert sharpest([0.5, 0.4], 3) == [0, 1]
-    with pytest.raises(DevrfError, match=r"a\.mp4: 2 of its 3 sharpest frames are blurred; film"):
+    with pytest.raises(DevrfError, match=r"^a\.mp4: 2 of its 3"):
         check_sharp(Path("a.mp4"), [0.1, 0.1, 0.6], [0, 1, 2])
 
 
@@ -81,12 +80,11 @@ def bursts():
     return motion
 
 
-@pytest.mark.parametrize(("offset", "rate"), [(-1.3, 30), (0.77, 24)])
-def test_the_offset_is_found_within_a_quarter_of_a_frame(surveyed, offset, rate):
+def test_the_offset_is_found_within_a_quarter_of_a_frame(surveyed):
     first = surveyed(bursts(), 30, 8, begin=1.5)
-    second = surveyed(bursts(), rate, 7, begin=1.5 + offset)
+    second = surveyed(bursts(), 24, 7, begin=1.5 - 0.77)
     seconds, correlation = offset_between(first, second)
-    assert seconds == pytest.approx(offset, abs=0.25 / rate)
+    assert seconds == pytest.approx(-0.77, abs=0.25 / 24)
     assert correlation > 0.95
 
 
@@ -102,13 +100,10 @@ def test_times_are_those_of_the_slower_video_in_the_common_part(surveyed):
 
 def test_what_cannot_be_aligned_is_refused(surveyed):
     one, still = surveyed(bursts(), 30, 8), surveyed(np.zeros_like, 30, 8)
-    with pytest.raises(DevrfError, match=r"b\.mp4: nothing moves in it; give capture\.offsets="):
-        timeline(PATHS, [one, still], 10)
     noise = surveyed(lambda t: np.random.default_rng(5).uniform(0, 1, len(t)), 30, 8)
-    with pytest.raises(DevrfError, match=r"b\.mp4: what moves in it does not tell when it began"):
-        timeline(PATHS, [one, noise], 10)
-    with pytest.raises(DevrfError, match=r"b\.mp4: all 2 videos together show 2\.97 s, of 7\.97"):
-        timeline(PATHS, [one, one], 10, offsets=[0, 5])
+    for other, offsets in ((still, None), (noise, None), (one, [0, 5])):
+        with pytest.raises(DevrfError, match=r"^b\.mp4: "):
+            timeline(PATHS, [one, other], 10, offsets)
 
 
 # Images and their alpha masks.
@@ -165,26 +160,27 @@ def test_photographs_have_masks_of_their_names(tmp_path, textured, masks):
     shown = written(Chosen(tmp_path / "walk", "static", (0, 1), folder), tmp_path / "images")
     assert [int(image[0, -1, 3]) for image in shown] == [1, 3]
     (masks / "walk" / "3.png").unlink()
-    with pytest.raises(DevrfError, match=r"masks/walk/3\.png: no such alpha mask, of .*/3\.jpg"):
+    with pytest.raises(DevrfError, match=r"masks/walk/3\.png: "):
         alpha_masks_of(masks, tmp_path / "walk", 2)
 
 
 def test_masks_that_do_not_fit_are_refused(walk, masks, tmp_path):
-    with pytest.raises(DevrfError, match=r"nowhere: no such folder of alpha masks; correct"):
-        alpha_masks_of(tmp_path / "nowhere", walk, 4)
-    with pytest.raises(DevrfError, match=r"masks/left: no such folder, expected the alpha masks"):
-        alpha_masks_of(masks, Path("left.mp4"), 4)
-    with pytest.raises(DevrfError, match=r"walk: 4 alpha masks, but .*walk\.mp4 has 5 frames"):
-        alpha_masks_of(masks, walk, 5)
+    for folder, footage, count, named in (
+        (tmp_path / "nowhere", walk, 4, "nowhere: "),
+        (masks, Path("left.mp4"), 4, "masks/left: "),
+        (masks, walk, 5, "walk: 4 alpha masks"),
+    ):
+        with pytest.raises(DevrfError, match=named):
+            alpha_masks_of(folder, footage, count)
     cv2.imwrite(str(masks / "walk" / "2.png"), mask(0, (32, 24)))
-    with pytest.raises(DevrfError, match=r"2\.png: 32x24 px, but its image .* has 64x48 px"):
+    with pytest.raises(DevrfError, match=r"2\.png: 32x24 px"):
         written(Chosen(walk, "static", (2,), masks / "walk"), tmp_path / "images")
 
 
 def test_frames_are_cropped_to_common_proportions_and_shrunk(textured):
     a, b = PATHS
     assert common_size({a: (1920, 1080), b: (1280, 720)}, 960) == (960, 540)
-    with pytest.raises(DevrfError, match=r"b\.mp4: 720x1280 px, but a\.mp4 has 1920x1080 px; hold"):
+    with pytest.raises(DevrfError, match=r"^b\.mp4: 720x1280 px"):
         common_size({a: (1920, 1080), b: (720, 1280)}, 960)
     picture = textured(0)
     assert (fitted(picture, (48, 48)) == picture[:, 8:56]).all()
@@ -202,11 +198,11 @@ def test_what_moves_says_where_the_box_is(tmp_path):
     for v in range(4):
         wall = generator.integers(0, 180, (24, 24, 3), dtype=np.uint8)
         wall = cv2.resize(wall, (96, 96), interpolation=cv2.INTER_LINEAR)
-        names.append([f"view{v}/{t}.png" for t in range(12)])
+        names.append([f"view{v}/{t}.png" for t in range(8)])
         (tmp_path / f"view{v}").mkdir()
         for t, name in enumerate(names[-1]):
             # A white ball of radius 0.3 before the wall.
-            center = torch.tensor([[2 * t / 11 - 1, 0.0, 0.2]])
+            center = torch.tensor([[2 * t / 7 - 1, 0.0, 0.2]])
             place, depth = ring.project(torch.tensor([v]), center)
             at = tuple((place[0].numpy() * 16).round().astype(int).tolist())
             radius, white = round(16 * 0.3 * 100 / float(depth)), (255, 255, 255)
@@ -220,15 +216,8 @@ def test_what_moves_says_where_the_box_is(tmp_path):
     for low, high, (least, most) in zip(box.low, box.high, exact, strict=True):
         assert least - 0.35 < low <= least + 0.1 and most - 0.1 <= high < most + 0.35
     still = [[view[0]] * 3 for view in names]
-    with pytest.raises(DevrfError, match=r"capture\.alpha_masks: subtract needs at least 2 fixed"):
+    with pytest.raises(DevrfError, match=r"^capture\.alpha_masks: "):
         box_of_motion(tmp_path, still, poses, [lens] * 4, area)
-
-
-def test_noise_is_no_silhouette():
-    generator = np.random.default_rng(1)
-    wall = generator.integers(20, 230, (48, 64, 3))
-    pictures = [(wall + generator.normal(0, 2, wall.shape)).astype(np.uint8) for _ in range(10)]
-    assert not any(silhouette.any() for silhouette in silhouettes(pictures))
 
 
 # Structure from motion.
@@ -259,18 +248,17 @@ def test_a_model_that_does_not_hold_the_scene_is_refused(tmp_path):
     fixed = {"view1/00003.png": Path("left.mp4")}
     folder = model(tmp_path / "whole", *MOVING.names, *fixed)
     assert len(checked_model(folder, MOVING, fixed).images) == 5
-    with pytest.raises(DevrfError, match=r"right\.mp4: its camera could not be placed among"):
+    with pytest.raises(DevrfError, match=r"^right\.mp4: "):
         checked_model(folder, MOVING, {**fixed, "view2/00000.png": Path("right.mp4")})
     folder = model(tmp_path / "few", *MOVING.names[:2], *fixed)
-    with pytest.raises(DevrfError, match=r"walk\.mp4: cameras were found for 2 of 4 frames only"):
+    with pytest.raises(DevrfError, match=r"^walk\.mp4: .* 2 of 4 frames"):
         checked_model(folder, MOVING, {})
 
 
 def test_cameras_that_jump_within_a_video_are_refused(tmp_path):
     moving = Chosen(Path("walk.mp4"), "static", tuple(range(6)))
     folder = model(tmp_path / "model", *moving.names, turned=(4, 5))
-    expected = r"walk\.mp4: between 00003 and 00004, .* its camera seems to turn by 180 degrees"
-    with pytest.raises(DevrfError, match=expected):
+    with pytest.raises(DevrfError, match=r"walk\.mp4: between 00003 and 00004"):
         checked_model(folder, moving, {})
     (tmp_path / "photographs").mkdir()
     photographs = Chosen(tmp_path / "photographs", "static", tuple(range(6)))

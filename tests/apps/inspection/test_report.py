@@ -105,15 +105,24 @@ def ring(angles: list[float], height: float = 1.0) -> Cameras:
 
 
 @pytest.mark.parametrize(
-    ("angles", "gap"),
-    [([0, 90, 180, 270], 90), ([10, 20, 30], 340), ([0, 45, 90, 225, 270, 315], 135), ([7], 360)],
+    ("angles", "height", "gap"),
+    [
+        ([0, 90, 180, 270], 1.0, 90),
+        ([0, 45, 90, 225, 270, 315], 1.0, 135),
+        ([7], 1.0, 360),
+        ([0, 10, 20], 60.0, None),  # straight above
+    ],
 )
-def test_the_widest_gap_by_hand(angles: list[float], gap: float) -> None:
-    assert widest_gap(ring(angles), torch.zeros(3)) == pytest.approx(gap, abs=0.01)
-
-
-def test_views_from_straight_above_have_no_side() -> None:
-    assert widest_gap(ring([0, 10, 20], height=60.0), torch.zeros(3)) is None
+def test_the_widest_gap_by_hand(
+    tiny_scene: Scene, cube: Box, angles: list[float], height: float, gap: float | None
+) -> None:
+    views = replace(tiny_scene.static.train, cameras=ring(angles, height))
+    scene = replace(
+        tiny_scene,
+        static=replace(tiny_scene.static, train=views),
+        bounds=replace(tiny_scene.bounds, box=cube),
+    )
+    assert widest_gap(scene) == (gap if gap is None else pytest.approx(gap, abs=0.01))
 
 
 def test_up_of_level_cameras() -> None:

@@ -77,31 +77,17 @@ def test_failures_are_listed_with_their_reason(pig_and_robot, failed, runs):
     )
     text = markdown(found, {})
     assert f"## Failed\n\n- {first}\n- {second}\n" in text
-    assert "5 finished runs" in text and ", 2 failed." in text
     assert f"## Skipped\n\n- {runs}/9_robot/metrics.json: skipped; damaged" in text
-    said = plain(found)
-    assert f"failed: {first}\nfailed: {second}\n" in said
-    assert said.count("metrics.json: skipped") == 1
+    assert f"failed: {first}\nfailed: {second}\n" in plain(found)
     assert f"% failed: {first}\n% failed: {second}\n" in latex(found)
-
-
-def test_plain_text_is_aligned_and_marked(pig_and_robot):
-    lines = plain(pig_and_robot()).splitlines()
-    assert lines[0].split() == ["pig_toy", *" ".join(METRICS).split()]
-    assert lines[1].startswith("Ours (base) ") and "20.00³" in lines[1] and "20 s¹" in lines[1]
-    assert len({line.index("–") for line in lines[1:4]}) == 1
 
 
 @pytest.mark.parametrize(
     ("escaped", "text", "expected"),
     [
-        (markdown_escaped, "pig_toy _a_ a|b 2*3*4", r"pig_toy \_a\_ a\|b 2\*3\*4"),
-        (markdown_escaped, "<b> `x` [y] a\\b", r"\<b\> \`x\` \[y\] a\\b"),
-        (latex_escaped, "pig_toy 100 % & more", r"pig\_toy 100 \% \& more"),
-        (latex_escaped, "$x^2$ #{1}", r"\$x\textasciicircum{}2\$ \#\{1\}"),
-        (latex_escaped, "C:\\x~", r"C:\textbackslash{}x\textasciitilde{}"),
-        (latex_escaped, "29 ± 1 ↑ ↓", r"29 $\pm$ 1 $\uparrow$ $\downarrow$"),
-        (latex_escaped, "– † <|>", r"-- $\dagger$ \textless{}\textbar{}\textgreater{}"),
+        (markdown_escaped, "pig_toy _a_ a|b <`[", r"pig_toy \_a\_ a\|b \<\`\["),
+        (latex_escaped, "pig_toy 100 % & $x^2$", r"pig\_toy 100 \% \& \$x\textasciicircum{}2\$"),
+        (latex_escaped, "29 ± 1 ↑ <|", r"29 $\pm$ 1 $\uparrow$ \textless{}\textbar{}"),
     ],
 )
 def test_nothing_in_a_text_is_taken_for_markup(escaped, text, expected):

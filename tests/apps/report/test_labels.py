@@ -58,11 +58,6 @@ def test_runs_equal_in_all_that_was_typed_but_seed_and_folder_share_a_row(rows, 
         ),
         ({"train_views": 1}, {"train_views": 2}, ["; 1 view", "; 2 views"]),
         ({"device": "GPU"}, {"device": "CPU"}, ["; on CPU", "; on GPU"]),
-        (
-            {"git": "ab" * 20},
-            {"git": "ab" * 20 + "-dirty"},
-            ["; at ababababa", "; at ababababa-dirty"],
-        ),
         ({"protocol": "joint"}, {}, ["; joint", "; two_stage"]),
         ({"choices": {"method": "devrf_big"}}, {}, ["", "; method=devrf_big"]),
     ],
@@ -139,9 +134,3 @@ def test_a_name_for_the_settings_is_said_where_all_equal_runs_have_it(labels, le
             width = {"schedule.side": k, "data.width": 96 + k}
             learned(f"{k}{seed}", width, seed=seed, choices={"schedule": schedule})
     assert labels() == [f"{FULL}; schedule=paper", f"{FULL}; schedule=quick"]
-
-
-def test_captures_of_one_name_are_not_taken_for_one(labels, learned):
-    for k in "ab":
-        learned(k, fingerprint=f"{k}bcdefgh")
-    assert labels() == [f"{FULL}; capture abcdef", f"{FULL}; capture bbcdef"]

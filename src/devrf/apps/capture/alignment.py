@@ -34,12 +34,10 @@ class Timeline:
     """Times that all fixed views show.
 
     Attributes:
-        offsets: V seconds that each video began after the first.
         times: T times in [0, 1], ascending, the first 0 and the last 1.
         positions: V tuples of T positions, the frame of each video nearest to each time.
     """
 
-    offsets: tuple[float, ...]
     times: tuple[float, ...]
     positions: tuple[tuple[int, ...], ...]
 
@@ -50,30 +48,21 @@ def timeline(
     max_timesteps: int,
     offsets: Sequence[float] | None = None,
 ) -> Timeline:
-    """Align the videos of the fixed views.
+    """Align the videos of the fixed views, ``offsets`` seconds after the first, or as they move.
 
     The times are those of the frames of the video with the lowest rate, every n-th where it has
     more of them than ``max_timesteps``; of the others the nearest frames are taken.
-
-    Args:
-        paths: V videos, for messages.
-        surveys: what they show.
-        max_timesteps: at most so many.
-        offsets: V seconds that each began after the first; None: found from the motion.
 
     Raises:
         DevrfError: the offsets cannot be found, or the videos have too little time in common.
     """
     begun = list(map(float, offsets)) if offsets is not None else offsets_found(paths, surveys)
-    shown = [
-        (begin + survey.times[0], begin + survey.times[-1])
-        for begin, survey in zip(begun, surveys, strict=True)
-    ]
-    start, end = max(first for first, _ in shown), min(last for _, last in shown)
-    shortest = min(last - first for first, last in shown)
-    longest = max(last - first for first, last in shown)
+    clocks = [begin + np.array(s.times) for begin, s in zip(begun, surveys, strict=True)]
+    first, last = (np.array([clock[k] for clock in clocks]) for k in (0, -1))
+    start, end = first.max(), last.min()
+    shortest, longest = (last - first).min(), (last - first).max()
     if end - start < LEAST_OVERLAP * shortest:
-        late = paths[int(np.argmax([first for first, _ in shown]))]
+        late = paths[int(first.argmax())]
         raise DevrfError(
             f"{late}: all {len(paths)} videos together show {max(end - start, 0):.2f} s, of "
             f"{shortest:.2f} to {longest:.2f} s each; cut them to the same part, or correct "
@@ -86,7 +75,7 @@ def timeline(
         )
     slowest = int(np.argmin([survey.rate for survey in surveys]))
     slack = 0.5 / surveys[slowest].rate
-    clock = np.array(surveys[slowest].times) + begun[slowest]
+    clock = clocks[slowest]
     usable = np.flatnonzero((clock >= start - slack) & (clock <= end + slack))
     usable = usable[:: -(-len(usable) // max_timesteps)]
     if len(usable) < 2:
@@ -95,12 +84,9 @@ def timeline(
             "at least 2; give longer videos"
         )
     instants = clock[usable]
-    positions = tuple(
-        _nearest(np.array(survey.times) + begin, instants)
-        for begin, survey in zip(begun, surveys, strict=True)
-    )
+    positions = tuple(_nearest(other, instants) for other in clocks)
     scaled = (instants - instants[0]) / (instants[-1] - instants[0])
-    return Timeline(tuple(begun), tuple(scaled.tolist()), positions)
+    return Timeline(tuple(scaled.tolist()), positions)
 
 
 def offsets_found(paths: Sequence[Path], surveys: Sequence[Survey]) -> list[float]:

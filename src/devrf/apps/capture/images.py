@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import repeat
@@ -33,7 +32,6 @@ class Chosen:
     """Which frames of one video become images.
 
     Attributes:
-        path: the footage.
         label: the folder of its images: ``static``, ``view1`` …
         positions: of its frames, ascending where distinct; a frame may be wanted twice.
         masks: of all its frames, which become the images' alpha; None: the images have none.
@@ -68,31 +66,24 @@ def common_size(sizes: dict[Path, Size], longer: int) -> Size:
 
 
 def write_frames(folder: Path, footage: Chosen, size: Size, filmed: Size) -> Iterator[Path]:
-    """Write the images of one video, each when it is asked for.
+    """Write the images of one video, each when it is asked for, from frames of size ``filmed``.
 
     Frames of other proportions are cropped in the middle; then all are brought to ``size``.
 
-    Args:
-        folder: of images.
-        footage: which of its frames.
-        size: of the images.
-        filmed: of the frames.
-
     Raises:
-        DevrfError: what :func:`devrf.scenes.footage.chosen` and
-            :func:`devrf.apps.capture.images.chosen_masks` raise, or an image cannot be written.
+        DevrfError: a frame or a mask cannot be read, or an image cannot be written.
     """
     (folder / footage.label).mkdir(parents=True, exist_ok=True)
     places = dict(zip(footage.positions, footage.names, strict=True))
     wanted = sorted(places)
-    masks: Iterator[tuple[int, Mask] | None] = repeat(None, len(wanted))
+    masks: Iterator[Mask | None] = repeat(None, len(wanted))
     if footage.masks is not None:
         masks = chosen_masks(footage.masks, footage.path, wanted, filmed)
     for (position, picture), mask in zip(chosen(footage.path, wanted), masks, strict=False):
         path = folder / places[position]
         image = cv2.cvtColor(fitted(picture, size), cv2.COLOR_RGB2BGR)
         if mask is not None:
-            image = np.dstack([image, fitted(mask[1], size)])
+            image = np.dstack([image, fitted(mask, size)])
         if not cv2.imwrite(str(path), image):
             raise DevrfError(f"{path}: cannot be written; see that there is room, and permission")
         yield path
@@ -121,24 +112,20 @@ def alpha_masks_of(folder: Path, footage: Path, count: int) -> Path:
     """The alpha masks of some footage: ``<folder>/<its name without suffix>``, a folder or a video.
 
     Of photographs it is a folder with a file of each one's name; of a video one with as many
-    images as it has frames, in the order of their names, or a video of as many frames.
-
-    Args:
-        folder: ``capture.alpha_masks``.
-        footage: the video, or the folder of photographs.
-        count: how many frames it has.
+    images as it has frames (``count``), in the order of their names, or a video of as many frames.
 
     Raises:
         DevrfError: there are none, or not of all frames.
     """
-    if not os.path.isdir(folder):
+    if not folder.is_dir():
         raise DevrfError(
             f"{folder}: no such folder of alpha masks; correct "
             "capture.alpha_masks, or give subtract"
         )
     place = folder / footage.stem
-    video = next((v for v in (folder / f"{footage.stem}{s}" for s in VIDEOS) if v.is_file()), None)
-    if not os.path.isdir(place):
+    if not place.is_dir():
+        videos = (folder / f"{footage.stem}{suffix}" for suffix in VIDEOS)
+        video = next((path for path in videos if path.is_file()), None)
         if video is None or is_folder(footage):
             raise DevrfError(
                 f"{place}: no such folder, expected the alpha masks of {footage}; add it with an "
@@ -157,15 +144,9 @@ def alpha_masks_of(folder: Path, footage: Path, count: int) -> Path:
 
 
 def chosen_masks(
-    masks: Path, footage: Path, positions: Sequence[int], size: tuple[int, int]
-) -> Iterator[tuple[int, Mask]]:
-    """The alpha masks of the frames at ``positions``, ascending, each with its position.
-
-    Args:
-        masks: what :func:`alpha_masks_of` returned.
-        footage: what they belong to.
-        positions: of the frames.
-        size: width and height of the frames.
+    masks: Path, footage: Path, positions: Sequence[int], size: Size
+) -> Iterator[Mask]:
+    """The alpha masks, as :func:`alpha_masks_of` found them, of frames at ascending ``positions``.
 
     Raises:
         DevrfError: one is no grey image, has another size than its frame, or is missing.
@@ -175,9 +156,9 @@ def chosen_masks(
         if is_folder(footage):
             files = [_of_photograph(masks, photograph) for photograph in listed_images(footage)]
         for position in positions:
-            yield position, read_mask(files[position], size, None, footage)
+            yield read_mask(files[position], size, None, footage)
         return
-    for position, picture in chosen(masks, positions):
+    for _, picture in chosen(masks, positions):
         height, width = picture.shape[:2]
         if (width, height) != size:
             raise DevrfError(
@@ -185,7 +166,7 @@ def chosen_masks(
                 "masks of its size"
             )
         # Grey as it is, whatever compression has made of its colours.
-        yield position, picture.mean(axis=2).round().astype(np.uint8)
+        yield picture.mean(axis=2).round().astype(np.uint8)
 
 
 def _of_photograph(masks: Path, photograph: Path) -> Path:
@@ -214,11 +195,8 @@ _SPECK = 5e-4
 def silhouettes(pictures: Sequence[Picture]) -> list[Mask]:
     """Where each picture of a camera that stands still differs from what stays, (H, W): 0 or 255.
 
-    The background is learned from all pictures (Zivkovic's mixtures of Gaussians, OpenCV's MOG2).
-    What comes to rest for most of the time is background.
-
-    Args:
-        pictures: at least two, of one size.
+    The background is learned from all pictures, at least two (Zivkovic's mixtures of Gaussians,
+    OpenCV's MOG2). What comes to rest for most of the time is background.
     """
     model = cv2.createBackgroundSubtractorMOG2(len(pictures), _FAR, detectShadows=False)
     model.setVarMin(_LEAST_VARIANCE)
@@ -227,13 +205,10 @@ def silhouettes(pictures: Sequence[Picture]) -> list[Mask]:
     for picture in pictures:
         # Of equal weight, whatever their order.
         model.apply(picture, learningRate=1 / len(pictures))
-    return [
-        _cleaned(np.asarray(model.apply(frame, learningRate=0), np.uint8)) for frame in pictures
-    ]
+    return [_without_specks(model.apply(picture, learningRate=0)) for picture in pictures]
 
 
-def _cleaned(mask: Mask) -> Mask:
-    """The mask without specks."""
+def _without_specks(mask: npt.NDArray[Any]) -> Mask:
     opened = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
     _, labels, stats, _ = cv2.connectedComponentsWithStats(opened)
     large = stats[:, cv2.CC_STAT_AREA] >= _SPECK * mask.size
@@ -254,8 +229,7 @@ def box_of_motion(
         images: the folder of images.
         names: of each of V ≥ 2 views its T images, relative to the folder.
         poses: (V, 3, 4) camera-to-world, OpenGL axes, world units.
-        lenses: of each view its ``fl_x``, ``cx`` … in pixels; a distortion is left alone, being
-            less than a cell of the carved grid at the middle.
+        lenses: of each view its ``fl_x``, ``cx`` … in pixels; distortion is left alone.
         around: where it is looked for, half as far again.
 
     Raises:
@@ -263,17 +237,13 @@ def box_of_motion(
     """
     shown: list[Mask] = []
     for view_names in names:
-        shown += silhouettes([_small(images / name) for name in view_names])
+        pictures = [cv2.imread(str(images / name), cv2.IMREAD_COLOR) for name in view_names]
+        shown += silhouettes([shrunk(np.asarray(p, np.uint8), LONGER_SIDE) for p in pictures])
     count = len(names[0])
     height, width = shown[0].shape
-    shares = [width / lens["w"] for lens in lenses]
-    focal, center = (
-        torch.tensor(
-            [[lens[x] * s, lens[y] * s] for lens, s in zip(lenses, shares, strict=True)],
-            dtype=torch.float32,
-        )
-        for x, y in (("fl_x", "fl_y"), ("cx", "cy"))
-    )
+    keys = ("fl_x", "fl_y", "cx", "cy")
+    intrinsics = [[lens[key] * (width / lens["w"]) for key in keys] for lens in lenses]
+    focal, center = torch.split(torch.tensor(intrinsics, dtype=torch.float32), 2, dim=1)
     view = torch.arange(len(names)).repeat_interleave(count)
     alpha = torch.from_numpy(np.stack(shown))[..., None]
     views = Views(
@@ -293,12 +263,6 @@ def box_of_motion(
         )
     log.info("what moves is in %s", found)
     return found
-
-
-def _small(path: Path) -> Picture:
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    assert image is not None  # the step before has written it
-    return np.asarray(shrunk(image, LONGER_SIDE), np.uint8)
 
 
 def shrunk(image: npt.NDArray[Any], longer: int) -> npt.NDArray[Any]:

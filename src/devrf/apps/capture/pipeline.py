@@ -40,13 +40,7 @@ WORK, IMAGES = "capture", "images"
 
 
 def scene_from_footage(settings: CaptureSettings) -> Path:
-    """Make a scene of footage, or go on with it.
-
-    Args:
-        settings: what was filmed, and how it is to be taken.
-
-    Returns:
-        The scene's folder, which ``data=auto`` reads.
+    """Make a scene of footage, or go on with it; its folder, which ``data=auto`` reads.
 
     Raises:
         DevrfError: the footage cannot be read, aligned or reconstructed; the line says what to
@@ -55,10 +49,10 @@ def scene_from_footage(settings: CaptureSettings) -> Path:
     settings.check()
     check_library()
     into, work = _folders(settings)
-    views = [] if settings.monocular else [_path(view) for view in settings.views]
+    views = [] if settings.monocular else [Path(view).expanduser() for view in settings.views]
     source = settings.views[0] if settings.monocular else settings.static
     assert source is not None  # settings.check has seen to it
-    static = _path(source)
+    static = Path(source).expanduser()
     surveys = {path: _surveyed(path, work) for path in (static, *views)}
     for path in views:
         if len(surveys[path].times) < 2 or is_folder(path):
@@ -68,10 +62,10 @@ def scene_from_footage(settings: CaptureSettings) -> Path:
     check_sharp(static, sharp, picked)
     masks: dict[Path, Path] = {}
     if settings.alpha_masks is not None and not settings.subtracts:
-        folder = _path(settings.alpha_masks)
+        folder = Path(settings.alpha_masks).expanduser()
         masks = {path: alpha_masks_of(folder, path, len(s.times)) for path, s in surveys.items()}
     moving = Chosen(static, "static", tuple(picked), masks.get(static))
-    clock = Timeline((), (), ())
+    clock = Timeline((), ())
     if views:
         in_view = [surveys[view] for view in views]
         clock = timeline(views, in_view, settings.max_timesteps, settings.offsets)
@@ -110,13 +104,7 @@ def scene_from_footage(settings: CaptureSettings) -> Path:
 
 
 def kept(file: Path, source: Any, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """What ``make`` returns, or what it returned before from the same source.
-
-    Args:
-        file: the JSON file that keeps it.
-        source: all that it depends on, as JSON can hold it.
-        make: makes it again.
-    """
+    """What ``make`` returns, or what the JSON ``file`` keeps that it made from the same source."""
     key = _digest(source)
     if file.is_file():
         try:
@@ -146,7 +134,7 @@ def _stamp(path: Path) -> list[Any]:
 
 def _folders(settings: CaptureSettings) -> tuple[Path, Path]:
     assert settings.into is not None  # settings.check has seen to it
-    into = _path(settings.into)
+    into = Path(settings.into).expanduser()
     work = into / WORK
     if into.exists() and not work.is_dir() and (not into.is_dir() or any(into.iterdir())):
         raise DevrfError(
@@ -154,10 +142,6 @@ def _folders(settings: CaptureSettings) -> tuple[Path, Path]:
             "folder"
         )
     return into, work
-
-
-def _path(given: str | Path) -> Path:
-    return Path(given).expanduser()
 
 
 def _surveyed(path: Path, work: Path) -> Survey:
@@ -218,8 +202,7 @@ def _model(
     images = [[video.label, _stamp(video.path), video.positions] for video in (moving, *fixed)]
 
     def make() -> dict[str, Any]:
-        folder = reconstruct(into / IMAGES, work, moving, list(first), settings)
-        return {"model": folder.name}
+        return {"model": reconstruct(into / IMAGES, work, moving, list(first), settings).name}
 
     result = kept(work / "structure.json", [images, options, settings.size], make)
     return checked_model(work / "models" / result["model"], moving, first)
@@ -254,14 +237,7 @@ def _frames(
 ) -> tuple[list[dict[str, Any]], set[str]]:
     """All images with cameras and times, as nerfstudio's file has them; which are held out.
 
-    Args:
-        model: the structure from motion.
-        world: the same, normalised.
-        moving: the moving camera's images.
-        fixed: those of the fixed views.
-        clock: the times of the fixed views.
-        settings: what is held out.
-        taken: seconds of the moving camera's frames, if the scene moved before it; else None.
+    ``taken`` are seconds of the moving camera's frames, if the scene moved before it.
     """
     place = {image.name: k for k, image in enumerate(model.images)}
     frames, test = list[dict[str, Any]](), set[str]()

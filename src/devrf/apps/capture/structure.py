@@ -37,11 +37,7 @@ _FILM = (
 
 
 def check_library() -> None:
-    """Check that COLMAP's Python package is there.
-
-    Raises:
-        DevrfError: it is not installed.
-    """
+    """Refuse to begin where COLMAP's Python package is not installed."""
     if find_spec("pycolmap") is None:
         raise DevrfError(
             'stage=capture: pycolmap is not installed; run pip install "devrf[capture]"'
@@ -49,13 +45,9 @@ def check_library() -> None:
 
 
 def pairs(moving: Sequence[str], fixed: Sequence[str], matching: str) -> list[tuple[str, str]]:
-    """Which images are compared.
+    """Which images are compared: all with all, or those near in the moving camera's order.
 
-    Args:
-        moving: images of a moving camera, in their order.
-        fixed: an image of each fixed view.
-        matching: ``exhaustive``: all with all; ``sequential``: of the moving camera those that
-            are near in its order, the fixed views with all.
+    Images of the ``fixed`` views are compared with all.
     """
     if matching == "exhaustive":
         return list(combinations([*moving, *fixed], 2))
@@ -67,17 +59,13 @@ def pairs(moving: Sequence[str], fixed: Sequence[str], matching: str) -> list[tu
 
 
 def reconstruct(
-    images: Path,
-    work: Path,
-    moving: Chosen,
-    fixed: Sequence[str],
-    settings: CaptureSettings,
+    images: Path, work: Path, moving: Chosen, fixed: Sequence[str], settings: CaptureSettings
 ) -> Path:
-    """Run structure from motion and write the model.
+    """Run structure from motion, and write the data base and the models to ``work``.
 
     Args:
         images: the folder of images.
-        work: where the data base and the model go; what is there of them is replaced.
+        work: what is there of an earlier run is replaced.
         moving: the moving camera's images.
         fixed: one image of each fixed view, all of the scene at rest.
         settings: the lens model, whether lenses are shared, and what is compared.
@@ -97,34 +85,26 @@ def reconstruct(
     models.mkdir(parents=True)
     names = [*dict.fromkeys([*moving.names, *fixed])]
     log.info("structure from motion: features of %d images", len(names))
-    modes = library.CameraMode
-    reading = library.ImageReaderOptions()
-    reading.camera_model = settings.camera
-    extraction = library.FeatureExtractionOptions()
-    extraction.use_gpu = False
+    modes, on_host = library.CameraMode, {"device": library.Device.cpu}
     library.extract_features(
         base,
         images,
         names,
         camera_mode=modes.SINGLE if settings.intrinsics == "shared" else modes.PER_FOLDER,
-        reader_options=reading,
-        extraction_options=extraction,
-        device=library.Device.cpu,
+        reader_options=library.ImageReaderOptions(camera_model=settings.camera),
+        extraction_options=library.FeatureExtractionOptions(use_gpu=False),
+        **on_host,
     )
     compared = pairs(moving.names, [n for n in fixed if n not in moving.names], settings.matching)
     listed.write_text("".join(f"{a} {b}\n" for a, b in compared))
     log.info("structure from motion: matches of %d pairs", len(compared))
-    matching = library.FeatureMatchingOptions()
-    matching.use_gpu = False
-    wanted = library.ImportedPairingOptions()
-    wanted.match_list_path = str(listed)
+    matching = library.FeatureMatchingOptions(use_gpu=False)
+    wanted = library.ImportedPairingOptions(match_list_path=str(listed))
     verification = library.TwoViewGeometryOptions()
     verification.ransac.random_seed = 0
-    library.match_image_pairs(base, matching, wanted, verification, device=library.Device.cpu)
+    library.match_image_pairs(base, matching, wanted, verification, **on_host)
     log.info("structure from motion: cameras and points")
-    mapping = library.IncrementalPipelineOptions()
-    mapping.random_seed = 0
-    mapping.min_model_size = 3
+    mapping = library.IncrementalPipelineOptions(random_seed=0, min_model_size=3)
     found = library.incremental_mapping(base, images, models, mapping)
     if not found:
         raise DevrfError(
@@ -135,12 +115,7 @@ def reconstruct(
 
 
 def checked_model(folder: Path, moving: Chosen, fixed: dict[str, Path]) -> SparseModel:
-    """The model, if it holds the scene.
-
-    Args:
-        folder: the model's.
-        moving: the moving camera's images.
-        fixed: the video of each fixed view by its image.
+    """The model in a folder, if it holds the scene; ``fixed``: each fixed view's video by image.
 
     Raises:
         DevrfError: too few of the moving camera's images are in it, or a fixed view is not; or

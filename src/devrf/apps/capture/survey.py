@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -41,8 +42,7 @@ class Survey:
         size: width and height of its frames in pixels.
         times: N times in seconds, the first frame's 0.
         sharpness: N values in [0, 1], see :func:`sharpness`.
-        motion: N values, how much has changed since the frame before (grey levels, mean over the
-            image of what exceeds noise); 0 of the first frame.
+        motion: N values, how much has changed since the frame before (:func:`moved`).
     """
 
     size: tuple[int, int]
@@ -56,12 +56,8 @@ class Survey:
         return 1 / float(np.median(np.diff(self.times)))
 
 
-def survey(path: Path, followed: Iterable[tuple[float, Picture]] | None = None) -> Survey:
-    """Look at all frames of a video, or at all photographs of a folder.
-
-    Args:
-        path: the footage.
-        followed: its frames, if the caller watches the progress; None: they are read here.
+def survey(path: Path, frames: Iterable[tuple[float, Picture]] | None = None) -> Survey:
+    """Look at all frames of a video, or at all photographs of a folder, or at ``frames`` of it.
 
     Raises:
         DevrfError: what :func:`devrf.scenes.footage.pictures` raises, or the frames have
@@ -70,7 +66,7 @@ def survey(path: Path, followed: Iterable[tuple[float, Picture]] | None = None) 
     size: tuple[int, int] | None = None
     times, sharp, motion = list[float](), list[float](), list[float]()
     before: Grey | None = None
-    for time, picture in followed or pictures(path):
+    for time, picture in frames or pictures(path):
         height, width = picture.shape[:2]
         if size not in (None, (width, height)):
             raise DevrfError(
@@ -92,14 +88,11 @@ def survey(path: Path, followed: Iterable[tuple[float, Picture]] | None = None) 
 
 
 def sharpness(grey: Grey) -> float:
-    """How sharp an image is, from 0 (blurred) to 1, whatever it shows.
+    """How sharp an image (H, W) is, from 0 (blurred) to 1, whatever it shows.
 
     What a strong blur takes away of the differences between neighbouring pixels, as a share of
     them: much of a sharp image, little of one that is blurred already (Crété et al., "The blur
     effect", 2007). The less sharp of both directions counts.
-
-    Args:
-        grey: (H, W).
     """
     shares = []
     for axis, kernel in ((0, (1, 9)), (1, (9, 1))):
@@ -122,17 +115,10 @@ def moved(before: Grey, after: Grey) -> float:
 
 
 def sharpest(sharpness: Sequence[float], count: int) -> list[int]:
-    """Positions, ascending, of the sharpest frame of each of ``count`` equal stretches.
-
-    Of no more than ``count`` frames all are taken.
-    """
-    if len(sharpness) <= count:
-        return list(range(len(sharpness)))
+    """Positions, ascending, of the sharpest frame of each of at most ``count`` equal stretches."""
+    count = min(count, len(sharpness))
     bounds = np.linspace(0, len(sharpness), count + 1).round().astype(int)
-    return [
-        int(low + np.argmax(sharpness[low:high]))
-        for low, high in zip(bounds, bounds[1:], strict=False)
-    ]
+    return [int(low + np.argmax(sharpness[low:high])) for low, high in pairwise(bounds)]
 
 
 def check_sharp(path: Path, sharpness: Sequence[float], picked: Sequence[int]) -> None:

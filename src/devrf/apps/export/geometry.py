@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
-from typing import Literal
+from typing import Literal, cast
 
 import torch
 from torch import Tensor
@@ -14,8 +15,8 @@ from torch import Tensor
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
-from devrf.geometry.space import Space
-from devrf.rendering.renderer import Renderer
+from devrf.methods.base import Renderable
+from devrf.rendering.renderer import Renderer, points_at_depth
 
 Format = Literal["gltf", "ply", "obj", "usd"]
 Up = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
@@ -77,18 +78,14 @@ class ExportSettings:
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
                 raise DevrfError(f"export.{name}: expected more than 0, not {value}")
-        self._check_times()
-
-    def _check_times(self) -> None:
         if self.times is None:
             return
         if self.fps is not None:
             raise DevrfError("export.times: export.fps also says which times; give one of them")
-        pairs = zip(self.times, list(self.times)[1:], strict=False)
-        if not self.times or not all(a < b for a, b in pairs):
-            raise DevrfError("export.times: expected ascending times, such as [0,0.5,1]")
-        if not (0 <= self.times[0] and self.times[-1] <= 1):
-            raise DevrfError(f"export.times: expected times from 0 to 1, not {list(self.times)}")
+        if not self.times or not all(a < b for a, b in pairwise([-1e-9, *self.times, 1 + 1e-9])):
+            raise DevrfError(
+                f"export.times: expected ascending times from 0 to 1, not {list(self.times)}"
+            )
 
     def export_times(self, clock: FrameClock) -> tuple[float, ...]:
         """The times to export, of a scene whose training frames have the clock's times."""
@@ -98,9 +95,6 @@ class ExportSettings:
             steps = max(1, round(self.seconds * self.fps))
             return tuple(k / steps for k in range(steps + 1))
         return clock.times
-
-
-AXES = "xyz"
 
 
 @dataclass(frozen=True)
@@ -119,38 +113,26 @@ class UpFrame:
 
     @classmethod
     def of(cls, cameras: Cameras, up: Up, metres: float) -> UpFrame:
-        """The frame of a scene.
-
-        Args:
-            cameras: that saw it, for ``up=auto``: the axis nearest to their mean up.
-            up: the world's axis that points up.
-            metres: length of a unit of the world.
-        """
+        """The frame of a scene; ``auto`` takes the axis nearest to the cameras' mean up."""
         if up == "auto":
             mean = cameras.camera_to_world[:, :, 1].mean(dim=0)
             axis = int(mean.abs().argmax())
-            sign = -1.0 if mean[axis] < 0 else 1.0
-        else:
-            axis, sign = AXES.index(up[-1]), -1.0 if up.startswith("-") else 1.0
-        y = torch.zeros(3)
-        y[axis] = sign
-        x = torch.zeros(3)
-        x[1 if axis == 0 else 0] = 1.0
-        name = ("-" if sign < 0 else "") + AXES[axis]
-        return cls(torch.stack([x, y, torch.linalg.cross(x, y)]), metres, name)
+            up = cast(Up, "-" * bool(mean[axis] < 0) + "xyz"[axis])
+        axis, sign = "xyz".index(up[-1]), -1.0 if up.startswith("-") else 1.0
+        x, y = torch.zeros(3), torch.zeros(3)
+        x[1 if axis == 0 else 0], y[axis] = 1.0, sign
+        return cls(torch.stack([x, y, torch.linalg.cross(x, y)]), metres, up)
 
     def points(self, points: Tensor) -> Tensor:
         """Points (..., 3) of the world in the frame."""
         return self.metres * (points @ self.rotation.T)
 
-    def cameras(self, cameras: Cameras) -> Cameras:
-        """Cameras of the world in the frame."""
-        pose = cameras.camera_to_world
-        turned = self.rotation @ pose[:, :, :3]
-        return replace(
-            cameras,
-            camera_to_world=torch.cat([turned, self.points(pose[:, :, 3])[:, :, None]], dim=2),
-        )
+    def pose(self, camera: Cameras) -> Tensor:
+        """Camera-to-frame (4, 4) float64 of one camera of the world, OpenGL axes."""
+        pose, whole = camera.camera_to_world[0], torch.eye(4, dtype=torch.float64)
+        whole[:3, :3] = self.rotation @ pose[:, :3]
+        whole[:3, 3] = self.points(pose[:, 3])
+        return whole
 
 
 @dataclass(frozen=True)
@@ -168,15 +150,11 @@ class Surface:
     colors: Tensor
 
 
-ForwardMap = Callable[[Tensor], Tensor]
-
-
 @dataclass(frozen=True)
 class MovingMesh:
-    """A mesh at T times.
+    """A mesh at T times, ascending in [0, 1].
 
     Attributes:
-        times: T times in [0, 1], ascending.
         vertices: (T, V, 3) float32, in the capture's world.
         faces: (F, 3) int64, counter-clockwise from outside.
         colors: (V, 3) RGB in [0, 1], sRGB.
@@ -188,24 +166,13 @@ class MovingMesh:
     colors: Tensor
 
 
-def carried(
-    surface: Surface,
-    forward: Callable[[float], ForwardMap],
-    space: Space,
-    times: Sequence[float],
-    device: torch.device,
-) -> MovingMesh:
-    """A surface at rest, carried through time: each canonical vertex q goes to x(q, t).
-
-    Args:
-        surface: at rest, in the fields' space.
-        forward: time → q → x(q, t), in the fields' space.
-        space: that space.
-        times: in [0, 1], ascending.
-        device: of the fields.
-    """
-    points = surface.points.to(device)
-    moved = [space.to_world(forward(time)(points)).float().cpu() for time in times]
+def carried(surface: Surface, model: Renderable, times: Sequence[float]) -> MovingMesh:
+    """A surface at rest, carried through time: each canonical vertex q goes to x(q, t)."""
+    points, moved = surface.points.to(model.device), []
+    for time in times:
+        forward = model.forward_map(time)
+        assert forward is not None  # who has a surface to export has it
+        moved.append(model.space.to_world(forward(points)).float().cpu())
     return MovingMesh(tuple(times), torch.stack(moved), surface.faces, surface.colors)
 
 
@@ -219,22 +186,9 @@ SPARE = 1.3
 SOLID = 0.5
 
 
-@dataclass(frozen=True)
-class PointCloud:
-    """Coloured points.
-
-    Attributes:
-        points: (N, 3) in the capture's world.
-        colors: (N, 3) RGB in [0, 1], sRGB.
-    """
-
-    points: Tensor
-    colors: Tensor
-
-
 def seen_points(
     renderer: Renderer, cameras: Cameras, time: float, background: float, count: int
-) -> PointCloud:
+) -> tuple[Tensor, Tensor]:
     """What the cameras see at ``time``: the points where their rays end, in the mean.
 
     Args:
@@ -243,30 +197,33 @@ def seen_points(
         time: in [0, 1].
         background: grey level.
         count: of points, at most; of more some, evenly chosen.
+
+    Returns:
+        Points (N, 3) in the capture's world, and their sRGB colours (N, 3) in [0, 1].
     """
     some = cameras[_evenly(len(cameras), CAMERAS)].to(renderer.device)
-    filled = len(_seen(renderer, some.of_height(FIRST), time, background).points)
+    filled = len(_seen(renderer, some.of_height(FIRST), time, background)[0])
     rows = FIRST * (SPARE * count / max(filled, 1)) ** 0.5
-    seen = _seen(renderer, some.of_height(min(round(rows), LARGEST)), time, background)
-    kept = _evenly(len(seen.points), count)
-    return PointCloud(seen.points[kept], seen.colors[kept])
+    points, colors = _seen(renderer, some.of_height(min(round(rows), LARGEST)), time, background)
+    kept = _evenly(len(points), count)
+    return points[kept], colors[kept]
 
 
-def _seen(renderer: Renderer, cameras: Cameras, time: float, background: float) -> PointCloud:
-    """The points that all pixels of the cameras show."""
-    space, points, colors = renderer.model.space, [], []
+def _seen(
+    renderer: Renderer, cameras: Cameras, time: float, background: float
+) -> tuple[Tensor, Tensor]:
+    """As :func:`seen_points`, of all pixels of the cameras."""
+    points, colors = [], []
     for camera in range(len(cameras)):
         rays = cameras.image_rays(camera)
         image = renderer.picture(rays, time, background)
         solid = (image.opacity > SOLID).nonzero()[:, 0]
-        ends = space.rays(rays).at(solid, image.depth[solid])
-        points.append(space.to_world(ends).float().cpu())
+        ends = points_at_depth(renderer.model.space, rays[solid], image.depth[solid])
+        points.append(ends.float().cpu())
         colors.append(image.color[solid].clamp(0, 1).float().cpu())
-    return PointCloud(torch.cat(points), torch.cat(colors))
+    return torch.cat(points), torch.cat(colors)
 
 
 def _evenly(count: int, most: int) -> Tensor:
     """Positions of at most ``most`` of ``count`` things, evenly spread."""
-    if count <= most:
-        return torch.arange(count)
-    return torch.arange(most) * count // most
+    return torch.arange(count) if count <= most else torch.arange(most) * count // most

@@ -35,11 +35,7 @@ Array = npt.NDArray[Any]
 
 
 def write_gltf(
-    path: Path,
-    mesh: MovingMesh,
-    cameras: dict[str, Cameras],
-    frame: UpFrame,
-    seconds: float,
+    path: Path, mesh: MovingMesh, cameras: dict[str, Cameras], frame: UpFrame, seconds: float
 ) -> None:
     """Write a .glb file.
 
@@ -97,30 +93,19 @@ def write_gltf(
             for name, camera in cameras.items()
         ]
         for index, (name, camera) in enumerate(cameras.items()):
-            pose = torch.eye(4, dtype=torch.float64)
-            pose[:3] = frame.cameras(camera).camera_to_world[0]
             # The standard has columns one after another.
-            matrix = pose.T.reshape(-1).tolist()
+            matrix = frame.pose(camera).T.reshape(-1).tolist()
             nodes.append({"name": name, "camera": index, "matrix": matrix})
-    whole["scenes"] = [
-        {
-            "name": "scene",
-            "nodes": list(range(len(nodes))),
-            "extras": {"frame": f"y up ({frame.up} of the capture's world), metres"},
-        }
-    ]
+    extras = {"frame": f"y up ({frame.up} of the capture's world), metres"}
+    whole["scenes"] = [{"name": "scene", "nodes": list(range(len(nodes))), "extras": extras}]
     content.write(path, whole)
 
 
 def _animation(content: _Content, times: tuple[float, ...], seconds: float) -> dict[str, Any]:
     """Each target's weight is 1 at its own time and 0 at the others'."""
-    keys = np.array(times, "f4") * np.float32(seconds)
-    weights = np.eye(len(times), dtype="f4")[:, 1:].reshape(-1)
-    sampler = {
-        "input": content.array(keys, None, limits=True),
-        "output": content.array(weights, None),
-        "interpolation": "LINEAR",
-    }
+    keys = content.array(np.array(times, "f4") * np.float32(seconds), None, limits=True)
+    weights = content.array(np.eye(len(times), dtype="f4")[:, 1:].reshape(-1), None)
+    sampler = {"input": keys, "output": weights, "interpolation": "LINEAR"}
     channel = {"sampler": 0, "target": {"node": 0, "path": "weights"}}
     return {"name": "motion", "samplers": [sampler], "channels": [channel]}
 
@@ -178,12 +163,8 @@ class _Content:
 
     def write(self, path: Path, whole: dict[str, Any]) -> None:
         """Write the file: a header, the description, the arrays."""
-        described = {
-            **whole,
-            "buffers": [{"byteLength": len(self._bytes)}],
-            "bufferViews": self._views,
-            "accessors": self._accessors,
-        }
+        described = whole | {"buffers": [{"byteLength": len(self._bytes)}]}
+        described |= {"bufferViews": self._views, "accessors": self._accessors}
         text = json.dumps(described, separators=(",", ":")).encode()
         text += b" " * (-len(text) % 4)
         length = 12 + 8 + len(text) + 8 + len(self._bytes)

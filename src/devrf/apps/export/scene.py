@@ -8,17 +8,9 @@ from pathlib import Path
 
 import torch
 
-from devrf.apps.export.geometry import (
-    ExportSettings,
-    ForwardMap,
-    MovingMesh,
-    PointCloud,
-    UpFrame,
-    carried,
-    seen_points,
-)
+from devrf.apps.export.geometry import ExportSettings, MovingMesh, UpFrame, carried, seen_points
 from devrf.apps.export.gltf import write_gltf
-from devrf.apps.export.sequence import mesh_files, point_files, write_sequence
+from devrf.apps.export.sequence import Drawn, mesh_files, point_file, write_sequence
 from devrf.apps.export.surface import canonical_surface
 from devrf.apps.export.usd import write_usd
 from devrf.errors import DevrfError
@@ -31,8 +23,8 @@ from devrf.system.progress import followed
 
 log = logging.getLogger(__name__)
 
-# Files of the formats that have one for all times.
-SINGLE = {"gltf": "scene.glb", "usd": "scene.usdc"}
+# Formats that have one file for all times.
+SINGLE = {"gltf": ("scene.glb", write_gltf), "usd": ("scene.usdc", write_usd)}
 
 
 def export_scene(model: Renderable, scene: Scene, settings: ExportSettings, folder: Path) -> None:
@@ -50,7 +42,8 @@ def export_scene(model: Renderable, scene: Scene, settings: ExportSettings, fold
     folder = folder if settings.into is None else Path(settings.into)
     times = settings.export_times(scene.clock) if model.moves else (0.0,)
     if _takes_surface(model, settings):
-        mesh = _moving_mesh(model, scene, settings, times)
+        surface = canonical_surface(model, scene.static.train.cameras, settings)
+        mesh = carried(surface, model, times)
         path = _write_mesh(folder, mesh, scene, settings)
         faces, vertices = len(mesh.faces), mesh.vertices.shape[1]
         log.info(
@@ -65,11 +58,7 @@ def export_scene(model: Renderable, scene: Scene, settings: ExportSettings, fold
 
 
 def _takes_surface(model: Renderable, settings: ExportSettings) -> bool:
-    """Whether a surface is exported, not points.
-
-    Raises:
-        DevrfError: what is asked for cannot be had of the method.
-    """
+    """Whether a surface is exported, not points; refuses what cannot be had of the method."""
     has = model.surface() is not None and model.forward_map(0.0) is not None
     wanted = has if settings.content == "auto" else settings.content == "surface"
     if wanted and not has:
@@ -86,35 +75,16 @@ def _takes_surface(model: Renderable, settings: ExportSettings) -> bool:
     return wanted
 
 
-def _moving_mesh(
-    model: Renderable, scene: Scene, settings: ExportSettings, times: tuple[float, ...]
-) -> MovingMesh:
-    field, device = model.surface(), model.device
-    assert field is not None
-    cameras = scene.static.train.cameras
-    surface = canonical_surface(field, model.space, model.depth_limits, cameras, settings, device)
-
-    def forward(time: float) -> ForwardMap:
-        found = model.forward_map(time)
-        assert found is not None
-        return found
-
-    return carried(surface, forward, model.space, times, device)
-
-
 def _write_mesh(folder: Path, mesh: MovingMesh, scene: Scene, settings: ExportSettings) -> Path:
     """Write in the wanted format; the file, or the folder of files."""
-    if settings.format == "ply" or settings.format == "obj":
-        path = folder / settings.format
-        write_sequence(
-            path, settings.format, mesh.times, mesh_files(mesh), "surface", settings.seconds
-        )
+    if settings.format not in SINGLE:
+        path, drawn = folder / settings.format, mesh_files(mesh)
+        write_sequence(path, settings.format, mesh.times, drawn, "surface", settings.seconds)
         return path
-    path = folder / SINGLE[settings.format]
+    name, write = SINGLE[settings.format]
     frame = UpFrame.of(scene.static.train.cameras, settings.up, settings.metres)
-    write = write_gltf if settings.format == "gltf" else write_usd
-    write(path, mesh, _named_cameras(scene), frame, settings.seconds)
-    return path
+    write(folder / name, mesh, _named_cameras(scene), frame, settings.seconds)
+    return folder / name
 
 
 def _write_points(
@@ -128,15 +98,15 @@ def _write_points(
     renderer, behind = Renderer(model, times=1), background_value(scene.background)
     cameras, most = scene.static.train.cameras, 0
 
-    def clouds() -> Iterator[PointCloud]:
+    def drawn() -> Iterator[Drawn]:
         nonlocal most
         for time in times:
-            cloud = seen_points(renderer, cameras, time, behind, settings.points)
-            most = max(most, len(cloud.points))
-            yield cloud
+            points, colors = seen_points(renderer, cameras, time, behind, settings.points)
+            most = max(most, len(points))
+            yield point_file(points, colors)
 
-    drawn = followed(point_files(clouds()), len(times), "points")
-    write_sequence(folder, "ply", times, drawn, "points", settings.seconds)
+    clouds = followed(drawn(), len(times), "points")
+    write_sequence(folder, "ply", times, clouds, "points", settings.seconds)
     return most
 
 

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from torch import Tensor
 
-from devrf.apps.export.geometry import MovingMesh, PointCloud
+from devrf.apps.export.geometry import MovingMesh
 from devrf.system.files import atomic_write, write_json
 
-INDEX = "index.json"
 FRAME = "world: the axes and the unit of the capture"
 
 # What a moment's file holds: as trimesh writes it.
@@ -29,17 +28,16 @@ def mesh_files(mesh: MovingMesh) -> Iterable[Drawn]:
         yield trimesh.Trimesh(vertices.numpy(), faces, vertex_colors=colors, process=False)
 
 
-def point_files(clouds: Iterable[PointCloud]) -> Iterable[Drawn]:
-    """The points of each time."""
+def point_file(points: Tensor, colors: Tensor) -> Drawn:
+    """The points (N, 3) of a time, with their colours (N, 3) in [0, 1]."""
     import trimesh
 
-    for cloud in clouds:
-        yield trimesh.PointCloud(cloud.points.numpy(), colors=_bytes(cloud.colors))
+    return trimesh.PointCloud(points.numpy(), colors=_bytes(colors))
 
 
 def write_sequence(
     folder: Path,
-    format: Literal["ply", "obj"],
+    format: str,
     times: tuple[float, ...],
     drawn: Iterable[Drawn],
     content: str,
@@ -51,23 +49,21 @@ def write_sequence(
 
     Args:
         folder: for the files.
-        format: of the files, in the capture's world; colours are sRGB.
+        format: ``ply`` or ``obj``, in the capture's world; colours are sRGB.
         times: in [0, 1], one for each file.
         drawn: what each file holds.
         content: ``surface`` or ``points``, for the index.
         seconds: how long time 0 to 1 takes, for the index.
     """
-    names = [f"frame_{number:04d}.{format}" for number in range(len(times))]
-    for name, geometry in zip(names, drawn, strict=True):
+    frames = []
+    for number, (time, geometry) in enumerate(zip(times, drawn, strict=True)):
+        name = f"frame_{number:04d}.{format}"
         with atomic_write(folder / name) as partial:
             geometry.export(str(partial), file_type=format)
-    frames = [
-        {"file": name, "time": time, "seconds": time * seconds}
-        for name, time in zip(names, times, strict=True)
-    ]
-    write_json(folder / INDEX, {"content": content, "frame": FRAME, "frames": frames})
+        frames.append({"file": name, "time": time, "seconds": time * seconds})
+    write_json(folder / "index.json", {"content": content, "frame": FRAME, "frames": frames})
     for path in folder.glob(f"frame_[0-9]*.{format}"):
-        if path.name not in names:
+        if path.name not in {frame["file"] for frame in frames}:
             path.unlink()
 
 

@@ -15,6 +15,7 @@ from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.space import Space
+from devrf.methods.base import Renderable
 from devrf.rendering.view import SurfaceField
 
 # Points at which a field is asked at once.
@@ -27,7 +28,7 @@ ENTRIES = 16
 Mesh = tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]
 
 
-def isosurface(field: SurfaceField, outside: Tensor, threshold: float, side: int | None) -> Mesh:
+def isosurface(model: Renderable, outside: Tensor, threshold: float, side: int | None) -> Mesh:
     """Marching cubes on a field, as if solid wherever no empty way leads from ``outside``.
 
     Density is learned where images show it: behind a surface it often falls to nothing again. A
@@ -37,7 +38,7 @@ def isosurface(field: SurfaceField, outside: Tensor, threshold: float, side: int
     softplus(v + b) that is v + b, which DeVRF interpolates, too (docs/method.md#density).
 
     Args:
-        field: at rest.
+        model: that has a surface.
         outside: (K, 3) points of the fields' space that cameras see through.
         threshold: opacity of one voxel on the surface, in (0, 1).
         side: grid points along the box's longest edge; None: those of the field.
@@ -51,9 +52,13 @@ def isosurface(field: SurfaceField, outside: Tensor, threshold: float, side: int
     """
     from skimage import measure  # an extra
 
-    box = field.box
-    shape = field.shape if side is None else _shape(box, side)
-    depth = _sampled(field, shape)
+    field = _field(model)
+    box, shape = field.box, field.shape
+    if side is not None:
+        x, y, z = (max(2, round(edge / box.longest * (side - 1)) + 1) for edge in box.size)
+        shape = x, y, z
+    points = torch.split(box.grid_points(shape, torch.empty(0)).view(-1, 3), CHUNK)
+    depth = torch.cat([_optical_depth(model, part) for part in points]).view(shape)
     level = _logit(torch.tensor(-math.log1p(-threshold))).item()
     values = _logit(depth).numpy()
     empty = values < level
@@ -75,36 +80,28 @@ def isosurface(field: SurfaceField, outside: Tensor, threshold: float, side: int
     return points.astype(np.float32), faces.astype(np.int64)
 
 
-def entries(cameras: Cameras, space: Space, box: Box, limits: tuple[float, float]) -> Tensor:
-    """Points (K, 3) in the fields' space at which rays of the cameras begin to be sampled.
-
-    Args:
-        cameras: in world units, on the host.
-        space: the space of the fields.
-        box: what holds the scene, in it.
-        limits: distances before and behind which nothing is sampled, in it.
-    """
+def entries(model: Renderable, cameras: Cameras) -> Tensor:
+    """Points (K, 3) in the fields' space at which rays of the cameras begin to be sampled."""
+    space, box = model.space, _field(model).box
     cameras = cameras.resized(ENTRIES, ENTRIES)
     found = []
     for camera in range(len(cameras)):
         rays = space.rays(cameras.image_rays(camera))
-        entry, leave = box.crossing(rays, *limits)
+        entry, leave = box.crossing(rays, *model.depth_limits)
         met = (entry < leave).nonzero()[:, 0]
         found.append(rays.at(met, entry[met]))
     return torch.cat(found)
 
 
-def _shape(box: Box, side: int) -> tuple[int, int, int]:
-    x, y, z = (max(2, round(edge / box.longest * (side - 1)) + 1) for edge in box.size)
-    return x, y, z
+def _field(model: Renderable) -> SurfaceField:
+    field = model.surface()
+    assert field is not None  # the export has asked
+    return field
 
 
-def _sampled(field: SurfaceField, shape: tuple[int, int, int]) -> Tensor:
-    """Optical depth (X, Y, Z) at a grid's points, on the host."""
-    points = field.box.grid_points(shape, torch.empty(0)).view(-1, 3)
-    return torch.cat([field.optical_depth(part).cpu() for part in torch.split(points, CHUNK)]).view(
-        shape
-    )
+def _optical_depth(model: Renderable, points: Tensor) -> Tensor:
+    """τ (M,) at ``points`` (M, 3) of the host, there."""
+    return _field(model).optical_depth(points.to(model.device)).cpu()
 
 
 def _logit(depth: Tensor) -> Tensor:
@@ -126,51 +123,26 @@ def _reached(empty: npt.NDArray[np.bool_], box: Box, outside: Tensor) -> npt.NDA
     return found if found.any() else empty
 
 
-def canonical_surface(
-    field: SurfaceField,
-    space: Space,
-    limits: tuple[float, float],
-    cameras: Cameras,
-    settings: ExportSettings,
-    device: torch.device,
-) -> Surface:
-    """The surface of a field, decimated and coloured.
+def canonical_surface(model: Renderable, cameras: Cameras, settings: ExportSettings) -> Surface:
+    """The surface of a model at rest, decimated and coloured.
 
     Args:
-        field: at rest.
-        space: the space of the fields.
-        limits: distances before and behind which nothing is sampled, in that space.
+        model: that has a surface.
         cameras: that saw the scene, world units, on the host.
         settings: threshold, number of faces, which pieces, how it is coloured.
-        device: of the field.
 
     Raises:
         DevrfError: there is no surface at that threshold, or none within reach.
     """
-    outside = entries(cameras, space, field.box, limits)
-    asked = _OnDevice(field, device)
-    mesh = isosurface(asked, outside, settings.threshold, settings.side)
+    space = model.space
+    mesh = isosurface(model, entries(model, cameras), settings.threshold, settings.side)
     mesh = _within_reach(mesh, space, cameras, settings.reach)
     mesh = _decimated(_large_pieces(mesh, settings.pieces), settings.faces)
     points, faces = torch.from_numpy(mesh[0]), torch.from_numpy(mesh[1])
-    seen = faces.flip(1) if _mirrors(space, field) else faces
+    seen = faces.flip(1) if _mirrors(space, _field(model).box) else faces
     normals = vertex_normals(space.to_world(points), seen)
-    colors = vertex_colors(asked, points, faces, normals, averaged=settings.colors == "mean")
+    colors = vertex_colors(model, points, faces, normals, averaged=settings.colors == "mean")
     return Surface(points, seen, colors)
-
-
-class _OnDevice:
-    """A field that is asked for points on the host, and answers there."""
-
-    def __init__(self, field: SurfaceField, device: torch.device) -> None:
-        self._field, self._device = field, device
-        self.box, self.shape = field.box, field.shape
-
-    def optical_depth(self, points: Tensor) -> Tensor:
-        return self._field.optical_depth(points.to(self._device)).cpu()
-
-    def color(self, points: Tensor, viewdirs: Tensor) -> Tensor:
-        return self._field.color(points.to(self._device), viewdirs.to(self._device)).cpu()
 
 
 def _within_reach(mesh: Mesh, space: Space, cameras: Cameras, reach: float) -> Mesh:
@@ -214,9 +186,9 @@ def _decimated(mesh: Mesh, faces: int) -> Mesh:
     return np.asarray(fewer.vertices, np.float32), np.asarray(fewer.faces, np.int64)
 
 
-def _mirrors(space: Space, field: SurfaceField) -> bool:
+def _mirrors(space: Space, box: Box) -> bool:
     """Whether the way to the world turns right-handed axes into left-handed ones."""
-    corner, steps = torch.tensor(field.box.middle), torch.diag(torch.tensor(field.box.size) / 100)
+    corner, steps = torch.tensor(box.middle), torch.diag(torch.tensor(box.size) / 100)
     way = space.to_world(corner + steps) - space.to_world(corner)
     return bool(torch.linalg.det(way / way.norm(dim=1, keepdim=True)) < 0)
 
@@ -232,7 +204,7 @@ DIRECTIONS, WIDEST = 16, 60.0
 
 
 def vertex_colors(
-    field: SurfaceField, points: Tensor, faces: Tensor, normals: Tensor, *, averaged: bool
+    model: Renderable, points: Tensor, faces: Tensor, normals: Tensor, *, averaged: bool
 ) -> Tensor:
     """RGB (V, 3) in [0, 1] of vertices.
 
@@ -240,46 +212,37 @@ def vertex_colors(
     is that of a ray that goes straight in, Σ w_i c_i / Σ w_i (docs/method.md#compositing).
 
     Args:
-        field: at rest, on the host.
+        model: that has a surface.
         points: (V, 3) in the fields' space.
         faces: (F, 3) int64, counter-clockwise from outside in that space.
         normals: (V, 3) unit normals, outward in the world.
         averaged: over directions up to 60 degrees off the normal; False: along the normal.
     """
-    box = field.box
-    low, _ = box.corners(points)
-    voxel = points.new_tensor(box.size) / (points.new_tensor(field.shape) - 1)
+    field = _field(model)
+    low, _ = field.box.corners(points)
+    voxel = points.new_tensor(field.box.size) / (points.new_tensor(field.shape) - 1)
     inward = -voxel * vertex_normals((points - low) / voxel, faces)
     eyes = _cap(DIRECTIONS, math.radians(WIDEST)) if averaged else torch.eye(3)[2:]
-    found = [
-        _seen(
-            field,
-            points[k : k + VERTICES],
-            inward[k : k + VERTICES],
-            normals[k : k + VERTICES],
-            eyes,
-        )
-        for k in range(0, len(points), VERTICES)
-    ]
-    return torch.cat(found).clamp(0, 1)
+    parts = zip(*(torch.split(part, VERTICES) for part in (points, inward, normals)), strict=True)
+    return torch.cat([_seen(model, p, way, n, eyes) for p, way, n in parts]).clamp(0, 1)
 
 
 def _seen(
-    field: SurfaceField, points: Tensor, inward: Tensor, normals: Tensor, toward_eyes: Tensor
+    model: Renderable, points: Tensor, inward: Tensor, normals: Tensor, toward_eyes: Tensor
 ) -> Tensor:
     """RGB (V, 3), the mean over the directions (K, 3), each weighted by its cosine."""
     way = torch.arange(BEFORE, BEHIND + STEP / 2, STEP)
     samples = points[:, None] + way[:, None] * inward[:, None]
-    depth = STEP * field.optical_depth(samples.reshape(-1, 3)).view(samples.shape[:2])
+    depth = STEP * _optical_depth(model, samples.reshape(-1, 3)).view(samples.shape[:2])
     weight = torch.exp(depth - depth.cumsum(dim=1)) * -torch.expm1(-depth)
     weight = weight / weight.sum(dim=1, keepdim=True).clamp(min=1e-9)
     vertex, sample = (weight > SIGNIFICANT).nonzero(as_tuple=True)
     share, where = weight[vertex, sample, None], samples[vertex, sample]
-    frames = _frames(normals)
+    field, device, frames = _field(model), model.device, _frames(normals)
     seen, total = torch.zeros_like(points), toward_eyes[:, 2].sum()
     for direction in toward_eyes:
         viewdirs = -(frames @ direction)
-        color = field.color(where, viewdirs[vertex])
+        color = field.color(where.to(device), viewdirs[vertex].to(device)).cpu()
         seen.index_add_(0, vertex, share * color * (direction[2] / total))
     kept = torch.zeros(len(points)).index_add_(0, vertex, share[:, 0])
     return seen / kept.clamp(min=1e-9)[:, None]

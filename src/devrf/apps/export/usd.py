@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from devrf.apps.export.geometry import MovingMesh, UpFrame
 from devrf.apps.export.gltf import linear
@@ -21,15 +20,7 @@ FILM = 20.955
 def write_usd(
     path: Path, mesh: MovingMesh, cameras: dict[str, Cameras], frame: UpFrame, seconds: float
 ) -> None:
-    """Write a .usdc file.
-
-    Args:
-        path: the file.
-        mesh: in the capture's world.
-        cameras: one each, by name, in that world; principal points are taken to be the centres.
-        frame: of the file.
-        seconds: how long time 0 to 1 takes.
-    """
+    """Write a .usdc file; arguments as for :func:`~devrf.apps.export.gltf.write_gltf`."""
     from pxr import Gf, Sdf, Usd, UsdGeom, Vt  # an extra
 
     stage = Usd.Stage.CreateInMemory()
@@ -62,9 +53,7 @@ def write_usd(
         lens.CreateHorizontalApertureAttr(FILM)
         lens.CreateVerticalApertureAttr(focal * camera.height / fy)
         lens.CreateFocalLengthAttr(focal)
-        pose = torch.eye(4, dtype=torch.float64)
-        pose[:3] = frame.cameras(camera).camera_to_world[0]
         # Gf multiplies rows from the left.
-        lens.AddTransformOp().Set(Gf.Matrix4d(pose.T.tolist()))
+        lens.AddTransformOp().Set(Gf.Matrix4d(frame.pose(camera).T.tolist()))
     with atomic_write(path) as partial:
         stage.GetRootLayer().Export(str(partial))

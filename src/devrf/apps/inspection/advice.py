@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -30,15 +30,8 @@ MIN_FLOW = 0.02
 MUCH_MASKED = 0.5
 
 
-@dataclass(frozen=True)
-class Advice:
-    """A problem that lowers quality.
-
-    Attributes:
-        where: the file, the view or the part of the scene.
-        what: what was found there.
-        remedy: what to do.
-    """
+class Advice(NamedTuple):
+    """A problem that lowers quality: a file, view or part of the scene, and what to do."""
 
     where: str
     what: str
@@ -50,18 +43,8 @@ class Advice:
 
 def advice_on(scene: Scene) -> list[Advice]:
     """Problems that cameras, images, masks, times and flow show."""
-    return [
-        *_held_out(scene),
-        *_looking_away(scene),
-        *_box_unknown(scene),
-        *_one_side(scene),
-        *_blank(scene),
-        *_turned(scene),
-        *_alpha(scene),
-        *_masks(scene),
-        *_times(scene),
-        *_flow(scene.dynamic.train),
-    ]
+    checks = _held_out, _box_unknown, _one_side, _images, _alpha, _masks, _times, _flow
+    return [advice for check in checks for advice in check(scene)]
 
 
 def image_sets(scene: Scene) -> dict[str, Views]:
@@ -72,20 +55,6 @@ def image_sets(scene: Scene) -> dict[str, Views]:
         for kind, views in (("training", capture.train), ("test", capture.test))
         if len(views)
     }
-
-
-def images_where(scene: Scene, test: Callable[[Views, int], bool]) -> list[str]:
-    """Names of the images of all sets that pass a test of (views, position), each once.
-
-    Sets may share files.
-    """
-    names = (
-        views.names[k]
-        for views in image_sets(scene).values()
-        for k in range(len(views))
-        if test(views, k)
-    )
-    return list(dict.fromkeys(names))
 
 
 def listed(names: Sequence[str], most: int = 3) -> str:
@@ -125,25 +94,6 @@ def _twins(test: Views, train: Views, middle: Tensor) -> list[str]:
     return names
 
 
-def _looking_away(scene: Scene) -> Iterator[Advice]:
-    points = box_points(scene, scene.bounds.box, (9, 9, 9))
-
-    def away(views: Views, k: int) -> bool:
-        return float(views.cameras.project_into(k, points[4, 4, 4:5])[1]) <= 0
-
-    def beside(views: Views, k: int) -> bool:
-        pixels, depth = views.cameras.project_into(k, points.reshape(-1, 3))
-        size = pixels.new_tensor([views.width, views.height])
-        seen = (depth > 0) & ((pixels >= 0) & (pixels <= size)).all(dim=1)
-        return not away(views, k) and not bool(seen.any())
-
-    remedy = "check the pose (camera-to-world, x right, y up, looking along -z), or set data.box"
-    if names := images_where(scene, away):
-        yield Advice(listed(names), "looks away from the middle of the box", remedy)
-    if names := images_where(scene, beside):
-        yield Advice(listed(names), "does not have the box in the picture", remedy)
-
-
 def _box_unknown(scene: Scene) -> Iterator[Advice]:
     views, box = scene.static.train, scene.bounds.box
     if scene.kind != "inward" or not scene.space.is_linear or views.has_alpha:
@@ -162,8 +112,7 @@ def _box_unknown(scene: Scene) -> Iterator[Advice]:
 
 
 def _one_side(scene: Scene) -> Iterator[Advice]:
-    inward, cameras = scene.kind == "inward", scene.static.train.cameras
-    gap = widest_gap(cameras, box_middle(scene)) if inward else None
+    gap = widest_gap(scene)
     if gap is not None and gap > WIDEST_GAP:
         yield Advice(
             "static training set",
@@ -179,13 +128,41 @@ def mean_share(masks: Iterable[Tensor]) -> float:
     return sum(shares) / len(shares)
 
 
-def _blank(scene: Scene) -> Iterator[Advice]:
-    if flat := images_where(scene, _is_flat):
-        remedy = "look at the file, and leave it out if it is lost"
-        yield Advice(listed(flat), "one colour all over", remedy)
-    if empty := images_where(scene, _is_empty):
-        what = "its alpha mask is empty: it shows background only"
-        yield Advice(listed(empty), what, "look at the alpha channel, or leave the image out")
+def _images(scene: Scene) -> Iterator[Advice]:
+    """Problems of single images; sets may share files, and each is named once."""
+    points = box_points(scene, scene.bounds.box, (9, 9, 9))
+
+    def away(views: Views, k: int) -> bool:
+        return float(views.cameras.project_into(k, points[4, 4, 4:5])[1]) <= 0
+
+    def beside(views: Views, k: int) -> bool:
+        pixels, depth = views.cameras.project_into(k, points.reshape(-1, 3))
+        size = pixels.new_tensor([views.width, views.height])
+        seen = (depth > 0) & ((pixels >= 0) & (pixels <= size)).all(dim=1)
+        return not away(views, k) and not bool(seen.any())
+
+    pose = "check the pose (camera-to-world, x right, y up, looking along -z), or set data.box"
+    for test, what, remedy in (
+        (away, "looks away from the middle of the box", pose),
+        (beside, "does not have the box in the picture", pose),
+        (_is_flat, "one colour all over", "look at the file, and leave it out if it is lost"),
+        (
+            _is_empty,
+            "its alpha mask is empty: it shows background only",
+            "look at the alpha channel, or leave the image out",
+        ),
+        (
+            _is_ambiguous,
+            "its EXIF orientation says that it is to be seen turned; it is read as it is stored, "
+            "since its camera does not tell",
+            "if the cameras were found on turned images, turn the files too "
+            "(mogrify -auto-orient); else take the orientation out (exiftool -Orientation=)",
+        ),
+    ):
+        sets = image_sets(scene).values()
+        names = [views.names[k] for views in sets for k in range(len(views)) if test(views, k)]
+        if names:
+            yield Advice(listed(list(dict.fromkeys(names))), what, remedy)
 
 
 def _valid_pixels(views: Views, k: int) -> Tensor:
@@ -210,17 +187,6 @@ def _is_ambiguous(views: Views, k: int) -> bool:
     return views.ambiguous_orientation is not None and bool(views.ambiguous_orientation[k])
 
 
-def _turned(scene: Scene) -> Iterator[Advice]:
-    if names := images_where(scene, _is_ambiguous):
-        yield Advice(
-            listed(names),
-            "its EXIF orientation says that it is to be seen turned; it is read as it is stored, "
-            "since its camera does not tell",
-            "if the cameras were found on turned images, turn the files too "
-            "(mogrify -auto-orient); else take the orientation out (exiftool -Orientation=)",
-        )
-
-
 def _alpha(scene: Scene) -> Iterator[Advice]:
     sets = image_sets(scene)
     without = [name for name, views in sets.items() if not views.has_alpha]
@@ -240,13 +206,10 @@ def _alpha(scene: Scene) -> Iterator[Advice]:
 
 
 def _masks(scene: Scene) -> Iterator[Advice]:
-    masked = {
-        name: mean_share(~mask for mask in views.valid_mask)
-        for name, views in image_sets(scene).items()
-        if views.valid_mask is not None
-    }
-    much = {name: share for name, share in masked.items() if share > MUCH_MASKED}
-    if much:
+    sets = image_sets(scene).items()
+    masks = {name: views.valid_mask for name, views in sets if views.valid_mask is not None}
+    shares = {name: mean_share(~mask for mask in of_set) for name, of_set in masks.items()}
+    if much := {name: share for name, share in shares.items() if share > MUCH_MASKED}:
         yield Advice(
             listed(list(much), 4),
             f"masks leave out up to {100 * max(much.values()):.0f} % of the pixels, of which "
@@ -271,11 +234,9 @@ def _times(scene: Scene) -> Iterator[Advice]:
     numbers = set(views.view.tolist())
     if len(numbers) == len(views):
         return  # a moving camera: each image is a view of its own
-    frames = clock.frames_of(views.times)
-    fewer = []
+    frames, fewer = clock.frames_of(views.times), []
     for frame in sorted(set(frames.tolist())):
-        missing = sorted(numbers - set(views.view[frames == frame].tolist()))
-        if missing:
+        if missing := sorted(numbers - set(views.view[frames == frame].tolist())):
             without = ", ".join(map(str, missing))
             fewer.append(f"time {clock.times[frame]:.3g} without view {without}")
     if fewer:
@@ -286,8 +247,8 @@ def _times(scene: Scene) -> Iterator[Advice]:
         )
 
 
-def _flow(views: Views) -> Iterator[Advice]:
-    flow = views.flow
+def _flow(scene: Scene) -> Iterator[Advice]:
+    views, flow = scene.dynamic.train, scene.dynamic.train.flow
     if flow is None:
         return
     longest = max(views.width, views.height)

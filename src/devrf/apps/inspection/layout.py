@@ -22,13 +22,9 @@ STEEP = 75.0
 
 
 def box_points(scene: Scene, box: Box, shape: tuple[int, int, int]) -> Tensor:
-    """A grid (X, Y, Z, 3) over a box of the scene, in world units.
+    """A grid (X, Y, Z, 3) over a box in the fields' space, faces included, in world units.
 
-    Args:
-        scene: its space maps the box into the world; an NDC box is cut off before infinity, and of
-            contracted space the inner box is taken.
-        box: a box in the fields' space.
-        shape: grid points along x, y, z; the outer ones lie on the box's faces.
+    An NDC box is cut off before infinity, and of contracted space the inner box is taken.
     """
     if scene.kind == "forward":
         box = Box.of(list(box.low), [*box.high[:2], min(box.high[2], NDC_CUT)])
@@ -59,31 +55,26 @@ def common_up(cameras: Cameras) -> Tensor | None:
 
 
 def horizontal_axes(up: Tensor, near: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Unit vectors east and north (3,), at right angles to ``up`` and to each other.
+    """Unit vectors east and north (3,), at right angles to the unit vector ``up`` (3,).
 
-    Args:
-        up: (3,) unit vector.
-        near: (3,) direction that east is to be near to; None: the most level world axis.
+    East is ``near`` (3,), or the most level world axis.
     """
     near = torch.eye(3).to(up)[int(up.abs().argmin())] if near is None else near
     east = normalize(near - (near @ up) * up, dim=0)
     return east, torch.linalg.cross(up, east)
 
 
-def widest_gap(cameras: Cameras, middle: Tensor) -> float | None:
-    """The widest angle in degrees, seen from above, in which no camera stands.
+def widest_gap(scene: Scene) -> float | None:
+    """The widest angle in degrees, seen from above, in which no static camera stands.
 
-    Args:
-        cameras: cameras around the scene.
-        middle: (3,) the point that they surround, world units.
-
-    Returns:
-        360 for a single direction; None where up is unknown or most cameras look from above.
+    360 for a single direction; None where cameras look from one side or most from above, or up is
+    unknown.
     """
-    up = common_up(cameras)
+    cameras = scene.static.train.cameras
+    up = common_up(cameras) if scene.kind == "inward" else None
     if up is None:
         return None
-    toward = normalize(cameras.positions - middle, dim=1)
+    toward = normalize(cameras.positions - box_middle(scene), dim=1)
     toward = toward[(toward @ up).abs() < math.sin(math.radians(STEEP))]
     if len(toward) < len(cameras) / 2:
         return None

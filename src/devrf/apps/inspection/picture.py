@@ -100,25 +100,21 @@ def inspection_figure(scene: Scene) -> Figure:
 def _dynamic_sections(views: Views) -> list[Section]:
     """Sample images of the dynamic views, and below the flow of the same images."""
     samples = sample_images(views)
-    label = {
-        k: f"view {int(views.view[k])}, time {float(views.times[k]):.2f}"
-        for row in samples
-        for k in row
-    }
+    shown_images = [k for row in samples for k in row]
+    label = {k: f"view {views.view[k]}, time {float(views.times[k]):.2f}" for k in shown_images}
     numbers, times = len(set(views.view.tolist())), len(set(views.times.tolist()))
     motion = "a moving camera" if numbers == len(views) else f"{numbers} fixed views"
     rows: list[list[Tile]] = [[(shown(views, k), label[k]) for k in row] for row in samples]
     sections: list[Section] = [(f"Dynamic training set: {motion}, {times} times", rows)]
     if views.flow is None:
         return sections
-    longest, flowing = flow_scale(views.flow), {image for image, _ in frame_pairs(views)}
+    longest, vectors, valid = flow_scale(views.flow), views.flow.vectors, views.flow.valid
     images = {
-        k: _smaller(flow_colors(views.flow.vectors[k], views.flow.valid[k], longest))
-        for k in flowing.intersection(label)
+        k: (_smaller(flow_colors(vectors[k], valid[k], longest)), label[k])
+        for k, _ in frame_pairs(views)
+        if k in label
     }
-    flow: list[list[Tile]] = [
-        [(images[k], label[k]) if k in images else None for k in row] for row in samples
-    ]
+    flow: list[list[Tile]] = [[images.get(k) for k in row] for row in samples]
     # The first image of a view has no frame before it.
     flow[0][0] = (to_bytes(flow_wheel(300)).numpy(), f"rim: {longest:.3g} px or more")
     heading = (
@@ -129,10 +125,7 @@ def _dynamic_sections(views: Views) -> list[Section]:
 
 
 def sample_images(views: Views) -> list[list[int]]:
-    """Positions of images to show: a row for each of some fixed views, at some times.
-
-    Images of a moving camera follow one another in up to two rows.
-    """
+    """Rows of images to show: some fixed views at some times, or up to two of a moving camera."""
     order = sorted(range(len(views)), key=lambda k: (float(views.times[k]), k))
     numbers = list(first_images(views))
     if len(numbers) == len(views):
@@ -187,8 +180,7 @@ class Lines(NamedTuple):
 def draw_cameras(scene: Scene, side: Any, plan: Axes) -> None:
     """Draw cameras and boxes, in perspective (an Axes3D) and from above.
 
-    Axes are in world units, counted from the middle of the box, along east, north and up of
-    the cameras.
+    World units from the middle of the box, along east, north and up of the cameras.
     """
     axes, middle = compass(scene), box_middle(scene)
     groups = scene_lines(scene)
@@ -232,16 +224,12 @@ def scene_lines(scene: Scene) -> list[Lines]:
     lines = [Lines("box" + endless * " (endless, cut off)", box_edges(scene, bounds.box), "0.2", 2)]
     if bounds.motion is not None:
         lines.append(Lines("room for motion", box_edges(scene, bounds.motion), "#1f9e6b", 2))
-    sets = [
+    for label, views, color, width in (
         ("static views", scene.static.train, "#4f7fd0", 1.0),
         ("held-out static", scene.static.test, "#7cc4ea", 1.0),
-    ]
-    if scene.moves:
-        sets += [
-            ("dynamic views", scene.dynamic.train, TRAIN_COLOR, 2.0),
-            ("held-out dynamic", scene.dynamic.test, TEST_COLOR, 2.0),
-        ]
-    for label, views, color, width in sets:
+        ("dynamic views", scene.dynamic.train, TRAIN_COLOR, 2.0),
+        ("held-out dynamic", scene.dynamic.test, TEST_COLOR, 2.0),
+    )[: 4 if scene.moves else 2]:
         images = list(first_images(views).values())
         ends = frusta(views.cameras[images], size)
         lines.append(Lines(f"{label} ({len(images)})", ends, color, width))

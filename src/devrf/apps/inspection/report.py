@@ -82,9 +82,7 @@ def scene_facts(scene: Scene) -> list[Row]:
             text += f", drift by {100 * drift:.1f} % over all"
             text += ": try schedule.extensions.color_residual.learn=always" * (drift >= CHANGING)
         rows.append(("colours along the flow", text))
-    gap = None
-    if scene.kind == "inward":
-        gap = widest_gap(scene.static.train.cameras, box_middle(scene))
+    gap = widest_gap(scene)
     if gap is not None:
         rows.insert(2, ("static views", f"widest sector without one: {gap:.0f} degrees"))
     return rows
@@ -99,8 +97,8 @@ def _times(views: Views) -> str:
     times = _distinct_times(views)
     steps = times.diff()
     even = torch.allclose(steps, steps.mean(), rtol=0.01, atol=FrameClock.TOLERANCE)
-    spacing = "evenly spaced" if even else "unevenly spaced"
-    return f"{len(times)} from {float(times[0]):g} to {float(times[-1]):g}, {spacing}"
+    spacing = "" if even else "un"
+    return f"{len(times)} from {float(times[0]):g} to {float(times[-1]):g}, {spacing}evenly spaced"
 
 
 def _distinct_times(views: Views) -> Tensor:

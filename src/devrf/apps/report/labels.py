@@ -69,10 +69,9 @@ RECORDED: tuple[tuple[str, str, type, Callable[[Any], str]], ...] = (
 def labelled(runs: pd.DataFrame) -> pd.DataFrame:
     """The runs in the order of a table: scenes as they come, ablations as in the paper.
 
-    Returns:
-        The runs with further columns: ``label``, the same for runs that share a row; ``name``, the
-        label without the protocol; ``line``, the label without the number of views; ``views``,
-        the number of dynamic training views (NaN where unknown).
+    Further columns are ``label``, the same for runs that share a row; ``name``, the label without
+    the protocol; ``line``, the label without the number of views; ``views``, the number of dynamic
+    training views (NaN where unknown).
     """
     traits = _distinguishing(runs["scene"], [_traits(run) for run in runs.to_dict("records")])
     views = runs.get("run.train_views", pd.Series(None, runs.index, dtype=object))
@@ -147,7 +146,9 @@ def _distinguishing(scenes: pd.Series, traits: list[dict[str, str]]) -> list[dic
     frame = frame.reindex(columns=[*ALWAYS, *keys, IDENTITY], fill_value="").assign(scene=scenes)
     equal = frame.groupby(["scene", IDENTITY])
     # Equal runs have one name, that of the ablation that its settings were called by, if any.
-    frame["method"] = equal["method"].transform(lambda names: min(names, key=_rank_of_name))
+    frame["method"] = equal["method"].transform(
+        lambda names: min(names, key=lambda name: _rank(name, ABLATIONS.values()))
+    )
     chosen = list(ALWAYS)
     rows = frame.groupby(["scene", *chosen]).ngroups
     for key in keys:
@@ -156,10 +157,6 @@ def _distinguishing(scenes: pd.Series, traits: list[dict[str, str]]) -> list[dic
         if finer > rows and (equal[key].nunique() == 1).all():
             chosen, rows = [*chosen, key], finer
     return list(frame[chosen].to_dict("records"))
-
-
-def _rank_of_name(name: str) -> int:
-    return _rank(name, ABLATIONS.values())
 
 
 def _label(traits: Mapping[str, str], without: str = "") -> str:

@@ -92,10 +92,7 @@ def file_name(text: str) -> str:
 
 @mpl.rc_context(STYLE)
 def psnr_over_time(table: Table, scene: str) -> Figure | None:
-    """PSNR of the held-out images of one scene over time, a curve a row; the mean over runs.
-
-    None where no run has frames.
-    """
+    """PSNR of one scene's held-out images over time, a mean curve a row; None without frames."""
     figure = Figure(figsize=(6.4, 3.6), layout="constrained")
     axes = figure.subplots()
     for label, runs in table.runs[table.runs["scene"] == scene].groupby("label", sort=False):
@@ -114,10 +111,7 @@ def psnr_over_time(table: Table, scene: str) -> Figure | None:
 
 @mpl.rc_context(STYLE)
 def psnr_against_seconds(table: Table) -> Figure | None:
-    """PSNR against training time, a panel a scene, the paper's rows as hollow marks.
-
-    None where no run has both.
-    """
+    """PSNR against training time, a panel a scene, the paper's rows hollow; None without both."""
     both = table.rows[(table.rows[TIME.title] > 0) & table.rows[PSNR.title].notna()]
     scenes = both.index.get_level_values("scene")
     blocks = [block for block in table.blocks if block.title in scenes]
@@ -203,10 +197,7 @@ def _style(k: int) -> tuple[str, str]:
 
 
 def _legend(figure: Figure) -> None:
-    """One legend below the figure for all its panels: each label once, ours first.
-
-    The figure grows, so that the legend takes no room from the panels and is nowhere cut off.
-    """
+    """One legend for all panels, ours first; the figure grows by it, so that nothing is cut off."""
     handles: dict[str, Artist] = {}
     for axes in figure.axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
@@ -226,19 +217,11 @@ def _legend(figure: Figure) -> None:
 
 
 BATCHES, MEAN, PREVIEWS = "#9ec9e6", "#0072b2", "#d55e00"
-CURVE_STYLE: dict[Any, Any] = {
-    "font.size": 10,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": "#e6e6e6",
-    "legend.frameon": False,
-}
 # The running mean is over so large a part of the curve; more labels of grids would overlap.
 WINDOW, MOST_GRIDS = 1 / 25, 8
 
 
+@mpl.rc_context(STYLE)
 def write_training_curve(
     path: Path,
     stage: str,
@@ -246,22 +229,10 @@ def write_training_curve(
     previews: Sequence[tuple[int, float]] = (),
     grids: Sequence[tuple[int, str]] = (),
 ) -> None:
-    """Write the plot as a PNG; see :func:`training_curve`."""
-    figure = training_curve(stage, batches, previews, grids)
-    with atomic_write(path) as partial:
-        figure.savefig(partial, format="png", dpi="figure")
-
-
-@mpl.rc_context(CURVE_STYLE)
-def training_curve(
-    stage: str,
-    batches: Sequence[tuple[int, float]],
-    previews: Sequence[tuple[int, float]] = (),
-    grids: Sequence[tuple[int, str]] = (),
-) -> Figure:
-    """The plot of (iteration, PSNR in dB) of training batches.
+    """Plot (iteration, PSNR in dB) of training batches, and write it as a PNG.
 
     Args:
+        path: the file.
         stage: its name.
         batches: of each step, ascending, at least one.
         previews: the same of a held-out view; may be empty.
@@ -278,10 +249,9 @@ def training_curve(
     if 1 < len(grids) <= MOST_GRIDS:
         for iteration, shape in grids:
             axes.axvline(iteration, color="0.75", linewidth=0.8, linestyle=":")
-            place: dict[str, Any] = {"xytext": (3, 2), "textcoords": "offset points"}
-            at = (iteration, 1), ("data", "axes fraction")
-            axes.annotate(shape, at[0], xycoords=at[1], fontsize=8, color="0.4", **place)
+            axes.text(iteration, 1, f" {shape}", transform=axes.get_xaxis_transform(), color="0.4")
     axes.set(xlabel="iteration", ylabel="PSNR (dB)")
     axes.set_title(f"{stage}: PSNR of the training batches", loc="left", pad=20)
     figure.legend(loc="outside lower center", ncols=3)
-    return figure
+    with atomic_write(path) as partial:
+        figure.savefig(partial, format="png", dpi="figure")

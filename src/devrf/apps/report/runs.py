@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,8 +24,6 @@ Section = dict[str, Any]
 
 
 class _Setup(BaseModel):
-    """How a run was configured, and where it ran."""
-
     model_config = ConfigDict(strict=True, extra="allow")
     choices: dict[str, str | None] | None = None
     overrides: list[str] | None = None
@@ -60,7 +57,6 @@ class Collection:
     """What was found below a folder.
 
     Attributes:
-        folder: the folder that was searched.
         runs: a row for each scored run: ``COLUMNS`` and everything in its ``metrics.json``.
             ``folder`` is relative to the one searched; ``train_seconds`` and ``peak_gpu_gb`` (GiB)
             are of the whole run, NaN unless every stage recorded its own.
@@ -75,10 +71,7 @@ class Collection:
 
 
 def collect(folder: Path) -> Collection:
-    """Find every run below ``folder``, at any depth, ``folder`` itself included.
-
-    A finished run has a ``metrics.json``, a failed job a ``failure.json``. Hidden folders are
-    passed over.
+    """Find every ``metrics.json`` and ``failure.json`` below ``folder``, but for hidden folders.
 
     Raises:
         DevrfError: no such folder.
@@ -87,7 +80,9 @@ def collect(folder: Path) -> Collection:
         raise DevrfError(f"report.runs: no folder {folder}; give the folder that holds the runs")
     records: dict[str, list[dict[str, Any]]] = {"finished": [], "failed": []}
     skipped: list[str] = []
-    for place in _folders(folder):
+    for walked, inner, _ in os.walk(folder):
+        inner[:] = sorted((name for name in inner if not name.startswith(".")), key=_natural)
+        place = Path(walked)
         name = folder.resolve().name if place == folder else place.relative_to(folder).as_posix()
         for file, status, read in (
             (place / "failure.json", "failed", _failed),
@@ -122,12 +117,6 @@ def metric_over_time(path: Path, metric: str) -> pd.Series:
         return frames.astype({"time": float, metric: float}).groupby("time")[metric].mean()
     except (OSError, ValueError, KeyError):
         return pd.Series(dtype=float)
-
-
-def _folders(folder: Path) -> Iterator[Path]:
-    for place, inner, _ in os.walk(folder):
-        inner[:] = sorted((name for name in inner if not name.startswith(".")), key=_natural)
-        yield Path(place)
 
 
 def _natural(name: str) -> tuple[int, int, str]:

@@ -20,17 +20,14 @@ METRICS = ["PSNR", "SSIM", "LPIPS", "GPU (GB)", "Time"]
 
 @dataclass(frozen=True)
 class Published:
-    """What the paper reports.
+    """What the paper reports, and where.
 
     Attributes:
-        title: of the paper.
-        authors: of the paper.
         venue: where it appeared, and in which tables.
         hardware: what it was measured on.
         tables: the number of the table that holds each scene, by devrf's name of the scene.
-        texts: the cells as printed, indexed by scene and label; PSNR in dB, LPIPS with VGG, time
-            in minutes or hours (``8mins``, ``22.4hrs``). The column ``method`` is the paper's own
-            name: ``[7]`` is one of its references, and its "Ours" is DeVRF in the label.
+        texts: the cells as printed, indexed by scene and label. The column ``method`` is the
+            paper's own name; its "Ours" is DeVRF in the label.
         values: the same cells as numbers, the time in seconds.
     """
 
@@ -118,11 +115,7 @@ class Block:
     Both frames are indexed by label. Their columns have two levels: ``head`` has ``name``,
     ``protocol`` and ``counts`` (a set of numbers of runs averaged); ``value`` (NaN where unknown),
     ``text`` and ``rank`` (1, 2, 3 for the best, else 0) have the title of each column.
-
-    Attributes:
-        title: the scene's name, or what was averaged.
-        measured: rows of runs, ranked among themselves.
-        published: rows of the paper, not ranked.
+    Published rows are not ranked.
     """
 
     title: str
@@ -135,10 +128,8 @@ class Table:
     """The contents of a report.
 
     Attributes:
-        collection: the runs and failures that it is about.
-        columns: those of its rows.
-        runs: the runs whose dynamic capture was scored, or of a scene at rest the static one;
-            labelled.
+        runs: the labelled runs whose dynamic capture was scored, or of a scene at rest the static
+            one.
         rows: means over runs, indexed by scene and label: ``name``, ``protocol``, ``line``,
             ``views``, ``count`` and each column's title; NaN unless all runs of the row have the
             value.
@@ -160,17 +151,12 @@ class Table:
 
 
 def tabulate(collection: Collection, published_scenes: PublishedScenes = "matching") -> Table:
-    """Make the tables of a collection.
-
-    Args:
-        collection: finished runs and failures.
-        published_scenes: which of the paper's rows to show: of the scenes that were run, all, or
-            none.
-    """
+    """The tables of a collection, beside the paper's rows of its scenes, of all, or of none."""
     scored = _values(collection.runs, PSNR).notna()
     again = _scored_again(collection.runs[scored])
     runs = labelled(collection.runs[scored].drop(index=again.index))
-    columns = _columns(runs)
+    of_times = [c for c in OF_TIMES if c.key in runs and _values(runs, c).notna().any()]
+    columns = (PSNR, *of_times, *COLUMNS[1:])
     titles = [column.title for column in columns]
     for column in columns:
         runs[column.title] = _values(runs, column)
@@ -202,12 +188,6 @@ def tabulate(collection: Collection, published_scenes: PublishedScenes = "matchi
     return Table(collection, columns, runs, rows, tuple(blocks), tuple(notes))
 
 
-def _columns(runs: pd.DataFrame) -> tuple[Column, ...]:
-    """The paper's columns, and those of training and novel times that a run has."""
-    known = [c for c in OF_TIMES if c.key in runs and _values(runs, c).notna().any()]
-    return (*COLUMNS[:1], *known, *COLUMNS[1:])
-
-
 def _values(runs: pd.DataFrame, column: Column) -> pd.Series:
     """The values of a column, NaN where unknown; those of scenes at rest are of the static set."""
     values = runs[column.key].map(number).astype(float)
@@ -232,10 +212,7 @@ def shown(value: float, column: Column, spread: float = math.nan) -> str:
 
 
 def ranked(values: pd.Series, column: Column) -> pd.Series:
-    """1, 2, 3 for the best values, else 0; values with the same text share a rank.
-
-    No value is ranked where all have the same text.
-    """
+    """1, 2, 3 for the best, else 0: values with one text share a rank; no rank where all do."""
     texts = values.map(lambda value: shown(value, column)).where(values.notna())
     ranks = values.groupby(texts).transform("min")
     ranks = ranks.rank(method="dense", ascending=not column.higher_is_better)
@@ -253,10 +230,7 @@ def _cells(
     columns: Sequence[Column],
     devices: pd.Series | None,
 ) -> pd.DataFrame:
-    """Rows as a block holds them, with their standard deviations (or NaN).
-
-    Memory and time are ranked only if all ``devices`` agree; nothing is without devices.
-    """
+    """A block's rows; memory and time are ranked only if all ``devices`` agree, None ranks none."""
     titles = [column.title for column in columns]
     texts, ranks = rows[titles].astype(object), pd.DataFrame(0, rows.index, titles)
     for column in columns:
@@ -272,10 +246,7 @@ def _cells(
 def _average(
     runs: pd.DataFrame, rows: pd.DataFrame, scenes: list[str], columns: Sequence[Column]
 ) -> pd.DataFrame:
-    """Means over all scenes of the configurations that were run on all of them.
-
-    Without a spread: the difference between scenes is no uncertainty of a measurement.
-    """
+    """Means over all scenes of the configurations that were run on all of them, without spread."""
     groups, titles = rows.groupby("label", sort=False), [column.title for column in columns]
     means = _over_scenes(rows[titles], scenes).join(groups[["name", "protocol"]].first())
     means = means.assign(counts=groups["count"].agg(set))[groups.size() == len(scenes)]
@@ -339,10 +310,9 @@ def _notes(runs: pd.DataFrame, at_rest: pd.Series, again: pd.Series) -> list[str
     still = runs.loc[runs["at_rest"].eq(True), "scene"].unique()
     if len(still):
         notes.append(f"At rest, scored on held-out images of the static set: {', '.join(still)}.")
-    if len(at_rest):
-        names = ", ".join(at_rest)
-        notes.append(f"Scored at rest only, and therefore not in the tables: {names}.")
-    if len(again):
-        names = ", ".join(again)
-        notes.append(f"Counted once, as last scored elsewhere with the same checkpoint: {names}.")
+    for why, folders in (
+        ("Scored at rest only, and therefore not in the tables", at_rest),
+        ("Counted once, as last scored elsewhere with the same checkpoint", again),
+    ):
+        notes += [f"{why}: {', '.join(folders)}."] if len(folders) else []
     return notes

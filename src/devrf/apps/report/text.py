@@ -30,10 +30,8 @@ class Style:
 def printed(table: Table, blocks: Sequence[Block], style: Style) -> pd.DataFrame:
     """Blocks side by side as text: measured rows, then published ones below a line of their own.
 
-    Returns:
-        Columns of two levels: the label, and the protocol where it differs, below an empty title;
-        then each block's title with every metric's heading below it. What a block does not have is
-        empty.
+    Columns have two levels: the label, and the protocol where it differs, below an empty title;
+    then each block's title with every metric's heading below it.
     """
     parts = [_rows(table, blocks, [block.measured for block in blocks], style, "{}")]
     if any(len(block.published) for block in blocks):
@@ -139,7 +137,11 @@ def markdown(
     if table.shows_published:
         parts.append(f"† {markdown_escaped(credit())}")
     for block in table.blocks:
-        parts += [f"## {markdown_escaped(block.title)}", _block(table, block)]
+        frame = printed(table, [block], MARKDOWN).droplevel(0, axis=1)
+        left = len(frame.columns) - len(table.columns)
+        align = ["left"] * left + ["right"] * len(table.columns)
+        cells = frame.to_markdown(index=False, disable_numparse=True, colalign=align)
+        parts += [f"## {markdown_escaped(block.title)}", cells]
     for heading, lines in (
         ("", table.notes),
         ("## Failed", reasons(collection)),
@@ -151,10 +153,8 @@ def markdown(
         parts.append("## Plots")
         parts += [f"![{markdown_escaped(shows)}](<{link}>)" for shows, link in figures.items()]
     if videos:
-        parts.append("## Videos")
-        parts.append(
-            "\n".join(f"- [{markdown_escaped(show)}](<{link}>)" for show, link in videos.items())
-        )
+        links = [f"- [{markdown_escaped(shows)}](<{link}>)" for shows, link in videos.items()]
+        parts += ["## Videos", "\n".join(links)]
     return "\n\n".join(filter(None, parts)) + "\n"
 
 
@@ -163,13 +163,6 @@ def plain(table: Table) -> str:
     parts = [_plain_block(table, block) + "\n" for block in table.blocks]
     failed = [f"failed: {why}" for why in reasons(table.collection)]
     return "\n".join([*parts, *table.notes, *failed, *table.collection.skipped]).rstrip()
-
-
-def _block(table: Table, block: Block) -> str:
-    frame = printed(table, [block], MARKDOWN).droplevel(0, axis=1)
-    left = len(frame.columns) - len(table.columns)
-    align = ["left"] * left + ["right"] * len(table.columns)
-    return str(frame.to_markdown(index=False, disable_numparse=True, colalign=align))
 
 
 def _plain_block(table: Table, block: Block) -> str:
@@ -223,9 +216,8 @@ def latex(table: Table) -> str:
     words += f" † {credit()}" if table.shows_published else ""
     parts = [HEAD]
     for start in range(0, len(table.blocks), SIDE_BY_SIDE):
-        parts.append(
-            _tables(table, table.blocks[start : start + SIDE_BY_SIDE], latex_escaped(words))
-        )
+        blocks = table.blocks[start : start + SIDE_BY_SIDE]
+        parts.append(_tables(table, blocks, latex_escaped(words)))
         words = "Continued."
     lines = [*table.notes, *(f"failed: {why}" for why in reasons(table.collection))]
     parts.append("".join(f"% {' '.join(line.split())}\n" for line in lines))

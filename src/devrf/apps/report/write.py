@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -56,11 +56,7 @@ def write_report(settings: ReportSettings) -> Report:
 
 
 def csv(table: Table) -> str:
-    """A row for each run and failure, with everything that is known of it.
-
-    ``train_seconds`` and ``peak_gpu_gb`` are the tables' Time and GPU; further columns are those
-    of ``metrics.json``, by dotted name. Unknown values are empty.
-    """
+    """A row for each run and failure, with all of ``metrics.json`` by dotted name."""
     runs = table.collection.runs.drop(columns="path").copy()  # in one piece
     runs.insert(3, "row", table.runs["label"])
     failures = table.collection.failures.drop(columns="path")
@@ -108,48 +104,36 @@ def _write(path: Path, text: str) -> None:
 # What each run's video of the held-out views shows from left to right: truth, rendering, depth.
 COLUMNS, TRUTH, RENDERED = 3, 0, 1
 BAND, MARGIN = 22, 4  # pixels: above each picture for its label, and between them
-Frames = list[np.ndarray]
 
 
 def scene_video(table: Table, scene: str) -> Iterator[np.ndarray] | None:
     """Pictures (H, W, 3) uint8 of the truth and of each row's rendering while time runs.
 
     The first run of a row that has a video stands for it. Pictures have the size of the first
-    row's, and as many frames as the shortest video.
-
-    Returns:
-        None where fewer than two rows have a video.
+    row's, and as many frames as the shortest video. None where fewer than two rows have a video.
     """
-    runs = table.runs[table.runs["scene"] == scene]
-    videos = {str(label): _video(group) for label, group in runs.groupby("label", sort=False)}
-    shown = {label: video for label, video in videos.items() if video is not None}
-    return _pictures(shown) if len(shown) > 1 else None
-
-
-def _video(runs: pd.DataFrame) -> Path | None:
-    """The held-out video of the first of these runs that has one."""
-    paths = (Path(folder) / "videos" / "held_out.mp4" for folder in runs["path"])
-    return next((path for path in paths if path.is_file()), None)
+    runs, videos = table.runs[table.runs["scene"] == scene], dict[str, Path]()
+    for label, folder in zip(runs["label"], runs["path"], strict=True):
+        path = Path(folder) / "videos" / "held_out.mp4"
+        if path.is_file():
+            videos.setdefault(label, path)
+    return _pictures(videos) if len(videos) > 1 else None
 
 
 def _pictures(paths: Mapping[str, Path]) -> Iterator[np.ndarray]:
     videos = {label: list(iio.imiter(path)) for label, path in paths.items()}
-    count = min(map(len, videos.values()))
-    first = next(iter(videos.values()))
-    size = _column(first[0], RENDERED).size
-    for index in range(count):
-        tiles = {"truth": _column(_at(first, index, count), TRUTH)}
+    count, first = min(map(len, videos.values())), next(iter(videos.values()))
+    size = _column(first, 0, RENDERED).size
+    for time in np.linspace(0, 1, count):
+        tiles = {"truth": _column(first, time, TRUTH)}
         for label, frames in videos.items():
-            tiles[label] = _column(_at(frames, index, count), RENDERED).resize(size)
+            tiles[label] = _column(frames, time, RENDERED).resize(size)
         yield _page(tiles)
 
 
-def _at(frames: Frames, index: int, count: int) -> np.ndarray:
-    """The frame of a video at the time of frame ``index`` of ``count``."""
-    return frames[round(index * (len(frames) - 1) / max(count - 1, 1))]
-
-
-def _column(picture: np.ndarray, column: int) -> Image.Image:
+def _column(frames: Sequence[np.ndarray], time: float, column: int) -> Image.Image:
+    """A column of the video's frame at a time in [0, 1]."""
+    picture = frames[round(time * (len(frames) - 1))]
     width = picture.shape[1] / COLUMNS
     return Image.fromarray(picture[:, round(column * width) : round((column + 1) * width)])
 
@@ -163,12 +147,7 @@ def _page(tiles: Mapping[str, Image.Image]) -> np.ndarray:
     pen = ImageDraw.Draw(page)
     for place, (label, tile) in enumerate(tiles.items()):
         x, y = place % across * (width + MARGIN), place // across * (height + BAND + MARGIN)
-        pen.text(
-            (x + width / 2, y + BAND / 2),
-            label,
-            "black",
-            fitted_font(label, BAND // 2, width),
-            "mm",
-        )
+        font = fitted_font(label, BAND // 2, width)
+        pen.text((x + width / 2, y + BAND / 2), label, "black", font, "mm")
         page.paste(tile, (x, y + BAND))
     return np.asarray(page)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
 import torch
 from kornia.geometry.conversions import (
     quaternion_to_rotation_matrix,
@@ -14,6 +15,7 @@ from kornia.geometry.conversions import (
 from torch import Tensor
 
 from devrf.apps.images import evenly, scaled, to_bytes
+from devrf.apps.keyframes import Keyframe, keyframes_of
 from devrf.evaluation.held_out import truth_image
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.scene import Scene, Views
@@ -30,65 +32,21 @@ DEPTH = 0.04
 COLOR = (40, 110, 170)
 
 
-@dataclass(frozen=True)
-class Pose:
-    """A camera of the browser.
+def from_browser(camera: viser.CameraHandle, time: float, seconds: float = 0.0) -> Keyframe:
+    """The camera that a page is looked at from, at a time of the scene, as a keyframe."""
+    wxyz = torch.tensor([list(camera.wxyz)], dtype=torch.float64)
+    turned = quaternion_to_rotation_matrix(wxyz)[0] * wxyz.new_tensor(FLIP)
+    position = wxyz.new_tensor(list(camera.position))
+    pose = torch.cat([turned, position[:, None]], dim=1).float()
+    return Keyframe(pose, math.degrees(camera.fov), time, seconds)
 
-    Attributes:
-        wxyz: the unit quaternion of camera to world, OpenCV axes (x right, y down, z forwards).
-        position: (x, y, z) in world units.
-        fov: the vertical angle of view in radians.
-        aspect: width over height.
-    """
 
-    wxyz: tuple[float, float, float, float]
-    position: tuple[float, float, float]
-    fov: float
-    aspect: float
-
-    @staticmethod
-    def of(camera_to_world: Tensor, fov: float, aspect: float) -> Pose:
-        """The pose of a camera (3, 4) with OpenGL axes; ``fov`` in radians."""
-        pose = camera_to_world.double().cpu()
-        turned = pose[:, :3] * pose.new_tensor(FLIP)
-        w, x, y, z = rotation_matrix_to_quaternion(turned[None])[0].tolist()
-        px, py, pz = pose[:, 3].tolist()
-        return Pose((w, x, y, z), (px, py, pz), fov, aspect)
-
-    @staticmethod
-    def of_browser(camera: viser.CameraHandle) -> Pose:
-        """The pose that a page is looked at from."""
-        w, x, y, z = map(float, camera.wxyz)
-        px, py, pz = map(float, camera.position)
-        return Pose((w, x, y, z), (px, py, pz), camera.fov, camera.aspect)
-
-    @staticmethod
-    def of_cameras(cameras: Cameras, index: int) -> Pose:
-        """The pose of one of N cameras, whose pixels need not be square."""
-        fx, fy = cameras.focal[index].tolist()
-        aspect = (cameras.width / fx) / (cameras.height / fy)
-        return Pose.of(
-            cameras.camera_to_world[index], 2 * math.atan(cameras.height / 2 / fy), aspect
-        )
-
-    @property
-    def camera_to_world(self) -> Tensor:
-        """(3, 4) float64, OpenGL axes."""
-        turned = quaternion_to_rotation_matrix(torch.tensor([self.wxyz], dtype=torch.float64))[0]
-        position = turned.new_tensor(self.position)
-        return torch.cat([turned * turned.new_tensor(FLIP), position[:, None]], dim=1)
-
-    def camera(self, height: int) -> Cameras:
-        """One camera, with images ``height`` pixels high."""
-        width = max(1, round(self.aspect * height))
-        focal = height / 2 / math.tan(self.fov / 2)
-        return Cameras(
-            self.camera_to_world.float()[None],
-            torch.tensor([[focal, focal]]),
-            torch.tensor([[width / 2, height / 2]]),
-            width,
-            height,
-        )
+def in_browser(keyframe: Keyframe) -> tuple[np.ndarray, np.ndarray, float]:
+    """Where a browser has the camera: unit quaternion wxyz, position, vertical angle in radians."""
+    pose = keyframe.camera_to_world.double().cpu()
+    turned = pose[:, :3] * pose.new_tensor(FLIP)
+    wxyz = rotation_matrix_to_quaternion(turned[None])[0]
+    return wxyz.numpy(), pose[:, 3].numpy(), math.radians(keyframe.fov)
 
 
 class Frustum(NamedTuple):
@@ -96,12 +54,12 @@ class Frustum(NamedTuple):
 
     Attributes:
         name: tells it from others; the same for a fixed camera at every time.
-        pose: where it is.
+        camera: one.
         image: (H', W', 3) uint8, what it took; None where no image was read.
     """
 
     name: str
-    pose: Pose
+    camera: Cameras
     image: Tensor | None
 
 
@@ -110,31 +68,32 @@ def dynamic_frusta(scene: Scene, time: float) -> list[Frustum]:
     views = scene.dynamic.train
     images = ((views.times - time).abs() < scene.clock.TOLERANCE).nonzero()[:, 0].tolist()
     chosen = [images[k] for k in evenly(len(images), MAX_FRUSTA)]
-    return [
-        Frustum(
-            f"moving/{int(views.view[k])}",
-            Pose.of_cameras(views.cameras, k),
-            _thumbnail(scene, views, k),
-        )
-        for k in chosen
-    ]
+    names = [f"moving/{int(views.view[k])}" for k in chosen]
+    return _frusta(names, views.cameras, chosen, scene, views)
 
 
 def static_frusta(cameras: Cameras, scene: Scene | None) -> list[Frustum]:
     """The cameras that saw the scene at rest, with images if there is a scene."""
-    return [
-        Frustum(
-            f"static/{k}",
-            Pose.of_cameras(cameras, k),
-            None if scene is None else _thumbnail(scene, scene.static.train, k),
-        )
-        for k in evenly(len(cameras), MAX_FRUSTA)
-    ]
+    chosen = evenly(len(cameras), MAX_FRUSTA)
+    views = None if scene is None else scene.static.train
+    return _frusta([f"static/{k}" for k in chosen], cameras, chosen, scene, views)
 
 
-def _thumbnail(scene: Scene, views: Views, index: int) -> Tensor:
-    image = truth_image(views, index, scene.background)
-    return to_bytes(scaled(image, min(views.height, ROWS)))
+def _frusta(
+    names: Sequence[str],
+    cameras: Cameras,
+    chosen: Sequence[int],
+    scene: Scene | None,
+    views: Views | None,
+) -> list[Frustum]:
+    frusta = []
+    for name, k in zip(names, chosen, strict=True):
+        image = None
+        if scene is not None and views is not None:
+            small = scaled(truth_image(views, k, scene.background), min(views.height, ROWS))
+            image = to_bytes(small)
+        frusta.append(Frustum(name, cameras[[k]], image))
+    return frusta
 
 
 class FrustaLayer:
@@ -175,14 +134,16 @@ class FrustaLayer:
                 self._handles[frustum.name].image = frustum.image.numpy()
 
     def _added(self, frustum: Frustum) -> viser.CameraFrustumHandle:
+        wxyz, position, fov = in_browser(keyframes_of(frustum.camera, [0.0], 0.0)[0])
+        fx, fy = frustum.camera.focal[0].tolist()
         return self._server.scene.add_camera_frustum(
             f"/cameras/{frustum.name}",
-            frustum.pose.fov,
-            frustum.pose.aspect,
+            fov,
+            (frustum.camera.width / fx) / (frustum.camera.height / fy),
             scale=self._depth,
             thickness=0.02 * self._depth,
             color=COLOR,
             image=None if frustum.image is None else frustum.image.numpy(),
-            wxyz=frustum.pose.wxyz,
-            position=frustum.pose.position,
+            wxyz=wxyz,
+            position=position,
         )

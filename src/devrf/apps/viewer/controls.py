@@ -9,7 +9,7 @@ from typing import Any
 
 import viser
 
-from devrf.apps.viewer.cameras import Pose
+from devrf.apps.viewer.cameras import from_browser
 from devrf.apps.viewer.drawing import Drawing, Shot
 from devrf.geometry.box import Box
 
@@ -122,11 +122,11 @@ class Controls:
         self._change(lambda now: replace(now, time=time, playing=False))
         set_value(self._time, time)
 
-    def shot(self, pose: Pose, box: Box, *, with_depth: bool) -> Shot:
-        """What a camera is to show.
+    def shot(self, camera: viser.CameraHandle, box: Box, *, with_depth: bool) -> Shot:
+        """What a page's camera is to show.
 
         Args:
-            pose: the camera.
+            camera: of the page.
             box: what the crop is a part of.
             with_depth: whether something beside frusta is drawn into the scene.
         """
@@ -140,7 +140,8 @@ class Controls:
             )
         with_depth = with_depth or self.dynamic.value or self.static.value
         beside = self._rest.value and self._rest.visible
-        return Shot(pose, self.playback.time, self._channel.value, beside, crop, with_depth)
+        keyframe = from_browser(camera, self.playback.time)
+        return Shot(keyframe, camera.aspect, self._channel.value, beside, crop, with_depth)
 
     def show_status(self, text: str) -> None:
         """Show a line below the choice of channels."""

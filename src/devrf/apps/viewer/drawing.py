@@ -5,18 +5,17 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Hashable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from devrf.apps.images import depth_colors, flow_colors, to_bytes
-from devrf.apps.viewer.cameras import Pose
+from devrf.apps.keyframes import Keyframe, cameras_of
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
-from devrf.geometry.rays import Rays
 from devrf.rendering.output import RenderedImage
-from devrf.rendering.renderer import Renderer, in_chunks
+from devrf.rendering.renderer import Renderer, points_at_depth
 from devrf.rendering.view import MovingView
 
 # Motion is shown as optical flow over so much time, and saturated at this share of the height.
@@ -37,16 +36,16 @@ class Shot:
     """What a frame is to show.
 
     Attributes:
-        pose: the camera.
-        time: in [0, 1].
+        keyframe: the camera and the scene's time.
+        aspect: width over height.
         channel: ``color``, ``depth``, ``opacity`` or ``motion``.
         beside_rest: whether the rest state is shown beside, on the left.
         crop: leave out what is outside this box (:class:`~devrf.rendering.renderer.CroppedRays`).
         with_depth: whether distances are asked for, to hide what is behind the scene.
     """
 
-    pose: Pose
-    time: float
+    keyframe: Keyframe
+    aspect: float
     channel: str = "color"
     beside_rest: bool = False
     crop: Box | None = None
@@ -72,7 +71,7 @@ class Drawing:
     """Draws shots of a learned scene, and knows how fast that goes.
 
     Attributes:
-        renderer: of the scene.
+        renderer: of the scene; another may take its place while the scene is learned.
         channels: what can be shown of it.
         has_rest: whether it has a rest state beside others.
         at_rest: whether it looks the same at all times.
@@ -89,10 +88,6 @@ class Drawing:
         self._rays_per_second = 20_000.0
         self._overhead = 0.0
 
-    def set_renderer(self, renderer: Renderer) -> None:
-        """Draw what the scene has become, by a renderer without views of before."""
-        self.renderer = renderer
-
     def height_within(self, seconds: float, aspect: float, height: int) -> int:
         """The rows of a frame that takes about ``seconds``, at most ``height``."""
         left = max(seconds - self._overhead, seconds / 4)
@@ -102,11 +97,12 @@ class Drawing:
     def draw(self, shot: Shot, height: int) -> Iterator[Frame | None]:
         """Render a shot: None after each block of rays, then the frame."""
         began = time.perf_counter()
-        times = [0.0, shot.time] if shot.beside_rest and self.has_rest else [shot.time]
+        shown = shot.keyframe.time
+        times = [0.0, shown] if shot.beside_rest and self.has_rest else [shown]
         parts, depth = [], None
         for moment in times:
-            aspect = shot.pose.aspect / len(times)
-            camera = replace(shot.pose, aspect=aspect).camera(height).to(self.renderer.device)
+            camera = cameras_of([shot.keyframe], shot.aspect / len(times), height)
+            camera = camera.to(self.renderer.device)
             started = time.perf_counter()
             with torch.no_grad():
                 self.renderer.at(moment)  # cached, or it takes a while
@@ -131,30 +127,17 @@ class Drawing:
         """Consecutive pixels in row-major order, with the motion (K, 2) where it is shown."""
         rays, pixels = camera.image_rays(0), camera.pixel_grid()
         crop = shot.crop or self.renderer.reach(camera.positions[0])
+        later = time + STEP if time + STEP <= 1 else time - STEP
         size = max(MIN_RAYS, int(BLOCK_SECONDS * self._rays_per_second))
         for first in range(0, len(rays), size):
             block = slice(first, first + size)
             image = self.renderer.picture(rays[block], time, self._background, crop)
             vectors = torch.zeros_like(image.color[:, :2])
             if shot.channel == "motion":
-                vectors = self._motion(rays[block], pixels[block], camera, time)
+                flow = self.renderer.induced_flow(rays[block], pixels[block], camera, time, later)
+                assert flow is not None  # the channel is offered where there is motion
+                vectors = flow[0] * (1 if later > time else -1)
             yield image, vectors
-
-    def _motion(self, rays: Rays, pixels: Tensor, camera: Cameras, time: float) -> Tensor:
-        """Optical flow (K, 2) in pixels over the next :data:`STEP`, at the end over the last."""
-        view = self.renderer.at(time)
-        assert isinstance(view, MovingView)
-        later = time + STEP if time + STEP <= 1 else time - STEP
-        first = 0
-
-        def flow(part: Rays) -> Tensor:
-            nonlocal first
-            mean, _ = view.induced_flow(part, pixels[first : first + len(part)], camera, later)
-            first += len(part)
-            return mean
-
-        flows = in_chunks(flow, self.renderer.model.space.rays(rays), view.chunk)
-        return torch.cat(flows) * (1 if later > time else -1)
 
     def _colored(
         self, channel: str, camera: Cameras, image: RenderedImage, vectors: Tensor
@@ -176,10 +159,8 @@ class Drawing:
 
     def _axial(self, camera: Cameras, image: RenderedImage) -> Tensor:
         """(H, W) world distances along the camera's axis; far away where nothing is."""
-        space = self.renderer.model.space
-        rays = space.rays(camera.image_rays(0))
-        points = rays.at(torch.arange(len(rays), device=rays.origins.device), image.depth)
-        _, depth = camera.project_into(0, space.to_world(points))
+        space, rays = self.renderer.model.space, camera.image_rays(0)
+        _, depth = camera.project_into(0, points_at_depth(space, rays, image.depth))
         depth = torch.where(image.opacity > SOLID, depth, NOWHERE)
         return depth.view(camera.height, camera.width).cpu()
 
@@ -255,14 +236,7 @@ class RenderScheduler:
         return bool(self._requests)
 
     def render_next(self, timeout: float) -> bool:
-        """Render the most urgent frame, and show it.
-
-        Args:
-            timeout: seconds to wait for something to render.
-
-        Returns:
-            Whether a frame was shown.
-        """
+        """Show the most urgent frame, after at most ``timeout`` seconds; whether there was one."""
         with self._change:
             self._change.wait_for(self._most_urgent, timeout)
             urgent = self._most_urgent()
@@ -287,7 +261,7 @@ class RenderScheduler:
 
     def _next_rows(self, request: _Request) -> int:
         rows = FINER * request.rows or self.drawing.height_within(
-            self._move_seconds, request.shot.pose.aspect, self._height
+            self._move_seconds, request.shot.aspect, self._height
         )
         return self._height if rows > NEARLY * self._height else rows
 

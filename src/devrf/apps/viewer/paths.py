@@ -20,7 +20,7 @@ from devrf.apps.keyframes import (
     write_path,
 )
 from devrf.apps.video import VideoSettings, bullet_time, orbit, spiral, time_freeze
-from devrf.apps.viewer.cameras import Pose
+from devrf.apps.viewer.cameras import from_browser
 from devrf.apps.viewer.controls import set_value
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
@@ -45,7 +45,8 @@ def known_paths(cameras: Cameras, model: Callable[[], Viewable]) -> dict[str, Pr
         cameras: the static captured ones.
         model: gives the scene, once there is one.
     """
-    settings = VideoSettings(frames=KEYFRAMES)
+    once, longer = VideoSettings(frames=KEYFRAMES), VideoSettings(frames=3 * KEYFRAMES)
+    times = torch.linspace(0, 1, KEYFRAMES).tolist()
 
     def ring(video: VideoSettings) -> Cameras:
         """Comes back to where it began."""
@@ -55,17 +56,11 @@ def known_paths(cameras: Cameras, model: Callable[[], Viewable]) -> dict[str, Pr
             return spiral(cameras, distance_ahead(cameras), video)[closed]
         return orbit(cameras, space.inner(model().box), video)[closed]
 
-    def orbiting(time: float) -> tuple[Keyframe, ...]:
-        return keyframes_of(ring(settings), torch.linspace(0, 1, KEYFRAMES).tolist(), SECONDS)
-
-    def bullet(time: float) -> tuple[Keyframe, ...]:
-        return keyframes_of(*bullet_time(ring, time, settings), SECONDS)
-
-    def freeze(time: float) -> tuple[Keyframe, ...]:
-        longer = VideoSettings(frames=3 * KEYFRAMES)
-        return keyframes_of(*time_freeze(ring, time, longer), 3 * SECONDS)
-
-    return {"orbit": orbiting, "bullet time": bullet, "time freeze": freeze}
+    return {
+        "orbit": lambda _: keyframes_of(ring(once), times, SECONDS),
+        "bullet time": lambda stop: keyframes_of(*bullet_time(ring, stop, once), SECONDS),
+        "time freeze": lambda stop: keyframes_of(*time_freeze(ring, stop, longer), 3 * SECONDS),
+    }
 
 
 def distance_ahead(cameras: Cameras) -> float:
@@ -114,27 +109,26 @@ class PathPanel:
         """
         self.keyframes: tuple[Keyframe, ...] = ()
         self._server, self._folder, self._height = server, folder, height
-        self._presets, self._time, self._fly, self._changed = presets, time, fly, changed
+        self._time, self._changed = time, changed
         self._line: viser.LineSegmentsHandle | None = None
         gui = server.gui
         with gui.add_folder("Video", expand_by_default=False):
             self._count = gui.add_markdown("")
-            self._on(gui.add_button("Add keyframe", icon=viser.Icon.PLUS), self._add)
-            self._on(gui.add_button("Remove the last"), lambda _: self._take(self.keyframes[:-1]))
-            self._on(gui.add_button("Remove all"), lambda _: self._take(()))
+            self._button("Add keyframe", self._add, viser.Icon.PLUS)
+            self._button("Remove the last", lambda _: self._take(self.keyframes[:-1]))
+            self._button("Remove all", lambda _: self._take(()))
             self._gap = gui.add_number("seconds to it", 2.0, min=0.05, max=600.0, step=0.05)
             self._fps = gui.add_number("pictures/s", 24.0, min=1.0, max=120.0, step=1.0)
             self._aspect = gui.add_number(
                 "width/height", 1.5, min=0.1, max=10.0, step=0.01, hint="of the video"
             )
             self._preset = gui.add_dropdown("path", tuple(presets), hint="a path that is known")
-            self._on(
-                gui.add_button("Take this path"),
-                lambda _: self._take(self._presets[self._preset.value](self._time())),
+            self._button(
+                "Take this path", lambda _: self._take(presets[self._preset.value](time()))
             )
-            self._on(gui.add_button("Fly through"), lambda _: self._fly(self.path()))
+            self._button("Fly through", lambda _: fly(self.path()))
             self._name = gui.add_text("name", "path")
-            self._on(gui.add_button("Save"), self._save)
+            self._button("Save", self._save)
             self._upload = gui.add_upload_button("Load", mime_type="application/json")
             self._upload.on_upload(self._answer(self._load))
         self._draw()
@@ -154,8 +148,8 @@ class PathPanel:
             raise DevrfError("a path needs two keyframes; add the camera at two places or times")
         return CameraPath(self.keyframes, float(self._aspect.value), float(self._fps.value))
 
-    def _on(self, button: viser.GuiButtonHandle, act: Act) -> None:
-        button.on_click(self._answer(act))
+    def _button(self, label: str, act: Act, icon: viser.IconName | None = None) -> None:
+        self._server.gui.add_button(label, icon=icon).on_click(self._answer(act))
 
     def _answer(self, act: Act) -> Act:
         """``act``, which shows what is wrong, and the keyframes afterwards."""
@@ -180,11 +174,10 @@ class PathPanel:
         """Add the camera of the page after the other keyframes."""
         if event.client is None:
             return
-        camera = event.client.camera
-        pose, fov = Pose.of_browser(camera).camera_to_world.float(), float(np.degrees(camera.fov))
         last = self.keyframes[-1:]
         seconds = last[0].seconds + float(self._gap.value) if last else 0.0
-        self.keyframes = (*self.keyframes, Keyframe(pose, fov, self._time(), seconds))
+        added = from_browser(event.client.camera, self._time(), seconds)
+        self.keyframes = (*self.keyframes, added)
 
     def _take(self, keyframes: tuple[Keyframe, ...]) -> None:
         """Take other keyframes, the first at second 0."""

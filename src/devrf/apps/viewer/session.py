@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
-import math
 import threading
 import time
 from collections.abc import Hashable
@@ -14,9 +13,9 @@ from pathlib import Path
 import torch
 import viser
 
-from devrf.apps.keyframes import CameraPath
+from devrf.apps.keyframes import CameraPath, keyframes_of
 from devrf.apps.settings import ViewerSettings
-from devrf.apps.viewer.cameras import FrustaLayer, Pose
+from devrf.apps.viewer.cameras import FrustaLayer, in_browser
 from devrf.apps.viewer.controls import Controls
 from devrf.apps.viewer.drawing import Drawing, Frame, RenderScheduler
 from devrf.apps.viewer.paths import PathPanel, distance_ahead, known_paths
@@ -127,8 +126,7 @@ class Session:
         if self.scheduler is None or not client.camera.image_height:
             return
         box = self._model.space.inner(self._model.box)
-        pose = Pose.of_browser(client.camera)
-        shot = self.controls.shot(pose, box, with_depth=self.paths.drawn)
+        shot = self.controls.shot(client.camera, box, with_depth=self.paths.drawn)
         self.scheduler.ask(client.client_id, shot)
 
     @property
@@ -168,9 +166,10 @@ class Session:
         """Begin where the held-out camera is, with the cameras' mean up."""
         static, held_out = self.viewpoints.static, self.viewpoints.held_out
         self.server.scene.set_up_direction(static.camera_to_world[:, :, 1].mean(dim=0).numpy())
-        start, pose = self.server.initial_camera, Pose.of_cameras(held_out, 0)
-        target = held_out.positions[0] + distance_ahead(static) * held_out.forwards[0]
-        start.position, start.look_at, start.fov = pose.position, target.numpy(), pose.fov
+        start, target = self.server.initial_camera, held_out[[0]]
+        ahead = target.positions[0] + distance_ahead(static) * target.forwards[0]
+        _, start.position, start.fov = in_browser(keyframes_of(target, [0.0], 0.0)[0])
+        start.look_at = ahead.numpy()
 
     def _fly(self, path: CameraPath) -> None:
         self._flight = (path, time.monotonic())
@@ -184,12 +183,12 @@ class Session:
             self._flight = None
         keyframe = path.at(torch.tensor([path.keyframes[0].seconds + seconds]))[0]
         self.controls.set_time(keyframe.time)
-        pose = Pose.of(keyframe.camera_to_world, math.radians(keyframe.fov), path.aspect)
+        wxyz, position, fov = in_browser(keyframe)
         for client in self.server.get_clients().values():
             with client.atomic():
-                client.camera.position = pose.position
-                client.camera.wxyz = pose.wxyz
-                client.camera.fov = pose.fov
+                client.camera.position = position
+                client.camera.wxyz = wxyz
+                client.camera.fov = fov
             self._ask(client)
         self._show_cameras()
 
