@@ -141,7 +141,8 @@ def test_forward_flow_is_read_from_files_else_estimated_beside_the_backward_one(
         for path in flows.glob("*_bwd.npz"):
             number = int(path.name[:3]) - 2  # two views
             path.with_name(f"{number:03d}_fwd.npz").write_bytes(path.read_bytes())
-    module = InwardFacingDataModule(folder, flow_cache=tmp_path / "flow.npz")
+    source = "auto" if written else "dis"
+    module = InwardFacingDataModule(folder, flow=source, flow_cache=tmp_path / "flow.npz")
     assert module.scene.dynamic.train.forward_flow is None
     module.provide(("forward_flow",))
     views = module.scene.dynamic.train
