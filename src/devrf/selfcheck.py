@@ -14,18 +14,17 @@ import signal
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from statistics import mean
-from typing import Any, Literal
+from typing import Any, NamedTuple
 
 import torch
 from lightning import Callback, Trainer, seed_everything
 from lightning.pytorch.callbacks import LambdaCallback
 
-from devrf.accel.graphs import CudaGraphCapture, Graphs, Work
+from devrf.accel.graphs import Graphs
 from devrf.callbacks import GridUpscaling, LearningRateDecay, PeriodicCheckpoint, StopOnSignal
 from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, LoadedCheckpoint
 from devrf.checkpoints.progress import progress_files
@@ -36,16 +35,15 @@ from devrf.evaluation.held_out import background_value
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
-from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
+from devrf.methods.devrf.deformation_schedule import PAPER_LEVELS, DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.extensions.tracks import StartAlongFlow
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import MotionSettings, Precision, Sampling
 from devrf.ops.check import CASES, Case, compare
-from devrf.ops.dispatch import Kind, using
+from devrf.ops.dispatch import Kind, reaches, using
 from devrf.rendering.renderer import Renderer
 from devrf.system.device import wait
-from devrf.system.memory import free_cache
 
 log = logging.getLogger(__name__)
 
@@ -54,16 +52,8 @@ class CheckSkippedError(Exception):
     """The device cannot do the check; the text says why."""
 
 
-@dataclass(frozen=True)
-class Variant:
-    """How iterations are carried out.
-
-    Attributes:
-        kernels: which implementation of the hot operations runs.
-        graphs: whether CUDA graphs are captured.
-        precision: what the colour network computes in.
-        deterministic: whether only operations are allowed that add in a fixed order.
-    """
+class Variant(NamedTuple):
+    """How iterations are carried out: config keys of the same names."""
 
     kernels: Kind = "torch"
     graphs: Graphs = "off"
@@ -72,8 +62,8 @@ class Variant:
 
 
 PLAIN = Variant()
-# What a training on a GPU runs, with an error where ``auto`` would fall back to PyTorch.
-FAST = Variant("triton", "auto", "auto")
+# What ``python -m devrf`` runs on a GPU.
+FAST = Variant("auto", "auto", "auto")
 EXACT = Variant("auto", "auto", "auto", deterministic=True)
 
 
@@ -83,27 +73,25 @@ class SmallScene:
 
     Attributes:
         device: where stages learn.
-        seed: of everything that is drawn.
+        at_rest: the canonical stage's schedule.
+        in_motion: the deformation stage's schedule.
+        architecture: of the canonical field.
+        sampling: how rays are sampled.
         width: of the images, in pixels; they are three quarters as high.
         views: static ones.
         frames: T of the three moving views.
-        side: of the canonical grid at the end.
-        sides: of the motion grid, by level.
-        rays: of a batch.
-        decoder: width of the colour network.
-        iterations: of each stage, about.
+        seed: of everything that is drawn.
     """
 
     device: torch.device
+    at_rest: CanonicalSchedule
+    in_motion: DeformationSchedule
+    architecture: Architecture
+    sampling: Sampling
+    width: int
+    views: int
+    frames: int
     seed: int = 0
-    width: int = 32
-    views: int = 10
-    frames: int = 5
-    side: int = 24
-    sides: tuple[int, int] = (5, 10)
-    rays: int = 256
-    decoder: int = 32
-    iterations: int = 100
 
     @cached_property
     def data(self) -> ProceduralDataModule:
@@ -128,36 +116,19 @@ class SmallScene:
         return stage.result()
 
     def stage(self, name: str, variant: Variant) -> ScheduledStage:
-        """The canonical or the deformation stage, in two levels of resolution."""
+        """The canonical or the deformation stage."""
         common: dict[str, Any] = {
             "iterations_per_step": 5,
             "graphs": variant.graphs,
             "decoder_precision": variant.precision,
         }
         if name == "canonical":
-            schedule = CanonicalSchedule(
-                search_iterations=0,
-                search_side=max(12, self.side // 2),
-                visual_hull_init=True,
-                min_views=1,
-                iterations=self.iterations,
-                side=self.side,
-                upsample_at=(self.iterations // 2,),
-                decay_iterations=self.iterations,
-                rays=self.rays,
-            )
-            network, sampling = Architecture(width=self.decoder), Sampling(alpha_threshold=3e-3)
-            return CanonicalStage(schedule, network, sampling=sampling, **common)
-        # The first frame of the first level takes twice as many; the second level's are parallel.
-        coarse, fine = self.sides
-        first = Level(coarse, max(1, self.iterations * 3 // 4 // self.frames))
-        parallel = (self.frames - 1) // 2
-        second = Level(fine, max(1, self.iterations // 8), parallel_frames=parallel)
-        motion = DeformationSchedule((first, second), rays=self.rays)
-        settings = MotionSettings(2e-3, unit="box", views="one", store="host")
+            sizes = self.at_rest, self.architecture
+            return CanonicalStage(*sizes, sampling=self.sampling, **common)
+        settings = MotionSettings(2e-3, unit="box", store="host")
         along = {"tracks": StartAlongFlow("flow")}
         rest = copy.deepcopy(self.canonical)
-        return DeformationStage(rest, motion, settings, extensions=along, **common)
+        return DeformationStage(rest, self.in_motion, settings, extensions=along, **common)
 
     def learn(
         self,
@@ -181,12 +152,12 @@ class SmallScene:
             devices=[self.device.index or 0] if gpu else 1,
             deterministic=variant.deterministic,
             max_epochs=1,
+            use_distributed_sampler=False,
+            callbacks=[GridUpscaling(), LearningRateDecay(), curve, *callbacks],
             logger=False,
             enable_checkpointing=False,
             enable_progress_bar=False,
             enable_model_summary=False,
-            use_distributed_sampler=False,
-            callbacks=[GridUpscaling(), LearningRateDecay(), curve, *callbacks],
         )
         trainer.strategy.checkpoint_io = ChecksummedCheckpointIO()
         try:
@@ -196,6 +167,38 @@ class SmallScene:
         finally:
             torch.use_deterministic_algorithms(False)
         return torch.stack(losses).tolist() if losses else []
+
+
+def short(schedule: CanonicalSchedule, iterations: int) -> CanonicalSchedule:
+    """Few iterations, at all resolutions of ``schedule``, from the visual hull on."""
+    growths = len(schedule.upsample_at)
+    return replace(
+        schedule,
+        visual_hull_init=True,
+        min_views=1,
+        iterations=iterations,
+        upsample_at=[iterations * k // (growths + 1) for k in range(1, growths + 1)],
+        decay_iterations=iterations,
+    )
+
+
+def small_scene(device: torch.device, seed: int = 0) -> SmallScene:
+    """The scene for a device: a GPU learns what ``experiment=paper_inward`` does, for a moment.
+
+    Grids, batches, networks and levels are the paper's; images are small, iterations are few, and
+    coarse geometry begins with the visual hull, because it has no time to be found. Frames of one
+    level are learned in parallel. On a CPU all is tiny.
+    """
+    if device.type != "cuda":
+        tiny = CanonicalSchedule(0, search_side=12, side=16, upsample_at=[10], rays=192)
+        in_motion = DeformationSchedule([Level(4, 5), Level(6, 2)], rays=192)
+        sizes = short(tiny, 20), in_motion, Architecture(width=16), Sampling(alpha_threshold=3e-3)
+        return SmallScene(device, *sizes, 24, 8, 3, seed)
+    levels = [replace(level, iterations=10) for level in PAPER_LEVELS]
+    levels[2] = replace(levels[2], parallel_frames=4)
+    at_rest = replace(short(CanonicalSchedule(), 250), search_iterations=20)
+    sizes = at_rest, DeformationSchedule(levels), Architecture(), Sampling()
+    return SmallScene(device, *sizes, 96, 24, 9, seed)
 
 
 def require(condition: bool, said: str) -> None:
@@ -212,7 +215,7 @@ def require_gpu(scene: SmallScene, reason: str) -> None:
 
 def kernel(scene: SmallScene, case: Case) -> str:
     """Whether an operation gives the same in Triton as in PyTorch."""
-    if os.environ.get("TRITON_INTERPRET") != "1":
+    if not reaches(scene.device):
         require_gpu(scene, "or Triton's interpreter, TRITON_INTERPRET=1")
     error, share = compare(case, scene.device)
     require(share <= 1, f"off by {error:.2g}")
@@ -276,9 +279,9 @@ def resume(scene: SmallScene, name: str, variant: Variant) -> str:
     return f"{stopped}, the loss {100 * off:.2g} % off"
 
 
-# Kernels, whether the decoder works in half precision, and grey levels by which a picture may be
-# off PyTorch's in the mean: a sample at a threshold may be kept by one implementation alone.
-PICTURES: Sequence[tuple[Kind, bool, float]] = (("triton", False, 1e-3), ("triton", True, 5e-3))
+# Whether the decoder works in half precision, and grey levels by which a picture may be off
+# PyTorch's in the mean: a sample at a threshold may be kept by one implementation alone.
+PICTURES = ((False, 1e-3), (True, 5e-3))
 
 
 def rendering(scene: SmallScene) -> str:
@@ -297,76 +300,11 @@ def rendering(scene: SmallScene) -> str:
             return renderer.view(views.cameras, last, time, background).color.float()
 
     expected, largest = picture("torch", False), 0.0
-    for kernels, half, limit in PICTURES:
-        off = float((picture(kernels, half) - expected).abs().mean())
-        require(off <= limit, f"{kernels}, half={half}: {off:.2g} off PyTorch's picture")
+    for half, limit in PICTURES:
+        off = float((picture(FAST.kernels, half) - expected).abs().mean())
+        require(off <= limit, f"half={half}: {off:.2g} off PyTorch's picture")
         largest = max(largest, off)
     return f"{largest:.2g} off PyTorch's picture at most"
-
-
-@contextmanager
-def at_most(device: torch.device, more: int) -> Iterator[None]:
-    """Within the block torch's allocator may hold ``more`` bytes beside what it holds now."""
-    free_cache(device)
-    total = torch.cuda.get_device_properties(device).total_memory
-    limit = torch.cuda.memory_reserved(device) + more
-    torch.cuda.set_per_process_memory_fraction(min(1.0, limit / total), device)
-    try:
-        yield
-    finally:
-        torch.cuda.set_per_process_memory_fraction(1.0, device)
-
-
-class ScarceCapture(CudaGraphCapture):
-    """Captures; memory is short in the third warm-up, or in the first capture.
-
-    The first warm-up makes gradients and moments, which stay; the second takes a batch alone, and
-    is measured. The third has three quarters of that.
-
-    Attributes:
-        times_short: how often memory was short.
-    """
-
-    def __init__(self, device: torch.device, within: Literal["warm-up", "capture"]) -> None:
-        super().__init__(device)
-        self._within, self._warm_ups, self._taken = within, 0, 0
-        self.times_short = 0
-
-    def warm_up(self, work: Work) -> None:
-        """Run ``work``."""
-        self._warm_ups += 1
-        free_cache(self.device)
-        before = torch.cuda.memory_reserved(self.device)
-        torch.cuda.reset_peak_memory_stats(self.device)
-        scarce = self._warm_ups == 3 and self._within == "warm-up"
-        self.times_short += scarce
-        with at_most(self.device, 3 * self._taken // 4) if scarce else nullcontext():
-            super().warm_up(work)
-        self._taken = torch.cuda.max_memory_reserved(self.device) - before
-
-    def capture(self, work: Work) -> torch.cuda.CUDAGraph:
-        """A graph of ``work``."""
-        scarce = not self.times_short and self._within == "capture"
-        self.times_short += scarce
-        with at_most(self.device, 0) if scarce else nullcontext():
-            return super().capture(work)
-
-
-def short_memory(scene: SmallScene, within: Literal["warm-up", "capture"]) -> str:
-    """Whether all is learned when memory runs out: in micro-batches, or without graphs."""
-    require_gpu(scene, "its allocator takes a limit")
-    stage = scene.stage("canonical", FAST)
-    capturer = stage.loop._capture = ScarceCapture(scene.device, within)
-    losses = scene.learn(stage, FAST)
-    require(capturer.times_short == 1, "memory was never short")
-    require(stage.iteration == stage.total_iterations, f"ended at iteration {stage.iteration}")
-    require(all(map(math.isfinite, losses)) and min(losses) < losses[0], "the loss did not fall")
-    if within == "capture":
-        require(stage.loop.graphs == "off", "it was captured all the same")
-        return "went on without graphs"
-    count = stage.loop.micro_batching.count
-    require(count > 1, "batches were not split")
-    return f"batches were split into {count} micro-batches"
 
 
 CHECKS: dict[str, Callable[[SmallScene], str]] = {
@@ -382,16 +320,7 @@ CHECKS: dict[str, Callable[[SmallScene], str]] = {
     "resume canonical graphs": partial(resume, name="canonical", variant=FAST),
     "resume deformation graphs": partial(resume, name="deformation", variant=FAST),
     "rendering": rendering,
-    "memory warm-up": partial(short_memory, within="warm-up"),
-    "memory capture": partial(short_memory, within="capture"),
 }
-
-
-def small_scene(device: torch.device, seed: int = 0) -> SmallScene:
-    """The scene of a size that suits the device."""
-    if device.type != "cuda":
-        return SmallScene(device, seed)
-    return SmallScene(device, seed, 96, 24, 9, 64, (10, 20), rays=4096, decoder=128)
 
 
 def run_checks(

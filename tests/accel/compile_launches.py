@@ -28,6 +28,7 @@ from devrf.ops import dispatch
 from devrf.ops.check import CASES, Draw
 
 TWO = {"warped_depth_kernel", "composite_backward_kernel"}
+TWO_CASES = [*CASES["warped_depth"], *CASES["compositing"]]
 
 POINTERS = {
     torch.float32: "*fp32",
@@ -78,9 +79,10 @@ def main(extent: str, capabilities: list[int]) -> None:
     dispatch.reaches = lambda device: True
     draw = Draw(torch.device("cpu"))
     with dispatch.using("triton"):
-        for cases in CASES.values():
-            for case in cases:
-                case(draw)
+        for case in (
+            TWO_CASES if extent == "two" else [c for cases in CASES.values() for c in cases]
+        ):
+            case(draw)
     compiled: list[tuple[str, int]] = []
     for (name, *_), (source, options) in recorded.items():
         if extent == "two" and (name not in TWO or (name, capabilities[0]) in compiled):

@@ -1,7 +1,8 @@
-"""The checks of the machine: on a GPU all of them, on a CPU with stand-ins for what CUDA does."""
+"""The checks of the machine: on a GPU all of them, on a CPU with a stand-in for CUDA's graphs."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -12,40 +13,97 @@ import torch
 from devrf import selfcheck
 from devrf.accel.graphs import CudaGraphCapture, Work
 from devrf.engine.loop import Loop
-from devrf.engine.micro_batching import MicroBatching
 from devrf.errors import DevrfError
 from devrf.methods.devrf.voxel_stage import VoxelStage
 from devrf.rendering.sample_capacity import SampleCapacity
-from devrf.selfcheck import EXACT, SmallScene, capture, rendering, resume, short_memory, small_scene
+from devrf.selfcheck import EXACT, FAST, SmallScene, capture, rendering, resume, small_scene
+from devrf.system.memory import free_cache
+
+GPU = torch.device("cuda", 0)
+needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 
 
 @pytest.fixture(scope="module")
 def gpu_scene() -> SmallScene:
-    return small_scene(torch.device("cuda", 0))
+    return small_scene(GPU)
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@needs_gpu
 @pytest.mark.parametrize("name", selfcheck.CHECKS)
 def test_a_check_passes(name: str, gpu_scene: SmallScene) -> None:
     selfcheck.CHECKS[name](gpu_scene)
 
 
+@contextmanager
+def at_most(more: int) -> Iterator[None]:
+    """Within the block torch's allocator may hold ``more`` bytes beside what it holds now."""
+    free_cache(GPU)
+    total = torch.cuda.get_device_properties(GPU).total_memory
+    limit = torch.cuda.memory_reserved(GPU) + more
+    torch.cuda.set_per_process_memory_fraction(min(1.0, limit / total), GPU)
+    try:
+        yield
+    finally:
+        torch.cuda.set_per_process_memory_fraction(1.0, GPU)
+
+
+class ScarceWarmUp(CudaGraphCapture):
+    """Memory is short in the third warm-up.
+
+    The first makes gradients and moments, which stay; the second takes a batch alone, and is
+    measured. The third has three quarters of that.
+    """
+
+    warm_ups = taken = 0
+
+    def warm_up(self, work: Work) -> None:
+        self.warm_ups += 1
+        if self.warm_ups == 3:
+            with at_most(3 * self.taken // 4):
+                super().warm_up(work)
+            return
+        free_cache(GPU)
+        before = torch.cuda.memory_reserved(GPU)
+        torch.cuda.reset_peak_memory_stats(GPU)
+        super().warm_up(work)
+        self.taken = torch.cuda.max_memory_reserved(GPU) - before
+
+
+class ScarceCapture(CudaGraphCapture):
+    """There is no memory for the first capture."""
+
+    def capture(self, work: Work) -> torch.cuda.CUDAGraph:
+        with at_most(0):
+            return super().capture(work)
+
+
+@pytest.mark.gpu
+@needs_gpu
+@pytest.mark.parametrize("capturer", [ScarceWarmUp, ScarceCapture])
+def test_all_is_learned_when_memory_runs_out(
+    gpu_scene: SmallScene, capturer: type[CudaGraphCapture]
+) -> None:
+    stage = gpu_scene.stage("canonical", FAST)
+    stage.loop._capture = capturer(GPU)
+    losses = gpu_scene.learn(stage, FAST)
+    assert stage.iteration == stage.total_iterations
+    assert all(map(math.isfinite, losses)) and min(losses) < losses[0]
+    if capturer is ScarceCapture:
+        assert stage.loop.graphs == "off"
+    else:
+        assert stage.loop.micro_batching.count > 1
+
+
 @pytest.fixture(scope="module")
 def scene() -> SmallScene:
-    """As small as learning allows."""
-    cpu = torch.device("cpu")
-    return SmallScene(cpu, 0, 24, 8, 3, 16, (4, 6), rays=192, decoder=16, iterations=20)
+    return small_scene(torch.device("cpu"))
 
 
-@pytest.mark.parametrize("name", ["canonical", "deformation"])
-def test_a_stage_that_a_signal_stops_goes_on_to_equal_bits(scene: SmallScene, name: str) -> None:
-    assert resume(scene, name, EXACT).endswith("equal bits")
-
-
-def test_a_stage_that_goes_on_otherwise_is_noticed(
+def test_a_stage_that_a_signal_stops_goes_on_to_equal_bits(
     scene: SmallScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    assert resume(scene, "canonical", EXACT).endswith("equal bits")
     usual = VoxelStage._reseed
 
     def other(self: VoxelStage) -> None:
@@ -58,93 +116,46 @@ def test_a_stage_that_goes_on_otherwise_is_noticed(
         resume(scene, "canonical", EXACT)
 
 
-class Memory:
-    """A GPU's memory: while there is a limit, what exceeds it fails."""
-
-    def __init__(self) -> None:
-        self.left: int | None = None
-
-    @contextmanager
-    def at_most(self, device: torch.device, more: int) -> Iterator[None]:
-        self.left = more
-        try:
-            yield
-        finally:
-            self.left = None
-
-
 class Again:
     def __init__(self, work: Work) -> None:
         self.replay = work
 
 
 @pytest.fixture
-def memory(monkeypatch: pytest.MonkeyPatch) -> Memory:
-    """Graphs that run their work again, and a memory in which a batch takes 1000 bytes.
-
-    The stage, its loop and what it does when a capture fails or memory runs out are real.
-    """
-    memory = Memory()
+def graphs(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
+    """Graphs that run their work again; the stage and its loop are real."""
 
     def start(self: CudaGraphCapture, device: torch.device) -> None:
         self.device, self._side = device, None  # type: ignore[assignment]
 
     def capturer(self: Loop) -> Any:
-        self._capture = self._capture or CudaGraphCapture(self._device)
-        return self._capture if self.graphs == "auto" else None
-
-    def captured(self: CudaGraphCapture, work: Work) -> Any:
-        if memory.left is not None:
-            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 MiB.")
-        return Again(work)
-
-    usual = MicroBatching._accumulate
-
-    def accumulate(self: MicroBatching, *given: Any) -> Any:
-        if memory.left is not None and 1000 / self.count > memory.left:
-            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 MiB.")
-        return usual(self, *given)
+        return CudaGraphCapture(self._device) if self.graphs == "auto" else None
 
     monkeypatch.setattr(CudaGraphCapture, "__init__", start)
     monkeypatch.setattr(CudaGraphCapture, "warm_up", lambda self, work: work())
-    monkeypatch.setattr(CudaGraphCapture, "capture", captured)
+    monkeypatch.setattr(CudaGraphCapture, "capture", lambda self, work: Again(work))
     monkeypatch.setattr(Loop, "capturer", capturer)
-    monkeypatch.setattr(MicroBatching, "_accumulate", accumulate)
     monkeypatch.setattr(VoxelStage, "static_shape", lambda self, density: True)
     monkeypatch.setattr(SampleCapacity, "GRAIN", 64)
     monkeypatch.setattr(selfcheck, "require_gpu", lambda scene, reason: None)
-    monkeypatch.setattr(selfcheck, "at_most", memory.at_most)
     # Lists of fixed length learn the same in PyTorch.
     monkeypatch.setattr(selfcheck, "FAST", selfcheck.Variant("torch", "auto"))
-    for name in ("max_memory_reserved", "memory_reserved"):
-        monkeypatch.setattr(torch.cuda, name, lambda device, name=name: 1000 * ("max" in name))
-    monkeypatch.setattr(torch.cuda, "reset_peak_memory_stats", lambda device: None)
-    return memory
+    return monkeypatch
 
 
-@pytest.mark.parametrize("name", ["canonical", "deformation"])
-def test_every_resolution_is_captured(scene: SmallScene, memory: Memory, name: str) -> None:
-    assert int(capture(scene, name).split()[0]) >= 2
+def test_every_resolution_is_captured(scene: SmallScene, graphs: pytest.MonkeyPatch) -> None:
+    assert int(capture(scene, "deformation").split()[0]) >= 2
 
+    def short(self: CudaGraphCapture, work: Work) -> Any:
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 MiB.")
 
-def test_a_capture_that_fails_is_noticed(scene: SmallScene, memory: Memory) -> None:
-    memory.left = 10**6
+    graphs.setattr(CudaGraphCapture, "capture", short)
     with pytest.raises(DevrfError, match="a capture failed"):
         capture(scene, "canonical")
 
 
-def test_memory_that_runs_out_is_met_with_parts_or_without_graphs(
-    scene: SmallScene, memory: Memory
-) -> None:
-    assert short_memory(scene, "warm-up") == "batches were split into 2 micro-batches"
-    assert short_memory(scene, "capture") == "went on without graphs"
-
-
-def test_pictures_are_compared(
-    scene: SmallScene, memory: Memory, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(selfcheck, "PICTURES", [("torch", True, 1e-6)])
+def test_pictures_are_compared(scene: SmallScene, graphs: pytest.MonkeyPatch) -> None:
     assert rendering(scene).startswith("0 off")
-    monkeypatch.setattr(selfcheck, "PICTURES", [("torch", True, -1.0)])
-    with pytest.raises(DevrfError, match="off PyTorch's picture"):
+    graphs.setattr(selfcheck, "PICTURES", [(True, -1.0)])
+    with pytest.raises(DevrfError, match="half=True"):
         rendering(scene)

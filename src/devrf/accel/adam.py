@@ -30,59 +30,46 @@ def adam_step(
     gradient: Tensor,
     mean: Tensor,
     square: Tensor,
+    rule: Any,
     *,
-    rate: Tensor,
-    step: Tensor,
-    betas: tuple[float, float],
-    eps: float,
-    skip_zero: bool,
-    per_voxel_lr: Tensor | None,
     clear: bool = True,
     smoothing: float = 0.0,
 ) -> None:
     """As devrf.ops.adam_step.adam_step; as smooth_adam_step if ``into`` is not ``values``."""
-    smooth = into is not values
+    smooth, factors = into is not values, rule.per_voxel_lr
     length = _row(values) if smooth else values.numel()
-    beta1, beta2 = betas
-    factors = values if per_voxel_lr is None else per_voxel_lr.contiguous()
-    shape = values.shape[:2] if smooth else (1, 1)
-    decay = (1 - beta1, 1 - beta2, -math.log(beta1), -math.log(beta2))
     launch(
         adam_kernel,
         _programs(values, length),
-        *(values, into, gradient, mean, square, factors, rate, step),
-        *(length, *shape, *decay, eps, smoothing),
-        PER_VOXEL_LR=per_voxel_lr is not None,
-        SKIP_ZERO=skip_zero,
+        *(values, into, gradient, mean, square),
+        *(values if factors is None else factors.contiguous(), rule.rate, rule.step),
+        *(length, *(values.shape[:2] if smooth else (1, 1)), *_numbers(rule), smoothing),
+        PER_VOXEL_LR=factors is not None,
+        SKIP_ZERO=rule.skip_zero,
         CLEAR=clear,
         SMOOTH=smooth,
-        CHANNELS=values.shape[-1] if smooth or per_voxel_lr is not None else 1,
+        CHANNELS=values.shape[-1] if smooth or factors is not None else 1,
         WIDE=_is_wide(values),
         BLOCK=_block(length),
     )
 
 
-def adam_steps(tensors: Sequence[Sequence[Tensor]], steps: Sequence[Tensor], rule: Any) -> None:
-    """As devrf.ops.adam_step.adam_steps, of rules without options; gradients are set to zero.
-
-    Args:
-        tensors: values, gradient, mean and square of each.
-        steps: () float64, of each.
-        rule: gives rate, betas and eps.
-    """
-    device, (beta1, beta2) = tensors[0][0].device, rule.betas
+def adam_steps(tensors: Sequence[Sequence[Tensor]], rules: Sequence[Any]) -> None:
+    """As devrf.ops.adam_step.adam_steps, of rules without options; gradients are set to zero."""
     rows = tuple(
-        tuple(tensor.data_ptr() for tensor in (*four, step))
-        for four, step in zip(tensors, steps, strict=True)
+        tuple(tensor.data_ptr() for tensor in (*four, rule.step))
+        for four, rule in zip(tensors, rules, strict=True)
     )
-    addresses, pieces = _table(rows, tuple(four[0].numel() for four in tensors), device)
-    launch(
-        adam_several_kernel,
-        len(pieces),
-        *(addresses, pieces, rule.rate),
-        *(1 - beta1, 1 - beta2, -math.log(beta1), -math.log(beta2), rule.eps),
-        BLOCK=LARGEST,
-    )
+    lengths = tuple(values.numel() for values, *_ in tensors)
+    addresses, pieces = _table(rows, lengths, tensors[0][0].device)
+    known = addresses, pieces, rules[0].rate
+    launch(adam_several_kernel, len(pieces), *known, *_numbers(rules[0]), BLOCK=LARGEST)
+
+
+def _numbers(rule: Any) -> tuple[float, ...]:
+    """Shares, decays and epsilon, as :func:`moved` takes them."""
+    beta1, beta2 = rule.betas
+    return 1 - beta1, 1 - beta2, -math.log(beta1), -math.log(beta2), rule.eps
 
 
 @lru_cache(maxsize=64)

@@ -57,35 +57,32 @@ def find_samples(
         longest: an upper bound of ``count``.
         capacity: C.
     """
-    origins, directions, entry, counts = (tensor.contiguous() for tensor in rays)
-    device, number, density = origins.device, len(origins), density.contiguous()
+    along = [tensor.contiguous() for tensor in rays]
+    origins, density = along[0], density.contiguous()
     # The kernel takes two slices; the density stands in for missing ones, which are not read.
     before, after = (frame.contiguous() for frame in ([*slices, density, density])[:2])
-    stride = blocks(longest, LANES.value) * LANES.value
-    marks = torch.empty(number, stride, dtype=torch.uint8, device=device)
+    count, stride = len(origins), blocks(longest, LANES.value) * LANES.value
+    marks = origins.new_empty(count, stride, dtype=torch.uint8)
     # As wide as their running sum: no cast before it.
-    kept = torch.empty(number, dtype=torch.int64, device=device)
-    reached = torch.empty(number, dtype=torch.int32, device=device)
+    kept = origins.new_empty(count, dtype=torch.int64)
+    reached = origins.new_empty(count, dtype=torch.int32)
     launch(
         march_kernel,
-        number,
-        *(origins, directions, entry, counts),
-        *(mask.contiguous().view(torch.uint8), density, before, after, *axes),
+        count,
+        *(*along, mask.contiguous().view(torch.uint8), density, before, after, *axes),
         *(marks, kept, reached, longest, stride, *numbers),
         SLICES=len(slices),
         num_warps=1,
     )
-    ray = torch.empty(capacity, dtype=torch.int64, device=device)
-    distance = torch.empty(capacity, dtype=torch.float32, device=device)
-    points = torch.empty(capacity, 3, dtype=torch.float32, device=device)
-    significant = torch.empty(capacity, dtype=torch.uint8, device=device)
-    first, total = (torch.empty(n, dtype=torch.int64, device=device) for n in (number + 1, ()))
+    ray, first, total = (kept.new_empty(shape) for shape in (capacity, count + 1, ()))
+    distance, points = origins.new_empty(capacity), origins.new_empty(capacity, 3)
+    significant = marks.new_empty(capacity)
     launch(
         list_kernel,
         # One at least behind the rays, for the total.
-        number + max(1, padding_programs(capacity)),
-        *(origins, directions, entry, marks, reached, kept.cumsum(0)),
-        *(ray, distance, points, significant, first, total, number, stride, capacity, numbers[0]),
+        count + max(1, padding_programs(capacity)),
+        *(*along[:3], marks, reached, kept.cumsum(0), ray, distance, points, significant),
+        *(first, total, count, stride, capacity, numbers[0]),
         num_warps=1,
     )
     return ray, distance, points, significant.view(torch.bool), first, total

@@ -62,7 +62,7 @@ def adam_step(
     tensors = (values, gradient, mean, square)
     contiguous = all(tensor.is_contiguous() for tensor in tensors)
     if contiguous and (kernels := accelerated("adam", *tensors)):
-        kernels.adam_step(values, values, gradient, mean, square, **vars(rule), clear=clear)
+        kernels.adam_step(values, *tensors, rule, clear=clear)
         return
     _step(values, gradient, mean, square, rule)
     if clear:
@@ -87,7 +87,7 @@ def adam_steps(
     contiguous = all(tensor.is_contiguous() for tensor in every)
     several = len(tensors) > 1 and plain and clear and contiguous
     if several and (kernels := accelerated("adam", *every)):
-        kernels.adam_steps(tensors, [rule.step for rule in rules], rules[0])
+        kernels.adam_steps(tensors, rules)
         return
     for (values, gradient, mean, square), rule in zip(tensors, rules, strict=True):
         adam_step(values, gradient, mean, square, rule, clear=clear)
@@ -120,7 +120,7 @@ def smooth_adam_step(
     tensors = (values, into, gradient, mean, square)
     contiguous = all(tensor.is_contiguous() for tensor in tensors)
     if contiguous and (kernels := accelerated("adam", *tensors)):
-        kernels.adam_step(*tensors, **vars(rule), smoothing=smoothing)
+        kernels.adam_step(*tensors, rule, smoothing=smoothing)
         return
     smooth = torch.zeros_like(gradient)
     add_total_variation_gradient(values, smooth, smoothing)
@@ -168,11 +168,9 @@ def _neighbours(grid: Tensor, axis: int) -> tuple[Tensor, Tensor]:
 
 
 def _step(values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, rule: AdamRule) -> None:
-    step = _step_touched if rule.skip_zero else _step_all
-    step(values, grad, mean, square, rule)
-
-
-def _step_all(values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, rule: AdamRule) -> None:
+    if rule.skip_zero:
+        _step_touched(values, grad, mean, square, rule)
+        return
     beta1, beta2 = rule.betas
     mean.lerp_(grad, 1 - beta1)
     square.mul_(beta2).addcmul_(grad, grad, value=1 - beta2)
@@ -186,7 +184,7 @@ def _step_all(values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, rule: 
 def _step_touched(
     values: Tensor, grad: Tensor, mean: Tensor, square: Tensor, rule: AdamRule
 ) -> None:
-    """As :func:`_step_all`, only on rows with a gradient: most of a grid has none."""
+    """As :func:`_step`, only on rows with a gradient: most of a grid has none."""
     beta1, beta2 = rule.betas
     channels = values.shape[-1]
     flat_grad = grad.reshape(-1, channels).contiguous()

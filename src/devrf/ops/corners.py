@@ -6,7 +6,7 @@ at every step, the host would wait for the device.
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cache
 from typing import Protocol
 
 import torch
@@ -56,25 +56,20 @@ def shape_of(grid: Tensor) -> Shape:
     return x, y, z
 
 
-@lru_cache(maxsize=256)
-def _scale(low: Triple, high: Triple, shape: Shape, dtype: torch.dtype) -> Tensor:
-    # A cached tensor made in inference mode could not be used for training later.
-    with torch.inference_mode(False):
-        extent = torch.tensor(shape, dtype=dtype) - 1
-        return extent / (torch.tensor(high, dtype=dtype) - torch.tensor(low, dtype=dtype))
-
-
-@lru_cache(maxsize=256)
+@cache
 def _on_device(
     low: Triple, high: Triple, shape: Shape, dtype: torch.dtype, device: torch.device
 ) -> tuple[Tensor, Tensor]:
+    """The low corner, and the grid points per unit of length."""
+    # A cached tensor made in inference mode could not be used for training later.
     with torch.inference_mode(False):
-        corner = torch.tensor(low, dtype=dtype).to(device)
-        return corner, _scale(low, high, shape, dtype).to(device)
+        corner, points = torch.tensor(low, dtype=dtype), torch.tensor(shape, dtype=dtype)
+        scale = (points - 1) / (torch.tensor(high, dtype=dtype) - corner)
+        return corner.to(device), scale.to(device)
 
 
-@lru_cache(maxsize=256)
+@cache
 def _axes(low: Triple, high: Triple, shape: Shape, device: torch.device) -> Tensor:
+    corner, scale = _on_device(low, high, shape, torch.float32, torch.device("cpu"))
     with torch.inference_mode(False):
-        corner, points = torch.tensor(low), torch.tensor(shape, dtype=torch.float32)
-        return torch.cat([corner, _scale(low, high, shape, torch.float32), points]).to(device)
+        return torch.cat([corner, scale, torch.tensor(shape, dtype=torch.float32)]).to(device)

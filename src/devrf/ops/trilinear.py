@@ -6,7 +6,7 @@ and without intermediate copies.
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cache
 from typing import Any
 
 import torch
@@ -116,7 +116,7 @@ def _corner_rows(first: Tensor, shape: Shape) -> Tensor:
     return first[:, None] + _steps(shape, first.device)
 
 
-@lru_cache(maxsize=256)
+@cache
 def _steps(shape: Shape, device: torch.device) -> Tensor:
     """Rows (8,) of a cell's corners from its first one.
 
