@@ -232,7 +232,7 @@ def canonical() -> ScheduledStage:
     _attach(stage, images)
     stage.scene_model = model()
     field = stage.scene_model.canonical
-    stage._optimizer = GridAdam(
+    stage.optimizer = GridAdam(
         {"params": list(field.get_submodule(name).parameters()), "lr": rate, "base_lr": rate}
         for name, rate in asdict(stage.rates).items()
     )

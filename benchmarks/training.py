@@ -23,7 +23,8 @@ from devrf.callbacks import LearningRateDecay
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.cli.context import RunContext
 from devrf.cli.messages import report_user_errors
-from devrf.engine.stage import Phase, ScheduledStage
+from devrf.engine.learner import Phase
+from devrf.engine.stage import ScheduledStage
 from devrf.errors import DevrfError
 from devrf.methods.devrf.canonical_schedule import CanonicalPhase
 from devrf.methods.devrf.canonical_stage import CanonicalStage

@@ -24,3 +24,19 @@ def did_you_mean(word: object, known: Iterable[object], before: str = "") -> str
     """
     close = difflib.get_close_matches(str(word), [str(one) for one in known], n=1)
     return f"; did you mean {before}{close[0]}?" if close else ""
+
+
+def require(met: bool, key: str, expected: str, value: object) -> None:
+    """Refuse the ``value`` of a config key unless the condition is ``met``.
+
+    Args:
+        met: whether the value is good.
+        key: its place in the config.
+        expected: what it may be: ``at least 1``.
+        value: what it is.
+
+    Raises:
+        DevrfError: it is not.
+    """
+    if not met:
+        raise DevrfError(f"{key}: expected {expected}, not {value}")

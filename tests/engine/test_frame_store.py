@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import copy
-
 import pytest
 import torch
 from torch import Tensor
 
-from devrf.engine.frame_store import FrameStore, active_bytes, fits_on_device, resident_bytes
+from devrf.engine.frame_store import FrameStore, fits_on_device
 
 SHAPE = (3, 2, 4)
 OTHERS = [0, 1, 3]
@@ -34,11 +32,9 @@ def pair() -> tuple[Tensor, Tensor]:
 
 
 def test_a_frame_is_read_changed_and_written_back(store: FrameStore) -> None:
-    (backward, forward), frame, before = both(store), pair(), torch.empty(*SHAPE, 3)
+    (backward, forward), frame = both(store), pair()
     store.read(2, frame)
-    store.read_forward(1, before)
     assert torch.equal(frame[0], backward[2]) and torch.equal(frame[1], forward[2])
-    assert torch.equal(before, forward[1])
     frame[0].add_(1)
     assert torch.equal(store.to_canonical, backward)  # a copy, until it is written back
     store.write(2, frame)
@@ -97,20 +93,10 @@ def test_memory_is_locked_before_it_is_needed_and_once(
     locked.clear()
     store.reserve((9, 9, 9))
     assert locked == [(4, 9, 9, 9, 3)] * 2
-    assert copy.deepcopy(store)._reserved == []
     store.resize((5, 5, 5))
     store.resize((9, 9, 9))
     assert locked[2:] == [(4, 5, 5, 5, 3)] * 2 and not store._reserved
     assert store.to_time.data_ptr() != store.to_canonical.data_ptr()
-
-
-def test_a_prefetched_frame_is_discarded_once_it_has_been_written(store: FrameStore) -> None:
-    fetched = store.to_canonical[1], store.to_time[1]
-    store._fetched = {1: fetched, 2: fetched}
-    store.write(1, pair())
-    assert list(store._fetched) == [2] and copy.deepcopy(store)._fetched == {}
-    store.resize((4, 4, 4))
-    assert store._fetched == {}
 
 
 def test_a_stored_state_of_another_shape_is_taken(store: FrameStore) -> None:
@@ -123,14 +109,6 @@ def test_a_stored_state_of_another_shape_is_taken(store: FrameStore) -> None:
 PAPER = (160, 160, 160)
 
 
-def test_memory_of_fifty_frames_of_the_paper() -> None:
-    # 50 · 160³ displacements of 12 bytes: 2.46 GB in each direction.
-    assert resident_bytes(50, PAPER, False) == 2 * 50 * 160**3 * 12 == 2 * 2_457_600_000
-    assert resident_bytes(50, PAPER, True) == 2_457_600_000
-    # Of a frame that is learned: values 3, gradients 2, moments 4, copy 2.
-    assert active_bytes((2, 3, 4)) == 11 * 24 * 12
-
-
 @pytest.mark.parametrize(
     ("gigabytes", "half", "parallel", "fits"),
     [(6, False, 1, False), (8, False, 1, True), (6, True, 1, True), (8, False, 3, False)],
@@ -138,7 +116,8 @@ def test_memory_of_fifty_frames_of_the_paper() -> None:
 def test_a_quarter_of_the_gpu_is_left(
     gigabytes: int, half: bool, parallel: int, fits: bool
 ) -> None:
-    # 4.9 GB of frames, or 2.5 in half precision, and 0.54 for each that is learned.
+    # 2 · 50 · 160³ displacements of 12 bytes: 4.9 GB, or 2.5 in half precision. Of a frame that is
+    # learned 11 grids (values 3, gradients 2, Adam's 4, a copy 2): 0.54 GB.
     free = gigabytes * 10**9
     assert fits_on_device(free, 50, PAPER, half=half, parallel=parallel) is fits
 

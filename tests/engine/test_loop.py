@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from devrf.data.batch import Pixels
-from devrf.engine.loop import MetricAccumulator, ParallelBatch
+from devrf.engine.learner import ParallelBatch
+from devrf.engine.loop import MetricAccumulator, take
 from devrf.rendering.sample_capacity import SampleCapacity
 
 
@@ -19,10 +20,10 @@ def test_pixels_of_a_static_batch_stay_in_the_same_memory(static_shape: bool) ->
     capacity = SampleCapacity(3, torch.device("cpu")) if static_shape else None
     batch = ParallelBatch(0, [], capacity)
     first, second = pixels(0), pixels(10)
-    batch.take(first)
+    take(batch, first)
     held = batch.pixels
     assert held is not None and (held is first) == (not static_shape)
-    batch.take(second)
+    take(batch, second)
     assert batch.pixels is (held if static_shape else second)
     assert batch.pixels.image.tolist() == [10, 11, 12] and second.image[0] == 10
     assert first.image.tolist() == [0, 1, 2]

@@ -42,8 +42,8 @@ def test_the_views_of_the_last_times_are_cached(
     moving: DeVRFModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     looks: list[float] = []
-    usual = module.occupancy_through
-    monkeypatch.setattr(module, "occupancy_through", lambda *a: looks.append(1) or usual(*a))
+    usual = module.deformed_occupancy
+    monkeypatch.setattr(module, "deformed_occupancy", lambda *a: looks.append(1) or usual(*a))
     renderer = Renderer(moving, times=2)
     for time in (0.4, 0.7, 0.4, 0.7, 0.4):
         renderer.at(time)

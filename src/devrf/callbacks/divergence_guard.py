@@ -12,7 +12,8 @@ import torch
 from lightning import Callback, LightningModule, Trainer
 from torch import Tensor
 
-from devrf.engine.stage import Phase, ScheduledStage
+from devrf.engine.learner import Phase
+from devrf.engine.stage import ScheduledStage
 from devrf.errors import DevrfError
 
 log = logging.getLogger(__name__)

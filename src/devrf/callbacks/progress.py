@@ -14,7 +14,8 @@ from rich.progress import Progress as Bar
 from torch import Tensor
 
 from devrf.callbacks.curves import batch_psnr
-from devrf.engine.stage import ScheduledStage, in_words
+from devrf.engine.learner import in_words
+from devrf.engine.stage import ScheduledStage
 from devrf.system.progress import time_left
 
 log = logging.getLogger(__name__)

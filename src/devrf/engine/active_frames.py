@@ -4,27 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from devrf.checkpoints.stored_grids import pack_bits, unpack_bits
 from devrf.data.batch import PixelPool
-from devrf.engine.batches import frame_pools, images_of
-from devrf.engine.frame_store import FrameStore
+from devrf.engine.batches import images_of
+from devrf.engine.frame_store import FrameField, FrameStore
 from devrf.rendering.occupancy import Occupancy
-from devrf.rendering.view import Viewable
 from devrf.scenes.scene import Views
-
-
-class FrameField(Protocol):
-    """A field of frames that keeps them in one tensor."""
-
-    @property
-    def values(self) -> Tensor:
-        """(T, X, Y, Z, C)."""
-        ...
 
 
 @dataclass
@@ -60,7 +50,13 @@ class ActiveFrame:
     def of(
         store: FrameStore, occupancy: Occupancy, fields: Mapping[str, FrameField]
     ) -> ActiveFrame:
-        """Memory at the fields' resolutions, on their device, with an occupancy like the given."""
+        """Memory at the fields' present resolutions, on their device.
+
+        Args:
+            store: the displacements of all frames.
+            occupancy: at rest; the frame's is as large.
+            fields: further fields whose frames are learned, by name.
+        """
         backward, forward, before = (store.here.new_zeros(*store.shape, 3) for _ in range(3))
         empty = Occupancy(torch.zeros_like(occupancy.mask), occupancy.box)
         learned = backward.requires_grad_(), forward.requires_grad_()
@@ -85,7 +81,7 @@ class ActiveFrame:
         """Copy a frame out of the fields."""
         self.number = number
         self.store.read(number, self.slices)
-        self.store.read_forward(number - 1, self.before)
+        self.before.copy_(self.store.to_time[number - 1], non_blocking=True)
         for name, values in self.further.items():
             values.copy_(self.fields[name].values[number])
 
@@ -97,30 +93,30 @@ class ActiveFrame:
             for name, values in self.further.items():
                 self.fields[name].values[self.number].copy_(values)
 
-    def state(self, images: Tensor, area: int, *, exact: bool) -> dict[str, Any]:
+    def state(self, views: Views, *, exact: bool) -> dict[str, Any]:
         """Occupancy and pixels as plain data, for a progress file.
 
         Args:
-            images: (K,) the images of the frame.
-            area: pixels of an image.
+            views: what is learned from.
             exact: add the displacements, which the field would round.
         """
+        images, area = images_of(views, self.number), views.height * views.width
         return {
             "occupancy": pack_bits(self.occupancy.mask),
-            "shape": list(self.occupancy.mask.shape),
             "pixels": [pack_bits(pool.mask(images, area)) for pool in self.pools],
             "displacements": [tensor.detach().cpu() for tensor in self.slices if exact],
         }
 
     @torch.no_grad()
-    def load_state(self, state: dict[str, Any], images: Tensor, area: int) -> None:
+    def load_state(self, state: dict[str, Any], views: Views) -> None:
         """Restore what :meth:`state` gave; the frame has been checked out."""
+        images, area = images_of(views, self.number), views.height * views.width
         for tensor, value in zip(self.slices, state["displacements"], strict=False):
             tensor.copy_(value)
-        device, shape = self.backward.device, (len(images), area)
-        mask = unpack_bits(state["occupancy"], state["shape"], device)
+        device, shape = self.backward.device, self.occupancy.mask.shape
+        mask = unpack_bits(state["occupancy"], shape, device)
         self.occupancy.refill(Occupancy(mask, self.occupancy.box))
-        masks = [unpack_bits(bits, shape, device) for bits in state["pixels"]]
+        masks = [unpack_bits(bits, (len(images), area), device) for bits in state["pixels"]]
         self.pools = [PixelPool.of_mask(images, mask) for mask in masks]
 
 
@@ -130,9 +126,8 @@ class ActiveFrames:
     def __init__(self, module: nn.Module) -> None:
         """No frame yet.
 
-        Args:
-            module: a stage whose state holds the fields: before it is saved the frames are
-                written back, after it was loaded they are checked out again.
+        Before the state of ``module``, which holds the fields, is saved, the frames are written
+        back; after it was loaded they are checked out again.
         """
         self._frames: list[ActiveFrame] = []
         module.register_state_dict_pre_hook(  # type: ignore[no-untyped-call]
@@ -158,14 +153,7 @@ class ActiveFrames:
         occupancy: Occupancy,
         fields: Mapping[str, FrameField],
     ) -> None:
-        """Make memory for ``count`` frames at the fields' present resolutions.
-
-        Args:
-            count: how many frames are trained in parallel.
-            store: the displacements of all frames.
-            occupancy: at rest.
-            fields: further fields whose frames are learned, by name.
-        """
+        """Make memory for ``count`` frames, as :meth:`ActiveFrame.of` does."""
         self._frames = []  # frees the memory of those before
         self._frames = [ActiveFrame.of(store, occupancy, fields) for _ in range(count)]
 
@@ -173,33 +161,6 @@ class ActiveFrames:
         """Copy as many frames as there is memory for out of the fields."""
         for frame, number in zip(self._frames, numbers, strict=True):
             frame.check_out(number)
-
-    def choose_pixels(
-        self, views: Views, model: Viewable, *, occupied_only: bool, join_views: bool
-    ) -> None:
-        """Choose the pixels that each frame is learned from, as :func:`frame_pools` does."""
-        for frame in self._frames:
-            frame.pools = frame_pools(
-                views,
-                frame.number,
-                model,
-                frame.occupancy,
-                occupied_only=occupied_only,
-                join_views=join_views,
-            )
-
-    def state(self, views: Views, *, exact: bool) -> list[dict[str, Any]]:
-        """Each frame's :meth:`ActiveFrame.state`; ``views`` are those that it learns from."""
-        area = views.height * views.width
-        return [
-            frame.state(images_of(views, frame.number), area, exact=exact) for frame in self._frames
-        ]
-
-    def load_state(self, states: Sequence[dict[str, Any]], views: Views) -> None:
-        """Restore what :meth:`state` gave; the frames have been checked out."""
-        area = views.height * views.width
-        for frame, state in zip(self._frames, states, strict=True):
-            frame.load_state(state, images_of(views, frame.number), area)
 
     def write_back(self) -> None:
         """Copy what was learned of the frames into the fields; learning may go on."""

@@ -29,13 +29,9 @@ ON_CPU, ON_GPU = 1, 16
 
 
 def gather_batch(
-    views: Views,
-    image: Tensor,
-    flat: Tensor,
-    background: Tensor,
-    space: Space = WORLD,
+    views: Views, image: Tensor, flat: Tensor, background: Tensor, space: Space = WORLD
 ) -> RayBatch:
-    """The batch of given pixels.
+    """The rays of given pixels in the fields' space, with the truth there.
 
     Args:
         views: images and cameras, on the device of the indices.
@@ -43,9 +39,6 @@ def gather_batch(
         flat: (R,) int64, row-major pixel number within it.
         background: (3,) or (R, 3) RGB in [0, 1] that colours are composited on.
         space: the space that the fields live in.
-
-    Returns:
-        Rays in the fields' space with the truth at their pixels.
     """
     assert views.frames is not None, "views of a scene know their frames"
     cameras, flow = views.cameras, views.flow
@@ -97,11 +90,7 @@ class FramePool:
         frame = views.frames[everything.image.long()]
         order = frame.argsort(stable=True)
         _, counts = torch.unique(frame, return_counts=True)
-        return FramePool(
-            everything[order],
-            tuple(counts.cumsum(0).tolist()),
-            len(views),
-        )
+        return FramePool(everything[order], tuple(counts.cumsum(0).tolist()), len(views))
 
     @property
     def frames(self) -> int:
@@ -156,13 +145,7 @@ def rays_hit_occupied(
     for start in range(0, len(images), together):
         some = images[start : start + together]
         rays = coarse.rays(some.repeat_interleave(len(pixels)), pixels.repeat(len(some), 1))
-        hit = hits(
-            model.space.rays(rays),
-            model.box,
-            occupancy,
-            near=near,
-            far=far,
-        )
+        hit = hits(model.space.rays(rays), model.box, occupancy, near=near, far=far)
         rows = hit.view(-1, height, width).repeat_interleave(BLOCK, dim=1)[:, : cameras.height]
         found.append(rows.repeat_interleave(BLOCK, dim=2)[:, :, : cameras.width].flatten(1))
     return torch.cat(found)
@@ -195,7 +178,8 @@ def frame_pools(
         frame: the frame.
         model: gives box, space, near and far.
         occupancy: where something is at the frame's time.
-        occupied_only: only pixels on the alpha mask, or whose rays hit something occupied.
+        occupied_only: only pixels on the alpha mask, or whose rays hit something occupied; all
+            those of an image that has none.
         join_views: one pool of all views; else one pool a view.
 
     Raises:
@@ -204,10 +188,14 @@ def frame_pools(
     images = images_of(views, frame)
     if len(images) == 0:
         raise DevrfError(f"dynamic training set: no image at frame {frame}")
+    pools = [all_pixels(views, image[None]) for image in images]
     if occupied_only:
-        pools = _occupied(views, images, model, occupancy)
-    else:
-        pools = [all_pixels(views, image[None]) for image in images]
+        wanted = rays_hit_occupied(views.cameras, images, model, occupancy)
+        if views.has_alpha:
+            wanted |= views.pixels[images][..., 3].flatten(1) > 0
+        for k, whole in enumerate(pools):
+            pool = wanted_pixels(views, images[k : k + 1], wanted[k : k + 1])
+            pools[k] = pool if len(pool) else whole
     if not join_views:
         return pools
     return [PixelPool(torch.cat([pool.pixels for pool in pools], dim=1))]
@@ -217,17 +205,3 @@ def images_of(views: Views, frame: int) -> Tensor:
     """The images (K,) int64 of a frame, ascending."""
     assert views.frames is not None
     return (views.frames == frame).nonzero()[:, 0]
-
-
-def _occupied(
-    views: Views, images: Tensor, model: Viewable, occupancy: Occupancy
-) -> list[PixelPool]:
-    """Each image's pixels on its mask, or whose rays hit something occupied; all if none do."""
-    wanted = rays_hit_occupied(views.cameras, images, model, occupancy)
-    if views.has_alpha:
-        wanted |= views.pixels[images][..., 3].flatten(1) > 0
-    pools = []
-    for image, mask in zip(images, wanted, strict=True):
-        pool = wanted_pixels(views, image[None], mask[None])
-        pools.append(pool if len(pool) else all_pixels(views, image[None]))
-    return pools

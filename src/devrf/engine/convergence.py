@@ -26,17 +26,19 @@ def converged(losses: Sequence[float], min_rel_improvement: float) -> bool:
 class Convergence:
     """Watches the losses of parallel batches, step by step; on a GPU one step late.
 
-    Then it always has the next step's work.
+    What was given last may still be queued on the device; what was given before that has been
+    computed long ago, so that the device is never left without work. The delay is the same each
+    time, whatever the device's speed.
     """
 
     def __init__(self) -> None:
-        self._late = LateReading()
-        self._losses: list[list[float]] = []
+        self.reset()
 
     def reset(self) -> None:
         """Forget all losses: a visit begins, or begins again."""
-        self._late.reset()
-        self._losses = []
+        self._losses: list[list[float]] = []
+        self._waiting: Tensor | None = None
+        self._copied: torch.cuda.Event | None = None
 
     def converged(self, losses: Tensor, min_rel_improvement: float) -> bool:
         """Whether each batch's loss has stopped falling (docs/method.md#coarse-to-fine).
@@ -45,7 +47,7 @@ class Convergence:
             losses: (batches,) mean losses of a Lightning step.
             min_rel_improvement: as of :func:`converged`.
         """
-        known = self._late.exchange(losses) if losses.is_cuda else losses.tolist()
+        known = self._exchange(losses) if losses.is_cuda else losses.tolist()
         if known is None:
             return False
         self._losses = self._losses or [[] for _ in known]
@@ -53,48 +55,27 @@ class Convergence:
             course.append(loss)
         return all(converged(course, min_rel_improvement) for course in self._losses)
 
-    def state(self) -> dict[str, Any]:
-        """What :meth:`load_state` takes, as plain data."""
-        return {"losses": [list(course) for course in self._losses], "late": self._late.waiting}
-
-    def load_state(self, state: dict[str, Any]) -> None:
-        """Go on with what :meth:`state` gave."""
-        self._losses = [list(course) for course in state["losses"]]
-        self._late.reset(state["late"])
-
-
-class LateReading:
-    """Hands over at each call what was given at the call before.
-
-    What was given last may still be queued on the device; what was given before that has long been
-    computed, so that the device is never left without work. The delay is the same each time,
-    whatever the device's speed.
-    """
-
-    def __init__(self) -> None:
-        self._waiting: Tensor | None = None
-        self._copied: torch.cuda.Event | None = None
-
-    def exchange(self, values: Tensor) -> list[float] | None:
-        """The values (K,) of the call before, None at the first; these ones are for the next."""
-        before = self.waiting
-        if values.is_cuda:
-            self._waiting = torch.empty(values.shape, dtype=values.dtype, pin_memory=True)
-            self._waiting.copy_(values, non_blocking=True)
-            self._copied = torch.cuda.Event()  # type: ignore[no-untyped-call]
-            self._copied.record()
-        else:
-            self._waiting, self._copied = values.clone(), None
+    def _exchange(self, losses: Tensor) -> list[float] | None:
+        """The losses of the call before, None at the first; these ones are for the next."""
+        before = self._read()
+        self._waiting = torch.empty(losses.shape, dtype=losses.dtype, pin_memory=True)
+        self._waiting.copy_(losses, non_blocking=True)
+        self._copied = torch.cuda.Event()  # type: ignore[no-untyped-call]
+        self._copied.record()
         return before
 
-    @property
-    def waiting(self) -> list[float] | None:
-        """What the next call hands over; read when the device has it."""
+    def _read(self) -> list[float] | None:
+        """The losses that the next call is for, once the device has computed them."""
         if self._copied is not None:
             self._copied.synchronize()
         return None if self._waiting is None else list(self._waiting.tolist())
 
-    def reset(self, waiting: list[float] | None = None) -> None:
-        """Forget what was given, or hand over ``waiting`` next."""
-        self._waiting = None if waiting is None else torch.tensor(waiting)
-        self._copied = None
+    def state(self) -> dict[str, Any]:
+        """What :meth:`load_state` takes, as plain data."""
+        return {"losses": [list(course) for course in self._losses], "late": self._read()}
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Go on with what :meth:`state` gave."""
+        self.reset()
+        self._losses = [list(course) for course in state["losses"]]
+        self._waiting = None if state["late"] is None else torch.tensor(state["late"])

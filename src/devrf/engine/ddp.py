@@ -141,22 +141,17 @@ def _reached_points(gradients: Sequence[Tensor]) -> list[Tensor]:
     own = [(gradient != 0).any(dim=-1).view(-1) for gradient in gradients]
     anywhere = torch.cat(own).to(torch.uint8)
     distributed.all_reduce(anywhere, distributed.ReduceOp.MAX)
-    parts = torch.split(anywhere, [len(one) for one in own])
+    parts = torch.split(anywhere, [len(reached) for reached in own])
     return [part.nonzero()[:, 0] for part in parts]
 
 
 def largest(values: Sequence[int], device: torch.device) -> list[int]:
-    """For each value the largest of all processes; waits for them.
-
-    Args:
-        values: as many in each process.
-        device: of this process, for the exchange.
-    """
+    """For each value, as many in each process, the largest of all; waits for the others."""
     if world_size() == 1:
         return list(values)
-    found = torch.tensor(values, dtype=torch.int64, device=device)
-    distributed.all_reduce(found, distributed.ReduceOp.MAX)
-    return [int(value) for value in found.tolist()]
+    most = torch.tensor(values, dtype=torch.int64, device=device)
+    distributed.all_reduce(most, distributed.ReduceOp.MAX)
+    return [int(value) for value in most.tolist()]
 
 
 def average(values: Tensor) -> Tensor:
@@ -192,8 +187,7 @@ def assert_replicas_equal(tensors: Mapping[str, Tensor]) -> None:
     own = {name: _checksum(tensor) for name, tensor in tensors.items()}
     everyone: list[Any] = [None] * world_size()
     distributed.all_gather_object(everyone, own)
-    known = sorted({name for other in everyone for name in other})
-    differing = [n for n in known if any(other.get(n) != own.get(n) for other in everyone)]
+    differing = sorted({name for other in everyone for name, _ in other.items() ^ own.items()})
     if differing:
         raise DevrfError(
             f"trainer: the processes have learned different fields ({', '.join(differing)}); give "

@@ -1,4 +1,4 @@
-"""Storage for the displacements of all frames while a few of them are learned.
+"""Fields of all frames, and where their displacements are kept while a few of them are learned.
 
 All frames together are large (50 × 160³ × 3 single-precision values are 2.5 GB per direction), and
 few are needed at a time: they may be kept on the host, or in half precision. Frames are always
@@ -14,6 +14,8 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
+from devrf.geometry.box import Box
+from devrf.geometry.clock import FrameClock
 from devrf.ops.trilinear import resample
 from devrf.system.memory import page_locked
 
@@ -23,7 +25,6 @@ Directions = tuple[Tensor, Tensor]
 Shape = tuple[int, int, int]
 NAMES = ("to_canonical", "to_time")
 
-
 # A displacement: three float32.
 DISPLACEMENT = 12
 # Grids of an active frame: both directions and the forward one of the frame before (3),
@@ -32,6 +33,33 @@ ACTIVE_GRIDS = 11
 # The share of a GPU's free memory that frames may take. The rest is for images, the canonical
 # field and batches.
 FRAMES_SHARE = 0.75
+
+
+class FrameField(nn.Module):
+    """Where the grids of T frames are, in space and in time; kept in checkpoints.
+
+    Attributes:
+        box: where the field lives.
+        clock: the times of the T frames.
+        values: (T, X, Y, Z, C) of a field that keeps all its frames in one tensor.
+    """
+
+    values: Tensor
+
+    def __init__(self, box: Box, clock: FrameClock) -> None:
+        super().__init__()
+        self.box = box
+        self.clock = clock
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Box and clock, as plain numbers."""
+        low, high = list(self.box.low), list(self.box.high)
+        return {"low": low, "high": high, "times": list(self.clock.times)}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`get_extra_state` gave."""
+        self.box = Box.of(state["low"], state["high"])
+        self.clock = FrameClock(tuple(state["times"]))
 
 
 class FrameStore(nn.Module):
@@ -47,7 +75,7 @@ class FrameStore(nn.Module):
     to_time: Tensor
     here: Tensor
 
-    def __init__(self, frames: int, shape: tuple[int, int, int]) -> None:
+    def __init__(self, frames: int, shape: Shape) -> None:
         """Zero displacements of ``frames`` frames on grids of ``shape`` (X, Y, Z)."""
         super().__init__()
         self.on_host = False
@@ -62,7 +90,7 @@ class FrameStore(nn.Module):
         self._side: torch.cuda.Stream | None = None
 
     @property
-    def shape(self) -> tuple[int, int, int]:
+    def shape(self) -> Shape:
         """Grid points along x, y, z."""
         _, x, y, z, _ = self.to_canonical.shape
         return x, y, z
@@ -83,11 +111,6 @@ class FrameStore(nn.Module):
                 tensor.record_stream(present)
         for tensor, value in zip(into, source, strict=True):
             tensor.copy_(value, non_blocking=True)
-
-    @torch.no_grad()
-    def read_forward(self, frame: int, into: Tensor) -> None:
-        """As :meth:`read`, but only the forward displacements."""
-        into.copy_(self.to_time[frame], non_blocking=True)
 
     @torch.no_grad()
     def write(self, frame: int, displacements: Directions) -> None:
@@ -135,7 +158,7 @@ class FrameStore(nn.Module):
             getattr(self, name)[frame] = getattr(self, name)[frame - 1]
 
     @torch.no_grad()
-    def resize(self, shape: tuple[int, int, int]) -> None:
+    def resize(self, shape: Shape) -> None:
         """Resample every frame to grids of ``shape``, trilinearly."""
         self._fetched = {}
         for name in NAMES:
@@ -155,7 +178,7 @@ class FrameStore(nn.Module):
             on_host: on the host, in page-locked memory where CUDA is available.
             half: in half precision: to 1/2048 of each value.
         """
-        self.on_host = on_host
+        self.on_host, self._reserved = on_host, []
         for name in NAMES:
             frames = getattr(self, name)
             moved = self._empty(frames.shape, torch.float16 if half else torch.float32)
@@ -191,10 +214,10 @@ class FrameStore(nn.Module):
         self.offload(on_host=on_host, half=half)
         self.reserve(shape)
 
-    def reserve(self, shape: tuple[int, int, int]) -> None:
-        """Lock memory for grids of ``shape`` now, if frames rest in page-locked memory.
+    def reserve(self, shape: Shape) -> None:
+        """Lock memory for :meth:`resize` to ``shape`` now, if frames are kept in such memory.
 
-        It takes seconds for gigabytes. :meth:`resize` to that shape then takes this memory.
+        It takes seconds for gigabytes.
         """
         kept = self.to_time
         if self.on_host and torch.cuda.is_available() and kept.shape[1:4] != shape:
@@ -205,10 +228,7 @@ class FrameStore(nn.Module):
         """An uninitialised tensor where displacements are kept."""
         if not self.on_host:
             return torch.empty(shape, dtype=dtype, device=self.here.device)
-        if self._reserved and (self._reserved[-1].shape, self._reserved[-1].dtype) == (
-            shape,
-            dtype,
-        ):
+        if self._reserved and self._reserved[-1].shape == shape:
             return self._reserved.pop()
         if torch.cuda.is_available():
             try:

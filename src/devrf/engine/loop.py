@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from lightning.pytorch.core.optimizer import LightningOptimizer
@@ -15,6 +14,7 @@ from devrf.accel.graphs import CudaGraphCapture, GraphedStep, Graphs
 from devrf.accel.streams import StreamParallel
 from devrf.data.batch import Pixels
 from devrf.engine.ddp import average, average_gradients, rays_per_rank, world_size
+from devrf.engine.learner import Learner, ParallelBatch
 from devrf.engine.micro_batching import MicroBatching
 from devrf.ops.adam import GridAdam
 from devrf.rendering.sample_capacity import SampleCapacity
@@ -23,30 +23,14 @@ from devrf.system.memory import OutOfMemoryError
 from devrf.system.profiling import measured, span
 
 
-@dataclass
-class ParallelBatch:
-    """One of the batches that an iteration learns from, independent of the others.
-
-    Attributes:
-        number: its index in the iteration, from 0.
-        parameters: what is learned from it, and from no other batch.
-        capacity: the length of its sample lists; None where their length depends on data.
-        pixels: the pixels of the present iteration; None before the first.
-    """
-
-    number: int
-    parameters: Sequence[Tensor]
-    capacity: SampleCapacity | None = None
-    pixels: Pixels | None = None
-
-    def take(self, drawn: Pixels) -> None:
-        """Set the pixels to ``drawn``; with a capacity, copy them into the same memory."""
-        if self.capacity is None:
-            self.pixels = drawn
-        elif self.pixels is None:
-            self.pixels = drawn.clone()
-        else:
-            self.pixels.take(drawn)
+def take(batch: ParallelBatch, drawn: Pixels) -> None:
+    """Set a batch's pixels to ``drawn``; with a capacity, copy them into the same memory."""
+    if batch.capacity is None:
+        batch.pixels = drawn
+    elif batch.pixels is None:
+        batch.pixels = drawn.clone()
+    else:
+        batch.pixels.take(drawn)
 
 
 class MetricAccumulator:
@@ -56,12 +40,12 @@ class MetricAccumulator:
         self._names: tuple[str, ...] = ()
         self._values: Tensor | None = None  # (batches, names)
 
-    def add(self, found: Sequence[Mapping[str, Tensor]]) -> None:
+    def add(self, batches: Sequence[Mapping[str, Tensor]]) -> None:
         """Add the values () of an iteration, by name for each batch; all have the same names."""
-        self._names = tuple(found[0])
-        values = [terms[name] for terms in found for name in self._names]
+        self._names = tuple(batches[0])
+        values = [terms[name] for terms in batches for name in self._names]
         if self._values is None:
-            self._values = torch.stack(values).view(len(found), len(self._names))
+            self._values = torch.stack(values).view(len(batches), len(self._names))
         else:
             torch._foreach_add_(self._values.view(-1).unbind(), values)
 
@@ -74,38 +58,8 @@ class MetricAccumulator:
         assert self._values is not None
         means = average(self._values) / iterations
         self._values.zero_()
-        over_batches = means.mean(dim=0).unbind()
-        return dict(zip(self._names, over_batches, strict=True)), means[
-            :, self._names.index("loss")
-        ]
-
-
-class Learner(Protocol):
-    """What the loop asks of a stage."""
-
-    @property
-    def optimizer(self) -> GridAdam:
-        """Steps over everything that is learned."""
-        ...
-
-    @property
-    def view_cycle(self) -> int:
-        """In how many iterations a batch has come from every training view."""
-        ...
-
-    def draw(self, batch: ParallelBatch) -> Pixels:
-        """The pixels of a batch's next iteration."""
-        ...
-
-    def loss(
-        self, batch: ParallelBatch, views: Any, pixels: Pixels
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """The weighted loss () of a batch's pixels of ``views``, and its terms () by name."""
-        ...
-
-    def manual_backward(self, loss: Tensor, *args: Any, **kwargs: Any) -> None:
-        """Add the gradients of a loss."""
-        ...
+        over_batches = dict(zip(self._names, means.mean(dim=0).unbind(), strict=True))
+        return over_batches, means[:, self._names.index("loss")]
 
 
 class Loop:
@@ -122,8 +76,9 @@ class Loop:
         micro_batching: divides batches when memory runs out.
         metrics: losses and their terms since they were last taken.
         num_captures: how many CUDA graphs have been captured.
-        num_short_lists: how often a list of samples was found to have been too short, so that a
-            batch's last rays had lost theirs.
+        num_short_lists: how often a list of samples was found to have been too short, so that
+            samples of the last rays were dropped.
+        rays: of a batch in this process.
     """
 
     def __init__(self, graphs: Graphs = "auto") -> None:
@@ -132,18 +87,13 @@ class Loop:
         self.micro_batching = MicroBatching()
         self.metrics = MetricAccumulator()
         self.num_captures = self.num_short_lists = 0
-        self._rays, self._processes = 0, 1
+        self.rays, self._processes = 0, 1
         self._device = torch.device("cpu")
         # What losses are scaled by in the backward pass, which would fill one each time.
         self._one = torch.ones(())
         self._streams = StreamParallel()
         self._graphed: GraphedStep | None = None
         self._capture: CudaGraphCapture | None = None
-
-    @property
-    def rays(self) -> int:
-        """Rays of a batch in this process."""
-        return self._rays
 
     @property
     def capacities(self) -> list[SampleCapacity]:
@@ -167,8 +117,8 @@ class Loop:
             static_shape: whether all shapes must be independent of data.
         """
         self.release()
-        self._rays, self._device = rays_per_rank(rays), parameters[0][0].device
-        self._processes = world_size()
+        self.rays, self._processes = rays_per_rank(rays), world_size()
+        self._device = parameters[0][0].device
         self._one = self._one.to(self._device)
         self.batches = [ParallelBatch(k, learned) for k, learned in enumerate(parameters)]
         if static_shape:
@@ -196,7 +146,7 @@ class Loop:
             OutOfMemoryError: the smallest micro-batch does not fit; no parameter has changed.
         """
         for batch in self.batches:
-            batch.take(stage.draw(batch))
+            take(batch, stage.draw(batch))
         try:
             if self.capacities:
                 self._static_step(stage, views, optimizer)
@@ -217,21 +167,18 @@ class Loop:
         self.num_short_lists += sum(capacity.num_short for capacity in self.capacities) - before
 
     def _make_capacities(self) -> None:
-        rays = -(-self._rays // self.micro_batching.count)
+        rays = -(-self.rays // self.micro_batching.count)
         for batch in self.batches:
             batch.capacity = SampleCapacity(rays, self._device)
 
     def _accumulate(self, stage: Learner, views: Any) -> None:
         """Compute the gradients of all batches; add losses and terms to the metrics."""
-        if len(self.batches) == 1:
-            found = [self._gradients(self.batches[0], stage, views)]
-        else:
-            pieces = [partial(self._gradients, batch, stage, views) for batch in self.batches]
-            found = self._streams(pieces, self._device)
+        pieces = [partial(self._gradients, batch, stage, views) for batch in self.batches]
+        terms = self._streams(pieces, self._device)
         if self._processes > 1:
             groups = stage.optimizer.param_groups
             average_gradients(p for group in groups for p in group["params"])
-        self.metrics.add(found)
+        self.metrics.add(terms)
 
     def _gradients(self, batch: ParallelBatch, stage: Learner, views: Any) -> dict[str, Tensor]:
         """Compute the gradients of one batch; its loss and terms by name."""
@@ -283,12 +230,8 @@ class Loop:
 
     def capturer(self) -> CudaGraphCapture | None:
         """Captures work in graphs; None unless shapes are static, in one process on a GPU."""
-        if (
-            not self.capacities
-            or self.graphs != "auto"
-            or self._device.type != "cuda"
-            or self._processes > 1
-        ):
+        on_gpu = self._device.type == "cuda" and self._processes == 1
+        if not (self.capacities and self.graphs == "auto" and on_gpu):
             return None
         if self._capture is None or self._capture.device != self._device:
             self._capture = CudaGraphCapture(self._device)

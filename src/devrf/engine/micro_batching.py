@@ -97,7 +97,7 @@ class MicroBatching:
             raise OutOfMemoryError(f"out of memory ({numbers(said, device)})")
         self.count *= 2
         log.warning(
-            "out of memory (%s): batches are taken in %d parts from now on",
+            "out of memory (%s): batches are split into %d micro-batches from now on",
             numbers(said, device),
             self.count,
         )

@@ -1,21 +1,16 @@
-"""What a stage is: a part of training that follows a schedule, run by Lightning.
+"""A stage: a part of training that follows a schedule, run by Lightning.
 
-A schedule is a list of phases. Within a phase the same tensors are learned; between two phases
-grids grow or other frames become active. A subclass of :class:`ScheduledStage` says what is learned
-in each phase, which pixels an iteration draws, and what their loss is. How an iteration is carried
-out is in :mod:`devrf.engine.loop`.
+What is learned in each phase is defined by a subclass (:mod:`devrf.engine.learner`); how an
+iteration is carried out is in :mod:`devrf.engine.loop`.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Protocol
+from typing import Any
 
 import numpy as np
 import torch
-from lightning import LightningModule
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
 
@@ -29,61 +24,22 @@ from devrf.checkpoints.checkpoint import (
     metadata_in,
 )
 from devrf.checkpoints.progress import rng_state, set_rng_state
-from devrf.data.batch import Pixels, background_color
+from devrf.data.batch import background_color
 from devrf.engine.ddp import assert_replicas_equal, broadcast, check_strategy, rank
-from devrf.engine.loop import Loop, ParallelBatch
+from devrf.engine.learner import Learner
+from devrf.engine.loop import Loop
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import score
 from devrf.ops.adam import GridAdam
 from devrf.rendering.renderer import Renderer
-from devrf.rendering.view import Viewable
 from devrf.scenes.scene import CaptureName, Scene, Views
 from devrf.system.memory import OutOfMemoryError
 
-
-class Phase(Protocol):
-    """A range of iterations in which the same tensors are learned."""
-
-    @property
-    def start(self) -> int:
-        """First iteration."""
-        ...
-
-    @property
-    def stop(self) -> int:
-        """One past the last iteration."""
-        ...
-
-    @property
-    def kind(self) -> str:
-        """What is learned, in a word or two: ``search``, ``fine``, ``level 2``."""
-        ...
-
-    @property
-    def frames(self) -> tuple[int, ...]:
-        """The frames that are learned, ascending; empty where all times are learned at once."""
-        ...
+# Attributes of a stage that a progress file holds by name: where it is in its schedule.
+POSITION = ("iteration", "skipped", "seed", "num_rollbacks", "lr_scale")
 
 
-def in_words(frames: tuple[int, ...]) -> str:
-    """``frame 3``, or ``frames 3, 10``."""
-    noun = "frame" if len(frames) == 1 else "frames"
-    return f"{noun} {', '.join(str(frame) for frame in frames)}"
-
-
-class LearnedModel(Viewable, Protocol):
-    """What a stage learns: a :class:`~devrf.methods.base.Renderable`."""
-
-    def config(self) -> dict[str, Any]:
-        """Plain data to build it from."""
-        ...
-
-    def stored_state(self) -> dict[str, Any]:
-        """The state for a finished checkpoint."""
-        ...
-
-
-class ScheduledStage(LightningModule, ABC):
+class ScheduledStage(Learner):
     """A stage whose schedule says what each iteration learns.
 
     One Lightning step runs several optimiser iterations, so that Lightning's overhead is
@@ -91,12 +47,8 @@ class ScheduledStage(LightningModule, ABC):
     ``LearningRateDecay`` sets the learning rates before each optimiser step.
 
     Attributes:
-        name: what files, messages and protocols call the stage.
-        capture: the part of the scene that is learned from.
-        scene_model: what is learned.
         iteration: position in the schedule: optimiser iterations done or skipped.
         skipped: iterations left out because a phase had converged.
-        phase: the phase that grids and optimiser are ready for; None before the first.
         record: what training took, once a ``TrainingRecord`` callback has measured it.
         earlier_records: the same for the stages that this one builds on, by name.
         generator: draws pixels, on the stage's device. Its state at the beginning of a Lightning
@@ -105,8 +57,7 @@ class ScheduledStage(LightningModule, ABC):
         training_config: the settings that decide what is learned, by config key; empty for a
             stage that was not built from a config.
         earlier_configs: the same of the stages that this one builds on, by name.
-        command: the overrides of the command that learns, for its checkpoints; None where none
-            does.
+        command: the overrides of the command that learns, for its checkpoints, if there is one.
         protocol: the name of the protocol that the stage is a part of, if any.
         num_rollbacks: how often training diverged and was rolled back.
         lr_scale: factor of the scheduled learning rates; below 1 after a rollback.
@@ -115,118 +66,26 @@ class ScheduledStage(LightningModule, ABC):
         logged: what was last logged by :meth:`training_step`: means () by name, on the host.
     """
 
-    name: str
-    capture: CaptureName | Literal["both"]
-    # Config keys: what to lower when memory runs out, and what to lower when training diverges.
-    memory_keys: tuple[str, ...] = ()
-    rate_keys: ClassVar[str] = "the learning rates"
-    scene_model: LearnedModel
-
     def __init__(self, iterations_per_step: int, graphs: Graphs = "auto") -> None:
         super().__init__()
         self.automatic_optimization = False
         self.loop = Loop(graphs)
         self.iterations_per_step = iterations_per_step
-        self.iteration = 0
-        self.skipped = 0
-        self.phase: Phase | None = None
+        self.iteration = self.skipped = self.seed = self.num_rollbacks = 0
+        self.phase = None
         self.record: TrainingFigures = {}
         self.earlier_records: dict[str, TrainingFigures] = {}
         self.generator = torch.Generator()
-        self.seed = 0
         self.training_config: dict[str, Any] = {}
         self.earlier_configs: dict[str, dict[str, Any]] = {}
         self.command: list[str] | None = None
         self.protocol: str | None = None
-        self.num_rollbacks = 0
         self.lr_scale = 1.0
         self.abort_reason: str | None = None
         self.logged: dict[str, Tensor] = {}
-        self._plain: Tensor | None = None
+        self._plain_background: Tensor | None = None
         self._progress: dict[str, Any] | None = None
         self._finished: dict[str, Any] | None = None
-
-    # What a subclass defines.
-
-    @property
-    @abstractmethod
-    def total_iterations(self) -> int:
-        """Iterations of the whole schedule."""
-
-    @property
-    @abstractmethod
-    def resolution(self) -> tuple[int, ...]:
-        """Present shape of the grid that is learned; empty where there is none."""
-
-    @property
-    @abstractmethod
-    def optimizer(self) -> GridAdam:
-        """The stage's optimiser, the same object throughout."""
-
-    @abstractmethod
-    def phase_at(self, iteration: int) -> Phase:
-        """The phase that contains ``iteration``."""
-
-    @abstractmethod
-    def learning_rate_factor(self, iteration: int) -> float:
-        """Factor of the base learning rates at ``iteration``."""
-
-    @abstractmethod
-    def enter(self, phase: Phase) -> None:
-        """Make grids and optimiser ready for ``phase``; ends with :meth:`bind`."""
-
-    @abstractmethod
-    def draw(self, batch: ParallelBatch) -> Pixels:
-        """The pixels of a batch's next iteration, drawn with ``generator``."""
-
-    @abstractmethod
-    def loss(
-        self, batch: ParallelBatch, views: Any, pixels: Pixels
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """The weighted loss () of a batch's pixels of ``views``, and its terms () by name."""
-
-    @abstractmethod
-    def phase_state(self) -> dict[str, Any]:
-        """State of the present phase that does not follow from the schedule, as plain data."""
-
-    @abstractmethod
-    def restore(self, phase: Phase, kept: dict[str, Any]) -> None:
-        """Continue ``phase`` with the state ``kept``; the model's tensors are loaded."""
-
-    # What a subclass may define.
-
-    @classmethod
-    def check_settings(cls, **settings: Any) -> None:
-        """Find errors in the arguments of the stage before what it builds on has been learned.
-
-        Raises:
-            DevrfError: one is wrong.
-        """
-
-    def prepare(self) -> None:
-        """Called before each iteration; may wait for the device."""
-
-    @property
-    def view_cycle(self) -> int:
-        """In how many iterations a batch has come from every training view."""
-        return 1
-
-    def converged(self, losses: Tensor) -> bool:
-        """Whether the rest of the present phase can be skipped.
-
-        Args:
-            losses: (batches,) mean loss of each batch over the last Lightning step.
-        """
-        return False
-
-    def current_model(self) -> LearnedModel:
-        """The model, with everything learned so far written back to it."""
-        return self.scene_model
-
-    def resize_to(self, state: dict[str, Tensor]) -> None:
-        """Give modules the shapes of a stored ``state`` that is about to be loaded."""
-
-    # What subclasses and callbacks use.
 
     @property
     def scene(self) -> Scene:
@@ -241,6 +100,11 @@ class ScheduledStage(LightningModule, ABC):
         )
         return views
 
+    @property
+    def scored_capture(self) -> CaptureName:
+        """The capture whose held-out views measure what was learned."""
+        return "dynamic" if self.capture == "both" else self.capture
+
     def background(self, image: Tensor) -> Tensor:
         """What is behind the pixels of ``image`` (R,): (3,), always the same tensor, if plain.
 
@@ -249,20 +113,9 @@ class ScheduledStage(LightningModule, ABC):
         name = self.scene.background
         if name == "random":
             return background_color(name, len(image), self.generator)
-        if self._plain is None or self._plain.device != image.device:
-            self._plain = background_color(name, 0, self.generator).to(image.device)
-        return self._plain
-
-    @property
-    def scored_capture(self) -> CaptureName:
-        """The capture whose held-out views measure what was learned."""
-        return "dynamic" if self.capture == "both" else self.capture
-
-    def bind(
-        self, rays: int, parameters: Sequence[Sequence[Tensor]], *, static_shape: bool = False
-    ) -> None:
-        """Prepare the loop for the tensors of a phase: see :meth:`devrf.engine.loop.Loop.bind`."""
-        self.loop.bind(rays, parameters, self.optimizer, static_shape=static_shape)
+        if self._plain_background is None or self._plain_background.device != image.device:
+            self._plain_background = background_color(name, 0, self.generator).to(image.device)
+        return self._plain_background
 
     def metadata(self) -> CheckpointMetadata:
         """The metadata of a checkpoint of this stage."""
@@ -281,14 +134,6 @@ class ScheduledStage(LightningModule, ABC):
             complete=self.iteration >= self.total_iterations,
         )
 
-    def describe(self, iteration: int) -> str:
-        """An iteration of the present phase, with its frames and resolution, for messages."""
-        frames = self.phase.frames if self.phase is not None else ()
-        shape = "x".join(str(n) for n in self.resolution)
-        where = ", ".join([*([in_words(frames)] if frames else []), *([shape] if shape else [])])
-        place = f" ({where})" if where else ""
-        return f"iteration {iteration} of {self.total_iterations}{place}"
-
     def abort(self, why: str) -> None:
         """End the stage after the present step; the fit then raises an error that says ``why``."""
         self.abort_reason = f"{self.name} stage: {why}"
@@ -297,7 +142,7 @@ class ScheduledStage(LightningModule, ABC):
     def rollback(self, iteration: int, lr_scale: float) -> None:
         """Continue from an earlier iteration of the present phase, whose tensors are back in place.
 
-        Adam's moments start afresh, and other pixels are drawn than the first time.
+        Adam's state starts afresh, and other pixels are drawn than the first time.
 
         Args:
             iteration: where to continue.
@@ -342,19 +187,19 @@ class ScheduledStage(LightningModule, ABC):
         path = Path(str(self.trainer.ckpt_path))
         check_scene(path, metadata_in(path, checkpoint), self.scene)
         self.resize_to(checkpoint["state_dict"])
-        self._progress = kept = checkpoint.get("progress")
-        if kept is None:
+        self._progress = progress = checkpoint.get("progress")
+        if progress is None:
             return
-        course, ours = (kept["stage"], kept["total"]), (self.name, self.total_iterations)
-        if course != ours:
+        if (progress["stage"], progress["total"]) != (self.name, self.total_iterations):
             raise DevrfError(
-                f"{path}: left by the {course[0]} stage on a schedule of {course[1]} iterations, "
-                f"this is the {ours[0]} stage on one of {ours[1]}; give it its own schedule"
+                f"{path}: left by the {progress['stage']} stage on a schedule of "
+                f"{progress['total']} iterations, this is the {self.name} stage on one of "
+                f"{self.total_iterations}; give it its own schedule"
             )
-        self.iteration, self.skipped, self.seed = kept["iteration"], kept["skipped"], kept["seed"]
-        self.loop.micro_batching.count = kept["micro_batches"]
-        self.num_rollbacks, self.lr_scale = kept["num_rollbacks"], kept["lr_scale"]
-        self.phase = None if kept["phase"] is None else self.phase_at(kept["phase"])
+        for name in POSITION:
+            setattr(self, name, progress[name])
+        self.loop.micro_batching.count = progress["micro_batches"]
+        self.phase = None if progress["phase"] is None else self.phase_at(progress["phase"])
 
     def configure_optimizers(self) -> GridAdam:
         """The optimiser; in a resumed run with the parameters of the phase that was left."""
@@ -390,33 +235,19 @@ class ScheduledStage(LightningModule, ABC):
         first, stop = self.iteration, min(self.phase.stop, self.total_iterations)
         self._iterate(views, stop - first)
         self.loop.poll()
-        done = self.iteration - first
-        if not done:
-            self._reseed()
-            return {}
-        means, losses = self.loop.metrics.take(done)
-        if self.iteration < stop and self.converged(losses):
-            self.skipped += stop - self.iteration
-            self.iteration = stop
+        means: dict[str, Tensor] = {}
+        if self.iteration > first:
+            means, losses = self.loop.metrics.take(self.iteration - first)
+            if self.iteration < stop and self.converged(losses):
+                self.skipped += stop - self.iteration
+                self.iteration = stop
         self._reseed()
         if self.iteration >= self.total_iterations:
             self.trainer.should_stop = True
         # Reading from a GPU waits for it: there only what is written is read.
-        if self.device.type != "cuda" or self.logs(batch_idx):
+        if means and (self.device.type != "cuda" or self.logs(batch_idx)):
             self._log(means)
         return means
-
-    def logs(self, batch_idx: int) -> bool:
-        """Whether loggers write the values of a step, which its last hook asks as well."""
-        every: int = self.trainer.log_every_n_steps  # type: ignore[attr-defined]
-        return self.trainer.should_stop or (every > 0 and (batch_idx + 1) % every == 0)
-
-    def _log(self, means: dict[str, Tensor]) -> None:
-        """Log a step's means, which one copy brings to the host: the only wait for the device."""
-        self.logged = dict(zip(means, torch.stack(list(means.values())).cpu(), strict=True))
-        named = {f"{self.capture}/{k}": value for k, value in self.logged.items()}
-        # A tensor on the host: Lightning would copy a number to the device, and wait.
-        self.log_dict({**named, "step": torch.tensor(float(self.iteration))})
 
     def _iterate(self, views: Any, most: int) -> None:
         """Run a step's iterations, no more than ``most``; abort if memory runs out."""
@@ -439,6 +270,18 @@ class ScheduledStage(LightningModule, ABC):
                 return
             self.iteration += 1
 
+    def logs(self, batch_idx: int) -> bool:
+        """Whether loggers write the values of a step, which its last hook asks as well."""
+        every: int = self.trainer.log_every_n_steps  # type: ignore[attr-defined]
+        return self.trainer.should_stop or (every > 0 and (batch_idx + 1) % every == 0)
+
+    def _log(self, means: dict[str, Tensor]) -> None:
+        """Log a step's means, which one copy brings to the host: the only wait for the device."""
+        self.logged = dict(zip(means, torch.stack(list(means.values())).cpu(), strict=True))
+        named = {f"{self.capture}/{k}": value for k, value in self.logged.items()}
+        # A tensor on the host: Lightning would copy a number to the device, and wait.
+        self.log_dict({**named, "step": torch.tensor(float(self.iteration))})
+
     def _reseed(self) -> None:
         """Seed the generator for the next step, differently in each process."""
         mixed = np.random.SeedSequence([self.seed, rank(), self.iteration, self.num_rollbacks])
@@ -449,10 +292,6 @@ class ScheduledStage(LightningModule, ABC):
         if self.device.type == "cuda" and self.iteration >= self.total_iterations and rank() == 0:
             self._finished = self.current_model().stored_state()
 
-    def finished_state(self) -> dict[str, Any]:
-        """The model's state for the finished stage's checkpoint."""
-        return self._finished or self.current_model().stored_state()
-
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add the state that is not in tensors.
 
@@ -460,24 +299,19 @@ class ScheduledStage(LightningModule, ABC):
         """
         checkpoint["devrf"] = self.metadata().as_data()
         checkpoint["viewpoints"] = Viewpoints.of(self.scene).as_data()
-        if "optimizer_states" not in checkpoint:
-            if self.iteration >= self.total_iterations:
-                compact = self.finished_state()
-                checkpoint["state_dict"] = {f"{MODEL}{k}": v for k, v in compact.items()}
-            return
-        checkpoint["progress"] = {
-            "stage": self.name,
-            "iteration": self.iteration,
-            "skipped": self.skipped,
-            "total": self.total_iterations,
-            "phase": None if self.phase is None else self.phase.start,
-            "phase_state": {} if self.phase is None else self.phase_state(),
-            "seed": self.seed,
-            "random": rng_state(self.device),
-            "micro_batches": self.loop.micro_batching.count,
-            "num_rollbacks": self.num_rollbacks,
-            "lr_scale": self.lr_scale,
-        }
+        if "optimizer_states" in checkpoint:
+            checkpoint["progress"] = {
+                "stage": self.name,
+                "total": self.total_iterations,
+                **{name: getattr(self, name) for name in POSITION},
+                "phase": None if self.phase is None else self.phase.start,
+                "phase_state": {} if self.phase is None else self.phase_state(),
+                "random": rng_state(self.device),
+                "micro_batches": self.loop.micro_batching.count,
+            }
+        elif self.iteration >= self.total_iterations:
+            compact = self._finished or self.current_model().stored_state()
+            checkpoint["state_dict"] = {f"{MODEL}{k}": v for k, v in compact.items()}
 
     def on_fit_end(self) -> None:
         """Check the result.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,8 +17,8 @@ from devrf.data.batch import (
 )
 from devrf.engine.batches import FramePool, gather_batch
 from devrf.engine.ddp import rays_per_rank
-from devrf.engine.loop import ParallelBatch
-from devrf.engine.stage import Phase, ScheduledStage
+from devrf.engine.learner import ParallelBatch, Phase
+from devrf.engine.stage import ScheduledStage
 from devrf.errors import DevrfError
 from devrf.methods.base import RayTrainable
 from devrf.methods.protocol import ProtocolStage
@@ -27,21 +27,6 @@ from devrf.ops.adam import GridAdam
 from devrf.scenes.scene import CaptureName, Scene, Views
 from devrf.scenes.space import dynamic_only
 from devrf.system.profiling import span
-
-
-@dataclass(frozen=True)
-class RayPhase:
-    """The whole of a ray stage: one phase.
-
-    Attributes:
-        start: 0.
-        stop: one past the last iteration.
-    """
-
-    start: int
-    stop: int
-    kind: Literal["rays"] = "rays"
-    frames: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -132,7 +117,6 @@ class RayStage(ScheduledStage):
         self.weights = counted_weights(loss, self.scene_model.losses, "ray_stage.loss")
         self.pools: list[FramePool] = []
         self._rays = schedule.rays
-        self._optimizer: GridAdam | None = None
 
     @property
     def total_iterations(self) -> int:
@@ -144,15 +128,9 @@ class RayStage(ScheduledStage):
         """None: there is no grid that grows."""
         return ()
 
-    @property
-    def optimizer(self) -> GridAdam:
-        """Adam over the parts that are not frozen."""
-        assert self._optimizer is not None, "the stage has not been set up"
-        return self._optimizer
-
-    def phase_at(self, iteration: int) -> RayPhase:
+    def phase_at(self, iteration: int) -> Phase:
         """The one phase there is."""
-        return RayPhase(0, self.total_iterations)
+        return Phase(kind="rays", start=0, stop=self.total_iterations)
 
     def learning_rate_factor(self, iteration: int) -> float:
         """(final / initial)^(n / (N − 1)) at iteration n of N."""
@@ -168,14 +146,14 @@ class RayStage(ScheduledStage):
             self.scene_model.setup(self._scene_of_stage())
             self._ready = True
         self.scene_model.follow(self.step_of_protocol)
-        if self._optimizer is not None:
+        if hasattr(self, "optimizer"):
             return
         schedule, groups = self.schedule, self.scene_model.param_groups()
         for group in groups:
             rate = schedule.learning_rate * group.pop("rate", 1.0)
             group.update(lr=rate, base_lr=rate)
         first, second = schedule.betas
-        self._optimizer = GridAdam(groups, betas=(first, second), eps=schedule.eps)
+        self.optimizer = GridAdam(groups, betas=(first, second), eps=schedule.eps)
 
     def _scene_of_stage(self) -> Scene:
         """The scene; without its static set if no stage of the protocol learns from it."""
@@ -191,7 +169,8 @@ class RayStage(ScheduledStage):
         groups = self.optimizer.param_groups
         fewer = self.schedule.rays_without_hull
         self._rays = self.schedule.rays if fewer is None or self.scene_model.has_hull else fewer
-        self.bind(self._rays, [[p for group in groups for p in group["params"]]])
+        learned = [parameter for group in groups for parameter in group["params"]]
+        self.loop.bind(self._rays, [learned], self.optimizer, static_shape=False)
 
     @property
     def _captures(self) -> tuple[CaptureName, ...]:
@@ -264,10 +243,6 @@ class RayStage(ScheduledStage):
             offset += len(one)
         return parts[0] if len(parts) == 1 else concatenated(parts)
 
-    def phase_state(self) -> dict[str, Any]:
-        """Nothing: the images tell which pixels there are."""
-        return {}
-
-    def restore(self, phase: Phase, kept: dict[str, Any]) -> None:
-        """Go on with ``phase``, the model being loaded."""
+    def restore(self, phase: Phase, state: dict[str, Any]) -> None:
+        """Go on with ``phase``: the images tell which pixels there are."""
         self.enter(phase)

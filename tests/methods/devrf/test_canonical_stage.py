@@ -19,7 +19,7 @@ from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import ColorDecoder, SigmoidColor
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
-from devrf.methods.devrf.free_space import possible_matter, view_count, view_count_weight
+from devrf.methods.devrf.free_space import possibly_occupied, view_count, view_count_weight
 from devrf.methods.devrf.settings import Precision
 from devrf.scenes.scene import Scene
 
@@ -170,10 +170,10 @@ def test_no_matter_is_possible_where_too_few_cameras_look(tiny_scene: Scene) -> 
     points = bounds.box.grid_points((12, 12, 12), torch.zeros(()))
     seen = view_count(scene.static.train.cameras, points)
     assert 0 < (seen < 3).float().mean() < 1
-    apart = {n: possible_matter(scene, (12, 12, 12), carve=False, min_views=n) for n in (1, 3)}
+    apart = {n: possibly_occupied(scene, (12, 12, 12), carve=False, min_views=n) for n in (1, 3)}
     assert torch.equal(apart[3], apart[1] & (seen >= 3))
     # A capture of fewer views than that is kept whole.
-    everywhere = possible_matter(scene, (12, 12, 12), carve=False, min_views=1000)
+    everywhere = possibly_occupied(scene, (12, 12, 12), carve=False, min_views=1000)
     assert torch.equal(everywhere, apart[1])
 
 

@@ -16,7 +16,6 @@ from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import score
-from devrf.methods.devrf.compact_state import expanded_state
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.extensions.priors import Elastic
@@ -204,9 +203,7 @@ def test_where_the_field_rests_changes_what_is_learned_by_its_rounding_alone(
         trainer(max_epochs=1).fit(stage, datamodule=datamodule)
         assert stage.field.to_time.dtype == (torch.float16 if rounded else torch.float32)
         fields.append(stage.field.to_canonical.float())
-        # What is kept of it, and pictures of it, do not depend on how it rests.
-        state = expanded_state(stage.scene_model.stored_state())
-        assert state["deformation.frames.to_time"].dtype == torch.float32
+        # Pictures of it do not depend on how it is kept.
         assert score(Renderer(stage.scene_model), tiny_scene.dynamic.train, 5, "white").psnr > 10
     exact, on_host, in_half = fields
     assert torch.equal(exact, on_host) and not torch.equal(exact, in_half)

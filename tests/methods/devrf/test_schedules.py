@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from devrf.engine.stage import in_words
+from devrf.engine.learner import in_words
 from devrf.errors import DevrfError
 from devrf.methods.devrf.canonical_schedule import CanonicalPhase, CanonicalSchedule
 from devrf.methods.devrf.deformation_schedule import (
@@ -272,11 +272,10 @@ def test_rows_of_a_config_are_levels_in_the_order_of_their_numbers() -> None:
             DeformationSchedule.from_rows({**rows, **wrong})
 
 
-def test_a_level_may_have_a_rate_and_weights_of_its_own() -> None:
-    last = Level(8, 2, lr_factor=0.3, lr_final_factor=0.1, weight_factors={"tv": 0})
+def test_a_level_may_have_a_rate_of_its_own() -> None:
+    last = Level(8, 2, lr_factor=0.3, lr_final_factor=0.1)
     schedule = DeformationSchedule((Level(4, 2), Level(8, 2, lr_factor=0.5), last))
     phases = [schedule.phase(i, frames=2) for i in (0, 4, 8)]
     rates = [(p.learning_rate_factor, p.lr_final_factor) for p in phases]
     assert rates == [(1, 1), (0.5, 1), (0.3, 0.1)]
-    assert [schedule.weight_factor("tv", level) for level in range(3)] == [1, 1, 0]
-    assert schedule.weight_factor("flow", 2) == 1
+    assert phases[2].learning_rate_at(phases[2].stop) == pytest.approx(0.03)

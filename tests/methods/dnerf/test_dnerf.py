@@ -17,7 +17,7 @@ from devrf.checkpoints.checkpoint import (
 )
 from devrf.data.datamodule import SceneDataModule
 from devrf.data.rendered import RenderedDataModule
-from devrf.engine.loop import ParallelBatch
+from devrf.engine.learner import ParallelBatch
 from devrf.errors import DevrfError
 from devrf.methods.dnerf.model import DNeRF, DNeRFSettings
 from devrf.methods.protocol import ProtocolStage

@@ -4,10 +4,9 @@
 2. Rays, samples, compositing: ``volume_rendering``; then ``losses``.
 3. Canonical stage: ``canonical_schedule``, ``free_space``, ``canonical_stage``.
 4. Deformation field and warp: ``deformation_field``.
-5. Deformation stage: ``deformation_schedule``, ``motion_loss``, ``deformation_stage``.
+5. Deformation stage: ``deformation_schedule``, ``extension`` (the loss, and what may be added),
+   ``deformation_stage``.
 
 ``settings`` has the defaults of the stages and ``voxel_stage`` what they share; ``model`` and
-``view`` are the learned scene, ``compact_state`` is how a checkpoint holds it. ``extension`` says
-what may be added to the deformation stage, ``extensions`` has what is. ``fused_losses`` computes
-terms together where Triton runs.
+``view`` are the learned scene. ``extensions`` has what goes beyond the paper.
 """

@@ -1,7 +1,4 @@
-"""Sizes of the canonical field (docs/method.md#canonical-field), and what a scene asks of them.
-
-By its space, its images, and the depth that its views resolve.
-"""
+"""Sizes of the canonical field (docs/method.md#canonical-field), and what a scene asks of them."""
 
 from __future__ import annotations
 
@@ -10,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from devrf.errors import DevrfError
+from devrf.errors import DevrfError, require
 from devrf.geometry.box import Box
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.space import Space
@@ -18,8 +15,8 @@ from devrf.methods.devrf.canonical_field import CanonicalField, ColorDecoder, Si
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.scenes.scene import Scene
 
-# Between two planes a point moves by so many pixels from one outermost static view to the other:
-# less, and the views hardly tell two planes apart, while fog before the scene takes long to clear.
+# Parallax of a plane against the next, between the outermost static views: with less, the views
+# hardly tell two planes apart, while fog before the scene takes long to clear.
 PIXELS_PER_PLANE = 4.0
 FEWEST, MOST = 32, 256
 
@@ -54,10 +51,8 @@ class Architecture:
     aspect: float = 1.0
 
     def __post_init__(self) -> None:
-        if not 0 < self.contracted_opacity < 1:
-            raise DevrfError(
-                f"field.contracted_opacity: expected between 0 and 1, not {self.contracted_opacity}"
-            )
+        good = 0 < self.contracted_opacity < 1
+        require(good, "field.contracted_opacity", "between 0 and 1", self.contracted_opacity)
 
     def in_space(self, space: Space, side: float) -> Architecture:
         """The sizes that hold in ``space`` for a grid of ``side`` voxels along an edge."""
@@ -121,11 +116,7 @@ def fitted_to(
 
 
 def resolved_planes(positions: Tensor, space: NormalizedDevice) -> int:
-    """How many planes cameras at ``positions`` (N, 3) tell apart.
-
-    From the near plane n to infinity a point's images in two cameras, b apart, move against each
-    other by f·b/n pixels, evenly in NDC depth.
-    """
+    """Planes that cameras at ``positions`` (N, 3) tell apart (docs/method.md#forward-facing)."""
     apart = torch.cdist(positions[:, :2], positions[:, :2]).max()
     parallax = max(space.focal) * float(apart) / space.near
     return min(max(round(parallax / PIXELS_PER_PLANE) + 1, FEWEST), MOST)

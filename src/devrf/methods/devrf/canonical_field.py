@@ -21,8 +21,7 @@ SIZES = ("voxels", "base_voxels", "alpha_init", "planes", "aspect")
 def look_up(grid: Tensor, points: Tensor, box: Box) -> Tensor:
     """Trilinear values (M, C) of a ``grid`` (X, Y, Z, C) over ``box`` at ``points`` (M, 3).
 
-    Outside they are the border's. Differentiable in the grid and the points; a gradient that the
-    grid has already is added to in place.
+    Outside they are the border's. Differentiable in both.
     """
     coords = to_grid(points, box, shape_of(grid))
     return interpolate(grid, coords, gradient=kept_gradient(grid))
@@ -49,7 +48,7 @@ class VoxelGrid(StoredShape):
         return x, y, z
 
     def forward(self, points: Tensor, box: Box) -> Tensor:
-        """Trilinear values (M, C) at ``points`` (M, 3) in ``box``; outside, the border's."""
+        """:func:`look_up` at ``points`` (M, 3)."""
         return look_up(self.values, points, box)
 
     @torch.no_grad()
@@ -83,13 +82,7 @@ class ColorDecoder(nn.Module):
     octaves: Tensor
 
     def __init__(self, channels: int, width: int, frequencies: int = 4) -> None:
-        """Build the network.
-
-        Args:
-            channels: length of the feature vectors.
-            width: units of each of the two hidden layers.
-            frequencies: octaves k = 0 … frequencies − 1 of the direction; 0 gives it alone.
-        """
+        """Two hidden layers of ``width`` units, and so many octaves k = 0 … of the direction."""
         super().__init__()
         self.register_buffer("octaves", 2.0 ** torch.arange(frequencies), persistent=False)
         self.from_feature = nn.Linear(channels, width)
@@ -98,10 +91,6 @@ class ColorDecoder(nn.Module):
         self.output = nn.Linear(width, 3)
         nn.init.zeros_(self.output.bias)
         self.learns_directions = True
-
-    def forget_directions(self) -> None:
-        """Make colours the same from everywhere, until directions are learned."""
-        nn.init.zeros_(self.from_direction.weight)
 
     @property
     def network(self) -> ColorNetwork:
@@ -158,18 +147,10 @@ class CanonicalField(nn.Module):
         planes: int | None = None,
         aspect: float = 1.0,
     ) -> None:
-        """Build an empty field.
+        """Build an empty field with C = ``channels`` features per voxel.
 
-        Args:
-            box: where the field lives.
-            decoder: maps (features, viewdirs, ray, precision) to RGB.
-            channels: C, features per voxel.
-            voxels: about how many voxels to start with.
-            base_voxels: how many there are at full resolution; None: ``voxels``.
-            alpha_init: opacity of one base voxel before anything is learned.
-            planes: see docs/method.md#forward-facing; each starts with an equal share of every
-                ray, the last one opaque.
-            aspect: as the attribute.
+        The ``decoder`` maps (features, viewdirs, ray, precision, residual) to RGB; ``base_voxels``
+        None is ``voxels``. Each of ``planes`` starts with an equal share of every ray.
         """
         super().__init__()
         self.box = box
@@ -205,23 +186,17 @@ class CanonicalField(nn.Module):
     def step_length(self, step: float) -> float:
         """Length of ``step`` voxels along a ray, in units of the ray's direction.
 
-        In NDC a direction leads from the first plane to the last: samples are evenly spaced in
-        depth.
+        In NDC that leads from the near plane to infinity: samples are evenly spaced in depth.
         """
         if self.planes is None:
             return step * self.box.voxel_size(self.voxels)
-        return step * self._share_of_depth / (self.planes - 1)
+        return step * (self.box.size[2] / 2) / (self.planes - 1)
 
     def step_in_base_voxels(self, step: float) -> float:
         """δ = step · s / s_base, in NDC step · 256 / P · D / 2 (docs/method.md#step-length)."""
         if self.planes is None:
             return step * self.box.voxel_size(self.voxels) / self.box.voxel_size(self.base_voxels)
-        return step * 256 / self.planes * self._share_of_depth
-
-    @property
-    def _share_of_depth(self) -> float:
-        """D / 2: the box's share of the depth from the near plane to infinity, in NDC."""
-        return self.box.size[2] / 2
+        return step * 256 / self.planes * (self.box.size[2] / 2)
 
     @property
     def raw_density(self) -> Tensor:
@@ -257,27 +232,20 @@ class CanonicalField(nn.Module):
     ) -> Tensor:
         """RGB (S, 3) at ``points`` (S, 3) on rays ``ray`` (S,) with ``viewdirs`` (R, 3).
 
-        The decoder works in ``precision``; the result is in single precision. ``residual`` (S, 3)
-        is added before the sigmoid. With ``first`` (R + 1,), where each ray's samples begin, the
-        samples may end in padding, whose colours mean nothing.
+        ``residual`` (S, 3) is added before the sigmoid. With ``first`` (R + 1,), where each ray's
+        samples begin, the samples may end in padding, whose colours mean nothing.
         """
         if first is not None and residual is None and isinstance(self.decoder, ColorDecoder):
-            grid, network = self.color.values, self.decoder.network
-            listed = grid, points, self.box, viewdirs, ray, first, network
-            return listed_colors(*listed, precision)
+            looked_up = self.color.values, points, self.box, viewdirs, ray, first
+            return listed_colors(*looked_up, self.decoder.network, precision)
         features = self.color(points, self.box)
         color: Tensor = self.decoder(features, viewdirs, ray, precision, residual)
         return color
 
-    @property
-    def has_network(self) -> bool:
-        """Whether colours come from a network: not in the coarse geometry search."""
-        return isinstance(self.decoder, ColorDecoder)
-
     def forget_directions(self) -> None:
         """Make colours the same from everywhere, until directions are learned."""
         assert isinstance(self.decoder, ColorDecoder)
-        self.decoder.forget_directions()
+        nn.init.zeros_(self.decoder.from_direction.weight)
 
     def learn_directions(self, whether: bool) -> bool:
         """Let the network learn from viewing directions, or not; whether that is a change."""
@@ -295,38 +263,16 @@ class CanonicalField(nn.Module):
         self.color.resize(shape)
 
     @torch.no_grad()
-    def crop(self, box: Box) -> None:
-        """Keep what is in ``box``, a part of the field's own, at the same resolution.
-
-        Of a field with planes; new parameters result.
-        """
-        assert self.planes is not None, "only fields with planes are cropped"
-        before = self.box
-        planes = max(2, round((self.planes - 1) * box.size[2] / self.box.size[2]) + 1)
-        (width, height, _), (whole_width, whole_height, _) = box.size, self.box.size
-        share = width * height * planes / (whole_width * whole_height * self.planes)
-        self.box, self.planes = box, planes
-        self.voxels, self.base_voxels = round(self.voxels * share), round(self.base_voxels * share)
-        points = box.grid_points(self.grid_shape(self.voxels), self.density.values)
-        for grid in (self.density, self.color):
-            values = grid(points.view(-1, 3), before)
-            grid.values = nn.Parameter(values.view(*points.shape[:3], -1))
-
-    @torch.no_grad()
     def clear(self, where: Tensor, alpha: float) -> None:
-        """Lower the density to at most opacity ``alpha`` a base voxel ``where`` (X, Y, Z) bool.
-
-        Space that training never visited still holds the initial fog. A sample that a
-        displacement sends there must meet nothing.
-        """
+        """Lower the density to at most opacity ``alpha`` a base voxel ``where`` (X, Y, Z) bool."""
         empty = math.log(math.expm1(-math.log1p(-alpha))) - self.shift
         raw = self.density.values[..., 0]
         raw[where] = raw[where].clamp(max=empty)
 
     def get_extra_state(self) -> dict[str, Any]:
         """Box and sizes, as plain numbers."""
-        corners = {"low": list(self.box.low), "high": list(self.box.high)}
-        return {**corners, **{name: getattr(self, name) for name in SIZES}}
+        sizes = {name: getattr(self, name) for name in SIZES}
+        return {"low": list(self.box.low), "high": list(self.box.high), **sizes}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`get_extra_state` gave."""

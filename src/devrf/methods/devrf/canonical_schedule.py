@@ -5,29 +5,28 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from itertools import pairwise
 
-from devrf.errors import DevrfError
+from devrf.engine.learner import Phase
+from devrf.errors import DevrfError, require
 from devrf.geometry.space import Space
 
+# The least value of the schedule's numbers.
+LEAST = {
+    **dict.fromkeys(("search_iterations", "dense_tv_iterations", "view_dependence_start"), 0),
+    **dict.fromkeys(("iterations", "decay_iterations", "rays", "min_views"), 1),
+    **dict.fromkeys(("side", "search_side", "unbounded_initial_side"), 2),
+}
 
-@dataclass(frozen=True)
-class CanonicalPhase:
-    """A stretch of the canonical stage with one grid.
 
-    Attributes:
-        kind: ``search`` for the coarse geometry, ``fine`` for the radiance field.
-        start: first iteration.
-        stop: one past the last iteration.
-        voxels: about how many voxels the grids have.
-        frames: none: the scene is at rest.
+@dataclass(frozen=True, kw_only=True)
+class CanonicalPhase(Phase):
+    """A stretch of the canonical stage with one grid of about so many ``voxels``.
+
+    Its kind is ``search`` for the coarse geometry, ``fine`` for the radiance field.
     """
 
-    kind: Literal["search", "fine"]
-    start: int
-    stop: int
     voxels: int
-    frames: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -80,46 +79,29 @@ class CanonicalSchedule:
     phases: tuple[CanonicalPhase, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        least = {"search_side": 2, "side": 2}
-        least |= dict.fromkeys(("min_views", "iterations", "decay_iterations", "rays"), 1)
-        for name, bound in {"search_iterations": 0, "dense_tv_iterations": 0, **least}.items():
-            if getattr(self, name) < bound:
-                raise DevrfError(
-                    f"schedule.canonical.{name}: expected at least {bound}, "
-                    f"not {getattr(self, name)}"
-                )
-        if self.voxels_per_pixel is not None and not 0 < self.voxels_per_pixel <= 4:
+        key, limit = "schedule.canonical", self.voxels_per_pixel
+        for name, least in LEAST.items():
+            value = getattr(self, name)
+            require(value is None or value >= least, f"{key}.{name}", f"at least {least}", value)
+        fits = limit is None or 0 < limit <= 4
+        require(fits, f"{key}.voxels_per_pixel", "above 0, at most 4, or null", limit)
+        doublings, edges = len(self.upsample_at), [0, *self.upsample_at, self.iterations]
+        if self.side**3 < 8 * 2**doublings:
             raise DevrfError(
-                "schedule.canonical.voxels_per_pixel: expected above 0, at most 4, or null, not "
-                f"{self.voxels_per_pixel}"
+                f"{key}.upsample_at: {doublings} of them are too many for side {self.side}; start "
+                "from 8 voxels or more"
             )
-        if self.view_dependence_start is not None and self.view_dependence_start < 0:
-            raise DevrfError(
-                "schedule.canonical.view_dependence_start: expected 0 or more, or null, not "
-                f"{self.view_dependence_start}"
-            )
-        if self.unbounded_initial_side is not None and self.unbounded_initial_side < 2:
-            raise DevrfError(
-                "schedule.canonical.unbounded_initial_side: expected at least 2, or null, not "
-                f"{self.unbounded_initial_side}"
-            )
-        if self.side**3 < 8 * 2 ** len(self.upsample_at):
-            raise DevrfError(
-                f"schedule.canonical.upsample_at: {len(self.upsample_at)} of them are too many for "
-                f"side {self.side}; start from 8 voxels or more"
-            )
-        edges = [0, *self.upsample_at, self.iterations]
-        if any(a >= b for a, b in zip(edges, edges[1:], strict=False)):
-            raise DevrfError(
-                "schedule.canonical.upsample_at must ascend between 0 and iterations "
-                f"({self.iterations}), not {list(self.upsample_at)}"
-            )
+        ascend = all(a < b for a, b in pairwise(edges))
+        between = f"ascending numbers between 0 and iterations ({self.iterations})"
+        require(ascend, f"{key}.upsample_at", between, list(self.upsample_at))
         offset, phases = self.search_iterations, []
         if offset:
-            phases.append(CanonicalPhase("search", 0, offset, self.search_side**3))
-        for k, (start, stop) in enumerate(zip(edges, edges[1:], strict=False)):
-            voxels = round(self.side**3) // 2 ** (len(self.upsample_at) - k)
-            phases.append(CanonicalPhase("fine", offset + start, offset + stop, voxels))
+            voxels = self.search_side**3
+            phases.append(CanonicalPhase(kind="search", start=0, stop=offset, voxels=voxels))
+        for k, (start, stop) in enumerate(pairwise(edges)):
+            first, last = offset + start, offset + stop
+            voxels = round(self.side**3) // 2 ** (doublings - k)
+            phases.append(CanonicalPhase(kind="fine", start=first, stop=last, voxels=voxels))
         object.__setattr__(self, "phases", tuple(phases))
 
     @property
@@ -147,21 +129,18 @@ class CanonicalSchedule:
         """
         if space.is_linear:
             return self
-        side, late = self.side * space.side_factor, self.view_dependence_start
+        side, upsample_at = self.side * space.side_factor, self.upsample_at
+        if self.unbounded_initial_side is not None:
+            count = max(0, round(3 * math.log2(side / self.unbounded_initial_side)))
+            upsample_at = [3 * self.iterations * k // (4 * count) for k in range(1, count + 1)]
+        late = self.view_dependence_start
         return replace(
             self,
             side=side,
             search_side=round(self.search_side * space.side_factor),
-            upsample_at=self._upsampling_from(self.unbounded_initial_side, side),
+            upsample_at=tuple(upsample_at),
             view_dependence_start=self.iterations // 2 if late is None else late,
         )
-
-    def _upsampling_from(self, start: float | None, side: float) -> Sequence[int]:
-        """Equal intervals between the upsample_at that lead from ``start`` voxels to ``side``."""
-        if start is None:
-            return self.upsample_at
-        count = max(0, round(3 * math.log2(side / start)))
-        return tuple(3 * self.iterations * (k + 1) // (4 * count) for k in range(count))
 
     def learning_rate_factor(self, iteration: int) -> float:
         """0.1^(n / decay_iterations), n from the start of the search or of the radiance field."""

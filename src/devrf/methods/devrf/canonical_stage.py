@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import asdict
 from typing import Any
 
 import torch
@@ -12,16 +11,15 @@ from torch import Tensor
 
 from devrf.accel.graphs import Graphs
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
-from devrf.checkpoints.stored_grids import pack_bits, unpack_bits
 from devrf.data.batch import PixelPool, Pixels
 from devrf.engine.batches import static_pool
-from devrf.engine.loop import ParallelBatch
+from devrf.engine.learner import ParallelBatch
 from devrf.errors import DevrfError
 from devrf.methods.devrf.architecture import Architecture, fitted_to
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.canonical_schedule import CanonicalPhase, CanonicalSchedule
 from devrf.methods.devrf.extensions.depth_crop import crop_to_visible
-from devrf.methods.devrf.free_space import possible_matter, view_count_weight
+from devrf.methods.devrf.free_space import possibly_occupied, view_count_weight
 from devrf.methods.devrf.losses import (
     PHOTOMETRIC_TERMS,
     Prediction,
@@ -29,9 +27,8 @@ from devrf.methods.devrf.losses import (
 )
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import FINE_LOSS, SEARCH_LOSS, CanonicalRates, Precision, Sampling
-from devrf.methods.devrf.voxel_stage import VoxelStage, weighted_loss
+from devrf.methods.devrf.voxel_stage import VoxelStage, field_optimizer, weighted_loss
 from devrf.methods.weighted_loss import counted_weights
-from devrf.ops.adam import GridAdam
 from devrf.rendering.occupancy import Occupancy, bounding_box, dilate
 from devrf.rendering.sampling import RenderSettings
 from devrf.scenes.scene import CaptureName, Views
@@ -76,10 +73,9 @@ class CanonicalStage(VoxelStage):
             search_loss: weights of the loss terms in the geometry search; ``tv`` is the total
                 variation of both grids.
             fine_loss: their weights in the radiance field.
-            iterations_per_step: optimiser iterations in one Lightning step.
-            graphs: whether a GPU replays iterations from CUDA graphs: ``auto`` where it can.
-            decoder_precision: what the colour network computes in; ``auto``: ``bfloat16`` on a
-                GPU that multiplies it.
+            iterations_per_step: as of every :class:`VoxelStage`.
+            graphs: likewise.
+            decoder_precision: likewise.
         """
         super().__init__(iterations_per_step, graphs, decoder_precision)
         self.schedule = schedule or CanonicalSchedule()
@@ -92,7 +88,6 @@ class CanonicalStage(VoxelStage):
             self.tv[kind] = weights.pop("tv", 0.0)
             self.weights[kind] = counted_weights(weights, PHOTOMETRIC_TERMS, f"loss.{kind}")
         self.pool: PixelPool | None = None
-        self._optimizer: GridAdam | None = None
 
     @property
     def total_iterations(self) -> int:
@@ -103,12 +98,6 @@ class CanonicalStage(VoxelStage):
     def resolution(self) -> tuple[int, ...]:
         """Present shape of the density and feature grids."""
         return self.scene_model.canonical.density.shape
-
-    @property
-    def optimizer(self) -> GridAdam:
-        """Adam over density, features and decoder, in that order of groups."""
-        assert self._optimizer is not None, "the stage has not been set up"
-        return self._optimizer
 
     def phase_at(self, iteration: int) -> CanonicalPhase:
         """The schedule's phase."""
@@ -127,16 +116,14 @@ class CanonicalStage(VoxelStage):
         self.schedule, self.architecture = fitted_to(self.scene, asked, self.architecture)
         if self.schedule.side != asked.side:
             log.info("schedule.canonical.side: %g is %.4g here", asked.side, self.schedule.side)
-        box, first = self.scene.bounds.box, self.schedule.phase(0)
-        schedule, shape = self.schedule, box.grid_shape(self.schedule.search_side**3)
-        # The stage is moved to this device later.
-        device = self.trainer.strategy.root_device
-        possible = possible_matter(
+        schedule, box = self.schedule, self.scene.bounds.box
+        first = schedule.phase(0)
+        possible = possibly_occupied(
             self.scene,
-            shape,
+            box.grid_shape(schedule.search_side**3),
             carve=schedule.visual_hull_init,
             min_views=schedule.min_views,
-            device=device,
+            device=self.trainer.strategy.root_device,  # the stage is moved there later
         )
         occupancy = Occupancy(possible, box)
         if first.kind == "search":
@@ -150,11 +137,7 @@ class CanonicalStage(VoxelStage):
             self.render_settings(first),
             space=self.scene.space,
         )
-        groups: list[dict[str, Any]] = []
-        for name, rate in asdict(self.rates).items():
-            learned = list(canonical.get_submodule(name).parameters())
-            groups.append({"params": learned, "lr": rate, "base_lr": rate, "name": name})
-        self._optimizer = GridAdam(groups)
+        self.optimizer = field_optimizer(canonical, self.rates)
 
     def render_settings(self, phase: CanonicalPhase) -> RenderSettings:
         """How rays are sampled in a phase."""
@@ -163,16 +146,22 @@ class CanonicalStage(VoxelStage):
         threshold = sampling.search_alpha_threshold if searching else sampling.alpha_threshold
         return RenderSettings(sampling.step, threshold, bounds.near, bounds.far)
 
-    def enter(self, phase: CanonicalPhase) -> None:  # type: ignore[override]
+    def enter(self, phase: CanonicalPhase) -> None:
         """Make grids, occupancy, rays and optimiser ready for ``phase``."""
         previous, self.phase = self.phase, phase
-        views, model = self.scene.static.train, self.scene_model
-        model.settings = self.render_settings(phase)
+        self.scene_model.settings = self.render_settings(phase)
         if previous is not None and previous.kind != phase.kind:
             self._begin_fine(phase)
         elif previous is not None:
             self._grow(phase)
-        self.pool = static_pool(views, model, None if phase.kind == "search" else model.occupancy)
+        self.restore(phase, {})
+
+    def restore(self, phase: CanonicalPhase, state: dict[str, Any]) -> None:
+        """Choose the pixels to learn from, and let the optimiser learn the present grids."""
+        model, searching = self.scene_model, phase.kind == "search"
+        model.settings = self.render_settings(phase)
+        views = self.scene.static.train
+        self.pool = static_pool(views, model, None if searching else model.occupancy)
         if not len(self.pool):
             raise DevrfError(
                 f"the field has become empty by iteration {self.iteration}: check data.background, "
@@ -195,8 +184,8 @@ class CanonicalStage(VoxelStage):
     def _begin_fine(self, phase: CanonicalPhase) -> None:
         """Keep what the search found as the occupancy, and start the radiance field."""
         search, occupancy = self.scene_model.canonical, self.scene_model.occupancy
-        found = search.voxel_alpha(self.sampling.step) > self.sampling.occupancy_threshold
-        occupancy.replace(dilate(found & occupancy.mask, 1))
+        opaque = search.voxel_alpha(self.sampling.step) > self.sampling.occupancy_threshold
+        occupancy.replace(dilate(opaque & occupancy.mask, 1))
         self.scene_model.canonical = self._radiance_field(occupancy, phase).to(self.device)
 
     def _radiance_field(self, occupancy: Occupancy, phase: CanonicalPhase) -> CanonicalField:
@@ -233,28 +222,27 @@ class CanonicalStage(VoxelStage):
         """Find the occupancy at rest on the field's own grid, within the one before."""
         model, sampling = self.scene_model, self.sampling
         field = model.canonical
-        found = dilate(field.voxel_alpha(sampling.step) > sampling.occupancy_threshold, 1)
+        opaque = dilate(field.voxel_alpha(sampling.step) > sampling.occupancy_threshold, 1)
         points = field.box.grid_points(field.density.shape, field.density.values)
-        before = model.occupancy.at(points.view(-1, 3)).view(found.shape)
-        model.occupancy.replace(found & before, field.box)
+        before = model.occupancy.at(points.view(-1, 3)).view(opaque.shape)
+        model.occupancy.replace(opaque & before, field.box)
 
     def setup_optimizer(self) -> None:
         """Give the optimiser the present grids (docs/method.md#optimiser).
 
         In the search the learning rate of a voxel's density depends on how many views see it;
-        afterwards a voxel without gradient keeps its moments.
+        afterwards a voxel without gradient keeps its Adam state.
         """
         assert self.phase is not None
         searching, field = self.phase.kind == "search", self.scene_model.canonical
-        smoothing = total_variation_weight(
-            self.tv[self.phase.kind], max(field.density.shape), self.schedule.rays
-        )
+        shape, rays = field.density.shape, self.schedule.rays
+        smoothing = total_variation_weight(self.tv[self.phase.kind], max(shape), rays)
         per_voxel_lr = None
         if searching:
-            points = field.box.grid_points(field.density.shape, field.density.values)
-            points = self.scene.space.to_world(points)
+            points = field.box.grid_points(shape, field.density.values)
             cameras = self.scene.static.train.cameras.to(self.device)
-            per_voxel_lr = view_count_weight(cameras, points)[..., None]
+            seen = view_count_weight(cameras, self.scene.space.to_world(points))
+            per_voxel_lr = seen[..., None]
         for group, grid in ((0, field.density), (1, field.color)):
             self.optimizer.replace(
                 group,
@@ -264,12 +252,11 @@ class CanonicalStage(VoxelStage):
                 smoothing=smoothing,
                 touched_only=not self.schedule.smooths_all(self.iteration),
             )
-        decoder = list(field.decoder.parameters())
-        if [id(p) for p in decoder] != [id(p) for p in self.optimizer.param_groups[2]["params"]]:
+        decoder, groups = list(field.decoder.parameters()), self.optimizer.param_groups
+        if [id(p) for p in decoder] != [id(p) for p in groups[2]["params"]]:
             self.optimizer.replace(2, decoder)
-        learned = [p for group in self.optimizer.param_groups for p in group["params"]]
-        static_shape = self.static_shape(field.density.values)
-        self.bind(self.schedule.rays, [learned], static_shape=static_shape)
+        learned = [p for group in groups for p in group["params"]]
+        self.bind(rays, [learned])
 
     def prepare(self) -> None:
         """From the schedule's iterations on, smooth what batches touch, and learn directions."""
@@ -313,28 +300,6 @@ class CanonicalStage(VoxelStage):
         if fine and self.schedule.search_iterations:
             box = self.scene_model.canonical.box
             self.scene_model.canonical = self.architecture.radiance_field(box, 8, 8)
-
-    def phase_state(self) -> dict[str, Any]:
-        """The pixels that batches are drawn from."""
-        assert self.pool is not None
-        images, area = self._images
-        return {"pixels": pack_bits(self.pool.mask(images, area))}
-
-    def restore(  # type: ignore[override]
-        self, phase: CanonicalPhase, kept: dict[str, Any]
-    ) -> None:
-        """Go on with ``phase``, the field being loaded."""
-        images, area = self._images
-        mask = unpack_bits(kept["pixels"], (len(images), area), self.device)
-        self.pool = PixelPool.of_mask(images, mask)
-        self.scene_model.settings = self.render_settings(phase)
-        self.setup_optimizer()
-
-    @property
-    def _images(self) -> tuple[Tensor, int]:
-        """The numbers (N,) of the static training images, and the pixels of each."""
-        views = self.scene.static.train
-        return torch.arange(len(views), device=self.device), views.height * views.width
 
     def result(self) -> LoadedCheckpoint:
         """What the deformation stage builds on."""

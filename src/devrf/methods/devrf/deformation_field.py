@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from devrf.engine.frame_store import FrameStore
+from devrf.engine.frame_store import FrameField, FrameStore
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.ops.corners import shape_of, to_grid
@@ -46,33 +46,6 @@ class GridWarp:
         return points + move
 
 
-class FrameField(nn.Module):
-    """Where the grids of T frames are, in space and in time; kept in checkpoints.
-
-    Attributes:
-        box: where the field lives.
-        clock: the times of the T frames.
-        values: (T, X, Y, Z, 3) of a field that keeps all its frames in one tensor.
-    """
-
-    values: Tensor
-
-    def __init__(self, box: Box, clock: FrameClock) -> None:
-        super().__init__()
-        self.box = box
-        self.clock = clock
-
-    def get_extra_state(self) -> dict[str, Any]:
-        """Box and clock, as plain numbers."""
-        low, high = list(self.box.low), list(self.box.high)
-        return {"low": low, "high": high, "times": list(self.clock.times)}
-
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`get_extra_state` gave."""
-        self.box = Box.of(state["low"], state["high"])
-        self.clock = FrameClock(tuple(state["times"]))
-
-
 class DeformationField(FrameField):
     """Displacements (T, X, Y, Z, 3) over a box, backward and forward (docs/method.md#warp).
 
@@ -82,8 +55,6 @@ class DeformationField(FrameField):
 
     Attributes:
         frames: the displacements of all frames, in the box's units.
-        box: where the field lives.
-        clock: the times of the T frames.
         still_outside: whether nothing moves outside the box, which is then smaller than the
             canonical field's; else displacements are as on the border there.
     """
@@ -129,10 +100,9 @@ class DeformationField(FrameField):
         return GridWarp(slices, self.box, still_outside=self.still_outside)
 
     def _at(self, frames: Tensor, time: float) -> GridWarp:
-        moment = self.clock.at(time)
-        chosen = (moment.before,) if moment.weight == 0.0 else (moment.before, moment.after)
-        here = self.frames.here
-        slices = tuple(frames[k].to(here) for k in chosen if len(chosen) > 1 or k)
+        moment, here = self.clock.at(time), self.frames.here
+        chosen = [moment.before, moment.after] if moment.weight else [moment.before]
+        slices = () if chosen == [0] else tuple(frames[k].to(here) for k in chosen)
         return GridWarp(slices, self.box, moment.weight, self.still_outside)
 
     def blended(self, time: float) -> Tensor:
@@ -169,27 +139,14 @@ def deformed_occupancy(
 ) -> Occupancy:
     """The occupancy at a time: the grid points whose canonical position is occupied, grown by one.
 
+    The rim of one grid point is for what lies between the points.
+
     Args:
         occupancy: where something is at rest.
         box: the canonical field's.
-        warp: x → x + Δ_b(x, t), points (M, 3) at the time into canonical space.
+        warp: x → x + Δ_b(x, t), the points (M, 3) of the occupancy's grid into canonical space.
     """
-    points = occupancy_points(occupancy, box)
-    moved = warp(points.view(-1, 3)).view(points.shape)
-    return occupancy_through(occupancy, box, moved)
-
-
-def occupancy_points(occupancy: Occupancy, box: Box) -> Tensor:
-    """The grid points x (X, Y, Z, 3) at which a time's occupancy is looked up."""
     x, y, z = occupancy.mask.shape
-    return box.grid_points((x, y, z), torch.empty(0, device=occupancy.mask.device))
-
-
-@torch.no_grad()
-def occupancy_through(occupancy: Occupancy, box: Box, moved: Tensor) -> Occupancy:
-    """:func:`deformed_occupancy` of grid points with canonical positions ``moved`` (X, Y, Z, 3).
-
-    The rim of one grid point is for what lies between the points.
-    """
-    found = occupancy.at(moved.view(-1, 3)).view(moved.shape[:3])
-    return Occupancy(dilate(found, 1), box)
+    points = box.grid_points((x, y, z), torch.empty(0, device=occupancy.mask.device))
+    occupied = occupancy.at(warp(points.view(-1, 3))).view(x, y, z)
+    return Occupancy(dilate(occupied, 1), box)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate, pairwise
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
-from devrf.errors import DevrfError
+from devrf.engine.learner import Phase
+from devrf.errors import DevrfError, require
 
 # In time, from a visit of a level to the next.
 Order = Literal["forward", "backward"]
@@ -45,16 +47,13 @@ class Level:
 PAPER_LEVELS = (Level(10, 200), Level(20, 100), Level(40, 100), Level(80, 50), Level(160, 50))
 
 
-@dataclass(frozen=True)
-class DeformationPhase:
+@dataclass(frozen=True, kw_only=True)
+class DeformationPhase(Phase):
     """A visit to one frame at one resolution, or to several in parallel.
 
     Attributes:
         level: 0 is the coarsest resolution.
-        frames: the frames that are learned, from 1 on, ascending.
-        start: first iteration.
-        stop: one past the last iteration.
-        side: side of the motion grid: it has about side³ voxels.
+        side: the motion grid has about side³ voxels.
         learning_rate_factor: what the learning rate is multiplied by at the visit's start.
         lr_final_factor: what it has been multiplied by further at the visit's end.
         init_from_previous: whether the frame starts from the result of the frame before it.
@@ -64,31 +63,26 @@ class DeformationPhase:
     """
 
     level: int
-    frames: tuple[int, ...]
-    start: int
-    stop: int
     side: int
     learning_rate_factor: float
     lr_final_factor: float
     init_from_previous: bool
     has_previous: bool
-    backward: bool = False
+    backward: bool
 
-    @property
-    def kind(self) -> str:
-        """The level, in words, by the number of its row."""
-        return f"level {self.level + 1}"
+    def learning_rate_at(self, iteration: int) -> float:
+        """Factor of the learning rate in the visit (docs/method.md#motion-learning-rate)."""
+        share = (iteration - self.start) / (self.stop - self.start)
+        return self.learning_rate_factor * math.pow(self.lr_final_factor, share)
 
 
 @dataclass(frozen=True)
 class DeformationSchedule:
     """The deformation stage's visits; the defaults are the paper's, inward-facing.
 
-    See docs/method.md#coarse-to-fine.
-
-    Within a level the frames t = 1, …, T − 1 are visited one after another, each for the level's
-    share of iterations. Frame 0 is the identity; frame 1 gets its share, so that a level takes
-    share · T iterations.
+    Within a level (docs/method.md#coarse-to-fine) the frames t = 1, …, T − 1 are visited one after
+    another, each for the level's share of iterations. Frame 0 is the identity; frame 1 gets its
+    share, so that a level takes share · T iterations.
 
     Where K frames may be learned in parallel, the T frames are cut into contiguous stretches of
     L = max(2, ⌈T / K⌉) frames, so that neighbours are never learned together. Visit j of the level,
@@ -137,8 +131,8 @@ class DeformationSchedule:
         rows: dict[str, Any] = {str(name): row for name, row in levels.items() if row is not None}
         numbered = []
         for number in range(1, len(rows) + 1):
-            row = rows.get(str(number))
-            if row is None or not {"side", "iterations"} <= set(row):
+            row = rows.get(str(number), {})
+            if not {"side", "iterations"} <= set(row):
                 raise DevrfError(
                     f"schedule.deformation.levels: expected rows 1 to {len(rows)} with side and "
                     f"iterations, which row {number} has not; there are {', '.join(sorted(rows))}"
@@ -147,43 +141,22 @@ class DeformationSchedule:
         return cls(numbered, coarse_to_fine, decay, rays)
 
     def __post_init__(self) -> None:
-        if not self.levels:
-            raise DevrfError("schedule.deformation.levels: expected at least one")
-        if self.rays < 1:
-            raise DevrfError(f"schedule.deformation.rays: expected at least 1, not {self.rays}")
-        if not self.decay > 0:
-            raise DevrfError(f"schedule.deformation.decay: expected more than 0, not {self.decay}")
+        key = "schedule.deformation"
+        require(len(self.levels) > 0, f"{key}.levels", "at least one", "none")
+        require(self.rays >= 1, f"{key}.rays", "at least 1", self.rays)
+        require(self.decay > 0, f"{key}.decay", "more than 0", self.decay)
         for number, level in enumerate(self.levels, 1):
-            _check_level(f"schedule.deformation.levels.{number}", level)
+            _check_level(f"{key}.levels.{number}", level)
         first, last = self.levels[0], self.levels[-1]
-        if self.coarse_to_fine and first.parallel_frames > 1:
-            raise DevrfError(
-                "schedule.deformation.levels.1.parallel_frames: expected 1 at the first level, "
-                f"where a frame starts from the one before it, not {first.parallel_frames}"
-            )
-        if first.order != "forward":
-            raise DevrfError(
-                "schedule.deformation.levels.1.order: expected forward at the first level, where a "
-                f"frame starts from the one before it, not {first.order}"
-            )
+        together = first.parallel_frames if self.coarse_to_fine else 1
+        why = "at the first level, where a frame starts from the one before it"
+        require(together == 1, f"{key}.levels.1.parallel_frames", f"1 {why}", together)
+        forward = first.order == "forward"
+        require(forward, f"{key}.levels.1.order", f"forward {why}", first.order)
         if not self.coarse_to_fine:
             iterations = sum(level.iterations for level in self.levels)
             finest = replace(last, iterations=iterations, lr_factor=None, order="forward")
             object.__setattr__(self, "levels", (finest,))
-
-    def check_terms(self, known: Collection[str]) -> None:
-        """Check that the levels' ``weight_factors`` are of ``known`` loss terms.
-
-        Raises:
-            DevrfError: there is no such term.
-        """
-        for number, level in enumerate(self.levels, 1):
-            for name in level.weight_factors:
-                if name not in known:
-                    raise DevrfError(
-                        f"schedule.deformation.levels.{number}.weight_factors: {name} is no term "
-                        f"of loss.deformation; the terms are {', '.join(sorted(known))}"
-                    )
 
     def learning_rate_factor(self, level: int) -> float:
         """Factor of the learning rate when a visit of ``level`` begins."""
@@ -192,10 +165,6 @@ class DeformationSchedule:
             return factor
         sides = [row.side for row in self.levels[: level + 1]]
         return self.decay ** sum(a != b for a, b in pairwise(sides))
-
-    def weight_factor(self, term: str, level: int) -> float:
-        """Factor of the weight of a loss term at ``level``."""
-        return self.levels[level].weight_factors.get(term, 1.0)
 
     def visits(self, level: int, frames: int) -> int:
         """L of T = ``frames`` frames: visits of a level, and the distance of parallel frames."""
@@ -226,12 +195,12 @@ class DeformationSchedule:
         visit = min(max((iteration - begin) // row.iterations, first), apart - 1)
         backward = row.order == "backward"
         place = first + apart - 1 - visit if backward else visit
-        visited = tuple(range(place or apart, frames, apart))
         return DeformationPhase(
-            level=level,
-            frames=visited,
+            kind=f"level {level + 1}",
             start=begin + (0 if visit == first else visit * row.iterations),
             stop=begin + (visit + 1) * row.iterations,
+            frames=tuple(range(place or apart, frames, apart)),
+            level=level,
             side=row.side,
             learning_rate_factor=self.learning_rate_factor(level),
             lr_final_factor=row.lr_final_factor,
@@ -243,15 +212,13 @@ class DeformationSchedule:
 
 def _check_level(key: str, level: Level) -> None:
     """Check what holds for every level; ``key`` is that of its row."""
-    for name, bound in (("side", 2), ("iterations", 1), ("parallel_frames", 1)):
-        if getattr(level, name) < bound:
-            raise DevrfError(f"{key}.{name}: expected at least {bound}, not {getattr(level, name)}")
+    for name, least in (("side", 2), ("iterations", 1), ("parallel_frames", 1)):
+        value = getattr(level, name)
+        require(value >= least, f"{key}.{name}", f"at least {least}", value)
     for name in ("lr_factor", "lr_final_factor"):
         factor = getattr(level, name)
-        if factor is not None and not factor > 0:
-            raise DevrfError(f"{key}.{name}: expected more than 0, not {factor}")
-    if level.order not in ("forward", "backward"):
-        raise DevrfError(f"{key}.order: expected forward or backward, not {level.order}")
-    for term, factor in level.weight_factors.items():
-        if factor < 0:
-            raise DevrfError(f"{key}.weight_factors.{term}: expected at least 0, not {factor}")
+        require(factor is None or factor > 0, f"{key}.{name}", "more than 0", factor)
+    known = level.order in get_args(Order)
+    require(known, f"{key}.order", "forward or backward", level.order)
+    for term, weight in level.weight_factors.items():
+        require(weight >= 0, f"{key}.weight_factors.{term}", "at least 0", weight)

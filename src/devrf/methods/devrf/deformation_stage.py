@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
@@ -15,20 +14,19 @@ from devrf.accel.graphs import Graphs
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import Pixels
 from devrf.data.flow import previous_images
-from devrf.engine.active_frames import ActiveFrame, ActiveFrames
+from devrf.engine.active_frames import ActiveFrames
+from devrf.engine.batches import frame_pools
 from devrf.engine.convergence import Convergence
-from devrf.engine.loop import ParallelBatch
+from devrf.engine.learner import ParallelBatch
 from devrf.errors import DevrfError
 from devrf.methods.devrf.deformation_field import DeformationField, deformed_occupancy
 from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule
-from devrf.methods.devrf.extension import Extension
+from devrf.methods.devrf.extension import Extension, MotionLoss
 from devrf.methods.devrf.losses import FlowMean, MotionPrediction
 from devrf.methods.devrf.model import DeVRFModel
-from devrf.methods.devrf.motion_loss import MotionLoss
 from devrf.methods.devrf.settings import DEFORMATION_LOSS, MotionSettings, Precision
 from devrf.methods.devrf.voxel_stage import VoxelStage, weighted_loss
 from devrf.ops.adam import GridAdam
-from devrf.rendering.output import ColorChange
 from devrf.scenes.scene import CaptureName, Views
 from devrf.system.profiling import span
 
@@ -41,6 +39,10 @@ class DeformationStage(VoxelStage):
     Coarse to fine (docs/method.md#coarse-to-fine), frames are learned one after another, or several
     in parallel, each from batches of its own. Only their two slices are trained, and what
     extensions add; the canonical field and all other frames are frozen.
+
+    Attributes:
+        weights: of the loss terms that count at the present level.
+        active: the frames that are trained.
     """
 
     schedule: DeformationSchedule
@@ -71,10 +73,9 @@ class DeformationStage(VoxelStage):
             loss: weights of the loss terms; ``tv`` is the total variation of both fields.
             flow_mean: what the flow loss is a mean over (docs/method.md#flow).
             extensions: what is added beyond the paper, by name.
-            iterations_per_step: optimiser iterations in one Lightning step.
-            graphs: whether a GPU replays iterations from CUDA graphs: ``auto`` where it can.
-            decoder_precision: what the colour network computes in; ``auto``: ``bfloat16`` on a
-                GPU that multiplies it.
+            iterations_per_step: as of every :class:`VoxelStage`.
+            graphs: likewise.
+            decoder_precision: likewise.
         """
         super().__init__(iterations_per_step, graphs, decoder_precision)
         self.schedule = schedule or DeformationSchedule()
@@ -82,32 +83,23 @@ class DeformationStage(VoxelStage):
         self.flow_mean = flow_mean
         self.extensions = tuple((extensions or {}).values())
         self.motion_loss = MotionLoss(loss, self.extensions, self.schedule)
-        self.scene_model = DeVRFModel(
-            rest.model.architecture,
-            rest.model.canonical,
-            rest.model.occupancy,
-            rest.model.settings,
-            space=rest.model.space,
-        ).requires_grad_(False)
+        self.weights = self.motion_loss.weights_at(0)
+        still = rest.model
+        fields = still.architecture, still.canonical, still.occupancy, still.settings
+        self.scene_model = DeVRFModel(*fields, space=still.space).requires_grad_(False)
         self.earlier_records = rest.metadata.records
         placeholder = torch.zeros(2, 2, 2, 3, requires_grad=True)
-        self._optimizer = GridAdam(
+        self.optimizer = GridAdam(
             [{"params": [placeholder], "lr": self.motion.learning_rate, "name": "motion"}]
         )
         self.active = ActiveFrames(self)
         self._convergence = Convergence()
-        self._color_changes: list[ColorChange | None] = []
 
     @classmethod
     def check_settings(cls, **settings: Any) -> None:
         """Check the loss, before what the stage builds on has been learned."""
         extensions = tuple(settings.get("extensions", {}).values())
         MotionLoss(settings["loss"], extensions, settings["schedule"])
-
-    @property
-    def weights(self) -> Mapping[str, float]:
-        """Of the loss terms that count at the present level."""
-        return self.motion_loss.weights
 
     @property
     def field(self) -> DeformationField:
@@ -125,65 +117,51 @@ class DeformationStage(VoxelStage):
         """Present shape of the motion grids."""
         return self.field.shape
 
-    @property
-    def optimizer(self) -> GridAdam:
-        """Adam over the two slices of each active frame, and what extensions learn."""
-        return self._optimizer
-
     def phase_at(self, iteration: int) -> DeformationPhase:
         """The schedule's visit."""
         return self.schedule.phase(iteration, len(self.field.clock))
 
     def learning_rate_factor(self, iteration: int) -> float:
-        """Of the iteration's level, and of its visit (docs/method.md#motion-learning-rate)."""
-        phase = self.phase_at(iteration)
-        share = (iteration - phase.start) / (phase.stop - phase.start)
-        return phase.learning_rate_factor * math.pow(phase.lr_final_factor, share)
+        """Of the iteration's level, and of its visit."""
+        return self.phase_at(iteration).learning_rate_at(iteration)
 
     def setup(self, stage: str) -> None:
         """Build the field at rest, at the coarsest resolution.
-
-        It lives in the canonical field's box; in contracted space in the inner box, and what is
-        outside stays where it is.
 
         Raises:
             DevrfError: the scene is at rest.
         """
         super().setup(stage)
         if not self.scene.moves:
-            raise DevrfError(
-                f"{self.scene.name}: is at rest, so there is no motion to learn; the canonical "
-                "stage is all that it takes"
-            )
-        if self.scene.dynamic.train.by_moving_camera and self.weights.get("flow"):
+            raise DevrfError(f"{self.scene.name}: is at rest, so there is no motion to learn")
+        if self.scene.dynamic.train.by_moving_camera and self.motion_loss.leave_out("flow"):
             log.info("the camera moves, and so does all that it sees: the flow loss is left out")
-            self.motion_loss.leave_out("flow")
-        model, motion = self.scene_model, self.motion
-        if model.deformation is None:
-            box = model.space.inner(model.box)
-            model.deformation = DeformationField(
-                box,
-                self.scene.clock,
-                voxels=self.schedule.levels[0].side ** 3,
-                still_outside=box != model.box,
-            )
-            device, levels = self.trainer.strategy.root_device, self.schedule.levels
-            # Several processes keep frames on their devices.
-            self.field.frames.keep(
-                motion.store if self.trainer.world_size == 1 else "device",
-                device,
-                box.grid_shape(levels[-1].side ** 3),
-                half=motion.rests_half(device),
-                parallel=self.schedule.max_parallel_frames(-1, len(self.scene.clock)),
-            )
+        if self.scene_model.deformation is None:
+            self._build_field()
             for extension in self.extensions:
                 extension.setup(self)
-        scale = self.field.box.longest if motion.unit == "box" else 1.0
-        self._optimizer.param_groups[0]["base_lr"] = motion.learning_rate * scale
+        scale = self.field.box.longest if self.motion.unit == "box" else 1.0
+        self.optimizer.param_groups[0]["base_lr"] = self.motion.learning_rate * scale
 
-    def enter(self, phase: DeformationPhase) -> None:  # type: ignore[override]
+    def _build_field(self) -> None:
+        """The field over the canonical field's box; in contracted space, over the inner box."""
+        model, store, levels = self.scene_model, self.motion.store, self.schedule.levels
+        box, clock = model.space.inner(model.box), self.scene.clock
+        voxels, still_outside = levels[0].side ** 3, box != model.box
+        model.deformation = DeformationField(box, clock, voxels=voxels, still_outside=still_outside)
+        device = self.trainer.strategy.root_device
+        model.deformation.frames.keep(
+            # Several processes keep frames on their devices.
+            store if self.trainer.world_size == 1 else "device",
+            device,
+            box.grid_shape(levels[-1].side ** 3),
+            half=self.motion.stored_half(device),
+            parallel=self.schedule.max_parallel_frames(-1, len(clock)),
+        )
+
+    def enter(self, phase: DeformationPhase) -> None:
         """Go to the phase's frames: grow the grids if a level begins, fresh Adam if asked for."""
-        previous, self.phase = self.phase, phase
+        previous, self.phase, motion = self.phase, phase, self.motion
         self.active.write_back()
         if previous is not None and previous.level != phase.level:
             self._allocate(0)
@@ -193,19 +171,17 @@ class DeformationStage(VoxelStage):
                 self.field.frames.copy_previous(frame)
             for extension in self.extensions:
                 extension.initialise(self, phase, frame)
-        carried = self.motion.adam_state == "carried" and phase.level > 0
+        carried = motion.adam_state == "carried" and phase.level > 0
         if len(self.active) == len(phase.frames) and not carried:
-            for group in range(len(self._optimizer.param_groups)):
-                self._optimizer.forget(group)
+            for group in range(len(self.optimizer.param_groups)):
+                self.optimizer.forget(group)
         self._activate(phase)
         self._prefetch_after(phase)
         self._update_occupancy()
-        self.active.choose_pixels(
-            self.views,
-            self.scene_model,
-            occupied_only=self.motion.pixels == "occupied",
-            join_views=self.motion.views == "all",
-        )
+        occupied, joined = motion.pixels == "occupied", motion.views == "all"
+        for active in self.active:
+            shown = self.views, active.number, self.scene_model, active.occupancy
+            active.pools = frame_pools(*shown, occupied_only=occupied, join_views=joined)
 
     def _activate(self, phase: DeformationPhase) -> None:
         """Check out the phase's frames, with memory for them."""
@@ -216,39 +192,30 @@ class DeformationStage(VoxelStage):
 
     def _allocate(self, count: int) -> None:
         """Make memory for ``count`` active frames at the field's present resolution."""
+        assert self.phase is not None
+        level, memory = self.phase.level, (self.field.frames, self.scene_model.occupancy)
         # The memory of the frames before is freed first.
         self.loop.release()
-        assert self.phase is not None
-        level, occupancy = self.phase.level, self.scene_model.occupancy
-        self.active.allocate(0, self.field.frames, occupancy, {})
-        for group in range(len(self._optimizer.param_groups)):
-            self._optimizer.replace(group, [])
+        self.active.allocate(0, *memory, {})
+        for group in range(len(self.optimizer.param_groups)):
+            self.optimizer.replace(group, [])
         further = {k: v for e in self.extensions for k, v in e.frame_fields(self, level).items()}
-        self.active.allocate(count, self.field.frames, occupancy, further)
-        self.motion_loss.begin_level(level)
+        self.active.allocate(count, *memory, further)
+        self.weights = self.motion_loss.weights_at(level)
         learned = [tensor for frame in self.active for tensor in frame.slices]
         smoothing = self.motion_loss.smoothing(level, self.field.shape)
-        self._optimizer.replace(0, learned, smoothing=smoothing)
+        self.optimizer.replace(0, learned, smoothing=smoothing)
         for extension in self.extensions:
             extension.begin_level(self, level)
-        self._color_changes = [self._color_change(frame) for frame in self.active]
-        if len(self.active):
-            static_shape = self.static_shape(self.scene_model.canonical.density.values)
-            parameters = [frame.learned for frame in self.active]
-            self.bind(self.schedule.rays, parameters, static_shape=static_shape)
-
-    def _color_change(self, frame: ActiveFrame) -> ColorChange | None:
-        """What an extension adds to the colours' logits of a frame, if any does."""
-        changes = (extension.color_change(frame) for extension in self.extensions)
-        return next((change for change in changes if change is not None), None)
+        if count:
+            self.bind(self.schedule.rays, [frame.learned for frame in self.active])
 
     def _prefetch_after(self, phase: DeformationPhase) -> None:
         """Begin to fetch the next phase's frames, unless they change before it begins."""
         following = self.phase_at(phase.stop)
-        changed = following.init_from_previous or any(
-            extension.changes(self, following) for extension in self.extensions
-        )
-        if following.level == phase.level and following != phase and not changed:
+        changes = any(extension.changes(self, following) for extension in self.extensions)
+        same_level = following.level == phase.level and following != phase
+        if same_level and not (changes or following.init_from_previous):
             self.field.frames.prefetch(following.frames)
 
     def current_model(self) -> DeVRFModel:
@@ -303,7 +270,8 @@ class DeformationStage(VoxelStage):
         frame, capacity, field = self.active[batch.number], batch.capacity, self.field
         # Before frame 1 nothing has moved; lists of fixed length take the same work each time.
         before = [frame.before] if capacity is not None or frame.number > 1 else []
-        color_change = self._color_changes[batch.number]
+        changes = (extension.color_change(frame) for extension in self.extensions)
+        color_change = next((change for change in changes if change is not None), None)
         warp = field.warp_by(frame.backward)
         prediction = MotionPrediction(
             *self.render_pixels(views, pixels, frame.occupancy, capacity, warp, color_change),
@@ -332,21 +300,20 @@ class DeformationStage(VoxelStage):
 
     @property
     def memory_keys(self) -> tuple[str, ...]:  # type: ignore[override]
-        """The level's grids and rays; how many frames are learned together, if several are."""
+        """The rays, the level's grids, and how many frames are learned together."""
         level = f"schedule.deformation.levels.{1 if self.phase is None else self.phase.level + 1}"
-        keys = (f"{level}.side", "schedule.deformation.rays")
-        return (*keys, f"{level}.parallel_frames") if len(self.active) > 1 else keys
+        together = (f"{level}.parallel_frames",) if len(self.active) > 1 else ()
+        return f"{level}.side", "schedule.deformation.rays", *together
 
     def phase_state(self) -> dict[str, Any]:
         """The state of each active frame, and its losses so far."""
-        exact = self.motion.rests_half(self.device)
-        frames = self.active.state(self.views, exact=exact)
+        exact = self.motion.stored_half(self.device)
+        frames = [frame.state(self.views, exact=exact) for frame in self.active]
         return {"frames": frames, "convergence": self._convergence.state()}
 
-    def restore(  # type: ignore[override]
-        self, phase: DeformationPhase, kept: dict[str, Any]
-    ) -> None:
+    def restore(self, phase: DeformationPhase, state: dict[str, Any]) -> None:
         """Go on with the frames of ``phase``, the field being loaded."""
         self._activate(phase)
-        self.active.load_state(kept["frames"], self.views)
-        self._convergence.load_state(kept["convergence"])
+        for frame, of_frame in zip(self.active, state["frames"], strict=True):
+            frame.load_state(of_frame, self.views)
+        self._convergence.load_state(state["convergence"])

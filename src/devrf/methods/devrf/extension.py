@@ -1,4 +1,4 @@
-"""What an extension of the deformation stage may add, and what it sees of the stage.
+"""What an extension of the deformation stage may add, and the loss with what it adds.
 
 An extension is one file of ``extensions/`` and one block of ``schedule.extensions``; without both,
 all else runs as before.
@@ -6,18 +6,22 @@ all else runs as before.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from devrf.engine.active_frames import ActiveFrame, ActiveFrames
+from devrf.engine.frame_store import FrameField
 from devrf.engine.loop import Loop
-from devrf.methods.devrf.deformation_field import DeformationField, FrameField
+from devrf.errors import DevrfError
+from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule
-from devrf.methods.devrf.losses import MotionPrediction
+from devrf.methods.devrf.losses import MOTION_TERMS, MotionPrediction, total_variation_weight
 from devrf.methods.devrf.model import DeVRFModel
+from devrf.methods.weighted_loss import counted_weights
 from devrf.ops.adam import GridAdam
 from devrf.rendering.output import ColorChange
 from devrf.scenes.scene import Scene, Views
@@ -33,20 +37,19 @@ class MotionLearner(Protocol):
         schedule: levels, iterations and rays.
         scene_model: what is learned.
         generator: draws random numbers, on the stage's device.
+        optimizer: Adam; an extension that learns adds a group of its own.
         active: the frames that are trained.
         loop: carries iterations out.
+        weights: of the loss terms that count at the present level.
     """
 
     schedule: DeformationSchedule
     scene_model: DeVRFModel
     generator: torch.Generator
+    optimizer: GridAdam
     active: ActiveFrames
     loop: Loop
-
-    @property
-    def weights(self) -> Mapping[str, float]:
-        """Of the loss terms that count at the present level."""
-        ...
+    weights: dict[str, float]
 
     @property
     def scene(self) -> Scene:
@@ -56,11 +59,6 @@ class MotionLearner(Protocol):
     @property
     def field(self) -> DeformationField:
         """The deformation field; the active frames' part may not be written back yet."""
-        ...
-
-    @property
-    def optimizer(self) -> GridAdam:
-        """Adam; an extension that learns adds a group of its own."""
         ...
 
     @property
@@ -117,8 +115,68 @@ class Extension:
         """Give one of the phase's frames its first values, in the fields, before a visit."""
 
     def color_change(self, frame: ActiveFrame) -> ColorChange | None:
-        """What is added to the colours' logits of an active frame; None: nothing.
-
-        Asked once a level: it reads the frame's present values whenever it is called.
-        """
+        """What is added to the colours' logits of an active frame; None: nothing."""
         return None
+
+
+class MotionLoss:
+    """Σ weight · factor · term, the factors being those of the present level.
+
+    Attributes:
+        terms: what can be computed, by name.
+    """
+
+    def __init__(
+        self,
+        loss: Mapping[str, float],
+        extensions: Sequence[Extension],
+        schedule: DeformationSchedule,
+    ) -> None:
+        """Check the weights.
+
+        Args:
+            loss: weights by the terms' names; ``tv`` is the total variation of both fields.
+            extensions: add terms, weights and factors.
+            schedule: has the levels' factors.
+
+        Raises:
+            DevrfError: a weight, or a factor of the schedule or an extension, is of no term.
+        """
+        self.terms: dict[str, MotionTerm] = dict(MOTION_TERMS)
+        weights = {name: weight for name, weight in loss.items() if name != "tv"}
+        scaled = [("schedule.extensions", extension.scaled_terms) for extension in extensions]
+        for number, level in enumerate(schedule.levels, 1):
+            key = f"schedule.deformation.levels.{number}.weight_factors"
+            scaled.append((key, level.weight_factors.keys() - {"tv"}))
+        for extension in extensions:
+            self.terms |= extension.terms
+            weights |= extension.weights
+        for key, names in scaled:
+            for name in names:
+                if name not in self.terms:
+                    known = ", ".join(sorted(self.terms))
+                    raise DevrfError(
+                        f"{key}: {name} is no term of loss.deformation; the terms are {known}"
+                    )
+        self._whole = counted_weights(weights, self.terms, "loss.deformation")
+        self._tv = loss.get("tv", 0.0)
+        self._extensions, self._schedule = extensions, schedule
+
+    def leave_out(self, term: str) -> bool:
+        """Let a term count no more; whether it did."""
+        return bool(self._whole.pop(term, 0.0))
+
+    def weights_at(self, level: int) -> dict[str, float]:
+        """The weights of the terms that count at ``level``."""
+        weights = {name: weight * self._factor(name, level) for name, weight in self._whole.items()}
+        return {name: weight for name, weight in weights.items() if weight}
+
+    def _factor(self, term: str, level: int) -> float:
+        factors = (extension.weight_factor(term, level) for extension in self._extensions)
+        of_level = self._schedule.levels[level].weight_factors
+        return math.prod(factors, start=of_level.get(term, 1.0))
+
+    def smoothing(self, level: int, shape: tuple[int, int, int]) -> float:
+        """The optimiser's weight of the total variation of grids of ``shape`` at ``level``."""
+        weight = self._tv * self._schedule.levels[level].weight_factors.get("tv", 1.0)
+        return total_variation_weight(weight, max(shape), self._schedule.rays)

@@ -11,7 +11,7 @@ from devrf.scenes.scene import Scene
 from devrf.scenes.silhouettes import visual_hull
 
 
-def possible_matter(
+def possibly_occupied(
     scene: Scene,
     shape: tuple[int, int, int],
     *,
@@ -19,7 +19,7 @@ def possible_matter(
     min_views: int = 1,
     device: torch.device | None = None,
 ) -> Tensor:
-    """Where matter can be at rest: (X, Y, Z) bool on the host, on a grid over the scene's box.
+    """Where something can be at rest: (X, Y, Z) bool on the host, on a grid over the scene's box.
 
     It is found on ``device``; None: on the host.
 

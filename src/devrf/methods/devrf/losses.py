@@ -1,7 +1,4 @@
-"""The terms of the losses: those that compare rays with images, those that constrain the motion.
-
-See docs/method.md#photometric-losses and docs/method.md#motion-losses.
-"""
+"""The terms of the losses (docs/method.md#photometric-losses, docs/method.md#motion-losses)."""
 
 from __future__ import annotations
 
@@ -84,8 +81,8 @@ def cycle(prediction: MotionPrediction) -> Tensor:
 def flow(prediction: MotionPrediction) -> Tensor:
     """L_flow = (1/M) Σ_i w_i m_i |φ_i − φ_i^observed|₁ in pixels (docs/method.md#flow).
 
-    M is the number of ``rays`` whose flow is valid, or twice the number of their ``samples``;
-    the loss is 0 without observed flow.
+    M is the number of ``rays`` whose flow is valid, or twice the number of their ``samples``.
+    0 without observed flow.
     """
     batch, output = prediction.batch, prediction.output
     if batch.flow is None or batch.flow_valid is None:
@@ -99,8 +96,8 @@ def flow(prediction: MotionPrediction) -> Tensor:
         batch.pixel[ray],
         prediction.space,
     )
-    over_rays, valid = prediction.flow_mean == "rays", batch.flow_valid
-    count = valid.sum() if over_rays else 2 * output.count_on(valid)
+    valid = batch.flow_valid
+    count = valid.sum() if prediction.flow_mean == "rays" else 2 * output.count_on(valid)
     return flow_error(weight, induced, batch.flow[ray], count)
 
 

@@ -6,33 +6,35 @@ import pkgutil
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import partial
-from typing import Any, ClassVar, Protocol, Self, cast
+from typing import Any, ClassVar, Self
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from devrf.checkpoints.stored_grids import pack, unpack
+from devrf.engine.frame_store import FrameField
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.geometry.space import WORLD, Space, space_config, space_from
 from devrf.methods.base import Renderable
 from devrf.methods.devrf.architecture import Architecture
-from devrf.methods.devrf.canonical_field import CanonicalField
-from devrf.methods.devrf.compact_state import compact_state, expanded_state
-from devrf.methods.devrf.deformation_field import DeformationField, FrameField, deformed_occupancy
-from devrf.methods.devrf.view import DeVRFView
+from devrf.methods.devrf.canonical_field import CanonicalField, ColorDecoder
+from devrf.methods.devrf.deformation_field import DeformationField, deformed_occupancy
+from devrf.methods.devrf.view import CanonicalSurface, DeVRFView
 from devrf.methods.devrf.volume_rendering import Warp
+from devrf.ops.corners import shape_of
 from devrf.rendering.list_rendering import ListRenderer
-from devrf.rendering.occupancy import Occupancy
+from devrf.rendering.occupancy import Occupancy, dilate
 from devrf.rendering.output import ColorChange
 from devrf.rendering.sampling import RenderSettings
 
 
-class ColorField(Protocol):
-    """A field of frames that changes colours: a :class:`FrameField` of an extension."""
+class ColorField(FrameField):
+    """A field of frames that changes colours; an extension brings it."""
 
     def at(self, time: float) -> ColorChange | None:
         """What is added to the colours' logits at ``time`` in [0, 1]; None where nothing is."""
-        ...
+        raise NotImplementedError
 
 
 class DeVRFModel(Renderable):
@@ -58,7 +60,7 @@ class DeVRFModel(Renderable):
         settings: RenderSettings,
         deformation: DeformationField | None = None,
         space: Space = WORLD,
-        color_residual: FrameField | None = None,
+        color_residual: ColorField | None = None,
     ) -> None:
         super().__init__()
         self.architecture = architecture
@@ -86,7 +88,7 @@ class DeVRFModel(Renderable):
             "architecture": asdict(self.architecture),
             "settings": asdict(self.settings),
             "space": space_config(self.space),
-            "radiance": self.canonical.has_network,
+            "radiance": isinstance(self.canonical.decoder, ColorDecoder),
             "deforms": self.moves,
             "color_residual": _class_path(self.color_residual),
         }
@@ -117,9 +119,7 @@ class DeVRFModel(Renderable):
 
     def color_change(self, time: float) -> ColorChange | None:
         """q → A_t(q) at ``time``; None where colours are those of the canonical field."""
-        return (
-            None if self.color_residual is None else cast(ColorField, self.color_residual).at(time)
-        )
+        return None if self.color_residual is None else self.color_residual.at(time)
 
     def occupancy_at(self, time: float) -> Occupancy:
         """Where something is at ``time`` in [0, 1]."""
@@ -130,18 +130,11 @@ class DeVRFModel(Renderable):
 
     def at(self, time: float, *, half: bool = False) -> DeVRFView:
         """The scene at ``time``: its occupancy and its displacements, ready."""
-        lists, present = self._lists.get(half), (self.canonical, self.settings)
+        present, lists = (self.canonical, self.settings), self._lists.get(half)
         if lists is None or (lists.field, lists.settings) != present:
             lists = self._lists[half] = ListRenderer(*present, half=half)
-        return DeVRFView(
-            self.canonical,
-            self.occupancy,
-            self.deformation,
-            lists,
-            self.space,
-            time,
-            self.color_change(time),
-        )
+        fields = self.canonical, self.occupancy, self.settings, self.deformation, self.space
+        return DeVRFView(*fields, time, lists, self.color_change(time))
 
     def surface(self) -> CanonicalSurface:
         """The canonical field."""
@@ -177,64 +170,84 @@ class DeVRFModel(Renderable):
         frames += [] if residual is None else [residual.values]
         return super().size + sum(tensor.numel() for tensor in frames)
 
+    @torch.no_grad()
     def stored_state(self) -> dict[str, Any]:
-        """The state with packed grids (``compact_state``)."""
-        fields = self.occupancy, self.canonical, self.deformation, self.occupancy_at
-        unbounded = not self.space.is_linear
-        return compact_state(self.state_dict(), *fields, self.color_residual, unbounded=unbounded)
+        """The state with packed grids: in half precision, in detail near what is ever occupied.
+
+        A grid with a value that half precision cannot hold stays as it is.
+        """
+        state, motion, residual = self.state_dict(), self.deformation, self.color_residual
+        shown = _points_near(self.occupancy, self.canonical.density.shape, self.box)[None]
+        if not self.space.is_linear:  # rays end in the field's outer faces
+            rim = torch.ones_like(shown)
+            rim[:, 1:-1, 1:-1, 1:-1] = False
+            shown |= rim
+        for name in ("canonical.density.values", "canonical.color.values"):
+            state[name] = _packed(state[name][None], shown, smooth=False, many=False)
+        if motion is not None:
+            at_rest = _points_near(self.occupancy, motion.shape, motion.box)[None]
+            near = [
+                _points_near(self.occupancy_at(time), motion.shape, motion.box)
+                for time in motion.clock.times
+            ]
+            # Between two frames both are blended.
+            moving = [torch.stack(near[max(k - 1, 0) : k + 2]).any(dim=0) for k in range(len(near))]
+            frames = {"to_canonical": torch.stack(moving), "to_time": at_rest}
+            for name, keep in frames.items():
+                values = getattr(motion.frames, name)
+                state[f"deformation.frames.{name}"] = _packed(values, keep, smooth=True)
+        if residual is not None:
+            values = residual.values
+            at_rest = _points_near(self.occupancy, shape_of(values[0]), residual.box)[None]
+            state["color_residual.values"] = _packed(values, at_rest, smooth=False)
+        return state
 
     def load_stored_state(self, state: Mapping[str, Any]) -> None:
-        """Take a compact or a full state."""
-        self.load_state_dict(expanded_state(dict(state)))
+        """Take what :meth:`stored_state` gave, or a full state.
 
-
-class CanonicalSurface:
-    """The radiance field at rest, as :class:`~devrf.rendering.view.SurfaceField`.
-
-    Opacities are those of a voxel of the full grid (docs/method.md#step-length).
-    """
-
-    def __init__(self, field: CanonicalField, occupancy: Occupancy) -> None:
-        """Look at a field.
-
-        Args:
-            field: the canonical field.
-            occupancy: where something is at rest; elsewhere nothing is rendered.
+        Raises:
+            RuntimeError | KeyError | ValueError: it does not fit, or a packed grid lacks a part.
         """
-        self._field, self._occupancy = field, occupancy
-
-    @property
-    def box(self) -> Box:
-        """Where the field lives."""
-        return self._field.box
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """The density grid's points along x, y, z."""
-        return self._field.density.shape
-
-    @torch.no_grad()
-    def optical_depth(self, points: Tensor) -> Tensor:
-        """τ (M,) of one voxel, 0 in cells that are known to be empty."""
-        depth = self._field.optical_depth(points, self._field.step_in_base_voxels(1.0))
-        return torch.where(self._occupancy.at(points), depth, 0.0)
-
-    @torch.no_grad()
-    def color(self, points: Tensor, viewdirs: Tensor) -> Tensor:
-        """RGB (M, 3) of points, each seen in its own direction."""
-        return self._field.rgb(points, viewdirs, torch.arange(len(points), device=points.device))
+        self.load_state_dict(
+            {
+                name: _unpacked(value) if isinstance(value, dict) and "kept" in value else value
+                for name, value in state.items()
+            }
+        )
 
 
-def _class_path(field: nn.Module | None) -> str | None:
+def _packed(grids: Tensor, keep: Tensor, *, smooth: bool, many: bool = True) -> Any:
+    try:
+        return {**pack(grids.cpu(), keep.cpu(), smooth=smooth), "many": many}
+    except ValueError:
+        return grids if many else grids[0]
+
+
+def _unpacked(packed: dict[str, Any]) -> Tensor:
+    grids = unpack(packed)
+    return grids if packed["many"] else grids[0]
+
+
+def _points_near(occupancy: Occupancy, shape: tuple[int, int, int], box: Box) -> Tensor:
+    """The points of a grid over ``box`` that interpolation near anything occupied reads."""
+    cells = zip(occupancy.mask.shape, shape, strict=True)
+    # A cell of the grid may span several of the occupancy's cells.
+    reach = max(1, *(-(-(theirs - 1) // max(ours - 1, 1)) for theirs, ours in cells))
+    grown = Occupancy(dilate(occupancy.mask, reach), occupancy.box)
+    points = box.grid_points(shape, torch.empty(0, device=occupancy.mask.device))
+    return dilate(grown.at(points.view(-1, 3)).view(shape), 1)
+
+
+def _class_path(field: ColorField | None) -> str | None:
     """Where the field's class is, for :func:`_class_at`."""
     return None if field is None else f"{type(field).__module__}:{type(field).__qualname__}"
 
 
-def _class_at(path: str | None, box: Box, clock: FrameClock) -> FrameField | None:
+def _class_at(path: str | None, box: Box, clock: FrameClock) -> ColorField | None:
     """A field of a few voxels of the class at ``path``; a checkpoint names those of devrf only."""
     if path is None:
         return None
     if not path.startswith("devrf.methods."):
         raise ValueError(path)
-    field: FrameField = pkgutil.resolve_name(path)(box, clock, voxels=8)
+    field: ColorField = pkgutil.resolve_name(path)(box, clock, voxels=8)
     return field

@@ -7,7 +7,7 @@ from typing import Literal
 
 import torch
 
-from devrf.errors import DevrfError
+from devrf.errors import require
 
 # What the colour network computes in.
 Precision = Literal["auto", "float32", "bfloat16"]
@@ -27,13 +27,7 @@ DEFORMATION_LOSS = {
 
 @dataclass(frozen=True)
 class CanonicalRates:
-    """Base learning rates of the canonical field's parts, by name (docs/method.md#optimiser).
-
-    Attributes:
-        density: of the density grid.
-        color: of the feature grid.
-        decoder: of the colour decoder.
-    """
+    """Base learning rates of the canonical field's parts, by name (docs/method.md#optimiser)."""
 
     density: float = 0.1
     color: float = 0.1
@@ -61,9 +55,7 @@ class Sampling:
 
 @dataclass(frozen=True)
 class MotionSettings:
-    """How the deformation field is learned, beside its schedule.
-
-    What ``unit``, ``views`` and ``pixels`` add to the paper: docs/method.md#departures.
+    """How the deformation field is learned, beside its schedule (docs/method.md#departures).
 
     Attributes:
         learning_rate: base rate, in ``unit`` per step: how far a voxel moves at most
@@ -81,7 +73,7 @@ class MotionSettings:
         store_half: whether they are kept in half precision; ``auto``: on a GPU. Active frames
             never are.
         adam_state: ``fresh`` begins each visit with a fresh Adam; ``carried`` goes on, above the
-            coarsest level, with the moments of the visit before
+            coarsest level, with Adam's state from the visit before
             (docs/method.md#motion-learning-rate).
         min_rel_improvement: a visit ends early when two Lightning steps have taken less than
             this share off its loss; None goes through the whole schedule.
@@ -98,12 +90,10 @@ class MotionSettings:
     min_rel_improvement: float | None = None
 
     def __post_init__(self) -> None:
-        if self.min_rel_improvement is not None and not 0 < self.min_rel_improvement <= 1:
-            raise DevrfError(
-                "schedule.motion.min_rel_improvement: expected above 0, at most 1, or null, not "
-                f"{self.min_rel_improvement}"
-            )
+        gain = self.min_rel_improvement
+        key = "schedule.motion.min_rel_improvement"
+        require(gain is None or 0 < gain <= 1, key, "above 0, at most 1, or null", gain)
 
-    def rests_half(self, device: torch.device) -> bool:
+    def stored_half(self, device: torch.device) -> bool:
         """Whether frames are kept in half precision while a stage learns on ``device``."""
         return device.type == "cuda" if self.store_half == "auto" else self.store_half

@@ -1,118 +1,103 @@
-"""A DeVRF scene at one time, ready to be rendered."""
+"""A DeVRF scene at one time, ready to be rendered; and its surface at rest."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
+from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import Space
 from devrf.methods.devrf.canonical_field import CanonicalField
-from devrf.methods.devrf.deformation_field import (
-    DeformationField,
-    GridWarp,
-    occupancy_points,
-    occupancy_through,
-)
+from devrf.methods.devrf.deformation_field import DeformationField, GridWarp, deformed_occupancy
 from devrf.methods.devrf.losses import induced_flow
 from devrf.methods.devrf.volume_rendering import render
 from devrf.ops.compositing import sum_by_ray
-from devrf.ops.corners import shape_of
 from devrf.ops.dispatch import triton_runs
 from devrf.ops.trilinear import resample
 from devrf.rendering.list_rendering import ListRenderer
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.output import ColorChange, RenderedImage
+from devrf.rendering.sampling import RenderSettings
 
 # Rays at once: on a CPU what its caches hold, on a GPU what keeps it busy and fits.
 ON_CPU, ON_GPU, IN_LISTS = 8192, 2**15, 2**18
 
 
+def in_lists(space: Space, field: CanonicalField) -> bool:
+    """Whether rays are rendered in lists of fixed length: where Triton runs.
+
+    Its kernels take straight rays, which contracted space does not have.
+    """
+    return space.is_linear and triton_runs(field.density.values)
+
+
+@dataclass
 class DeVRFView:
     """The occupancy and the displacements of one time t; it shares the fields' memory.
 
     Attributes:
+        canonical: what the scene looks like at rest.
+        occupancy: where something is; at first at rest.
+        settings: how rays are sampled.
+        motion: how the scene moves; None: it is at rest at every time.
+        space: the space that the fields live in.
+        time: t in [0, 1].
+        lists: renders in lists of fixed length, where their kernels run.
+        color_change: what is added to the colours' logits at that time; None: nothing.
         at_rest: whether the warp of this time is the identity.
-        occupancy: where something is.
         displacement: Δ_b(·, t) (X, Y, Z, 3) over the deformation field's box; None at rest.
     """
 
+    canonical: CanonicalField
+    occupancy: Occupancy
+    settings: RenderSettings
+    motion: DeformationField | None
+    space: Space
+    time: float
+    lists: ListRenderer
+    color_change: ColorChange | None = None
+    at_rest: bool = field(init=False)
+    displacement: Tensor | None = field(init=False, default=None)
+    _warp: GridWarp | None = field(init=False, default=None)
+
     @torch.no_grad()
-    def __init__(
-        self,
-        canonical: CanonicalField,
-        occupancy: Occupancy,
-        deformation: DeformationField | None,
-        lists: ListRenderer,
-        space: Space,
-        time: float,
-        color_change: ColorChange | None = None,
-    ) -> None:
-        """Blend the displacements of a time, and find its occupancy.
+    def __post_init__(self) -> None:
+        """Blend the displacements of the time, and find its occupancy."""
+        motion = self.motion
+        self.at_rest = motion is None or motion.clock.at(self.time).after == 0
+        if motion is None or self.at_rest:
+            return
+        self.displacement = displacement = motion.blended(self.time)
+        self._warp = warp = motion.warp_by(displacement)
+        x, y, z = self.occupancy.mask.shape
 
-        Args:
-            canonical: what the scene looks like at rest.
-            occupancy: where something is at rest.
-            deformation: how the scene moves; None: it is at rest at every time.
-            lists: renders the canonical field where Triton runs; has its settings.
-            space: the space that the fields live in.
-            time: in [0, 1].
-            color_change: what is added to the colours' logits at that time; None: nothing.
-        """
-        self._canonical = canonical
-        self._lists, self._settings, self._space = lists, lists.settings, space
-        self._motion = deformation
-        self._color_change = color_change
-        self.occupancy, self.displacement = occupancy, None
-        self.at_rest = deformation is None or deformation.clock.at(time).after == 0
-        self._warp: GridWarp | None = None
-        if deformation is not None and not self.at_rest:
-            self.displacement = deformation.blended(time)
-            still_outside = deformation.still_outside
-            self._warp = GridWarp(
-                (self.displacement,), deformation.box, still_outside=still_outside
-            )
-            points = occupancy_points(occupancy, canonical.box)
-            if still_outside:
-                moved = self._warp(points.view(-1, 3)).view(points.shape)
-            else:
-                # Interpolation at the points of a grid over the same box is resampling, which is
-                # several times faster.
-                moved = points + resample(self.displacement, shape_of(points))
-            self.occupancy = occupancy_through(occupancy, canonical.box, moved)
+        def resampled(points: Tensor) -> Tensor:
+            """Interpolation at the points of a grid over the same box, several times faster."""
+            return points + resample(displacement, (x, y, z)).view(-1, 3)
 
-    @property
-    def _in_lists(self) -> bool:
-        """Whether lists of fixed length are rendered: their kernels take straight rays."""
-        return self._space.is_linear and triton_runs(self._canonical.density.values)
+        whole = resampled if not motion.still_outside else warp
+        self.occupancy = deformed_occupancy(self.occupancy, self.canonical.box, whole)
 
     @property
     def chunk(self) -> int:
         """Rays that are best rendered at once."""
-        density = self._canonical.density.values
-        if self._in_lists:
+        if in_lists(self.space, self.canonical):
             return IN_LISTS
-        return ON_GPU if density.is_cuda else ON_CPU
+        return ON_GPU if self.canonical.density.values.is_cuda else ON_CPU
 
     @torch.no_grad()
     def render(self, rays: Rays, background: Tensor) -> RenderedImage:
         """What R rays in the fields' space see."""
-        if self._in_lists:
-            return self._lists.picture(
-                rays, self.occupancy, self.displacement, background, self._color_change
-            )
-        return RenderedImage.of(
-            render(
-                rays,
-                self._canonical,
-                self.occupancy,
-                self._settings,
-                background,
-                self._warp,
-                color_change=self._color_change,
-            )
-        )
+        occupancy, color_change = self.occupancy, self.color_change
+        if in_lists(self.space, self.canonical):
+            shown = self.displacement, background, color_change
+            return self.lists.picture(rays, occupancy, *shown)
+        scene = self.canonical, occupancy, self.settings, background, self._warp
+        return RenderedImage.of(render(rays, *scene, color_change=color_change))
 
     @torch.no_grad()
     def induced_flow(
@@ -122,17 +107,52 @@ class DeVRFView:
 
         See docs/method.md#flow for φ_i, with ``time`` in place of t − 1.
         """
-        black = torch.zeros(3, device=rays.origins.device)
-        seen = render(rays, self._canonical, self.occupancy, self._settings, black, self._warp)
-        motion = self._motion
+        black, motion = torch.zeros(3, device=rays.origins.device), self.motion
+        seen = render(rays, self.canonical, self.occupancy, self.settings, black, self._warp)
 
         def unwarp(points: Tensor) -> Tensor:
             return points if motion is None else motion.unwarp(points, time)
 
         ray, weight = seen.samples.ray, seen.weight
         moved = induced_flow(
-            seen.canonical, unwarp, cameras, torch.zeros_like(ray), pixels[ray], self._space
+            seen.canonical, unwarp, cameras, torch.zeros_like(ray), pixels[ray], self.space
         )
         mass = sum_by_ray(weight, ray, len(rays))
         total = sum_by_ray(weight[:, None] * moved, ray, len(rays))
         return total / mass.clamp(min=1e-6)[:, None], mass
+
+
+@dataclass(frozen=True)
+class CanonicalSurface:
+    """The radiance field at rest, as :class:`~devrf.rendering.view.SurfaceField`.
+
+    Opacities are those of a voxel of the full grid (docs/method.md#step-length).
+
+    Attributes:
+        field: the canonical field.
+        occupancy: where something is at rest; elsewhere nothing is rendered.
+    """
+
+    field: CanonicalField
+    occupancy: Occupancy
+
+    @property
+    def box(self) -> Box:
+        """Where the field lives."""
+        return self.field.box
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """The density grid's points along x, y, z."""
+        return self.field.density.shape
+
+    @torch.no_grad()
+    def optical_depth(self, points: Tensor) -> Tensor:
+        """τ (M,) of one voxel, 0 in cells that are known to be empty."""
+        depth = self.field.optical_depth(points, self.field.step_in_base_voxels(1.0))
+        return torch.where(self.occupancy.at(points), depth, 0.0)
+
+    @torch.no_grad()
+    def color(self, points: Tensor, viewdirs: Tensor) -> Tensor:
+        """RGB (M, 3) of points, each seen in its own direction."""
+        return self.field.rgb(points, viewdirs, torch.arange(len(points), device=points.device))

@@ -17,7 +17,12 @@ from devrf.methods.devrf.canonical_field import CanonicalField, SigmoidColor
 from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.extensions import depth_crop
-from devrf.methods.devrf.extensions.depth_crop import crop_to_visible, visible_depths, with_room
+from devrf.methods.devrf.extensions.depth_crop import (
+    crop,
+    crop_to_visible,
+    visible_depths,
+    with_room,
+)
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.sampling import RenderSettings
@@ -66,7 +71,7 @@ def test_a_cropped_field_is_the_same_where_it_still_is() -> None:
     length, opacity = field.step_length(0.5), field.step_in_base_voxels(0.5)
     before = field.density.values[6:25, :, 10:, 0]
     kept = Box((-0.9, -1.0, 0.0), (0.9, 1.0, 1.0))
-    field.crop(kept)
+    crop(field, kept)
     assert field.box == kept and field.planes == 11
     assert field.density.shape == (18, 20, 11) and field.color.shape == (18, 20, 11)
     # Depths between planes are as they were, hence so is the way from sample to sample.

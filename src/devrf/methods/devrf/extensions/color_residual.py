@@ -13,14 +13,15 @@ from torch import Tensor
 from devrf.checkpoints.stored_grids import StoredShape
 from devrf.data.color_change import CHANGING, color_drift
 from devrf.engine.active_frames import ActiveFrame
-from devrf.errors import DevrfError
+from devrf.engine.frame_store import FrameField
+from devrf.errors import require
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.methods.devrf.canonical_field import look_up
-from devrf.methods.devrf.deformation_field import FrameField
 from devrf.methods.devrf.deformation_schedule import DeformationPhase
 from devrf.methods.devrf.extension import Extension, MotionLearner, MotionTerm
 from devrf.methods.devrf.losses import MotionPrediction, total_variation_weight
+from devrf.methods.devrf.model import ColorField
 from devrf.rendering.output import ColorChange
 from devrf.scenes.scene import Views
 
@@ -47,7 +48,7 @@ class ResidualGrid:
         return look_up(self.grid, points, self.box)
 
 
-class ResidualField(FrameField, StoredShape):
+class ResidualField(ColorField, StoredShape):
     """Residuals A_t (T, X, Y, Z, 3) over a box: c = sigmoid(decoder(f(q), d) + A_t(q)).
 
     Frame 0 is zero and never trained: the scene at rest looks as the canonical field says.
@@ -116,26 +117,18 @@ class ColorResidual(Extension):
             residual: weight of the squared residuals in the loss.
             tv: weight of their total variation.
         """
-        for name, level in (
-            ("start_level", start_level),
-            ("start_level_static_color", start_level_static_color),
-        ):
-            if level is not None and level < 1:
-                raise DevrfError(f"color_residual.{name}: expected at least 1, not {level}")
-        if side < 2 or not learning_rate > 0:
-            raise DevrfError(
-                "color_residual: expected a side of at least 2 and a learning_rate above 0, not "
-                f"{side} and {learning_rate}"
-            )
+        key, static = "schedule.extensions.color_residual", start_level_static_color
+        require(start_level >= 1, f"{key}.start_level", "at least 1", start_level)
+        good = static is None or static >= 1
+        require(good, f"{key}.start_level_static_color", "at least 1, or null", static)
+        require(side >= 2, f"{key}.side", "at least 2", side)
+        require(learning_rate > 0, f"{key}.learning_rate", "above 0", learning_rate)
         self._learn, self._side, self._learning_rate = learn, side, learning_rate
         self._start, self._start_if_static = start_level, start_level_static_color
         self._scale_if_drift = loss_scale_if_color_drift or {}
         for name, factor in self._scale_if_drift.items():
-            if factor < 0:
-                raise DevrfError(
-                    f"color_residual.loss_scale_if_color_drift.{name}: expected at least 0, "
-                    f"not {factor}"
-                )
+            place = f"{key}.loss_scale_if_color_drift.{name}"
+            require(factor >= 0, place, "at least 0", factor)
         self._residual, self._tv = residual, tv
         # Once set up: the first level that learns it, from 0; factors of weights from it on.
         self._first: int | None = None
@@ -183,10 +176,8 @@ class ColorResidual(Extension):
     def frame_fields(self, stage: MotionLearner, level: int) -> Mapping[str, FrameField]:
         """The residuals, if ``level`` learns them."""
         field = stage.scene_model.color_residual
-        if self._first is None or level < self._first:
-            return {}
-        assert isinstance(field, ResidualField)
-        return {NAME: field}
+        learned = self._first is not None and level >= self._first
+        return {NAME: field} if learned and field is not None else {}
 
     def begin_level(self, stage: MotionLearner, level: int) -> None:
         """Let the optimiser learn the active frames' residuals, (X, Y, Z, 3) each.
@@ -216,9 +207,7 @@ class ColorResidual(Extension):
         """q → A_t(q), as learned so far."""
         if NAME not in frame.further:
             return None
-        field = frame.fields[NAME]
-        assert isinstance(field, ResidualField)
-        return ResidualGrid(frame.further[NAME], field.box)
+        return ResidualGrid(frame.further[NAME], frame.fields[NAME].box)
 
 
 def squared_residual(prediction: MotionPrediction) -> Tensor:

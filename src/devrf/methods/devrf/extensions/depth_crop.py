@@ -5,12 +5,13 @@ from __future__ import annotations
 import logging
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from devrf.data.batch import PixelPool
 from devrf.engine.batches import gather_batch
 from devrf.geometry.box import Box
 from devrf.geometry.ndc import NormalizedDevice
+from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.volume_rendering import render
 from devrf.scenes.bounds import box_between
@@ -47,9 +48,29 @@ def crop_to_visible(model: DeVRFModel, scene: Scene, views: Views, pool: PixelPo
     learned_from = [scene.static.train, scene.dynamic.train]
     box = box_between(learned_from, space, front, back).clipped(field.box)
     before = field.density.values.numel()
-    field.crop(box)
+    crop(field, box)
     share = field.density.values.numel() / before
     log.info("fields live in %s now, in %.0f%% of the voxels", box, 100 * share)
+
+
+@torch.no_grad()
+def crop(field: CanonicalField, box: Box) -> None:
+    """Keep what is in ``box``, a part of the field's own, at the same resolution.
+
+    Of a field with planes; new parameters result.
+    """
+    assert field.planes is not None, "only fields with planes are cropped"
+    before = field.box
+    (width, height, depth), (whole_width, whole_height, whole_depth) = box.size, before.size
+    planes = max(2, round((field.planes - 1) * depth / whole_depth) + 1)
+    share = width * height * planes / (whole_width * whole_height * field.planes)
+    field.box, field.planes = box, planes
+    field.voxels = round(field.voxels * share)
+    field.base_voxels = round(field.base_voxels * share)
+    points = box.grid_points(field.grid_shape(field.voxels), field.density.values)
+    for grid in (field.density, field.color):
+        values = grid(points.view(-1, 3), before)
+        grid.values = nn.Parameter(values.view(*points.shape[:3], -1))
 
 
 @torch.no_grad()

@@ -6,7 +6,7 @@ See docs/method.md#refinement. It is a stage of a protocol that builds on ``defo
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import torch
@@ -15,14 +15,12 @@ from torch import Tensor
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import PixelPool, Pixels
 from devrf.engine.batches import frame_pools, static_pool
-from devrf.engine.loop import ParallelBatch
-from devrf.engine.stage import Phase
-from devrf.errors import DevrfError
+from devrf.engine.learner import ParallelBatch, Phase
+from devrf.errors import require
 from devrf.methods.devrf.losses import PHOTOMETRIC_TERMS, Prediction
 from devrf.methods.devrf.settings import FINE_LOSS, CanonicalRates, Precision
-from devrf.methods.devrf.voxel_stage import VoxelStage, weighted_loss
+from devrf.methods.devrf.voxel_stage import VoxelStage, field_optimizer, weighted_loss
 from devrf.methods.weighted_loss import counted_weights
-from devrf.ops.adam import GridAdam
 from devrf.rendering.occupancy import Occupancy, dilate
 from devrf.scenes.scene import Views
 from devrf.system.profiling import span
@@ -52,31 +50,12 @@ class RefinementSchedule:
     grow: int = 0
 
     def __post_init__(self) -> None:
+        key, share = "refinement.schedule", self.static_share
         for name, least in (("iterations", 0), ("rays", 1), ("grow", 0)):
-            if (given := getattr(self, name)) < least:
-                raise DevrfError(
-                    f"refinement.schedule.{name}: expected {least} or more, not {given}"
-                )
-        if not 0 < self.static_share < 1 or not 0 < self.decay <= 1:
-            raise DevrfError(
-                "refinement.schedule: expected a static_share between 0 and 1 and a decay above 0, "
-                f"at most 1, not {self.static_share} and {self.decay}"
-            )
-
-
-@dataclass(frozen=True)
-class RefinementPhase:
-    """The whole of the stage: one phase.
-
-    Attributes:
-        start: 0.
-        stop: one past the last iteration.
-    """
-
-    start: int
-    stop: int
-    kind: str = "refinement"
-    frames: tuple[int, ...] = ()
+            value = getattr(self, name)
+            require(value >= least, f"{key}.{name}", f"at least {least}", value)
+        require(0 < share < 1, f"{key}.static_share", "between 0 and 1", share)
+        require(0 < self.decay <= 1, f"{key}.decay", "above 0, at most 1", self.decay)
 
 
 class RefinementStage(VoxelStage):
@@ -89,6 +68,8 @@ class RefinementStage(VoxelStage):
     name = "refinement"
     capture = "both"
     memory_keys = ("refinement.schedule.rays",)
+    # Lists of samples are as long as these rays need: no capacity serves both captures.
+    static_shape = False
     rate_keys = "refinement.schedule.rates or the weights of refinement.loss"
 
     def __init__(
@@ -118,11 +99,7 @@ class RefinementStage(VoxelStage):
         self.scene_model = rest.model.requires_grad_(False)
         self.earlier_records = rest.metadata.records
         canonical = self.scene_model.canonical.requires_grad_(True)
-        groups: list[dict[str, Any]] = []
-        for part, rate in asdict(self.schedule.rates).items():
-            learned = list(canonical.get_submodule(part).parameters())
-            groups.append({"params": learned, "lr": rate, "base_lr": rate, "name": part})
-        self._optimizer = GridAdam(groups)
+        self.optimizer = field_optimizer(canonical, self.schedule.rates)
         self._static: PixelPool | None = None
         self._pools: list[PixelPool] = []
         self._occupancies: list[Occupancy] = []
@@ -137,14 +114,9 @@ class RefinementStage(VoxelStage):
         """Shape of the density and feature grids, which does not change."""
         return self.scene_model.canonical.density.shape
 
-    @property
-    def optimizer(self) -> GridAdam:
-        """Adam over density, features and decoder."""
-        return self._optimizer
-
-    def phase_at(self, iteration: int) -> RefinementPhase:
+    def phase_at(self, iteration: int) -> Phase:
         """The one phase there is."""
-        return RefinementPhase(0, self.total_iterations)
+        return Phase(kind="refinement", start=0, stop=self.total_iterations)
 
     def learning_rate_factor(self, iteration: int) -> float:
         """decay^(n / (N − 1)) at iteration n of N."""
@@ -158,12 +130,8 @@ class RefinementStage(VoxelStage):
             occupancy.replace(dilate(occupancy.mask, self.schedule.grow))
         self.restore(phase, {})
 
-    def phase_state(self) -> dict[str, Any]:
-        """Nothing: images and fields tell which pixels there are."""
-        return {}
-
-    def restore(self, phase: Phase, kept: dict[str, Any]) -> None:
-        """Go on with ``phase``, the fields being loaded."""
+    def restore(self, phase: Phase, state: dict[str, Any]) -> None:
+        """Go on with ``phase``: images and fields tell which pixels there are."""
         self.phase, model = phase, self.scene_model
         assert model.deformation is not None
         times, moving = model.deformation.clock.times, self.training_views("dynamic")
@@ -180,14 +148,13 @@ class RefinementStage(VoxelStage):
                 occupied_only=self.pixels == "occupied",
                 join_views=True,
             )
-        groups = self._optimizer.param_groups
+        groups = self.optimizer.param_groups
         for number, group in enumerate(groups):
             skip_zero = group["name"] != "decoder"
             part = model.canonical.get_submodule(group["name"])
-            self._optimizer.replace(number, list(part.parameters()), skip_zero=skip_zero)
+            self.optimizer.replace(number, list(part.parameters()), skip_zero=skip_zero)
         learned = [value for group in groups for value in group["params"]]
-        # Lists of samples are as long as these rays need: no capacity serves both captures.
-        self.bind(self.schedule.rays, [learned], static_shape=False)
+        self.bind(self.schedule.rays, [learned])
 
     def draw(self, batch: ParallelBatch) -> Pixels:
         """Random pixels: of static images first, then of one frame's dynamic images.

@@ -1,0 +1,173 @@
+"""What a stage of any method defines: its phases, and what each iteration draws and learns.
+
+A schedule is a list of phases. Within a phase the same tensors are learned; between two phases
+grids grow or other frames become active.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, Protocol
+
+from lightning import LightningModule
+from torch import Tensor
+
+from devrf.data.batch import Pixels
+from devrf.ops.adam import GridAdam
+from devrf.rendering.sample_capacity import SampleCapacity
+from devrf.rendering.view import Viewable
+from devrf.scenes.scene import CaptureName
+
+
+@dataclass(frozen=True, kw_only=True)
+class Phase:
+    """A range of iterations in which the same tensors are learned.
+
+    Attributes:
+        kind: what is learned, in a word or two: ``search``, ``fine``, ``level 2``.
+        start: first iteration.
+        stop: one past the last iteration.
+        frames: the frames that are learned, ascending; empty where all times are learned at once.
+    """
+
+    kind: str
+    start: int
+    stop: int
+    frames: tuple[int, ...] = ()
+
+
+def in_words(frames: tuple[int, ...]) -> str:
+    """``frame 3``, or ``frames 3, 10``."""
+    noun = "frame" if len(frames) == 1 else "frames"
+    return f"{noun} {', '.join(str(frame) for frame in frames)}"
+
+
+@dataclass
+class ParallelBatch:
+    """One of the batches that an iteration learns from, independent of the others.
+
+    Attributes:
+        number: its index in the iteration, from 0.
+        parameters: what is learned from it, and from no other batch.
+        capacity: the length of its sample lists; None where their length depends on data.
+        pixels: the pixels of the present iteration; None before the first.
+    """
+
+    number: int
+    parameters: Sequence[Tensor]
+    capacity: SampleCapacity | None = None
+    pixels: Pixels | None = None
+
+
+class LearnedModel(Viewable, Protocol):
+    """What a stage learns: a :class:`~devrf.methods.base.Renderable`."""
+
+    def config(self) -> dict[str, Any]:
+        """Plain data to build it from."""
+        ...
+
+    def stored_state(self) -> dict[str, Any]:
+        """The state for a finished checkpoint."""
+        ...
+
+
+class Learner(LightningModule, ABC):
+    """What is learned in each phase, from which pixels, and with what loss.
+
+    Attributes:
+        name: what files, messages and protocols call the stage.
+        capture: the part of the scene that is learned from.
+        memory_keys: the config keys of what to lower when memory runs out.
+        rate_keys: the config keys of what to lower when training diverges.
+        scene_model: what is learned.
+        optimizer: steps over everything that is learned; the same object throughout.
+        phase: the phase that grids and optimiser are ready for; None before the first.
+    """
+
+    name: str
+    capture: CaptureName | Literal["both"]
+    memory_keys: tuple[str, ...] = ()
+    rate_keys: ClassVar[str] = "the learning rates"
+    scene_model: LearnedModel
+    optimizer: GridAdam
+    phase: Phase | None
+
+    @property
+    @abstractmethod
+    def total_iterations(self) -> int:
+        """Iterations of the whole schedule."""
+
+    @property
+    @abstractmethod
+    def resolution(self) -> tuple[int, ...]:
+        """Present shape of the grid that is learned; empty where there is none."""
+
+    @abstractmethod
+    def phase_at(self, iteration: int) -> Phase:
+        """The phase that contains ``iteration``."""
+
+    @abstractmethod
+    def learning_rate_factor(self, iteration: int) -> float:
+        """Factor of the base learning rates at ``iteration``."""
+
+    @abstractmethod
+    def enter(self, phase: Any) -> None:
+        """Make grids and optimiser ready for ``phase``; ends by binding the loop to them."""
+
+    @abstractmethod
+    def draw(self, batch: ParallelBatch) -> Pixels:
+        """The pixels of a batch's next iteration, drawn with the stage's generator."""
+
+    @abstractmethod
+    def loss(
+        self, batch: ParallelBatch, views: Any, pixels: Pixels
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """The weighted loss () of a batch's pixels of ``views``, and its terms () by name."""
+
+    @abstractmethod
+    def restore(self, phase: Any, state: dict[str, Any]) -> None:
+        """Continue ``phase`` with what :meth:`phase_state` gave; the model's tensors are loaded."""
+
+    def phase_state(self) -> dict[str, Any]:
+        """State of the present phase that does not follow from schedule and model: plain data."""
+        return {}
+
+    @classmethod
+    def check_settings(cls, **settings: Any) -> None:
+        """Find errors in the arguments of the stage before what it builds on has been learned.
+
+        Raises:
+            DevrfError: one is wrong.
+        """
+
+    def current_model(self) -> LearnedModel:
+        """The model, with everything learned so far written back to it."""
+        return self.scene_model
+
+    def prepare(self) -> None:
+        """Called before each iteration; may wait for the device."""
+
+    @property
+    def view_cycle(self) -> int:
+        """In how many iterations a batch has come from every training view."""
+        return 1
+
+    def converged(self, losses: Tensor) -> bool:
+        """Whether the rest of the present phase can be skipped.
+
+        Args:
+            losses: (batches,) mean loss of each batch over the last Lightning step.
+        """
+        return False
+
+    def resize_to(self, state: dict[str, Tensor]) -> None:
+        """Give modules the shapes of a stored ``state`` that is about to be loaded."""
+
+    def describe(self, iteration: int) -> str:
+        """An iteration of the present phase, with its frames and resolution, for messages."""
+        frames = self.phase.frames if self.phase is not None else ()
+        shape = "x".join(str(n) for n in self.resolution)
+        place = ", ".join(part for part in (frames and in_words(frames), shape) if part)
+        return f"iteration {iteration} of {self.total_iterations}{place and f' ({place})'}"
