@@ -109,8 +109,7 @@ def test_a_contact_sheet_shows_truth_rendering_error_and_depth_of_spread_views(
         assert dark(sheet[top : top + 300, :left])
     # The nearest is the brightest.
     assert depths == sorted(depths, reverse=True) and len(set(depths)) == len(depths)
-    for column in range(4):
-        assert dark(sheet[:30, left + column * 406 : left + column * 406 + 400])
+    assert dark(sheet[:30, left : left + 400])
 
 
 def dark(area: np.ndarray) -> bool:
@@ -220,7 +219,6 @@ def test_rendering_keeps_to_its_seconds() -> None:
     fewer = film.within_limit(0.4)
     assert (fewer.frames, fewer.fps) == (30, 10)
     assert film.within_limit(100.0).frames == 8
-    assert VideoSettings(frames=4, max_seconds=1).within_limit(9.0).frames == 4
     assert VideoSettings(frames=60).within_limit(100.0).frames == 60
 
 

@@ -19,7 +19,6 @@ from devrf.apps.viewer.cameras import dynamic_frusta, from_browser, in_browser, 
 from devrf.apps.viewer.drawing import Drawing, Frame, RenderScheduler, Shot
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
-from devrf.methods.nerf.ray_view import RayView
 from devrf.rendering.renderer import Renderer
 
 
@@ -77,22 +76,12 @@ def test_the_frame_is_the_renderers_in_blocks_of_any_size(drawing, shot, seen, m
     assert int((small.pixels.int() - frame.pixels.int()).abs().max()) <= 1
 
 
-def test_what_a_scene_offers(drawing, learned, moving):
+def test_what_a_scene_offers(drawing, learned):
     assert drawing.channels == ("color", "depth", "opacity", "motion")
     assert drawing.has_rest and not drawing.at_rest
     at_rest = Drawing(Renderer(learned[0].scene_model), 1.0)
     assert at_rest.channels == ("color", "depth", "opacity")
     assert at_rest.at_rest and not at_rest.has_rest
-
-    class WithoutMotion:
-        device, space, box, depth_limits = moving.device, moving.space, moving.box, (0.0, 1.0)
-
-        def at(self, time: float, *, half: bool = False) -> RayView:
-            return RayView(self, time, self.device, at_rest=False, half=half)
-
-    other = Drawing(Renderer(WithoutMotion()), 1.0)
-    assert other.channels == ("color", "depth", "opacity")
-    assert not other.has_rest and not other.at_rest
 
 
 def test_each_channel_has_a_frame_of_its_own(drawing, shot):
@@ -311,7 +300,7 @@ def test_an_address_that_cannot_be_listened_on():
     assert ViewerSettings().address == "http://127.0.0.1:8080"  # this machine alone
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
-        with pytest.raises(DevrfError, match=rf"^viewer\.port: {port} on"):
+        with pytest.raises(DevrfError, match=rf"^viewer\.port: .*{port}"):
             ViewerSettings(port=port).check_free()
     ViewerSettings(port=port).check_free()
     with pytest.raises(DevrfError, match=r"^viewer\.host: "):

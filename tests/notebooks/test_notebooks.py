@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import os
+import re
 import sys
 from pathlib import Path
 
 import pytest
+from hydra import compose, initialize_config_dir
 
 import devrf
+from devrf.cli.config import config_folder
 
 REASON = "needs devrf[notebooks]"
 nbformat = pytest.importorskip("nbformat", reason=REASON)
@@ -48,7 +52,44 @@ def test_it_is_stored_with_its_figures(notebook):
     assert len(nbformat.writes(notebook)) < 1_500_000
 
 
+def leave_run(folder, number, ablation, psnr):
+    """What ``compare_runs`` reads of a finished run."""
+    choices = {"ablation": ablation, "method": "devrf", "protocol": "two_stage"}
+    learned = {"choices": choices, "settings": {"loss.terms": ablation, "views": number}}
+    dynamic = {"psnr": psnr, "rest_pose_psnr": 20.0, "ssim": 0.9, "lpips": None, "seconds": 9.0}
+    record = {
+        "scene": "robot",
+        "method": "devrf",
+        "protocol": "two_stage",
+        "static": {"psnr": 33.0, "seconds": 5.0},
+        "dynamic": dynamic,
+        "run": {**learned, "train_views": number, "device": "a processor"},
+    }
+    folder.mkdir(parents=True)
+    (folder / "metrics.json").write_text(json.dumps(record))
+    rows = "".join(f"dynamic,m{k},{k},{psnr + k}\n" for k in range(2))
+    (folder / "frames.csv").write_text(f"capture,name,time,psnr\n{rows}")
+
+
+def test_the_sweep_of_compare_runs_composes(monkeypatch):
+    monkeypatch.setenv("DEVRF_NOTEBOOK_SCALE", "0.05")
+    cells = code_cells(nbformat.read(PATHS[0], as_version=4))
+    source = next(cell.source for cell in cells if "SWEEP = [" in cell.source)
+    names = {"os": os, "Path": Path}
+    exec(source[: source.index("\nif ")], names)
+    overrides = [re.sub(r",[^,\[\]{}]*$", "", text) for text in names["SWEEP"][:2]]
+    with initialize_config_dir(str(config_folder()), version_base=None):
+        composed = compose("config", [*overrides, *names["SWEEP"][2:]])
+    assert composed.data.train_views == 1
+
+
 def test_its_short_form_runs(notebook, monkeypatch, tmp_path):
+    runs = tmp_path / "runs"
+    for k, (views, ablation, psnr) in enumerate(
+        ((1, "base", 21), (1, "full", 24), (4, "full", 28))
+    ):
+        leave_run(runs / str(k), views, ablation, psnr)
+    monkeypatch.setenv("DEVRF_RUNS", str(runs))
     # The kernel is a process of its own: it finds the devrf that is tested here.
     source = str(Path(devrf.__file__).parents[1])
     before = [path for path in (os.environ.get("PYTHONPATH"),) if path]

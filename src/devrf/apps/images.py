@@ -29,14 +29,7 @@ TEXT, SMALLEST_TEXT, LARGEST_TEXT = 0.05, 9, 26
 
 
 def depth_colors(depth: Tensor, opacity: Tensor, near: float, far: float) -> Tensor:
-    """Depth as RGB (H, W, 3) in [0, 1]: ``near`` bright, ``far`` dark, empty space white.
-
-    Args:
-        depth: (H, W) distances, in the unit of ``near`` and ``far``.
-        opacity: (H, W) in [0, 1].
-        near: the distance shown brightest.
-        far: the distance shown darkest.
-    """
+    """Depth (H, W) as RGB (H, W, 3) in [0, 1]: ``near`` bright, ``far`` dark, empty space white."""
     closeness = 1 - ((depth - near) / (far - near)).clamp(0, 1)
     colors = _mapped(closeness, "viridis")
     return 1 + opacity[..., None] * (colors - 1)
@@ -48,15 +41,10 @@ def error_colors(prediction: Tensor, truth: Tensor) -> Tensor:
 
 
 def flow_colors(vectors: Tensor, valid: Tensor, full: float) -> Tensor:
-    """Optical flow as colours: hue is direction, saturation length, white is no motion.
+    """Optical flow as RGB (H, W, 3): hue is direction, saturation length, white is no motion.
 
-    Args:
-        vectors: (H, W, 2) pixels, x to the right, then y down.
-        valid: (H, W) bool; elsewhere the picture is grey.
-        full: the length in pixels from which on colours are saturated.
-
-    Returns:
-        (H, W, 3) RGB in [0, 1].
+    ``vectors`` (H, W, 2) are in pixels, x to the right, then y down; where they are not ``valid``
+    the picture is grey. From ``full`` pixels on colours are saturated.
     """
     x, y = torch.where(valid[..., None], vectors, 0.0).float().unbind(-1)
     hue = torch.atan2(-y, x) % (2 * math.pi)  # counted upwards, as angles are drawn
@@ -114,16 +102,10 @@ def image_grid(
     labels: Sequence[Sequence[str]] = (),
     text: int | None = None,
 ) -> Tensor:
-    """A picture of all images, with text that is fitted to its place, never cut off.
+    """A picture (H', W', 3) of images (H, W, 3) in [0, 1], all of one size, and fitted text.
 
-    Args:
-        rows: images (H, W, 3) in [0, 1], all of one size, as many in each row.
-        headings: text above each column; none: no line of them.
-        labels: lines of text left of each row; none: no room for them.
-        text: its height in pixels; None: a twentieth of that of the images, within limits.
-
-    Returns:
-        (H', W', 3) in [0, 1].
+    ``headings`` stand above each column, ``labels`` are lines left of each row. ``text`` is its
+    height in pixels; None: a twentieth of that of the images, within limits.
     """
     height, width = rows[0][0].shape[:2]
     size = text or min(max(round(TEXT * height), SMALLEST_TEXT), LARGEST_TEXT)
@@ -156,13 +138,7 @@ def image_grid(
 
 
 def scaled(image: Tensor, height: int, width: int | None = None) -> Tensor:
-    """An image (H, W, 3) in [0, 1] of another size, smoothly interpolated.
-
-    Args:
-        image: the image.
-        height: the new height in pixels.
-        width: the new width; None: in proportion.
-    """
+    """An image (H, W, 3) in [0, 1] of another size, smoothly interpolated, by default in shape."""
     if width is None:
         width = max(1, round(image.shape[1] * height / image.shape[0]))
     if tuple(image.shape[:2]) == (height, width):

@@ -47,17 +47,12 @@ class Keyframe:
 
 @dataclass(frozen=True)
 class CameraPath:
-    """A way through keyframes.
+    """A way through at least one keyframe, their seconds ascending.
 
     Positions, angles of view and quaternions follow a cubic Hermite spline through the keyframes,
     whose slope at each is that between its neighbours (Catmull-Rom); quaternions are made unit
     ones afterwards. The scene's time goes straight from one keyframe to the next, so that it
-    stands still between two of the same time.
-
-    Attributes:
-        keyframes: at least one, their seconds ascending.
-        aspect: width over height of the video.
-        fps: its frames a second.
+    stands still between two of the same time. The video's ``aspect`` is width over height.
     """
 
     keyframes: tuple[Keyframe, ...]

@@ -100,10 +100,9 @@ class CaptureSettings:
                 "each, 0 for the first, or null"
             )
         if self.subtracts and (views < 2 or self.monocular):
-            fixed = 0 if self.monocular else views
             raise DevrfError(
-                "capture.alpha_masks: subtract needs at least 2 views by cameras that stand still, "
-                f"not {fixed}; give capture.alpha_masks=FOLDER, or leave it out"
+                "capture.alpha_masks: subtract needs at least 2 views by cameras that stand still; "
+                "give capture.alpha_masks=FOLDER, or leave it out"
             )
         if self.test_view == 0 or (views > 1 and not -views <= self.test_view <= views):
             raise DevrfError(
@@ -181,12 +180,10 @@ class ViewerSettings:
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 probe.bind(found[4])
         except OSError as error:
+            key, remedy = "host", "an address of this machine, such as viewer.host=127.0.0.1"
             if error.errno == errno.EADDRINUSE:
-                raise DevrfError(
-                    f"viewer.port: {self.port} on {self.host} is in use by another program; "
-                    f"give another, such as viewer.port={self.port % 65535 + 1}"
-                ) from None
+                key, remedy = "port", f"another, such as viewer.port={self.port % 65535 + 1}"
             raise DevrfError(
-                f"viewer.host: cannot listen on {self.host}:{self.port} ({error.strerror}); "
-                "give an address of this machine, such as viewer.host=127.0.0.1"
+                f"viewer.{key}: cannot listen on {self.host}:{self.port} ({error.strerror}); "
+                f"give {remedy}"
             ) from None

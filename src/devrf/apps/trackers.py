@@ -52,12 +52,7 @@ class TensorBoardTracker(TensorBoardLogger):
     """One set of event files for all stages of a devrf run, added to by each."""
 
     def __init__(self, save_dir: str | Path, name: str = "tensorboard") -> None:
-        """Choose the folder; the first file is written when something is logged.
-
-        Args:
-            save_dir: the run's folder.
-            name: the folder in it.
-        """
+        """Choose a folder in the run's; the first file is written when something is logged."""
         super().__init__(save_dir=save_dir, name=name, version="", default_hp_metric=False)
 
     def show_image(self, name: str, image: Tensor, step: int | None = None) -> None:
@@ -107,14 +102,8 @@ class WandbTracker(WandbLogger):
     ) -> None:
         """Name the run; it begins when something is logged first.
 
-        Args:
-            save_dir: the run's folder; wandb works in ``wandb/`` below it.
-            project: what the run belongs to.
-            name: the run's name.
-            group: the sweep that it is a job of.
-            tags: to find it by.
-            entity: the account or team; None is the one that is logged in.
-            offline: whether to keep the run on this machine (``wandb sync`` sends it later).
+        wandb works in ``wandb/`` below the run's folder. ``group`` is the sweep that it is a job
+        of; ``entity`` None the account that is logged in. Offline, ``wandb sync`` sends it later.
         """
         if offline:
             # Read when wandb is first imported. It reports on itself even when offline.

@@ -73,17 +73,6 @@ def test_the_page_of_a_scene(
     assert found[12].startswith("rim: ") and found[13:] == rows[1:3] + rows[4:]
 
 
-def test_the_page_of_a_moving_camera_without_flow(forward_scene: Scene) -> None:
-    train = forward_scene.dynamic.train
-    train = replace(train, view=torch.arange(6), times=torch.linspace(0, 1, 6), flow=None)
-    figure = inspection_figure(replace(forward_scene, dynamic=Capture(train, train)))
-    assert "a moving camera, 6 times" in headings(figure)
-    assert "Optical flow" not in headings(figure)
-    assert [label.split(",")[0] for label in captions(figure)[6:]] == [
-        f"view {k}" for k in range(6)
-    ]
-
-
 def test_a_camera_is_a_pyramid_that_opens_where_it_looks() -> None:
     cameras = Cameras(
         torch.eye(3, 4)[None], torch.tensor([[10.0, 10.0]]), torch.tensor([[10.0, 5.0]]), 20, 10

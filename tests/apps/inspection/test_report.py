@@ -35,22 +35,6 @@ def test_the_sets_of_a_scene(tiny_scene: Scene) -> None:
     assert rows[1][4:6] == (f"cover {100 * inside:.0f} %", "no")
 
 
-def test_cameras_by_hand(tiny_scene: Scene) -> None:
-    # One camera at the origin and seven 4 away, around a box whose middle is 3 away along x.
-    pose = torch.eye(3, 4).repeat(8, 1, 1)
-    pose[:, 2, 3] = torch.tensor([0.0] + 7 * [4.0])
-    views = tiny_scene.static.train
-    focal = torch.full((8, 2), 30.0)
-    focal[5] = torch.tensor([20.0, 40.0])
-    cameras = replace(views.cameras, camera_to_world=pose, focal=focal)
-    scene = replace(
-        tiny_scene,
-        static=replace(tiny_scene.static, train=replace(views, cameras=cameras)),
-        bounds=replace(tiny_scene.bounds, box=Box((2.0, -1.0, -1.0), (4.0, 1.0, 1.0))),
-    )
-    assert image_facts(scene)[0][6:] == ("20 to 40 px", "3 to 5")
-
-
 @pytest.mark.parametrize(
     ("times", "text"),
     [

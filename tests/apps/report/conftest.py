@@ -46,18 +46,9 @@ def ran(runs):
         }
         usual = {"device": "a processor", "git": "0123456789abcdef", "overrides": [], "seed": 0}
         named = {"ablation": ablation, "method": method, "protocol": protocol, **choices}
-        record = {
-            "scene": scene,
-            "method": method,
-            "protocol": protocol,
-            **sections,
-            "run": {
-                **usual,
-                "choices": named,
-                "settings": {"loss.terms": ablation, **learned},
-                **of_run,
-            },
-        }
+        settings = {"loss.terms": ablation, **learned}
+        run = {**usual, "choices": named, "settings": settings, **of_run}
+        record = {"scene": scene, "method": method, "protocol": protocol, **sections, "run": run}
         folder = runs / name
         folder.mkdir(parents=True)
         (folder / "metrics.json").write_text(json.dumps(record))
@@ -77,15 +68,8 @@ def failed(runs):
     """``failed(name, error, …)``: leaves the record of a failed job in ``runs/name``."""
 
     def write(name, error, **further):
-        record = {
-            "scene": "robot",
-            "choices": {"ablation": "base"},
-            "overrides": ["ablation=base"],
-            "seed": 0,
-            "error": error,
-            "mistake": True,
-            "date": "2026-01-01T00:00:00+00:00",
-        }
+        setup = {"choices": {"ablation": "base"}, "overrides": ["ablation=base"], "seed": 0}
+        record = {"scene": "robot", **setup, "error": error, "mistake": True}
         folder = runs / name
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "failure.json").write_text(json.dumps({**record, **further}))

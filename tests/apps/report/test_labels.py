@@ -40,13 +40,6 @@ def test_ablations_are_called_and_ordered_as_in_the_paper(labels, ran):
     ]
 
 
-def test_runs_equal_in_all_that_was_typed_but_seed_and_folder_share_a_row(rows, ran):
-    for k, seed in enumerate((0, 1, 2, 2, None)):
-        ran(f"{k}/run", seed=seed, overrides=[f"seed={seed}", f"hydra.run.dir={k}", "logger=wandb"])
-    ran("5", choices={"logger": "wandb"}, overrides=["video.frames=3"])
-    assert rows() == [("robot", FULL, ["0/run", "1/run", "2/run", "3/run", "4/run", "5"])]
-
-
 @pytest.mark.parametrize(
     ("one", "other", "endings"),
     [

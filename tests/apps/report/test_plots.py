@@ -41,11 +41,6 @@ def test_psnr_against_seconds_has_a_panel_a_scene_and_the_published_rows(table, 
     points = [(x, y) for line in lego.get_lines() for x, y in zip(*line.get_data(), strict=True)]
     assert len(points) == 1 + 17
     assert points[0] == (300, 30) and (540, 29.25) in points
-    assert {line.get_label() for line in lego.get_lines()[1:]} == {
-        f"{name}, published"
-        for name in ("Neural Volumes", "D-NeRF", "Nerfies", "HyperNeRF", "NSFF", "DeVRF")
-    }
-    assert lego.get_xscale() == "log"
 
 
 def test_metrics_against_views_need_several_numbers_of_them(table, ran):
@@ -56,9 +51,6 @@ def test_metrics_against_views_need_several_numbers_of_them(table, ran):
     psnr, ssim = against_views(table()).axes
     assert curves(psnr) == {"robot": [(1, 20), (3, 26)]}
     assert curves(ssim) == {"robot": [(1, 0.8), (3, 0.9)]}
-    ran("lpips", train_views=2, scores={"lpips": 0.1})
-    _, lpips = against_views(table()).axes
-    assert lpips.get_ylabel() == "LPIPS ↓" and curves(lpips) == {"robot": [(2, 0.1)]}
 
 
 def test_no_plot_of_what_is_not_there(table, ran):

@@ -47,21 +47,12 @@ def test_csv_has_a_row_for_each_run_and_failure_and_every_number(runs, ran, fail
         rows = {row["folder"]: row for row in csv.DictReader(file)}
     assert set(rows) == {"a", "at_rest", "7_robot"}
     assert rows["at_rest"]["row"] == ""
-    expected = {"status": "finished", "scene": "robot", "method": "devrf", "protocol": "two_stage"}
-    expected |= {"row": "Ours w/ c2f, tv, cycle, flow", "run.seed": "1", "run.overrides": "seed=1"}
-    expected |= {"dynamic.psnr": "31.0", "dynamic.lpips": "", "peak_gpu_gb": ""}
-    expected |= {"static.seconds": "3", "dynamic.seconds": "20", "train_seconds": "23.0"}
-    expected |= {"run.choices.ablation": "full", "run.git": "0123456789abcdef"}
+    expected = {"status": "finished", "row": "Ours w/ c2f, tv, cycle, flow", "run.seed": "1"}
+    expected |= {"dynamic.psnr": "31.0", "dynamic.lpips": "", "train_seconds": "23.0"}
     assert rows["a"].items() >= expected.items()
     expected = {"status": "failed", "error": "data.frames: expected 2, or more", "mistake": "true"}
     expected |= {"run.overrides": "data.frames=1 seed=0", "run.choices.ablation": "base"}
     assert rows["7_robot"].items() >= {**expected, "dynamic.psnr": ""}.items()
-
-
-def test_failures_alone_are_a_report(runs, failed):
-    failed("a", "out of luck")
-    text = write_report(ReportSettings(runs)).path.read_text(encoding="utf-8")
-    assert "0 finished runs" in text and "out of luck" in text
 
 
 def test_damaged_runs_alone_are_an_error_and_nothing_is_written(runs):

@@ -14,13 +14,12 @@
        │
     writing     ``transforms.json`` with a ``time`` on each frame, and the lists of held-out images
 
-``footage`` and ``normalisation`` are in :mod:`devrf.scenes`, whose readers use them, too.
-``scene_from_footage`` in :mod:`devrf.apps.capture.pipeline` leads through them. Optical flow is
-estimated when the scene is read, as of any other scene (:mod:`devrf.scenes.optical_flow`).
+``footage`` and ``normalisation`` are in :mod:`devrf.scenes`, whose readers use them, too;
+``picking`` is in ``survey``, ``frames`` in ``images``, and ``writing`` in ``pipeline``.
 
-What a step has found is kept in ``<into>/capture`` together with what it was found from
-(:mod:`devrf.apps.capture.pipeline`): the same command again goes on behind the last step that
-still holds. ``transforms.json`` is written last: a folder with it is whole.
+What a step has found is kept in ``<into>/capture`` together with what it was found from: the same
+command again goes on behind the last step that still holds. ``transforms.json`` is written last:
+a folder with it is whole.
 
 World: OpenGL axes. Cameras that face the scene from one side get the world of their average pose
 (x right, y up, −z ahead), in which the nearest point is at 1/0.75; cameras around the scene one in

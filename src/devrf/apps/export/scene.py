@@ -30,11 +30,7 @@ SINGLE = {"gltf": ("scene.glb", write_gltf), "usd": ("scene.usdc", write_usd)}
 def export_scene(model: Renderable, scene: Scene, settings: ExportSettings, folder: Path) -> None:
     """Write the surface of what was learned, as it moves, or coloured points of each time.
 
-    Args:
-        model: ready to be rendered.
-        scene: that it was learned from.
-        settings: what is written.
-        folder: where, unless the settings say.
+    ``folder`` is where, unless the settings say.
 
     Raises:
         DevrfError: what is asked for cannot be had of the method, or is empty.

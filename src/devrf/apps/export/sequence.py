@@ -45,15 +45,9 @@ def write_sequence(
 ) -> None:
     """Write ``frame_0000.ply`` and so on, and ``index.json`` last.
 
-    Files of an earlier, longer sequence there are removed.
-
-    Args:
-        folder: for the files.
-        format: ``ply`` or ``obj``, in the capture's world; colours are sRGB.
-        times: in [0, 1], one for each file.
-        drawn: what each file holds.
-        content: ``surface`` or ``points``, for the index.
-        seconds: how long time 0 to 1 takes, for the index.
+    Files of an earlier, longer sequence there are removed. They are in the capture's world, and
+    colours are sRGB. The index says that ``content`` is a surface or points, and how many
+    ``seconds`` time 0 to 1 takes.
     """
     frames = []
     for number, (time, geometry) in enumerate(zip(times, drawn, strict=True)):

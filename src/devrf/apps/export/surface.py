@@ -124,12 +124,7 @@ def _reached(empty: npt.NDArray[np.bool_], box: Box, outside: Tensor) -> npt.NDA
 
 
 def canonical_surface(model: Renderable, cameras: Cameras, settings: ExportSettings) -> Surface:
-    """The surface of a model at rest, decimated and coloured.
-
-    Args:
-        model: that has a surface.
-        cameras: that saw the scene, world units, on the host.
-        settings: threshold, number of faces, which pieces, how it is coloured.
+    """The surface of a model at rest, as ``cameras`` on the host saw it, decimated and coloured.
 
     Raises:
         DevrfError: there is no surface at that threshold, or none within reach.

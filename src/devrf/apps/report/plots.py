@@ -229,14 +229,10 @@ def write_training_curve(
     previews: Sequence[tuple[int, float]] = (),
     grids: Sequence[tuple[int, str]] = (),
 ) -> None:
-    """Plot (iteration, PSNR in dB) of training batches, and write it as a PNG.
+    """Plot (iteration, PSNR in dB) of at least one training batch, and write it as a PNG.
 
-    Args:
-        path: the file.
-        stage: its name.
-        batches: of each step, ascending, at least one.
-        previews: the same of a held-out view; may be empty.
-        grids: iterations at which the grid took another size, and that size.
+    ``previews`` are the same of a held-out view; at iterations of ``grids`` the grid took that
+    size.
     """
     figure = Figure(figsize=(8.0, 4.2), dpi=120, layout="constrained")
     axes = figure.subplots()

@@ -62,7 +62,6 @@ class Column:
     """A column of the paper's tables.
 
     Attributes:
-        title: its heading.
         key: the column of a collection that holds its value; times are in seconds.
         higher_is_better: else lower is.
         digits: after the point; None: a time in the unit that reads best.

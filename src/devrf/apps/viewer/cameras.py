@@ -100,13 +100,7 @@ class FrustaLayer:
     """The captured cameras in the page's scene."""
 
     def __init__(self, server: viser.ViserServer, cameras: Cameras, scene: Scene | None) -> None:
-        """Show none yet.
-
-        Args:
-            server: of the page.
-            cameras: that saw the scene at rest.
-            scene: with their images; None where they cannot be read.
-        """
+        """Show none yet; ``cameras`` saw the scene at rest, their images are the ``scene``'s."""
         self._server, self._cameras, self._scene = server, cameras, scene
         extent = float((cameras.positions.amax(dim=0) - cameras.positions.amin(dim=0)).norm())
         self._depth = DEPTH * (extent or 1.0)

@@ -20,11 +20,9 @@ DURATION = 5.0
 
 @dataclass(frozen=True)
 class Playback:
-    """The state of the time controls.
+    """The state of the time controls: the time in [0, 1], and how it runs.
 
     Attributes:
-        time: in [0, 1].
-        playing: whether time runs.
         loop: whether it restarts at its end; otherwise it stops there.
         speed: recordings for each :data:`DURATION` seconds.
     """
@@ -63,12 +61,7 @@ class Controls:
     """
 
     def __init__(self, server: viser.ViserServer, changed: Callable[[], None]) -> None:
-        """Put them on the page.
-
-        Args:
-            server: of the page.
-            changed: called when a frame must be rendered again; from any thread.
-        """
+        """Put them on the page; ``changed`` is called, from any thread, to render again."""
         self.playback, self._lock, self._changed = Playback(), threading.Lock(), changed
         gui = server.gui
         with gui.add_folder("Time"):
@@ -78,8 +71,7 @@ class Controls:
             hint = f"1: all of it in {DURATION:g} seconds"
             self._speed = gui.add_dropdown("speed", SPEEDS, initial_value="1", hint=hint)
         with gui.add_folder("Picture"):
-            channels: tuple[str, ...] = ("color",)
-            self._channel = gui.add_dropdown("show", channels)
+            self._channel: Any = gui.add_dropdown("show", ("color",))
             self._rest = gui.add_checkbox("rest beside", False, hint="the rest state on the left")
             self._status = gui.add_markdown("")
         with gui.add_folder("Cameras", expand_by_default=False):
@@ -123,12 +115,9 @@ class Controls:
         set_value(self._time, time)
 
     def shot(self, camera: viser.CameraHandle, box: Box, *, with_depth: bool) -> Shot:
-        """What a page's camera is to show.
+        """What a page's camera is to show; the crop is a part of the ``box``.
 
-        Args:
-            camera: of the page.
-            box: what the crop is a part of.
-            with_depth: whether something beside frusta is drawn into the scene.
+        ``with_depth``: whether something beside frusta is drawn into the scene.
         """
         crop = None
         if self._crop.value:

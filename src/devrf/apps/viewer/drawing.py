@@ -167,13 +167,7 @@ class Drawing:
 
 @dataclass
 class _Request:
-    """What one browser wants, and how far it has come.
-
-    Attributes:
-        shot: the newest one.
-        number: counts the shots of all browsers, in order.
-        rows: of the last frame of it that was shown; 0 before the first.
-    """
+    """A browser's newest shot, its number among all, and the rows last shown of it, or 0."""
 
     shot: Shot
     number: int
@@ -199,12 +193,8 @@ class RenderScheduler:
     ) -> None:
         """Begin with nothing to render.
 
-        Args:
-            drawing: renders.
-            show: takes each frame, with the browser's key.
-            height: rows of a full frame.
-            move_seconds: about what a first frame may take.
-            stop: once set, the current frame is given up, coarse or not.
+        ``show`` takes each frame, with the browser's key. A full frame has ``height`` rows; a first
+        one takes about ``move_seconds``. Once ``stop`` is set the current frame is given up.
         """
         self.drawing, self._stop = drawing, stop
         self._show, self._height, self._move_seconds = show, height, move_seconds

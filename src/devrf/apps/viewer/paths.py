@@ -39,11 +39,7 @@ Act = Callable[[viser.GuiEvent[Any]], None]
 def known_paths(cameras: Cameras, model: Callable[[], Viewable]) -> dict[str, Preset]:
     """An orbit while time runs, bullet time, and a freeze in time, by name.
 
-    They lead around a scene, or before a forward-facing one.
-
-    Args:
-        cameras: the static captured ones.
-        model: gives the scene, once there is one.
+    They lead around a scene, or before a forward-facing one, as the static ``cameras`` saw it.
     """
     once, longer = VideoSettings(frames=KEYFRAMES), VideoSettings(frames=3 * KEYFRAMES)
     times = torch.linspace(0, 1, KEYFRAMES).tolist()
@@ -98,14 +94,9 @@ class PathPanel:
     ) -> None:
         """Put the panel on the page.
 
-        Args:
-            server: of the page.
-            folder: the run's.
-            height: rows of frames, for files that say so.
-            presets: keyframes by name, from the current time.
-            time: the current time in [0, 1].
-            fly: shows a path from its beginning to its end.
-            changed: called when a path appears in the scene, or vanishes.
+        ``folder`` is the run's; ``height`` the rows of frames, for files that say so; ``presets``
+        are keyframes from the current ``time`` in [0, 1]. ``fly`` shows a path from its beginning
+        to its end; ``changed`` is called when a path appears in the scene, or vanishes.
         """
         self.keyframes: tuple[Keyframe, ...] = ()
         self._server, self._folder, self._height = server, folder, height
@@ -158,17 +149,13 @@ class PathPanel:
             try:
                 act(event)
             except (DevrfError, OSError) as error:
-                self._notify(event, "Not done", str(error))
+                _notify(event, "Not done", str(error))
             before = self.drawn
             self._draw()
             if before != self.drawn:
                 self._changed()
 
         return answered
-
-    def _notify(self, event: viser.GuiEvent[Any], title: str, text: str) -> None:
-        if event.client is not None:
-            event.client.add_notification(title, text, auto_close_seconds=20)
 
     def _add(self, event: viser.GuiEvent[Any]) -> None:
         """Add the camera of the page after the other keyframes."""
@@ -190,7 +177,7 @@ class PathPanel:
         file = self._folder / "paths" / f"{check_name(self._name.value)}.json"
         write_path(file, self.path(), self._height)
         command = f"`python -m devrf stage=render hydra.run.dir={self._folder} video.path={file}`"
-        self._notify(event, f"Saved {file.name}", f"Film it with {command}")
+        _notify(event, f"Saved {file.name}", f"Film it with {command}")
 
     def _load(self, _: object) -> None:
         upload = self._upload.value
@@ -217,3 +204,8 @@ class PathPanel:
             thickness=2.0,
             thickness_units="screen",
         )
+
+
+def _notify(event: viser.GuiEvent[Any], title: str, text: str) -> None:
+    if event.client is not None:
+        event.client.add_notification(title, text, auto_close_seconds=20)

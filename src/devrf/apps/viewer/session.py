@@ -47,12 +47,8 @@ class Session:
     ) -> None:
         """Open the page; there is nothing on it before :meth:`present`.
 
-        Args:
-            settings: where it listens, how fine frames are.
-            viewpoints: the captured cameras, and what is behind the scene.
-            scene: with its images, for the cameras' pictures; None where they cannot be read.
-            folder: of the run: saved paths go below it.
-            stop: ends :meth:`serve` once it is set, within the time of a block of rays.
+        The cameras have pictures if there is a ``scene``. Saved paths go below the run's
+        ``folder``. ``stop`` ends :meth:`serve` within the time of a block of rays.
 
         Raises:
             DevrfError: the address is in use, or not this machine's.
