@@ -23,7 +23,7 @@ from devrf.ops.search import PackedSamples, select_listed
 def test_both_implementations_agree(case: check.Case, device: torch.device) -> None:
     state = torch.get_rng_state()
     error, share = compare(case, device)
-    assert error > 0, "nothing was compared"
+    assert error > 0 or case is check.selection, "nothing was compared"
     # The check's tolerance covers a GPU's exponential and bfloat16; the interpreter is exact.
     assert share < (0.1 if device.type == "cpu" else 1)
     assert torch.equal(torch.get_rng_state(), state)

@@ -68,16 +68,6 @@ def test_the_rate_of_each_voxel_is_scaled(rng: torch.Generator, skip_zero: bool)
     torch.testing.assert_close(moved, factors * run(GridAdam([plain], lr=0.1), plain, grads))
 
 
-def test_a_restored_optimizer_continues_exactly(rng: torch.Generator) -> None:
-    grads = gradients(rng, 6)
-    whole, resumed = (torch.zeros(SHAPE, dtype=torch.float64, requires_grad=True) for _ in range(2))
-    run(GridAdam([whole], lr=0.1), whole, grads)
-    first, second = GridAdam([resumed], lr=0.1), GridAdam([resumed], lr=0.1)
-    run(first, resumed, grads[:3])
-    second.load_state_dict(first.state_dict())
-    torch.testing.assert_close(run(second, resumed, grads[3:]), whole.detach())
-
-
 def test_a_parameter_without_gradient_is_not_moved_and_the_closure_is_called() -> None:
     parameter = torch.ones(1, 1, 1, 1, requires_grad=True)
     other = torch.ones(1, 1, 1, 1, requires_grad=True)
@@ -92,10 +82,6 @@ def test_a_parameter_without_gradient_is_not_moved_and_the_closure_is_called() -
     assert parameter.item() == pytest.approx(0.9) and other.item() == 1.0
 
 
-def smoothing_adam(values: Tensor, **settings: object) -> GridAdam:
-    return GridAdam([{"params": [values], "smoothing": 0.4, **settings}], lr=0.1)
-
-
 @pytest.mark.parametrize("touched_only", [False, True])
 def test_smoothing_adds_the_gradient_of_the_total_variation(
     rng: torch.Generator, touched_only: bool
@@ -103,7 +89,8 @@ def test_smoothing_adds_the_gradient_of_the_total_variation(
     start, grads = torch.randn(SHAPE, generator=rng, dtype=torch.float64), gradients(rng, 5)
     grads = [grad.clamp(min=0) for grad in grads]
     ours, theirs = (start.clone().requires_grad_() for _ in range(2))
-    smooth = smoothing_adam(ours, touched_only=touched_only)
+    settings = {"smoothing": 0.4, "touched_only": touched_only}
+    smooth = GridAdam([{"params": [ours], **settings}], lr=0.1)
     plain = GridAdam([theirs], lr=0.1)
     for grad in grads:
         more = torch.zeros_like(grad)

@@ -12,7 +12,6 @@ from devrf.ops.compositing import (
     composite,
     composite_segments,
     sum_by_doubling,
-    sum_by_ray,
     sum_segments,
     transmittances,
 )
@@ -46,13 +45,6 @@ def test_a_faint_ray_keeps_its_digits_behind_many_opaque_ones() -> None:
 def test_gradients(rng: torch.Generator) -> None:
     depth = torch.rand(5, generator=rng, dtype=torch.float64, requires_grad=True)
     assert gradcheck(lambda tau: composite(tau, RAY, 3), (depth,))
-
-
-def test_sum_by_ray_of_scalars_and_vectors() -> None:
-    values = torch.tensor([1.0, 2.0, 4.0, 8.0, 16.0])
-    assert torch.equal(sum_by_ray(values, RAY, 4), torch.tensor([7.0, 0.0, 24.0, 0.0]))
-    pairs = torch.stack([values, -values], dim=1)
-    assert torch.equal(sum_by_ray(pairs, RAY, 3)[2], torch.tensor([24.0, -24.0]))
 
 
 def test_segments_are_the_same_rays_and_padding_is_nothing(rng: torch.Generator) -> None:

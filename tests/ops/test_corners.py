@@ -29,13 +29,3 @@ def test_corners_by_hand() -> None:
     points = torch.tensor([BOX.low, BOX.middle, BOX.high])
     expected = torch.tensor([[0.0, 0.0, 0.0], [3.0, 79.5, 16.0], [6.0, 159.0, 32.0]])
     torch.testing.assert_close(to_grid(points, BOX, SHAPE), expected)
-
-
-def test_first_met_in_inference_mode_then_trained() -> None:
-    box = Box((0.0, 0.0, 0.0), (3.0, 3.0, 3.0))
-    with torch.inference_mode():
-        to_grid(torch.ones(1, 3), box, (4, 4, 7))
-    points = torch.ones(1, 3, requires_grad=True)
-    to_grid(points, box, (4, 4, 7)).sum().backward()
-    assert points.grad is not None
-    assert points.grad.tolist() == [[1.0, 1.0, 2.0]]

@@ -1,20 +1,14 @@
-"""The search for visible samples: by hand, and as the renderer finds them."""
+"""The search for visible samples, by hand."""
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import pytest
 import torch
 
 from devrf.geometry.box import Box
-from devrf.geometry.rays import Rays
-from devrf.methods.devrf.architecture import Architecture
-from devrf.methods.devrf.volume_rendering import render
-from devrf.ops.search import PackedSamples, Thresholds, find_samples, select_listed
-from devrf.rendering.occupancy import Occupancy
-from devrf.rendering.sampling import STOP, RenderSettings
+from devrf.ops.search import PackedSamples, Thresholds, find_samples
 
 LINE = Box((0.0, 0.0, 0.0), (4.0, 1.0, 1.0))
 # Opacities of five grid points along x: empty, half, half, opaque, half.
@@ -81,40 +75,3 @@ def test_what_does_not_fit_is_dropped_with_overflow(capacity: int) -> None:
     assert found.total == 3 and found.overflow
     longer = along_x(longest=2)
     assert longer.total == 1 and longer.overflow
-
-
-def test_finds_what_the_renderer_finds(rng: torch.Generator, cube: Box) -> None:
-    field = Architecture(channels=3, width=8, frequencies=1).radiance_field(cube, 12**3, 12**3)
-    with torch.no_grad():
-        field.density.values.copy_(8 * torch.rand(12, 12, 12, 1, generator=rng) - 3)
-    occupancy = Occupancy(torch.rand(9, 9, 9, generator=rng) > 0.5, cube)
-    directions = torch.nn.functional.normalize(torch.randn(40, 3, generator=rng), dim=1)
-    rays = Rays(-2 * directions + 0.3 * torch.randn(40, 3, generator=rng), directions, directions)
-    settings = RenderSettings(step=0.5, alpha_threshold=0.02, near=0.5, far=3.0)
-    truth = render(rays, field, occupancy, settings, torch.ones(3)).samples
-    entry, leave = cube.crossing(rays)
-    entry, leave = entry.clamp(min=settings.near), leave.clamp(max=settings.far)
-    step = field.step_length(settings.step)
-    count = torch.where(leave >= entry, ((leave - entry) / step + 1e-3).floor() + 1, 0.0).long()
-    found = find_samples(
-        rays.origins,
-        rays.directions,
-        entry,
-        count,
-        occupancy.mask,
-        field.density.values,
-        step=step,
-        longest=math.ceil(12**0.5 / step) + 1,
-        capacity=2000,
-        mask_box=cube,
-        box=cube,
-        shift=field.shift,
-        delta=field.step_in_base_voxels(settings.step),
-        thresholds=Thresholds(0.02, STOP, 0.02),
-    )
-    chosen = select_listed(found, found.points, found.distance, 1000)
-    used = int(chosen.total)
-    assert len(truth) == used > 100 and not found.overflow
-    assert torch.equal(chosen.ray[:used], truth.ray)
-    torch.testing.assert_close(chosen.distance[:used], truth.distance)
-    torch.testing.assert_close(chosen.points[:used], truth.points)

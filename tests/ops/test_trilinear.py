@@ -7,6 +7,8 @@ import torch
 from torch import Tensor
 from torch.autograd import gradcheck
 
+from devrf.geometry.box import Box
+from devrf.ops.corners import to_grid
 from devrf.ops.trilinear import interpolate
 
 
@@ -77,8 +79,10 @@ def test_the_gradient_of_a_grid_may_be_added_to_a_buffer() -> None:
 
 
 def test_a_shape_first_met_in_inference_mode_can_be_trained() -> None:
+    grid, box = torch.zeros(2, 3, 9, 1), Box((0.0, 0.0, 0.0), (1.0, 1.0, 8.0))
     with torch.inference_mode():
-        interpolate(torch.zeros(2, 3, 9, 1), torch.ones(1, 3))
-    coords = torch.ones(1, 3, requires_grad=True)
-    interpolate(torch.zeros(2, 3, 9, 1), coords).sum().backward()
-    assert coords.grad is not None
+        interpolate(grid, to_grid(torch.ones(1, 3), box, (2, 3, 9)))
+    points = torch.ones(1, 3, requires_grad=True)
+    coords = to_grid(points, box, (2, 3, 9))
+    (interpolate(grid, coords).sum() + coords.sum()).backward()
+    assert points.grad is not None and points.grad.tolist() == [[1.0, 2.0, 1.0]]

@@ -3,10 +3,8 @@
 With features f and what the first layer gives of a ray's direction, d, RGB = sigmoid(w₃·h₂ + b₃),
 h₂ = relu(w₂·h₁ + b₂) and h₁ = relu(w₁·f + b₁ + d): so weights are named.
 
-Products are those of tensor cores, summed in single precision. The backward pass computes the
-layers again. What the weights of the first two layers get is left to matrix products of its own:
-a program's registers do not hold that. Nor do they hold the second layer, which is taken in shares
-of its units.
+The backward pass computes the layers again. What the weights of the first two layers get is left to
+matrix products of its own: a program's registers do not hold that.
 """
 
 from __future__ import annotations
@@ -28,13 +26,19 @@ from devrf.accel.blocks import (
     sigmoid,
     store_vectors,
 )
+from devrf.accel.color_layers import (
+    BLOCK,
+    SHARE,
+    directions_kernel,
+    load_tile,
+    lower_units,
+    output_weights,
+    padded,
+    product,
+    store_tile,
+    upper_units,
+)
 from devrf.accel.trilinear import rows_between, spread_rows
-
-# Samples of a block, and units of the second layer that are computed at a time.
-BLOCK: tl.constexpr = tl.constexpr(64)
-SHARE: tl.constexpr = tl.constexpr(16)
-# The least side of a matrix that tensor cores multiply.
-LEAST = 16
 
 
 class ListedColors(torch.autograd.Function):
@@ -54,29 +58,18 @@ class ListedColors(torch.autograd.Function):
         kept: Sequence[Tensor | None],
         *weights: Tensor,
     ) -> Tensor:
-        """Colours (S, 3) of S places.
+        """Colours (S, 3) of S places; ``weights`` in the order of ``ColorNetwork``.
 
-        Args:
-            ctx: keeps what the backward pass needs.
-            points: (S, 3).
-            grid: (X, Y, Z, C) features.
-            axes: of the grid.
-            viewdirs: (R, 3).
-            octaves: (F,).
-            ray: (S,) int64.
-            first: (R + 1,) int64.
-            precision: what the hidden layers are computed in.
-            kept: the gradients that grid and weights have already.
-            weights: of the network, in the order of ``ColorNetwork``.
+        ``kept``: the gradients that grid and weights have already.
         """
         points, grid, viewdirs, ray = (t.contiguous() for t in (points, grid, viewdirs, ray))
         w1, b1, v1, w2, b2, w3, b3 = (weight.contiguous() for weight in weights)
         layers, rays = (w1, b1, w2, b2, w3, b3), len(viewdirs)
         ctx.sizes = {
             "CHANNELS": grid.shape[3],
-            "PADDED": _padded(grid.shape[3]),
+            "PADDED": padded(grid.shape[3]),
             "WIDTH": len(b2),
-            "UNITS": _padded(len(b2)),
+            "UNITS": padded(len(b2)),
         }
         encoded = points.new_empty(rays, v1.shape[1], dtype=precision)
         from_ray = encoded.new_empty(rays, len(b2))
@@ -85,9 +78,9 @@ class ListedColors(torch.autograd.Function):
             blocks(rays, BLOCK.value),
             *(viewdirs, octaves, v1, encoded, from_ray, rays),
             DIRECTIONS=v1.shape[1],
-            ENCODED=_padded(v1.shape[1]),
+            ENCODED=padded(v1.shape[1]),
             WIDTH=len(b2),
-            UNITS=_padded(len(b2)),
+            UNITS=padded(len(b2)),
         )
         features, colors = points.new_empty(len(points), grid.shape[3]), torch.empty_like(points)
         launch(
@@ -139,103 +132,6 @@ class ListedColors(torch.autograd.Function):
 
 
 listed_colors = ListedColors.apply
-
-
-def _padded(length: int) -> int:
-    return max(LEAST, int(triton.next_power_of_2(length)))
-
-
-@triton.jit
-def product(left, right, PRECISION: tl.constexpr):
-    """A matrix product of numbers in ``PRECISION``, summed in single precision."""
-    return tl.dot(left.to(PRECISION), right.to(PRECISION), input_precision="ieee")
-
-
-@triton.jit
-def load_tile(matrix, row, column, rows, COLUMNS: tl.constexpr):
-    """Rows and columns of a matrix (rows, COLUMNS); 0 beyond it."""
-    there = (row < rows)[:, None] & (column < COLUMNS)[None, :]
-    return tl.load(matrix + row[:, None] * COLUMNS + column[None, :], mask=there, other=0.0)
-
-
-@triton.jit
-def store_tile(matrix, row, column, rows, values, COLUMNS: tl.constexpr):
-    """The reverse of :func:`load_tile`."""
-    there = (row < rows)[:, None] & (column < COLUMNS)[None, :]
-    tl.store(matrix + row[:, None] * COLUMNS + column[None, :], values, mask=there)
-
-
-@triton.jit(do_not_specialize=["rays"])
-def directions_kernel(
-    viewdirs,
-    octaves,
-    v1,
-    encoded,
-    from_ray,
-    rays,
-    DIRECTIONS: tl.constexpr,
-    ENCODED: tl.constexpr,
-    WIDTH: tl.constexpr,
-    UNITS: tl.constexpr,
-):
-    """Encodes directions, (d, sin(2^k d), cos(2^k d)), and what the first layer gives of them."""
-    # Three for each octave; at least one, which is then not used.
-    angles: tl.constexpr = (DIRECTIONS - 3) // 2 if DIRECTIONS > 3 else 1
-    ray = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    column, unit = tl.arange(0, ENCODED), tl.arange(0, UNITS)
-    angle = tl.maximum(column - 3, 0) % angles
-    axis = tl.where(column < 3, column, angle % 3)
-    wanted = (ray < rays)[:, None] & (column < DIRECTIONS)[None, :]
-    along = tl.load(viewdirs + ray[:, None] * 3 + axis[None, :], mask=wanted, other=0.0)
-    times = tl.load(octaves + angle // 3, mask=(column >= 3) & (column < DIRECTIONS), other=1.0)
-    turned = along * times[None, :]
-    waves = tl.where((column < 3 + angles)[None, :], tl.sin(turned), tl.cos(turned))
-    values = tl.where(wanted, tl.where((column < 3)[None, :], along, waves), 0.0)
-    store_tile(encoded, ray, column, rays, values, DIRECTIONS)
-    weight = load_tile(v1, unit, column, WIDTH, DIRECTIONS)
-    given = product(values, tl.trans(weight), encoded.dtype.element_ty)
-    store_tile(from_ray, ray, unit, rays, given, WIDTH)
-
-
-@triton.jit
-def lower_units(
-    features,
-    from_ray,
-    own,
-    w1,
-    b1,
-    CHANNELS: tl.constexpr,
-    WIDTH: tl.constexpr,
-    UNITS: tl.constexpr,
-):
-    """What the first layer gives of samples on rays ``own``, (BLOCK, UNITS)."""
-    unit = tl.arange(0, UNITS)
-    known = unit < WIDTH
-    row = from_ray + own[:, None] * WIDTH + unit[None, :]
-    directions = tl.load(row, mask=known[None, :], other=0.0)
-    weight = load_tile(w1, unit, tl.arange(0, features.shape[1]), WIDTH, CHANNELS)
-    x = directions + product(features, tl.trans(weight), directions.dtype)
-    x += tl.load(b1 + unit, mask=known, other=0.0)[None, :]
-    return tl.maximum(x, 0.0).to(directions.dtype)
-
-
-@triton.jit
-def upper_units(lower, w2, b2, unit, WIDTH: tl.constexpr):
-    """What units of the second layer give, (BLOCK, SHARE), and their weights."""
-    weight = load_tile(w2, unit, tl.arange(0, lower.shape[1]), WIDTH, WIDTH).to(lower.dtype)
-    x = product(lower, tl.trans(weight), lower.dtype)
-    x += tl.load(b2 + unit, mask=unit < WIDTH, other=0.0)[None, :]
-    return tl.maximum(x, 0.0).to(lower.dtype), weight
-
-
-@triton.jit
-def output_weights(w3, unit, WIDTH: tl.constexpr):
-    """The weights of units of the second layer for red, green and blue, (1, SHARE) each."""
-    known = unit < WIDTH
-    red = tl.load(w3 + unit, mask=known, other=0.0)
-    green = tl.load(w3 + WIDTH + unit, mask=known, other=0.0)
-    blue = tl.load(w3 + 2 * WIDTH + unit, mask=known, other=0.0)
-    return red[None, :], green[None, :], blue[None, :]
 
 
 @triton.jit(do_not_specialize=["places", "rays"])

@@ -49,19 +49,10 @@ class Motion(torch.autograd.Function):
         ndc: tuple[float, float, float] | None,
         kept: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
-        """The sum and the terms.
+        """The sum and the terms; an argument that is None is not there.
 
-        Args:
-            ctx: keeps what the backward pass needs.
-            canonical: (K, 3) q.
-            weight: (K,) w.
-            forward: Δ_f of the frame.
-            known: points, ray and present of the samples; Δ_f of the frame before; axes of both.
-            seen: the fields of ``SeenEarlier``, or None.
-            weights: of cycle and flow.
-            over_samples: whether flow is a mean over samples.
-            ndc: slopes and near plane, or None.
-            kept: the gradient that ``forward`` has already.
+        ``known``: points, ray and present of the samples; Δ_f of the frame before; axes of both.
+        ``seen``: the fields of ``SeenEarlier``. ``kept``: the gradient that ``forward`` has.
         """
         # Any pointers stand in for what was not seen.
         valid = known[2] if seen is None else seen[1]

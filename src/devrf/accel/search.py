@@ -8,23 +8,19 @@ sum is where each ray's samples end; the second kernel writes them there, and th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from devrf.accel.blocks import (
-    BLOCK,
     LANES,
     PADDING,
     blocks,
     displaced,
     grid_coordinate,
     launch,
-    load_vectors,
     opacity,
     padding_places,
     padding_programs,
@@ -46,16 +42,8 @@ def find_samples(
 ) -> tuple[Tensor, ...]:
     """As devrf.ops.search.find_samples: ray, distance, points, significant, first, total.
 
-    Args:
-        rays: origins, directions, entry and count of R rays.
-        mask: the occupancy.
-        density: raw densities.
-        slices: displacements.
-        axes: of the mask, of the slices and of the density.
-        numbers: step, weight of the second slice, shift, delta; thresholds of opacity, of
-            transmittance and of weight.
-        longest: an upper bound of ``count``.
-        capacity: C.
+    ``rays``: origins, directions, entry and count; ``axes``: of the mask, of the slices and of the
+    density; ``numbers``: step, weight of the second slice, shift, delta, and the thresholds.
     """
     along = [tensor.contiguous() for tensor in rays]
     origins, density = along[0], density.contiguous()
@@ -247,137 +235,3 @@ def list_kernel(
         tl.store(distances + place, nothing, mask=empty)
         store_vectors(points, place * 3, nothing, nothing, nothing, empty)
         tl.store(significant + place, nothing.to(tl.uint8), mask=empty)
-
-
-class SelectListed(torch.autograd.Function):
-    """As devrf.ops.search.select_listed; ``listed``: ray, distance, points, significant, first."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, canonical: Tensor, weight: Tensor, listed: Sequence[Tensor], capacity: int
-    ) -> tuple[Tensor, ...]:
-        rays, distances, points, flags, begin = (tensor.contiguous() for tensor in listed)
-        canonical, weight = canonical.contiguous(), weight.contiguous()
-        running = flags.cumsum(0)
-        first, ray, present = (
-            torch.empty_like(begin),
-            *(t.new_empty(capacity) for t in (rays, flags)),
-        )
-        distance, where = weight.new_empty(capacity), points.new_empty(capacity, 3)
-        into_canonical, into_weight = torch.empty_like(where), torch.empty_like(distance)
-        launch(
-            select_kernel,
-            blocks(max(len(flags), len(begin))),
-            *(flags.view(torch.uint8), running, begin, rays, distances, points, canonical, weight),
-            *(first, ray, distance, where, present.view(torch.uint8), into_canonical, into_weight),
-            *(len(flags), len(begin) - 1, capacity),
-        )
-        ctx.save_for_backward(flags, running)
-        ctx.set_materialize_grads(False)
-        known = (first, running[-1], ray, distance, where, present)
-        moves = ctx.needs_input_grad[0]
-        ctx.mark_non_differentiable(*known, *(() if moves else (into_canonical,)))
-        return *known, into_canonical, into_weight
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
-        flags, running = ctx.saved_tensors
-        given = [None if up is None else up.contiguous() for up in upstream[-2:]]
-        into = [None if up is None else up.new_empty(len(flags), *up.shape[1:]) for up in given]
-        launch(
-            select_backward_kernel,
-            blocks(len(flags)),
-            *(flags.view(torch.uint8), running),
-            # Any pointer where there is no gradient.
-            *(running if tensor is None else tensor for tensor in (*given, *into)),
-            *(len(flags), max(0 if up is None else len(up) for up in given)),
-            HAS_CANONICAL=given[0] is not None,
-            HAS_WEIGHT=given[1] is not None,
-        )
-        return *into, None, None
-
-
-select_listed = SelectListed.apply
-
-
-@triton.jit(do_not_specialize=["places", "count", "capacity"])
-def select_kernel(
-    flags,
-    running,
-    first,
-    rays,
-    distances,
-    points,
-    canonical,
-    weights,
-    begin,
-    owner,
-    reached,
-    where,
-    present,
-    into_canonical,
-    into_weight,
-    places,
-    count,
-    capacity,
-):
-    """Copies flagged samples to the places that the flags' ``running`` sum gives; the padding.
-
-    A place of the padding copies the sample of the same number, which differ: atomic additions of
-    gradients to them do not collide. ``begin`` is where each of the ``count`` rays begins.
-    """
-    place = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = place < places
-    flag = tl.load(flags + place, mask=here, other=0) != 0
-    rank = tl.load(running + place, mask=here, other=0) - 1
-    kept = here & flag & (rank < capacity)
-    empty = (place >= tl.load(running + places - 1)) & (place < capacity)
-    ray = tl.load(rays + place, mask=here, other=0)
-    distance = tl.load(distances + place, mask=here, other=0.0)
-    weight = tl.load(weights + place, mask=kept, other=0.0)
-    x, y, z = load_vectors(points, place * 3, here)
-    qx, qy, qz = load_vectors(canonical, place * 3, here)
-    tl.store(owner + rank, ray, mask=kept)
-    tl.store(reached + rank, distance, mask=kept)
-    store_vectors(where, rank * 3, x, y, z, kept)
-    store_vectors(into_canonical, rank * 3, qx, qy, qz, kept)
-    tl.store(into_weight + rank, weight, mask=kept)
-    tl.store(present + rank, (rank >= 0).to(tl.uint8), mask=kept)
-    tl.store(owner + place, place % count, mask=empty)
-    tl.store(reached + place, distance, mask=empty)
-    store_vectors(where, place * 3, x, y, z, empty)
-    store_vectors(into_canonical, place * 3, qx, qy, qz, empty)
-    tl.store(into_weight + place, distance * 0.0, mask=empty)
-    tl.store(present + place, (place < 0).to(tl.uint8), mask=empty)
-    bounds = place <= count
-    start = tl.load(first + place, mask=bounds, other=0)
-    before = tl.load(running + start - 1, mask=bounds & (start > 0), other=0)
-    tl.store(begin + place, tl.minimum(before, capacity), mask=bounds)
-
-
-@triton.jit(do_not_specialize=["places", "capacity"])
-def select_backward_kernel(
-    flags,
-    running,
-    to_canonical,
-    to_weight,
-    into_canonical,
-    into_weight,
-    places,
-    capacity,
-    HAS_CANONICAL: tl.constexpr,
-    HAS_WEIGHT: tl.constexpr,
-):
-    """The gradient of each place of the first list: that of the place that took it, or none."""
-    place = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = place < places
-    flag = tl.load(flags + place, mask=here, other=0) != 0
-    rank = tl.load(running + place, mask=here, other=0) - 1
-    kept = here & flag & (rank < capacity)
-    if HAS_CANONICAL:
-        gx, gy, gz = load_vectors(to_canonical, rank * 3, kept)
-        store_vectors(into_canonical, place * 3, gx, gy, gz, here)
-    if HAS_WEIGHT:
-        change = tl.load(to_weight + rank, mask=kept, other=0.0)
-        tl.store(into_weight + place, change, mask=here)

@@ -47,14 +47,8 @@ class WarpedDepth(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         """Canonical positions (M, 3) and optical depths (M,).
 
-        Args:
-            ctx: keeps what the backward pass needs.
-            points: (M, 3).
-            axes: of the slices and of the density.
-            numbers: weight of the second slice, shift, delta.
-            kept: gradients that the density and each slice have already, or None.
-            density: raw densities.
-            slices: displacements.
+        ``axes``: of the slices and of the density. ``numbers``: weight of the second slice, shift,
+        delta. ``kept``: gradients that the density and each slice have already, or None.
         """
         points, grids = points.contiguous(), [grid.contiguous() for grid in (density, *slices)]
         # The kernel takes two slices; the density stands in for missing ones, which are not read.

@@ -26,7 +26,7 @@ from devrf.ops.dispatch import using
 from devrf.ops.motion import ListedSamples, SeenEarlier, motion_sum
 from devrf.ops.photometric import photometric_sum
 from devrf.ops.pixel_rays import gather_pixels, steps_in_box
-from devrf.ops.search import Thresholds, find_samples, select_listed
+from devrf.ops.search import PackedSamples, Thresholds, find_samples, select_listed
 from devrf.ops.trilinear import interpolate
 from devrf.ops.warped_depth import warped_depth
 
@@ -133,7 +133,7 @@ def pixels_and_steps(draw: Draw) -> Results:
     return tuple(tensor for tensor in results if tensor is not None)
 
 
-def samples_and_selection(draw: Draw) -> Results:
+def visible_samples(draw: Draw) -> Results:
     """Rays through a box that is partly occupied, at rest, at a frame, and between two."""
     results: Results = ()
     for frames in (0, 1, 2):
@@ -155,10 +155,18 @@ def samples_and_selection(draw: Draw) -> Results:
             thresholds=Thresholds(alpha=0.05, stop=0.05, weight=0.1),
         )
         listed = found.ray, found.distance, found.points, found.significant, found.first
-        canonical, weight = draw.leaf(40, 3), draw.leaf(40)
-        chosen = select_listed(found, canonical, weight, 12)
-        results += *listed, found.total, *draw.gradients(chosen, canonical, weight)
+        results += *listed, found.total
     return results
+
+
+def selection(draw: Draw) -> Results:
+    """Half of a list, with padding behind them."""
+    first = torch.tensor([0, 0, 9, 9, 30]).to(draw.device)
+    flags = (draw(40) > 0) & (torch.arange(40, device=draw.device) < 30)
+    listed = (4 * draw(40).abs()).long(), draw(40), draw(40, 3), flags, first
+    found = PackedSamples(*listed, total=first[-1], steps=first.diff(), longest=40)
+    canonical, weight = draw.leaf(40, 3), draw.leaf(40)
+    return draw.gradients(select_listed(found, canonical, weight, 30), canonical, weight)
 
 
 def segments(draw: Draw) -> Results:
@@ -269,7 +277,8 @@ CASES: dict[str, tuple[Case, ...]] = {
     "trilinear": (interpolation,),
     "warped_depth": (warped_depths,),
     "pixel_rays": (pixels_and_steps,),
-    "search": (samples_and_selection,),
+    "search": (visible_samples,),
+    "selection": (selection,),
     "compositing": (segments,),
     "photometric": (photometric_terms,),
     "color_network": (color_network, half_color_network),

@@ -211,7 +211,7 @@ def select_listed(
     """
     rays = len(found.first) - 1
     floats = found.distance, found.points, canonical, weight
-    if capacity <= len(found.ray) and (kernels := accelerated("search", *floats)):
+    if capacity <= len(found.ray) and (kernels := accelerated("selection", *floats)):
         listed = found.ray, found.distance, found.points, found.significant, found.first
         return ListedSubset(*kernels.select_listed(canonical, weight, listed, capacity))
     if capacity > len(found.ray):
