@@ -14,6 +14,16 @@ class DevrfError(Exception):
     """
 
 
+def expect(holds: bool, key: str, expected: str, given: object) -> None:
+    """Refuse the value ``given`` of a config key unless a condition ``holds``.
+
+    Raises:
+        DevrfError: it does not; the message says what was ``expected``.
+    """
+    if not holds:
+        raise DevrfError(f"{key}: expected {expected}, not {given}")
+
+
 def did_you_mean(word: object, known: Iterable[object], before: str = "") -> str:
     """The end of a message that names the closest of the known words, empty where none is close.
 

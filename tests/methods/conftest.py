@@ -1,71 +1,76 @@
-"""What tests of several methods share."""
+"""What tests of several methods share: stages of a few iterations on tiny networks."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
-from lightning import Callback, Trainer
 
-from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, save_checkpoint
-from devrf.data.datamodule import SceneDataModule
-from devrf.methods.ray_stage import RayStage
+from devrf.checkpoints.checkpoint import LoadedCheckpoint, load_checkpoint, save_checkpoint
+from devrf.data.batch import RayBatch
+from devrf.engine.batches import gather_batch
+from devrf.engine.stage import ScheduledStage
+from devrf.methods.base import RayTrainable
+from devrf.methods.protocol import ProtocolStage
+from devrf.methods.ray_stage import RaySchedule, RayStage
+from devrf.scenes.procedural.recipe import ProceduralForwardScene
 from devrf.scenes.scene import Scene
 
-MakeStage = Callable[[], RayStage]
-
-
-def assert_same_weights(one: RayStage, other: RayStage) -> None:
-    """Fails unless two stages have learned the same, to the last bit."""
-    found = other.state_dict()
-    for name, value in one.state_dict().items():
-        if isinstance(value, torch.Tensor):
-            assert torch.equal(value, found[name]), name
+STEPS = {
+    "joint": ProtocolStage("joint", "both"),
+    "dynamic": ProtocolStage("dynamic", "dynamic"),
+    "canonical": ProtocolStage("canonical", "static"),
+}
 
 
 @pytest.fixture
-def assert_goes_on_exactly(
-    trainer: Callable[..., Trainer], datamodule: SceneDataModule, tmp_path: Path
-) -> Callable[[MakeStage], None]:
-    """Fails unless a run that is killed half-way goes on to the weights of one that is not."""
+def ray_stage() -> Callable[..., RayStage]:
+    """``ray_stage(model, step)``: a stage of four iterations; other options change its schedule."""
 
-    def check(stage: MakeStage) -> None:
-        whole, path = stage(), tmp_path / "progress.ckpt"
-        trainer(max_epochs=1).fit(whole, datamodule=datamodule)
+    def make(
+        model: RayTrainable,
+        step: str | ProtocolStage = "joint",
+        loss: Mapping[str, float] | None = None,
+        rest: LoadedCheckpoint | None = None,
+        static_share: float = 0.5,
+        **changes: Any,
+    ) -> RayStage:
+        usual = {"iterations": 4, "rays": 32, "iterations_per_step": 2}
+        rates = {"learning_rate": 1e-2, "final_learning_rate": 1e-3}
+        schedule = RaySchedule(**{**usual, **rates, **changes})
+        step = STEPS[step] if isinstance(step, str) else step
+        return RayStage(model, schedule, loss or {"color": 1.0}, step, static_share, rest)
 
-        class StopHalfWay(Callback):
-            def on_train_batch_end(self, fitted: Trainer, *arguments: object) -> None:
-                save_checkpoint(fitted, path, weights_only=False)
-                fitted.should_stop = True
-
-        trainer(StopHalfWay(), max_epochs=1).fit(stage(), datamodule=datamodule)
-        on, resumed = stage(), trainer(max_epochs=1)
-        torch.manual_seed(123)
-        resumed.strategy.checkpoint_io = ChecksummedCheckpointIO()
-        resumed.fit(on, datamodule=datamodule, ckpt_path=str(path))
-        assert on.iteration == 4
-        assert_same_weights(whole, on)
-
-    return check
+    return make
 
 
 @pytest.fixture
-def assert_never_reads_the_static_set(
-    trainer: Callable[..., Trainer],
-    serve: Callable[[Scene], SceneDataModule],
-    tiny_scene: Scene,
-    dark_scene: Scene,
-) -> Callable[[MakeStage], None]:
-    """Fails unless a stage learns the same, in the same box, where static images are black."""
+def stored(tmp_path: Path) -> Callable[[ScheduledStage], LoadedCheckpoint]:
+    """``stored(stage)``: what the checkpoint of a fitted stage holds."""
 
-    def check(stage: MakeStage) -> None:
-        clean, dark = stage(), stage()
-        for one, scene in ((clean, tiny_scene), (dark, dark_scene)):
-            torch.manual_seed(0)
-            trainer(max_epochs=1).fit(one, datamodule=serve(scene))
-        assert_same_weights(clean, dark)
-        assert clean.scene_model.box == dark.scene_model.box
+    def store(stage: ScheduledStage) -> LoadedCheckpoint:
+        path = tmp_path / f"{stage.name}.ckpt"
+        save_checkpoint(stage.trainer, path)
+        return load_checkpoint(path, stage.scene)
 
-    return check
+    return store
+
+
+@pytest.fixture(scope="session")
+def some_rays(tiny_scene: Scene) -> RayBatch:
+    """Rays through some pixels of all moving images of the tiny scene."""
+    views = tiny_scene.dynamic.train
+    image = torch.arange(len(views)).repeat_interleave(30)
+    flat = torch.arange(len(image)) * 7 % (views.width * views.height)
+    return gather_batch(views, image, flat, torch.ones(3))
+
+
+@pytest.fixture(scope="session")
+def facing() -> Scene:
+    """A toy before a wall, without alpha masks, in NDC: 24×18 pixels, 2 views of 2 frames."""
+    return ProceduralForwardScene(
+        width=24, height=18, static_views=4, train_views=2, frames=2, supersample=1
+    )()

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from devrf.data.batch import RayBatch
-from devrf.engine.batches import gather_batch
 from devrf.methods.hypernerf.model import HyperNeRF, HyperNeRFSettings
 from devrf.scenes.scene import Scene
 
@@ -28,58 +27,46 @@ def learner(settings: HyperNeRFSettings, scene: Scene) -> HyperNeRF:
     return model
 
 
-@pytest.fixture
-def batch(tiny_scene: Scene) -> RayBatch:
-    """Some rays of each moving image."""
-    views = tiny_scene.dynamic.train
-    image = torch.arange(len(views)).repeat_interleave(30)
-    flat = torch.arange(len(image)) * 7 % (views.width * views.height)
-    return gather_batch(views, image, flat, torch.ones(3))
-
-
-def test_the_field_alone_learns_in_bfloat16_if_asked_to(tiny_scene: Scene, batch: RayBatch) -> None:
-    exact = learner(SMALL, tiny_scene)(batch)
+def test_the_field_alone_learns_in_bfloat16_if_asked_to(
+    tiny_scene: Scene, some_rays: RayBatch
+) -> None:
+    exact = learner(SMALL, tiny_scene)(some_rays)
     model = learner(replace(SMALL, precision="bfloat16"), tiny_scene)
-    seen = model(batch)
-    assert seen.color.dtype == torch.float32
-    assert torch.equal(seen.extras["points"], exact.extras["points"])
-    torch.testing.assert_close(seen.color, exact.color, atol=0.02, rtol=0)
-    assert not torch.equal(seen.color, exact.color)
-    model.loss_terms(seen, batch, ["color", "elastic"])["color"].backward()
+    output = model(some_rays)
+    assert output.color.dtype == torch.float32
+    assert torch.equal(output.extras["points"], exact.extras["points"])
+    torch.testing.assert_close(output.color, exact.color, atol=0.02, rtol=0)
+    assert not torch.equal(output.color, exact.color)
+    model.loss_terms(output, some_rays, ["color"])["color"].backward()
     for parameter in model.canonical.parameters():
         assert parameter.grad is not None and parameter.grad.isfinite().all()
     # What was learned is shown in all its digits.
-    shown = model.eval()(batch), learner(SMALL, tiny_scene).eval()(batch)
-    assert torch.equal(shown[0].color, shown[1].color)
+    shown = model.eval()(some_rays).color
+    assert torch.equal(shown, learner(SMALL, tiny_scene).eval()(some_rays).color)
+    with torch.autocast("cpu", torch.bfloat16), torch.no_grad():  # or nearly, if asked to
+        torch.testing.assert_close(model(some_rays).color, shown, atol=0.03, rtol=0)
 
 
-def test_without_hulls_all_of_the_box_is_sampled(tiny_scene: Scene, batch: RayBatch) -> None:
-    with_hull = learner(SMALL, tiny_scene)(batch)
+def test_without_hulls_all_of_the_box_is_sampled(tiny_scene: Scene, some_rays: RayBatch) -> None:
     without = learner(replace(SMALL, hull=False), tiny_scene)
     assert without.occupancy.mask.all()
-    assert len(without(batch).extras["weight"]) > len(with_hull.extras["weight"])
+    with_hull = learner(SMALL, tiny_scene)(some_rays).extras["weight"]
+    assert len(without(some_rays).extras["weight"]) > len(with_hull)
 
 
 @pytest.mark.parametrize("separate", [False, True])
 def test_coarse_colors_count_where_coarse_samples_have_a_field_of_their_own(
-    separate: bool, tiny_scene: Scene, batch: RayBatch
+    separate: bool, tiny_scene: Scene, some_rays: RayBatch
 ) -> None:
     settings = replace(SMALL, sampling="hierarchical", separate_coarse=separate)
     model = learner(settings, tiny_scene)
-    seen = model(batch)
-    fine = (seen.color - batch.color).square().mean()
-    found = model.loss_terms(seen, batch, ["color"])["color"]
+    output = model(some_rays)
+    fine = (output.color - some_rays.color).square().mean()
+    loss = model.loss_terms(output, some_rays, ["color"])["color"]
+    assert len(output.extras["weight"]) == 12 * len(some_rays.time)
     if not separate:
-        torch.testing.assert_close(found, fine)
+        torch.testing.assert_close(loss, fine)
         return
-    coarse = (seen.extras["coarse_color"] - batch.color).square().mean()
-    torch.testing.assert_close(found, fine + coarse)
-    assert len(seen.extras["coarse_weight"]) == 6 * len(batch.time)
-    assert len(seen.extras["weight"]) == 12 * len(batch.time)
-
-
-def test_views_in_half_precision_show_nearly_the_same(tiny_scene: Scene, batch: RayBatch) -> None:
-    model = learner(SMALL, tiny_scene).eval()
-    exact = model(batch).color
-    with torch.autocast("cpu", torch.bfloat16), torch.no_grad():
-        torch.testing.assert_close(model(batch).color, exact, atol=0.03, rtol=0)
+    coarse = (output.extras["coarse_color"] - some_rays.color).square().mean()
+    torch.testing.assert_close(loss, fine + coarse)
+    assert len(output.extras["coarse_weight"]) == 6 * len(some_rays.time)

@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
 from devrf.methods.dnerf.model import DNeRF, DNeRFSettings
@@ -144,8 +145,6 @@ def test_the_denser_of_two_fields_counts(tiny_scene: Scene) -> None:
     assert torch.equal(found[0], found[1]) and (found[2] < 1e-6).all()
 
 
-@pytest.mark.parametrize("share", [-0.1, 1.5])
-def test_what_is_no_share_is_refused(share: float) -> None:
-    for settings in (DNeRFSettings, NSFFSettings):
-        with pytest.raises(Exception, match=r"empty_from: expected 0 to 1, or null"):
-            settings(empty_from=share)
+def test_what_is_no_share_is_refused() -> None:
+    with pytest.raises(DevrfError, match=r"settings\.empty_from: .* 1\.5"):
+        replace(TINY, empty_from=1.5)

@@ -94,8 +94,7 @@ def test_marching_keeps_samples_of_either_frame(cube: Box) -> None:
 def test_the_hull_of_each_frame_holds_its_shape(tiny_scene: Scene) -> None:
     box = tiny_scene.bounds.motion
     assert box is not None
-    occupancy = OccupancyFrames(len(tiny_scene.clock), (16, 16, 16))
-    occupancy.carve(tiny_scene, box)
+    occupancy = OccupancyFrames.of(tiny_scene, box, 16, hull=True)
     shares = occupancy.mask.flatten(1).float().mean(dim=1)
     # Eight static views carve frame 0 further than two views carve the others.
     assert 0 < shares[0] < shares[1:].min() < 1

@@ -1,137 +1,121 @@
-"""NSFF learns by both of its protocols, on scenes of every space."""
+"""NSFF learns from all of its terms, on scenes of every space."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from lightning import Callback, Trainer
+from lightning import Callback
 
-from devrf.checkpoints.checkpoint import (
-    load_checkpoint,
-    save_checkpoint,
-)
+from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
-from devrf.data.rendered import RenderedDataModule
+from devrf.engine.learner import ParallelBatch
 from devrf.errors import DevrfError
 from devrf.methods.nsff.model import NSFF
-from devrf.methods.nsff.settings import NSFFSettings
-from devrf.methods.protocol import ProtocolStage
-from devrf.methods.ray_stage import RaySchedule, RayStage
+from devrf.methods.nsff.settings import NSFFSettings, Warmup
+from devrf.methods.ray_stage import RayStage
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Capture, Scene
 
-MakeStage = Callable[..., RayStage]
-Fit = Callable[..., Trainer]
-DYNAMIC = ProtocolStage("dynamic", "dynamic")
+Make = Callable[..., RayStage]
+Fit = Callable[..., RayStage]
+EVERY = dict.fromkeys(NSFF.losses, 0.1)
 
 
 @pytest.mark.parametrize(("sampling", "blend"), [("occupancy", "v"), ("stratified", "additive")])
 def test_it_learns(
-    sampling: Any, blend: Any, tiny: NSFFSettings, stage: MakeStage, fit: Fit
+    sampling: Any, blend: Any, tiny: NSFFSettings, ray_stage: Make, fit: Fit
 ) -> None:
-    settings = replace(tiny, sampling=sampling, blend=blend, hard_rays=0)
-    schedule = RaySchedule(45, 64, 1e-2, 1e-3, iterations_per_step=15)
-    one = stage(settings=settings, schedule=schedule, loss={"color": 1.0, "neighbours": 0.1})
     colors: list[float] = []
 
     class Note(Callback):
         def on_train_batch_end(self, *arguments: Any) -> None:
             colors.append(float(arguments[2]["color"]))
 
-    fit(one, Note())
+    model = NSFF(replace(tiny, sampling=sampling, blend=blend, hard_rays=0))
+    loss = {"color": 1.0, "neighbours": 0.1}
+    fit(ray_stage(model, loss=loss, iterations=45, rays=64, iterations_per_step=15), Note())
     assert len(colors) == 3 and colors[-1] < 0.8 * colors[0]
 
 
 def test_every_term_is_learned_from_and_finite(
-    stage: MakeStage, fit: Fit, four_frames: SceneDataModule
+    tiny: NSFFSettings, ray_stage: Make, fit: Fit, four_frames: SceneDataModule
 ) -> None:
-    one = stage()
-    fitted = fit(one, data=four_frames)
+    stage = fit(ray_stage(NSFF(tiny), loss=EVERY), data=four_frames)
     for name in NSFF.losses:
-        assert fitted.callback_metrics[f"both/{name}"].isfinite(), name
-    assert fitted.callback_metrics["both/chained"] > 0
-    grown = {n for n, p in one.scene_model.named_parameters() if p.grad is not None}
-    assert grown == {n for n, _ in one.scene_model.named_parameters()}
+        assert stage.trainer.callback_metrics[f"both/{name}"].isfinite(), name
+    assert stage.trainer.callback_metrics["both/chained"] > 0
+    assert all(p.grad is not None for p in stage.scene_model.parameters())
 
 
 def test_batches_have_further_rays_where_something_moves(
-    stage: MakeStage, fit: Fit, tiny_scene: Scene
+    tiny: NSFFSettings, ray_stage: Make, fit: Fit, tiny_scene: Scene
 ) -> None:
-    one, seen = stage(), []
-    gather = one._gather
-
-    def noted(views: Any, pixels: Any) -> Any:
-        batch = gather(views, pixels)
-        seen.append(len(batch.rays))
+    stage = fit(ray_stage(NSFF(tiny), loss=EVERY))
+    sizes = []
+    for step in (0, 1, 2):  # N₀ = 2
+        stage.scene_model.on_iteration(step, 4)
         # Images are numbered through both captures.
-        static = int((batch.image < len(tiny_scene.static.train)).sum())
-        assert static == 16 and bool((batch.time[batch.image < 8] == 0).all())
-        return batch
-
-    one._gather = noted  # type: ignore[method-assign]
-    fit(one)
-    assert seen == [36, 36, 32, 32]  # N₀ = 2
-
-
-def test_dynamic_never_reads_the_static_set(
-    stage: MakeStage, fit: Fit, serve: Callable[[Scene], SceneDataModule], dark_scene: Scene
-) -> None:
-    clean = stage(DYNAMIC)
-    fit(clean)
-    poisoned = stage(DYNAMIC)
-    fit(poisoned, data=serve(dark_scene))
-    for name, value in clean.state_dict().items():
-        if isinstance(value, torch.Tensor):
-            assert torch.equal(value, poisoned.state_dict()[name])
-    assert clean.scene_model.box == poisoned.scene_model.box
-
-
-def test_a_killed_run_goes_on_to_the_same_weights(
-    stage: MakeStage, assert_goes_on_exactly: Callable[[MakeStage], None]
-) -> None:
-    assert_goes_on_exactly(stage)
+        image = stage.draw(ParallelBatch(0, [])).image
+        sizes.append(len(image))
+        assert int((image < len(tiny_scene.static.train)).sum()) == 16
+    assert sizes == [36, 36, 32]
 
 
 @pytest.mark.parametrize(
     ("where", "sampling", "precision"),
-    [
-        ("inward", "stratified", "float32"),
-        ("forward", "stratified", "bfloat16"),
-        ("forward", "occupancy", "float32"),
-        ("room", "occupancy", "float32"),
-    ],
+    [("forward", "stratified", "bfloat16"), ("room", "occupancy", "float32")],
 )
 def test_a_scene_of_any_space_is_learned_and_comes_back(
-    where: str, sampling: Any, precision: Any, tiny: NSFFSettings, stage: MakeStage, fit: Fit,
-    tiny_scene: Scene, facing: Scene, tiny_room: Scene, tmp_path: Path,
+    where: str, sampling: Any, precision: Any, tiny: NSFFSettings, ray_stage: Make, fit: Fit,
+    stored: Callable[[RayStage], LoadedCheckpoint], serve: Callable[[Scene], SceneDataModule],
+    facing: Scene, tiny_room: Scene,
 ) -> None:  # fmt: skip
-    scene = {"inward": tiny_scene, "forward": facing, "room": tiny_room}[where]
-    one = stage(settings=replace(tiny, sampling=sampling, precision=precision))
-    fitted = fit(one, data=RenderedDataModule(lambda: scene, None))
-    save_checkpoint(fitted, tmp_path / "joint.ckpt")
-    loaded = load_checkpoint(tmp_path / "joint.ckpt", scene)
-    model = loaded.model
-    assert isinstance(model, NSFF) and loaded.metadata.complete
-    assert model.space == scene.space and model.settings == one.scene_model.settings
-    assert model.fields.dynamic.reach == (1.0 if where == "forward" else 0.2)
+    scene = {"forward": facing, "room": tiny_room}[where]
+    model = NSFF(replace(tiny, sampling=sampling, precision=precision))
+    loaded = stored(fit(ray_stage(model, loss=EVERY), data=serve(scene))).model
+    assert isinstance(loaded, NSFF) and loaded.settings == model.settings
+    assert loaded.fields.dynamic.reach == (1.0 if where == "forward" else 0.2)
     cameras = scene.dynamic.test.cameras
     # 0.7 lies between frames.
-    seen = [Renderer(m).view(cameras, 1, 0.7, 1.0) for m in (one.scene_model, model)]
-    assert torch.equal(seen[0].color, seen[1].color)
-    if where != "inward":
-        # The last sample stands for all that is behind it: no background shows.
-        torch.testing.assert_close(seen[1].opacity, torch.ones_like(seen[1].opacity))
+    images = [Renderer(m).view(cameras, 1, 0.7, 1.0) for m in (model, loaded)]
+    assert torch.equal(images[0].color, images[1].color)
+    # The last sample stands for all that is behind it: no background shows.
+    torch.testing.assert_close(images[1].opacity, torch.ones_like(images[1].opacity))
 
 
 def test_a_scene_that_says_nothing_has_nothing_to_learn(
-    stage: MakeStage, fit: Fit, tiny_scene: Scene
-) -> None:
+    tiny: NSFFSettings, ray_stage: Make, fit: Fit, serve: Callable[[Scene], SceneDataModule],
+    tiny_scene: Scene,
+) -> None:  # fmt: skip
     train = replace(tiny_scene.dynamic.train, flow=None)
     mute = replace(tiny_scene, dynamic=Capture(train, tiny_scene.dynamic.test))
-    with pytest.raises(DevrfError, match="ray_stage.loss: this scene has nothing for any"):
-        fit(stage(DYNAMIC, loss={"flow": 1.0}), data=RenderedDataModule(lambda: mute, None))
+    with pytest.raises(DevrfError, match="ray_stage.loss"):
+        fit(ray_stage(NSFF(tiny), "dynamic", loss={"flow": 1.0}), data=serve(mute))
+
+
+@pytest.mark.parametrize(("frames", "steps"), [(12, 30_000), (50, 50_000), (400, 250_000)])
+def test_the_beginning_grows_with_the_frames_within_limits(frames: int, steps: int) -> None:
+    assert Warmup().steps(frames) == steps
+
+
+def test_priors_fall_tenfold_after_each_beginning() -> None:
+    warmup = Warmup(steps_per_frame=10, min_frames=1)
+    factors = [warmup.prior_factor(step, frames=5) for step in (0, 49, 50, 99, 100)]
+    assert factors == pytest.approx([1, 1, 0.1, 0.1, 0.01])
+
+
+@pytest.mark.parametrize(
+    ("make", "key"),
+    [
+        (lambda: NSFFSettings(width=1), r"settings\.width: .* 1$"),
+        (lambda: NSFFSettings(flow_reach=0.0), r"settings\.flow_reach"),
+        (lambda: Warmup(min_frames=300), r"settings\.warmup\.min_frames: .*250"),
+    ],
+)
+def test_what_cannot_be_is_named(make: Any, key: str) -> None:
+    with pytest.raises(DevrfError, match=key):
+        make()

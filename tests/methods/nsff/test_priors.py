@@ -13,7 +13,7 @@ from devrf.engine.batches import gather_batch
 from devrf.methods.nsff.fields import BACKWARD, FORWARD
 from devrf.methods.nsff.model import NSFF
 from devrf.methods.nsff.priors import ImagePriors
-from devrf.methods.nsff.settings import NSFFSettings, Warmup
+from devrf.methods.nsff.settings import NSFFSettings
 from devrf.scenes.procedural import ProceduralScene
 from devrf.scenes.scene import OpticalFlow, Scene, Views
 
@@ -82,61 +82,39 @@ def test_pixels_that_move_are_those_of_fixed_cameras_with_long_flow(tiny_scene: 
     assert ImagePriors([one_camera], tiny_scene.space).moving is None
 
 
-def test_the_first_batches_have_rays_that_move(tiny: NSFFSettings, tiny_scene: Scene) -> None:
-    model = NSFF(replace(tiny, warmup=Warmup(steps_per_frame=1, min_frames=3, max_frames=3)))
-    model.setup(tiny_scene)
-    generator = torch.Generator().manual_seed(0)
-    assert model.further_pixels(generator) is None  # nothing has been looked at
-    model.learn_from([tiny_scene.dynamic.train], ["color"])
-    for step, expected in ((0, 4), (2, 4), (3, 0)):
-        model.on_iteration(step, 10)
-        found = model.further_pixels(generator)
-        assert (0 if found is None else len(found[0])) == expected
+def missing(caplog: pytest.LogCaptureFixture, model: NSFF, views: Views, scene: Scene) -> str:
+    """What a model says that images do not have, and the terms that are left."""
+    model.setup(scene)
+    with caplog.at_level(logging.INFO):
+        model.learn_from([views], model.losses)
+    (record,) = caplog.records
+    return record.getMessage().rpartition(": ")[2]
 
 
-def bare(views: Views) -> Views:
-    """Images that tell nothing but colours."""
-    return replace(views, flow=None, depth=None)
+def terms(model: NSFF, views: Views) -> dict[str, torch.Tensor]:
+    """The terms of two rays."""
+    batch = gather_batch(views, torch.tensor([1, 2]), torch.tensor([40, 80]), torch.ones(3))
+    return model.loss_terms(model(batch), batch, model.losses)
 
 
 def test_what_is_missing_is_said_once_and_counts_nothing(
     tiny: NSFFSettings, tiny_scene: Scene, caplog: pytest.LogCaptureFixture
 ) -> None:
-    model, views = NSFF(tiny), bare(tiny_scene.dynamic.train)
-    model.setup(tiny_scene)
-    with caplog.at_level(logging.INFO):
-        model.learn_from([views], model.losses)
-    assert len(caplog.records) == 1
-    assert "flow (no optical flow), depth (no depth), hard_rays (no motion masks)" in caplog.text
-    batch = gather_batch(views, torch.tensor([1, 2]), torch.tensor([40, 80]), torch.ones(3))
-    terms = model.loss_terms(model(batch), batch, model.losses)
-    assert set(terms) == set(model.losses) - {"flow", "depth"}
+    model, bare = NSFF(tiny), replace(tiny_scene.dynamic.train, flow=None, depth=None)
+    said = missing(caplog, model, bare, tiny_scene)
+    assert [name in said for name in ("flow", "depth", "hard_rays")] == [True] * 3
+    assert set(terms(model, bare)) == set(model.losses) - {"flow", "depth"}
 
 
-def test_flow_in_one_direction_counts_alone(
-    tiny: NSFFSettings, tiny_scene: Scene, caplog: pytest.LogCaptureFixture
-) -> None:
-    model = NSFF(tiny)
-    model.setup(tiny_scene)
-    with caplog.at_level(logging.INFO):
-        model.learn_from([tiny_scene.dynamic.train], model.losses)
-    assert [r.message.rpartition(": ")[2] for r in caplog.records] == [
-        "half of flow (no forward flow)"
-    ]
-
-
-def test_added_densities_have_no_terms_of_a_share(
+def test_flow_in_one_direction_counts_alone_and_added_densities_have_no_terms_of_a_share(
     tiny: NSFFSettings, tiny_scene: Scene, caplog: pytest.LogCaptureFixture
 ) -> None:
     model, views = NSFF(replace(tiny, blend="additive")), tiny_scene.dynamic.train
-    model.setup(tiny_scene)
-    with caplog.at_level(logging.INFO):
-        model.learn_from([views], model.losses)
-    assert "dynamic (no blend v), disocclusion (no blend v)" in caplog.text
-    batch = gather_batch(views, torch.tensor([1, 2]), torch.tensor([40, 80]), torch.ones(3))
-    terms = model.loss_terms(model(batch), batch, model.losses)
-    assert set(terms) == set(model.losses) - {"dynamic", "disocclusion"}
-    assert all(bool(value.isfinite()) for value in terms.values())
+    said = missing(caplog, model, views, tiny_scene)
+    assert [name in said for name in ("dynamic", "disocclusion", "half of flow")] == [True] * 3
+    left = terms(model, views)
+    assert set(left) == set(model.losses) - {"dynamic", "disocclusion"}
+    assert all(bool(value.isfinite()) for value in left.values())
 
 
 def test_an_embedded_scene_tells_flow_both_ways(tiny_recipe: ProceduralScene) -> None:

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 import torch
 
 from devrf.data.batch import RayBatch
-from devrf.methods.nerf.samples import RaySamples, volume_render
+from devrf.methods.nerf.samples import volume_render
 from devrf.methods.nsff.fields import BACKWARD, FORWARD
 from devrf.methods.nsff.model import NSFF
-from devrf.methods.nsff.renders import BlendedOutput, Renders
+from devrf.methods.nsff.renders import Renders
 
-
-def rendered(model: NSFF, batch: RayBatch, *, both: bool = True) -> Renders:
-    output = model(batch)
-    assert isinstance(output, BlendedOutput)
-    return Renders(model.fields, model.times, output, batch, both=both, weighted=False)
+Compared = Callable[..., Renders]
 
 
 def share(model: NSFF, v: float) -> None:
@@ -34,9 +31,11 @@ def move(model: NSFF, forward: tuple[float, ...], backward: tuple[float, ...]) -
         head.weight[:6], head.bias[:6] = 0.0, torch.atanh(wanted)
 
 
-def test_without_a_share_it_is_a_static_field(placed: NSFF, batch: RayBatch) -> None:
+def test_without_a_share_it_is_a_static_field(
+    placed: NSFF, batch: RayBatch, compared: Compared
+) -> None:
     share(placed, 0.0)
-    out = rendered(placed, batch).output
+    out = compared(placed, batch).output
     samples = out.samples
     density = torch.nn.functional.softplus(out.static.raw) * placed.settings.density_scale
     plain = volume_render(samples, density, out.static.color, batch.background)
@@ -47,12 +46,12 @@ def test_without_a_share_it_is_a_static_field(placed: NSFF, batch: RayBatch) -> 
 
 @pytest.mark.parametrize("both", [True, False])
 def test_without_motion_and_time_another_frame_is_this_one(
-    placed: NSFF, batch: RayBatch, both: bool
+    placed: NSFF, batch: RayBatch, compared: Compared, both: bool
 ) -> None:
     share(placed, 1.0)
     move(placed, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     placed.times[:] = batch.time[0]  # all frames at one time
-    renders = rendered(placed, batch, both=both)
+    renders = compared(placed, batch, both=both)
     assert len(renders.warps) == (2 if both else 1)
     for warp in renders.warps:
         torch.testing.assert_close(warp.color, renders.alone[0])
@@ -60,15 +59,15 @@ def test_without_motion_and_time_another_frame_is_this_one(
         assert warp.there.all()
 
 
-def test_a_translation_is_chained(placed: NSFF, batch: RayBatch) -> None:
+def test_a_translation_is_chained(placed: NSFF, batch: RayBatch, compared: Compared) -> None:
     """At frame 0 of three; two steps of a constant flow lead twice as far."""
     move(placed, (0.05, 0.0, -0.02), (-0.05, 0.0, 0.02))
     first = replace(batch, frame=torch.zeros_like(batch.frame), time=torch.zeros_like(batch.time))
-    renders = rendered(placed, first)
+    renders = compared(placed, first)
     after, before = renders.warps
     assert after.there.all() and not before.there.any() and len(before.kept) == 0
     assert (renders.trust(before) == 0).all() and (renders.trust(after) > 0).all()
-    further = renders.chained(0)
+    further = renders.chained()
     start = renders.output.points
     step = torch.tensor([0.05, 0.0, -0.02])
     torch.testing.assert_close(further.points, start + 2 * step, atol=1e-5, rtol=0)
@@ -76,15 +75,17 @@ def test_a_translation_is_chained(placed: NSFF, batch: RayBatch) -> None:
     # There and back again.
     back = after.found.flow[:, BACKWARD]
     torch.testing.assert_close(after.moved + back, torch.zeros_like(back), atol=1e-5, rtol=0)
-    assert (further.frame == 2).all() and not renders.chained(1).there.any()
+    assert (further.frame == 2).all() and not replace(renders, step=1).chained().there.any()
 
 
-def test_one_neighbour_is_at_either_side_and_exists(placed: NSFF, batch: RayBatch) -> None:
+def test_one_neighbour_is_at_either_side_and_exists(
+    placed: NSFF, batch: RayBatch, compared: Compared
+) -> None:
     frame = torch.tensor([0, 1, 2, 0, 1, 2, 0, 2])
     many = replace(batch, frame=frame, time=placed.times[frame])
     sides = set()
     for _ in range(8):
-        (warp,) = rendered(placed, many, both=False).warps
+        (warp,) = compared(placed, many, both=False).warps
         assert warp.there.all()
         assert (warp.side[frame == 0] == FORWARD).all()
         assert (warp.side[frame == 2] == BACKWARD).all()
@@ -92,40 +93,25 @@ def test_one_neighbour_is_at_either_side_and_exists(placed: NSFF, batch: RayBatc
     assert sides == {FORWARD, BACKWARD}
 
 
-def test_what_the_other_frame_does_not_show_is_not_trusted(placed: NSFF, batch: RayBatch) -> None:
+def test_what_the_other_frame_does_not_show_is_not_trusted(
+    placed: NSFF, batch: RayBatch, compared: Compared
+) -> None:
     head = placed.fields.dynamic.further
     with torch.no_grad():
         head.weight[6:], head.bias[6:] = 0.0, 50.0  # o = 1 everywhere
-    renders = rendered(placed, batch)
+    renders = compared(placed, batch)
     for warp in renders.warps:
         seen = torch.zeros(8).index_add(0, warp.ray, warp.weight)
         torch.testing.assert_close(renders.trust(warp), 1 - seen)
 
 
 def test_added_densities_keep_the_static_part_in_other_frames(
-    placed: NSFF, batch: RayBatch
+    placed: NSFF, batch: RayBatch, compared: Compared
 ) -> None:
     placed.fields.additive = True
     move(placed, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     placed.times[:] = batch.time[0]
-    renders = rendered(placed, batch)
+    renders = compared(placed, batch)
     for warp in renders.warps:
         torch.testing.assert_close(warp.color, renders.output.color)
         torch.testing.assert_close(renders.trust(warp), torch.ones(8))
-
-
-def test_times_between_frames_are_times_too(placed: NSFF, batch: RayBatch) -> None:
-    torch.nn.init.normal_(placed.fields.dynamic.trunk.layers[0].weight)
-    share(placed, 1.0)
-    pictures = [
-        placed.render_rays(batch.rays, torch.full((8,), t), batch.background).color
-        for t in (0.5, 0.6, 0.75)
-    ]
-    assert not torch.equal(pictures[0], pictures[1])
-    assert not torch.equal(pictures[1], pictures[2])
-
-
-def test_samples_have_normalised_lengths(placed: NSFF, batch: RayBatch) -> None:
-    samples: RaySamples = rendered(placed, batch).output.samples
-    way = torch.zeros(8).index_add(0, samples.ray, samples.length)
-    assert 0 < way.max() <= 2 * 3**0.5

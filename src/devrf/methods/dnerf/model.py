@@ -22,23 +22,13 @@ SMALL = 1e-4
 class TranslationField(nn.Module):
     """Δ(x, t) = D(γ(x), γ(t)), and exactly 0 at t = 0 (docs/methods/dnerf.md#deformation)."""
 
-    def __init__(
-        self, width: int, depth: int, bands: int, time_bands: int, skip: int | None = None
-    ) -> None:
-        """Build the network.
-
-        Args:
-            width: units of each layer.
-            depth: layers.
-            bands: octaves of the position.
-            time_bands: octaves of the time.
-            skip: the layer that γ(x) enters again; None: the middle one.
-        """
+    def __init__(self, settings: DNeRFSettings) -> None:
         super().__init__()
-        self.encode_position = SinusoidalEncoding(3, bands)
-        self.encode_time = SinusoidalEncoding(1, time_bands)
+        width, depth = settings.deformation_width, settings.deformation_depth
+        self.encode_position = SinusoidalEncoding(3, settings.bands)
+        self.encode_time = SinusoidalEncoding(1, settings.time_bands)
         position, time = self.encode_position.size, self.encode_time.size
-        self.trunk = Trunk(position + time, width, depth, skipped=position, skip=skip)
+        self.trunk = Trunk(position + time, width, depth, settings.skip, skipped=position)
         self.output = nn.Linear(width, 3)
         nn.init.uniform_(self.output.weight, -SMALL, SMALL)
         nn.init.zeros_(self.output.bias)
@@ -80,16 +70,10 @@ class DNeRF(DeformableField):
     settings_class = DNeRFSettings
 
     def __init__(self, settings: DNeRFSettings | None = None) -> None:
-        """Build the networks.
-
-        Args:
-            settings: sizes and sampling.
-        """
-        s = settings or DNeRFSettings()
-        super().__init__(s)
-        self.deformation = TranslationField(
-            s.deformation_width, s.deformation_depth, s.bands, s.time_bands, s.skip
-        )
+        """Build the networks, as published if no settings are given."""
+        settings = settings or DNeRFSettings()
+        super().__init__(settings)
+        self.deformation = TranslationField(settings)
 
     def deform(self, points: Tensor, time: Tensor) -> tuple[Tensor, None]:
         """x + Δ(x, t)."""

@@ -9,7 +9,7 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor, nn
 
-from devrf.errors import DevrfError
+from devrf.errors import expect
 from devrf.methods.nerf.networks import (
     SinusoidalEncoding,
     TimeCodes,
@@ -31,23 +31,12 @@ class SlicingSurface(nn.Module):
     See docs/methods/hypernerf.md#slicing.
     """
 
-    def __init__(
-        self, width: int, depth: int, bands: int, code: int, ambient: int, skip: int | None = None
-    ) -> None:
-        """Build the network.
-
-        Args:
-            width: units of each layer.
-            depth: layers.
-            bands: octaves of the position, which does not enter by itself.
-            code: length of a code ω.
-            ambient: length of w.
-            skip: the layer that the input enters again; None: the middle one.
-        """
+    def __init__(self, settings: HyperNeRFSettings) -> None:
         super().__init__()
-        self.encode = SinusoidalEncoding(3, bands, identity=False)
-        self.trunk = Trunk(self.encode.size + code, width, depth, skip=skip)
-        self.output = nn.Linear(width, ambient)
+        s, width = settings, settings.slicing_width
+        self.encode = SinusoidalEncoding(3, s.slicing_bands, identity=False)
+        self.trunk = Trunk(self.encode.size + s.code, width, s.slicing_depth, s.slicing_skip)
+        self.output = nn.Linear(width, s.ambient)
         initialise(self.trunk, "glorot")
         nn.init.normal_(self.output.weight, std=SMALL)
         nn.init.zeros_(self.output.bias)
@@ -87,19 +76,14 @@ class HyperNeRFSettings(NerfiesSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("ambient", "ambient_bands"):
-            if getattr(self, name) < 1:
-                raise DevrfError(
-                    f"{self.key}.{name}: expected at least 1, not {getattr(self, name)}; "
-                    "method=nerfies has no ambient space"
-                )
-        if not (self.ambient_delay >= 0 <= self.ambient_window) or (
-            self.ambient_delay + self.ambient_window > 1
-        ):
-            raise DevrfError(
-                f"{self.key}: expected shares ambient_delay and ambient_window of at most 1 "
-                f"together, not {self.ambient_delay} and {self.ambient_window}"
-            )
+        self.expect_at_least(1, "ambient", "ambient_bands")
+        self.expect_at_least(0, "ambient_delay", "ambient_window")
+        expect(
+            self.ambient_delay + self.ambient_window <= 1,
+            f"{self.key}.ambient_window",
+            f"at most 1 with ambient_delay ({self.ambient_delay})",
+            self.ambient_window,
+        )
 
 
 class HyperNeRF(Nerfies):
@@ -115,11 +99,7 @@ class HyperNeRF(Nerfies):
     opened: Tensor
 
     def __init__(self, settings: HyperNeRFSettings | None = None) -> None:
-        """Build the networks.
-
-        Args:
-            settings: sizes and sampling.
-        """
+        """Build the networks, as published if no settings are given."""
         s = settings or HyperNeRFSettings()
         encode = SinusoidalEncoding(s.ambient, s.ambient_bands, identity=False)
         super().__init__(s, encode.size)
@@ -127,9 +107,7 @@ class HyperNeRF(Nerfies):
         self.register_buffer("opened", torch.zeros(()))
         self._shut = False
         if s.slicing == "surface":
-            self.slicing = SlicingSurface(
-                s.slicing_width, s.slicing_depth, s.slicing_bands, s.code, s.ambient, s.slicing_skip
-            )
+            self.slicing = SlicingSurface(s)
 
     def set_times(self, times: tuple[float, ...]) -> None:
         """Take the frames' times, and draw a code for each, and a w if that is the frame's."""

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Collection, Iterable
-from contextlib import AbstractContextManager, nullcontext
-from typing import ClassVar
+from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
@@ -13,7 +12,7 @@ from torch import Tensor, nn
 from devrf.data.batch import RayBatch
 from devrf.geometry.rays import Rays
 from devrf.methods.nerf.networks import RadianceField
-from devrf.methods.nerf.placed_model import PlacedModel
+from devrf.methods.nerf.placed_model import NeuralField
 from devrf.methods.nerf.samples import (
     RaySamples,
     flattened,
@@ -25,22 +24,19 @@ from devrf.methods.nerf.samples import (
 from devrf.methods.nerf.settings import FieldSettings
 from devrf.ops.compositing import composite
 from devrf.rendering.output import RenderOutput
-from devrf.system.device import multiplies_bfloat16
 
 
-class DeformableField(PlacedModel):
+class DeformableField(NeuralField):
     """(σ, c) = T(x′, w, d), where a deformation leads a point x at time t to x′ and w.
 
     A method says what the deformation is (:meth:`deform`). T lives in normalised space.
 
     Attributes:
-        settings: sizes and sampling.
-        ambient: length of w as it enters T; 0: there is none.
         canonical: T.
         coarse: a T of its own for the coarse samples, if the settings ask for one.
     """
 
-    settings_class: ClassVar[type[FieldSettings]]
+    settings: FieldSettings
     coarse: RadianceField | None
 
     def __init__(self, settings: FieldSettings, ambient: int = 0) -> None:
@@ -50,10 +46,12 @@ class DeformableField(PlacedModel):
             settings: sizes and sampling.
             ambient: length of w as it enters T; 0: there is none.
         """
-        super().__init__()
-        self.settings, self.ambient = settings, ambient
-        self.canonical = settings.radiance_field(ambient)
-        self.coarse = settings.radiance_field(ambient) if settings.separate_coarse else None
+        super().__init__(settings)
+        s = settings
+        self.canonical = RadianceField(s, ambient=ambient, initialisation=s.initialisation)
+        self.coarse = None
+        if s.separate_coarse:
+            self.coarse = RadianceField(s, ambient=ambient, initialisation=s.initialisation)
         self.place()
 
     @abstractmethod
@@ -70,9 +68,11 @@ class DeformableField(PlacedModel):
 
     def radiance_parts(self) -> dict[str, Iterable[nn.Parameter]]:
         """The radiance fields as parts; what takes w is a part of its own."""
-        fields = [field for field in (self.canonical, self.coarse) if field is not None]
-        own = [one for field in fields for one in field.own_parameters()]
-        beside = [one for field in fields for one in field.ambient_parameters()]
+        own: list[nn.Parameter] = []
+        beside: list[nn.Parameter] = []
+        for field in (self.canonical, self.coarse):
+            for name, parameter in field.named_parameters() if field is not None else ():
+                (beside if name.startswith("trunk.beside.") else own).append(parameter)
         return {"canonical": own, "canonical_ambient": beside} if beside else {"canonical": own}
 
     def render_rays(
@@ -84,21 +84,17 @@ class DeformableField(PlacedModel):
         and ``weight`` (S,); and if a coarse field learns, ``coarse_color`` (R, 3) and the others
         with ``coarse_`` before their names.
         """
-        first = None
         if self.settings.sampling == "occupancy":
             samples = self.march(rays, time, jitter=jitter)
-        else:
-            samples, first = self._by_weight(rays, time, background, jitter=jitter)
-        seen = self._seen(self.canonical, samples, rays, time, background)
-        extras = dict(seen.extras)
-        if first is not None:
-            extras["coarse_color"] = first.color
-            extras |= {f"coarse_{name}": value for name, value in first.extras.items()}
-        return RenderOutput(
-            color=seen.color, depth=seen.depth, transmittance=seen.transmittance, extras=extras
-        )
+            return self._rendered(self.canonical, samples, rays, time, background)
+        samples, coarse = self._by_weight(rays, time, background, jitter=jitter)
+        fine = self._rendered(self.canonical, samples, rays, time, background)
+        if coarse is None:
+            return fine
+        beside = {f"coarse_{name}": value for name, value in coarse.extras.items()}
+        return replace(fine, extras={**fine.extras, "coarse_color": coarse.color, **beside})
 
-    def _seen(
+    def _rendered(
         self,
         field: RadianceField,
         samples: RaySamples,
@@ -111,17 +107,10 @@ class DeformableField(PlacedModel):
             samples = samples.endless()
         points, when = self.placement.normalised(samples.points), time.index_select(0, samples.ray)
         canonical, ambient = self.deform(points, when)
-        with self._reduced():
-            density, color = field(canonical, rays.viewdirs, samples.ray, ambient)
-        seen = volume_render(
-            samples.scaled(self.placement.half_edge), density.float(), color.float(), background
-        )
-        return RenderOutput(
-            color=seen.color,
-            depth=seen.depth,
-            transmittance=seen.transmittance,
-            extras={**seen.extras, "points": points, "time": when},
-        )
+        density, color = field(canonical, rays.viewdirs, samples.ray, ambient)
+        scaled = samples.scaled(self.placement.half_edge)
+        output = volume_render(scaled, density, color, background)
+        return replace(output, extras={**output.extras, "points": points, "time": when})
 
     def _by_weight(
         self, rays: Rays, time: Tensor, background: Tensor, *, jitter: bool
@@ -130,42 +119,29 @@ class DeformableField(PlacedModel):
         s, field = self.settings, self.coarse or self.canonical
         near, far = limits(rays, self.box, self.depth_limits)
         distance = stratified(near, far, s.coarse, jitter=jitter)
-        first, seen = flattened(rays, distance, far), None
+        first, output = flattened(rays, distance, far), None
         if self.coarse is not None and jitter:
-            seen = self._seen(field, first, rays, time, background)
-            weight = seen.extras["weight"].detach()
+            output = self._rendered(field, first, rays, time, background)
+            weight = output.extras["weight"].detach()
         else:
             weight = self._weights(field, first, time)
         with torch.no_grad():
             drawn = importance(distance, weight.view_as(distance), near, far, s.fine, jitter=jitter)
             distance, _ = torch.cat([distance, drawn], dim=1).sort(dim=1)
-        return flattened(rays, distance, far), seen
+        return flattened(rays, distance, far), output
 
     @torch.no_grad()
     def _weights(self, field: RadianceField, samples: RaySamples, time: Tensor) -> Tensor:
         """Weights (S,) of samples, from their densities alone."""
         points, when = self.placement.normalised(samples.points), time.index_select(0, samples.ray)
-        with self._reduced():
-            density = field.sigma(*self.deform(points, when))
+        density = field.sigma(*self.deform(points, when))
         length = samples.length / self.placement.half_edge
-        weight, _ = composite(density.float() * length, samples.ray, samples.rays)
+        weight, _ = composite(density * length, samples.ray, samples.rays)
         return weight
 
-    def opacity(self, points: Tensor, time: Tensor) -> Tensor:
-        """Opacity (S,) of a step at points (S, 3) of the fields' space and times (S,)."""
-        points = self.placement.normalised(points)
-        step = self.box.diagonal / self.settings.steps / self.placement.half_edge
-        with self._reduced():
-            density = self.canonical.sigma(*self.deform(points, time))
-        return -torch.expm1(-density.float() * step)
-
-    def _reduced(self) -> AbstractContextManager[None]:
-        """Where T learns in bfloat16, if it is to."""
-        chosen = self.settings.precision
-        reduced = multiplies_bfloat16(self.device) if chosen == "auto" else chosen == "bfloat16"
-        if not (reduced and self.training):
-            return nullcontext()
-        return torch.autocast(self.device.type, torch.bfloat16)
+    def optical_depth(self, points: Tensor, time: Tensor, length: float) -> Tensor:
+        """τ (S,) of the canonical field, where the points lead."""
+        return self.canonical.sigma(*self.deform(points, time)) * length
 
     def loss_terms(
         self, output: RenderOutput, batch: RayBatch, names: Collection[str]

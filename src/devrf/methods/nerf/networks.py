@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from typing import Literal
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 
 import torch
 from torch import Tensor, nn
 
 from devrf.geometry.clock import FrameClock
+from devrf.methods.nerf.settings import Initialisation, PlacedSettings
+from devrf.system.device import multiplies_bfloat16
 
 
 class SinusoidalEncoding(nn.Module):
@@ -65,14 +67,12 @@ def octave_window(opened: Tensor, bands: int) -> Tensor:
     return (1 - torch.cos(math.pi * (opened - octave).clamp(0, 1))) / 2
 
 
-Initialisation = Literal["uniform", "glorot"]
-
-
 class Trunk(nn.Module):
     """Layers of equal width with ReLU; the input enters once more on the way.
 
     Attributes:
-        width: units of each layer, and of the result.
+        beside: the weights of a second input, apart from the others, so that they can be learned
+            where the others stay as they are.
     """
 
     def __init__(
@@ -80,26 +80,22 @@ class Trunk(nn.Module):
         inputs: int,
         width: int,
         depth: int,
+        skip: int | None,
         skipped: int | None = None,
-        skip: int | None = None,
         beside: int = 0,
     ) -> None:
         """Build the layers.
 
         Args:
             inputs: length of the input.
-            width: units of each layer.
+            width: units of each layer, and of the result.
             depth: how many layers.
-            skipped: how much of the input, from its beginning, enters the layer ``skip`` again;
-                None: all of it.
-            skip: number of that layer, from 0; None: the middle one, of a trunk of three or more.
-                A trunk without a layer of that number has no such input.
-            beside: length of a second input that enters with the first one, both times. Its
-                weights are apart from the others (:meth:`beside_weights`), so that they can be
-                learned where the others stay as they are.
+            skip: number, from 0, of the layer that the input enters again; None: the middle one, of
+                a trunk of three or more. A trunk without that layer has no such input.
+            skipped: how much of the input, from its beginning, does; None: all of it.
+            beside: length of a second input that enters with the first one, both times.
         """
         super().__init__()
-        self.width = width
         self._skipped = inputs if skipped is None else skipped
         self._skip = skip if skip is not None else depth // 2 if depth > 2 else -1
         sizes = [inputs, *[width] * (depth - 1)]
@@ -111,10 +107,6 @@ class Trunk(nn.Module):
         self.beside = nn.ModuleDict(
             {str(k): nn.Linear(beside, width, bias=False) for k in dict.fromkeys(entries)}
         )
-
-    def beside_weights(self) -> Iterator[nn.Parameter]:
-        """Weights of the second input."""
-        return self.beside.parameters()
 
     def forward(self, values: Tensor, beside: Tensor | None = None) -> Tensor:
         """(M, width) of ``values`` (M, inputs), and ``beside`` (M, beside) where that enters."""
@@ -155,18 +147,10 @@ class TimeCodes(nn.Module):
 
     At frames' own times this is what was published; what is between them was never learned
     (docs/methods/nerfies.md#codes).
-
-    Attributes:
-        clock: the frames' times.
     """
 
     def __init__(self, times: Sequence[float], size: int) -> None:
-        """Draw the codes.
-
-        Args:
-            times: of the frames, in [0, 1], ascending from 0.
-            size: length of a code.
-        """
+        """Draw codes of length ``size`` for frames at ``times`` in [0, 1], ascending from 0."""
         super().__init__()
         self.clock = FrameClock(tuple(times))
         self.table = nn.Embedding(len(self.clock), size)
@@ -180,55 +164,45 @@ class TimeCodes(nn.Module):
 
 
 class RadianceField(nn.Module):
-    """(x, d) → (σ, c): a trunk over γ(x), a density head, and a colour branch over γ(d).
-
-    Attributes:
-        density_scale: σ = scale · softplus(raw), per unit of normalised space.
-    """
+    """(x, d) → (σ, c): a trunk over γ(x), a density head, and a colour branch over γ(d)."""
 
     def __init__(
         self,
-        width: int,
-        depth: int,
-        bands: int,
-        direction_bands: int,
-        density_scale: float,
+        settings: PlacedSettings,
         *,
-        skip: int | None = None,
+        inputs: int = 3,
         ambient: int = 0,
+        further: int = 0,
         initialisation: Initialisation = "uniform",
     ) -> None:
         """Build the network.
 
         Args:
-            width: units of each layer of the trunk.
-            depth: layers of the trunk.
-            bands: octaves of the position.
-            direction_bands: octaves of the viewing direction.
-            density_scale: what a softplus of 1 means, per unit of normalised space.
-            skip: the layer of the trunk that γ(x) enters again; None: the middle one.
+            settings: sizes.
+            inputs: length of x; a time may be a part of it.
             ambient: length of what enters the trunk beside γ(x).
+            further: numbers of one more linear head on the trunk; 0: there is none.
             initialisation: of all layers.
         """
         super().__init__()
-        self.density_scale = density_scale
-        self.encode_position = SinusoidalEncoding(3, bands)
-        self.encode_direction = SinusoidalEncoding(3, direction_bands)
-        self.trunk = Trunk(self.encode_position.size, width, depth, skip=skip, beside=ambient)
-        self.density = nn.Linear(width, 1)
-        self.feature = nn.Linear(width, width)
-        self.branch = nn.Linear(width + self.encode_direction.size, width // 2)
-        self.color = nn.Linear(width // 2, 3)
+        s = self._settings = settings
+        self.encode_position = SinusoidalEncoding(inputs, s.bands)
+        self.encode_direction = SinusoidalEncoding(3, s.direction_bands)
+        self.trunk = Trunk(self.encode_position.size, s.width, s.depth, s.skip, beside=ambient)
+        self.density = nn.Linear(s.width, 1)
+        self.further = nn.Linear(s.width, further) if further else None
+        self.feature = nn.Linear(s.width, s.width)
+        self.branch = nn.Linear(s.width + self.encode_direction.size, s.width // 2)
+        self.color = nn.Linear(s.width // 2, 3)
         initialise(self, initialisation)
 
-    def own_parameters(self) -> Iterator[nn.Parameter]:
-        """All but :meth:`ambient_parameters`."""
-        beside = {id(one) for one in self.ambient_parameters()}
-        return (one for one in self.parameters() if id(one) not in beside)
-
-    def ambient_parameters(self) -> Iterator[nn.Parameter]:
-        """The weights of what enters beside γ(x)."""
-        return self.trunk.beside_weights()
+    def reduced(self) -> AbstractContextManager[None]:
+        """Where the field computes in bfloat16 while it learns, if its settings say so."""
+        chosen, device = self._settings.precision, self.density.weight.device
+        reduced = multiplies_bfloat16(device) if chosen == "auto" else chosen == "bfloat16"
+        if not (reduced and self.training):
+            return nullcontext()
+        return torch.autocast(device.type, torch.bfloat16)
 
     def forward(
         self, points: Tensor, viewdirs: Tensor, ray: Tensor, ambient: Tensor | None = None
@@ -236,7 +210,7 @@ class RadianceField(nn.Module):
         """Densities and colours of samples.
 
         Args:
-            points: (S, 3) in normalised space, [−1, 1] inside the box.
+            points: (S, inputs) in normalised space, [−1, 1] inside the box.
             viewdirs: (R, 3) unit viewing directions of the rays.
             ray: (S,) int64, the ray of each sample.
             ambient: (S, ambient) what enters beside γ(x), or None where nothing does.
@@ -244,16 +218,34 @@ class RadianceField(nn.Module):
         Returns:
             σ (S,) ≥ 0 per unit of normalised space, and RGB (S, 3) in [0, 1].
         """
-        x = self.trunk(self.encode_position(points), ambient)
-        density = self._density(x)
-        direction = self.encode_direction(viewdirs).index_select(0, ray)
-        x = torch.relu(self.branch(torch.cat([self.feature(x), direction], dim=-1)))
-        return density, torch.sigmoid(self.color(x))
+        with self.reduced():
+            raw, logits, _ = self.heads(points, viewdirs, ray, ambient)
+            density, color = self._activated(raw), torch.sigmoid(logits)
+        return density.float(), color.float()
 
     def sigma(self, points: Tensor, ambient: Tensor | None = None) -> Tensor:
         """σ (S,) alone, for samples whose colour does not count; arguments as above."""
-        return self._density(self.trunk(self.encode_position(points), ambient))
+        with self.reduced():
+            return self._activated(self.raw_density(points, ambient)).float()
 
-    def _density(self, features: Tensor) -> Tensor:
-        raw: Tensor = self.density(features)[:, 0]
-        return nn.functional.softplus(raw) * self.density_scale
+    def heads(
+        self, points: Tensor, viewdirs: Tensor, ray: Tensor, ambient: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Density (S,) and RGB (S, 3) before their activations, and the further head's numbers.
+
+        Arguments as for :meth:`forward`.
+        """
+        x = self.trunk(self.encode_position(points), ambient)
+        density = self.density(x)[:, 0]
+        further = x[:, :0] if self.further is None else self.further(x)
+        direction = self.encode_direction(viewdirs).index_select(0, ray)
+        x = torch.relu(self.branch(torch.cat([self.feature(x), direction], dim=-1)))
+        return density, self.color(x), further
+
+    def raw_density(self, points: Tensor, ambient: Tensor | None = None) -> Tensor:
+        """Density (S,) alone before its activation; arguments as for :meth:`forward`."""
+        raw: Tensor = self.density(self.trunk(self.encode_position(points), ambient))
+        return raw[:, 0]
+
+    def _activated(self, raw: Tensor) -> Tensor:
+        return nn.functional.softplus(raw) * self._settings.density_scale

@@ -75,38 +75,25 @@ class LearnedOccupancy(StoredShape):
         start = round(share * total)
         if step < start or step % EVERY:
             return
-        count, flat = self.opacity.numel(), self.opacity.view(-1)
+        flat = self.opacity.view(-1)
         if step < start + EVERY:
             flat.zero_()
-            for _ in range(FIRST):
-                self._look(torch.arange(count, device=flat.device), box, opacity_at)
+            looks = [torch.arange(len(flat), device=flat.device)] * FIRST
         else:
-            chosen = torch.rand(count, device=flat.device) < SHARE
-            self._look(chosen.nonzero()[:, 0], box, opacity_at)
-
-    def _look(
-        self, cells: Tensor, box: Box, opacity_at: Callable[[Tensor, Tensor], Tensor]
-    ) -> None:
-        flat = self.opacity.view(-1)
-        for part in torch.split(cells, CHUNK):
-            points = self._points(part, box)
-            seen = opacity_at(points, torch.rand_like(points[:, 0]))
-            flat[part] = torch.maximum(DECAY * flat[part], seen)
+            looks = [(torch.rand(len(flat), device=flat.device) < SHARE).nonzero()[:, 0]]
+        for cells in looks:
+            for part in torch.split(cells, CHUNK):
+                points = self._points(part, box)
+                seen = opacity_at(points, torch.rand_like(points[:, 0]))
+                flat[part] = torch.maximum(DECAY * flat[part], seen)
 
     def _points(self, cells: Tensor, box: Box) -> Tensor:
         """A random point (S, 3) nearest to each of the grid points of numbers (S,)."""
-        _, y, z = self.opacity.shape
-        place = torch.stack([cells // (y * z), cells // z % y, cells % z], dim=1)
+        place = torch.stack(torch.unravel_index(cells, self.opacity.shape), dim=1)
         low, high = box.corners(self.opacity)
         last = torch.tensor(self.opacity.shape, device=cells.device) - 1
         jittered = place + torch.rand(len(cells), 3, device=cells.device) - 0.5
         return box.nearest(low + jittered / last * (high - low))
-
-
-def diagonal_step(box: Box, rays: Rays, steps: int) -> float:
-    """One of ``steps`` even steps along the box's diagonal, in units of the longest direction."""
-    unit = float(rays.directions.norm(dim=1).amax()) if len(rays) else 1.0
-    return box.diagonal / (steps * unit)
 
 
 class OccupancyFrames(StoredShape):
@@ -132,53 +119,31 @@ class OccupancyFrames(StoredShape):
         return not bool(self.mask.all())
 
     @classmethod
+    @torch.no_grad()
     def of(
-        cls,
-        scene: Scene,
-        box: Box,
-        side: int,
-        device: torch.device,
-        *,
-        hull: bool,
-        empty_from: float | None = None,
+        cls, scene: Scene, box: Box, side: int, *, hull: bool, empty_from: float | None = None
     ) -> OccupancyFrames:
         """Masks of each of the scene's frames over ``box``, of about ``side``³ cells.
 
         Args:
-            scene: seen from all around its alpha masks carve them; else the field itself has to
-                tell what is empty.
+            scene: seen from all around, the training images' alpha masks carve them, grown by a
+                cell; static images show frame 0. Else the field itself has to tell what is empty.
             box: in the fields' space.
             side: cells along an edge of a cube of the box's size.
-            device: where the masks are.
             hull: whether to carve at all.
             empty_from: share of a stage after which the field is asked; None: never.
         """
-        masks = cls(len(scene.clock), box.grid_shape(side**3)).to(device)
-        if hull and scene.kind == "inward" and scene.space.is_linear:
-            masks.carve(scene, box)
-        if empty_from is not None and not masks.has_hull:
-            _, x, y, z = masks.mask.shape
-            masks.learned = LearnedOccupancy((x, y, z)).to(device)
-        return masks
-
-    @torch.no_grad()
-    def carve(self, scene: Scene, box: Box) -> None:
-        """Take the visual hull of each frame's alpha masks, grown by a cell; nothing without.
-
-        Args:
-            scene: its training views are looked at; static images show frame 0.
-            box: where the masks live, in world units.
-        """
-        _, *points = self.mask.shape
-        x, y, z = points
-        for views in (scene.static.train, scene.dynamic.train):
-            if not views.has_alpha:
-                continue
+        shape = box.grid_shape(side**3)
+        masks = cls(len(scene.clock), shape)
+        carved = hull and scene.kind == "inward" and scene.space.is_linear
+        for views in (scene.static.train, scene.dynamic.train) if carved else ():
             assert views.frames is not None
-            for frame in torch.unique(views.frames).tolist():
+            for frame in torch.unique(views.frames).tolist() if views.has_alpha else ():
                 shown = views[(views.frames == frame).nonzero()[:, 0]]
-                hull = dilate(visual_hull(shown, box, (x, y, z)), 1)
-                self.mask[frame] &= hull.to(self.mask.device)
+                masks.mask[frame] &= dilate(visual_hull(shown, box, shape), 1).cpu()
+        if empty_from is not None and not masks.has_hull:
+            masks.learned = LearnedOccupancy(shape)
+        return masks
 
     def march(
         self,
@@ -206,20 +171,16 @@ class OccupancyFrames(StoredShape):
         number = torch.arange(len(ray), device=ray.device) - (count.cumsum(0) - count)[ray]
         offset = torch.rand_like(entry) if jitter else torch.full_like(entry, 0.5)
         distance = entry[ray] + (number + offset[ray]) * step
-        cell = self._cells(rays.at(ray, distance), box)
-        flat, cells = self.mask.flatten(1), self.mask[0].numel()
+        _, x, y, z = self.mask.shape
+        nearest = box.to_grid(box.nearest(rays.at(ray, distance)), (x, y, z)).round().long()
+        cell = (nearest[:, 0] * y + nearest[:, 1]) * z + nearest[:, 2]
+        cells = self.mask[0].numel()
         met = torch.zeros_like(ray, dtype=torch.bool)
         for frame in frames:
-            met |= flat.view(-1)[frame[ray] * cells + cell]
+            met |= self.mask.view(-1)[frame[ray] * cells + cell]
         occupied = self.learned.occupied(cell)
         if occupied is not None:
             # The last sample of a ray stays: it may stand for all that is behind it.
             met &= occupied | (number == count[ray] - 1)
         kept = met.nonzero()[:, 0]
         return RaySamples.at(rays, ray[kept], distance[kept], step)
-
-    def _cells(self, points: Tensor, box: Box) -> Tensor:
-        """The row-major number (M,) of the grid point nearest to each of ``points`` (M, 3)."""
-        _, x, y, z = self.mask.shape
-        place = box.to_grid(box.nearest(points), (x, y, z)).round().long()
-        return (place[:, 0] * y + place[:, 1]) * z + place[:, 2]

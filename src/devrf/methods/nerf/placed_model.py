@@ -1,12 +1,13 @@
-"""What four peers share: networks placed in a scene, whose empty space rays skip."""
+"""What the peers share: networks placed in a scene, whose empty space rays skip."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import Any, ClassVar, Self
 
+import torch
 from torch import Tensor
 
 from devrf.data.batch import RayBatch
@@ -15,30 +16,37 @@ from devrf.geometry.clock import FrameClock
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import WORLD, Space, space_config, space_from
 from devrf.methods.base import RayTrainable
-from devrf.methods.nerf.occupancy import OccupancyFrames, diagonal_step
+from devrf.methods.nerf.occupancy import OccupancyFrames
 from devrf.methods.nerf.placement import Placement
-from devrf.methods.nerf.ray_view import RayView
 from devrf.methods.nerf.samples import RaySamples
-from devrf.rendering.output import RenderOutput
+from devrf.rendering.output import RenderedImage, RenderOutput
 from devrf.scenes.scene import Scene
+
+# Rays of a view that are rendered at once, on a CPU and on a GPU.
+ON_CPU, ON_GPU = 2048, 2**14
 
 
 class PlacedModel(RayTrainable):
-    """Networks in normalised space: the box that holds the scene, its longest edge being 2.
+    """A method with settings, placed in a box of the scene, whose frames it knows.
 
     Attributes:
-        settings: sizes and sampling.
-        placement: the maps from the fields' space (world units, NDC or contracted) and back.
-        occupancy: where something may be at each frame, with ``sampling=occupancy``.
+        settings_class: what :attr:`settings` are: sizes and sampling.
+        placement: the maps from the fields' space (world units, NDC or contracted) to normalised
+            space, where the box's longest edge is 2, and back.
+        occupancy: where something may be at each frame.
         clock: the frames' times.
     """
 
     settings_class: ClassVar[type[Any]]
     settings: Any
 
+    def __init__(self, settings: Any) -> None:
+        super().__init__()
+        self.settings = settings
+        self.occupancy = OccupancyFrames(1, (2, 2, 2))
+
     def place(self) -> None:
         """Build what depends on the scene, as yet for one at rest in a cube around the origin."""
-        self.occupancy = OccupancyFrames(1, (2, 2, 2))
         self.set_place(Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)), WORLD, (0.0, 1.0))
         self.set_times((0.0, 1.0))
 
@@ -50,17 +58,6 @@ class PlacedModel(RayTrainable):
     def set_times(self, times: tuple[float, ...]) -> None:
         """Take the frames' times; a method with codes for them makes these here."""
         self.clock = FrameClock(times)
-
-    def setup(self, scene: Scene) -> None:
-        """Take the scene's bounds and times; carve the frames' occupancy from their alpha masks."""
-        bounds, s = scene.bounds, self.settings
-        box = bounds.whole
-        self.set_place(box, scene.space, (bounds.near, bounds.far))
-        self.set_times(scene.clock.times)
-        if s.sampling == "occupancy":
-            self.occupancy = OccupancyFrames.of(
-                scene, box, s.occupancy_side, self.device, hull=s.hull, empty_from=s.empty_from
-            )
 
     @property
     def has_hull(self) -> bool:
@@ -86,14 +83,34 @@ class PlacedModel(RayTrainable):
         model.set_times(tuple(config["times"]))
         return model
 
+
+class NeuralField(PlacedModel):
+    """Networks that are asked point by point, in normalised space."""
+
+    def setup(self, scene: Scene) -> None:
+        """Take the scene's bounds and times; carve the frames' occupancy from their alpha masks."""
+        bounds, s = scene.bounds, self.settings
+        self.set_place(bounds.whole, scene.space, (bounds.near, bounds.far))
+        self.set_times(scene.clock.times)
+        if s.sampling == "occupancy":
+            self.occupancy = OccupancyFrames.of(
+                scene, self.box, s.occupancy_side, hull=s.hull, empty_from=s.empty_from
+            ).to(self.device)
+
     def on_iteration(self, step: int, total: int) -> None:
         """Look where the fields are empty."""
         share = self.settings.empty_from
         self.occupancy.learned.follow(step, total, share, self.box, self.opacity)
 
-    @abstractmethod
     def opacity(self, points: Tensor, time: Tensor) -> Tensor:
         """Opacity (S,) of a step at points (S, 3) of the fields' space and times (S,)."""
+        length = self.box.diagonal / self.settings.steps / self.placement.half_edge
+        depth = self.optical_depth(self.placement.normalised(points), time, length)
+        return -torch.expm1(-depth)
+
+    @abstractmethod
+    def optical_depth(self, points: Tensor, time: Tensor, length: float) -> Tensor:
+        """τ (S,) of ways of ``length`` at points (S, 3) and times (S,), in normalised space."""
 
     @abstractmethod
     def render_rays(
@@ -115,12 +132,52 @@ class PlacedModel(RayTrainable):
     def march(self, rays: Rays, time: Tensor, *, jitter: bool) -> RaySamples:
         """Even steps where something may be at the frames around each ray's time."""
         before, after, _ = self.clock.between(time)
-        step = diagonal_step(self.box, rays, self.settings.steps)
+        # Of the box's diagonal, in units of the longest direction.
+        longest = float(rays.directions.norm(dim=1).amax()) if len(rays) else 1.0
+        step = self.box.diagonal / (self.settings.steps * longest)
         return self.occupancy.march(
             rays, (before, after), self.box, self.depth_limits, step, jitter=jitter
         )
 
     def at(self, time: float, *, half: bool = False) -> RayView:
         """The scene at ``time``."""
-        at_rest = self.clock.at(time).after == 0
-        return RayView(self, time, self.device, at_rest=at_rest, half=half)
+        return RayView(self, self.render_rays, time, half=half)
+
+
+class RayView:
+    """A model at one time.
+
+    Attributes:
+        at_rest: whether the time shows the rest state.
+        chunk: rays that are best rendered at once.
+    """
+
+    def __init__(
+        self,
+        model: PlacedModel,
+        render_rays: Callable[[Rays, Tensor, Tensor], RenderOutput],
+        time: float,
+        *,
+        half: bool,
+    ) -> None:
+        """Keep what there is to know.
+
+        Args:
+            model: the model.
+            render_rays: as :meth:`NeuralField.render_rays`.
+            time: in [0, 1].
+            half: networks in half precision, on a CUDA device.
+        """
+        on_gpu = model.device.type == "cuda"
+        self._render_rays, self._time = render_rays, time
+        self._half = half and on_gpu
+        self.at_rest = model.clock.at(time).after == 0
+        self.chunk = ON_GPU if on_gpu else ON_CPU
+
+    @torch.no_grad()
+    def render(self, rays: Rays, background: Tensor) -> RenderedImage:
+        """What R rays in the fields' space see."""
+        time = torch.full_like(rays.origins[:, 0], self._time)
+        with torch.autocast(time.device.type, torch.float16, enabled=self._half):
+            seen = self._render_rays(rays, time, background)
+        return RenderedImage(seen.color.float(), seen.depth.float(), 1 - seen.transmittance.float())

@@ -72,19 +72,30 @@ def volume_render(
     Returns:
         ``extras`` has the ``weight`` (S,) and the ``ray`` (S,) of the samples.
     """
+    weight, transmittance = composite(density * samples.length, samples.ray, samples.rays)
+    output = accumulated(samples, weight, weight[:, None] * color, transmittance, background)
+    return replace(output, extras={"weight": weight, "ray": samples.ray})
+
+
+def accumulated(
+    samples: RaySamples, weight: Tensor, color: Tensor, transmittance: Tensor, background: Tensor
+) -> RenderOutput:
+    """C = Σ w_i c_i + T_end · background, and the samples' mean distance.
+
+    Args:
+        samples: S samples of R rays.
+        weight: (S,) w_i.
+        color: (S, 3) w_i c_i.
+        transmittance: (R,) T_end.
+        background: (3,) or (R, 3) RGB.
+    """
     ray, rays = samples.ray, samples.rays
-    weight, transmittance = composite(density * samples.length, ray, rays)
-    seen = sum_by_ray(weight[:, None] * color, ray, rays)
+    seen = sum_by_ray(color, ray, rays)
     with torch.no_grad():
         mass = sum_by_ray(weight, ray, rays)
         reached = sum_by_ray(weight * samples.distance, ray, rays)
     image, depth = color_and_depth(seen, reached, mass, transmittance, background)
-    return RenderOutput(
-        color=image,
-        depth=depth,
-        transmittance=transmittance,
-        extras={"weight": weight, "ray": ray},
-    )
+    return RenderOutput(color=image, depth=depth, transmittance=transmittance)
 
 
 def limits(rays: Rays, box: Box, depths: tuple[float, float]) -> tuple[Tensor, Tensor]:

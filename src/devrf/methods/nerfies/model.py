@@ -10,18 +10,17 @@ import torch
 from torch import Tensor, nn
 
 from devrf.data.batch import RayBatch
-from devrf.errors import DevrfError
+from devrf.errors import expect
 from devrf.geometry.poses import rigid_motion
 from devrf.methods.nerf.deformable import DeformableField
 from devrf.methods.nerf.networks import (
-    Initialisation,
     SinusoidalEncoding,
     TimeCodes,
     Trunk,
     initialise,
     octave_window,
 )
-from devrf.methods.nerf.settings import FieldSettings
+from devrf.methods.nerf.settings import FieldSettings, Initialisation
 from devrf.methods.nerfies.elastic import SCALE, drawn, jacobians, robust, strain
 from devrf.methods.protocol import ProtocolStage
 from devrf.rendering.output import RenderOutput
@@ -39,22 +38,12 @@ class RigidWarp(nn.Module):
 
     opened: Tensor
 
-    def __init__(
-        self, width: int, depth: int, bands: int, code: int, skip: int | None = None
-    ) -> None:
-        """Build the network.
-
-        Args:
-            width: units of each layer.
-            depth: layers.
-            bands: octaves of the position.
-            code: length of a code ω.
-            skip: the layer that the input enters again; None: the middle one.
-        """
+    def __init__(self, settings: NerfiesSettings) -> None:
         super().__init__()
-        self.bands = bands
-        self.encode = SinusoidalEncoding(3, bands)
-        self.trunk = Trunk(self.encode.size + code, width, depth, skip=skip)
+        s, width = settings, settings.warp_width
+        self.bands = s.warp_bands
+        self.encode = SinusoidalEncoding(3, s.warp_bands)
+        self.trunk = Trunk(self.encode.size + s.code, width, s.warp_depth, s.warp_skip)
         self.rotation, self.velocity = nn.Linear(width, 3), nn.Linear(width, 3)
         self.register_buffer("opened", torch.zeros(()))
         initialise(self.trunk, "glorot")
@@ -110,12 +99,8 @@ class NerfiesSettings(FieldSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0 <= self.window <= 1:
-            raise DevrfError(f"{self.key}.window: expected a share from 0 to 1, not {self.window}")
-        if self.elastic_rays < 0:
-            raise DevrfError(
-                f"{self.key}.elastic_rays: expected 0 or more, not {self.elastic_rays}"
-            )
+        expect(0 <= self.window <= 1, f"{self.key}.window", "a share from 0 to 1", self.window)
+        self.expect_at_least(0, "elastic_rays")
 
 
 class Nerfies(DeformableField):
@@ -137,13 +122,13 @@ class Nerfies(DeformableField):
         """Build the networks.
 
         Args:
-            settings: sizes and sampling.
+            settings: sizes and sampling; None: as published.
             ambient: length of what enters T beside the position.
         """
-        s = settings or NerfiesSettings()
-        super().__init__(s, ambient)
+        settings = settings or NerfiesSettings()
+        super().__init__(settings, ambient)
         self.rest_is_canonical = False
-        self.warp = RigidWarp(s.warp_width, s.warp_depth, s.warp_bands, s.code, s.warp_skip)
+        self.warp = RigidWarp(settings)
 
     def set_times(self, times: tuple[float, ...]) -> None:
         """Take the frames' times, and draw a code for each."""

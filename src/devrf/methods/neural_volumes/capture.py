@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor, nn
 
@@ -37,67 +35,54 @@ def check_scene(scene: Scene) -> None:
 
 
 def encoder_images(scene: Scene, settings: NeuralVolumesSettings) -> Tensor:
-    """The images of each frame by cameras that are spread over the rig: (T, K, 3, h, w) uint8.
+    """The images of each frame by cameras that are spread over the rig, on the host.
+
+    Images larger than the encoder's are made smaller; what is left around them is the background. A
+    frame that no camera has (time 0 of a capture that begins later) has the images of the next.
+
+    Returns:
+        (T, K, 3, h, w) uint8.
 
     Raises:
         DevrfError: too few fixed cameras have an image of every frame.
     """
     views, wanted = scene.dynamic.train, settings.encoder_views
+    assert views.frames is not None
     cameras = cameras_of_every_frame(views)
     if len(cameras) < wanted:
         raise DevrfError(
             f"{KEY}.encoder_views: expected {wanted} fixed training cameras with an image of every "
             f"frame, and {scene.name} has {len(cameras)}; set it no higher, or give more cameras"
         )
-    last = max(wanted - 1, 1)
-    chosen = [cameras[k * (len(cameras) - 1) // last] for k in range(wanted)]
-    behind = 0.0 if scene.background == "black" else 1.0
-    return moment_images(views, chosen, len(scene.clock), settings.encoder_size, behind)
-
-
-def cameras_of_every_frame(views: Views) -> list[int]:
-    """The fixed cameras that have an image of each frame that any camera has."""
-    assert views.frames is not None
-    seen: dict[int, set[int]] = {}
-    for camera, frame in zip(views.view.tolist(), views.frames.tolist(), strict=True):
-        seen.setdefault(camera, set()).add(frame)
-    everything = set().union(*seen.values())
-    return sorted(camera for camera, frames in seen.items() if frames == everything)
-
-
-def moment_images(
-    views: Views, cameras: Sequence[int], frames: int, size: Sequence[int], background: float
-) -> Tensor:
-    """What the encoder reads of each frame: (T, K, 3, h, w) uint8, on the host.
-
-    Images larger than ``size`` are made smaller; what is left around them is the background. A
-    frame that no camera has (time 0 of a capture that begins later) has the images of the next.
-
-    Args:
-        views: images with alpha masks.
-        cameras: K numbers of fixed cameras.
-        frames: T.
-        size: height and width (h, w).
-        background: grey level in [0, 1] behind the alpha masks.
-    """
-    assert views.frames is not None
-    height, width = size
+    height, width = settings.encoder_size
     scale = min(1.0, height / views.height, width / views.width)
     rows, columns = round(views.height * scale), round(views.width * scale)
     top, left = (height - rows) // 2, (width - columns) // 2
+    behind = 0.0 if scene.background == "black" else 1.0
     images = torch.full(
-        (frames, len(cameras), 3, height, width), round(255 * background), dtype=torch.uint8
+        (len(scene.clock), wanted, 3, height, width), round(255 * behind), dtype=torch.uint8
     )
-    first = int(views.frames.min())
-    for k, camera in enumerate(cameras):
+    for k in range(wanted):
+        camera = cameras[k * (len(cameras) - 1) // max(wanted - 1, 1)]
         for place in (views.view == camera).nonzero()[:, 0].tolist():
             pixels = views.pixels[place].permute(2, 0, 1).float() / 255
-            color = background + pixels[3:] * (pixels[:3] - background)
+            color = behind + pixels[3:] * (pixels[:3] - behind)
             if scale < 1:
                 color = nn.functional.interpolate(
                     color[None], (rows, columns), mode="bilinear", antialias=True
                 )[0]
             own = images[int(views.frames[place]), k, :, top : top + rows, left : left + columns]
             own.copy_((255 * color).round().clamp(0, 255))
+    first = int(views.frames.min())
     images[:first] = images[first]
     return images
+
+
+def cameras_of_every_frame(views: Views) -> list[int]:
+    """The fixed cameras that have an image of each frame that any camera has."""
+    assert views.frames is not None
+    frames_of: dict[int, set[int]] = {}
+    for camera, frame in zip(views.view.tolist(), views.frames.tolist(), strict=True):
+        frames_of.setdefault(camera, set()).add(frame)
+    every = set().union(*frames_of.values())
+    return sorted(camera for camera, frames in frames_of.items() if frames == every)

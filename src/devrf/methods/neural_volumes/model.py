@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping
-from dataclasses import asdict
-from typing import Any, ClassVar
+from collections.abc import Collection, Iterable
+from dataclasses import replace
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from devrf.data.batch import RayBatch
-from devrf.geometry.box import Box
-from devrf.geometry.clock import FrameClock
 from devrf.geometry.rays import Rays
-from devrf.geometry.space import WORLD
-from devrf.methods.base import RayTrainable
 from devrf.methods.nerf.occupancy import OccupancyFrames
-from devrf.methods.nerf.ray_view import RayView
+from devrf.methods.nerf.placed_model import PlacedModel, RayView
 from devrf.methods.nerf.samples import RaySamples
 from devrf.methods.neural_volumes.capture import check_scene, encoder_images
 from devrf.methods.neural_volumes.networks import AffineWarp, ConvWarp, TimeEncoder, VolumeDecoder
@@ -36,45 +32,36 @@ from devrf.scenes.scene import Scene
 MOMENTS = 16
 
 
-class NeuralVolumes(RayTrainable):
+class NeuralVolumes(PlacedModel):
     """z from the images of a moment; a template and a warp from z, seen by adding up opacity."""
 
     name: ClassVar[str] = "neural_volumes"
     losses: ClassVar[tuple[str, ...]] = ("color", "kl", "opacity_prior", "tv")
     protocols: ClassVar[tuple[str, ...] | None] = ("joint", "dynamic")
+    settings_class = NeuralVolumesSettings
+    settings: NeuralVolumesSettings
     codes: Tensor
     images: Tensor
 
     def __init__(self, settings: NeuralVolumesSettings | None = None) -> None:
-        """Build the networks.
-
-        Args:
-            settings: sizes and sampling.
-        """
-        super().__init__()
-        self.settings = s = settings or NeuralVolumesSettings()
-        self.encoder = TimeEncoder(
-            s.encoder_views, s.encoder_size, s.encoder_channels, s.encoder_width, s.code
-        )
+        """Build the networks, as published if no settings are given."""
+        s = settings or NeuralVolumesSettings()
+        super().__init__(s)
+        self.encoder = TimeEncoder(s)
         self.template = VolumeDecoder(s.code, s.template_channels, 4)
         # Whatever the scale, the cube begins as translucent as published: softplus(0) = ln 2.
         with torch.no_grad():
             assert self.template.output.bias is not None
             self.template.output.bias[3] = math.log(math.expm1(math.log(2) / s.density_scale))
-        self.warp: ConvWarp | AffineWarp = (
-            ConvWarp(s.code, s.warp_channels, s.warp_scale)
-            if s.warp == "conv"
-            else AffineWarp(s.code, s.warp_side, s.maps)
-        )
-        self.occupancy = OccupancyFrames(1, (2, 2, 2))
+        self.warp: ConvWarp | AffineWarp = ConvWarp(s) if s.warp == "conv" else AffineWarp(s)
         self.register_buffer("images", torch.zeros(0, dtype=torch.uint8), persistent=False)
         self.register_buffer("codes", torch.zeros(1, s.code))
         self.register_state_dict_pre_hook(_keep_codes)  # type: ignore[no-untyped-call]
-        self.space = WORLD
-        self._place(Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)), (0.0, 1.0), (0.0,))
+        self.place()
 
-    def _place(self, box: Box, limits: tuple[float, float], times: tuple[float, ...]) -> None:
-        self.box, self.depth_limits, self.clock = box, limits, FrameClock(times)
+    def set_times(self, times: tuple[float, ...]) -> None:
+        """Take the frames' times; a checkpoint has a code of each."""
+        super().set_times(times)
         self.codes = self.codes.new_zeros(len(times), self.settings.code)
 
     def setup(self, scene: Scene) -> None:
@@ -87,34 +74,12 @@ class NeuralVolumes(RayTrainable):
         check_scene(scene)
         bounds, s = scene.bounds, self.settings
         box = bounds.motion or bounds.box.scaled(bounds.scale)
-        self._place(box, (bounds.near, bounds.far), scene.clock.times)
+        self.set_place(box, scene.space, (bounds.near, bounds.far))
+        self.set_times(scene.clock.times)
         self.images = encoder_images(scene, s).to(self.device)
         if s.hull:
-            self.occupancy = OccupancyFrames.of(
-                scene, box, s.occupancy_side, self.device, hull=True
-            )
-
-    @property
-    def has_hull(self) -> bool:
-        """Whether the occupancy was carved from alpha masks."""
-        return self.occupancy.has_hull
-
-    def config(self) -> dict[str, Any]:
-        """Settings, and where and when the scene is."""
-        return {
-            "settings": asdict(self.settings),
-            "box": [list(self.box.low), list(self.box.high)],
-            "limits": list(self.depth_limits),
-            "times": list(self.clock.times),
-        }
-
-    @classmethod
-    def from_config(cls, config: Mapping[str, Any]) -> NeuralVolumes:
-        """Networks of the same sizes in the same place; without images, codes stand in for them."""
-        model = cls(NeuralVolumesSettings(**config["settings"]))
-        near, far = config["limits"]
-        model._place(Box.of(*config["box"]), (near, far), tuple(config["times"]))
-        return model
+            occupancy = OccupancyFrames.of(scene, box, s.occupancy_side, hull=True)
+            self.occupancy = occupancy.to(self.device)
 
     def parts(self) -> dict[str, Iterable[nn.Parameter]]:
         """Encoder, template and warp."""
@@ -137,12 +102,7 @@ class NeuralVolumes(RayTrainable):
             batch.rays, volumes, moment, pair, batch.background, jitter=self.training
         )
         extras = {"mean": mean, "log_deviation": log_deviation, "voxels": volumes.template[:, 3]}
-        return RenderOutput(
-            color=output.color,
-            depth=output.depth,
-            transmittance=output.transmittance,
-            extras=extras,
-        )
+        return replace(output, extras=extras)
 
     def encoded(self, frames: Tensor) -> tuple[Tensor, Tensor]:
         """μ and log s, (M, code) each, of ``frames`` (M,), from their images."""
@@ -191,7 +151,7 @@ class NeuralVolumes(RayTrainable):
     def loss_terms(
         self, output: RenderOutput, batch: RayBatch, names: Collection[str]
     ) -> dict[str, Tensor]:
-        """``color``, and the priors of codes, rays and voxels (losses.py)."""
+        """``color``, and the priors of codes, rays and voxels (``volumes.py``)."""
         terms = super().loss_terms(output, batch, names) if "color" in names else {}
         if "kl" in names:
             terms["kl"] = code_divergence(output.extras["mean"], output.extras["log_deviation"])
@@ -212,23 +172,14 @@ class NeuralVolumes(RayTrainable):
     @torch.no_grad()
     def at(self, time: float, *, half: bool = False) -> RayView:
         """The scene at ``time``; its volume is decoded here, once for all pictures."""
-        moment = self.clock.at(time)
-        decoded = Decoded(self, self.decoded(self.code_at(time)), (moment.before, moment.after))
-        return RayView(decoded, time, self.device, at_rest=moment.after == 0, half=half)
+        moment, volumes = self.clock.at(time), self.decoded(self.code_at(time))
 
+        def render_rays(rays: Rays, times: Tensor, background: Tensor) -> RenderOutput:
+            first = torch.zeros_like(times, dtype=torch.long)
+            frames = (first + moment.before, first + moment.after)
+            return self.render(rays, volumes, first, frames, background)
 
-class Decoded:
-    """Neural Volumes at one time, decoded."""
-
-    def __init__(self, model: NeuralVolumes, volumes: Volumes, frames: tuple[int, int]) -> None:
-        """Keep the volume and the frames around its time."""
-        self._model, self._volumes, self._frames = model, volumes, frames
-
-    def render_rays(self, rays: Rays, time: Tensor, background: Tensor) -> RenderOutput:
-        """What rays see at that time."""
-        moment = torch.zeros_like(time, dtype=torch.long)
-        before, after = (torch.full_like(moment, frame) for frame in self._frames)
-        return self._model.render(rays, self._volumes, moment, (before, after), background)
+        return RayView(self, render_rays, time, half=half)
 
 
 @torch.no_grad()

@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
 
+from devrf.methods.neural_volumes.settings import NeuralVolumesSettings
+
 LEAK = 0.2
+Layer = TypeVar("Layer", nn.Linear, nn.Conv2d)
 
 
-def linear(inputs: int, outputs: int, leak: float = LEAK) -> nn.Linear:
-    """A linear layer with Xavier's uniform weights; ``leak`` 1 for one without activation."""
-    layer = nn.Linear(inputs, outputs)
+def xavier(layer: Layer, leak: float = LEAK) -> Layer:
+    """``layer`` with Xavier's uniform weights; ``leak`` 1 for one without activation."""
     nn.init.xavier_uniform_(layer.weight, nn.init.calculate_gain("leaky_relu", leak))
-    nn.init.zeros_(layer.bias)
-    return layer
-
-
-def halving(inputs: int, outputs: int) -> nn.Conv2d:
-    """A convolution that halves an image (4×4, stride 2)."""
-    layer = nn.Conv2d(inputs, outputs, 4, 2, 1)
-    nn.init.xavier_uniform_(layer.weight, nn.init.calculate_gain("leaky_relu", LEAK))
     assert layer.bias is not None
     nn.init.zeros_(layer.bias)
     return layer
@@ -64,7 +59,7 @@ class VolumeDecoder(nn.Module):
         levels: list[nn.Module] = [nn.LeakyReLU(LEAK)]
         for read, made in zip(channels, channels[1:], strict=False):
             levels += [doubling(read, made), nn.LeakyReLU(LEAK)]
-        self.first, self.levels = linear(code, channels[0]), nn.Sequential(*levels)
+        self.first, self.levels = xavier(nn.Linear(code, channels[0])), nn.Sequential(*levels)
         self.output = doubling(channels[-1], outputs, 1.0)
         self.side = 2 ** len(channels)
 
@@ -81,30 +76,21 @@ MEAN, DEVIATION = 100 / 255, 25 / 255
 class TimeEncoder(nn.Module):
     """K images of a moment → μ and log s of its code (docs/methods/neural_volumes.md#encoder)."""
 
-    def __init__(
-        self, views: int, size: Sequence[int], channels: Sequence[int], width: int, code: int
-    ) -> None:
-        """Build a stack of convolutions for each camera, and the layers that join them.
-
-        Args:
-            views: K cameras.
-            size: height and width of an image.
-            channels: of each convolution.
-            width: units of the joining layer.
-            code: numbers in a code.
-        """
+    def __init__(self, settings: NeuralVolumesSettings) -> None:
+        """Build a stack of convolutions for each camera, and the layers that join them."""
         super().__init__()
-        stack = [3, *channels]
+        s, stack = settings, [3, *settings.encoder_channels]
         self.cameras = nn.ModuleList()
-        for _ in range(views):
+        for _ in range(s.encoder_views):
             layers: list[nn.Module] = []
             for read, made in zip(stack, stack[1:], strict=False):
-                layers += [halving(read, made), nn.LeakyReLU(LEAK)]
+                layers += [xavier(nn.Conv2d(read, made, 4, 2, 1)), nn.LeakyReLU(LEAK)]
             self.cameras.append(nn.Sequential(*layers, nn.Flatten()))
-        cells = (size[0] >> len(channels)) * (size[1] >> len(channels))
-        joined = linear(views * channels[-1] * cells, width)
+        height, width = (edge >> len(s.encoder_channels) for edge in s.encoder_size)
+        joined = xavier(nn.Linear(s.encoder_views * stack[-1] * height * width, s.encoder_width))
         self.joined = nn.Sequential(joined, nn.LeakyReLU(LEAK))
-        self.mean, self.log_deviation = linear(width, code, 1.0), linear(width, code, 1.0)
+        self.mean = xavier(nn.Linear(s.encoder_width, s.code), 1.0)
+        self.log_deviation = xavier(nn.Linear(s.encoder_width, s.code), 1.0)
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """μ and log s, (M, code) each.
@@ -136,17 +122,10 @@ class ConvWarp(nn.Module):
 
     grid: Tensor
 
-    def __init__(self, code: int, channels: list[int], scale: float) -> None:
-        """Build the decoder of displacements.
-
-        Args:
-            code: numbers in a code.
-            channels: as of :class:`VolumeDecoder`.
-            scale: displacement for an output of 1; the cube's edge is 2.
-        """
+    def __init__(self, settings: NeuralVolumesSettings) -> None:
         super().__init__()
-        self.scale = scale
-        self.decoder = VolumeDecoder(code, channels, 3)
+        self.scale = settings.warp_scale
+        self.decoder = VolumeDecoder(settings.code, settings.warp_channels, 3)
         self.register_buffer("grid", identity_grid(self.decoder.side), persistent=False)
 
     def forward(self, code: Tensor) -> Tensor:
@@ -164,16 +143,15 @@ class AffineWarp(nn.Module):
 
     grid: Tensor
 
-    def __init__(self, code: int, side: int, maps: int) -> None:
-        """Build the networks of the maps and of their weights."""
+    def __init__(self, settings: NeuralVolumesSettings) -> None:
         super().__init__()
+        code, side, maps = settings.code, settings.warp_side, settings.maps
         self.side, self.maps = side, maps
         self.scale, self.rotation, self.shift = (
             _small_network(code, 128, outputs * maps) for outputs in (3, 4, 3)
         )
-        self.weight = nn.Sequential(
-            linear(code, 64), nn.LeakyReLU(LEAK), linear(64, maps * side**3, 1.0)
-        )
+        first, last = xavier(nn.Linear(code, 64)), xavier(nn.Linear(64, maps * side**3), 1.0)
+        self.weight = nn.Sequential(first, nn.LeakyReLU(LEAK), last)
         self.register_buffer("grid", identity_grid(side), persistent=False)
 
     def forward(self, code: Tensor) -> Tensor:
@@ -207,4 +185,4 @@ def _small_network(code: int, width: int, outputs: int) -> nn.Sequential:
     last = nn.Linear(width, outputs)
     nn.init.uniform_(last.weight, -SMALL, SMALL)
     nn.init.zeros_(last.bias)
-    return nn.Sequential(linear(code, width), nn.LeakyReLU(LEAK), last)
+    return nn.Sequential(xavier(nn.Linear(code, width)), nn.LeakyReLU(LEAK), last)

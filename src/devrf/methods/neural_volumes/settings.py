@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from devrf.errors import DevrfError
+from devrf.errors import expect
 
 KEY = "ray_stage.model.settings"
 
@@ -53,26 +53,23 @@ class NeuralVolumesSettings:
     def __post_init__(self) -> None:
         least = {"code": 1, "encoder_views": 1, "encoder_width": 1, "warp_width": 1, "maps": 1}
         for name, smallest in {**least, "occupancy_side": 2}.items():
-            if getattr(self, name) < smallest:
-                raise _refused(name, f"at least {smallest}", getattr(self, name))
+            self._expect(name, getattr(self, name) >= smallest, f"at least {smallest}")
         for name in ("density_scale", "step", "warp_scale"):
-            if not getattr(self, name) > 0:
-                raise _refused(name, "more than 0", getattr(self, name))
+            self._expect(name, getattr(self, name) > 0, "more than 0")
         for name in ("encoder_channels", "template_channels"):
-            if not getattr(self, name) or min(getattr(self, name)) < 1:
-                raise _refused(name, "one or more numbers above 0", list(getattr(self, name)))
-        if self.warp_side < 2 or self.warp_side & (self.warp_side - 1):
-            raise _refused("warp_side", "a power of two", self.warp_side)
-        multiple = 2 ** len(self.encoder_channels)
-        size = self.encoder_size
-        if len(size) != 2 or any(edge < multiple or edge % multiple for edge in size):
-            raise _refused("encoder_size", f"two multiples of {multiple}", list(size))
+            channels = getattr(self, name)
+            self._expect(name, channels and min(channels) >= 1, "one or more numbers above 0")
+        side, multiple = self.warp_side, 2 ** len(self.encoder_channels)
+        self._expect("warp_side", side >= 2 and not side & (side - 1), "a power of two")
+        holds = len(self.encoder_size) == 2 and all(
+            edge >= multiple and edge % multiple == 0 for edge in self.encoder_size
+        )
+        self._expect("encoder_size", holds, f"two multiples of {multiple}")
+
+    def _expect(self, name: str, holds: bool, expected: str) -> None:
+        expect(holds, f"{KEY}.{name}", expected, getattr(self, name))
 
     @property
     def warp_channels(self) -> list[int]:
         """Of each level of the convolutional warp, from 1³ on."""
         return [self.warp_width] * (self.warp_side.bit_length() - 1)
-
-
-def _refused(name: str, expected: str, given: object) -> DevrfError:
-    return DevrfError(f"{KEY}.{name}: expected {expected}, not {given}")

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from devrf.methods.nerf.samples import RaySamples
-from devrf.ops.compositing import color_and_depth, sum_by_ray
+from devrf.methods.nerf.samples import RaySamples, accumulated
+from devrf.ops.compositing import sum_by_ray
 from devrf.rendering.output import RenderOutput
 
 
@@ -82,14 +82,10 @@ def seen(samples: RaySamples, values: Tensor, background: Tensor) -> RenderOutpu
         values: (S, 4) RGB and opacity per unit of the samples' lengths.
         background: (3,) or (R, 3) RGB.
     """
-    ray, rays = samples.ray, samples.rays
-    weight, opacity = added_opacity(values[:, 3] * samples.length, ray, rays)
-    found = sum_by_ray(weight[:, None] * values[:, :3], ray, rays)
-    transmittance = 1 - opacity
-    with torch.no_grad():
-        reached, mass = sum_by_ray(weight * samples.distance, ray, rays), opacity.detach()
-    color, depth = color_and_depth(found, reached, mass, transmittance, background)
-    return RenderOutput(color=color, depth=depth, transmittance=transmittance)
+    amount = values[:, 3] * samples.length
+    weight, opacity = added_opacity(amount, samples.ray, samples.rays)
+    color = weight[:, None] * values[:, :3]
+    return accumulated(samples, weight, color, 1 - opacity, background)
 
 
 # log(0.1) + log(1.1): the opacity prior is 0 where all or nothing is seen.

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
-from devrf.methods.nerf.networks import SinusoidalEncoding, Trunk
+from devrf.methods.nerf.networks import RadianceField
 from devrf.methods.nsff.settings import NSFFSettings
 from devrf.ops.compositing import composite, sum_by_ray
-from devrf.system.device import multiplies_bfloat16
 
 # No sample is more opaque than 1 − LEAST: its optical depth stays finite.
 LEAST = 1e-6
@@ -122,71 +120,21 @@ class DynamicSamples:
     occlusion: Tensor
 
 
-class HeadedField(nn.Module):
-    """A radiance field with one more linear head on its trunk."""
-
-    def __init__(self, inputs: int, further: int, settings: NSFFSettings) -> None:
-        """Build the network.
-
-        Args:
-            inputs: length of what is encoded.
-            further: numbers of the additional head.
-            settings: sizes.
-        """
-        super().__init__()
-        width = settings.width
-        self._precision = settings.precision
-        self.encode = SinusoidalEncoding(inputs, settings.bands)
-        self.encode_direction = SinusoidalEncoding(3, settings.direction_bands)
-        self.trunk = Trunk(self.encode.size, width, settings.depth, skip=settings.skip)
-        self.density = nn.Linear(width, 1)
-        self.further = nn.Linear(width, further)
-        self.feature = nn.Linear(width, width)
-        self.branch = nn.Linear(width + self.encode_direction.size, width // 2)
-        self.color = nn.Linear(width // 2, 3)
-
-    def forward(
-        self, values: Tensor, viewdirs: Tensor, ray: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Density before its activation (S,), RGB (S, 3), and the additional head's numbers (S, K).
-
-        Args:
-            values: (S, inputs) in normalised space; in [−1, 1] where training rays were.
-            viewdirs: (R, 3) unit viewing directions of the rays.
-            ray: (S,) int64, the ray of each sample.
-        """
-        encoded = self.encode(values)
-        direction = self.encode_direction(viewdirs).index_select(0, ray)
-        reduced = self._precision == "bfloat16"
-        if self._precision == "auto":
-            reduced = multiplies_bfloat16(values.device)
-        reduced = reduced and self.training
-        with torch.autocast(values.device.type, torch.bfloat16) if reduced else nullcontext():
-            x = self.trunk(encoded)
-            raw, further = self.density(x)[:, 0], self.further(x)
-            x = torch.relu(self.branch(torch.cat([self.feature(x), direction], dim=-1)))
-            color = self.color(x)
-        return raw.float(), torch.sigmoid(color.float()), further.float()
-
-    def density_alone(self, values: Tensor) -> Tensor:
-        """Density before its activation (S,) at ``values`` (S, inputs)."""
-        raw: Tensor = self.density(self.trunk(self.encode(values)))
-        return raw[:, 0]
-
-
-class StaticField(HeadedField):
+class StaticField(RadianceField):
     """S(γ(x), γ(d)) → σ_s, c_s, v (docs/methods/nsff.md#model)."""
 
     def __init__(self, settings: NSFFSettings) -> None:
-        super().__init__(3, 1, settings)
+        super().__init__(settings, further=1)
 
     def at(self, points: Tensor, viewdirs: Tensor, ray: Tensor) -> StaticSamples:
-        """The field at points (S, 3); other arguments as for :meth:`HeadedField.forward`."""
-        raw, color, further = self(points, viewdirs, ray)
-        return StaticSamples(raw, color, torch.sigmoid(further[:, 0]))
+        """The field at points (S, 3); other arguments as for :meth:`forward`."""
+        with self.reduced():
+            raw, color, share = self.heads(points, viewdirs, ray)
+        share = torch.sigmoid(share[:, 0].float())
+        return StaticSamples(raw.float(), torch.sigmoid(color.float()), share)
 
 
-class DynamicField(HeadedField):
+class DynamicField(RadianceField):
     """D(γ(x, 2t − 1), γ(d)) → σ_d, c_d, f⁺, f⁻, o⁺, o⁻ (docs/methods/nsff.md#model).
 
     Attributes:
@@ -194,18 +142,26 @@ class DynamicField(HeadedField):
     """
 
     def __init__(self, settings: NSFFSettings) -> None:
-        super().__init__(4, 8, settings)
+        super().__init__(settings, inputs=4, further=8)
         self.reach = 1.0
+        assert self.further is not None
         with torch.no_grad():
             self.further.weight[:6].uniform_(-SMALL, SMALL)
             self.further.bias[:6].zero_()
 
     def at(self, points: Tensor, time: Tensor, viewdirs: Tensor, ray: Tensor) -> DynamicSamples:
         """The field at points (S, 3) and times (S,) in [0, 1]; else as :meth:`forward`."""
-        values = torch.cat([points, 2 * time[:, None] - 1], dim=-1)
-        raw, color, further = self(values, viewdirs, ray)
-        flow = self.reach * torch.tanh(further[:, :6]).view(-1, 2, 3)
-        return DynamicSamples(raw, color, flow, torch.sigmoid(further[:, 6:]))
+        with self.reduced():
+            raw, color, motion = self.heads(with_time(points, time), viewdirs, ray)
+        motion = motion.float()
+        flow = self.reach * torch.tanh(motion[:, :6]).view(-1, 2, 3)
+        color, occlusion = torch.sigmoid(color.float()), torch.sigmoid(motion[:, 6:])
+        return DynamicSamples(raw.float(), color, flow, occlusion)
+
+
+def with_time(points: Tensor, time: Tensor) -> Tensor:
+    """(x, 2t − 1) (S, 4) of points (S, 3) and times (S,) in [0, 1]."""
+    return torch.cat([points, 2 * time[:, None] - 1], dim=-1)
 
 
 class TwoFields(nn.Module):
@@ -227,7 +183,7 @@ class TwoFields(nn.Module):
         """Noise for densities like ``raw`` (S,) while they are learned; 0 otherwise."""
         return self._noise * torch.randn_like(raw) if self.training and self._noise else 0.0
 
-    def optical_depth(self, raw: Tensor, length: Tensor, noise: Tensor | float) -> Tensor:
+    def optical_depth(self, raw: Tensor, length: Tensor | float, noise: Tensor | float) -> Tensor:
         """τ = σ δ (S,) with σ = scale · softplus(raw + noise); ``length`` in normalised units."""
         return nn.functional.softplus(raw + noise) * self._scale * length
 

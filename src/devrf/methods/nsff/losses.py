@@ -3,41 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from devrf.methods.nerf.placement import Placement
 from devrf.methods.nsff.fields import BACKWARD, FORWARD
 from devrf.methods.nsff.priors import ImagePriors
-from devrf.methods.nsff.renders import Renders, Warp
+from devrf.methods.nsff.renders import Renders
 from devrf.ops.compositing import sum_by_ray
 
 # Shares of the nearest depths whose flow is held smooth in space, and in time.
 SPACE_SHARE, TIME_SHARE = 0.95, 0.9
 EPS = 1e-6
-
-
-@dataclass(frozen=True)
-class LossInput:
-    """What the terms of an iteration are computed from.
-
-    Attributes:
-        renders: the batch and its further renders.
-        placement: where the networks live.
-        priors: of the images that the rays were drawn from; None where nothing is known.
-        step: the iteration.
-        chains: whether flows are chained by now.
-        prior_factor: what the weights of depth and flow priors have decayed to.
-    """
-
-    renders: Renders
-    placement: Placement
-    priors: ImagePriors | None
-    step: int
-    chains: bool
-    prior_factor: float
 
 
 def photometric(color: Tensor, truth: Tensor, weight: Tensor) -> Tensor:
@@ -46,80 +23,72 @@ def photometric(color: Tensor, truth: Tensor, weight: Tensor) -> Tensor:
     return (weight * error).sum() / weight.sum().clamp(min=EPS)
 
 
-def color(given: LossInput) -> Tensor:
+def color(r: Renders) -> Tensor:
     """‖C − C_gt‖² of the blended render."""
-    r = given.renders
     return photometric(r.output.color, r.batch.color, torch.ones_like(r.batch.time))
 
 
-def dynamic(given: LossInput) -> Tensor:
+def dynamic(r: Renders) -> Tensor:
     """‖C_d − C_gt‖²; rays weighted by sg(Σ w_d) after N₀."""
-    r = given.renders
     return photometric(r.alone[0], r.batch.color, r.dynamic_share)
 
 
-def neighbours(given: LossInput) -> Tensor:
+def neighbours(r: Renders) -> Tensor:
     """Σ_j ‖C_{j→i} − C_gt‖², rays weighted by Ŵ_{j→i}, and by sg(Σ w_d) after N₀."""
-    r = given.renders
     terms = [photometric(w.color, r.batch.color, r.trust(w) * r.dynamic_share) for w in r.warps]
     return torch.stack(terms).sum()
 
 
-def chained(given: LossInput) -> Tensor:
+def chained(r: Renders) -> Tensor:
     """‖C_{k→i} − C_gt‖² of the frame k two steps away, rays weighted by sg(Σ w_d)."""
-    r = given.renders
-    if not given.chains:
+    if not r.chains:
         return r.output.color.new_zeros(())
-    warp = r.chained(given.step)
+    warp = r.chained()
     return photometric(warp.color, r.batch.color, warp.there * r.dynamic_share)
 
 
-def cycle(given: LossInput) -> Tensor:
+def cycle(r: Renders) -> Tensor:
     """‖f_{i→j}(x) + f_{j→i}(x + f_{i→j})‖₁, samples weighted by W = 1 − o_{i→j}."""
-    return torch.stack([_returning(given.renders, warp) for warp in given.renders.warps]).sum()
+    terms = []
+    for warp in r.warps:
+        sample = torch.arange(len(warp.kept), device=warp.kept.device)
+        back = warp.found.flow[sample, 1 - warp.side[warp.ray]]
+        trust = torch.ones_like(warp.occlusion) if r.fields.additive else 1 - warp.occlusion
+        miss = (warp.moved + back).abs().mean(dim=1)
+        terms.append((trust * miss).sum() / trust.sum().clamp(min=EPS))
+    return torch.stack(terms).sum()
 
 
-def _returning(renders: Renders, warp: Warp) -> Tensor:
-    number = torch.arange(len(warp.kept), device=warp.kept.device)
-    back = warp.found.flow[number, 1 - warp.side[warp.ray]]
-    trust = torch.ones_like(warp.occlusion) if renders.fields.additive else 1 - warp.occlusion
-    miss = (warp.moved + back).abs().mean(dim=1)
-    return (trust * miss).sum() / trust.sum().clamp(min=EPS)
-
-
-def small_flow(given: LossInput) -> Tensor:
+def small_flow(r: Renders) -> Tensor:
     """‖Σ sg(w) f‖₁ of the rendered flow, both ways."""
-    r = given.renders
     weight = r.seen[1].detach()[:, None, None]
     return sum_by_ray(weight * r.output.dynamic.flow, r.output.samples.ray, r.rays).abs().mean()
 
 
-def smooth_space(given: LossInput) -> Tensor:
+def smooth_space(r: Renders) -> Tensor:
     """‖Δ_k (X' − X)‖₁ between neighbours on a ray, X' = X + flow in Euclidean space."""
-    out = given.renders.output
-    start = given.placement.euclidean(out.points)
-    near = given.placement.within(out.points, SPACE_SHARE)
+    out = r.output
+    start = r.placement.euclidean(out.points)
+    near = r.placement.within(out.points, SPACE_SHARE)
     ray = out.samples.ray
     pair = ((ray[1:] == ray[:-1]) & near[1:] & near[:-1])[:, None]
     terms = []
     for side in (FORWARD, BACKWARD):
-        moved = given.placement.euclidean(out.points + out.dynamic.flow[:, side]) - start
+        moved = r.placement.euclidean(out.points + out.dynamic.flow[:, side]) - start
         terms.append(_mean((moved[1:] - moved[:-1]).abs(), pair))
     return torch.stack(terms).sum()
 
 
-def smooth_time(given: LossInput) -> Tensor:
+def smooth_time(r: Renders) -> Tensor:
     """½‖X⁺ + X⁻ − 2X‖², twice for a ray's own points, once for those of the chained pair."""
-    r = given.renders
-    found = 2 * _bending(given, r.output.points, r.output.dynamic.flow)
-    if given.chains:
-        near = r.warps[given.step % len(r.warps)]
-        found = found + _bending(given, near.points, near.found.flow)
+    found = 2 * _bending(r, r.output.points, r.output.dynamic.flow)
+    if r.chains:
+        found = found + _bending(r, r.near.points, r.near.found.flow)
     return found
 
 
-def _bending(given: LossInput, points: Tensor, flow: Tensor) -> Tensor:
-    place = given.placement
+def _bending(r: Renders, points: Tensor, flow: Tensor) -> Tensor:
+    place = r.placement
     after, before = (place.euclidean(points + flow[:, side]) for side in (FORWARD, BACKWARD))
     bend = 0.5 * (after + before - 2 * place.euclidean(points)).square()
     return _mean(bend, place.within(points, TIME_SHARE)[:, None])
@@ -131,11 +100,10 @@ def _mean(values: Tensor, mask: Tensor) -> Tensor:
     return total / (values.shape[1] * mask.sum()).clamp(min=1)
 
 
-def depth(given: LossInput) -> Tensor:
+def depth(r: Renders) -> Tensor:
     """Mean squared difference of rendered and known depth, each normalised over the batch."""
-    assert given.priors is not None
-    r = given.renders
-    truth = given.priors.distance(r.batch)
+    assert r.priors is not None
+    truth = r.priors.distance(r.batch)
     known = truth.isfinite().nonzero()[:, 0]
     if len(known) < 2:
         return r.output.color.new_zeros(())
@@ -143,7 +111,7 @@ def depth(given: LossInput) -> Tensor:
     mass = sum_by_ray(weight, samples.ray, r.rays).clamp(min=1e-3)
     found = sum_by_ray(weight * samples.distance, samples.ray, r.rays) / mass
     difference = normalised(found[known]) - normalised(truth[known])
-    return given.prior_factor * difference.square().mean()
+    return r.prior_factor * difference.square().mean()
 
 
 def normalised(depth: Tensor) -> Tensor:
@@ -152,43 +120,40 @@ def normalised(depth: Tensor) -> Tensor:
     return away / away.abs().mean().clamp(min=1e-3)
 
 
-def flow(given: LossInput) -> Tensor:
+def flow(r: Renders) -> Tensor:
     """‖proj_j(Σ w (x + f_{i→j})) − (p + flow)‖₁ in pixels, where flow is known."""
-    assert given.priors is not None
-    terms = [_flow_error(given, side) for side in (FORWARD, BACKWARD)]
-    return given.prior_factor * torch.stack(terms).sum()
-
-
-def _flow_error(given: LossInput, side: int) -> Tensor:
-    assert given.priors is not None
-    r, samples = given.renders, given.renders.output.samples
-    observed, valid = given.priors.flow(r.batch, side)
+    assert r.priors is not None
+    out, ray = r.output, r.output.samples.ray
     weight, moving = r.seen
-    place = weight[:, None] * r.output.points + moving[:, None] * r.output.dynamic.flow[:, side]
-    mass = sum_by_ray(weight, samples.ray, r.rays)
-    mean = sum_by_ray(place, samples.ray, r.rays) / mass.clamp(min=1e-3)[:, None]
-    camera = given.priors.neighbour[r.batch.image, side]
-    pixel, ahead = given.priors.cameras.project(camera, given.placement.world(mean))
-    counts = (valid & (ahead > 0) & (mass > 1e-3))[:, None]
-    miss = torch.where(counts, pixel - (r.batch.pixel + observed), 0.0)
-    return miss.abs().sum() / (2 * counts.sum()).clamp(min=1)
+    terms = []
+    for side in (FORWARD, BACKWARD):
+        observed, valid = r.priors.flow(r.batch, side)
+        place = weight[:, None] * out.points + moving[:, None] * out.dynamic.flow[:, side]
+        mass = sum_by_ray(weight, ray, r.rays)
+        mean = sum_by_ray(place, ray, r.rays) / mass.clamp(min=1e-3)[:, None]
+        camera = r.priors.neighbour[r.batch.image, side]
+        pixel, ahead = r.priors.cameras.project(camera, r.placement.world(mean))
+        counts = (valid & (ahead > 0) & (mass > 1e-3))[:, None]
+        miss = torch.where(counts, pixel - (r.batch.pixel + observed), 0.0)
+        terms.append(miss.abs().sum() / (2 * counts.sum()).clamp(min=1))
+    return r.prior_factor * torch.stack(terms).sum()
 
 
-def disocclusion(given: LossInput) -> Tensor:
+def disocclusion(r: Renders) -> Tensor:
     """Mean o⁺ + mean o⁻."""
-    return given.renders.output.dynamic.occlusion.mean(dim=0).sum()
+    return r.output.dynamic.occlusion.mean(dim=0).sum()
 
 
-def blend_entropy(given: LossInput) -> Tensor:
+def blend_entropy(r: Renders) -> Tensor:
     """−v log v; where densities add, of the share w_d / (w_d + w_s)."""
-    out = given.renders.output
+    out = r.output
     share = out.static.blend
-    if given.renders.fields.additive:
+    if r.fields.additive:
         share = out.blend.dynamic / (out.blend.dynamic + out.blend.static).clamp(min=1e-10)
     return -(share * share.clamp(min=1e-10).log()).mean()
 
 
-TERMS: Mapping[str, Callable[[LossInput], Tensor]] = {
+TERMS: Mapping[str, Callable[[Renders], Tensor]] = {
     "color": color,
     "dynamic": dynamic,
     "neighbours": neighbours,

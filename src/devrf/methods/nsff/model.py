@@ -16,14 +16,13 @@ from devrf.geometry.box import Box
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import Space
-from devrf.methods.nerf.placed_model import PlacedModel
-from devrf.methods.nerf.samples import RaySamples, evenly
-from devrf.methods.nsff.fields import TwoFields
-from devrf.methods.nsff.losses import TERMS, LossInput, missing_terms
+from devrf.methods.nerf.placed_model import NeuralField
+from devrf.methods.nerf.samples import RaySamples, accumulated, evenly
+from devrf.methods.nsff.fields import TwoFields, with_time
+from devrf.methods.nsff.losses import TERMS, missing_terms
 from devrf.methods.nsff.priors import ImagePriors
 from devrf.methods.nsff.renders import BlendedOutput, Renders
 from devrf.methods.nsff.settings import NSFFSettings, Warmup
-from devrf.ops.compositing import color_and_depth, sum_by_ray
 from devrf.rendering.output import RenderOutput
 from devrf.scenes.scene import Scene, Views
 
@@ -33,7 +32,7 @@ log = logging.getLogger(__name__)
 REACH_IN_NDC, REACH_IN_A_BOX = 1.0, 0.2
 
 
-class NSFF(PlacedModel):
+class NSFF(NeuralField):
     """S(x, d) → σ_s, c_s, v and D(x, t, d) → σ_d, c_d, f±, o±, composited in one pass."""
 
     name: ClassVar[str] = "nsff"
@@ -42,17 +41,11 @@ class NSFF(PlacedModel):
     priors: ClassVar[tuple[str, ...]] = ("forward_flow",)
     settings_class = NSFFSettings
     settings: NSFFSettings
-
     times: Tensor
 
     def __init__(self, settings: NSFFSettings | None = None) -> None:
-        """Build the networks.
-
-        Args:
-            settings: sizes, sampling, blending and schedule.
-        """
-        super().__init__()
-        self.settings = settings or NSFFSettings()
+        """Build the networks, as published if no settings are given."""
+        super().__init__(settings or NSFFSettings())
         self.fields = TwoFields(self.settings)
         self._step, self._absent, self._cut_out = 0, frozenset[str](), True
         self._images: ImagePriors | None = None
@@ -97,16 +90,11 @@ class NSFF(PlacedModel):
         self._step = step
         super().on_iteration(step, total)
 
-    def opacity(self, points: Tensor, time: Tensor) -> Tensor:
-        """Opacity (S,) of a step at points (S, 3) and times (S,), of the denser field."""
-        points, step = self.placement.normalised(points), self.box.diagonal / self.settings.steps
-        still = self.fields.static.density_alone(points)
-        moving = self.fields.dynamic.density_alone(
-            torch.cat([points, 2 * time[:, None] - 1], dim=-1)
-        )
-        length = points.new_full((), step / self.placement.half_edge)
-        depth = self.fields.optical_depth(torch.maximum(still, moving), length, 0.0)
-        return -torch.expm1(-depth)
+    def optical_depth(self, points: Tensor, time: Tensor, length: float) -> Tensor:
+        """τ (S,) of the denser field."""
+        static = self.fields.static.raw_density(points)
+        dynamic = self.fields.dynamic.raw_density(with_time(points, time))
+        return self.fields.optical_depth(torch.maximum(static, dynamic), length, 0.0)
 
     @property
     def _first(self) -> int:
@@ -156,17 +144,13 @@ class NSFF(PlacedModel):
             fields.optical_depth(static.raw, samples.length, noise),
         )
         blend = fields.blended(*depths, static.blend, ray, len(rays), endless=self._endless)
-        moving, still = blend.dynamic[:, None], blend.static[:, None]
-        seen = sum_by_ray(moving * dynamic.color + still * static.color, ray, len(rays))
-        with torch.no_grad():
-            weight = blend.dynamic + blend.static
-            mass = sum_by_ray(weight, ray, len(rays))
-            reached = sum_by_ray(weight * samples.distance, ray, len(rays))
-        color, depth = color_and_depth(seen, reached, mass, blend.transmittance, background)
+        weight = blend.dynamic + blend.static
+        color = blend.dynamic[:, None] * dynamic.color + blend.static[:, None] * static.color
+        output = accumulated(samples, weight, color, blend.transmittance, background)
         return BlendedOutput(
-            color=color,
-            depth=depth,
-            transmittance=blend.transmittance,
+            color=output.color,
+            depth=output.depth,
+            transmittance=output.transmittance,
             samples=samples,
             points=points,
             static=static,
@@ -195,24 +179,21 @@ class NSFF(PlacedModel):
             DevrfError: nothing that counts is there.
         """
         assert isinstance(output, BlendedOutput)
-        s = self.settings
+        warmup, step = self.settings.warmup, self._step
         renders = Renders(
-            self.fields,
-            self.times,
-            output,
-            batch,
-            both=s.neighbours == "both",
-            weighted=self._step >= self._first,
-        )
-        given = LossInput(
-            renders=renders,
+            fields=self.fields,
             placement=self.placement,
+            times=self.times,
             priors=self._images,
-            step=self._step,
-            chains="chained" in names and self._step >= s.warmup.chained_from * self._first,
-            prior_factor=s.warmup.prior_factor(self._step, len(self.clock)),
+            output=output,
+            batch=batch,
+            step=step,
+            both=self.settings.neighbours == "both",
+            weighted=step >= self._first,
+            chains="chained" in names and step >= warmup.chained_from * self._first,
+            prior_factor=warmup.prior_factor(step, len(self.clock)),
         )
-        terms = {name: TERMS[name](given) for name in names if name not in self._absent}
+        terms = {name: TERMS[name](renders) for name in names if name not in self._absent}
         if not terms:
             raise DevrfError("ray_stage.loss: this scene has nothing for any of its terms")
         return terms

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from devrf.data.batch import RayBatch
+from devrf.methods.nerf.placement import Placement
 from devrf.methods.nerf.samples import RaySamples
 from devrf.methods.nsff.fields import (
     BACKWARD,
@@ -18,6 +19,7 @@ from devrf.methods.nsff.fields import (
     StaticSamples,
     TwoFields,
 )
+from devrf.methods.nsff.priors import ImagePriors
 from devrf.ops.compositing import composite, sum_by_ray
 from devrf.rendering.output import RenderOutput
 
@@ -74,37 +76,35 @@ class Warp:
     weight: Tensor
 
 
+@dataclass(frozen=True)
 class Renders:
-    """Further renders of a batch, each made when a loss first asks for it.
+    """What an iteration's loss terms compare; further renders are made when first asked for.
 
     Attributes:
         fields: the networks.
+        placement: where the networks live.
+        times: (T,) of the frames.
+        priors: of the images that the rays were drawn from; None where nothing is known.
         output: the batch as it was rendered.
-        batch: the rays, and the truth at their pixels.
+        batch: R rays, and the truth at their pixels.
+        step: the iteration.
+        both: render from both neighbouring frames; else from one at random.
+        weighted: weigh rays by how much of them is dynamic: the first N₀ iterations are over.
+        chains: whether flows are chained by now.
+        prior_factor: what the weights of depth and flow priors have decayed to.
     """
 
-    def __init__(
-        self,
-        fields: TwoFields,
-        times: Tensor,
-        output: BlendedOutput,
-        batch: RayBatch,
-        *,
-        both: bool,
-        weighted: bool,
-    ) -> None:
-        """Keep what there is to know.
-
-        Args:
-            fields: the networks.
-            times: (T,) of the frames.
-            output: the batch as it was rendered.
-            batch: R rays.
-            both: render from both neighbouring frames; else from one at random.
-            weighted: weigh rays by how much of them is dynamic: the first N₀ iterations are over.
-        """
-        self.fields, self.output, self.batch = fields, output, batch
-        self._times, self._both, self._weighted = times, both, weighted
+    fields: TwoFields
+    placement: Placement
+    times: Tensor
+    priors: ImagePriors | None
+    output: BlendedOutput
+    batch: RayBatch
+    step: int
+    both: bool
+    weighted: bool
+    chains: bool
+    prior_factor: float
 
     @property
     def rays(self) -> int:
@@ -114,7 +114,7 @@ class Renders:
     @cached_property
     def dynamic_share(self) -> Tensor:
         """(R,) sg(Σ w_d), how much of each ray is dynamic; 1 in the first N₀ iterations."""
-        if not self._weighted:
+        if not self.weighted:
             return torch.ones_like(self.batch.time)
         return sum_by_ray(self.output.blend.dynamic, self.output.samples.ray, self.rays).detach()
 
@@ -139,28 +139,27 @@ class Renders:
     @cached_property
     def warps(self) -> list[Warp]:
         """The rays rendered from one or both neighbouring frames."""
-        if self._both:
+        if self.both:
             sides = [torch.full_like(self.batch.frame, side) for side in (FORWARD, BACKWARD)]
         else:
             # At the ends of the recording there is one neighbour alone.
             side = (torch.rand_like(self.batch.time) < 0.5).long()
             side = torch.where(self.batch.frame == 0, FORWARD, side)
-            sides = [torch.where(self.batch.frame == len(self._times) - 1, BACKWARD, side)]
+            sides = [torch.where(self.batch.frame == len(self.times) - 1, BACKWARD, side)]
         every = torch.arange(len(self.output.points), device=self.batch.time.device)
         anyone = torch.ones_like(self.batch.time, dtype=torch.bool)
-        return [
-            self._warp(side, self.batch.frame, anyone, every, self.output.points, self.output)
-            for side in sides
-        ]
+        frame, points, dynamic = self.batch.frame, self.output.points, self.output.dynamic
+        return [self._warp(side, frame, anyone, every, points, dynamic) for side in sides]
 
-    def chained(self, number: int) -> Warp:
-        """The rays rendered from two frames away, flows chained, beyond a neighbour.
+    @property
+    def near(self) -> Warp:
+        """The rays rendered from a neighbouring frame: on either side by turns."""
+        return self.warps[self.step % len(self.warps)]
 
-        Args:
-            number: of an iteration, so that sides alternate.
-        """
-        near = self.warps[number % len(self.warps)]
-        return self._warp(near.side, near.frame, near.there, near.kept, near.points, near)
+    def chained(self) -> Warp:
+        """The rays rendered from two frames away, flows chained, beyond :attr:`near`."""
+        near = self.near
+        return self._warp(near.side, near.frame, near.there, near.kept, near.points, near.found)
 
     def _warp(
         self,
@@ -169,7 +168,7 @@ class Renders:
         there: Tensor,
         kept: Tensor,
         points: Tensor,
-        source: BlendedOutput | Warp,
+        dynamic: DynamicSamples,
     ) -> Warp:
         """One frame further to each ray's ``side`` (R,) from ``frame`` (R,), where there is one.
 
@@ -179,9 +178,9 @@ class Renders:
             there: (R,) whether that frame exists.
             kept: (K,) samples of the rays whose frame exists.
             points: (K, 3) where they are in that frame.
-            source: has the dynamic field there.
+            dynamic: the dynamic field there.
         """
-        samples, count = self.output.samples, len(self._times)
+        samples, count = self.output.samples, len(self.times)
         frame = frame + torch.where(side == FORWARD, 1, -1)
         there = there & (frame >= 0) & (frame < count)
         frame = frame.clamp(0, count - 1)
@@ -189,11 +188,10 @@ class Renders:
         kept = kept[going]
         ray = samples.ray[kept]
         toward = side[ray]
-        before = source.dynamic if isinstance(source, BlendedOutput) else source.found
-        moved, occlusion = before.flow[going, toward], before.occlusion[going, toward]
+        moved, occlusion = dynamic.flow[going, toward], dynamic.occlusion[going, toward]
         points = points[going] + moved
         found = self.fields.dynamic.at(
-            points, self._times[frame[ray]], self.batch.rays.viewdirs, ray
+            points, self.times[frame[ray]], self.batch.rays.viewdirs, ray
         )
         color, weight = self._composited(found, kept, ray)
         return Warp(there, frame, side, kept, ray, moved, occlusion, points, found, color, weight)

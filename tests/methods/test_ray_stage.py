@@ -1,0 +1,144 @@
+"""How any method is learned from rays: which pixels are drawn, what is frozen, what resumes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from lightning import Callback, Trainer
+
+from devrf.checkpoints.checkpoint import LoadedCheckpoint, save_checkpoint
+from devrf.data.datamodule import SceneDataModule
+from devrf.engine.learner import ParallelBatch
+from devrf.errors import DevrfError
+from devrf.methods.dnerf.model import DNeRF, DNeRFSettings
+from devrf.methods.hypernerf.model import HyperNeRF, HyperNeRFSettings
+from devrf.methods.protocol import ProtocolStage
+from devrf.methods.ray_stage import RayStage
+from devrf.rendering.renderer import Renderer
+from devrf.scenes.scene import Scene
+
+SMALL = {"width": 8, "depth": 2, "bands": 2, "sampling": "occupancy", "steps": 16}
+TINY = DNeRFSettings(**SMALL, occupancy_side=8, deformation_width=8, deformation_depth=2)
+# All that a peer may keep beside its weights: windows, codes, occupancy that it learns.
+WHOLE = HyperNeRFSettings(
+    **SMALL, occupancy_side=8, separate_coarse=False, hull=False, empty_from=0.0, code=3,
+    warp_width=8, warp_depth=2, slicing_width=8, slicing_depth=2,
+)  # fmt: skip
+Make = Callable[..., RayStage]
+Fit = Callable[..., RayStage]
+
+
+def assert_same_weights(one: RayStage, other: RayStage) -> None:
+    state = other.state_dict()
+    for name, value in one.state_dict().items():
+        assert not isinstance(value, torch.Tensor) or torch.equal(value, state[name]), name
+
+
+def test_a_killed_run_goes_on_to_the_same_weights(
+    ray_stage: Make, fit: Fit, tmp_path: Path
+) -> None:
+    path = tmp_path / "progress.ckpt"
+
+    class StopHalfWay(Callback):
+        def on_train_batch_end(self, fitted: Trainer, *arguments: object) -> None:
+            save_checkpoint(fitted, path, weights_only=False)
+            fitted.should_stop = True
+
+    def stage() -> RayStage:
+        torch.manual_seed(0)
+        return ray_stage(HyperNeRF(WHOLE), loss={"color": 1.0, "elastic": 0.01})
+
+    whole = fit(stage())
+    assert fit(stage(), StopHalfWay()).iteration == 2
+    resumed = stage()
+    torch.manual_seed(123)
+    fit(resumed, ckpt_path=path)
+    assert resumed.iteration == 4
+    assert_same_weights(whole, resumed)
+
+
+def test_dynamic_never_reads_the_static_set(
+    ray_stage: Make, fit: Fit, serve: Callable[[Scene], SceneDataModule], tiny_scene: Scene,
+    dark_scene: Scene,
+) -> None:  # fmt: skip
+    """It learns the same, in the same box, where static images are black."""
+    stages = []
+    for scene in (tiny_scene, dark_scene):
+        torch.manual_seed(0)
+        stages.append(fit(ray_stage(DNeRF(TINY), "dynamic"), data=serve(scene)))
+    assert_same_weights(*stages)
+    assert stages[0].scene_model.box == stages[1].scene_model.box
+
+
+@pytest.mark.parametrize(("share", "static"), [(0.5, 16), (0.25, 8)])
+def test_a_fixed_share_of_a_joint_batch_is_static(
+    share: float, static: int, ray_stage: Make, fit: Fit, tiny_scene: Scene
+) -> None:
+    stage = fit(ray_stage(DNeRF(TINY), static_share=share))
+    image = stage.draw(ParallelBatch(0, [])).image
+    assert len(image) == 32 and int((image < len(tiny_scene.static.train)).sum()) == static
+
+
+def test_the_curriculum_adds_frames(
+    ray_stage: Make, fit: Fit, four_frames: SceneDataModule
+) -> None:
+    stage = fit(ray_stage(DNeRF(TINY), "dynamic", curriculum=0.99, rays=400), data=four_frames)
+    views = stage.training_views("dynamic")
+    assert views.frames is not None
+    for iteration, frames in ((0, 3), (4, 4)):
+        stage.iteration = iteration
+        image = stage.draw(ParallelBatch(0, [])).image
+        assert len(views.frames[image].unique()) == frames
+
+
+@pytest.mark.parametrize(("step", "times"), [("joint", 3), ("dynamic", 2)])
+def test_a_batch_may_have_few_times(
+    step: str, times: int, ray_stage: Make, fit: Fit, four_frames: SceneDataModule
+) -> None:
+    stage = fit(ray_stage(DNeRF(TINY), step, times_per_batch=times, rays=60), data=four_frames)
+    image = stage.draw(ParallelBatch(0, [])).image
+    if step == "joint":
+        static = len(stage.training_views("static"))
+        assert (image[:30] < static).all()
+        image = image[30:] - static
+    frames = stage.training_views("dynamic").frames[image]  # type: ignore[index]
+    # Two times with as many rays each, one after the other.
+    first, second = frames.chunk(2)
+    assert len(first.unique()) == len(second.unique()) == 1 and first[0] != second[0]
+
+
+def test_a_batch_may_have_fewer_rays_where_no_masks_tell_what_is_empty(
+    ray_stage: Make, fit: Fit
+) -> None:
+    sizes = []
+    for hull in (True, False):
+        stage = fit(ray_stage(DNeRF(replace(TINY, hull=hull)), rays_without_hull=7))
+        sizes.append(len(stage.draw(ParallelBatch(0, [])).image))
+    assert sizes == [32, 7]
+
+
+def test_a_checkpoint_shows_what_was_learned(
+    ray_stage: Make, fit: Fit, stored: Callable[[RayStage], LoadedCheckpoint], tiny_scene: Scene
+) -> None:
+    stage = fit(ray_stage(DNeRF(TINY)))
+    loaded = stored(stage)
+    assert isinstance(loaded.model, DNeRF) and loaded.metadata.complete
+    cameras = tiny_scene.dynamic.test.cameras
+    now, then = (Renderer(m).view(cameras, 1, 0.7, 1.0) for m in (stage.scene_model, loaded.model))
+    assert torch.equal(now.color, then.color)
+
+
+def test_an_unknown_term_and_an_unknown_part_are_named(ray_stage: Make, fit: Fit) -> None:
+    with pytest.raises(DevrfError, match=r"ray_stage.loss: unknown term 'elastic'"):
+        ray_stage(DNeRF(TINY), loss={"elastic": 1.0})
+    with pytest.raises(DevrfError, match=r"dnerf has no part 'codes'"):
+        fit(ray_stage(DNeRF(TINY), ProtocolStage("joint", "both", frozen=("codes",))))
+
+
+def test_a_batch_has_a_time_at_least(ray_stage: Make) -> None:
+    with pytest.raises(DevrfError, match=r"ray_stage\.schedule\.times_per_batch"):
+        ray_stage(DNeRF(TINY), times_per_batch=0)
