@@ -41,13 +41,14 @@ def steps(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[RunContext], N
 def test_a_mistake_in_one_job_is_recorded_and_the_others_go_on(devrf, tmp_path, tiny):
     outcome = devrf("-m", *tiny, *LEARN, "data.frames=1,3,4", "seed=7")
     assert outcome.status == 3
-    assert outcome.err.splitlines() == [
-        "devrf: job 0_robot: data.frames: must be at least 2, not 1",
-        "devrf: jobs failed: 0_robot; failure.json in each folder below sweep says why",
-    ]
+    mistake, summary = outcome.err.splitlines()
+    assert mistake.startswith("devrf: job 0_robot: data.frames: ")
+    assert (
+        summary == "devrf: jobs failed: 0_robot; failure.json in each folder below sweep says why"
+    )
     found = failure(tmp_path / "sweep" / "0_robot")
     assert found["scene"] == "robot" and found["seed"] == 7 and found["mistake"] is True
-    assert found["error"] == "data.frames: must be at least 2, not 1"
+    assert found["error"].startswith("data.frames: ")
     assert found["choices"]["schedule"] == "quick" and "data.frames=1" in found["overrides"]
     assert found["date"].endswith("+00:00")
     assert (tmp_path / "sweep" / "0_robot" / ".hydra" / "config.yaml").is_file()
@@ -120,7 +121,7 @@ def test_jobs_in_processes_of_their_own(python, tmp_path, tiny):
     joblib = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "data.frames=3,1")
     done = python(tmp_path, "-m", "devrf", "-m", *tiny, *LEARN, *joblib)
     assert done.status == 3
-    assert "devrf: job 1_robot: data.frames: must be at least 2, not 1\n" in done.err
+    assert "devrf: job 1_robot: data.frames: " in done.err
     assert "jobs failed: 1_robot" in done.err and "Traceback" not in done.err
     assert (tmp_path / "sweep" / "0_robot" / "checkpoints" / "canonical.ckpt").is_file()
     assert failure(tmp_path / "sweep" / "1_robot")["mistake"] is True

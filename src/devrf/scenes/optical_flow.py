@@ -8,7 +8,7 @@ import math
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -20,7 +20,7 @@ from devrf.geometry.clock import FrameClock
 from devrf.scenes.flow_files import content_key, load_flow, save_flow
 from devrf.scenes.resampling import LONGEST_SIDE, area_average
 from devrf.scenes.scene import OpticalFlow, Views
-from devrf.scenes.validation import check_choice, scene_error
+from devrf.scenes.validation import scene_error
 
 log = logging.getLogger(__name__)
 
@@ -125,10 +125,9 @@ def estimate_flow(
         forward: the same with frames swapped: to the image a frame later.
 
     Raises:
-        DevrfError: an unknown method, its library or weights are missing, the images have no
+        DevrfError: the library or weights are missing, the images have no
             two distinct times, or are too large.
     """
-    check_choice("data.flow", method, get_args(FlowMethod))
     pairs = frame_pairs(views)
     if not pairs:
         raise scene_error(

@@ -8,7 +8,7 @@ from dataclasses import KW_ONLY, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, PlainValidator, ValidationError, model_validator
+from pydantic import Field, PlainValidator
 from pydantic.dataclasses import dataclass
 
 from devrf.geometry.clock import FrameClock
@@ -17,7 +17,7 @@ from devrf.scenes.image_folders import Downscale, Missing
 from devrf.scenes.scene import Background, Capture, OpticalFlow, Scene, Views
 from devrf.scenes.space import SpaceChoice, centred, forward_facing_scene, inward_space
 from devrf.scenes.transforms import SceneBounds
-from devrf.scenes.validation import LARGEST, checked_box, first_error, scene_error
+from devrf.scenes.validation import LARGEST, Options, checked_box, scene_error
 
 FlowSource = Literal["auto", "files", "dis", "raft", "none"]
 # Of layouts that have no place for flow files.
@@ -49,8 +49,8 @@ BoundScale = Annotated[float | str, PlainValidator(_bound_scale)]
 Corners = Annotated[Sequence[Sequence[float]] | None, PlainValidator(_box)]
 
 
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class SceneReader(ABC):
+@dataclass(frozen=True)
+class SceneReader(Options, ABC):
     """Where a scene is on disk and how it is to be read.
 
     Attributes:
@@ -104,14 +104,6 @@ class SceneReader(ABC):
     def name_of(self, folder: Path) -> str:
         """The scene's name, its folder's where none was given."""
         return self.name or folder.resolve().name
-
-    @model_validator(mode="wrap")
-    @classmethod
-    def _in_one_line(cls, value: Any, validate: Any) -> Any:
-        try:
-            return validate(value)
-        except ValidationError as error:
-            raise first_error(error, "data.") from None
 
 
 @dataclass(frozen=True)

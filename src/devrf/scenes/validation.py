@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 import reprlib
-from collections.abc import Iterable
+from typing import Any
 
 import psutil
 import torch
-from pydantic import ValidationError
+from pydantic import ConfigDict, ValidationError, model_validator
+from pydantic.dataclasses import dataclass
 from torch import Tensor
 
-from devrf.errors import DevrfError, did_you_mean
+from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 
 # Below this the fields see nothing and the window of SSIM does not fit.
@@ -57,6 +58,19 @@ def first_error(error: ValidationError, where: str) -> DevrfError:
     return scene_error(place, f"{expected[0].lower()}{expected[1:]}{given}; correct it")
 
 
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class Options:
+    """Options of a scene, checked when they are given; a wrong one is a DevrfError of one line."""
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _in_one_line(cls, value: Any, validate: Any) -> Any:
+        try:
+            return validate(value)
+        except ValidationError as error:
+            raise first_error(error, "data.") from None
+
+
 def abbreviated(value: object) -> str:
     """A value from a file as a message shows it: however large or deep, in a few words."""
     return _shortened(_brief.repr(value), LONGEST_VALUE)
@@ -83,14 +97,6 @@ def reduced_size(width: int, height: int, downscale: int, where: object) -> tupl
 def same_shape(one: tuple[float, float], other: tuple[float, float]) -> bool:
     """Whether two (width, height) are those of one image at two scales, sides rounded."""
     return abs(one[0] * other[1] / (one[1] * other[0]) - 1) <= SAME_SHAPE
-
-
-def check_choice(key: str, value: object, choices: Iterable[str]) -> None:
-    """DevrfError unless ``value`` is one of ``choices``."""
-    allowed = tuple(choices)
-    if value not in allowed:
-        meant = did_you_mean(value, allowed, f"{key}=")
-        raise scene_error(key, f"expected one of {', '.join(allowed)}, not {value!r}{meant}")
 
 
 def checked_box(value: object) -> Box:

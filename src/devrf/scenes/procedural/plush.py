@@ -84,14 +84,14 @@ class Plush:
         # Back to rest, lengths grow by no more than 1/s up and √s across.
         height = self._height(time)
         longer = _BENDING.stretch(self.speed, time) * max(1 / height, math.sqrt(height))
-        ball[near] = 1 / longer * self._distances(local).amin(dim=0)
+        ball[near] = 1 / longer * TABLE.distances_of(local).amin(dim=0)
         return ball
 
     def material(self, points: Tensor, time: float) -> Material:
         """The nearest solid's material."""
         base = points.new_tensor(BASE)
         local = self._at_rest(points - base, time)
-        return Material(local + base, self._distances(local).argmin(dim=0))
+        return Material(local + base, TABLE.distances_of(local).argmin(dim=0))
 
     def forward(self, material: Material, time: float) -> Tensor:
         """Squash, then bend and twist, all about the base."""
@@ -120,7 +120,3 @@ class Plush:
         x, y, z = _BENDING.unbent(local, self.speed, time).unbind(-1)
         wide = math.sqrt(height)
         return torch.stack([x * wide, y / height, z * wide], dim=-1)
-
-    def _distances(self, local: Tensor) -> Tensor:
-        """Distance (K, M) at rest to each solid, of points (M, 3) relative to the base."""
-        return TABLE.distances(*(local.T[:, None] - TABLE.center.to(local).T[..., None]))

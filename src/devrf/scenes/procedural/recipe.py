@@ -1,14 +1,16 @@
-"""The procedural scenes: the numbers that each is made from, checked, and how it is rendered."""
+"""The procedural scenes: the numbers that each is made from, and how it is rendered."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import KW_ONLY
+from typing import Annotated, Any, Literal
 
 import torch
+from pydantic import Field, model_validator
+from pydantic.dataclasses import dataclass
 
 from devrf.scenes.bounds import forward_bounds, reference_space
 from devrf.scenes.procedural.filming import Filming, extent
@@ -28,27 +30,19 @@ from devrf.scenes.procedural.surroundings import REACH, STEPS, Backdrop, Room, S
 from devrf.scenes.scene import Bounds, Scene
 from devrf.scenes.space import inward_space
 from devrf.scenes.splits import every_nth
-from devrf.scenes.validation import MIN_SIDE, check_choice, scene_error
+from devrf.scenes.validation import MIN_SIDE, Options, scene_error
 
-_LARGEST_SIDE = 4096
-_MOST = 10_000
-# Least and largest value of each count that a recipe may have.
-_COUNTS = {
-    "width": (MIN_SIDE, _LARGEST_SIDE),
-    "height": (MIN_SIDE, _LARGEST_SIDE),
-    "static_views": (1, _MOST),
-    "static_test_views": (1, _MOST),
-    "train_views": (1, _MOST),
-    "frames": (2, _MOST),
-    "supersample": (1, 16),
-}
-# Further than at this speed the flower folds into itself, the robot goes through its own body
-# and the toy is squashed to pieces.
-_FASTEST = 2.0
+Side = Annotated[int, Field(strict=True, ge=MIN_SIDE, le=4096)]
+Count = Annotated[int, Field(strict=True, ge=1, le=10_000)]
+Frames = Annotated[int, Field(strict=True, ge=2, le=10_000)]
+# Further than at speed 2 the flower folds into itself, the robot goes through its own body and the
+# toy is squashed to pieces.
+Speed = Annotated[float, Field(strict=True, ge=0, le=2)]
+Texture = Literal["soft", "fine"]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Recipe(ABC):
+@dataclass(frozen=True)
+class Recipe(Options, ABC):
     """Calling a recipe renders its scene. The same recipe always gives the same scene.
 
     Attributes:
@@ -62,17 +56,30 @@ class Recipe(ABC):
         light: share of the lamp in the lighting, 0 … 1: how much motion changes the colours.
         novel_times_every: n: every n-th frame is seen by the held-out camera alone, the last
             frame excepted; None: all frames are learned from.
+
+    Raises:
+        DevrfError: a number is out of range; the message names it.
     """
 
-    width: int = 96
-    height: int = 96
-    static_views: int = 36
-    train_views: int = 4
-    frames: int = 14
-    speed: float = 1.0
-    supersample: int = 2
-    light: float = 0.2
-    novel_times_every: int | None = None
+    _: KW_ONLY
+    width: Side = 96
+    height: Side = 96
+    static_views: Count = 36
+    train_views: Count = 4
+    frames: Frames = 14
+    speed: Speed = 1.0
+    supersample: Annotated[int, Field(strict=True, ge=1, le=16)] = 2
+    light: Annotated[float, Field(strict=True, ge=0, le=1)] = 0.2
+    novel_times_every: Annotated[int, Field(strict=True, ge=2)] | None = None
+
+    @model_validator(mode="after")
+    def _some_frames_are_learned_from(self) -> Recipe:
+        if self.novel_times_every is not None and self.novel_times_every >= self.frames:
+            raise scene_error(
+                "data.novel_times_every",
+                f"should be less than data.frames={self.frames}, not {self.novel_times_every}",
+            )
+        return self
 
     @property
     def unseen_frames(self) -> list[int]:
@@ -83,43 +90,17 @@ class Recipe(ABC):
         return [frame for frame in held_out if frame < self.frames - 1]
 
     def __call__(self) -> Scene:
-        """Render everything.
-
-        Raises:
-            DevrfError: an argument is out of range.
-        """
-        # Not in __post_init__: Hydra would wrap the error in one of its own, many lines long.
-        self._check()
+        """Render everything."""
         with _one_thread():
             return self.render()
 
     @abstractmethod
     def render(self) -> Scene:
-        """The scene, from checked numbers."""
+        """The scene."""
 
     @abstractmethod
     def filmed(self) -> Shape:
         """All that the cameras see, for exact answers at any point and time."""
-
-    def _check(self) -> None:
-        for key, (least, most) in _COUNTS.items():
-            value = getattr(self, key, least)
-            if isinstance(value, bool) or not isinstance(value, int):
-                raise scene_error(f"data.{key}", f"must be a whole number, not {value!r}")
-            if not least <= value <= most:
-                bound = f"at least {least}" if value < least else f"at most {most}"
-                raise scene_error(f"data.{key}", f"must be {bound}, not {value}")
-        every = self.novel_times_every
-        whole = isinstance(every, int) and not isinstance(every, bool)
-        if every is not None and not (whole and 2 <= every < self.frames):
-            expected = f"must be a whole number in 2 … {self.frames - 1}, or null, not {every!r}"
-            raise scene_error("data.novel_times_every", expected)
-        for key, highest in (("speed", _FASTEST), ("light", 1.0)):
-            given = getattr(self, key)
-            number = isinstance(given, int | float) and not isinstance(given, bool)
-            if not (number and 0 <= given <= highest):
-                expected = f"must be a number in 0 … {highest:g}, not {given!r}"
-                raise scene_error(f"data.{key}", expected)
 
 
 @contextmanager
@@ -137,13 +118,6 @@ def _one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-SHAPES: dict[str, Callable[[float], BoundedShape]] = {"robot": Robot, "flower": Flower}
-
-
-SURROUNDINGS = ("none", "room")
-TEXTURES = ("soft", "fine")
-
-
 @dataclass(frozen=True)
 class ProceduralScene(Recipe):
     """An object with cameras all around it, in world units about the origin.
@@ -159,39 +133,34 @@ class ProceduralScene(Recipe):
             more, in which no place looks like another.
     """
 
-    shape: str = "robot"
-    static_test_views: int = field(default=8, kw_only=True)
-    surroundings: str = field(default="none", kw_only=True)
-    texture: str = field(default="soft", kw_only=True)
+    shape: Literal["robot", "flower"] = "robot"
+    _: KW_ONLY
+    static_test_views: Count = 8
+    surroundings: Literal["none", "room"] = "none"
+    texture: Texture = "soft"
 
     def render(self) -> Scene:
-        """The scene, from checked numbers."""
-        shape = self.model()
-        where = extent(shape)
-        reach, size = where.reach, {"width": self.width, "height": self.height}
-        check_choice("data.surroundings", self.surroundings, SURROUNDINGS)
-        check_choice("data.texture", self.texture, TEXTURES)
+        """The scene."""
+        where = extent(self.model())
         inside = self.surroundings == "room"
-        rig = HAND_HELD if inside else STUDIO
-        views = self.static_views, self.static_test_views
-        learned, tested = static_rig(*views, reach=reach, rig=rig, **size)
-        watching, unseen = dynamic_rig(self.train_views, reach=reach, rig=rig, **size)
-        film = Filming(shape, reach, self.supersample, self.light)
+        rig, surface = HAND_HELD if inside else STUDIO, self.filmed()
+        placed: dict[str, Any] = {"width": self.width, "height": self.height}
+        placed |= {"reach": where.reach, "rig": rig}
+        learned, tested = static_rig(self.static_views, self.static_test_views, **placed)
+        watching, unseen = dynamic_rig(self.train_views, **placed)
+        film = Filming(surface, where.reach, self.supersample, self.light)
         if inside:
-            room = self.filmed()
-            film = Filming(room, REACH, self.supersample, self.light, STEPS, opaque=True)
-        static, dynamic = (
-            film.at_rest(learned, tested),
-            film.moving(watching, unseen, self.frames, self.unseen_frames),
-        )
+            film = Filming(surface, REACH, self.supersample, self.light, STEPS, opaque=True)
+        static = film.at_rest(learned, tested)
+        dynamic = film.moving(watching, unseen, self.frames, self.unseen_frames)
         if inside:
             everyone = [static.train, static.test, dynamic.train, dynamic.test]
             space, bounds = inward_space("auto", static.train, dynamic.train, everyone)
             return Scene(f"{self.shape}_room", "inward", static, dynamic, bounds, "white", space)
         bounds = Bounds(
             box=where.rest,
-            near=rig.distance - reach,
-            far=rig.distance + reach,
+            near=rig.distance - where.reach,
+            far=rig.distance + where.reach,
             motion=where.motion,
             scale=1.0,
             source="known exactly (procedural scene)",
@@ -208,9 +177,8 @@ class ProceduralScene(Recipe):
         return Surrounded(shape, room, where.reach)
 
     def model(self) -> BoundedShape:
-        """The moving shape itself, for exact answers at any point and time."""
-        check_choice("data.shape", self.shape, SHAPES)
-        return SHAPES[self.shape](float(self.speed))
+        """The moving shape itself."""
+        return Robot(self.speed) if self.shape == "robot" else Flower(self.speed)
 
 
 # Radius of a ball about the origin that holds all that the cameras see of wall and floor.
@@ -238,14 +206,15 @@ class ProceduralForwardScene(Recipe):
     """
 
     name: str = "plush"
-    texture: Literal["soft", "fine"] = field(default="soft", kw_only=True)
-    height: int = field(default=72, kw_only=True)
-    static_views: int = field(default=20, kw_only=True)
-    frames: int = field(default=12, kw_only=True)
+    _: KW_ONLY
+    texture: Texture = "soft"
+    height: Side = 72
+    static_views: Count = 20
+    frames: Frames = 12
 
     def render(self) -> Scene:
-        """The scene, from checked numbers."""
-        film = Filming(self.model(), _REACH, self.supersample, self.light, _STEPS, opaque=True)
+        """The scene."""
+        film = Filming(self.filmed(), _REACH, self.supersample, self.light, _STEPS, opaque=True)
         size = {"width": self.width, "height": self.height}
         # Of each eight views seven are learned from.
         held_out = -(-self.static_views // (HOLDOUT - 1))
@@ -262,8 +231,4 @@ class ProceduralForwardScene(Recipe):
 
     def filmed(self) -> Shape:
         """The toy and its stage."""
-        return self.model()
-
-    def model(self) -> Shape:
-        """The toy and its stage themselves, for exact answers at any point and time."""
-        return Surrounded(Plush(float(self.speed)), Backdrop(weave=self.texture == "fine"))
+        return Surrounded(Plush(self.speed), Backdrop(weave=self.texture == "fine"))

@@ -111,6 +111,7 @@ def blade(
     return torch.hypot(lens.clamp_min(0), z) - thickness
 
 
+Xyz = tuple[float, float, float]
 Rgb = tuple[float, float, float]
 
 
@@ -132,7 +133,7 @@ class Paint:
 
     base: Rgb
     accent: Rgb
-    periods: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    periods: Xyz = (0.0, 0.0, 0.0)
     threshold: float = 0.0
     sharpness: float = 6.0
 
@@ -187,9 +188,6 @@ class PaintedParts:
         return Material(rest.reshape(-1, 3), part)
 
 
-Xyz = tuple[float, float, float]
-
-
 @dataclass(frozen=True)
 class Solid:
     """A rounded box; capsules and balls are boxes with large roundings.
@@ -231,6 +229,10 @@ class SolidTable:
         """Distance (K, M) to each solid of coordinates (K, M) about its centre, along its axes."""
         a, b, c = self.half.to(x).T[..., None]
         return rounded_box(x, y, z, (a, b, c), self._rounding.to(x))
+
+    def distances_of(self, points: Tensor) -> Tensor:
+        """Distance (K, M) at rest to each solid, of points (M, 3) relative to the base."""
+        return self.distances(*(points.T[:, None] - self.center.to(points).T[..., None]))
 
     def outline(self) -> Material:
         """Points around the solids at rest."""

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import torch
 from torch import Tensor
@@ -13,6 +12,7 @@ from torch import Tensor
 from devrf.scenes.procedural.solids import (
     Material,
     Paint,
+    PaintedParts,
     Rgb,
     Shape,
     Solid,
@@ -23,12 +23,13 @@ from devrf.scenes.procedural.solids import (
 
 
 class Surroundings(Protocol):
-    """Things around a shape, which stand still; each is a part."""
+    """Things around a shape, which stand still.
 
-    @property
-    def parts(self) -> int:
-        """How many things there are."""
-        ...
+    Attributes:
+        parts: how many things there are; each is a part.
+    """
+
+    parts: ClassVar[int]
 
     def distances(self, points: Tensor) -> Tensor:
         """Lower bounds (K, M) of the distances of ``points`` (M, 3) to the K parts."""
@@ -109,8 +110,7 @@ _ROUNDING = 0.04
 # The number of the part: the wall is 0, the floor 1.
 _PEDESTAL = 2
 
-Vector = tuple[float, float, float]
-Wave = tuple[Vector, float, Vector]
+Wave = tuple[Xyz, float, Rgb]
 
 # Waves of the paint: direction (x, y, z) times angular frequency in radians per world unit, a
 # phase, and how much of it goes into red, green and blue. No two wavelengths have a common
@@ -146,10 +146,7 @@ class Backdrop:
 
     weave: bool = False
 
-    @property
-    def parts(self) -> int:
-        """How many there are."""
-        return 3
+    parts: ClassVar[int] = 3
 
     def distances(self, points: Tensor) -> Tensor:
         """Distances (3, M) to wall, floor and pedestal."""
@@ -196,12 +193,12 @@ MIST: Rgb = (0.70, 0.78, 0.84)
 # Floor, ceiling, and the walls at −x, +x, −y, +y: the finest pattern is some five pixels wide in
 # images of 96.
 _SURFACES = (
-    Paint(WOOD, DARK, (1.1, 0.8, 0), 0.1),
-    Paint(LINEN, MIST, (2.4, 2.4, 0), 0.2),
-    Paint(PLASTER, SAGE, (0, 1.6, 1.6), 0.1),
-    Paint(MIST, SLATE, (0, 1.5, 0), 0.3),
-    Paint(LINEN, BRICK, (1.8, 0, 1.1), 0.3),
-    Paint(PLASTER, OCHRE, (2.1, 0, 0), 0.2),
+    Paint(WOOD, DARK, (1.1, 0.8, 0), 0.1, 4),
+    Paint(LINEN, MIST, (2.4, 2.4, 0), 0.2, 4),
+    Paint(PLASTER, SAGE, (0, 1.6, 1.6), 0.1, 4),
+    Paint(MIST, SLATE, (0, 1.5, 0), 0.3, 4),
+    Paint(LINEN, BRICK, (1.8, 0, 1.1), 0.3, 4),
+    Paint(PLASTER, OCHRE, (2.1, 0, 0), 0.2, 4),
 )
 
 
@@ -229,6 +226,11 @@ _FURNITURE = (
     _box((-1.5, -4.95, 2.8), (1.0, 0.08, 0.7), SAGE, LINEN, 1.2, 0.04),
 )
 _TABLE = SolidTable(_FURNITURE)
+_PAPER = PaintedParts(
+    _SURFACES,
+    torch.eye(3, dtype=torch.float64).repeat(len(_SURFACES), 1, 1),
+    torch.zeros(len(_SURFACES), 3, dtype=torch.float64),
+)
 
 
 @dataclass(frozen=True)
@@ -244,10 +246,7 @@ class Room:
     floor: float
     weave: bool = False
 
-    @property
-    def parts(self) -> int:
-        """How many there are."""
-        return len(_SURFACES) + len(_FURNITURE)
+    parts: ClassVar[int] = len(_SURFACES) + len(_FURNITURE)
 
     def distances(self, points: Tensor) -> Tensor:
         """Distances (K, M) to floor, ceiling, walls and furniture."""
@@ -255,36 +254,18 @@ class Room:
         z = z - self.floor
         width, depth = _ROOM_HALF
         faces = torch.stack([z, _HEIGHT - z, x + width, width - x, y + depth, depth - y])
-        lifted = torch.stack([x, y, z])[:, None] - _TABLE.center.to(points).T[..., None]
-        return torch.cat([faces, _TABLE.distances(*lifted)])
+        return torch.cat([faces, _TABLE.distances_of(torch.stack([x, y, z], dim=-1))])
 
     def color(self, material: Material) -> Tensor:
         """The paper or the paint (M, 3)."""
         lifted = material.rest - material.rest.new_tensor([0.0, 0.0, self.floor])
         furniture = (material.part - len(_SURFACES)).clamp(0, len(_FURNITURE) - 1)
         painted = _TABLE.painted.color(Material(lifted, furniture))
-        surface = _papered(lifted, material.part.clamp(max=len(_SURFACES) - 1))
-        color = torch.where((material.part < len(_SURFACES))[:, None], surface, painted)
+        papered = _PAPER.color(Material(lifted, material.part.clamp(max=len(_SURFACES) - 1)))
+        # A slow wave of brightness along each axis makes repeats of the pattern differ.
+        slow = (lifted * lifted.new_tensor([0.55, 0.71, 0.83]) + 0.4).cos().mean(dim=-1)
+        papered = papered * (0.82 + 0.18 * slow)[:, None]
+        color = torch.where((material.part < len(_SURFACES))[:, None], papered, painted)
         if not self.weave:
             return color
         return color.lerp(mural(material.rest / _LONGER, (*WAVES, *WEAVE)), _MURAL)
-
-
-def _papered(points: Tensor, surface: Tensor) -> Tensor:
-    """Colours (M, 3) of points on floor, ceiling and walls, shaded so that no place is another's.
-
-    A slow wave of brightness along each axis makes repeats of the pattern differ.
-    """
-
-    def rows(values: list[tuple[float, ...]]) -> Tensor:
-        return points.new_tensor(values)[surface]
-
-    wave = rows([tuple(2 * math.pi / q if q else 0.0 for q in p.periods) for p in _SURFACES])
-    pattern = (points * wave).cos().prod(dim=-1)
-    threshold = rows([(p.threshold,) for p in _SURFACES])[:, 0]
-    share = (4 * (pattern - threshold)).sigmoid()[:, None]
-    mixed = torch.lerp(
-        rows([p.base for p in _SURFACES]), rows([p.accent for p in _SURFACES]), share
-    )
-    slow = (points * points.new_tensor([0.55, 0.71, 0.83]) + 0.4).cos().mean(dim=-1)
-    return mixed * (0.82 + 0.18 * slow)[:, None]
