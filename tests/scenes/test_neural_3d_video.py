@@ -118,7 +118,7 @@ def poses(folder: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
         ),
         (
             lambda root: poses(root, lambda rows: rows * np.where(np.arange(17) == 4, 2, 1)),
-            "the poses are for images of 32x48 px (width x height), but these have 32x24 px",
+            "poses_bounds.npy: 32x24 px, but its camera is one for 32x48 px",
         ),
     ],
 )

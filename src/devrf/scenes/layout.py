@@ -109,7 +109,12 @@ def fewer(layout: Layout, train_views: int | None, frames: int | None) -> tuple[
     """
     if not layout.moves:
         for key, asked in (("train_views", train_views), ("frames", frames)):
-            refuse_at_rest(layout.static_train.transforms.file, f"data.{key}", asked)
+            if asked is not None:
+                raise scene_error(
+                    f"data.{key}",
+                    f"{asked} was asked for, but all images of "
+                    f"{layout.static_train.transforms.file} show one moment; leave it null",
+                )
         return layout, False
     train, test = first_views(layout.dynamic_train, train_views), layout.dynamic_test
     if len(distinct_times(train.used_times)) < 2:
@@ -126,16 +131,12 @@ def fewer(layout: Layout, train_views: int | None, frames: int | None) -> tuple[
     return replace(layout, dynamic_train=train, dynamic_test=test), kept is not None
 
 
-def refuse_at_rest(file: Path, key: str, asked: object) -> None:
-    """DevrfError where an option on motion is set (not None) for the scene at rest in ``file``."""
-    if asked is not None:
-        raise scene_error(
-            key, f"{asked} was asked for, but all images of {file} show one moment; leave it null"
-        )
-
-
 def load_layout(
-    layout: Layout, root: Path, downscale: int | str, masks: Masks = "none"
+    layout: Layout,
+    root: Path,
+    downscale: int | str,
+    masks: Masks = "none",
+    dynamic_downscale: int | None = None,
 ) -> tuple[Capture, Capture]:
     """The static and the dynamic capture, images read.
 
@@ -144,15 +145,20 @@ def load_layout(
         root: the scene's folder.
         downscale: as :class:`devrf.scenes.reader.SceneReader` has it.
         masks: as for :func:`devrf.scenes.splits.load_views`.
+        dynamic_downscale: of the dynamic images, where they are not of the size of the static ones.
     """
     factor = whole_factor(downscale, partial(_shorter_side, layout.static_train))
-    splits = (layout.static_train, layout.static_test, layout.dynamic_train, layout.dynamic_test)
+    moving = factor if dynamic_downscale is None else dynamic_downscale
     loaded: list[tuple[Split, Views]] = []
-    for split in splits:
+    for split, by in (
+        (layout.static_train, factor),
+        (layout.static_test, factor),
+        (layout.dynamic_train, moving),
+        (layout.dynamic_test, moving),
+    ):
         # Without a static set the captures share files: read them once.
         twin = next((v for s, v in loaded if _same_images(s, split)), None)
-        views = load_views(split, root, factor, masks) if twin is None else twin
-        loaded.append((split, views))
+        loaded.append((split, twin or load_views(split, root, by, masks)))
     a, b, c, d = (views for _, views in loaded)
     return Capture(a, b), Capture(c, d)
 

@@ -100,14 +100,9 @@ class SparseModel:
 
     @cached_property
     def poses(self) -> Tensor:
-        """(N, 3, 4) float64 camera-to-world, OpenGL axes, world units.
-
-        Raises:
-            DevrfError: a rotation or a position is none.
-        """
+        """(N, 3, 4) float64 camera-to-world, OpenGL axes, world units."""
         quaternion = torch.tensor([one.quaternion for one in self.images], dtype=torch.float64)
-        length = quaternion.norm(dim=1, keepdim=True)
-        w, x, y, z = (quaternion / length).unbind(dim=1)
+        w, x, y, z = (quaternion / quaternion.norm(dim=1, keepdim=True)).unbind(dim=1)
         rows = [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
             [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
@@ -115,16 +110,9 @@ class SparseModel:
         ]
         to_camera = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
         moved = torch.tensor([one.translation for one in self.images], dtype=torch.float64)
-        position = -(to_camera.mT @ moved[:, :, None])
         # COLMAP's y points down and its z ahead; ours point up and back.
         axes = to_camera.mT * to_camera.new_tensor([1, -1, -1])
-        good = ((length[:, 0] - 1).abs() < 1e-2) & in_reach(position[:, :, 0])
-        if not bool(good.all()):
-            name = self.images[int((~good).nonzero()[0])].name
-            raise scene_error(
-                self.folder, f"the pose of image {name} is no rigid transform; write it again"
-            )
-        return torch.cat([axes, position], dim=2)
+        return torch.cat([axes, -(to_camera.mT @ moved[:, :, None])], dim=2)
 
     def depths(self, image: int) -> Tensor:
         """(K,) float64: how far along its axis the points of an image are, world units."""
@@ -138,16 +126,10 @@ class SparseModel:
 def model_folder(root: Path) -> Path | None:
     """Where a scene's model is: ``sparse/0``, ``sparse`` or ``colmap/sparse/0``; None: nowhere."""
     for inner in ("sparse/0", "sparse", "colmap/sparse/0"):
-        if suffix_of(root / inner) is not None:
-            return root / inner
-    return None
-
-
-def suffix_of(folder: Path) -> str | None:
-    """How the model in a folder is written, ``.bin`` or ``.txt``; None: there is none."""
-    for suffix in (".bin", ".txt"):
-        if all(os.path.isfile(folder / f"{part}{suffix}") for part in ("cameras", "images")):
-            return suffix
+        for suffix in ("bin", "txt"):
+            files = (root / inner / f"{part}.{suffix}" for part in ("cameras", "images"))
+            if all(map(os.path.isfile, files)):
+                return root / inner
     return None
 
 
@@ -188,14 +170,9 @@ def _camera(folder: Path, camera: Any) -> ModelCamera:
 def _image(image: Any) -> ModelImage:
     pose = image.cam_from_world()
     x, y, z, w = pose.rotation.quat.tolist()
-    shown = [point.point3D_id for point in image.get_observation_points2D()]
-    return ModelImage(
-        image.name,
-        image.camera_id,
-        (w, x, y, z),
-        tuple(pose.translation.tolist()),
-        np.array(shown, np.int64),
-    )
+    shift = tuple(pose.translation.tolist())
+    shown = np.array([point.point3D_id for point in image.get_observation_points2D()], np.int64)
+    return ModelImage(image.name, image.camera_id, (w, x, y, z), shift, shown)
 
 
 Corner = tuple[float, float, float]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from torch import Tensor
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
 from devrf.scenes.images import load_images
+from devrf.scenes.lens import Lens
 from devrf.scenes.masks import Masks, cutting_out, valid_pixels
 from devrf.scenes.resampling import as_pinhole
 from devrf.scenes.scene import Views
@@ -224,13 +226,7 @@ def load_views(split: Split, root: Path, downscale: int, masks: Masks = "none") 
         )
     # Undistorted after the images are made smaller: a tenth of the work for the same picture.
     pixels, lenses = as_pinhole(loaded.pixels, distorted, files)
-    cameras = Cameras(
-        split.transforms.poses[used],
-        torch.tensor([lens.focal for lens in lenses]),
-        torch.tensor([lens.center for lens in lenses]),
-        width,
-        height,
-    )
+    cameras = pinholes(split.transforms.poses[used], lenses, width, height)
     names = tuple(str(file.relative_to(root)) for file in files)
     return Views(
         pixels,
@@ -240,4 +236,15 @@ def load_views(split: Split, root: Path, downscale: int, masks: Masks = "none") 
         names,
         ambiguous_orientation=loaded.ambiguous_orientation,
         valid_mask=valid_mask,
+    )
+
+
+def pinholes(poses: Tensor, lenses: Sequence[Lens], width: int, height: int) -> Cameras:
+    """Cameras of N images of ``width`` × ``height`` pixels at poses (N, 3, 4), in float32."""
+    return Cameras(
+        poses.float(),
+        torch.tensor([lens.focal for lens in lenses]),
+        torch.tensor([lens.center for lens in lenses]),
+        width,
+        height,
     )

@@ -6,13 +6,19 @@ import fnmatch
 import logging
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+import torch
+from torch import Tensor
 
 from devrf.scenes.files import entries
 from devrf.scenes.flow_files import FlowDirection
 from devrf.scenes.image_folders import image_folder, listed_images
+from devrf.scenes.lens import Intrinsics
+from devrf.scenes.splits import Split
+from devrf.scenes.transforms import Transforms
 from devrf.scenes.validation import scene_error
 
 log = logging.getLogger(__name__)
@@ -48,8 +54,7 @@ def chosen_dynamic(root: Path, chosen: str | None) -> Path:
     return folders[0]
 
 
-_VIEW = re.compile(r"view([1-9]\d{0,5})")
-_FROM_ZERO = re.compile(r"view0\d*")
+_VIEW = re.compile(r"view(\d{1,6})")
 _DIGITS = re.compile(r"\d+")
 
 
@@ -75,25 +80,19 @@ def view_folders(folder: Path, downscale: int) -> list[ViewFolder]:
         DevrfError: there are none, a number is left out or written with a zero in front, or
             they hold different numbers of images or fewer than two.
     """
-    numbered = {}
+    numbered: dict[int, Path] = {}
     for path in entries(folder):
         match = _VIEW.fullmatch(path.name)
-        if _FROM_ZERO.fullmatch(path.name) and os.path.isdir(path):
-            raise scene_error(
-                path,
-                "views are numbered view1, view2, … from 1 on, without zeros in front; rename the "
-                "fixed cameras' folders, in the order of their rows in poses.npy",
-            )
         if match and os.path.isdir(path):
             numbered[int(match[1])] = path
     if not numbered:
         raise scene_error(folder, "no folders view1, view2, …; add one for each fixed camera")
     for number in range(1, len(numbered) + 1):
-        if number not in numbered:
+        if number not in numbered or numbered[number].name != f"view{number}":
             raise scene_error(
                 folder,
-                f"no folder view{number} although there is view{max(numbered)}; number "
-                "the fixed cameras' folders from 1 on",
+                f"no folder view{number} although there is {numbered[max(numbered)].name}; number "
+                "the fixed cameras' folders from 1 on, without zeros in front",
             )
     views: list[ViewFolder] = []
     for _, path in sorted(numbered.items()):
@@ -110,42 +109,63 @@ def view_folders(folder: Path, downscale: int) -> list[ViewFolder]:
                 path, f"no folder {views[0].images[0].parent.name} as the other views have; add it"
             )
         views.append(ViewFolder(images, source.downscale, source.flow))
-    if len(views[0].images) < 2:
-        raise scene_error(folder, "its views have one image each, expected at least 2 frames")
+    if min(len(views), len(views[0].images)) < 2:
+        raise scene_error(
+            folder,
+            f"has {len(views)} views of {len(views[0].images)} images, expected at least 2 views, "
+            "one of them to hold out, of at least 2 frames",
+        )
     return views
 
 
-def chosen_views(
-    folder: Path, count: int, test_view: int, train_views: int | None
-) -> tuple[int, list[int]]:
-    """Positions of the held-out view and of the views to learn from.
+def held_out_view(count: int, test_view: int) -> int:
+    """The position of the held-out one of ``count`` views.
 
     Args:
-        folder: where the views are, for messages.
         count: how many there are.
-        test_view: the number of the one to hold out, from 1 on; −1 is the last one.
-        train_views: learn from the first so many of the others; None: all.
+        test_view: its number, from 1 on; −1 is the last one.
 
     Raises:
-        DevrfError: there is no such view, or there are too few.
+        DevrfError: there is no such view.
     """
     if test_view == 0 or not -count <= test_view <= count:
         raise scene_error(
             "data.test_view",
-            f"{test_view} is none of the {count} views in {folder}, view1 … view{count}; give 1 … "
-            f"{count}, or -1 for the last one",
+            f"{test_view} is none of the {count} views view1 … view{count}; give 1 … {count}, or "
+            "-1 for the last one",
         )
-    test = test_view - 1 if test_view > 0 else count + test_view
-    train = [v for v in range(count) if v != test]
-    if not train:
-        raise scene_error(folder, "has one view, expected at least one more to learn from")
-    if train_views is not None and train_views > len(train):
-        raise scene_error(
-            folder,
-            f"data.train_views={train_views}, but there are {len(train)} views to learn "
-            "from next to the held-out one; ask for fewer",
+    return test_view - 1 if test_view > 0 else count + test_view
+
+
+def fixed_views(
+    views: list[ViewFolder], posed_by: Path, poses: Tensor, lenses: Sequence[Intrinsics], test: int
+) -> tuple[Split, Split]:
+    """What fixed cameras saw, to learn from and held out: all at the first frame, then at the next.
+
+    Args:
+        views: V folders, in the order of their numbers.
+        posed_by: the file of the cameras, for messages.
+        poses: (V, 3, 4) camera-to-world.
+        lenses: V intrinsics.
+        test: the position of the held-out view.
+    """
+    frames = len(views[0].images)
+
+    def of(chosen: list[int]) -> Split:
+        shots = [(t, v) for t in range(frames) for v in chosen]
+        cameras = [v for _, v in shots]
+        times = tuple(t / (frames - 1) for t, _ in shots)
+        transforms = Transforms(
+            posed_by,
+            tuple(lenses[v] for v in cameras),
+            tuple(views[v].images[t] for t, v in shots),
+            poses[cameras].float(),
+            times,
         )
-    return test, train[:train_views]
+        number = torch.arange(len(chosen)).repeat(frames)
+        return Split(transforms, torch.tensor(times), number, True, torch.arange(len(shots)))
+
+    return of([v for v in range(len(views)) if v != test]), of([test])
 
 
 def flow_files(
@@ -159,39 +179,43 @@ def flow_files(
     ``0007.png``), by the last number in it (``7`` for ``img_0007.png``), or by its position,
     counted from 0. The way that finds the most files holds for all views; in doubt the first.
     """
+    suffix = f"_{direction}.npz"
     ways: tuple[Callable[[int, Path], str | int | None], ...] = (
         lambda position, image: image.stem,
         lambda position, image: _last_number(image.stem),
         lambda position, image: position,
     )
-    suffix, best = f"_{direction}.npz", dict[tuple[int, int], Path]()
-    for way in ways:
-        found: dict[tuple[int, int], Path] = {}
-        for v, view in enumerate(views):
-            named: dict[str | int | None, Path] = {}
-            for path in entries(view.flow) if os.path.isdir(view.flow) else ():
-                name = path.name.removesuffix(suffix)
-                if name == path.name or not os.path.isfile(path):
-                    continue
-                named[name] = path
-                if name.isdecimal():
-                    named[int(name)] = path
-            for k, image in enumerate(view.images):
-                path_of = named.get(way(k, image))
-                without = 0 if direction == "bwd" else len(view.images) - 1
-                if k != without and path_of is not None:
-                    found[v, k] = path_of
-        if len(found) > len(best):
-            best = found
-    expected = len(views) * (len(views[0].images) - 1) if views else 0
-    if 0 < len(best) < expected:
+    frames = len(views[0].images)
+    shots = [
+        (v, k, view.images[k], files)
+        for v, view in enumerate(views)
+        for files in [_named(view.flow, suffix)]
+        for k in (range(1, frames) if direction == "bwd" else range(frames - 1))
+    ]
+    found = [
+        {(v, k): files[name] for v, k, image, files in shots if (name := way(k, image)) in files}
+        for way in ways
+    ]
+    best = max(found, key=len)
+    if 0 < len(best) < len(shots):
         log.warning(
             "%d of %d flow files are missing in %s and its like; those images go without flow",
-            expected - len(best),
-            expected,
+            len(shots) - len(best),
+            len(shots),
             views[0].flow,
         )
     return best
+
+
+def _named(folder: Path, suffix: str) -> dict[str | int | None, Path]:
+    """The files whose names end with ``suffix``, by what comes before it, as text and as number."""
+    files: dict[str | int | None, Path] = {}
+    for path in sorted(folder.glob(f"*{suffix}")):
+        name = path.name.removesuffix(suffix)
+        files[name] = path
+        if name.isdecimal():
+            files[int(name)] = path
+    return files
 
 
 def _last_number(stem: str) -> int | None:

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY
 from pathlib import Path, PurePosixPath
 from typing import Annotated
 
-import pydantic
 from pydantic import Field
+from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from devrf.scenes.files import scene_folder
 from devrf.scenes.image_folders import (
     Downscale,
     ImageFolder,
-    Missing,
     image_folder,
     present_images,
     whole_factor,
@@ -32,12 +30,17 @@ from devrf.scenes.sparse_model import (
     model_folder,
     normalised,
     read_model,
-    suffix_of,
 )
-from devrf.scenes.splits import at_rest, first_of_every, in_motion
+from devrf.scenes.splits import at_rest, first_of_every
 from devrf.scenes.transforms import SceneBounds, Transforms
 from devrf.scenes.validation import scene_error
-from devrf.scenes.view_folders import chosen_dynamic, chosen_views, dynamic_folders, view_folders
+from devrf.scenes.view_folders import (
+    chosen_dynamic,
+    dynamic_folders,
+    fixed_views,
+    held_out_view,
+    view_folders,
+)
 
 IMAGES = "images"
 
@@ -61,111 +64,35 @@ def images_of(model: SparseModel, root: Path, factor: int) -> ImageFolder:
     return source
 
 
-def present_of(model: SparseModel, folder: Path, root: Path, missing: Missing) -> dict[int, Path]:
-    """The images that are in ``folder``, by their positions in the model."""
-    file = model.folder / f"images{suffix_of(model.folder)}"
-    from_file = os.path.relpath(folder, model.folder)
-    names = [f"{from_file}/{image.name}" for image in model.images]
-    return present_images(names, file, root, missing)
-
-
-def posed_by(
-    model: SparseModel,
-    poses: Tensor,
-    positions: Sequence[int],
-    images: Sequence[Path],
-    times: tuple[float, ...] | None = None,
-) -> Transforms:
-    """K images with cameras of the model.
+def fixed_cameras(model: SparseModel, folder: Path, count: int) -> list[int]:
+    """The positions in the model of an image by each of ``count`` fixed cameras.
 
     Args:
-        model: N cameras.
-        poses: (N, 3, 4) camera-to-world in the scene's world.
-        positions: K positions in the model, whose cameras took the images.
-        images: K files.
-        times: K times in [0, 1]; None: the scene is at rest.
+        model: poses, among others, an image of each: ``view1.png``, or in ``view1/``.
+        folder: ``dynamic_<V>views``.
+        count: how many there are.
+
+    Raises:
+        DevrfError: a camera has no pose.
     """
-    lenses = {number: camera.intrinsics for number, camera in model.cameras.items()}
-    return Transforms(
-        model.folder,
-        tuple(lenses[model.images[k].camera] for k in positions),
-        tuple(images),
-        poses[list(positions)].float(),
-        times,
-    )
+    known: dict[str, int] = {}
+    for position, image in enumerate(model.images):
+        path = PurePosixPath(image.name)
+        known.setdefault(path.stem, position)
+        known.setdefault(path.parent.name, position)
+    names = [f"view{number}" for number in range(1, count + 1)]
+    for name in names:
+        if name not in known:
+            raise scene_error(
+                model.folder,
+                f"poses no image {name}.png, nor one in a folder {name}, to say where the camera "
+                f"of {folder.name}/{name} stands; put its first frame among the images, and run "
+                "COLMAP again",
+            )
+    return [known[name] for name in names]
 
 
 @dataclass(frozen=True)
-class FixedViews:
-    """What the fixed cameras saw of the scene in motion.
-
-    Attributes:
-        train: images to learn from: all views at the first frame, then all at the next.
-        test: those of the held-out view.
-        held_out: the position in the model of the image that poses the held-out camera.
-    """
-
-    train: Transforms
-    test: Transforms
-    held_out: int
-
-
-def fixed_views(
-    folder: Path,
-    model: SparseModel,
-    poses: Tensor,
-    static: ImageFolder,
-    downscale: int,
-    test_view: int,
-) -> FixedViews:
-    """The images below ``folder``, with cameras and times.
-
-    Args:
-        folder: ``dynamic_<V>views``.
-        model: poses, among others, an image of each fixed camera: ``view1.png``, or in ``view1/``.
-        poses: (N, 3, 4) camera-to-world of the model's images, world units.
-        static: where the static images are read from.
-        downscale: by how much images are made smaller in all.
-        test_view: the number of the view to hold out, from 1 on; −1 is the last one.
-
-    Raises:
-        DevrfError: a folder or an image is missing, or a camera has no pose.
-    """
-    views = view_folders(folder, downscale)
-    if views[0].downscale != static.downscale:
-        raise scene_error(
-            folder,
-            f"its views are not read from {static.path.name}, as the static images are; give both "
-            "the same folders of images",
-        )
-    posed = [_poser(model, number, folder) for number in range(1, len(views) + 1)]
-    test, train = chosen_views(folder, len(views), test_view, None)
-    moments = range(len(views[0].images))
-
-    def of(chosen: list[int]) -> Transforms:
-        shots = [(t, v) for t in moments for v in chosen]
-        times = tuple(t / moments[-1] for t, _ in shots)
-        files = [views[v].images[t] for t, v in shots]
-        return posed_by(model, poses, [posed[v] for _, v in shots], files, times)
-
-    return FixedViews(of(train), of([test]), posed[test])
-
-
-def _poser(model: SparseModel, number: int, folder: Path) -> int:
-    """The position in the model of the image by a fixed camera."""
-    name = f"view{number}"
-    for position, one in enumerate(model.images):
-        path = PurePosixPath(one.name)
-        if name in (path.stem, path.parent.name):
-            return position
-    raise scene_error(
-        model.folder,
-        f"poses no image {name}.png, nor one in a folder {name}, to say where the camera of "
-        f"{folder.name}/{name} stands; put its first frame among the images, and run COLMAP again",
-    )
-
-
-@pydantic.dataclasses.dataclass(frozen=True)
 class ColmapReader(PosedReader):
     """Reads COLMAP's ``sparse/0`` (or ``sparse``), binary or as text, and ``images/``.
 
@@ -212,31 +139,39 @@ class ColmapReader(PosedReader):
         size = model.cameras[model.images[0].camera].size
         factor = whole_factor(self.downscale, lambda factor: min(size) // factor)
         source = images_of(model, folder, factor)
-        layout = self._layout(folder, model, world.poses, source, factor)
+        layout, smaller = self._layout(folder, model, world.poses, source.path, factor)
         layout, _ = fewer(layout, self.train_views, self.frames)
-        static, dynamic = load_layout(layout, folder, source.downscale)
+        static, dynamic = load_layout(layout, folder, source.downscale, dynamic_downscale=smaller)
         bounds = _bounds(world, static.train.cut_out)
         return self.placed(folder, static, dynamic, bounds, "the sparse model")
 
     def _layout(
-        self, folder: Path, model: SparseModel, poses: Tensor, source: ImageFolder, factor: int
-    ) -> Layout:
-        """The splits of a scene at rest, or of one with folders of fixed views."""
-        present = present_of(model, source.path, folder, self.missing)
-        images = posed_by(model, poses, list(present), list(present.values()))
+        self, folder: Path, model: SparseModel, poses: Tensor, source: Path, factor: int
+    ) -> tuple[Layout, int | None]:
+        """The splits, and by what the images of fixed views are yet to be made smaller."""
+        lenses = [model.cameras[image.camera].intrinsics for image in model.images]
+        names = [os.path.relpath(source / image.name, model.folder) for image in model.images]
+        present = present_images(names, model.folder / "images", folder, self.missing)
         if len(present) < 2:
             raise scene_error(model.folder, "poses one image, expected one more to hold out")
-        train, test = first_of_every(len(present), self.holdout)
+        known = list(present)
+        used, files = tuple(lenses[k] for k in known), tuple(present.values())
+        images = Transforms(model.folder, used, files, poses[known].float(), None)
+        train, test = first_of_every(len(known), self.holdout)
         if self.dynamic is None and not dynamic_folders(folder):
             why = "there is no folder dynamic_<V>views"
-            return static_alone(images[train], images[test], why)
+            return static_alone(images[train], images[test], why), None
         moving = chosen_dynamic(folder, self.dynamic)
-        views = fixed_views(moving, model, poses, source, factor, self.test_view)
+        views = view_folders(moving, factor)
+        posed = fixed_cameras(model, moving, len(views))
+        test_view = held_out_view(len(views), self.test_view)
+        used = tuple(lenses[k] for k in posed)
+        moving_sets = fixed_views(views, model.folder, poses[posed], used, test_view)
         # What the held-out camera saw of the scene at rest is held out, too.
-        known = {k for k, position in enumerate(present) if position == views.held_out}
-        train, test = [k for k in train if k not in known], sorted({*test, *known})
-        rest = at_rest(images[train]), at_rest(images[test])
-        return Layout(*rest, in_motion(views.train), in_motion(views.test))
+        unseen = {k for k, position in enumerate(known) if position == posed[test_view]}
+        train, test = [k for k in train if k not in unseen], sorted({*test, *unseen})
+        rest_sets = at_rest(images[train]), at_rest(images[test])
+        return Layout(*rest_sets, *moving_sets), views[0].downscale
 
 
 def _facing(space: str) -> Facing:

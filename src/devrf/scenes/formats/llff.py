@@ -8,29 +8,36 @@ from dataclasses import KW_ONLY, replace
 from pathlib import Path
 from typing import Annotated
 
-import torch
 from pydantic import Field
 from pydantic.dataclasses import dataclass
-from torch import Tensor
 
-from devrf.geometry.clock import FrameClock
 from devrf.scenes.files import Positive, existing_folder, scene_folder
 from devrf.scenes.flow_files import FlowDirection, stacked_flow
-from devrf.scenes.formats.llff_poses import POSES, PosedSet, read_dynamic_poses, read_static_poses
+from devrf.scenes.formats.llff_poses import POSES, read_dynamic_poses, read_static_poses
 from devrf.scenes.image_folders import Downscale, folder_factor, image_folder, listed_images
-from devrf.scenes.images import Size, image_size, load_images
-from devrf.scenes.layout import refuse_at_rest
+from devrf.scenes.images import image_size
+from devrf.scenes.layout import Layout, fewer, load_layout, static_alone, without_static_set
 from devrf.scenes.reader import Count, Holdout, SceneReader, Time
-from devrf.scenes.scene import Capture, OpticalFlow, Scene, Views
+from devrf.scenes.scene import OpticalFlow, Scene, Views
 from devrf.scenes.space import forward_facing_scene
-from devrf.scenes.splits import evenly_spread, every_nth, first_of_every
+from devrf.scenes.splits import (
+    Split,
+    at_rest,
+    at_times,
+    evenly_spread,
+    every_nth,
+    first_of_every,
+    in_motion,
+)
+from devrf.scenes.transforms import Transforms
 from devrf.scenes.validation import scene_error
 from devrf.scenes.view_folders import (
     ViewFolder,
     chosen_dynamic,
-    chosen_views,
     dynamic_folders,
+    fixed_views,
     flow_files,
+    held_out_view,
     view_folders,
 )
 
@@ -73,48 +80,75 @@ class LlffReader(SceneReader):
     def read(self) -> Scene:
         """See :meth:`devrf.scenes.reader.SceneReader.read`."""
         folder = scene_folder(self.root)
-        static, dynamic = self._captures(folder)
+        layout, downscale, views = self._layout(folder)
+        layout, thinned = fewer(layout, self.train_views, self.frames)
+        smaller = views[0].downscale if views else None
+        static, dynamic = load_layout(layout, folder, downscale, dynamic_downscale=smaller)
+        if views and self.wants_flow_files and thinned:
+            log.info("flow files dropped: data.frames=%s leaves out neighbours", self.frames)
+        elif views and self.wants_flow_files:
+            flow = _flow(dynamic.train, layout.dynamic_train, views, "bwd")
+            dynamic = replace(dynamic, train=replace(dynamic.train, flow=flow))
         name = self.name_of(folder)
         return forward_facing_scene(name, static, dynamic, self.near, self.background)
 
     def forward_flow(self, views: Views) -> OpticalFlow | None:
         """See :meth:`devrf.scenes.reader.SceneReader.forward_flow`."""
-        folder = scene_folder(self.root)
-        if not (dynamic_folders(folder) or self.dynamic):
+        layout, _, folders = self._layout(scene_folder(self.root))
+        layout, thinned = fewer(layout, self.train_views, self.frames)
+        if not folders or thinned:
             return None
-        moving = chosen_dynamic(folder, self.dynamic)
-        folders = view_folders(moving, folder_factor(static_folder(folder), self.downscale))
-        if self.frames is not None and self.frames < len(folders[0].images):
-            return None
-        _, train = chosen_views(moving, len(folders), self.test_view, self.train_views)
-        sizes = read_dynamic_poses(moving).last(len(folders)).sizes
-        return _flow(views, [folders[v] for v in train], sizes[train[0]], "fwd")
+        return _flow(views, layout.dynamic_train, folders, "fwd")
 
-    def _captures(self, folder: Path) -> tuple[Capture, Capture]:
-        """The static and the dynamic capture; of a scene at rest the same twice."""
+    def _layout(self, folder: Path) -> tuple[Layout, int, list[ViewFolder]]:
+        """The splits, by what static images are made smaller, and the fixed views learned from."""
         posed, moving = static_folder(folder), bool(dynamic_folders(folder)) or self.dynamic
         if moving and self.monocular:
             raise scene_error(
                 "data.monocular", f"{folder} has fixed views, so it is no video; leave it null"
             )
+        factor = folder_factor(posed, self.downscale)
+        source = image_folder(posed, factor)
+        images = _posed_images(posed, source.path)
         video = self.monocular
         if video is None:
             video = not moving and os.path.isfile(posed / VIDEO)
-        factor = folder_factor(posed, self.downscale)
-        images = _posed_images(posed, folder, factor)
         if video:
-            if self.train_views is not None:
-                raise scene_error(
-                    posed, "data.train_views needs fixed cameras, and this one moves; leave it null"
-                )
-            return video_captures(images, posed, self.holdout, self.frames, self.static_until)
-        static = _held_out(images, self.holdout)
-        if moving:
-            return static, _dynamic(self, chosen_dynamic(folder, self.dynamic), folder, factor)
-        log.info("%s: no times: all images show one moment, the scene is at rest", posed)
-        for key in ("train_views", "frames"):
-            refuse_at_rest(posed, f"data.{key}", getattr(self, key))
-        return static, static
+            return self._video(images), source.downscale, []
+        train, test = (images[part] for part in first_of_every(len(images.images), self.holdout))
+        if not moving:
+            return static_alone(train, test, "there are no times"), source.downscale, []
+        folder = chosen_dynamic(folder, self.dynamic)
+        views, cameras = view_folders(folder, factor), read_dynamic_poses(folder)
+        count = len(views)
+        if len(cameras) < count:
+            raise scene_error(
+                cameras.file,
+                f"has {len(cameras)} cameras, but there are {count} folders view1 … "
+                f"view{count}; the last rows are those of the fixed cameras",
+            )
+        unseen = held_out_view(count, self.test_view)
+        moving_sets = fixed_views(
+            views, cameras.file, cameras.poses[-count:], cameras.intrinsics[-count:], unseen
+        )
+        layout = Layout(at_rest(train), at_rest(test), *moving_sets)
+        return layout, source.downscale, views[:unseen] + views[unseen + 1 :]
+
+    def _video(self, images: Transforms) -> Layout:
+        """The splits of images by one moving camera, in the order of their times."""
+        count = len(images.images)
+        if count < 3:
+            raise scene_error(images.file, f"a video of {count} images; expected at least 3")
+        timed = replace(images, times=tuple(k / (count - 1) for k in range(count)))
+        train, test = (in_motion(timed[part]) for part in every_nth(count, self.holdout))
+        kept = None if self.frames is None else evenly_spread(train.times, self.frames)
+        # Of a video the static set is thinned out, too.
+        train = train if kept is None else at_times(train, kept)
+        return without_static_set(train, test, self.static_until)
+
+
+# NR-NeRF's file of the cameras: where it lies, the images follow one another in time.
+VIDEO = "precomputed.json"
 
 
 def static_folder(root: Path) -> Path:
@@ -129,152 +163,30 @@ def static_folder(root: Path) -> Path:
     return existing_folder(static)
 
 
-def _posed_images(folder: Path, root: Path, downscale: int) -> Views:
-    """All images of a folder, with the cameras of its ``poses_bounds.npy``, at time 0."""
-    posed = read_static_poses(folder).normalised()
-    source = image_folder(folder, downscale)
-    images = listed_images(source.path)
+def _posed_images(folder: Path, source: Path) -> Transforms:
+    """All images in ``source`` with the cameras of the folder's ``poses_bounds.npy``."""
+    posed, images = read_static_poses(folder).normalised(), listed_images(source)
     if len(images) != len(posed):
         raise scene_error(
             posed.file,
-            f"has {len(posed)} cameras, but {source.path} has {len(images)} images; "
+            f"has {len(posed)} cameras, but {source} has {len(images)} images; "
             "remove the images without a camera, or write the cameras again",
         )
     if len(images) < 2:
-        raise scene_error(source.path, "holds one image, expected at least one more to hold out")
-    loaded = load_images(images, source.downscale, posed.sizes)
-    count, height, width = loaded.pixels.shape[:3]
-    return Views(
-        loaded.pixels,
-        posed.cameras(width, height),
-        torch.zeros(count),
-        torch.arange(count),
-        _names(images, root),
-        ambiguous_orientation=loaded.ambiguous_orientation,
-    )
-
-
-def _held_out(views: Views, holdout: int) -> Capture:
-    """A static capture of which one image in ``holdout`` is held out, the first included."""
-    train, test = (views[torch.tensor(part)] for part in first_of_every(len(views), holdout))
-    return Capture(_numbered(train), _numbered(test))
-
-
-def _numbered(views: Views) -> Views:
-    """Static views with their own positions as view numbers."""
-    return replace(views, view=torch.arange(len(views)))
-
-
-def _dynamic(options: LlffReader, folder: Path, root: Path, downscale: int) -> Capture:
-    views = view_folders(folder, downscale)
-    posed = read_dynamic_poses(folder)
-    if len(posed) < len(views):
-        raise scene_error(
-            posed.file,
-            f"has {len(posed)} cameras, but there are {len(views)} folders view1 … "
-            f"view{len(views)}; the last rows are those of the fixed cameras",
-        )
-    posed = posed.last(len(views))
-    test, train = chosen_views(folder, len(views), options.test_view, options.train_views)
-    total, frames = len(views[0].images), options.frames
-    kept = torch.arange(total)
-    if frames is not None and frames < total:
-        kept = torch.linspace(0, total - 1, frames).round().long()
-    train_set, test_set = (
-        _moving([views[v] for v in chosen], posed, chosen, kept, root) for chosen in (train, [test])
-    )
-    if options.wants_flow_files and len(kept) < total:
-        log.info("flow files dropped: data.frames=%s leaves out neighbours", frames)
-    elif options.wants_flow_files:
-        flow = _flow(train_set, [views[v] for v in train], posed.sizes[train[0]], "bwd")
-        train_set = replace(train_set, flow=flow)
-    return Capture(train_set, test_set)
-
-
-def _moving(
-    folders: list[ViewFolder], posed: PosedSet, chosen: list[int], kept: Tensor, root: Path
-) -> Views:
-    """All views at the first frame, then all at the next, and so on."""
-    images = [folder.images[k] for k in kept.tolist() for folder in folders]
-    sizes = [posed.sizes[v] for v in chosen] * len(kept)
-    loaded = load_images(images, folders[0].downscale, sizes)
-    count, height, width = loaded.pixels.shape[:3]
-    view = torch.arange(len(folders)).repeat(len(kept))
-    times = kept / (len(folders[0].images) - 1)
-    cameras = posed.cameras(width, height)[torch.tensor(chosen)][view]
-    return Views(
-        loaded.pixels,
-        cameras,
-        times.float().repeat_interleave(len(folders)),
-        view,
-        _names(images, root),
-        ambiguous_orientation=loaded.ambiguous_orientation,
-    )
+        raise scene_error(source, "holds one image, expected at least one more to hold out")
+    return Transforms(posed.file, posed.intrinsics, tuple(images), posed.poses.float(), None)
 
 
 def _flow(
-    views: Views, folders: list[ViewFolder], camera: Size, direction: FlowDirection
+    views: Views, split: Split, folders: list[ViewFolder], direction: FlowDirection
 ) -> OpticalFlow | None:
+    """The flow in the folders of the first views, as many as the split has."""
+    folders = folders[: int(views.view.max()) + 1]
     files = flow_files(folders, direction)
     if not files:
         where = folders[0].flow
         log.info("no optical flow: no <frame>_%s.npz in %s and its like", direction, where)
         return None
     rows = {frame * len(folders) + view: path for (view, frame), path in sorted(files.items())}
-    source = image_size(folders[0].images[0], camera)
+    source = image_size(folders[0].images[0], split.transforms.intrinsics[0].size)
     return stacked_flow(rows, len(views), source, (views.width, views.height))
-
-
-def _names(images: list[Path], root: Path) -> tuple[str, ...]:
-    return tuple(str(image.relative_to(root)) for image in images)
-
-
-# NR-NeRF's file of the cameras: where it lies, the images follow one another in time.
-VIDEO = "precomputed.json"
-
-
-def video_captures(
-    images: Views, folder: Path, holdout: int, frames: int | None, static_until: float
-) -> tuple[Capture, Capture]:
-    """The static and the dynamic capture of a video.
-
-    Args:
-        images: N images in the order of their times.
-        folder: where they are from, for messages.
-        holdout: every ``holdout``-th is held out.
-        frames: learn from so many times, evenly spread; None: from all.
-        static_until: the latest time of an image that counts as static.
-
-    Raises:
-        DevrfError: fewer than three images, or none that early.
-    """
-    if len(images) < 3:
-        raise scene_error(folder, f"a video of {len(images)} images; expected at least 3")
-    timed = replace(images, times=torch.arange(len(images)) / (len(images) - 1))
-    train, test = (timed[torch.tensor(part)] for part in every_nth(len(timed), holdout))
-    kept = None if frames is None else evenly_spread(train.times, frames)
-    if kept is not None:
-        gap = (train.times[:, None] - kept).abs().amin(dim=1)
-        train = train[(gap <= FrameClock.TOLERANCE).nonzero()[:, 0]]
-    early, early_test = _until(train, static_until), _until(test, static_until)
-    if len(early) == 0:
-        raise scene_error(
-            folder,
-            f"no image at a time of data.static_until={static_until:g} or before to learn the "
-            "static scene from; set it higher",
-        )
-    log.warning(
-        "%s: a video by one camera, without a static set: the canonical field is learned from %d "
-        "of the %d training images (times up to %g)",
-        folder,
-        len(early),
-        len(train),
-        static_until,
-    )
-    return Capture(early, early_test if len(early_test) else test), Capture(train, test)
-
-
-def _until(views: Views, time: float) -> Views:
-    """The views up to a time: all of them stay one object."""
-    early = views.times <= time + FrameClock.TOLERANCE
-    return views if bool(early.all()) else views[early.nonzero()[:, 0]]

@@ -13,16 +13,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from devrf.geometry.cameras import Cameras
 from devrf.geometry.poses import average_pose, relative_to
 from devrf.scenes.files import Numbers, read_numbers
-from devrf.scenes.lens import LEAST_FOCAL, MOST_FOCAL, MOST_OFFSET
+from devrf.scenes.lens import Intrinsics
 from devrf.scenes.validation import FARTHEST, in_reach, is_rotation, scene_error
 
 # The file of LLFF's cameras.
 POSES = "poses_bounds.npy"
-# Images made smaller lose a fraction of a pixel; images of another shape belong to other poses.
-ASPECT_TOLERANCE = 0.05
 # The nearest point of the scene comes to rest at 1/0.75 of the near plane, as the field does it.
 BOUND_FACTOR = 0.75
 
@@ -34,31 +31,17 @@ class PosedSet:
     Attributes:
         file: where they are from, for messages.
         poses: (N, 3, 4) camera-to-world, OpenGL axes, the unit of the file.
-        size: (N, 2) width and height in pixels of the images that the next two refer to.
-        focal: (N, 2) fx, fy in pixels.
-        center: (N, 2) cx, cy in pixels.
+        intrinsics: N, in pixels of images of the size that the file states.
         bounds: (N, 2) least and largest depth of what each camera sees, the unit of the file.
     """
 
     file: Path
     poses: Tensor
-    size: Tensor
-    focal: Tensor
-    center: Tensor
+    intrinsics: tuple[Intrinsics, ...]
     bounds: Tensor
 
     def __len__(self) -> int:
         return self.poses.shape[0]
-
-    @property
-    def sizes(self) -> list[tuple[float, float]]:
-        """N (width, height) in pixels, as in ``size``."""
-        return [(width, height) for width, height in self.size.tolist()]
-
-    def last(self, count: int) -> PosedSet:
-        """The last ``count`` cameras."""
-        rows = ("poses", "size", "focal", "center", "bounds")
-        return replace(self, **{name: getattr(self, name)[-count:] for name in rows})
 
     def normalised(self) -> PosedSet:
         """The set in units of 0.75 · its least depth, its average pose the identity.
@@ -89,29 +72,6 @@ class PosedSet:
             )
         return replace(self, poses=poses, bounds=self.bounds * scale)
 
-    def cameras(self, width: int, height: int) -> Cameras:
-        """The cameras of images of ``width`` × ``height`` pixels, in single precision.
-
-        Raises:
-            DevrfError: the images have another shape than the file says.
-        """
-        size = torch.tensor([width, height], dtype=self.size.dtype)
-        scale = size / self.size
-        if float((scale[:, 0] / scale[:, 1] - 1).abs().max()) > ASPECT_TOLERANCE:
-            w, h = self.size[0].tolist()
-            raise scene_error(
-                self.file,
-                f"the poses are for images of {w:g}x{h:g} px (width x height), but "
-                f"these have {width}x{height} px, another shape; bring images or poses in line",
-            )
-        return Cameras(
-            self.poses.float(),
-            (self.focal * scale).float(),
-            (self.center * scale).float(),
-            width,
-            height,
-        )
-
 
 def read_static_poses(folder: Path) -> PosedSet:
     """The cameras of ``poses_bounds.npy``: (N, 17), or (N, 14) next to ``hwf_cxcy.npy``.
@@ -133,13 +93,13 @@ def read_static_poses(folder: Path) -> PosedSet:
         )
     if rows.shape[1] == 17:
         matrix = rows[:, :15].reshape(-1, 3, 5)
-        intrinsics, where = _of_column(matrix[:, :, 4]), file
+        intrinsics = _of_columns(file, matrix[:, :, 4])
     else:
         matrix = rows[:, :12].reshape(-1, 3, 4)
-        intrinsics, where = np.tile(_shared(inner), (len(rows), 1)), inner
+        intrinsics = (_shared(inner),) * len(rows)
     down, right, back, position = (matrix[:, :, k] for k in range(4))
     poses = np.stack([right, -down, back, position], axis=2)
-    return _checked(file, poses, where, intrinsics, file, rows[:, -2:])
+    return _posed_set(file, poses, intrinsics, file, rows[:, -2:])
 
 
 def read_dynamic_poses(folder: Path) -> PosedSet:
@@ -165,72 +125,60 @@ def read_dynamic_poses(folder: Path) -> PosedSet:
             f"has shape {bounds.shape}, expected ({len(matrix)}, 2): a row for "
             f"each camera of {file.name}; write it again",
         )
-    return _checked(file, matrix[:, :, :4], file, _of_column(matrix[:, :, 4]), depths, bounds)
+    intrinsics = _of_columns(file, matrix[:, :, 4])
+    return _posed_set(file, matrix[:, :, :4], intrinsics, depths, bounds)
 
 
-def _of_column(column: Numbers) -> Numbers:
-    """W, H, fx, fy, cx, cy (N, 6) of columns H, W, focal (N, 3)."""
-    height, width, focal = column.T
-    return np.stack([width, height, focal, focal, width / 2, height / 2], axis=1)
+def _of_columns(file: Path, columns: Numbers) -> tuple[Intrinsics, ...]:
+    """The intrinsics in columns H, W, focal (N, 3)."""
+    return tuple(_intrinsics(file, h, w, f, f, w / 2, h / 2) for h, w, f in columns.tolist())
 
 
-def _shared(file: Path) -> Numbers:
-    """W, H, fx, fy, cx, cy (6,) of ``hwf_cxcy.npy``."""
+def _shared(file: Path) -> Intrinsics:
+    """The intrinsics in ``hwf_cxcy.npy``."""
     values = read_numbers(file, "H, W, focal, cx, cy next to a poses_bounds.npy of (N, 14)")
-    given = values.flatten()[:7].tolist()
-    if len(given) == 3:
-        h, w, focal = given
-        given = [h, w, focal, w / 2, h / 2]
-    if len(given) == 5:
-        h, w, focal, cx, cy = given
-        given = [h, w, focal, focal, cx, cy]
-    if len(given) != 6:
+    match values.flatten()[:7].tolist():
+        case [h, w, focal]:
+            return _intrinsics(file, h, w, focal, focal, w / 2, h / 2)
+        case [h, w, focal, cx, cy]:
+            return _intrinsics(file, h, w, focal, focal, cx, cy)
+        case [h, w, fx, fy, cx, cy]:
+            return _intrinsics(file, h, w, fx, fy, cx, cy)
+    raise scene_error(
+        file,
+        f"holds {values.size} numbers, expected H, W, focal, cx, cy, or H, W, fx, fy, cx, cy; "
+        "write it again",
+    )
+
+
+def _intrinsics(
+    file: Path, h: float, w: float, fx: float, fy: float, cx: float, cy: float
+) -> Intrinsics:
+    if min(h, w) < 1 or min(fx, fy) <= 0:
         raise scene_error(
-            file,
-            f"holds {values.size} numbers, expected H, W, focal, cx, cy, or H, W, "
-            "fx, fy, cx, cy; write it again",
+            file, f"height {h:g}, width {w:g} or focal length {fx:g} is not above 0; correct it"
         )
-    h, w, fx, fy, cx, cy = given
-    return np.array([w, h, fx, fy, cx, cy])
+    return Intrinsics(None, (fx, fy), (cx, cy), (w, h))
 
 
-def _checked(
-    file: Path, poses: Numbers, inner: Path, intrinsics: Numbers, outer: Path, bounds: Numbers
+def _posed_set(
+    file: Path, poses: Numbers, intrinsics: tuple[Intrinsics, ...], depths: Path, bounds: Numbers
 ) -> PosedSet:
     """The set, or DevrfError that names the file and the row at fault."""
-    matrices = torch.from_numpy(np.ascontiguousarray(poses))
-    values, depths = torch.from_numpy(intrinsics), torch.from_numpy(np.ascontiguousarray(bounds))
-    size, focal, center = values[:, :2], values[:, 2:4], values[:, 4:]
-    side = size.amax(dim=1, keepdim=True)
+    cameras = torch.from_numpy(np.ascontiguousarray(poses))
+    ranges = torch.from_numpy(np.ascontiguousarray(bounds))
     for good, where, what in (
+        (is_rotation(cameras[:, :, :3]), file, "its axes are no rotation (or of other order)"),
+        (in_reach(cameras[:, :, 3]), file, f"it is farther than {FARTHEST:g} from the origin"),
         (
-            is_rotation(matrices[:, :, :3]),
-            file,
-            "its axes are no rotation (scaled, sheared, mirrored or of another convention)",
-        ),
-        (in_reach(matrices[:, :, 3]), file, f"it is farther than {FARTHEST:g} from the origin"),
-        ((size >= 1).all(dim=1), inner, "height or width is under 1 px"),
-        ((focal > 0).all(dim=1), inner, "the focal length is not above 0"),
-        (
-            ((focal >= LEAST_FOCAL * side) & (focal <= MOST_FOCAL * side)).all(dim=1),
-            inner,
-            "the focal length cannot be that of an image of this height and width",
-        ),
-        (
-            (center.abs() <= MOST_OFFSET * side).all(dim=1),
-            inner,
-            "the principal point is far outside the image",
-        ),
-        (
-            (depths[:, 0] > 0) & (depths[:, 0] < depths[:, 1]),
-            outer,
+            (ranges[:, 0] > 0) & (ranges[:, 0] < ranges[:, 1]),
+            depths,
             "expected 0 < least depth < largest depth",
         ),
     ):
         if not bool(good.all()):
+            row = int((~good).nonzero()[0])
             raise scene_error(
-                where,
-                f"camera {int((~good).nonzero()[0])}: {what}; correct or leave "
-                "out the image and its row",
+                where, f"camera {row}: {what}; correct or leave out the image and its row"
             )
-    return PosedSet(file, matrices, size, focal, center, depths)
+    return PosedSet(file, cameras, intrinsics, ranges)

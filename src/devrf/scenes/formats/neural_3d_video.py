@@ -26,6 +26,7 @@ from devrf.scenes.reader import Count, EstimatedFlow, SceneReader, SeveralFrames
 from devrf.scenes.resampling import shrink_pixels
 from devrf.scenes.scene import Capture, Scene, Views
 from devrf.scenes.space import forward_facing_scene
+from devrf.scenes.splits import pinholes
 from devrf.scenes.validation import check_memory, reduced_size, scene_error
 
 log = logging.getLogger(__name__)
@@ -221,9 +222,10 @@ def _views(
     pixels = read_frames(videos, chosen, frames, factor)
     height, width = pixels.shape[1:3]
     view = torch.arange(len(chosen)).repeat(len(frames))
+    lenses = [posed.intrinsics[video].lens(width, height, posed.file) for video in chosen]
     return Views(
         pixels,
-        posed.cameras(width, height)[torch.tensor(chosen)][view],
+        pinholes(posed.poses[chosen], lenses, width, height)[view],
         times.repeat_interleave(len(chosen)),
         view,
         tuple(videos.name_of(video, frame) for frame in frames for video in chosen),
