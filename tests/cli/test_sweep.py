@@ -146,7 +146,7 @@ def test_a_search_maximises_the_objective(devrf, tmp_path, tiny):
 @pytest.mark.parametrize(
     ("argument", "why"),
     [
-        ("data.frames=1", "data.frames: must be at least 2, not 1"),
+        ("data.frames=1", "data.frames: should be greater than or equal to 2"),
         ("stage=canonical", "stage: a search needs the objective"),
     ],
 )
