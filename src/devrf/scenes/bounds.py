@@ -151,17 +151,11 @@ def inward_bounds(
     far: float | None = None,
     box: Box | None = None,
 ) -> Bounds:
-    """Bounds of a scene that its cameras look in at.
+    """Bounds in the world of a scene that its cameras look in at.
 
-    Args:
-        static: training views at rest, whose cameras give the box.
-        dynamic: training views in motion, whose alpha masks give the motion box; None at rest.
-        everyone: all views, test included; near and far hold for all their cameras.
-        bound_scale: "auto" (silhouettes where there are alpha masks, else the given box or a
-            fixed scale) or a number ≥ 1.
-        near: distance in world units, or None for the cameras to say.
-        far: distance in world units, or None.
-        box: the scene's box, or None.
+    Arguments are those of :func:`devrf.scenes.space.inward_space`. With ``bound_scale="auto"``
+    silhouettes say where it moves, where there are alpha masks; else the given box, or a fixed
+    scale, leaves room.
 
     Raises:
         DevrfError: the cameras do not say where the scene is, or near ≥ far.

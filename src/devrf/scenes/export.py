@@ -16,7 +16,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from devrf.geometry.cameras import Cameras
 from devrf.scenes.files import Numbers
 from devrf.scenes.flow_files import write_flow
 from devrf.scenes.formats.llff_poses import BOUND_FACTOR
@@ -61,23 +60,29 @@ def time_major(views: Views) -> Views:
 _VALIDATION_VIEWS = 4
 
 
-def export_blender(scene: Scene, folder: Path) -> None:
-    """Write ``scene`` as ``folder/static`` and ``folder/dynamic_<V>views``.
+def export(scene: Scene, folder: Path) -> None:
+    """Write ``scene`` for ``data=inward`` or ``data=forward`` to read, as its kind says.
+
+    Args:
+        scene: an embedded one: all images of one focal length, their principal points in the
+            middle; fixed cameras stand still, and one of them is held out.
+        folder: a new or an empty folder.
+
+    Raises:
+        DevrfError: the folder is in use or cannot be written, or a frame is left out by some views
+            of a forward-facing scene.
+    """
+    write = _export_blender if scene.kind == "inward" else _export_llff
+    write(scene, folder)
+
+
+def _export_blender(scene: Scene, folder: Path) -> None:
+    """Write ``folder/static`` and ``folder/dynamic_<V>views``.
 
     Each holds ``transforms_{train,val,test}.json`` and images, RGBA where they have
     alpha masks; dynamic images are ordered time-major, and their flow, where there is one, goes to
     ``train_flow/<index>_bwd.npz``. Poses, times and images read back exactly.
-
-    Args:
-        scene: an inward-facing scene.
-        folder: a new or an empty folder.
-
-    Raises:
-        DevrfError: the folder is in use or cannot be written, or the layout cannot hold the
-            scene.
     """
-    if scene.kind != "inward":
-        raise scene_error(scene.name, "only inward-facing scenes fit the Blender layout")
     dynamic = Capture(time_major(scene.dynamic.train), time_major(scene.dynamic.test))
     count = len(set(dynamic.train.view.tolist()))
     with whole_folder(folder) as partial:
@@ -112,21 +117,11 @@ def _write_split(views: Views, split: str, folder: Path) -> None:
                 "transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]],
             }
         )
-    content = {"camera_angle_x": _field_of_view(views.cameras), "frames": frames}
+    focal = float(views.cameras.focal[0, 0])
+    angle = 2 * math.atan(views.width / 2 / focal)
+    content = {"camera_angle_x": angle, "frames": frames}
     text = json.dumps(content, indent=1)
     (folder / f"transforms_{split}.json").write_text(text + "\n", encoding="utf-8")
-
-
-def _field_of_view(cameras: Cameras) -> float:
-    """``camera_angle_x`` in radians, the only intrinsic that the layout has."""
-    focal, center = cameras.focal.double(), cameras.center.double()
-    middle = center.new_tensor([cameras.width / 2, cameras.height / 2])
-    shared = float(focal[0, 0])
-    if not torch.allclose(focal, focal.new_tensor(shared), rtol=1e-6, atol=0.0):
-        raise scene_error("cameras", "one camera_angle_x cannot hold different focal lengths")
-    if not torch.allclose(center, middle.expand_as(center), rtol=0.0, atol=1e-4):
-        raise scene_error("cameras", "camera_angle_x needs principal points in the images' middle")
-    return 2 * math.atan(cameras.width / 2 / shared)
 
 
 # The published scenes are read at this factor, from folders images_4; larger images need not
@@ -142,48 +137,23 @@ _FAR = 100.0
 Flags = np.ndarray[Any, np.dtype[np.bool_]]
 
 
-def export_llff(scene: Scene, folder: Path) -> None:
-    """Write ``scene`` as ``folder/static`` and ``folder/dynamic_<V>views``.
+def _export_llff(scene: Scene, folder: Path) -> None:
+    """Write ``folder/static`` and ``folder/dynamic_<V>views``.
 
     ``static/poses_bounds.npy`` (N, 17) speaks of images four times as large as those in
     ``static/images_4``, as LLFF's does. The moving capture has V − 1 views to learn from and,
     the last one, the held-out view; flow goes to ``view<k>/images_4_flow/<frame>_bwd.npz``.
     Least depths are written as 1/0.75, so a reader scales by one; a scene whose static cameras
     have the identity as their average pose reads back as it is.
-
-    Args:
-        scene: a forward-facing scene.
-        folder: a new or an empty folder.
-
-    Raises:
-        DevrfError: the folder is in use or cannot be written, or the layout cannot hold the
-            scene.
     """
-    if scene.kind != "forward":
-        raise scene_error(scene.name, "only forward-facing scenes fit LLFF's layout")
-    held_out = _held_out(scene.static)
+    held_out = np.arange(len(scene.static.train) + len(scene.static.test)) % HOLDOUT == 0
     views = [*_by_camera(scene.dynamic.train), *_by_camera(scene.dynamic.test)]
-    _check_moving(scene.dynamic, views)
+    _check_times(views)
     far = _farthest([scene.static.train, scene.static.test, *views])
     bounds = np.array([1 / BOUND_FACTOR, far])
     with whole_folder(folder) as partial:
         _write_static(scene.static, held_out, bounds, partial / "static")
         _write_moving(views, bounds, partial / f"dynamic_{len(views)}views")
-
-
-def _held_out(static: Capture) -> Flags:
-    """Which of the N static images readers hold out (N,); DevrfError if they would differ."""
-    count = len(static.train) + len(static.test)
-    held_out: Flags = np.arange(count) % HOLDOUT == 0
-    if held_out.sum() != len(static.test):
-        raise scene_error(
-            "static",
-            f"the layout holds out every {HOLDOUT}th image, {held_out.sum()} of "
-            f"{count}, but {len(static.test)} are held out here",
-        )
-    if static.train.pixels.shape[1:] != static.test.pixels.shape[1:]:
-        raise scene_error("static", "the layout needs static images of one size and channel count")
-    return held_out
 
 
 def _by_camera(views: Views) -> list[Views]:
@@ -195,24 +165,16 @@ def _by_camera(views: Views) -> list[Views]:
     ]
 
 
-def _check_moving(capture: Capture, views: list[Views]) -> None:
-    held_out = len(set(capture.test.view.tolist()))
-    if held_out != 1:
-        raise scene_error(
-            "dynamic", f"the layout holds one held-out view, but there are {held_out}"
-        )
-    frames = len(views[0])
-    expected = torch.arange(frames) / max(frames - 1, 1)
+def _check_times(views: list[Views]) -> None:
+    frames = len(views[-1])
+    expected = torch.arange(frames) / (frames - 1)
     for view in views:
         if len(view) != frames or bool(((view.times - expected).abs() > _TIME_TOLERANCE).any()):
             raise scene_error(
-                "dynamic",
-                "the layout has no times: each view needs the same frames, evenly "
-                "spread over [0, 1]",
+                "data.export",
+                "the layout has no times: each view needs the same frames, evenly spread; set "
+                "data.novel_times_every=null",
             )
-        poses = view.cameras.camera_to_world
-        if not torch.equal(poses, poses[:1].expand_as(poses)):
-            raise scene_error("dynamic", "the layout needs cameras that stand still")
 
 
 def _farthest(everyone: list[Views]) -> float:
@@ -222,15 +184,9 @@ def _farthest(everyone: list[Views]) -> float:
 
 
 def _intrinsics(views: Views, factor: int) -> Numbers:
-    """[H, W, focal] (N, 3) of images larger by ``factor``; else DevrfError."""
-    cameras = views.cameras
-    middle = cameras.center.new_tensor([cameras.width / 2, cameras.height / 2])
-    if not torch.allclose(cameras.focal[:, 0], cameras.focal[:, 1], rtol=1e-6, atol=0.0):
-        raise scene_error("cameras", "the layout has one focal length for both axes")
-    if not torch.allclose(cameras.center, middle.expand_as(cameras.center), rtol=0.0, atol=1e-4):
-        raise scene_error("cameras", "the layout needs principal points in the images' middle")
-    sides = np.tile([cameras.height, cameras.width], (len(views), 1))
-    focal = cameras.focal[:, :1].double().cpu().numpy()
+    """[H, W, focal] (N, 3) of images larger by ``factor``."""
+    sides = np.tile([views.height, views.width], (len(views), 1))
+    focal = views.cameras.focal[:, :1].double().cpu().numpy()
     return np.concatenate([sides, focal], axis=1) * factor
 
 
@@ -268,17 +224,3 @@ def _write_images(views: Views, numbers: Iterable[int], folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for k, pixels in zip(numbers, views.pixels, strict=True):
         iio.imwrite(folder / f"{k:03d}.png", pixels.cpu().numpy())
-
-
-def export(scene: Scene, folder: Path) -> None:
-    """Write ``scene`` for ``data=inward`` or ``data=forward`` to read, as its kind says.
-
-    Args:
-        scene: any scene.
-        folder: a new or an empty folder.
-
-    Raises:
-        DevrfError: what :func:`export_blender` or :func:`export_llff` raises.
-    """
-    write = export_blender if scene.kind == "inward" else export_llff
-    write(scene, folder)

@@ -100,10 +100,8 @@ class PublishedScene:
     @property
     def downloads(self) -> dict[str, str]:
         """The address of each file to fetch, by its name."""
-        url = self.collection.url
-        if not self.collection.files:
-            return {ARCHIVE: url.format(scene=self.name)}
-        return {file: url.format(scene=self.name, file=file) for file in self.collection.files}
+        files = self.collection.files or [ARCHIVE]
+        return {file: self.collection.url.format(scene=self.name, file=file) for file in files}
 
     @property
     def is_archive(self) -> bool:

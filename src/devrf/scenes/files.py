@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import codecs
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -164,46 +163,3 @@ def read_numbers(path: Path, expected: str) -> Numbers:
     if not bool((values < LARGEST).all() and (values > -LARGEST).all()):
         raise scene_error(path, "holds NaN or infinity; write it again from valid camera poses")
     return values.astype(np.float64)
-
-
-@dataclass(frozen=True)
-class Form:
-    """What an array should be.
-
-    Attributes:
-        shape: its lengths.
-        kinds: the letters of the kinds of values that it may hold, as in ``numpy.dtype.kind``.
-    """
-
-    shape: tuple[int, ...]
-    kinds: str = "fiu"
-
-
-def read_archive(
-    path: Path, forms: Mapping[str, Form], explained_by: str, remedy: str
-) -> dict[str, npt.NDArray[Any]]:
-    """Arrays of an ``.npz``, each of a known form.
-
-    Args:
-        path: an existing file.
-        forms: the arrays that are wanted.
-        explained_by: what says that they have these shapes, in words, for the message.
-        remedy: what to do about a wrong file, for the message.
-
-    Raises:
-        DevrfError: the file is damaged, or an array is missing or of another form.
-    """
-    with decoding(path, "npz", remedy), np.load(path, allow_pickle=False) as archive:
-        arrays = {name: archive[name] for name in forms if name in archive}
-    for name, form in forms.items():
-        if name not in arrays:
-            raise scene_error(path, f'has no array "{name}"; {remedy}')
-        shape, dtype = arrays[name].shape, arrays[name].dtype
-        if shape != form.shape:
-            raise scene_error(
-                path,
-                f'"{name}" has shape {shape}, expected {form.shape} as {explained_by}; {remedy}',
-            )
-        if dtype.kind not in form.kinds:
-            raise scene_error(path, f'"{name}" holds values of type {dtype}; {remedy}')
-    return arrays

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
-import tempfile
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -16,11 +15,12 @@ import numpy.typing as npt
 import torch
 
 from devrf.errors import DevrfError
-from devrf.scenes.files import Form, read_archive
+from devrf.scenes.files import decoding
 from devrf.scenes.images import in_threads
 from devrf.scenes.resampling import shrink_flow
 from devrf.scenes.scene import OpticalFlow, Views
 from devrf.scenes.validation import check_memory, scene_error
+from devrf.system.files import atomic_write
 
 log = logging.getLogger(__name__)
 
@@ -49,12 +49,16 @@ def read_flow_file(
     Raises:
         DevrfError: not an npz, an array is missing, or an array is of another size.
     """
-    arrays = read_archive(
-        path,
-        {"flow": Form((height, width, 2)), "mask": Form((height, width), "bfiu")},
-        "the image has before downscaling",
-        REMEDY,
-    )
+    with decoding(path, "npz", REMEDY), np.load(path, allow_pickle=False) as archive:
+        arrays = {name: archive[name] for name in ("flow", "mask") if name in archive}
+    for name, shape in (("flow", (height, width, 2)), ("mask", (height, width))):
+        found = arrays.get(name, np.empty(0, "O"))
+        if found.shape != shape or found.dtype.kind not in "bfiu":
+            raise scene_error(
+                path,
+                f'"{name}" has shape {found.shape} and type {found.dtype}, expected numbers of '
+                f"shape {shape} as the image has before downscaling; {REMEDY}",
+            )
     with np.errstate(over="ignore"):  # infinite is as good as too long
         vectors = arrays["flow"].astype(np.float32)
     # NaN compares false.
@@ -169,20 +173,16 @@ def load_flow(path: Path, key: str, shape: tuple[int, int, int]) -> OpticalFlow 
     """
     if not os.path.isfile(path):
         return None
-    forms = {"key": Form((), "U"), "vectors": Form((*shape, 2), "f"), "valid": Form(shape, "b")}
     try:
-        stored = read_archive(path, forms, "the images explain", "it is written again")
+        with decoding(path, "npz", "it is written again"), np.load(path) as stored:
+            known, vectors, valid = (stored[name] for name in ("key", "vectors", "valid"))
     except DevrfError as error:
         log.warning("the flow is estimated again: %s", error)
         return None
-    if str(stored["key"]) != key:
+    if str(known) != key or vectors.shape != (*shape, 2) or not np.isfinite(vectors).all():
         log.info("%s holds the flow of other images or of another method", path)
         return None
-    vectors = torch.from_numpy(stored["vectors"].astype(np.float32))
-    if not bool(vectors.isfinite().all()):
-        log.warning("the flow is estimated again: %s holds NaN or infinity", path)
-        return None
-    return OpticalFlow(vectors, torch.from_numpy(stored["valid"]))
+    return OpticalFlow(torch.from_numpy(vectors), torch.from_numpy(valid))
 
 
 def save_flow(path: Path, key: str, flow: OpticalFlow) -> None:
@@ -191,19 +191,10 @@ def save_flow(path: Path, key: str, flow: OpticalFlow) -> None:
     Raises:
         DevrfError: the file cannot be written.
     """
-    temporary = None
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(
-            dir=path.parent, prefix=f".{path.name}.", delete=False
-        ) as file:
-            temporary = Path(file.name)
+        with atomic_write(path) as partial:
             np.savez_compressed(
-                file, key=np.array(key), vectors=flow.vectors.numpy(), valid=flow.valid.numpy()
+                partial, key=np.array(key), vectors=flow.vectors.numpy(), valid=flow.valid.numpy()
             )
-        os.replace(temporary, path)
     except OSError as error:
         raise scene_error(path, f"cannot write the flow ({error}); choose another folder") from None
-    finally:
-        if temporary is not None:
-            temporary.unlink(missing_ok=True)

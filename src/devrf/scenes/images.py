@@ -82,17 +82,6 @@ def image_at(path: Path) -> Path | None:
     return None
 
 
-def find_image(path: Path) -> Path:
-    """As :func:`image_at`; DevrfError where there is none."""
-    found = image_at(path)
-    if found is None:
-        raise scene_error(
-            path,
-            f"no such image (looked for {', '.join(SUFFIXES)}); correct file_path or add the file",
-        )
-    return found
-
-
 def _open(path: Path) -> Image.Image:
     """The image at ``path``, its header read, nothing decoded yet."""
     with decoding(path, "image", "replace the file, or make it smaller"):

@@ -7,10 +7,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, TypeAdapter
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
@@ -42,7 +42,6 @@ from devrf.scenes.transforms import Transforms
 from devrf.scenes.validation import (
     FARTHEST,
     abbreviated,
-    first_error,
     in_reach,
     is_rotation,
     scene_error,
@@ -151,16 +150,13 @@ class Camera(BaseModel):
 _CAMERA = TypeAdapter(Camera)
 
 
-def read_camera(
-    folder: Path, item: str, center: tuple[float, float, float], scale: float
-) -> tuple[Tensor, Intrinsics]:
+def read_camera(folder: Path, item: str, world: World) -> tuple[Tensor, Intrinsics]:
     """The camera of image ``item``.
 
     Args:
         folder: the scene's folder.
         item: the image's id.
-        center: x, y, z of the world's origin, in the file's units.
-        scale: world units in one of the file's.
+        world: the frame of reference.
 
     Returns:
         The camera-to-world transform (3, 4) float32 in OpenGL axes, world units, and the
@@ -171,8 +167,22 @@ def read_camera(
     """
     file = inside(folder, folder / "camera", f"{item}.json", folder / "dataset.json")
     camera = read_json(file, _CAMERA, "every image needs its camera; add it")
+    world_to_camera = torch.tensor(camera.orientation, dtype=torch.float64)
+    if not bool(is_rotation(world_to_camera)):
+        raise scene_error(
+            file, "orientation is no rotation (scaled, sheared or mirrored axes); correct it"
+        )
+    # OpenCV's y points down and its z ahead; ours point up and back.
+    axes = world_to_camera.T * world_to_camera.new_tensor([1, -1, -1])
+    where = (axes.new_tensor(camera.position) - axes.new_tensor(world.center)) * world.scale
+    if not bool(in_reach(where)):
+        raise scene_error(
+            file,
+            f"position is farther than {FARTHEST:g} from the scene's center, in units of "
+            "scene.json; correct it, or center and scale there",
+        )
     focal = camera.focal_length
-    return _pose(camera, file, center, scale), Intrinsics(
+    intrinsics = Intrinsics(
         None,
         (focal, focal * camera.pixel_aspect_ratio),
         camera.principal_point,
@@ -180,25 +190,7 @@ def read_camera(
         Distortion((*camera.radial_distortion, 0.0), camera.tangential_distortion),
         camera.skew,
     )
-
-
-def _pose(camera: Camera, file: Path, center: tuple[float, float, float], scale: float) -> Tensor:
-    world_to_camera = torch.tensor(camera.orientation, dtype=torch.float64)
-    if not bool(is_rotation(world_to_camera)):
-        raise scene_error(
-            file,
-            "orientation is no rotation (scaled, sheared or mirrored axes); correct it",
-        )
-    # OpenCV's y points down and its z ahead; ours point up and back.
-    axes = world_to_camera.T * world_to_camera.new_tensor([1, -1, -1])
-    where = (axes.new_tensor(camera.position) - axes.new_tensor(center)) * scale
-    if not bool(in_reach(where)):
-        raise scene_error(
-            file,
-            f"position is farther than {FARTHEST:g} from the scene's center, in units of "
-            "scene.json; correct it, or center and scale there",
-        )
-    return torch.cat([axes, where[:, None]], dim=1).float()
+    return torch.cat([axes, where[:, None]], dim=1).float(), intrinsics
 
 
 Masks = Callable[[tuple[str, ...], ImageFolder], tuple[Path | None, ...]]
@@ -242,7 +234,7 @@ def read_items(
         raise scene_error(
             listing, "all images to learn from, or all that are held out, are absent; add them"
         )
-    cameras = [read_camera(folder, item, world.center, world.scale) for item in ids]
+    cameras = [read_camera(folder, item, world) for item in ids]
     source, moments = times[0], times[1](ids)
     first, span = min(moments), (max(moments) - min(moments)) or 1.0
     posed = Transforms(
@@ -271,7 +263,6 @@ class _Dataset(BaseModel):
 
     model_config = ConfigDict(coerce_numbers_to_str=True)
 
-    count: int | None = None
     ids: Ids | None = None
     train_ids: Ids | None = None
     val_ids: Ids | None = None
@@ -285,7 +276,7 @@ class _Moment(BaseModel):
 
 
 _DATASET = TypeAdapter(_Dataset)
-_ENTRIES: TypeAdapter[dict[str, Any]] = TypeAdapter(dict[str, Any])
+_MOMENTS = TypeAdapter(dict[str, _Moment])
 
 
 @dataclass(frozen=True)
@@ -319,10 +310,6 @@ def _items(file: Path, holdout: int) -> tuple[list[str], list[int], list[int]]:
     """The ids of the images, and the positions of those to learn from and those held out."""
     listed = read_json(file, _DATASET, "it lists the images; add it")
     ids, train, val = listed.ids or [], listed.train_ids or [], listed.val_ids or []
-    if ids and listed.count not in (None, len(ids)):
-        raise scene_error(
-            file, f'"count" is {listed.count}, but "ids" lists {len(ids)} images; correct it'
-        )
     items = ids or list(dict.fromkeys(train + val))
     position = {item: i for i, item in enumerate(items)}
     unknown = [item for item in train + val if item not in position]
@@ -330,14 +317,12 @@ def _items(file: Path, holdout: int) -> tuple[list[str], list[int], list[int]]:
         raise scene_error(
             file, f'{abbreviated(unknown[0])} is in train_ids or val_ids, but not in "ids"'
         )
-    if len(items) < 2:
-        raise scene_error(
-            file, f"lists {len(items)} images, expected at least two; correct its ids"
-        )
     if not val:
         chosen = [position[item] for item in train] or list(range(len(items)))
         if len(chosen) < 2:
-            raise scene_error(file, "one image in train_ids and none in val_ids; list more")
+            raise scene_error(
+                file, f"lists {len(chosen)} images to learn from, none in val_ids; add some"
+            )
         learn, held_out = every_nth(len(chosen), holdout)
         return items, [chosen[i] for i in learn], [chosen[i] for i in held_out]
     held = set(val)
@@ -352,24 +337,18 @@ def _items(file: Path, holdout: int) -> tuple[list[str], list[int], list[int]]:
 
 def _times(file: Path, items: Sequence[str]) -> tuple[float, ...]:
     """When each image was taken, on the scale of the file."""
-    content = read_json(
+    moments = read_json(
         file,
-        _ENTRIES,
+        _MOMENTS,
         "it says when each image was taken; add it, with one time_id for all of a scene at rest",
     )
-    moments = []
     for item in items:
-        if item not in content:
+        if item not in moments:
             raise scene_error(file, f"says nothing of image {abbreviated(item)}; add its warp_id")
-        try:
-            moments.append(_Moment.model_validate(content[item]))
-        except ValidationError as error:
-            raise first_error(error, f"{file}: {item}.") from None
-    key = "warp_id" if any(moment.time_id is None for moment in moments) else "time_id"
-    ids = []
-    for item, moment in zip(items, moments, strict=True):
-        value = getattr(moment, key)
-        if value is None:
-            raise scene_error(file, f"image {abbreviated(item)} has no {key}; add it")
-        ids.append(value)
-    return tuple(ids)
+    taken = [moments[item].time_id for item in items]
+    if None in taken:
+        taken = [moments[item].warp_id for item in items]
+    if None in taken:
+        item = items[taken.index(None)]
+        raise scene_error(file, f"image {abbreviated(item)} has no warp_id; add it")
+    return tuple(time for time in taken if time is not None)

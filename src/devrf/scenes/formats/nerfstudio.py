@@ -12,7 +12,7 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from devrf.scenes.files import inside, scene_folder
-from devrf.scenes.images import find_image, image_at
+from devrf.scenes.images import image_at
 from devrf.scenes.layout import Layout, fewer, load_layout, static_alone, without_static_set
 from devrf.scenes.masks import Masks
 from devrf.scenes.reader import Count, EstimatedFlow, Holdout, PosedReader, Time
@@ -138,12 +138,11 @@ def _train_and_test(
 def _listed(names: list[str] | None, split: str, transforms: Transforms, root: Path) -> list[int]:
     """Positions in the file, ascending, of the images that it lists for a split."""
     position = {image: i for i, image in enumerate(transforms.images)}
-    found = []
+    found = list[int]()
     for name in names or []:
-        place = inside(root, transforms.file.parent, name, transforms.file)
-        if transforms.skipped and image_at(place) is None:
+        image = image_at(inside(root, transforms.file.parent, name, transforms.file))
+        if image is None and transforms.skipped:
             continue
-        image = find_image(place)
         if image not in position:
             raise scene_error(
                 transforms.file,
