@@ -166,7 +166,7 @@ def _kept(file: Path, cameras: Cameras, times: list[float]) -> np.ndarray:
     if not file.is_file():
         room = ProceduralScene(surroundings="room", texture="fine")
         film = Filming(room.filmed(), REACH, steps=STEPS, opaque=True)
-        shown = [film.pictures(cameras[[k]], time).pixels for k, time in enumerate(times)]
+        shown = [film.pictures(cameras[[k]], time)[0] for k, time in enumerate(times)]
         torch.save(torch.cat(shown), file)
     pixels: Tensor = torch.load(file, weights_only=True)
     return pixels.numpy()

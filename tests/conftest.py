@@ -54,7 +54,7 @@ from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import CanonicalRates
 from devrf.methods.devrf.volume_rendering import render
 from devrf.rendering.output import RenderedImage
-from devrf.scenes.procedural import ProceduralScene
+from devrf.scenes.procedural import ProceduralForwardScene, ProceduralScene
 from devrf.scenes.scene import Scene
 
 logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
@@ -189,6 +189,14 @@ def tiny_recipe() -> ProceduralScene:
 def tiny_scene(tiny_recipe: ProceduralScene) -> Scene:
     """A robot in 24×18 pixels (not square): 8 static views, 2 moving views of 3 frames."""
     return tiny_recipe()
+
+
+@pytest.fixture(scope="session")
+def tiny_toy() -> Scene:
+    """A toy before a wall in 24×18 pixels: 7 static views, 3 moving views of 3 frames."""
+    return ProceduralForwardScene(
+        width=24, height=18, static_views=7, train_views=3, frames=3, supersample=1
+    )()
 
 
 @pytest.fixture(scope="session")

@@ -46,20 +46,11 @@ def folder(tmp_path, ring_cameras, picture, write_sparse) -> Path:
     return root
 
 
-def test_points_fall_on_the_pixels_that_show_them(folder):
+def test_points_fall_on_the_pixels_that_show_them(folder, balls_are_where_they_project):
     scene = ColmapReader(folder, downscale=1).read()
     balls = normalised(read_model(folder / "sparse/0")).points[:3].float()
     for views in (scene.static.train, scene.static.test):
-        for k, pixels in enumerate(views.pixels):
-            weight = pixels[..., :3].float() * pixels[..., 3:]
-            place = torch.stack(
-                torch.meshgrid(torch.arange(WIDTH), torch.arange(HEIGHT), indexing="xy"), dim=-1
-            )
-            middles = torch.einsum("hwb,hwc->bc", weight, place + 0.5)
-            expected, depth = views.cameras.project_into(k, balls)
-            assert (depth > 0).all()
-            found = middles / weight.sum(dim=(0, 1))[:, None]
-            torch.testing.assert_close(found, expected, atol=0.15, rtol=0)
+        balls_are_where_they_project(views, balls)
 
 
 def test_every_eighth_image_is_held_out_and_nothing_moves(folder, message_of):
@@ -95,9 +86,6 @@ def test_photographs_are_of_a_scene_without_end(folder):
     assert scene.bounds.box_source == "what the static cameras all see"
     # Half the depth of the nearest points, which lie on this side of the middle.
     assert 1.0 < scene.bounds.near < 2.0
-    given = ColmapReader(folder, downscale=1, near=0.7, box=[[-1, -1, -1], [1, 1, 1]]).read()
-    assert given.bounds.near == 0.7 and given.space.low == (-1, -1, -1)
-    assert given.bounds.box_source == "data.box is given"
 
 
 def test_cameras_on_one_side_make_a_forward_facing_scene(tmp_path, ring_cameras, write_sparse):
@@ -127,11 +115,9 @@ def test_smaller_images_are_used_where_they_are(folder):
     assert reduced.names[0].startswith("images_2/") and reduced.width == WIDTH // 2
     torch.testing.assert_close(reduced.cameras.focal, averaged.cameras.focal)
     # Of other names, as LLFF's tools write them.
-    for k, path in enumerate(sorted((folder / "images_2/round").iterdir())):
-        path.rename(folder / f"images_2/image{k:03d}.png")
-    assert torch.equal(
-        ColmapReader(folder, downscale=2).read().static.train.pixels, averaged.pixels
-    )
+    (folder / "images_2/round").rename(folder / "images_2/other")
+    again = ColmapReader(folder, downscale=2).read().static.train
+    assert torch.equal(again.pixels, averaged.pixels)
 
 
 @pytest.fixture
@@ -160,19 +146,15 @@ def test_fixed_views_are_posed_by_an_image_of_each(moving, message_of):
     torch.testing.assert_close(at_rest["images/round/view2.png"], train.cameras.positions[1])
     # What stands where the held-out camera does is not learned from.
     assert "images/round/view3.png" in scene.static.test.names
-    few = ColmapReader(moving, downscale=1, test_view=1, train_views=1, frames=2).read()
-    assert few.dynamic.train.pixels[:, 0, 0, 0].tolist() == [10, 12]
     (moving / "dynamic_3views").rename(moving / "dynamic_4views")
     shutil.copytree(moving / "dynamic_4views/view1", moving / "dynamic_4views/view4")
     assert "sparse/0: poses no image view4.png, nor one in a folder view4" in message_of(moving)
-    assert "data.dynamic" in message_of(moving, dynamic="dynamic_5views")
 
 
 @pytest.mark.parametrize(
     ("change", "said"),
     [
         (lambda root: shutil.rmtree(root / "sparse"), "balls: no COLMAP model (looked for cameras"),
-        (lambda root: shutil.rmtree(root / "images"), "balls: no folder images (found: none)"),
         (
             lambda root: (root / "sparse/0/points3D.txt").write_text(""),
             "sparse/0: its images show 0 sparse points, expected 50 or more",
@@ -184,14 +166,6 @@ def test_fixed_views_are_posed_by_an_image_of_each(moving, message_of):
         (
             lambda root: rewrite(root, "cameras", " OPENCV ", " OPENCV_FISHEYE "),
             "sparse/0: camera model OPENCV_FISHEYE is not supported, only SIMPLE_PINHOLE",
-        ),
-        (
-            lambda root: rewrite(root, "cameras", f" {WIDTH} {HEIGHT} ", f" {HEIGHT} {WIDTH} "),
-            "80x60 px, but its camera is one for 60x80 px",
-        ),
-        (
-            lambda root: rewrite(root, "images", "round/", "../../"),
-            "leads outside the scene's folder",
         ),
     ],
 )

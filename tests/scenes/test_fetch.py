@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+import shutil
 import tarfile
 import zipfile
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -40,8 +42,6 @@ def test_a_misspelt_name_is_answered_with_the_closest():
     "text",
     [
         "not TOML",
-        "[[collection]]\npage='https://a'\nlicence=''\ndata='inward'\nlearn=''\nurl='file:///etc'\n"
-        "scenes.a=''",
         "[[collection]]\npage='https://a'\nlicence=''\ndata='inward'\nlearn=''\nurl='https://a'\n"
         "scenes.'../a'=''",
     ],
@@ -84,20 +84,14 @@ def written(work: Path, kind: str, files: dict[str, bytes]) -> Path:
 
 
 @pytest.mark.parametrize("kind", ["zip", "tar"])
-def test_one_of_several_scenes_without_the_folders_around_it(tmp_path, kind):
+def test_the_scene_alone_is_unpacked_and_nothing_leaves_its_folder(tmp_path, kind):
     written(tmp_path, kind, FILES)
     folder = _unpacked(lego(), tmp_path)
     assert (folder / "transforms_train.json").read_bytes() == b"{}"
     assert (folder / "train/r_0.png").read_bytes() == b"picture"
-
-
-@pytest.mark.parametrize("kind", ["zip", "tar"])
-def test_nothing_leaves_the_folder(tmp_path, kind):
+    shutil.rmtree(tmp_path / "files")
     written(tmp_path, kind, {"lego/transforms_train.json": b"{}", "lego/../../../x.txt": b"out"})
-    if kind == "tar":
-        with pytest.raises(DevrfError, match="cannot be unpacked"):
-            _unpacked(lego(None), tmp_path)
-    else:
+    with pytest.raises(DevrfError, match="unpacked") if kind == "tar" else nullcontext():
         _unpacked(lego(None), tmp_path)
     assert not list(tmp_path.parent.rglob("x.txt"))
 

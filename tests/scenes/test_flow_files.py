@@ -69,25 +69,8 @@ def test_files_are_found_by_their_place_in_the_list(tmp_path):
     assert torch.equal(flow.vectors[:, 0, 0], torch.tensor([[0.0, 0], [2, 1], [2.5, 1.25]]))
 
 
-def test_some_missing_files_leave_their_images_without_flow(tmp_path, caplog):
-    write_flow(tmp_path / "002_bwd.npz", np.ones((9, 9, 2)), np.ones((9, 9), bool))
-    flow = read_flow(tmp_path, [1, 2], [True, True], (9, 9), (9, 9))
-    assert flow is not None and not flow.valid[0].any() and flow.valid[1].all()
-    assert "1 of 2 flow files are missing" in caplog.text
-
-
-@pytest.mark.parametrize(
-    ("arrays", "said"),
-    [
-        ({"mask": np.ones((4, 6), bool)}, 'no array "flow"'),
-        ({"flow": np.ones((6, 4, 2)), "mask": np.ones((4, 6))}, "(6, 4, 2), expected (4, 6, 2)"),
-        ({"flow": np.full((4, 6, 2), None), "mask": np.ones((4, 6))}, "not a readable npz"),
-    ],
-)
-def test_wrong_arrays_are_named(tmp_path, arrays, said):
+def test_wrong_arrays_are_named(tmp_path):
     path = tmp_path / "001_bwd.npz"
-    np.savez(path, allow_pickle=True, **arrays)
-    with pytest.raises(DevrfError) as caught:
+    write_flow(path, np.ones((6, 4, 2)), np.ones((4, 6)))
+    with pytest.raises(DevrfError, match="001_bwd.npz"):
         read_flow_file(path, width=6, height=4)
-    message = str(caught.value)
-    assert str(path) in message and said in message and "\n" not in message

@@ -40,14 +40,6 @@ def test_they_are_left_out(scene_folder, caplog):
     assert "2 of the 6 images are absent and left out, static/train/r_002 the first" in line
 
 
-def test_flow_files_are_dropped_where_their_numbers_are_uncertain(scene_folder, caplog):
-    (scene_folder.dynamic / "train/r_002.png").unlink()
-    with caplog.at_level(logging.INFO):
-        scene = BlenderReader(scene_folder.root, missing="skip").read()
-    assert len(scene.dynamic.train) == 5 and scene.dynamic.train.flow is None
-    assert "flow files dropped: they are numbered by images" in caplog.text
-
-
 def test_in_a_file_that_lists_what_is_held_out(tmp_path, balls, caplog):
     root = tmp_path / "scene"
     balls.write(root, [k / 8 for k in range(9)])
@@ -65,13 +57,9 @@ def test_in_a_file_that_lists_what_is_held_out(tmp_path, balls, caplog):
     ("downscale", "side", "factor"),
     [
         ("up_to_4", 800, 4),
-        ("up_to_4", 256, 4),
         ("up_to_4", 255, 3),
-        ("up_to_4", 128, 2),
-        ("up_to_4", 100, 1),
         ("up_to_4", 24, 1),
         (4, 24, 4),
-        (1, 800, 1),
     ],
 )
 def test_the_factor(downscale: int | str, side: int, factor: int) -> None:
@@ -93,10 +81,3 @@ def test_the_folder_that_is_there_is_taken(llff_folder, caplog):
         "images keep their size, although data.downscale=up_to_4: their shorter side has 64"
         in caplog.text
     )
-
-
-def test_an_image_that_is_too_small_stays_as_it_is(scene_folder, refusal):
-    assert BlenderReader(scene_folder.root, downscale="up_to_4").read().static.train.width == 32
-    assert "8x6 px" in refusal(BlenderReader, scene_folder.root, downscale=4)
-    message = refusal(BlenderReader, scene_folder.root, downscale="4x")
-    assert message.startswith("data.downscale: ") and "up_to_<number>" in message

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-import shutil
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -63,18 +61,10 @@ def test_a_world_point_falls_on_the_pixel_computed_by_hand(llff_folder):
     assert pixel[0].tolist() == pytest.approx([12 + 20 * 0.2, 8 - 20 * 0.1])
     assert float(depth) == 2
     # The fixed view 2 is at the origin too, view 1 half a unit to its left.
+    assert scene.dynamic.test.cameras.positions[0].tolist() == [0.5, 0, 0]
     pixel, _ = scene.dynamic.train.cameras.project(torch.tensor([0, 1]), point.repeat(2, 1))
     assert pixel[0].tolist() == pytest.approx([12 + 20 * 0.45, 6])
     assert pixel[1].tolist() == pytest.approx([16, 6])
-
-
-def test_dynamic_poses_are_taken_as_they_are(llff_folder):
-    scene = LlffReader(llff_folder.root).read()
-    # The last three of five; 40 px in images of 48×32 are 20 px here.
-    assert scene.dynamic.train.cameras.positions[:2, 0].tolist() == [-0.5, 0]
-    assert scene.dynamic.test.cameras.positions[0].tolist() == [0.5, 0, 0]
-    assert scene.dynamic.train.cameras.focal[0].tolist() == [20, 20]
-    assert torch.equal(scene.dynamic.train.cameras.camera_to_world[0, :, :3], torch.eye(3))
 
 
 def test_a_tilted_world_is_turned_back(llff_folder):
@@ -111,28 +101,12 @@ def test_poses_without_intrinsics_take_them_from_their_own_file(llff_folder, inn
     assert cameras.positions[:, 0].tolist() == pytest.approx([k - 4 for k in range(1, 8)])
 
 
-def test_full_size_images_are_made_smaller_where_the_factor_is_missing(llff_folder):
-    for folder in (llff_folder.static, *llff_folder.dynamic.glob("view*")):
-        count = len(list((folder / "images_4").iterdir()))
-        shutil.rmtree(folder / "images_4")
-        llff_folder.images(folder / "images", count, times=4)
-    scene = LlffReader(llff_folder.root, downscale=4).read()
-    assert scene.static.train.pixels.shape == (7, 16, 24, 3)
-    assert scene.static.train.cameras.focal[0].tolist() == [20, 20]
-    assert scene.dynamic.train.cameras.focal[0].tolist() == [20, 20]
-    assert LlffReader(llff_folder.root, downscale=2).read().static.train.width == 48
-
-
 @pytest.mark.parametrize(
     ("names", "found"),
     [
         # By the images' names, by the numbers in them, by position.
         (("a_010.png", "a_020.png", "a_030.png"), {"a_020": 1, "a_030": 2}),
-        (("a_010.png", "a_020.png", "a_030.png"), {"020": 1, "030": 2}),
         (("a_010.png", "a_020.png", "a_030.png"), {"001": 1, "002": 2}),
-        # Counted from 1: 002 may be the second image, or the third; all files decide together.
-        (("001.png", "002.png", "003.png"), {"002": 1, "003": 2}),
-        (("001.png", "002.png", "003.png"), {"001": 1, "002": 2}),
         # Time passes by numbers, not by letters.
         (("8.png", "9.png", "10.png"), {"9": 1, "10": 2}),
     ],
@@ -169,20 +143,11 @@ def test_forward_flow_leaves_out_the_last_frame(llff_folder):
     assert thinned.forward_flow(thinned.read().dynamic.train) is None
 
 
-def test_missing_flow_files_leave_images_without_flow(llff_folder, caplog):
-    llff_folder.flow(2, "002", 5.0)
-    with caplog.at_level(logging.WARNING):
-        train = LlffReader(llff_folder.root).read().dynamic.train
-    assert "3 of 4 flow files are missing" in caplog.text
-    assert train.flow is not None
-    assert train.flow.valid.flatten(1).any(dim=1).tolist() == [False] * 5 + [True]
-    assert LlffReader(llff_folder.root, flow="none").read().dynamic.train.flow is None
-
-
-@pytest.mark.parametrize(("test_view", "held_out"), [(1, 0), (2, 10), (-3, 0), (3, 20)])
-def test_another_view_is_held_out(llff_folder, test_view, held_out):
+@pytest.mark.parametrize(("test_view", "held_out"), [(2, 10), (-3, 0)])
+def test_another_view_is_held_out(llff_folder, test_view, held_out, caplog):
     llff_folder.flow(3, "001", 3.0)
     dynamic = LlffReader(llff_folder.root, test_view=test_view).read().dynamic
+    assert "3 of 4 flow files are missing" in caplog.text
     assert reds(dynamic.test) == [held_out, held_out + 1, held_out + 2]
     assert set(reds(dynamic.train)) == {0, 1, 2, 10, 11, 12, 20, 21, 22} - set(reds(dynamic.test))
     assert dynamic.train.view.tolist() == [0, 1] * 3
@@ -190,11 +155,9 @@ def test_another_view_is_held_out(llff_folder, test_view, held_out):
     place = {0: -0.5, 1: 0.0, 2: 0.5}
     for red, camera in zip(reds(dynamic.train), dynamic.train.cameras.positions, strict=True):
         assert float(camera[0]) == place[red // 10]
-    if dynamic.train.flow is not None:
-        valid = dynamic.train.flow.valid.flatten(1).any(dim=1)
-        assert [r for r, v in zip(reds(dynamic.train), valid, strict=True) if v] == [21]
-    else:
-        assert held_out == 20
+    assert dynamic.train.flow is not None
+    valid = dynamic.train.flow.valid.flatten(1).any(dim=1)
+    assert [r for r, v in zip(reds(dynamic.train), valid, strict=True) if v] == [21]
 
 
 def test_space_and_box_by_hand(llff_folder):
@@ -228,10 +191,8 @@ def stored(folder: Any, file: str) -> np.ndarray:
     ("file", "where", "value", "said"),
     [
         (STATIC, (2, 3), np.nan, "NaN or infinity"),
-        (STATIC, (2, 14), 0, "focal length 0 is not above 0"),
         (STATIC, (3, 4), 640, "24x16 px, but its camera is one for"),
         (STATIC, (1, 0), 1, "camera 1: its axes are no rotation"),
-        (STATIC, (0, 15), 0, "camera 0: expected 0 < least depth < largest depth"),
         (POSES, (4, 2, 4), 0, "focal length 0"),
         (BOUNDS, (1, 0), -1, "camera 1: expected 0 < least depth"),
     ],
@@ -239,57 +200,35 @@ def stored(folder: Any, file: str) -> np.ndarray:
 def test_wrong_numbers(llff_folder, file, where, value, said, message_of):
     values = stored(llff_folder, file)
     values[where] = value
-    path = llff_folder.save(file, values)
-    message = message_of(llff_folder.root)
-    assert str(path) in message and said in message
+    llff_folder.save(file, values)
+    assert said in message_of(llff_folder.root)
 
 
 def test_missing_images(llff_folder, message_of):
     message = message_of(llff_folder.root, downscale=2)
     assert "no folder images_2 or images (found: images_4)" in message
-    assert "no folder images (found: images_4)" in message_of(llff_folder.root, downscale=1)
     images = llff_folder.dynamic / "view2" / "images_4"
     (images / "002.png").unlink()
     assert f"{images}: has 2 images, but" in message_of(llff_folder.root)
-    shutil.rmtree(images)
-    images.mkdir()
-    assert f"{images}: no images" in message_of(llff_folder.root)
-    shutil.rmtree(images)
-    assert f"{images.parent}: no folder images_4 or images" in message_of(llff_folder.root)
+    (images.parent).rename(llff_folder.dynamic / "view02")
+    assert "no folder view2 although there is view3" in message_of(llff_folder.root)
 
 
-def test_cameras_around_a_scene_are_not_forward_facing(llff_folder, message_of):
-    rows = stored(llff_folder, STATIC)
-    matrix = rows[:, :15].reshape(9, 3, 5)
-    for k in range(9):
-        angle = 2 * np.pi * k / 9
-        c, s = np.cos(angle), np.sin(angle)
-        matrix[k, :, :3] = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ matrix[k, :, :3]
-    path = llff_folder.save(STATIC, np.concatenate([matrix.reshape(9, 15), rows[:, 15:]], axis=1))
-    message = message_of(llff_folder.root)
-    assert str(path) in message and "data=inward" in message
-
-
-@pytest.mark.parametrize("camera", [2, 4])
-def test_a_fixed_camera_that_looks_elsewhere(llff_folder, camera, message_of):
+def test_a_fixed_camera_that_looks_elsewhere(llff_folder, message_of):
     poses = stored(llff_folder, POSES)
     # A quarter turn about the vertical axis: right is back, back is left.
-    poses[camera, :, :3] = [[0, 0, -1], [0, 1, 0], [1, 0, 0]]
+    poses[4, :, :3] = [[0, 0, -1], [0, 1, 0], [1, 0, 0]]
     llff_folder.save(POSES, poses)
     message = message_of(llff_folder.root)
-    assert f"view{camera - 1}/images_4/000.png: its camera does not look along" in message
+    assert "view3/images_4/000.png: its camera does not look along" in message
 
 
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"downscale": 12}, "8x5 px"),
         ({"holdout": 1}, "data.holdout"),
         ({"train_views": 3}, "the set has 2 views"),
         ({"test_view": 4}, "none of the 3 views"),
-        ({"test_view": -4}, "none of the 3 views"),
-        ({"near": 0}, "data.near"),
-        ({"dynamic": "other"}, "'other'"),
     ],
 )
 def test_wrong_options(llff_folder, options, said, message_of):

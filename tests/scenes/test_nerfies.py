@@ -48,46 +48,18 @@ class Folder:
 
 
 @pytest.fixture
-def folder(tmp_path, ring_cameras, picture) -> Folder:
+def folder(tmp_path, ring_cameras, picture, write_camera) -> Folder:
     """The scene of the balls, in a world that scene.json moves back to the origin."""
     made = Folder(tmp_path / "scene")
     ring = ring_cameras(COUNT, width=WIDTH, height=HEIGHT, angle=0.9)
-    (made.root / "rgb/1x").mkdir(parents=True)
     for item, pose in zip(IDS, ring.camera_to_world, strict=True):
-        iio.imwrite(made.root / f"rgb/1x/{item}.png", picture(pose, LENS, WIDTH, HEIGHT))
-        axes = pose[:, :3] * torch.tensor([1.0, -1.0, -1.0])
-        made.write(
-            f"camera/{item}.json",
-            {
-                "orientation": axes.T.tolist(),
-                "position": (pose[:, 3] / SCALE + CENTER).tolist(),
-                "focal_length": 88.0,
-                "pixel_aspect_ratio": 0.95,
-                "skew": 3.0,
-                "principal_point": [42.0, 28.0],
-                "image_size": [WIDTH, HEIGHT],
-                "radial_distortion": [-0.3, 0.1, 0.01],
-                "tangential_distortion": [6e-3, -8e-3],
-            },
-        )
+        pixels = picture(pose, LENS, WIDTH, HEIGHT)
+        placed = torch.cat([pose[:, :3], (pose[:, 3] / SCALE + CENTER)[:, None]], dim=1)
+        write_camera(made.root, "1x", item, pixels, placed, LENS)
     made.write("scene.json", {"center": CENTER.tolist(), "scale": SCALE, "near": 0.5, "far": 9.0})
-    made.write(
-        "metadata.json",
-        {
-            item: {"warp_id": 10 + i, "appearance_id": i, "camera_id": 0}
-            for i, item in enumerate(IDS)
-        },
-    )
-    made.write(
-        "dataset.json",
-        {
-            "count": COUNT,
-            "num_exemplars": 7,
-            "ids": IDS,
-            "train_ids": IDS[:3] + IDS[4:8],
-            "val_ids": [IDS[3], IDS[8]],
-        },
-    )
+    made.write("metadata.json", {item: {"warp_id": 10 + i} for i, item in enumerate(IDS)})
+    lists = {"train_ids": IDS[:3] + IDS[4:8], "val_ids": [IDS[3], IDS[8]]}
+    made.write("dataset.json", {"count": COUNT, "ids": IDS, **lists})
     return made
 
 
@@ -100,14 +72,6 @@ def test_points_fall_on_the_pixels_that_show_them(folder, balls_are_where_they_p
     distance = scene.dynamic.train.cameras.positions.norm(dim=1)
     torch.testing.assert_close(distance, torch.full((7,), 4.0))
     assert (scene.bounds.near, scene.bounds.far) == (0.5, 9.0)
-
-
-@pytest.mark.parametrize("key", ["radial_distortion", "tangential_distortion", "skew"])
-def test_without_one_of_the_numbers_they_do_not(folder, balls_are_where_they_project, key):
-    for item in IDS:
-        folder.edit(f"camera/{item}.json", lambda c: c.pop(key))
-    with pytest.raises(AssertionError, match="not close"):
-        balls_are_where_they_project(NerfiesReader(folder.root, downscale=1).read().dynamic.train)
 
 
 def test_smaller_images_are_used_where_they_are(folder, balls_are_where_they_project, message_of):
@@ -155,9 +119,6 @@ def test_without_alpha_masks_the_box_holds_the_backdrop(folder):
         for distance in (0.5, 3.0, 6.0):
             assert box.scaled(1.001).contains(rays.origins + distance * rays.directions).all()
     assert box.volume > cut_out.volume
-    assert NerfiesReader(
-        folder.root, downscale=1, box=[[-1, -1, -1], [1, 1, 1]]
-    ).read().bounds.box.size == (2, 2, 2)
 
 
 def test_time_ids_come_before_warp_ids(folder):
@@ -185,19 +146,13 @@ CAMERA = "camera/000004.json"
 @pytest.mark.parametrize(
     ("file", "change", "said"),
     [
-        ("dataset.json", lambda c: c.update(count=12), '"count" is 12, but "ids" lists 9'),
-        ("dataset.json", lambda c: c["train_ids"].append("x"), "'x' is in train_ids or val_ids"),
-        ("dataset.json", lambda c: c.update(train_ids=[], val_ids=IDS), "all images are held out"),
-        ("metadata.json", lambda c: c.pop(IDS[5]), "says nothing of image '000005'"),
         ("metadata.json", lambda c: c[IDS[5]].pop("warp_id"), "image '000005' has no warp_id"),
         ("scene.json", lambda c: c.pop("near"), "near: is missing"),
         (CAMERA, lambda c: c.update(focal_length=0), "focal_length: should be greater than 0"),
         (CAMERA, lambda c: c.update(orientation=[[1, 0, 0]] * 3), "orientation is no rotation"),
-        (CAMERA, lambda c: c.update(image_size=[60, 80]), "80x60 px, but its camera is one for"),
-        (CAMERA, lambda c: c.update(radial_distortion=[-9, 0, 0]), "folds over"),
     ],
 )
 def test_wrong_values(folder, file, change, said, message_of):
     folder.edit(file, change)
     message = message_of(folder.root)
-    assert said in message and (Path(file).stem in message or "rgb/1x/000004.png" in message)
+    assert said in message and Path(file).stem in message

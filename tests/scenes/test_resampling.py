@@ -16,8 +16,7 @@ PINCUSHION = Distortion((0.15, 0.02, 0.01, 0.0), (-0.004, 0.003))
 WIDTH, HEIGHT = 96, 64
 
 
-@pytest.mark.parametrize("distortion", [BARREL, PINCUSHION, Distortion()])
-@pytest.mark.parametrize("skew", [0.0, 4.0])
+@pytest.mark.parametrize(("distortion", "skew"), [(BARREL, 0.0), (PINCUSHION, 4.0)])
 def test_straight_lines_come_out_straight(distortion, skew, lens_directions):
     """Each pixel shows its own direction: an image of x/z and y/z becomes one linear in them."""
     lens = Lens((70.0, 60.0), (50.0, 30.0), distortion, skew)
@@ -53,12 +52,6 @@ def test_colours_behind_the_matte_do_not_bleed_in():
     places = np.array([[[1.0, 0.5], [1.5, 0.5], [0.5, 0.5]]], dtype=np.float32)
     between = look_up_pixels(image, places)
     assert between[0].tolist() == [[200, 100, 50, 128], [0, 0, 0, 0], [200, 100, 50, 255]]
-
-
-def test_an_image_that_is_too_wide_is_an_error_that_names_it():
-    image = torch.zeros(1, 8, 40_000, 3, dtype=torch.uint8)
-    with pytest.raises(DevrfError, match=r"a.png: 40000x8 px, .* use a larger data.downscale"):
-        as_pinhole(image, [Lens((4e4, 4e4), (2e4, 4.0), BARREL)], ["a.png"])
 
 
 @pytest.mark.parametrize("k1", [-3.0, 60.0])

@@ -102,16 +102,3 @@ def test_hull_holds_the_ball_and_little_more():
     assert hull[distance < BALL].all()
     # A pixel is 0.06 wide here, a cell 0.06: no more than a few of both may be added.
     assert not hull[distance > BALL + 0.3].any()
-
-
-def test_points_that_no_view_has_in_the_picture_stay():
-    views = masks_of_a_ball()
-    away = Cameras.looking_at(
-        views.cameras.positions,
-        2 * views.cameras.positions,
-        focal=70.0,
-        width=views.width,
-        height=views.height,
-    )
-    blind = Views(views.pixels, away, views.times, views.view, views.names)
-    assert visual_hull(blind, BOX, (5, 5, 5)).all()

@@ -74,16 +74,6 @@ def test_one_folder_without_times(single_folder, caplog, time, said):
     assert len(lines) == 1 and f"transforms_train.json: its frames have {said}" in lines[0]
 
 
-def test_times_in_the_test_set_alone_are_motion(single_folder):
-    file = single_folder / "transforms_train.json"
-    content = json.loads(file.read_text())
-    for frame in content["frames"]:
-        frame["time"] = 0.0
-    file.write_text(json.dumps(content))
-    with pytest.raises(Exception, match="all dynamic images have one time"):
-        BlenderReader(single_folder).read()
-
-
 def test_a_static_folder_without_a_dynamic_one(scene_folder, refusal):
     shutil.rmtree(scene_folder.dynamic)
     assert_at_rest(BlenderReader(scene_folder.root).read(), 6, 2)
@@ -92,23 +82,19 @@ def test_a_static_folder_without_a_dynamic_one(scene_folder, refusal):
         assert f"data.{next(iter(option))}" in message and "one moment" in message
 
 
-@pytest.mark.parametrize("nested", [True, False])
-def test_llff_alone(llff_folder, nested, refusal):
-    shutil.rmtree(llff_folder.dynamic)
-    root = llff_folder.root if nested else llff_folder.static
+def test_llff_alone(llff_folder, refusal):
+    root = llff_folder.static
     scene = LlffReader(root).read()
     assert scene.kind == "forward"
     assert_at_rest(scene, 7, 2)
     assert "data.frames: 2 was asked for" in refusal(LlffReader, root, frames=2)
 
 
-@pytest.mark.parametrize("told", [True, False])
-def test_an_llff_video(llff_folder, told, refusal):
+def test_an_llff_video(llff_folder, refusal):
     """Nine images of one camera: the eighth is held out, each has a time of its own."""
     root = llff_folder.static
-    if not told:
-        (root / "precomputed.json").write_text("{}")
-    scene = LlffReader(root, monocular=True if told else None).read()
+    (root / "precomputed.json").write_text("{}")
+    scene = LlffReader(root).read()
     assert scene.moves and scene.static.train is scene.dynamic.train
     times = torch.arange(9) / 8
     assert torch.equal(scene.dynamic.train.times, times[[0, 1, 2, 3, 4, 5, 6, 8]])
@@ -117,15 +103,13 @@ def test_an_llff_video(llff_folder, told, refusal):
     early = LlffReader(root, monocular=True, static_until=0.25, frames=3).read()
     assert early.static.train.times.tolist() == [0.0]
     assert early.dynamic.train.times.tolist() == [0.0, 0.5, 1.0]
-    still = LlffReader(root, monocular=False).read()
-    assert_at_rest(still, 7, 2)
+    assert not LlffReader(root, monocular=False).read().moves
     assert "data.train_views" in refusal(LlffReader, root, monocular=True, train_views=1)
     assert "data.monocular" in refusal(LlffReader, llff_folder.root, monocular=True)
 
 
-@pytest.mark.parametrize("time", [None, 0.5])
-def test_nerfstudio_without_times(tmp_path, balls, time):
-    balls.write(tmp_path / "one", None if time is None else [time] * 9)
+def test_nerfstudio_without_times(tmp_path, balls):
+    balls.write(tmp_path / "one", [0.5] * 9)
     assert_at_rest(NerfstudioReader(tmp_path / "one").read(), 8, 1)
     balls.write(tmp_path / "two/static", None)
     assert_at_rest(NerfstudioReader(tmp_path / "two").read(), 8, 1)

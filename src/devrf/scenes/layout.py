@@ -20,7 +20,9 @@ from devrf.scenes.splits import (
     distinct_times,
     evenly_spread,
     first_views,
+    in_motion,
     load_views,
+    one_moment,
 )
 from devrf.scenes.transforms import Transforms
 from devrf.scenes.validation import scene_error
@@ -63,6 +65,14 @@ def static_alone(train: Transforms, test: Transforms, why: str) -> Layout:
     return Layout(train_set, test_set, train_set, test_set)
 
 
+def one_capture(train: Transforms, test: Transforms, static_until: float) -> Layout:
+    """The layout of one capture: at rest without times, or with one, else without a static set."""
+    if one_moment(train, test):
+        found = "no time" if train.times is None else "one time"
+        return static_alone(train, test, f"its frames have {found}")
+    return without_static_set(in_motion(train), in_motion(test), static_until)
+
+
 def without_static_set(train: Split, test: Split, static_until: float) -> Layout:
     """The layout of one capture in motion, whose early images count as static.
 
@@ -74,14 +84,13 @@ def without_static_set(train: Split, test: Split, static_until: float) -> Layout
     Raises:
         DevrfError: no image to learn from is that early.
     """
-    early = train.where(train.times <= static_until + 1e-6)
+    early, early_test = (split.where(split.times <= static_until + 1e-6) for split in (train, test))
     if len(early.index) == 0:
         raise scene_error(
             train.transforms.file,
             f"no image at a time of data.static_until={static_until:g} or "
             "before to learn the static scene from; set it higher",
         )
-    early_test = test.where(test.times <= static_until + 1e-6)
     if len(early_test.index) == 0:
         early_test = test
     log.warning(

@@ -16,7 +16,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from devrf.scenes.images import Finish, Header, Size, decode, in_threads, read_header
+from devrf.scenes.images import Finish, Size, decode, in_threads, read_header
 from devrf.scenes.lens import Lens
 from devrf.scenes.resampling import as_pinhole, shrink_pixels
 from devrf.scenes.validation import check_memory, scene_error
@@ -52,7 +52,14 @@ def read_mask(path: Path, image: tuple[int, int], camera: Size | None, name: obj
         DevrfError: the file cannot be read, has another size, or is not grey.
     """
     header = read_header(path, image)
-    _check_size(path, header, image, camera, name)
+    size = (header.width, header.height)
+    full = camera is not None and size == camera and size[0] >= image[0] and size[1] >= image[1]
+    if size != image and not full:
+        raise scene_error(
+            path,
+            f"{size[0]}x{size[1]} px, but its image {name} has {image[0]}x{image[1]} px; "
+            "give the mask in the image's size",
+        )
     pixels = decode(path, header, "RGBA")
     spread = pixels[..., :3].max(axis=2) - pixels[..., :3].min(axis=2)
     if int(spread.max()) > GREY_NOISE or int(pixels[..., 3].min()) < WHITE:
@@ -64,22 +71,9 @@ def read_mask(path: Path, image: tuple[int, int], camera: Size | None, name: obj
     grey = np.ascontiguousarray(pixels[..., :1])
     if int(grey.max()) == 1:
         grey *= WHITE
-    if (header.width, header.height) != image:
+    if size != image:
         grey = shrink_pixels(grey, *image)
     return grey[..., 0]
-
-
-def _check_size(
-    path: Path, header: Header, image: tuple[int, int], camera: Size | None, name: object
-) -> None:
-    size = (header.width, header.height)
-    full = camera is not None and size == camera and size[0] >= image[0] and size[1] >= image[1]
-    if size != image and not full:
-        raise scene_error(
-            path,
-            f"{size[0]}x{size[1]} px, but its image {name} has {image[0]}x{image[1]} px; "
-            "give the mask in the image's size",
-        )
 
 
 def cutting_out(

@@ -51,7 +51,9 @@ def motion_box(views: Views, box: Box, *, resolution: int = 64, search: float = 
     area = box.scaled(search)
     cell = area.longest / (resolution - 1)
     points = area.grid_points((resolution,) * 3, views.cameras.focal).reshape(-1, 3)
-    masks = _silhouettes(views, _reach(views, area, cell))
+    low, high = area.corners(views.cameras.positions)
+    distance = float((views.cameras.positions - (low + high) / 2).norm(dim=1).median())
+    masks = _silhouettes(views, _reach(views, cell, distance, float(views.cameras.focal.amax())))
     cached: dict[int, Array] = {}
     hull = np.zeros(len(points), dtype=np.bool_)
     for images in frames:
@@ -87,14 +89,12 @@ def _frames(views: Views) -> list[list[int]] | None:
     return frames
 
 
-def _reach(views: Views, area: Box, cell: float) -> int:
-    """Pixels by which silhouettes are dilated: half a grid cell's diagonal at the box's centre.
+def _reach(views: Views, cell: float, distance: float, focal: float) -> int:
+    """Pixels that half a grid cell's diagonal covers at a distance, all in world units.
 
-    With less, a part thinner than a cell could pass between the grid's points unseen.
+    Silhouettes are dilated by them: else a part thinner than a cell could pass between the grid's
+    points unseen.
     """
-    low, high = area.corners(views.cameras.positions)
-    distance = float((views.cameras.positions - (low + high) / 2).norm(dim=1).median())
-    focal = float(views.cameras.focal.amax())
     pixels = math.sqrt(3) / 2 * cell * focal / max(distance, cell)
     return max(1, min(math.ceil(pixels), max(views.width, views.height)))
 
@@ -113,16 +113,12 @@ def _silhouettes(views: Views, reach: int) -> Array:
     at_border = perhaps[:, [0, -1]].any(axis=(1, 2)) | perhaps[:, :, [0, -1]].any(axis=(1, 2))
     cut_off = at_border | ~solid.any(axis=(1, 2))
     codes = np.empty((count, height * width + 1), dtype=np.uint8)
-    codes[:, :-1] = _dilated(solid, reach).reshape(count, -1)
+    square = np.ones((2 * reach + 1,) * 2, dtype=np.uint8)
+    grown = [cv2.dilate(mask, square) for mask in solid.astype(np.uint8)]
+    codes[:, :-1] = np.stack(grown).reshape(count, -1)
     codes[:, :-1][unknown.reshape(count, -1)] = UNSEEN
     codes[:, -1] = np.where(cut_off, UNSEEN, OUTSIDE)
     return codes
-
-
-def _dilated(masks: Array, reach: int) -> Array:
-    """Masks (N, H, W) grown by ``reach`` pixels to each side, as a square."""
-    square = np.ones((2 * reach + 1,) * 2, dtype=np.uint8)
-    return np.stack([cv2.dilate(mask, square) for mask in masks.astype(np.uint8)])
 
 
 def _pixel_index(views: Views, image: int, points: Tensor) -> Array:
@@ -160,7 +156,9 @@ def visual_hull(
     for k in range(len(views)):
         left = held.nonzero()[:, 0]
         pixel, depth = cameras.project_into(k, points[left])
-        reach = _cell_reach(views, k, cell, box)
+        position = views.cameras.positions[k]
+        nearest = float((position - box.nearest(position)).norm())
+        reach = _reach(views, cell, nearest, float(views.cameras.focal[k].max()))
         solid = views.pixels[k, :, :, 3][None].float()
         if views.valid_mask is not None:
             solid = solid.masked_fill(~views.valid_mask[k], 255.0)
@@ -171,12 +169,3 @@ def visual_hull(
         row = torch.where(seen, y * views.width + x, 0)
         held[left[seen & (grown.view(-1)[row] == 0)]] = False
     return held.view(shape)
-
-
-def _cell_reach(views: Views, k: int, cell: float, box: Box) -> int:
-    """Pixels that half a cell's diagonal covers where the box is nearest to the camera."""
-    position = views.cameras.positions[k]
-    nearest = float((position - box.nearest(position)).norm())
-    focal = float(views.cameras.focal[k].max())
-    pixels = math.sqrt(3) / 2 * cell * focal / max(nearest, cell)
-    return max(1, min(math.ceil(pixels), max(views.width, views.height)))

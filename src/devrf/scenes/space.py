@@ -73,7 +73,7 @@ def inward_space(
         )
         why = "data.space=world" if choice == "world" else given or masks
         where = given or "what the static cameras all see"
-        return WORLD, _because(bounds, why, where)
+        return WORLD, replace(bounds, reason=why, box_source=where)
     inner, where = box or box_from_cameras(static.cameras), given
     if box is None:
         where = "what the static cameras all see"
@@ -89,13 +89,10 @@ def inward_space(
         near = NEAR_SHARE * float(min(distances))
     if not 0 <= near < math.inf:
         raise scene_error("data.near", f"expected a distance of 0 or more, not {near:g}")
-    bounds = Bounds(space.box, near, math.inf, None, 1.0, "the box")
     why = "data.space=contracted" if choice == "contracted" else f"{masks}, data.box is not given"
-    return space, _because(bounds, why, where)
-
-
-def _because(bounds: Bounds, why: str, where: str) -> Bounds:
-    return replace(bounds, reason=why, box_source=where)
+    return space, Bounds(
+        space.box, near, math.inf, None, 1.0, "the box", reason=why, box_source=where
+    )
 
 
 # Where the room for motion comes from.
@@ -129,7 +126,14 @@ def forward_facing_scene(
     bounds = forward_bounds(learned, space, SEEN if moves else STILL)
     # The held-out cameras need not see inside the box, but they have to look the same way.
     forward_bounds(held_out, space, "")
-    _warn_of_cameras_beyond(near, learned + held_out)
+    for views in learned + held_out:
+        beyond = (views.cameras.positions[:, 2] <= -near).nonzero().flatten()
+        if len(beyond):  # it would look through what is behind the near plane
+            log.warning(
+                "%d cameras are beyond the near plane, %s the first of them; set data.near higher",
+                len(beyond),
+                views.names[int(beyond[0])],
+            )
     return Scene(name, "forward", static, dynamic, bounds, background, space)
 
 
@@ -146,18 +150,6 @@ def centred(static: Capture, dynamic: Capture) -> tuple[Capture, Capture]:
         Capture(moved[id(one.train)], moved[id(one.test)]) for one in (static, dynamic)
     )
     return first, second
-
-
-def _warn_of_cameras_beyond(near: float, everyone: list[Views]) -> None:
-    """A camera beyond the near plane would look through what is behind it."""
-    for views in everyone:
-        beyond = (views.cameras.positions[:, 2] <= -near).nonzero().flatten()
-        if len(beyond):
-            log.warning(
-                "%d cameras are beyond the near plane, %s the first of them; set data.near higher",
-                len(beyond),
-                views.names[int(beyond[0])],
-            )
 
 
 def dynamic_only(scene: Scene) -> Scene:

@@ -24,23 +24,17 @@ from devrf.scenes.validation import scene_error
 log = logging.getLogger(__name__)
 
 
-def every_nth(count: int, holdout: int) -> tuple[list[int], list[int]]:
+def every_nth(count: int, holdout: int, start: int | None = None) -> tuple[list[int], list[int]]:
     """The positions to learn from and those to hold out, of ``count`` ≥ 2 images.
 
-    Every ``holdout``-th (≥ 2) is held out: the last of each such run, since the first image of a
-    sequence shows the scene at rest. Of fewer images the last one is held out.
+    Args:
+        count: how many images there are.
+        holdout: every ``holdout``-th (≥ 2) is held out; of fewer images the last one is.
+        start: the first to hold out: 0 for images at rest, as LLFF's scenes are scored; None: the
+            last of the first run, since a sequence begins at rest.
     """
-    held_out = list(range(holdout - 1, count, holdout)) or [count - 1]
-    return sorted(set(range(count)) - set(held_out)), held_out
-
-
-def first_of_every(count: int, holdout: int) -> tuple[list[int], list[int]]:
-    """The positions to learn from and those to hold out, of ``count`` ≥ 2 images at rest.
-
-    Every ``holdout``-th (≥ 2) is held out, the first included: so are LLFF's scenes scored, and
-    those of mip-NeRF 360.
-    """
-    held_out = list(range(0, count, holdout))
+    start = holdout - 1 if start is None else start
+    held_out = list(range(start, count, holdout)) or [count - 1]
     return sorted(set(range(count)) - set(held_out)), held_out
 
 
@@ -110,11 +104,6 @@ def one_moment(*sets: Transforms) -> bool:
     """Whether some sets of images have no times, or one time altogether."""
     times = [time for transforms in sets for time in transforms.times or ()]
     return len(distinct_times(torch.tensor(times))) < 2
-
-
-def one_moment_in_words(transforms: Transforms) -> str:
-    """What says that :func:`one_moment` holds."""
-    return "its frames have no time" if transforms.times is None else "its frames have one time"
 
 
 def in_motion(transforms: Transforms) -> Split:

@@ -125,42 +125,22 @@ class Transforms:
         )
 
 
-def read_listing(file: Path) -> TransformsFile:
-    """What a transforms file says, each value checked by itself.
-
-    Raises:
-        DevrfError: the file is missing, is no JSON, lacks a key, holds no frames, or holds a
-            wrong value (NaN poses, times outside [0, 1], negative focal lengths …).
-    """
-    return read_json(file, _FILE, "every capture needs its posed images")
-
-
-def read_transforms(file: Path, root: Path, missing: Missing = "error") -> Transforms:
-    """One split, or one file of all images; see :func:`read_listing` and :func:`posed_images`."""
-    return posed_images(read_listing(file), file, root, missing=missing)
-
-
-def posed_images(
-    listing: TransformsFile,
-    file: Path,
-    root: Path,
-    *,
-    masked: bool = False,
-    missing: Missing = "error",
-) -> Transforms:
-    """The posed images that a transforms file lists.
+def read_transforms(
+    file: Path, root: Path, *, masked: bool = False, missing: Missing = "error"
+) -> tuple[TransformsFile, Transforms]:
+    """What a transforms file says, and the posed images that it lists.
 
     Args:
-        listing: what the file says.
         file: where it is; its image paths are relative to its folder.
         root: the scene's folder, which no image path may leave.
         masked: whether ``mask_path`` is followed, too.
         missing: as for :func:`devrf.scenes.image_folders.present_images`.
 
     Raises:
-        DevrfError: an image is missing, a pose is no rigid transform, or only some frames have
-            a time.
+        DevrfError: the file or an image is missing, a value is wrong (NaN, a time outside [0, 1], a
+            negative focal length …), a pose is no rigid transform, or only some frames have a time.
     """
+    listing = read_json(file, _FILE, "every capture needs its posed images")
     images = present_images([one.file_path for one in listing.frames], file, root, missing)
     frames = [listing.frames[index] for index in images]
     where = [f"{file}: frames[{index}]" for index in images]
@@ -171,7 +151,7 @@ def posed_images(
             where[times.index(None)],
             'has no "time" although others have; give every frame its time, or none',
         )
-    return Transforms(
+    transforms = Transforms(
         file,
         _intrinsics(listing, frames, where, file),
         tuple(images.values()),
@@ -181,6 +161,7 @@ def posed_images(
         skipped=len(listing.frames) - len(frames),
         bounds=listing.scene_bounds,
     )
+    return listing, transforms
 
 
 def _intrinsics(

@@ -13,10 +13,10 @@ from devrf.scenes.files import existing_folder, scene_folder
 from devrf.scenes.flow_files import FlowDirection, read_flow
 from devrf.scenes.image_folders import Missing
 from devrf.scenes.images import image_size
-from devrf.scenes.layout import Layout, fewer, load_layout, static_alone, without_static_set
+from devrf.scenes.layout import Layout, fewer, load_layout, one_capture, static_alone
 from devrf.scenes.reader import Count, InwardReader, Time
 from devrf.scenes.scene import OpticalFlow, Scene, Views
-from devrf.scenes.splits import Split, at_rest, in_motion, one_moment, one_moment_in_words
+from devrf.scenes.splits import Split, at_rest, in_motion
 from devrf.scenes.transforms import Transforms, read_transforms
 from devrf.scenes.validation import scene_error
 from devrf.scenes.view_folders import chosen_dynamic, dynamic_folders
@@ -84,28 +84,22 @@ def _layout(
                 "set data.root to the scene's folder",
             )
         train, test = _train_and_test(root, root, missing)
-        if one_moment(train, test):
-            return static_alone(train, test, one_moment_in_words(train)), root
-        layout = without_static_set(in_motion(train), in_motion(test), static_until)
-        return layout, root / "train_flow"
+        return one_capture(train, test, static_until), root / "train_flow"
     existing_folder(static)
     if dynamic is None and not dynamic_folders(root):
         why = "there is no folder dynamic_<V>views"
         return static_alone(*_train_and_test(static, root, missing), why), root
     moving = chosen_dynamic(root, dynamic)
-    rest_sets, moving_sets = (
-        _train_and_test(static, root, missing),
-        _train_and_test(moving, root, missing),
-    )
-    return Layout(*map(at_rest, rest_sets), *map(in_motion, moving_sets)), moving / "train_flow"
+    rest, motion = (_train_and_test(folder, root, missing) for folder in (static, moving))
+    return Layout(*map(at_rest, rest), *map(in_motion, motion)), moving / "train_flow"
 
 
 def _train_and_test(folder: Path, root: Path, missing: Missing) -> tuple[Transforms, Transforms]:
     """The images of a capture to learn from, and those held out."""
     test, val = folder / "transforms_test.json", folder / "transforms_val.json"
     held_out = val if os.path.isfile(val) and not os.path.isfile(test) else test
-    train = read_transforms(folder / "transforms_train.json", root, missing)
-    return train, read_transforms(held_out, root, missing)
+    _, train = read_transforms(folder / "transforms_train.json", root, missing=missing)
+    return train, read_transforms(held_out, root, missing=missing)[1]
 
 
 def _flow(views: Views, split: Split, folder: Path, direction: FlowDirection) -> OpticalFlow | None:

@@ -31,7 +31,7 @@ from devrf.scenes.sparse_model import (
     normalised,
     read_model,
 )
-from devrf.scenes.splits import at_rest, first_of_every
+from devrf.scenes.splits import at_rest, every_nth
 from devrf.scenes.transforms import SceneBounds, Transforms
 from devrf.scenes.validation import scene_error
 from devrf.scenes.view_folders import (
@@ -157,7 +157,7 @@ class ColmapReader(PosedReader):
         known = list(present)
         used, files = tuple(lenses[k] for k in known), tuple(present.values())
         images = Transforms(model.folder, used, files, poses[known].float(), None)
-        train, test = first_of_every(len(known), self.holdout)
+        train, test = every_nth(len(known), self.holdout, 0)
         if self.dynamic is None and not dynamic_folders(folder):
             why = "there is no folder dynamic_<V>views"
             return static_alone(images[train], images[test], why), None

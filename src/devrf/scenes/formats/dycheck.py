@@ -64,7 +64,10 @@ class DycheckReader(ItemsReader):
         folder = scene_folder(self.root)
         moments, *split = _splits(folder, self.holdout)
         masks = None if self.masks == "none" else partial(_covisible, folder)
-        times = SPLITS, lambda items: [moments[item] for item in items]
+
+        def times(items: tuple[str, ...]) -> list[float]:
+            return [moments[item] for item in items]
+
         return read_items(self, folder / SPLITS, list(moments), (split[0], split[1]), times, masks)
 
 

@@ -26,7 +26,6 @@ from devrf.scenes.splits import (
     at_times,
     evenly_spread,
     every_nth,
-    first_of_every,
     in_motion,
 )
 from devrf.scenes.transforms import Transforms
@@ -115,7 +114,7 @@ class LlffReader(SceneReader):
             video = not moving and os.path.isfile(posed / VIDEO)
         if video:
             return self._video(images), source.downscale, []
-        train, test = (images[part] for part in first_of_every(len(images.images), self.holdout))
+        train, test = (images[part] for part in every_nth(len(images.images), self.holdout, 0))
         if not moving:
             return static_alone(train, test, "there are no times"), source.downscale, []
         folder = chosen_dynamic(folder, self.dynamic)

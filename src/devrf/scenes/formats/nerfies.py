@@ -33,11 +33,11 @@ from devrf.scenes.image_folders import (
     image_folder,
     present_images,
 )
-from devrf.scenes.layout import fewer, load_layout, static_alone, without_static_set
+from devrf.scenes.layout import fewer, load_layout, one_capture
 from devrf.scenes.lens import Intrinsics
 from devrf.scenes.reader import EstimatedFlow, Holdout, InwardReader, Time
 from devrf.scenes.scene import Capture, Scene
-from devrf.scenes.splits import every_nth, in_motion, one_moment
+from devrf.scenes.splits import every_nth
 from devrf.scenes.transforms import Transforms
 from devrf.scenes.validation import (
     FARTHEST,
@@ -201,7 +201,7 @@ def read_items(
     listing: Path,
     items: Sequence[str],
     split: tuple[list[int], list[int]],
-    times: tuple[str, Callable[[tuple[str, ...]], Sequence[float]]],
+    times: Callable[[tuple[str, ...]], Sequence[float]],
     masks: Masks | None = None,
 ) -> Scene:
     """The scene of listed images, with a camera file each.
@@ -211,8 +211,7 @@ def read_items(
         listing: what lists the images, in the scene's folder.
         items: N ids.
         split: positions of those to learn from, and of those held out.
-        times: the file that says when each was taken, for the log, and what gives the times of
-            ids on some scale: the first becomes 0, the last 1.
+        times: gives the times of ids on some scale: the first becomes 0, the last 1.
         masks: gives the mask of each id; what it leaves out is ignored. None: no masks.
 
     Raises:
@@ -235,7 +234,7 @@ def read_items(
             listing, "all images to learn from, or all that are held out, are absent; add them"
         )
     cameras = [read_camera(folder, item, world) for item in ids]
-    source, moments = times[0], times[1](ids)
+    moments = times(ids)
     first, span = min(moments), (max(moments) - min(moments)) or 1.0
     posed = Transforms(
         listing,
@@ -245,11 +244,7 @@ def read_items(
         tuple((moment - first) / span for moment in moments),
         None if masks is None else masks(ids, images),
     )
-    sets = posed[train], posed[test]
-    if one_moment(posed):
-        layout = static_alone(*sets, f"all images have one time in {source}")
-    else:
-        layout = without_static_set(in_motion(sets[0]), in_motion(sets[1]), reader.static_until)
+    layout = one_capture(posed[train], posed[test], reader.static_until)
     layout, _ = fewer(layout, None, reader.frames)
     captures = load_layout(layout, folder, images.downscale, "none" if masks is None else "ignore")
     return placed(reader, folder, world, *captures)
@@ -302,7 +297,7 @@ class NerfiesReader(ItemsReader):
         """See :meth:`devrf.scenes.reader.SceneReader.read`."""
         folder = scene_folder(self.root)
         items, *split = _items(folder / DATASET, self.holdout)
-        times = METADATA, partial(_times, folder / METADATA)
+        times = partial(_times, folder / METADATA)
         return read_items(self, folder / DATASET, items, (split[0], split[1]), times)
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from devrf.scenes.files import inside, scene_folder
 from devrf.scenes.images import image_at
-from devrf.scenes.layout import Layout, fewer, load_layout, static_alone, without_static_set
+from devrf.scenes.layout import Layout, fewer, load_layout, one_capture, static_alone
 from devrf.scenes.masks import Masks
 from devrf.scenes.reader import Count, EstimatedFlow, Holdout, PosedReader, Time
 from devrf.scenes.scene import Scene
@@ -23,9 +23,8 @@ from devrf.scenes.splits import (
     every_nth,
     in_motion,
     one_moment,
-    one_moment_in_words,
 )
-from devrf.scenes.transforms import Transforms, posed_images, read_listing
+from devrf.scenes.transforms import Transforms, read_transforms
 from devrf.scenes.validation import abbreviated, scene_error
 
 log = logging.getLogger(__name__)
@@ -83,8 +82,6 @@ class NerfstudioReader(PosedReader):
 def _layout(root: Path, options: NerfstudioReader) -> Layout:
     if os.path.isfile(root / FILE):
         train, test = _train_and_test(root / FILE, root, options)
-        if one_moment(train, test):
-            return static_alone(train, test, one_moment_in_words(train))
         return _one_file(train, test, options.static_until)
     still, moving = root / "static" / FILE, root / "dynamic" / FILE
     if not os.path.isfile(still) and not os.path.isfile(moving):
@@ -109,9 +106,8 @@ def _layout(root: Path, options: NerfstudioReader) -> Layout:
 def _train_and_test(
     file: Path, root: Path, options: NerfstudioReader
 ) -> tuple[Transforms, Transforms]:
-    listing = read_listing(file)
-    transforms = posed_images(
-        listing, file, root, masked=options.masks != "none", missing=options.missing
+    listing, transforms = read_transforms(
+        file, root, masked=options.masks != "none", missing=options.missing
     )
     count = len(transforms.images)
     listed = {
@@ -155,12 +151,14 @@ def _listed(names: list[str] | None, split: str, transforms: Transforms, root: P
 
 def _one_file(train: Transforms, test: Transforms, static_until: float | None) -> Layout:
     """The layout of a file that holds the scene at rest and in motion."""
+    if one_moment(train, test):
+        return one_capture(train, test, 1.0)
     times = _times(train)
     at_zero = times <= _AT_REST
     if static_until is None:
         static_until = 0.0 if int(at_zero.sum()) >= _SEVERAL else 1.0
     if static_until > 0 or not bool(at_zero.any()):
-        return without_static_set(in_motion(train), in_motion(test), static_until)
+        return one_capture(train, test, static_until)
     still = at_zero.nonzero()[:, 0].tolist()
     still_test = (_times(test) <= _AT_REST).nonzero()[:, 0].tolist()
     moving, moving_test = _seen_moving(train), _seen_moving(test)

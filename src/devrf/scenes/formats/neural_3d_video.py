@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import re
 import time
@@ -42,18 +43,12 @@ class CameraVideos:
     Attributes:
         paths: V files in the order of their names.
         numbers: V numbers in these names.
-        frames: how many frames each has.
-        size: width and height of the frames in pixels.
+        header: what each of them says of itself.
     """
 
     paths: tuple[Path, ...]
     numbers: tuple[int, ...]
-    frames: int
-    size: Size
-
-    def name_of(self, video: int, frame: int) -> str:
-        """What a frame is called in messages and tables."""
-        return f"{self.paths[video].name} frame {frame}"
+    header: FilmHeader
 
 
 def camera_videos(folder: Path) -> CameraVideos:
@@ -62,30 +57,27 @@ def camera_videos(folder: Path) -> CameraVideos:
     Raises:
         DevrfError: there are fewer than two, one cannot be read, or they differ in length or size.
     """
-    found = [
-        (path, int(match[1]))
+    found = {
+        path: int(match[1])
         for path in entries(folder)
         if (match := _VIDEO.fullmatch(path.name)) and os.path.isfile(path)
-    ]
+    }
     if len(found) < 2:
         raise scene_error(
             folder,
             f"{len(found)} videos cam00.mp4, cam01.mp4, …, expected at least 2: one to learn from, "
             "one to hold out; set data.root to the folder of poses_bounds.npy and the videos",
         )
-    paths, numbers = (tuple(part) for part in zip(*found, strict=True))
-    headers = [film_header(path) for path in paths]
-    first = headers[0]
-    for path, header in zip(paths, headers, strict=True):
-        if header != first:
+    headers = {path: film_header(path) for path in found}
+    first, header = next(iter(headers.items()))
+    for path, other in headers.items():
+        if other != header or other.frames < 2:
             raise scene_error(
                 path,
-                f"{_in_words(header)}, but {paths[0].name} has {_in_words(first)}; all videos show "
-                "the same moments, in the same size: cut or convert them",
+                f"{_in_words(other)}, but {first.name} has {_in_words(header)}; all videos show "
+                "the same moments, at least 2, in the same size: cut or convert them",
             )
-    if first.frames < 2:
-        raise scene_error(paths[0], f"{first.frames} frames, expected at least 2")
-    return CameraVideos(paths, numbers, first.frames, first.size)
+    return CameraVideos(tuple(found), tuple(found.values()), header)
 
 
 def _in_words(header: FilmHeader) -> str:
@@ -93,14 +85,14 @@ def _in_words(header: FilmHeader) -> str:
 
 
 def read_frames(
-    videos: CameraVideos, wanted: Sequence[int], frames: Sequence[int], downscale: int
+    paths: Sequence[Path], frames: Sequence[int], filmed: Size, downscale: int
 ) -> Tensor:
-    """The chosen frames of the chosen videos; of others nothing is kept in memory.
+    """The chosen frames of some videos; of others nothing is kept in memory.
 
     Args:
-        videos: where to read from.
-        wanted: K of their positions.
+        paths: K videos.
         frames: T positions of frames, ascending.
+        filmed: width and height of the frames in pixels.
         downscale: integer factor ≥ 1; each side becomes floor(side / downscale), by area averages.
 
     Returns:
@@ -109,26 +101,24 @@ def read_frames(
     Raises:
         DevrfError: a video is damaged, or they do not fit into memory.
     """
-    start, (width, height) = time.perf_counter(), videos.size
-    size = reduced_size(width, height, downscale, videos.paths[0])
-    shape = (len(frames), len(wanted), size[1], size[0], 3)
-    what = f"{len(frames)} frames of {len(wanted)} videos at {size[0]}x{size[1]} px"
-    check_memory(int(np.prod(shape, dtype=object)), videos.paths[0].parent, what)
-    pixels, row = np.empty(shape, dtype=np.uint8), {frame: t for t, frame in enumerate(frames)}
+    start, folder = time.perf_counter(), paths[0].parent
+    size = reduced_size(*filmed, downscale, paths[0])
+    shape = (len(frames), len(paths), size[1], size[0], 3)
+    what = f"{len(frames)} frames of {len(paths)} videos at {size[0]}x{size[1]} px"
+    check_memory(math.prod(shape), folder, what)
+    pixels = np.empty(shape, dtype=np.uint8)
 
     def fill(column: int) -> None:
-        path = videos.paths[wanted[column]]
-        for frame, picture in chosen(path, frames):
-            if picture.shape[:2] != (height, width):
+        for row, (frame, picture) in enumerate(chosen(paths[column], frames)):
+            if picture.shape[1::-1] != filmed:
                 raise scene_error(
-                    path, f"frame {frame} is not of {width}x{height} px; convert the video"
+                    paths[column],
+                    f"frame {frame} is not of {filmed[0]}x{filmed[1]} px; convert the video",
                 )
-            pixels[row[frame], column] = (
-                picture if downscale == 1 else shrink_pixels(picture, *size)
-            )
+            pixels[row, column] = picture if downscale == 1 else shrink_pixels(picture, *size)
 
-    in_threads(fill, range(len(wanted)), (width, height))
-    log.info("read %s from %s in %.1f s", what, videos.paths[0].parent, time.perf_counter() - start)
+    in_threads(fill, range(len(paths)), filmed)
+    log.info("read %s from %s in %.1f s", what, folder, time.perf_counter() - start)
     return torch.from_numpy(pixels.reshape(-1, *shape[2:]))
 
 
@@ -173,7 +163,8 @@ class Neural3DVideoReader(SceneReader):
         posed = posed.normalised()
         test, train = self._split(videos)
         frames, times = self._moments(videos)
-        factor = whole_factor(self.downscale, lambda factor: min(videos.size) // factor)
+        side = min(videos.header.size)
+        factor = whole_factor(self.downscale, lambda factor: side // factor)
         moving = Capture(
             *(_views(videos, posed, chosen, frames, times, factor) for chosen in (train, [test]))
         )
@@ -200,11 +191,10 @@ class Neural3DVideoReader(SceneReader):
 
     def _moments(self, videos: CameraVideos) -> tuple[list[int], Tensor]:
         """The frames that are read, ascending, and their times in [0, 1]."""
-        total = videos.frames if self.length is None else self.length
-        if total > videos.frames:
-            raise scene_error(
-                "data.length", f"{total} is more than the {videos.frames} frames of each video"
-            )
+        filmed = videos.header.frames
+        total = filmed if self.length is None else self.length
+        if total > filmed:
+            raise scene_error("data.length", f"{total} is more than the {filmed} frames of a video")
         count = total if self.frames is None else min(self.frames, total)
         frames = torch.linspace(0, total - 1, count, dtype=torch.float64).round().long()
         return frames.tolist(), (frames / (total - 1)).float()
@@ -219,7 +209,8 @@ def _views(
     factor: int,
 ) -> Views:
     """All chosen videos at the first frame, then all at the next."""
-    pixels = read_frames(videos, chosen, frames, factor)
+    paths = [videos.paths[video] for video in chosen]
+    pixels = read_frames(paths, frames, videos.header.size, factor)
     height, width = pixels.shape[1:3]
     view = torch.arange(len(chosen)).repeat(len(frames))
     lenses = [posed.intrinsics[video].lens(width, height, posed.file) for video in chosen]
@@ -228,7 +219,7 @@ def _views(
         pinholes(posed.poses[chosen], lenses, width, height)[view],
         times.repeat_interleave(len(chosen)),
         view,
-        tuple(videos.name_of(video, frame) for frame in frames for video in chosen),
+        tuple(f"{path.name} frame {frame}" for frame in frames for path in paths),
     )
 
 

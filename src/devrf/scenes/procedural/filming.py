@@ -134,20 +134,6 @@ def forward_flow(shape: Shape, views: Views) -> OpticalFlow:
 
 
 @dataclass(frozen=True)
-class Pictures:
-    """N images of a shape at one time.
-
-    Attributes:
-        pixels: (N, H, W, 4) uint8 RGBA, alpha not premultiplied; (N, H, W, 3) where opaque.
-        depth: (N, H, W) float32 distance along the ray through each pixel's centre, world
-            units, +inf where it meets nothing.
-    """
-
-    pixels: Tensor
-    depth: Tensor
-
-
-@dataclass(frozen=True)
 class Filming:
     """What is filmed, and how.
 
@@ -189,43 +175,45 @@ class Filming:
         )
 
     def _still(self, cameras: Cameras, split: str) -> Views:
-        pictures = self.pictures(cameras, 0.0)
-        return Views(
-            pixels=pictures.pixels,
-            cameras=cameras,
-            times=torch.zeros(len(cameras)),
-            view=torch.arange(len(cameras)),
-            names=tuple(f"static {split} {k:03d}" for k in range(len(cameras))),
-            depth=pictures.depth,
-        )
+        pixels, depth = self.pictures(cameras, 0.0)
+        order = torch.arange(len(cameras))
+        names = tuple(f"static {split} {k:03d}" for k in order.tolist())
+        return Views(pixels, cameras, torch.zeros(len(cameras)), order, names, depth=depth)
 
     def _moving(self, cameras: Cameras, shown: Sequence[int], frames: int, split: str) -> Views:
         times = torch.tensor(shown) / (frames - 1)
         clock: list[float] = times.tolist()
-        pictures = [self.pictures(cameras, time) for time in clock]
-        nowhere = torch.zeros_like(pictures[0].depth)
+        pixels, depths = zip(*(self.pictures(cameras, time) for time in clock), strict=True)
+        nowhere = torch.zeros_like(depths[0])
         flows = [OpticalFlow(torch.stack([nowhere, nowhere], dim=-1), nowhere.bool())]
-        for earlier, time, picture in zip(clock, clock[1:], pictures[1:], strict=False):
-            flows.append(backward_flow(self.shape, cameras, picture.depth, time, earlier))
+        for earlier, time, depth in zip(clock, clock[1:], depths[1:], strict=False):
+            flows.append(backward_flow(self.shape, cameras, depth, time, earlier))
         view = torch.arange(len(cameras)).repeat(len(shown))
-        frame = torch.arange(len(shown)).repeat_interleave(len(cameras))
         return Views(
-            pixels=torch.cat([p.pixels for p in pictures]),
-            cameras=cameras[view],
-            times=times[frame],
-            view=view,
-            names=tuple(
-                f"dynamic {split} frame {shown[k]:03d} view {v}"
-                for k, v in zip(frame.tolist(), view.tolist(), strict=True)
+            torch.cat(pixels),
+            cameras[view],
+            times.repeat_interleave(len(cameras)),
+            view,
+            tuple(
+                f"dynamic {split} frame {frame:03d} view {v}"
+                for frame in shown
+                for v in range(len(cameras))
             ),
             flow=OpticalFlow(
-                torch.cat([f.vectors for f in flows]), torch.cat([f.valid for f in flows])
+                torch.cat([flow.vectors for flow in flows]),
+                torch.cat([flow.valid for flow in flows]),
             ),
-            depth=torch.cat([p.depth for p in pictures]),
+            depth=torch.cat(depths),
         )
 
-    def pictures(self, cameras: Cameras, time: float) -> Pictures:
-        """One image from each of N ``cameras`` at ``time``."""
+    def pictures(self, cameras: Cameras, time: float) -> tuple[Tensor, Tensor]:
+        """One image from each of N ``cameras`` at ``time``.
+
+        Returns:
+            (N, H, W, 4) uint8 RGBA, alpha not premultiplied, or (N, H, W, 3) where opaque; and
+            (N, H, W) float32 distances along the rays through the pixels' centres, world units,
+            +inf where these meet nothing.
+        """
         start = block_starts(self.shape, cameras, time, self.reach)
         size = start.shape
         start = start.reshape(-1)
@@ -253,7 +241,7 @@ class Filming:
         pixels = (image * 255).round().clamp(0, 255).to(torch.uint8).view(*size, 4)
         if self.opaque:
             pixels = pixels[..., :3].contiguous()
-        return Pictures(pixels, depth.view(size))
+        return pixels, depth.view(size)
 
     def _trace(self, rays: Rays, time: float, start: Tensor) -> Tensor:
         return trace(self.shape, rays, time, start, self.reach, self.steps)

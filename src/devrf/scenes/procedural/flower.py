@@ -25,6 +25,25 @@ _AT_HINGE = 0.6
 
 
 @dataclass(frozen=True)
+class Blade:
+    """A pointed lens that starts at its hinge; lengths in world units.
+
+    Attributes:
+        half_length: half of its length.
+        half_width: half of its width.
+        thickness: its half thickness.
+    """
+
+    half_length: float
+    half_width: float
+    thickness: float
+
+    def distance(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+        """Distance (M,) of points along, across and above it."""
+        return blade(x - self.half_length, y, z, self.half_length, self.half_width, self.thickness)
+
+
+@dataclass(frozen=True)
 class Leaf:
     """A leaf on the stem, at rest; lengths in world units, angles in radians.
 
@@ -32,29 +51,20 @@ class Leaf:
         height: where it leaves the stem.
         azimuth: direction in which it points.
         elevation: angle above the horizon.
-        half_length: half of its length.
-        half_width: half of its width.
-        thickness: its half thickness.
+        blade: its shape.
         paint: its texture.
     """
 
     height: float
     azimuth: float
     elevation: float
-    half_length: float
-    half_width: float
-    thickness: float
+    blade: Blade
     paint: Paint
 
     def frame(self) -> tuple[Tensor, Tensor]:
         """Axes (3, 3) as columns (along, across, normal) and hinge (3,), float64."""
         axes = rotation((0, 0, 1), self.azimuth) @ rotation((0, 1, 0), -self.elevation)
         return axes, torch.tensor([0, 0, self.height], dtype=torch.float64)
-
-    def distance(self, local: Tensor) -> Tensor:
-        """Distance (M,) of points (M, 3) in the leaf's frame."""
-        x, y, z = local.unbind(-1)
-        return blade(x - self.half_length, y, z, self.half_length, self.half_width, self.thickness)
 
 
 @dataclass(frozen=True)
@@ -68,32 +78,26 @@ class Whorl:
     Attributes:
         first_part: part number of petal 0; the others follow.
         count: number of petals.
-        height: of the blossom's middle.
         hinge: distance of the hinges from the blossom's axis.
         elevation: angle above the horizon at which the petals stand at rest.
         opening: by how much their tips turn downward when open.
-        half_length: half of a petal's length.
-        half_width: half of a petal's width.
-        thickness: its half thickness.
+        blade: a petal's shape.
         paints: textures of the petals with even and with odd numbers.
     """
 
     first_part: int
     count: int
-    height: float
     hinge: float
     elevation: float
     opening: float
-    half_length: float
-    half_width: float
-    thickness: float
+    blade: Blade
     paints: tuple[Paint, Paint]
 
     def frame(self, petal: int) -> tuple[Tensor, Tensor]:
         """Axes (3, 3) as columns (along, across, normal) and hinge (3,) at rest, float64."""
         around = rotation((0, 0, 1), petal * 2 * math.pi / self.count)
         hinge = around @ torch.tensor([self.hinge, 0, 0], dtype=torch.float64)
-        hinge = hinge + torch.tensor([0, 0, self.height], dtype=torch.float64)
+        hinge = hinge + torch.tensor([0, 0, HEAD], dtype=torch.float64)
         return around @ rotation((0, 1, 0), -self.elevation), hinge
 
     def nearest(self, points: Tensor) -> Tensor:
@@ -110,19 +114,18 @@ class Whorl:
         x, z = self._curl(x, z, -opening)
         x, z = turn(x, z, -self.elevation)
         shear = abs(self.opening * opening) * (1 - _AT_HINGE)
-        flat = blade(x - self.half_length, y, z, self.half_length, self.half_width, self.thickness)
-        return flat / stretch(shear)
+        return self.blade.distance(x, y, z) / stretch(shear)
 
     def curled(self, rest: Tensor, petal: Tensor, opening: float) -> Tensor:
         """Rest points (M, 3) of the petals (M,), opened; the opposite opening undoes it."""
         x, y, z = self._at_hinge(rest, petal)
         x, z = self._curl(x, z, opening)
         x, y = turn(x + self.hinge, y, self._azimuth(petal, x))
-        return torch.stack([x, y, z + self.height], dim=-1)
+        return torch.stack([x, y, z + HEAD], dim=-1)
 
     def _curl(self, x: Tensor, z: Tensor, opening: float) -> tuple[Tensor, Tensor]:
         """Turn (x, z) about the hinge downward by opening · (share at hinge … 1 at the tip)."""
-        rho = torch.hypot(x, z) / (2 * self.half_length)
+        rho = torch.hypot(x, z) / (2 * self.blade.half_length)
         share = _AT_HINGE + (1 - _AT_HINGE) * rho.clamp_max(1)
         return turn(x, z, -self.opening * opening * share)
 
@@ -132,7 +135,7 @@ class Whorl:
     def _at_hinge(self, points: Tensor, petal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Coordinates outward, across and up from the petal's hinge."""
         x, y = turn(points[:, 0], points[:, 1], -self._azimuth(petal, points))
-        return x - self.hinge, y, points[:, 2] - self.height
+        return x - self.hinge, y, points[:, 2] - HEAD
 
 
 BASE = -0.66  # height at which the stem leaves the soil: the centre of the bending
@@ -161,33 +164,27 @@ BLUE: Rgb = (0.13, 0.35, 0.62)
 OUTER = Whorl(
     first_part=FIRST_PETAL,
     count=8,
-    height=HEAD,
     hinge=0.10,
     elevation=0.62,
     opening=0.8,
-    half_length=0.3,
-    half_width=0.145,
-    thickness=0.022,
+    blade=Blade(0.3, 0.145, 0.022),
     paints=(Paint(MAGENTA, ROSE, (0.3, 0, 0), 0.1, 5), Paint(VIOLET, LILAC, (0.3, 0, 0), 0.1, 5)),
 )
 INNER = Whorl(
     first_part=FIRST_PETAL + OUTER.count,
     count=6,
-    height=HEAD,
     hinge=0.07,
     elevation=1.05,
     opening=0.5,
-    half_length=0.19,
-    half_width=0.095,
-    thickness=0.02,
+    blade=Blade(0.19, 0.095, 0.02),
     paints=(Paint(AMBER, CREAM, (0.34, 0, 0), 0.2, 4), Paint(GOLD, CREAM, (0.34, 0, 0), 0.2, 4)),
 )
 WHORLS = (OUTER, INNER)
 
 LEAVES = (
-    Leaf(-0.50, 0.5, 0.55, 0.27, 0.12, 0.02, Paint(LEAF_GREEN, SPRING, (0.22, 0, 0), 0.2)),
-    Leaf(-0.32, 3.4, 0.60, 0.25, 0.11, 0.02, Paint(SPRING, LEAF_GREEN, (0, 0.2, 0), 0.2)),
-    Leaf(-0.16, 1.9, 0.65, 0.20, 0.10, 0.02, Paint(LEAF_GREEN, SPRING, (0.18, 0, 0), 0.1)),
+    Leaf(-0.50, 0.5, 0.55, Blade(0.27, 0.12, 0.02), Paint(LEAF_GREEN, SPRING, (0.22, 0, 0), 0.2)),
+    Leaf(-0.32, 3.4, 0.60, Blade(0.25, 0.11, 0.02), Paint(SPRING, LEAF_GREEN, (0, 0.2, 0), 0.2)),
+    Leaf(-0.16, 1.9, 0.65, Blade(0.20, 0.10, 0.02), Paint(LEAF_GREEN, SPRING, (0.18, 0, 0), 0.1)),
 )
 
 POT_PAINT = Paint(TERRACOTTA, CREAM, (0, 0, 0.26), 0.3)
@@ -279,10 +276,10 @@ class Flower:
             (HEART, HEART, HEART),
         ]
         middle = [(0.0, 0.0, 0.0)] * len(half)
-        flat: list[Leaf | Whorl] = [*LEAVES]
+        blades = [leaf.blade for leaf in LEAVES]
         for whorl in WHORLS:
-            flat += [whorl] * whorl.count
-        for each in flat:
+            blades += [whorl.blade] * whorl.count
+        for each in blades:
             a, b, t = each.half_length, each.half_width, each.thickness
             half.append((a + t, b + t, t))
             # A blade's frame starts at its hinge.
@@ -296,14 +293,7 @@ class Flower:
     def _distances(self, points: Tensor, unbent: Tensor, time: float) -> Tensor:
         """(kinds, M) safe distances: pot, stem, heart, the leaves, the whorls."""
         x, y, z = points.unbind(-1)
-        pot = rounded_cylinder(
-            x,
-            y,
-            z - POT_CENTER,
-            POT_RADIUS,
-            POT_HALF_HEIGHT,
-            POT_ROUNDING,
-        )
+        pot = rounded_cylinder(x, y, z - POT_CENTER, POT_RADIUS, POT_HALF_HEIGHT, POT_ROUNDING)
         x, y, z = unbent.unbind(-1)
         r = STEM_RADIUS
         stem = rounded_box(x, y, z - _STEM_MIDDLE, (r, r, _STEM_HALF), r)
@@ -311,7 +301,8 @@ class Flower:
         leaves = []
         for number, leaf in enumerate(LEAVES, start=FIRST_LEAF):
             axes, hinge = _PAINTED.rotation[number], _PAINTED.origin[number]
-            leaves.append(leaf.distance((unbent - hinge.to(unbent)) @ axes.to(unbent)))
+            local = (unbent - hinge.to(unbent)) @ axes.to(unbent)
+            leaves.append(leaf.blade.distance(*local.unbind(-1)))
         petals = [whorl.distance(unbent, _OPENING(self.speed, time)) for whorl in WHORLS]
         bending = torch.stack([stem, heart, *leaves, *petals])
         # Beyond the ramp the motion is rigid: up to the ramp's end, distances hold as they are.
