@@ -23,14 +23,14 @@ from devrf.apps.keyframes import (
 from devrf.errors import DevrfError
 
 
-def keyframe(seconds: float, x: float = 0.0, turn: float = 0.0, fov: float = 60.0, time: float = 0):
+def keyframe(seconds, x=0.0, turn=0.0, fov=60.0, time=0):
     """A camera at (x, 0, 0), turned about the vertical axis by ``turn`` degrees."""
     c, s = math.cos(math.radians(turn)), math.sin(math.radians(turn))
     pose = torch.tensor([[c, 0, s, x], [0, 1, 0, 0], [-s, 0, c, 0]], dtype=torch.float32)
     return Keyframe(pose, fov, time, seconds)
 
 
-def at(path: CameraPath, *moments: float) -> list[Keyframe]:
+def at(path, *moments):
     return path.at(torch.tensor(moments, dtype=torch.float64))
 
 
@@ -88,7 +88,7 @@ def frame(**more):
     return {"matrix": MATRIX, "fov": 50, "aspect": 1.5, "render_time": 0, "seconds": 0, **more}
 
 
-def content(**keys) -> bytes:
+def content(**keys):
     return json.dumps(keys).encode()
 
 

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from devrf.apps.images import (
     UNKNOWN,
@@ -30,7 +26,6 @@ from devrf.apps.video import (
     held_out_images,
     held_out_pictures,
     orbit,
-    orbit_pictures,
     time_freeze,
 )
 from devrf.apps.video_file import write_pictures
@@ -40,21 +35,20 @@ from devrf.evaluation.held_out import HeldOutView, truth_image
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.rendering.renderer import Renderer
-from devrf.scenes.scene import Scene
 
 
-def flat(height: int, width: int, color: tuple[float, float, float]) -> Tensor:
+def flat(height, width, color):
     return torch.tensor(color).expand(height, width, 3)
 
 
-def test_depth_is_bright_near_dark_far_and_white_where_nothing_is() -> None:
+def test_depth_is_bright_near_dark_far_and_white_where_nothing_is():
     depth = torch.tensor([[1.0, 1.5, 2.0, 3.0, 0.0]])
     opacity = torch.tensor([[1.0, 1.0, 1.0, 1.0, 0.0]])
     light = depth_colors(depth, opacity, near=1.0, far=2.0)[0].mean(dim=1)
     assert light[4] == 1 > light[0] > light[1] > light[2] == light[3]
 
 
-def test_flow_as_colours() -> None:
+def test_flow_as_colours():
     vectors = torch.tensor([[[2.0, 0.0], [0.0, -2.0], [-9.0, 0.0], [0.0, 0.0], [7.0, 7.0]]])
     valid = torch.tensor([[True, True, True, True, False]])
     expected = torch.tensor(
@@ -70,7 +64,7 @@ def test_flow_as_colours() -> None:
     torch.testing.assert_close(colors[0], expected, atol=1e-5, rtol=0)
 
 
-def view(number: int, height: int = 90, width: int = 120) -> HeldOutView:
+def view(number, height=90, width=120):
     truth = flat(height, width, (0.0, 0.0, 1.0))
     prediction = flat(height, width, (number / 255, 0.0, 0.0))
     return HeldOutView(
@@ -87,9 +81,7 @@ def view(number: int, height: int = 90, width: int = 120) -> HeldOutView:
     )
 
 
-def test_a_contact_sheet_shows_truth_rendering_error_and_depth_of_spread_views(
-    tmp_path: Path,
-) -> None:
+def test_a_contact_sheet_shows_truth_rendering_error_and_depth_of_spread_views(tmp_path):
     path, shades = tmp_path / "images" / "static.png", [0, 50, 100]
     shown = write_contact_sheet(path, [view(10 * k) for k in range(11)], rows=3)
     sheet = iio.imread(path)
@@ -112,20 +104,20 @@ def test_a_contact_sheet_shows_truth_rendering_error_and_depth_of_spread_views(
     assert dark(sheet[:30, left : left + 400])
 
 
-def dark(area: np.ndarray) -> bool:
+def dark(area):
     """Whether there is text, with a margin of white all around."""
     ink = area.max(axis=-1) < 128
     return bool(ink.any()) and not (ink[0].any() or ink[-1].any() or ink[:, [0, -1]].any())
 
 
-def test_names_and_positions() -> None:
+def test_names_and_positions():
     assert evenly(3, 6) == [0, 1, 2]
     assert evenly(50, 6) == [0, 10, 20, 29, 39, 49]
     assert short_name("folder/r_000.png") == "r_000.png"
     assert short_name(30 * "a" + "_000.png") == "…" + 21 * "a" + "_000.png"
 
 
-def test_a_video_has_even_sides_and_all_its_pictures(tmp_path: Path) -> None:
+def test_a_video_has_even_sides_and_all_its_pictures(tmp_path):
     path = tmp_path / "videos" / "orbit.mp4"
     shades = (0, 128, 255, 64)
     write_pictures(path, iter([np.full((17, 75, 3), s, np.uint8) for s in shades]), fps=7.5)
@@ -137,8 +129,8 @@ def test_a_video_has_even_sides_and_all_its_pictures(tmp_path: Path) -> None:
     assert [p.name for p in path.parent.iterdir()] == ["orbit.mp4"]
 
 
-def test_a_film_that_fails_leaves_nothing_behind(tmp_path: Path) -> None:
-    def broken() -> Iterator[np.ndarray]:
+def test_a_film_that_fails_leaves_nothing_behind(tmp_path):
+    def broken():
         yield np.zeros((240, 240, 3), np.uint8)
         raise RuntimeError("out of memory")
 
@@ -156,7 +148,7 @@ CAMERAS = Cameras.looking_at(
 )
 
 
-def test_an_orbit_circles_the_box_at_the_cameras_distance(cube: Box) -> None:
+def test_an_orbit_circles_the_box_at_the_cameras_distance(cube):
     settings = VideoSettings(frames=8, orbit_turns=2.0, orbit_elevation=30.0)
     cameras = orbit(CAMERAS, cube, settings)
     assert len(cameras) == 8 and (cameras.width, cameras.height) == (15, 10)
@@ -169,20 +161,9 @@ def test_an_orbit_circles_the_box_at_the_cameras_distance(cube: Box) -> None:
     torch.testing.assert_close(cameras.forwards, toward)
 
 
-def test_an_orbit_shows_colour_beside_depth_while_time_runs(moving, reference) -> None:
-    camera = CAMERAS[[0]]
-    shown = list(orbit_pictures(Renderer(moving), camera[[0, 0, 0]], 1.0))
-    # Images 10 x 15, a line of text 18 pixels high above them.
-    assert [tuple(image.shape) for image in shown] == [(28, 34, 3)] * 3
-    for image, time in zip(shown, (0.0, 0.5, 1.0), strict=True):
-        seen = reference(moving, camera.image_rays(0), time, torch.ones(3))
-        colors = image[18:, :15].reshape(-1, 3)
-        torch.testing.assert_close(colors, seen.color, atol=0.51 / 255, rtol=0)
-
-
 def test_held_out_pictures_are_rendered_in_the_films_size_beside_the_truth(
     moving, reference, tiny_scene
-) -> None:
+):
     views, film = tiny_scene.dynamic.test, VideoSettings(height=36)
     images = held_out_images(views, 3)
     shown = list(held_out_pictures(Renderer(moving), views, images, film, "white"))
@@ -197,7 +178,7 @@ def test_held_out_pictures_are_rendered_in_the_films_size_beside_the_truth(
         torch.testing.assert_close(rendered.reshape(-1, 3), seen.color, atol=0.51 / 255, rtol=0)
 
 
-def test_held_out_images_are_the_nearest_in_time(tiny_scene) -> None:
+def test_held_out_images_are_the_nearest_in_time(tiny_scene):
     views = tiny_scene.dynamic.test
     assert len(set(views.view.tolist())) == 1
     times = views.times[held_out_images(views, 7)]
@@ -213,7 +194,7 @@ def test_held_out_images_are_the_nearest_in_time(tiny_scene) -> None:
     assert held_out_images(rest, len(views)) == list(range(len(views)))
 
 
-def test_rendering_keeps_to_its_seconds() -> None:
+def test_rendering_keeps_to_its_seconds():
     film = VideoSettings(frames=60, fps=20, max_seconds=12)
     assert film.within_limit(0.2) == film
     fewer = film.within_limit(0.4)
@@ -222,7 +203,7 @@ def test_rendering_keeps_to_its_seconds() -> None:
     assert VideoSettings(frames=60).within_limit(100.0).frames == 60
 
 
-def circle(settings: VideoSettings) -> Cameras:
+def circle(settings):
     return orbit(CAMERAS, Box((-1.0, -1, -1), (1.0, 1, 1)), settings)
 
 
@@ -239,7 +220,7 @@ def test_in_a_time_freeze_time_runs_then_the_camera_then_time():
     torch.testing.assert_close(cameras.positions, around)
 
 
-def test_the_camera_that_is_meant(tiny_scene: Scene) -> None:
+def test_the_camera_that_is_meant(tiny_scene):
     held_out = StillSettings().camera(Viewpoints.of(tiny_scene))
     assert torch.equal(held_out.positions, tiny_scene.dynamic.test.cameras.positions[:1])
     # The images are 24 x 18: pictures of them are rendered 400 pixels high.
@@ -259,8 +240,6 @@ def test_the_camera_that_is_meant(tiny_scene: Scene) -> None:
         (VideoSettings, {"time": 1.5}, "video.time: "),
     ],
 )
-def test_what_cannot_be_shown(
-    tiny_scene: Scene, settings: type[Any], given: dict[str, float], expected: str
-) -> None:
+def test_what_cannot_be_shown(tiny_scene, settings, given, expected):
     with pytest.raises(DevrfError, match=expected):
         settings(**given).camera(Viewpoints.of(tiny_scene))

@@ -6,7 +6,6 @@ import csv
 import json
 import shutil
 import subprocess
-from pathlib import Path
 
 import pytest
 import torch
@@ -25,13 +24,13 @@ from devrf.geometry.clock import FrameClock
 METRICS = ["psnr", "ssim", "rest_pose_psnr", "depth_error", "flow_error"]
 
 
-def view(name: str, time: float, psnr: float, **further: float | None) -> HeldOutView:
+def view(name, time, psnr, **further):
     image = torch.zeros(2, 2, 3)
     planes = {"depth": image[..., 0], "opacity": image[..., 0]}
     return HeldOutView(name, time, image, image, psnr, 0.5, 9.0, further, compared=image, **planes)
 
 
-def test_means_are_over_what_is_known() -> None:
+def test_means_are_over_what_is_known():
     views = [
         view("a", 0.0, 20.0, depth_error=0.5, flow_error=None, lpips=None),
         view("b", 1.0, 31.0, depth_error=0.25, flow_error=3.0, lpips=None),
@@ -45,7 +44,7 @@ def test_means_are_over_what_is_known() -> None:
     }
 
 
-def test_times_that_no_training_view_has_are_scored_apart() -> None:
+def test_times_that_no_training_view_has_are_scored_apart():
     times = (0.0, 20.0), (0.25, 30.0), (0.5, 22.0), (1.0, 40.0)
     views = [view("a", time, psnr) for time, psnr in times]
     found = dynamic_scores(views, FrameClock((0.0, 0.5)))
@@ -60,12 +59,12 @@ def test_times_that_no_training_view_has_are_scored_apart() -> None:
     assert "training_times" not in alone
 
 
-def test_numbers_are_rounded_for_people() -> None:
+def test_numbers_are_rounded_for_people():
     values = {"psnr": 33.42981, "lpips": None, "iterations": 123456, "seconds": 12345.678}
     assert in_words(values) == "psnr 33.43, iterations 123456, seconds 12346"
 
 
-def test_frames_read_back(tmp_path: Path) -> None:
+def test_frames_read_back(tmp_path):
     path = tmp_path / "run" / "frames.csv"
     rest = [view("r, 0", 0.0, 20.0, depth_error=0.5, flow_error=None)]
     moving = [view("m", 0.5, 21.0, depth_error=None, flow_error=1.5)]
@@ -78,15 +77,15 @@ def test_frames_read_back(tmp_path: Path) -> None:
         ]
 
 
-def test_provenance_is_plain_data() -> None:
+def test_provenance_is_plain_data():
     found = provenance(12, torch.device("cpu"))
     assert json.loads(json.dumps(found)) == found
     assert found["device"] and found["parameters"] == 12 and found["date"].endswith("+00:00")
 
 
 @pytest.mark.skipif(shutil.which("git") is None, reason="git is not installed")
-def test_the_revision_is_that_of_a_checkout(tmp_path: Path) -> None:
-    def git(*arguments: str) -> str:
+def test_the_revision_is_that_of_a_checkout(tmp_path):
+    def git(*arguments):
         command = ["git", "-c", "user.name=a", "-c", "user.email=a@b.c", *arguments]
         return subprocess.check_output(command, cwd=tmp_path, text=True).strip()
 

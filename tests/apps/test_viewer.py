@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import socket
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -18,11 +18,10 @@ from devrf.apps.settings import ViewerSettings
 from devrf.apps.viewer.cameras import dynamic_frusta, from_browser, in_browser, static_frusta
 from devrf.apps.viewer.drawing import Drawing, Frame, RenderScheduler, Shot
 from devrf.errors import DevrfError
-from devrf.geometry.cameras import Cameras
 from devrf.rendering.renderer import Renderer
 
 
-def free_port() -> int:
+def free_port():
     with socket.create_server(("127.0.0.1", 0)) as probe:
         return int(probe.getsockname()[1])
 
@@ -41,19 +40,19 @@ def test_a_camera_of_the_browser_by_hand_and_back():
 # Frames: as the renderer's images, in blocks.
 
 
-def drawn(drawing: Drawing, shot: Shot, height: int = 18) -> Frame:
+def drawn(drawing, shot, height=18):
     *blocks, frame = drawing.draw(shot, height)
     assert blocks and not any(blocks)
     return frame
 
 
 @pytest.fixture
-def drawing(moving) -> Drawing:
+def drawing(moving):
     return Drawing(Renderer(moving, times=6), 1.0)
 
 
 @pytest.fixture
-def shot(tiny_scene) -> Shot:
+def shot(tiny_scene):
     (keyframe,) = keyframes_of(tiny_scene.dynamic.test.cameras[[0]], [0.7], 0.0)
     return Shot(keyframe, 24 / 18)
 
@@ -130,27 +129,25 @@ FIRST, SECOND = (Shot(Keyframe(torch.eye(3, 4), 60.0, time, 0.0), 1.0) for time 
 class Screen:
     """A scheduler whose frames have three blocks; ``between`` is called after each."""
 
-    def __init__(self, coarse: int = 20) -> None:
+    def __init__(self, coarse=20):
         self.coarse, self.shown = coarse, list[tuple[object, float, int]]()
         self.between: Callable[[int], None] = lambda rows: None
         self.stop = threading.Event()
-        self.scheduler = RenderScheduler(
-            self, self.show, height=100, move_seconds=0.2, stop=self.stop
-        )
+        self.scheduler = RenderScheduler(self, self.show, ViewerSettings(height=100), self.stop)
 
-    def height_within(self, seconds: float, aspect: float, height: int) -> int:
+    def height_within(self, seconds, aspect, height):
         return min(self.coarse, height)
 
-    def draw(self, shot: Shot, height: int) -> Iterator[Frame | None]:
+    def draw(self, shot, height):
         for _ in range(3):
             self.between(height)
             yield None
         yield Frame(torch.full((height, 1, 3), shot.keyframe.time), None, 0.1)
 
-    def show(self, key: object, frame: Frame) -> None:
+    def show(self, key, frame):
         self.shown.append((key, round(float(frame.pixels[0, 0, 0]), 3), len(frame.pixels)))
 
-    def render(self) -> None:
+    def render(self):
         for _ in range(20):
             self.scheduler.render_next(0)
 
@@ -229,17 +226,6 @@ def test_time_runs_at_its_speed_and_loops_or_stops():
     assert ended.toggled() == Playback(time=0.0, playing=True, loop=False)
 
 
-def test_where_cameras_look():
-    pytest.importorskip("viser", reason="the viewer's extra is not installed")
-    from devrf.apps.viewer.paths import distance_ahead
-
-    places = torch.tensor([[3.0, 0, 0], [0, 3, 0], [0, 0, 3.0]])
-    around = Cameras.looking_at(places, torch.zeros(3, 3), focal=1, width=2, height=2)
-    assert distance_ahead(around) == pytest.approx(3.0, abs=1e-4)
-    same_way = Cameras.looking_at(places, places - 1, focal=1, width=2, height=2)
-    assert distance_ahead(same_way) == pytest.approx(6**0.5, abs=1e-4)  # of the mean to each
-
-
 def test_keyframes_are_collected_saved_loaded_and_flown_through(moving, tiny_scene, tmp_path):
     pytest.importorskip("viser", reason="the viewer's extra is not installed")
     from devrf.apps.viewer.paths import known_paths
@@ -285,11 +271,7 @@ def test_keyframes_are_collected_saved_loaded_and_flown_through(moving, tiny_sce
 
 
 @pytest.mark.parametrize(
-    ("keys", "expected"),
-    [
-        ({"port": 70000}, "viewer.port: "),
-        ({"share": 2}, "viewer.share: "),
-    ],
+    ("keys", "expected"), [({"port": 70000}, "viewer.port: "), ({"share": 2}, "viewer.share: ")]
 )
 def test_settings_that_cannot_be(keys, expected):
     with pytest.raises(DevrfError, match=expected):

@@ -7,8 +7,6 @@ import shutil
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
-from typing import Any
 
 import numpy as np
 import pytest
@@ -33,7 +31,7 @@ PATIENCE = 120
 
 
 @pytest.fixture
-def browser() -> Iterator[Any]:
+def browser():
     if CHROMIUM is None or DRIVER is None:
         pytest.skip("no chromium and chromedriver on this machine")
     options = webdriver.ChromeOptions()
@@ -46,7 +44,7 @@ def browser() -> Iterator[Any]:
 
 
 @pytest.fixture
-def session(moving, tiny_scene, tmp_path) -> Iterator[Any]:
+def session(moving, tiny_scene, tmp_path):
     """The tiny scene, served by another thread."""
     from devrf.apps.viewer.session import Session
 
@@ -64,14 +62,14 @@ def session(moving, tiny_scene, tmp_path) -> Iterator[Any]:
     assert not thread.is_alive()
 
 
-def wait_for(true: Callable[[], bool]) -> None:
+def wait_for(true):
     until = time.monotonic() + PATIENCE
     while not true():
         assert time.monotonic() < until
         time.sleep(0.1)
 
 
-def canvas(browser: Any) -> np.ndarray:
+def canvas(browser):
     """The left half of the page, where no control is."""
     shot = Image.open(io.BytesIO(browser.get_screenshot_as_png())).convert("RGB")
     return np.asarray(shot)[150:, : shot.width // 2].astype(int)

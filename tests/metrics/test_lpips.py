@@ -65,10 +65,10 @@ def test_only_what_lies_inside_the_mask_counts(pair: tuple[Tensor, Tensor], tmp_
     mask = torch.zeros(40, 48, dtype=torch.bool)
     mask[8:20, 10:30] = True
     outside = torch.where(mask[..., None], truth, other)
-    assert lpips.inside(outside, truth, mask) == 0
-    inside = lpips.inside(other, truth, mask)
+    assert lpips(outside, truth, mask) == 0
+    inside = lpips(other, truth, mask)
     assert inside is not None and inside > 0
-    assert lpips.inside(other, truth, torch.zeros_like(mask)) is None
+    assert lpips(other, truth, torch.zeros_like(mask)) is None
 
 
 def test_images_that_are_too_small_have_none(tmp_path: Path) -> None:
@@ -77,7 +77,7 @@ def test_images_that_are_too_small_have_none(tmp_path: Path) -> None:
     enough, less = torch.rand(side, side, 3), torch.rand(side - 1, side + 9, 3)
     assert lpips(enough, enough) == 0
     assert lpips(less, less) is None
-    assert lpips.inside(less, less, torch.ones(less.shape[:2], dtype=torch.bool)) is None
+    assert lpips(less, less, torch.ones(less.shape[:2], dtype=torch.bool)) is None
 
 
 def test_without_weights_one_line_says_why(

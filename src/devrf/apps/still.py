@@ -135,21 +135,18 @@ def write_contact_sheet(path: Path, views: Sequence[HeldOutView], rows: int = 6)
     shown = [views[k] for k in evenly(len(views), rows)]
     near, far = _depth_range(shown)
     height = min(max(shown[0].truth.shape[0], MIN_HEIGHT), MAX_HEIGHT)
-    rows_of_tiles = []
+    rows_of_tiles, labels = [], []
     for view in shown:
         error = error_colors(view.compared, view.truth)
         depth = depth_colors(view.depth, view.opacity, near, far)
         tiles = view.truth, view.prediction, error, depth
         rows_of_tiles.append([scaled(tile, height) for tile in tiles])
-    sheet = image_grid(rows_of_tiles, HEADINGS, [_label(view) for view in shown])
+        name = wrap(short_name(view.name), 16, break_long_words=False, break_on_hyphens=False)
+        scores = f"PSNR {view.psnr:.2f} dB", f"SSIM {view.ssim:.3f}"
+        labels.append([*name, f"time {view.time:.2f}", *scores])
+    sheet = image_grid(rows_of_tiles, HEADINGS, labels)
     write_image(path, sheet)
     return sheet
-
-
-def _label(view: HeldOutView) -> list[str]:
-    name = wrap(short_name(view.name), 16, break_long_words=False, break_on_hyphens=False)
-    scores = [f"PSNR {view.psnr:.2f} dB", f"SSIM {view.ssim:.3f}"]
-    return [*name, f"time {view.time:.2f}", *scores]
 
 
 def _depth_range(views: Sequence[HeldOutView]) -> tuple[float, float]:

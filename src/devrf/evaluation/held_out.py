@@ -11,7 +11,6 @@ from devrf.evaluation.suite import MetricInput, MetricSuite
 from devrf.metrics.image import psnr, psnr_masked, ssim, ssim_masked, ssim_within
 from devrf.rendering.output import RenderedImage
 from devrf.rendering.renderer import Renderer, points_at_depth
-from devrf.rendering.view import Viewable
 from devrf.scenes.scene import Background, Views
 
 
@@ -80,7 +79,9 @@ def score(
     further: dict[str, float | None] = {}
     opacity = seen.opacity.cpu().view(truth.shape[:2])
     if suite is not None and suite.metrics:
-        distance = _world_distance(renderer.model, views, index, seen).view(truth.shape[:2])
+        rays = views.cameras.image_rays(index)
+        points = points_at_depth(renderer.model.space, rays, seen.depth.cpu())
+        distance = (points - rays.origins).norm(dim=1).view(truth.shape[:2])
         further = suite.scores(
             MetricInput(renderer, views, index, compared, truth, distance, opacity, suite.lpips)
         )
@@ -139,11 +140,3 @@ def background_value(background: Background) -> float:
 
 def _image(seen: RenderedImage, views: Views) -> Tensor:
     return seen.color.view(views.height, views.width, 3).clamp(0, 1).cpu()
-
-
-def _world_distance(model: Viewable, views: Views, index: int, seen: RenderedImage) -> Tensor:
-    """Depths (H·W,) of an image as distances from the camera in world units."""
-    rays = views.cameras.image_rays(index)
-    points = points_at_depth(model.space, rays, seen.depth.cpu())
-    distance: Tensor = torch.linalg.vector_norm(points - rays.origins, dim=1)
-    return distance

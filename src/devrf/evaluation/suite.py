@@ -61,12 +61,8 @@ def _ms_ssim(inputs: MetricInput) -> float | None:
 
 
 def _lpips(inputs: MetricInput, mask: Tensor | None) -> float | None:
-    if inputs.lpips is None:
-        return None
-    if mask is not None:
-        return inputs.lpips.inside(inputs.prediction, inputs.truth, mask)
-    whole: float | None = inputs.lpips(inputs.prediction, inputs.truth)
-    return whole
+    lpips = inputs.lpips
+    return None if lpips is None else lpips.forward(inputs.prediction, inputs.truth, mask)
 
 
 def _depth_error(inputs: MetricInput) -> float | None:

@@ -111,25 +111,23 @@ class Lpips(nn.Module):
         self.register_buffer("scale", torch.tensor(SCALE)[:, None, None])
         self.eval().requires_grad_(False)
 
-    def forward(self, prediction: Tensor, truth: Tensor) -> float | None:
-        """LPIPS of two (H, W, 3) images in [0, 1]; None where they are too small."""
-        maps = self.maps(prediction, truth)
-        return None if maps is None else float(sum(layer.mean() for layer in maps))
-
-    def inside(self, prediction: Tensor, truth: Tensor, mask: Tensor) -> float | None:
-        """LPIPS of two (H, W, 3) images in [0, 1] where ``mask`` (H, W) is True.
+    def forward(
+        self, prediction: Tensor, truth: Tensor, mask: Tensor | None = None
+    ) -> float | None:
+        """LPIPS of two (H, W, 3) images in [0, 1], where ``mask`` (H, W) is True if one is given.
 
         Outside it the prediction is taken to be right; the layers' differences, interpolated to the
         image's size, are averaged inside. None where it is empty or the images are too small.
         """
-        if not bool(mask.any()):
+        if mask is not None:
+            prediction = torch.where(mask[..., None], prediction, truth)
+        maps = self.maps(prediction, truth)
+        if maps is None or (mask is not None and not bool(mask.any())):
             return None
-        maps = self.maps(torch.where(mask[..., None], prediction, truth), truth)
-        if maps is None:
-            return None
-        shape = mask.shape
-        full = [interpolate(layer, shape, mode="bilinear")[0, 0].cpu() for layer in maps]
-        return float(sum(layer[mask].mean() for layer in full))
+        if mask is not None:
+            full = (interpolate(layer, mask.shape, mode="bilinear")[0, 0] for layer in maps)
+            maps = [layer.cpu()[mask] for layer in full]
+        return float(sum(layer.mean() for layer in maps))
 
     @torch.no_grad()
     def maps(self, prediction: Tensor, truth: Tensor) -> list[Tensor] | None:
@@ -158,14 +156,9 @@ def load_lpips(
 ) -> Lpips | None:
     """The metric, or None where its weights cannot be had; one logged line says why.
 
-    The weights of the trunk are those of torchvision's network trained on ImageNet: from
+    The weights of the trunk are those of torchvision's network trained on ImageNet: from the file
     ``weights``, else from torch's cache (``torch.hub.get_dir()/checkpoints``), else downloaded
-    into it. The heads come with torchmetrics.
-
-    Args:
-        network: ``vgg`` (what papers on radiance fields report) or ``alex``.
-        weights: a file with the network's weights, or with those of its ``features`` alone.
-        download: whether they may be downloaded (528 MB for ``vgg``, 233 MB for ``alex``).
+    into it (528 MB for ``vgg``, 233 MB for ``alex``). The heads come with torchmetrics.
 
     Raises:
         DevrfError: ``weights`` is no file, or holds something else.

@@ -18,7 +18,6 @@ from devrf.data.recorded import recognised_datamodule
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
-from devrf.scenes.sparse_model import normalised, read_model
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
@@ -161,21 +160,6 @@ def test_subtraction_gives_the_box_of_what_moves(capture):
     assert scene.bounds.box_source == "scene_bounds in transforms.json"
     # Its box is another than that of all sparse points, 1.2 units wide and their margin.
     assert Box.of(scene.space.low, scene.space.high).longest > 2
-
-
-# The world of a model.
-
-
-def test_the_world_of_cameras_before_a_wall(tmp_path):
-    model = read_model(row(tmp_path / "model", [f"{k}.png" for k in range(9)]))
-    world = normalised(model)
-    assert (world.space, world.near, world.box) == ("ndc", 1.0, None)
-    assert torch.allclose(world.poses[:, :, 3].mean(dim=0), torch.zeros(3).double(), atol=1e-6)
-    mean = world.poses[:, :, 2].mean(dim=0)
-    assert torch.allclose(mean / mean.norm(), UP, atol=1e-6)
-    # All but the nearest hundredth are beyond 1/0.75; the wall is 1.5 times as deep as near.
-    assert float((-world.points[:, 2]).min()) == pytest.approx(4 / 3, rel=0.1)
-    assert 1.3 < world.far / (4 / 3) < 1.7
 
 
 # What is wrong is said in one line, and nothing is left behind.

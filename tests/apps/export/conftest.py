@@ -9,10 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
-from devrf.geometry.space import WORLD, Space
+from devrf.geometry.space import WORLD
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.model import DeVRFModel
@@ -25,13 +24,7 @@ RADIUS = 0.5
 LEVEL = math.log(math.expm1(-math.log(0.9)))
 
 
-def solid(
-    distance: Distance,
-    box: Box,
-    side: int,
-    color: tuple[float, float, float] = (1.0, 0.0, 0.0),
-    space: Space = WORLD,
-) -> DeVRFModel:
+def solid(distance, box, side, color=(1.0, 0.0, 0.0), space=WORLD):
     """A scene at rest whose surface is where ``distance`` (M,) of points (M, 3) is 0.
 
     The raw density falls by 4 from a voxel to the next.
@@ -48,19 +41,19 @@ def solid(
     return DeVRFModel(Architecture(), field, Occupancy.full((2, 2, 2), box), settings, space=space)
 
 
-def ball(points: Tensor) -> Tensor:
+def ball(points):
     """The distance to a ball about the origin."""
     return points.norm(dim=1) - RADIUS
 
 
 @pytest.fixture
-def of_distance() -> Callable[..., DeVRFModel]:
+def of_distance():
     """The function :func:`solid`."""
     return solid
 
 
 @pytest.fixture(scope="module")
-def moving_ball(cube: Box) -> DeVRFModel:
+def moving_ball(cube):
     """A red ball of radius 0.5 that moves by 0.4 along x and grows by a fifth until t = 1.
 
     Its motion is linear in space, so that trilinear displacements are exact.
@@ -77,7 +70,7 @@ def moving_ball(cube: Box) -> DeVRFModel:
 
 
 @pytest.fixture(scope="module")
-def around() -> Cameras:
+def around():
     """Six cameras that look at the origin from 4 units away, z up."""
     angle = torch.arange(6) * math.pi / 3
     places = torch.stack([4 * angle.cos(), 4 * angle.sin(), 0.5 + 0 * angle], dim=1)

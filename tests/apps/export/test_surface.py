@@ -9,7 +9,7 @@ import torch
 import trimesh
 
 from devrf.apps.export.geometry import ExportSettings
-from devrf.apps.export.surface import Surface, canonical_surface
+from devrf.apps.export.surface import canonical_surface
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
@@ -20,17 +20,15 @@ from devrf.methods.devrf.model import DeVRFModel
 Build = Callable[..., DeVRFModel]
 
 
-def surface_of(model: DeVRFModel, cameras: Cameras, **settings: object) -> Surface:
+def surface_of(model, cameras, **settings):
     return canonical_surface(model, cameras, ExportSettings(**settings))
 
 
-def mesh_of(surface: Surface) -> trimesh.Trimesh:
+def mesh_of(surface):
     return trimesh.Trimesh(surface.points.numpy(), surface.faces.numpy(), process=False)
 
 
-def test_a_ball_is_where_it_is_closed_and_faces_outward(
-    moving_ball: DeVRFModel, around: Cameras
-) -> None:
+def test_a_ball_is_where_it_is_closed_and_faces_outward(moving_ball, around):
     surface = surface_of(moving_ball, around)
     # Within a tenth of a voxel of 1/12: distances are not quite linear along an edge.
     assert (surface.points.norm(dim=1) - 0.5).abs().max() < 0.1 / 12
@@ -39,15 +37,15 @@ def test_a_ball_is_where_it_is_closed_and_faces_outward(
     assert mesh.volume == pytest.approx(4 / 3 * torch.pi * 0.125, rel=0.03)
 
 
-def test_what_no_camera_can_reach_is_solid(of_distance: Build, cube: Box, around: Cameras) -> None:
+def test_what_no_camera_can_reach_is_solid(of_distance, cube, around):
     hollow = of_distance(lambda points: (points.norm(dim=1) - 0.4).abs() - 0.15, cube, 25)
     mesh = mesh_of(surface_of(hollow, around))
     assert mesh.body_count == 1
     assert mesh.volume == pytest.approx(4 / 3 * torch.pi * 0.55**3, rel=0.03)
 
 
-def test_small_pieces_are_left_out(of_distance: Build, cube: Box, around: Cameras) -> None:
-    def two(points: torch.Tensor) -> torch.Tensor:
+def test_small_pieces_are_left_out(of_distance, cube, around):
+    def two(points):
         small = (points - torch.tensor([0.8, 0.0, 0.0])).norm(dim=1) - 0.12
         return torch.minimum(points.norm(dim=1) - 0.5, small)
 
@@ -56,7 +54,7 @@ def test_small_pieces_are_left_out(of_distance: Build, cube: Box, around: Camera
     assert mesh_of(surface_of(model, around, pieces=0.2)).body_count == 1
 
 
-def test_it_has_the_colour_of_the_field(of_distance: Build, cube: Box, around: Cameras) -> None:
+def test_it_has_the_colour_of_the_field(of_distance, cube, around):
     model = of_distance(lambda points: points.norm(dim=1) - 0.5, cube, 21, (0.2, 0.4, 0.9))
     for colors in ("mean", "normal"):
         found = surface_of(model, around, colors=colors).colors
@@ -64,7 +62,7 @@ def test_it_has_the_colour_of_the_field(of_distance: Build, cube: Box, around: C
         torch.testing.assert_close(found, expected, atol=1e-3, rtol=0)
 
 
-def test_a_forward_facing_surface_is_in_the_world_and_faces_the_camera(of_distance: Build) -> None:
+def test_a_forward_facing_surface_is_in_the_world_and_faces_the_camera(of_distance):
     space = NormalizedDevice(40, 30, (40.0, 40.0), near=2.0)
     box = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
     # Everything further than 4 units, z' = 0, is matter.
@@ -80,10 +78,10 @@ def test_a_forward_facing_surface_is_in_the_world_and_faces_the_camera(of_distan
     assert mesh.area == pytest.approx(4.0 * 3.0, rel=0.01)
 
 
-def test_of_an_endless_scene_what_is_far_is_left_out(of_distance: Build) -> None:
+def test_of_an_endless_scene_what_is_far_is_left_out(of_distance):
     space = ContractedSpace((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 
-    def two_balls(points: torch.Tensor) -> torch.Tensor:
+    def two_balls(points):
         # In the shell, x = −1.4 is the world's −1 / (2 − 1.4), and 1.8 its 5.
         near = (points - torch.tensor([-1.25, 0, 0])).norm(dim=1) - 0.15
         return torch.minimum(near, (points - torch.tensor([1.9, 0, 0])).norm(dim=1) - 0.1)
@@ -111,14 +109,12 @@ def test_of_an_endless_scene_what_is_far_is_left_out(of_distance: Build) -> None
         ({"times": [0.0, 1.0], "fps": 3.0}, "export.times: "),
     ],
 )
-def test_settings_that_make_no_sense(settings: dict[str, object], expected: str) -> None:
+def test_settings_that_make_no_sense(settings, expected):
     with pytest.raises(DevrfError, match=expected):
         ExportSettings(**settings)
 
 
-def test_a_threshold_that_nothing_crosses_is_refused(
-    of_distance: Build, cube: Box, around: Cameras
-) -> None:
+def test_a_threshold_that_nothing_crosses_is_refused(of_distance, cube, around):
     flat = of_distance(lambda points: 0.01 * points[:, 0], cube, 9)
     for threshold in (0.999, 1e-9):
         with pytest.raises(DevrfError, match=r"^export\.threshold: "):

@@ -8,50 +8,47 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch import Tensor
 
 from devrf.apps.inspection.advice import advice_on
-from devrf.geometry.box import Box
 from devrf.scenes.bounds import box_from_cameras
-from devrf.scenes.procedural import ProceduralScene
-from devrf.scenes.scene import OpticalFlow, Scene, Views
+from devrf.scenes.scene import OpticalFlow, Scene
 
 Spoil = Callable[[Scene], Scene]
 
 
 @pytest.fixture(scope="module")
-def healthy(tiny_recipe: ProceduralScene) -> Scene:
+def healthy(tiny_recipe):
     """A robot in 24×18 pixels: 16 static views all around, 2 moving views of 3 frames."""
     return replace(tiny_recipe, static_views=16)()
 
 
-def changed(name: str, change: Callable[[Views], Views]) -> Spoil:
+def changed(name, change):
     """A scene with one of its sets of images changed: ``static.train``."""
     capture, part = name.split(".")
 
-    def spoil(scene: Scene) -> Scene:
+    def spoil(scene):
         sets = getattr(scene, capture)
         return replace(scene, **{capture: replace(sets, **{part: change(getattr(sets, part))})})
 
     return spoil
 
 
-def ambiguous(views: Views) -> Views:
+def ambiguous(views):
     return replace(views, ambiguous_orientation=torch.arange(len(views)) == 7)
 
 
-def late(views: Views) -> Views:
+def late(views):
     return replace(views, times=0.1 + 0.9 * views.times)
 
 
-def rgb(views: Views) -> Views:
+def rgb(views):
     return replace(views, pixels=views.pixels[..., :3])
 
 
-def turned(degrees: float) -> Callable[[Views], Views]:
+def turned(degrees):
     """The fourth camera turned about its own up axis."""
 
-    def change(views: Views) -> Views:
+    def change(views):
         poses = views.cameras.camera_to_world.clone()
         c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
         poses[3, :, :3] @= torch.tensor([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
@@ -60,8 +57,8 @@ def turned(degrees: float) -> Callable[[Views], Views]:
     return change
 
 
-def painted(image: int | slice, channels: slice, value: list[int]) -> Callable[[Views], Views]:
-    def change(views: Views) -> Views:
+def painted(image, channels, value):
+    def change(views):
         pixels = views.pixels.clone()
         pixels[image, ..., channels] = torch.tensor(value, dtype=torch.uint8)
         return replace(views, pixels=pixels)
@@ -69,26 +66,26 @@ def painted(image: int | slice, channels: slice, value: list[int]) -> Callable[[
     return change
 
 
-def where(test: Callable[[Views], Tensor]) -> Callable[[Views], Views]:
+def where(test):
     return lambda views: views[test(views).nonzero()[:, 0]]
 
 
-def flowing(change: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]) -> Spoil:
-    def flowed(views: Views) -> Views:
+def flowing(change):
+    def flowed(views):
         assert views.flow is not None
         return replace(views, flow=OpticalFlow(*change(views.flow.vectors, views.flow.valid)))
 
     return changed("dynamic.train", flowed)
 
 
-def without_alpha(scene: Scene, box: Box | None = None) -> Scene:
+def without_alpha(scene, box=None):
     for name in SETS:
         scene = changed(name, rgb)(scene)
     bounds = replace(scene.bounds, box=box or scene.bounds.box.scaled(0.9))
     return replace(scene, bounds=bounds)
 
 
-def one_colour(scene: Scene) -> Scene:
+def one_colour(scene):
     return changed(MOVING, painted(2, slice(3), [90, 90, 91]))(without_alpha(scene))
 
 
@@ -116,12 +113,12 @@ PROBLEMS: list[tuple[Spoil, str, str]] = [
 
 
 @pytest.mark.parametrize(("spoil", "where", "what"), PROBLEMS)
-def test_a_problem(healthy: Scene, spoil: Spoil, where: str, what: str) -> None:
+def test_a_problem(healthy, spoil, where, what):
     (advice,) = advice_on(spoil(healthy))
     assert where in advice.where and what in advice.what
 
 
-def test_held_out_views_that_are_learned_from(healthy: Scene) -> None:
+def test_held_out_views_that_are_learned_from(healthy):
     train = healthy.dynamic.train
     spoil = changed("dynamic.test", lambda _: train[torch.tensor([0, 4])])
     (advice,) = advice_on(spoil(healthy))
@@ -132,7 +129,7 @@ def test_held_out_views_that_are_learned_from(healthy: Scene) -> None:
     assert advice_on(changed("dynamic.test", lambda _: test)(healthy)) == []
 
 
-def test_a_box_that_is_only_guessed(healthy: Scene) -> None:
+def test_a_box_that_is_only_guessed(healthy):
     guess = box_from_cameras(healthy.static.train.cameras)
     (advice,) = advice_on(without_alpha(healthy, guess))
     assert "data.box=" in advice.remedy

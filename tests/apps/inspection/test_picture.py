@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import imageio.v3 as iio
 import pytest
 import torch
-from matplotlib.figure import Figure
 
 from devrf.apps.inspection.picture import (
     compass,
@@ -20,14 +18,14 @@ from devrf.apps.inspection.picture import (
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.ndc import NormalizedDevice
-from devrf.scenes.scene import Capture, Scene, Views
+from devrf.scenes.scene import Capture
 
 
 @pytest.fixture(scope="module")
-def forward_scene(tiny_scene: Scene) -> Scene:
+def forward_scene(tiny_scene):
     """The tiny scene as if it lived in NDC, its cameras side by side."""
 
-    def facing(views: Views) -> Views:
+    def facing(views):
         pose = torch.eye(3, 4).repeat(len(views), 1, 1)
         pose[:, 0, 3] = 0.1 * torch.arange(len(views))
         return replace(views, cameras=replace(views.cameras, camera_to_world=pose))
@@ -43,18 +41,16 @@ def forward_scene(tiny_scene: Scene) -> Scene:
     )
 
 
-def captions(figure: Figure) -> list[str]:
+def captions(figure):
     """Labels below the images of a page."""
     return [label for axes in figure.axes[2:] if (label := axes.get_xlabel())]
 
 
-def headings(figure: Figure) -> str:
+def headings(figure):
     return "\n".join(part.get_suptitle() for part in figure.subfigs)
 
 
-def test_the_page_of_a_scene(
-    tiny_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_page_of_a_scene(tiny_scene, tmp_path, monkeypatch):
     figure = inspection_figure(tiny_scene)
     monkeypatch.setattr("devrf.apps.inspection.picture.inspection_figure", lambda _: figure)
     write_inspection_picture(tmp_path / "images" / "inspect.png", tiny_scene)
@@ -73,7 +69,7 @@ def test_the_page_of_a_scene(
     assert found[12].startswith("rim: ") and found[13:] == rows[1:3] + rows[4:]
 
 
-def test_a_camera_is_a_pyramid_that_opens_where_it_looks() -> None:
+def test_a_camera_is_a_pyramid_that_opens_where_it_looks():
     cameras = Cameras(
         torch.eye(3, 4)[None], torch.tensor([[10.0, 10.0]]), torch.tensor([[10.0, 5.0]]), 20, 10
     )
@@ -85,12 +81,12 @@ def test_a_camera_is_a_pyramid_that_opens_where_it_looks() -> None:
     torch.testing.assert_close(lines[8, 1], torch.tensor([0.0, 1.4, -2.0]))
 
 
-def test_forward_facing_cameras_look_north(forward_scene: Scene) -> None:
+def test_forward_facing_cameras_look_north(forward_scene):
     east_north_up = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     torch.testing.assert_close(compass(forward_scene), east_north_up, atol=1e-5, rtol=0)
 
 
-def test_what_alpha_or_masks_leave_out_is_chequered(tiny_scene: Scene) -> None:
+def test_what_alpha_or_masks_leave_out_is_chequered(tiny_scene):
     views = tiny_scene.static.train[torch.tensor([0])]
     pixels = torch.tensor([255, 0, 0, 255], dtype=torch.uint8).expand(1, 18, 24, 4).clone()
     left = (torch.arange(24) < 12).expand(1, 18, 24)

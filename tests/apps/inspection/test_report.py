@@ -20,10 +20,10 @@ from devrf.apps.inspection.report import (
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.ndc import NormalizedDevice
-from devrf.scenes.scene import OpticalFlow, Scene, Views
+from devrf.scenes.scene import OpticalFlow, Views
 
 
-def test_the_sets_of_a_scene(tiny_scene: Scene) -> None:
+def test_the_sets_of_a_scene(tiny_scene):
     rows = image_facts(tiny_scene)
     assert [row[:4] for row in rows] == [
         ("static training set", "8", "8 x 1", "24 x 18"),
@@ -43,13 +43,13 @@ def test_the_sets_of_a_scene(tiny_scene: Scene) -> None:
         ([0.5, 0.5, 0.7500001, 0.75, 1, 1], "3 from 0.5 to 1, evenly spaced"),
     ],
 )
-def test_times(tiny_scene: Scene, times: list[float], text: str) -> None:
+def test_times(tiny_scene, times, text):
     train = replace(tiny_scene.dynamic.train, times=torch.tensor(times))
     scene = replace(tiny_scene, dynamic=replace(tiny_scene.dynamic, train=train))
     assert dict(scene_facts(scene))["times"] == text
 
 
-def test_flow_by_hand(tiny_scene: Scene) -> None:
+def test_flow_by_hand(tiny_scene):
     views: Views = tiny_scene.dynamic.train
     vectors, valid = torch.zeros(6, 18, 24, 2), torch.zeros(6, 18, 24, dtype=torch.bool)
     later = (views.times > 0).nonzero()[:, 0]
@@ -66,7 +66,7 @@ def test_flow_by_hand(tiny_scene: Scene) -> None:
     assert flow_facts(replace(views, flow=None)) == "none"
 
 
-def test_the_report_on_a_terminal_and_in_a_log(tiny_scene: Scene) -> None:
+def test_the_report_on_a_terminal_and_in_a_log(tiny_scene):
     named = replace(tiny_scene, name="a [bold] robot")
     report = inspection_text(named, [("checkpoint", "1.6 GB", "displacements 1.6 GB")])
     console = Console(width=160, record=True, file=io.StringIO())
@@ -81,7 +81,7 @@ def test_the_report_on_a_terminal_and_in_a_log(tiny_scene: Scene) -> None:
     assert all(line == line.rstrip() for line in log.splitlines())
 
 
-def ring(angles: list[float], height: float = 1.0) -> Cameras:
+def ring(angles, height=1.0):
     at = torch.tensor(angles).deg2rad()
     positions = torch.stack([3 * at.cos(), 3 * at.sin(), torch.full_like(at, height)], dim=1)
     middle = torch.zeros(len(angles), 3)
@@ -97,9 +97,7 @@ def ring(angles: list[float], height: float = 1.0) -> Cameras:
         ([0, 10, 20], 60.0, None),  # straight above
     ],
 )
-def test_the_widest_gap_by_hand(
-    tiny_scene: Scene, cube: Box, angles: list[float], height: float, gap: float | None
-) -> None:
+def test_the_widest_gap_by_hand(tiny_scene, cube, angles, height, gap):
     views = replace(tiny_scene.static.train, cameras=ring(angles, height))
     scene = replace(
         tiny_scene,
@@ -109,7 +107,7 @@ def test_the_widest_gap_by_hand(
     assert widest_gap(scene) == (gap if gap is None else pytest.approx(gap, abs=0.01))
 
 
-def test_up_of_level_cameras() -> None:
+def test_up_of_level_cameras():
     up = common_up(ring([0, 70, 200]))
     assert up is not None
     torch.testing.assert_close(up, torch.tensor([0.0, 0.0, 1.0]), atol=1e-5, rtol=0)
@@ -120,7 +118,7 @@ def test_up_of_level_cameras() -> None:
     assert common_up(replace(cameras, camera_to_world=poses)) is None
 
 
-def test_an_endless_box_is_cut_off_at_twice_the_near_plane(tiny_scene: Scene) -> None:
+def test_an_endless_box_is_cut_off_at_twice_the_near_plane(tiny_scene):
     space = NormalizedDevice(24, 18, (12.0, 9.0), near=1.0)
     box = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
     scene = replace(tiny_scene, kind="forward", space=space)

@@ -110,13 +110,3 @@ def test_latex_has_the_scenes_side_by_side(pig_and_robot):
     heading = r"\textit{$\dagger$ published, on an NVIDIA GeForce RTX 3090}"
     assert f"\\hline\n\\multicolumn{{16}}{{l}}{{{heading}}} \\\\\n" in body
     assert r"\providecommand{\devrfbest}[1]{\textbf{#1}}" in text
-
-
-def test_latex_begins_a_new_table_after_three_scenes(table, ran):
-    for k in range(4):
-        ran(str(k), f"scene_{k}")
-    text = latex(table())
-    assert text.count(r"\begin{table*}") == text.count(r"\end{table*}") == 2
-    assert text.count("{") == text.count("}")
-    assert r"\begin{tabular}{l|ccccc|ccccc|ccccc}" in text
-    assert r"\begin{tabular}{l|ccccc|ccccc}" in text  # the fourth, and the average

@@ -77,13 +77,6 @@ def test_methods_have_rows_of_their_own_after_ours(labels, ran):
     ]
 
 
-def test_a_row_knows_its_views_and_its_label_without_them(ran, runs):
-    for views in (1, 3):
-        ran(str(views), train_views=views, overrides=[f"data.train_views={views}"])
-    found = labelled(collect(runs).runs)
-    assert list(found["views"]) == [1, 3] and set(found["line"]) == {FULL}
-
-
 SETTINGS = {"data.frames": 14, "data.width": 96, "data.near": None, "seed": 0}
 
 

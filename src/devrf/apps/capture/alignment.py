@@ -148,9 +148,7 @@ def _correlation(a: Signal, b: Signal, lag: int) -> float:
     """Of the parts of two signals that overlap when the second is moved by ``lag`` samples."""
     low, high = max(0, lag), min(len(a), len(b) + lag)
     a, b = a[low:high], b[low - lag : high - lag]
-    a, b = a - a.mean(), b - b.mean()
-    norm = float(np.sqrt((a**2).sum() * (b**2).sum()))
-    return float((a * b).sum()) / norm if norm > 0 else -1.0
+    return float(np.corrcoef(a, b)[0, 1]) if a.std() * b.std() > 0 else -1.0
 
 
 def _nearest(clock: Signal, instants: Signal) -> tuple[int, ...]:

@@ -50,10 +50,13 @@ def write_gltf(
     vertices = frame.points(mesh.vertices)
     size = float((vertices.amax(dim=(0, 1)) - vertices.amin(dim=(0, 1))).norm())
     names = [f"t={time:.4g}" for time in mesh.times[1:]]
+    # The standard's vertex colours are linear, with alpha, in 16 bits.
+    rgba = torch.cat([linear(mesh.colors), torch.ones(len(mesh.colors), 1)], dim=1)
+    rgba16 = (rgba * 65535).round().numpy().astype("u2")
     primitive: dict[str, Any] = {
         "attributes": {
             "POSITION": content.array(vertices[0].numpy(), VERTICES, limits=True),
-            "COLOR_0": content.array(_linear16(mesh.colors), VERTICES, normalized=True),
+            "COLOR_0": content.array(rgba16, VERTICES, normalized=True),
         },
         "indices": content.array(mesh.faces.reshape(-1).numpy().astype("u4"), INDICES),
         "material": 0,
@@ -119,12 +122,6 @@ def linear(colors: Tensor) -> Tensor:
     """Linear light (..., 3) of sRGB colours (..., 3), both in [0, 1] (IEC 61966-2-1)."""
     dark = colors / 12.92
     return torch.where(colors <= 0.04045, dark, ((colors + 0.055) / 1.055) ** 2.4)
-
-
-def _linear16(colors: Tensor) -> Array:
-    """Linear RGBA (V, 4) in 16 bits: the standard's vertex colours are linear."""
-    values = torch.cat([linear(colors), torch.ones(len(colors), 1)], dim=1)
-    return (values * 65535).round().numpy().astype("u2")
 
 
 class _Content:

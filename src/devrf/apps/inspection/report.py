@@ -33,8 +33,8 @@ def inspection_text(scene: Scene, requirements: Sequence[Sequence[str]]) -> Rend
         _titled_table("what a run will need, estimated", requirements),
         Text(verdict, style="bold yellow" if advice else "bold green"),
         *(
-            Text.assemble((f"  {a.where}", "yellow"), f": {a.what}; ", (a.remedy, "italic"))
-            for a in advice
+            Text.assemble((f"  {where}", "yellow"), f": {what}; ", (remedy, "italic"))
+            for where, what, remedy in advice
         ),
     )
 
@@ -145,13 +145,11 @@ def flow_facts(views: Views) -> str:
     for k in images:  # one by one: all of a large scene's flow at once would be copied
         valid = views.flow.valid[k]
         length = views.flow.vectors[k][valid].norm(dim=-1)
-        count += len(length)
-        total += float(length.sum())
+        count, total = count + len(length), total + float(length.sum())
         longest = max(longest, float(length.max())) if len(length) else longest
         if views.has_alpha:
             alpha = views.pixels[k, ..., 3] > OPAQUE
-            inside += int(alpha.sum())
-            covered += int((alpha & valid).sum())
+            inside, covered = inside + int(alpha.sum()), covered + int((alpha & valid).sum())
     share = _percent(count / max(len(images) * views.width * views.height, 1))
     in_alpha = f" ({_percent(covered / max(inside, 1))} of the alpha masks)" * views.has_alpha
     return (

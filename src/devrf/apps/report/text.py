@@ -50,7 +50,9 @@ def _rows(
     found = pd.concat(cells, axis=1, keys=titles, sort=False)
     heads = pd.concat([frame["head"] for frame in frames]).groupby(level=0)
     counts = heads["counts"].agg(lambda sets: set().union(*sets))
-    names = heads["name"].first() + counts.map(_repeats)
+    # How many runs a row's values are means of, where it is more than one.
+    many = counts.map(lambda n: "" if n == {1} else f" (n = {', '.join(map(str, sorted(n)))})")
+    names = heads["name"].first() + many
     heading = "Method" if table.runs["method"].nunique() > 1 else ""
     lead = {("", heading): names.map(lambda name: style.escape(label.format(name)))}
     if table.rows["protocol"].nunique() > 1:
@@ -59,21 +61,12 @@ def _rows(
 
 
 def _marked(frame: pd.DataFrame, style: Style, columns: Sequence[Column]) -> pd.DataFrame:
-    def mark(rank: int, text: str) -> str:
-        return style.marks[rank].format(style.escape(text))
-
-    cells = {
-        style.escape(column.heading): list(
-            map(mark, frame["rank", column.title], frame["text", column.title])
-        )
-        for column in columns
-    }
+    cells = {}
+    for column in columns:
+        both = zip(frame["rank", column.title], frame["text", column.title], strict=True)
+        marked = [style.marks[rank].format(style.escape(text)) for rank, text in both]
+        cells[style.escape(column.heading)] = marked
     return pd.DataFrame(cells, index=frame.index, dtype=object)
-
-
-def _repeats(counts: set[int]) -> str:
-    """How many runs a row's values are means of, in parentheses; nothing where it is one."""
-    return "" if counts == {1} else f" (n = {', '.join(map(str, sorted(counts)))})"
 
 
 def caption(table: Table) -> str:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from devrf.apps.images import depth_colors, flow_colors, to_bytes
 from devrf.apps.keyframes import Keyframe, cameras_of
+from devrf.apps.settings import ViewerSettings
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.rendering.output import RenderedImage
@@ -186,18 +187,17 @@ class RenderScheduler:
         self,
         drawing: Drawing,
         show: Callable[[Hashable, Frame], None],
-        *,
-        height: int,
-        move_seconds: float,
+        settings: ViewerSettings,
         stop: threading.Event,
     ) -> None:
         """Begin with nothing to render.
 
-        ``show`` takes each frame, with the browser's key. A full frame has ``height`` rows; a first
-        one takes about ``move_seconds``. Once ``stop`` is set the current frame is given up.
+        ``show`` takes each frame, with the browser's key. The settings say how many rows a full
+        frame has, and about how long a first one takes. Once ``stop`` is set, the current frame is
+        given up.
         """
-        self.drawing, self._stop = drawing, stop
-        self._show, self._height, self._move_seconds = show, height, move_seconds
+        self.drawing, self._stop, self._show = drawing, stop, show
+        self._height, self._move_seconds = settings.height, settings.move_seconds
         self._requests: dict[Hashable, _Request] = {}
         self._number = 0
         self._change = threading.Condition()
@@ -233,7 +233,9 @@ class RenderScheduler:
         if urgent is None:
             return False
         key, request = urgent
-        rows, coarse = self._next_rows(request), request.rows == 0
+        full, coarse, aspect = self._height, request.rows == 0, request.shot.aspect
+        rows = FINER * request.rows or self.drawing.height_within(self._move_seconds, aspect, full)
+        rows = full if rows > NEARLY * full else rows
         for frame in self.drawing.draw(request.shot, rows):
             if frame is not None:
                 request.rows = rows
@@ -248,12 +250,6 @@ class RenderScheduler:
         """Whose frame is the coarsest; of several the one that has waited longest."""
         waiting = [item for item in self._requests.items() if item[1].rows < self._height]
         return min(waiting, key=lambda item: (item[1].rows, item[1].number), default=None)
-
-    def _next_rows(self, request: _Request) -> int:
-        rows = FINER * request.rows or self.drawing.height_within(
-            self._move_seconds, request.shot.aspect, self._height
-        )
-        return self._height if rows > NEARLY * self._height else rows
 
     def _overtaken(self, key: Hashable, request: _Request) -> bool:
         """Whether the browser has moved on, or another waits for its first frame."""

@@ -26,6 +26,7 @@ from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.rendering.view import Viewable
+from devrf.scenes.bounds import nearest_point
 
 # Keyframes of a known path, and the seconds that it takes to go round.
 KEYFRAMES, SECONDS = 13, 8.0
@@ -62,17 +63,13 @@ def known_paths(cameras: Cameras, model: Callable[[], Viewable]) -> dict[str, Pr
 def distance_ahead(cameras: Cameras) -> float:
     """How far before N cameras the point is that lies nearest to all their optical axes.
 
-    It solves Σ (1 − d dᵀ)(p − o) = 0 for p. Axes that meet nowhere give the cameras' extent.
+    Axes that meet nowhere give the cameras' extent.
     """
     origins, forwards = cameras.positions, cameras.forwards
-    across = torch.eye(3) - forwards[:, :, None] * forwards[:, None, :]
     extent = float((origins - origins.mean(dim=0)).norm(dim=1).max()) or 1.0
-    normal = across.sum(dim=0)
-    if float(torch.linalg.eigvalsh(normal)[0]) < 1e-3 * len(cameras):
-        return extent
-    point = torch.linalg.solve(normal, (across @ origins[:, :, None]).sum(dim=0)[:, 0])
-    distance = float(((point - origins) * forwards).sum(dim=1).mean())
-    return distance if distance > 0 else extent
+    point = nearest_point(origins, forwards, parallel=1e-3)
+    ahead = 0.0 if point is None else float(((point - origins) * forwards).sum(dim=1).mean())
+    return ahead if ahead > 0 else extent
 
 
 class PathPanel:
@@ -168,10 +165,8 @@ class PathPanel:
 
     def _take(self, keyframes: tuple[Keyframe, ...]) -> None:
         """Take other keyframes, the first at second 0."""
-        self.keyframes = tuple(
-            replace(keyframe, seconds=keyframe.seconds - keyframes[0].seconds)
-            for keyframe in keyframes
-        )
+        first = keyframes[0].seconds if keyframes else 0.0
+        self.keyframes = tuple(replace(key, seconds=key.seconds - first) for key in keyframes)
 
     def _save(self, event: viser.GuiEvent[Any]) -> None:
         file = self._folder / "paths" / f"{check_name(self._name.value)}.json"

@@ -79,13 +79,7 @@ class Session:
     def present(self, drawing: Drawing) -> None:
         """Show this scene from now on."""
         if self.scheduler is None:
-            self.scheduler = RenderScheduler(
-                drawing,
-                self._show,
-                height=self.settings.height,
-                move_seconds=self.settings.move_seconds,
-                stop=self._stop,
-            )
+            self.scheduler = RenderScheduler(drawing, self._show, self.settings, self._stop)
         self.scheduler.drawing = drawing
         self.controls.offer(drawing)
         self.refresh()
