@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 
-from devrf.errors import DevrfError
+from devrf.errors import DevrfError, expect
 
 CaptureChoice = Literal["static", "dynamic", "both"]
 
@@ -33,15 +33,11 @@ class ProtocolStage:
     optional: bool = False
 
     def __post_init__(self) -> None:
-        key = f"protocol.stages.{self.name}"
-        if self.capture not in get_args(CaptureChoice):
-            raise DevrfError(
-                f"{key}.capture: expected static, dynamic or both, not {self.capture!r}"
-            )
-        if not 0 < self.iterations <= 1:
-            raise DevrfError(
-                f"{key}.iterations: expected a share above 0, at most 1, not {self.iterations}"
-            )
+        key, captures = f"protocol.stages.{self.name}", get_args(CaptureChoice)
+        expected = "static, dynamic or both"
+        expect(self.capture in captures, f"{key}.capture", expected, repr(self.capture))
+        holds, expected = 0 < self.iterations <= 1, "a share above 0, at most 1"
+        expect(holds, f"{key}.iterations", expected, self.iterations)
 
 
 @dataclass(frozen=True)
@@ -65,10 +61,8 @@ class Protocol:
     steps: tuple[ProtocolStage, ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        if not 0 < self.static_share < 1:
-            raise DevrfError(
-                f"protocol.static_share: expected between 0 and 1, not {self.static_share}"
-            )
+        share = self.static_share
+        expect(0 < share < 1, "protocol.static_share", "between 0 and 1", share)
         try:
             steps = tuple(
                 self._frozen_as_asked(ProtocolStage(name, **given))
@@ -78,11 +72,8 @@ class Protocol:
             raise DevrfError(f"protocol.stages: {error}") from None
         names = [step.name for step in steps]
         for k, step in enumerate(steps):
-            if step.builds_on is not None and step.builds_on not in names[:k]:
-                raise DevrfError(
-                    f"protocol.stages.{step.name}.builds_on: expected an earlier stage, not "
-                    f"{step.builds_on!r}"
-                )
+            holds, key = step.builds_on in (None, *names[:k]), f"protocol.stages.{step.name}"
+            expect(holds, f"{key}.builds_on", "an earlier stage", repr(step.builds_on))
         object.__setattr__(self, "steps", steps)
 
     def _frozen_as_asked(self, step: ProtocolStage) -> ProtocolStage:

@@ -10,16 +10,12 @@ import torch
 from torch import Tensor
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
-from devrf.data.batch import (
-    Pixels,
-    RayBatch,
-    concatenated,
-)
+from devrf.data.batch import Pixels, RayBatch, concatenated
 from devrf.engine.batches import FramePool, gather_batch
 from devrf.engine.ddp import rays_per_rank
 from devrf.engine.learner import ParallelBatch, Phase
 from devrf.engine.stage import ScheduledStage
-from devrf.errors import DevrfError
+from devrf.errors import expect
 from devrf.methods.base import RayTrainable
 from devrf.methods.protocol import ProtocolStage
 from devrf.methods.weighted_loss import counted_weights, visibility, weighted_sum
@@ -60,20 +56,15 @@ class RaySchedule:
     iterations_per_step: int = 10
 
     def __post_init__(self) -> None:
+        key = "ray_stage.schedule"
         for name in ("iterations", "rays", "iterations_per_step"):
-            if getattr(self, name) < 1:
-                raise DevrfError(
-                    f"ray_stage.schedule.{name}: expected at least 1, not {getattr(self, name)}"
-                )
+            number = getattr(self, name)
+            expect(number >= 1, f"{key}.{name}", "at least 1", number)
         for name in ("times_per_batch", "rays_without_hull"):
-            if (given := getattr(self, name)) is not None and given < 1:
-                raise DevrfError(
-                    f"ray_stage.schedule.{name}: expected at least 1, or null, not {given}"
-                )
-        if not 0 <= self.curriculum < 1:
-            raise DevrfError(
-                f"ray_stage.schedule.curriculum: expected 0 or more, below 1, not {self.curriculum}"
-            )
+            number = getattr(self, name)
+            expect(number is None or number >= 1, f"{key}.{name}", "at least 1, or null", number)
+        holds, expected = 0 <= self.curriculum < 1, "0 or more, below 1"
+        expect(holds, f"{key}.curriculum", expected, self.curriculum)
 
 
 class RayStage(ScheduledStage):

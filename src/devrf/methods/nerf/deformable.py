@@ -47,11 +47,8 @@ class DeformableField(NeuralField):
             ambient: length of w as it enters T; 0: there is none.
         """
         super().__init__(settings)
-        s = settings
-        self.canonical = RadianceField(s, ambient=ambient, initialisation=s.initialisation)
-        self.coarse = None
-        if s.separate_coarse:
-            self.coarse = RadianceField(s, ambient=ambient, initialisation=s.initialisation)
+        self.canonical = RadianceField(settings, ambient=ambient)
+        self.coarse = RadianceField(settings, ambient=ambient) if settings.separate_coarse else None
         self.place()
 
     @abstractmethod

@@ -24,13 +24,7 @@ class SinusoidalEncoding(nn.Module):
     octaves: Tensor
 
     def __init__(self, dimensions: int, bands: int, *, identity: bool = True) -> None:
-        """Build the encoding.
-
-        Args:
-            dimensions: length of the vectors.
-            bands: octaves; 0 gives the vector alone.
-            identity: whether the vector itself is a part of its encoding.
-        """
+        """For vectors of so many ``dimensions``, themselves left out without ``identity``."""
         super().__init__()
         self.register_buffer("octaves", 2.0 ** torch.arange(bands), persistent=False)
         self._identity = identity
@@ -124,15 +118,11 @@ class Trunk(nn.Module):
 def initialise(network: nn.Module, how: Initialisation) -> None:
     """Set the first values of all linear layers of a network.
 
-    Args:
-        network: its linear layers are changed.
-        how: ``uniform``: as PyTorch has made them; ``glorot``: weights uniform in
-            ±√(6 / (inputs + outputs)), biases 0.
+    ``uniform``: as PyTorch has made them; ``glorot``: weights uniform in
+    ±√(6 / (inputs + outputs)), biases 0.
     """
-    if how == "uniform":
-        return
     for layer in network.modules():
-        if isinstance(layer, nn.Linear):
+        if how == "glorot" and isinstance(layer, nn.Linear):
             nn.init.xavier_uniform_(layer.weight)
             if layer.bias is not None:
                 nn.init.zeros_(layer.bias)
@@ -173,7 +163,6 @@ class RadianceField(nn.Module):
         inputs: int = 3,
         ambient: int = 0,
         further: int = 0,
-        initialisation: Initialisation = "uniform",
     ) -> None:
         """Build the network.
 
@@ -182,7 +171,6 @@ class RadianceField(nn.Module):
             inputs: length of x; a time may be a part of it.
             ambient: length of what enters the trunk beside γ(x).
             further: numbers of one more linear head on the trunk; 0: there is none.
-            initialisation: of all layers.
         """
         super().__init__()
         s = self._settings = settings
@@ -194,7 +182,7 @@ class RadianceField(nn.Module):
         self.feature = nn.Linear(s.width, s.width)
         self.branch = nn.Linear(s.width + self.encode_direction.size, s.width // 2)
         self.color = nn.Linear(s.width // 2, 3)
-        initialise(self, initialisation)
+        initialise(self, s.initialisation)
 
     def reduced(self) -> AbstractContextManager[None]:
         """Where the field computes in bfloat16 while it learns, if its settings say so."""

@@ -36,13 +36,9 @@ class RaySamples:
 
     @staticmethod
     def at(rays: Rays, ray: Tensor, distance: Tensor, stretch: Tensor | float) -> RaySamples:
-        """Samples at ``distance`` (S,) along the rays ``ray`` (S,).
+        """Samples at ``distance`` (S,) along the rays ``ray`` (S,) int64.
 
-        Args:
-            rays: R rays.
-            ray: (S,) int64.
-            distance: (S,) in units of the rays' directions.
-            stretch: (S,) or a number, what each stands for, in these units.
+        Each stands for a ``stretch`` (S,) or a number; both are in units of the rays' directions.
         """
         unit = rays.directions.norm(dim=1).index_select(0, ray)
         return RaySamples(ray, distance, unit * stretch, rays.at(ray, distance), len(rays))
@@ -53,9 +49,13 @@ class RaySamples:
 
     def endless(self) -> RaySamples:
         """The same samples, the last of each ray standing for all that is behind it."""
-        following = torch.cat([self.ray[1:], self.ray.new_full((1,), -1)])[: len(self.ray)]
-        length = torch.where(self.ray != following, ENDLESS, self.length)
-        return replace(self, length=length)
+        return replace(self, length=torch.where(last_of_ray(self.ray), ENDLESS, self.length))
+
+
+def last_of_ray(ray: Tensor) -> Tensor:
+    """(S,) bool, which samples are the last of their rays ``ray`` (S,) int64, ascending."""
+    following = torch.cat([ray[1:], ray.new_full((1,), -1)])[: len(ray)]
+    return ray != following
 
 
 def volume_render(

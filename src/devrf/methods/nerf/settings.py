@@ -22,6 +22,7 @@ class PlacedSettings:
         bands: octaves of positions.
         direction_bands: octaves of viewing directions.
         density_scale: density of a softplus of 1, per half of the box's longest edge.
+        initialisation: of all layers: ``uniform`` (PyTorch's) or ``glorot``.
         precision: what a radiance field computes in while it learns: float32, bfloat16, or
             ``auto`` (bfloat16 on a GPU that multiplies it). All else is in float32.
         steps: samples along the box's diagonal (occupancy).
@@ -40,6 +41,7 @@ class PlacedSettings:
     bands: int = 10
     direction_bands: int = 4
     density_scale: float = 10.0
+    initialisation: Initialisation = "uniform"
     precision: Precision = "float32"
     steps: int = 128
     occupancy_side: int = 128
@@ -68,7 +70,6 @@ class FieldSettings(PlacedSettings):
     """What D-NeRF, Nerfies and HyperNeRF have in common.
 
     Attributes:
-        initialisation: of all layers: ``uniform`` (PyTorch's) or ``glorot``.
         sampling: ``hierarchical`` (coarse, then fine by weight) or ``occupancy`` (even steps where
             something may be).
         coarse: samples a ray before weights are known (hierarchical).
@@ -77,7 +78,6 @@ class FieldSettings(PlacedSettings):
             other one (hierarchical).
     """
 
-    initialisation: Initialisation = "uniform"
     sampling: Literal["hierarchical", "occupancy"] = "hierarchical"
     coarse: int = 64
     fine: int = 128
@@ -86,9 +86,6 @@ class FieldSettings(PlacedSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.expect_at_least(2, "coarse", "fine")
-        expect(
-            not (self.separate_coarse and self.sampling == "occupancy"),
-            f"{self.key}.separate_coarse",
-            "false, as sampling=occupancy has no coarse samples",
-            self.separate_coarse,
-        )
+        none = self.separate_coarse and self.sampling == "occupancy"
+        expected = "false, as sampling=occupancy has no coarse samples"
+        expect(not none, f"{self.key}.separate_coarse", expected, self.separate_coarse)

@@ -14,16 +14,16 @@ from devrf.data.batch import RayBatch
 from devrf.geometry.rays import Rays
 from devrf.methods.nerf.occupancy import OccupancyFrames
 from devrf.methods.nerf.placed_model import PlacedModel, RayView
-from devrf.methods.nerf.samples import RaySamples
+from devrf.methods.nerf.samples import accumulated
 from devrf.methods.neural_volumes.capture import check_scene, encoder_images
 from devrf.methods.neural_volumes.networks import AffineWarp, ConvWarp, TimeEncoder, VolumeDecoder
 from devrf.methods.neural_volumes.settings import NeuralVolumesSettings
 from devrf.methods.neural_volumes.volumes import (
     Volumes,
+    added_opacity,
     code_divergence,
     log_total_variation,
     opacity_prior,
-    seen,
 )
 from devrf.rendering.output import RenderOutput
 from devrf.scenes.scene import Scene
@@ -93,14 +93,10 @@ class NeuralVolumes(PlacedModel):
         """Render rays; each moment among them is encoded and decoded once."""
         frames, moment = torch.unique(batch.frame, return_inverse=True)
         mean, log_deviation = self.encoded(frames)
-        code = mean
-        if self.training:
-            code = mean + log_deviation.exp() * torch.randn_like(mean)
+        jitter, pair = self.training, (batch.frame, batch.frame)
+        code = mean + log_deviation.exp() * torch.randn_like(mean) if jitter else mean
         volumes = self.decoded(code)
-        pair = (batch.frame, batch.frame)
-        output = self.render(
-            batch.rays, volumes, moment, pair, batch.background, jitter=self.training
-        )
+        output = self.render(batch.rays, volumes, moment, pair, batch.background, jitter=jitter)
         extras = {"mean": mean, "log_deviation": log_deviation, "voxels": volumes.template[:, 3]}
         return replace(output, extras=extras)
 
@@ -127,7 +123,7 @@ class NeuralVolumes(PlacedModel):
         *,
         jitter: bool = False,
     ) -> RenderOutput:
-        """What R rays see.
+        """What R rays see: C = Σ w_i c_i + (1 − A) · background.
 
         Args:
             rays: R rays in world space.
@@ -140,13 +136,15 @@ class NeuralVolumes(PlacedModel):
         if len(self.occupancy.mask) == 1:  # one mask for all frames, which excludes nothing
             frames = (torch.zeros_like(moment), torch.zeros_like(moment))
         half = self.box.longest / 2
-        step = self.settings.step * half
-        found = self.occupancy.march(rays, frames, self.box, self.depth_limits, step, jitter=jitter)
-        low, high = self.box.corners(found.points)
-        points = (2 * found.points - low - high) / (high - low)
-        samples = RaySamples(found.ray, found.distance, found.length / half, points, found.rays)
+        step, depths = self.settings.step * half, self.depth_limits
+        samples = self.occupancy.march(rays, frames, self.box, depths, step, jitter=jitter)
+        low, high = self.box.corners(samples.points)
+        points = (2 * samples.points - low - high) / (high - low)
         values = volumes.at(points, moment.index_select(0, samples.ray))
-        return seen(samples, values, background)
+        amount = values[:, 3] * (samples.length / half)
+        weight, opacity = added_opacity(amount, samples.ray, samples.rays)
+        color = weight[:, None] * values[:, :3]
+        return accumulated(samples, weight, color, 1 - opacity, background)
 
     def loss_terms(
         self, output: RenderOutput, batch: RayBatch, names: Collection[str]

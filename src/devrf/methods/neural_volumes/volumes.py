@@ -1,4 +1,4 @@
-"""Decoded volumes, what rays see of them (opacity that adds up), and the priors of both."""
+"""Decoded volumes, opacity that adds up along rays, and the priors of both."""
 
 from __future__ import annotations
 
@@ -9,9 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from devrf.methods.nerf.samples import RaySamples, accumulated
 from devrf.ops.compositing import sum_by_ray
-from devrf.rendering.output import RenderOutput
 
 
 @dataclass(frozen=True)
@@ -72,20 +70,6 @@ def added_opacity(amount: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tenso
     behind = reached - before_ray.index_select(0, ray)
     weight = behind.clamp(max=1) - (behind - amount).clamp(max=1)
     return weight.to(amount.dtype), sum_by_ray(amount, ray, rays).clamp(max=1)
-
-
-def seen(samples: RaySamples, values: Tensor, background: Tensor) -> RenderOutput:
-    """C = Σ w_i c_i + (1 − A) · background.
-
-    Args:
-        samples: S samples of R rays.
-        values: (S, 4) RGB and opacity per unit of the samples' lengths.
-        background: (3,) or (R, 3) RGB.
-    """
-    amount = values[:, 3] * samples.length
-    weight, opacity = added_opacity(amount, samples.ray, samples.rays)
-    color = weight[:, None] * values[:, :3]
-    return accumulated(samples, weight, color, 1 - opacity, background)
 
 
 # log(0.1) + log(1.1): the opacity prior is 0 where all or nothing is seen.

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from devrf.methods.nerf.networks import RadianceField
+from devrf.methods.nerf.samples import last_of_ray
 from devrf.methods.nsff.settings import NSFFSettings
 from devrf.ops.compositing import composite, sum_by_ray
 
@@ -38,11 +39,9 @@ def shared(dynamic: Tensor, static: Tensor, share: Tensor) -> tuple[Tensor, Tens
         static: (S,) τ_s of the static field alone.
         share: (S,) v in [0, 1], the share of the dynamic part.
     """
-    return _scaled(dynamic, share), _scaled(static, 1 - share)
-
-
-def _scaled(depth: Tensor, share: Tensor) -> Tensor:
-    return -torch.log1p((share * torch.expm1(-depth)).clamp(min=LEAST - 1))
+    opacities = share * torch.expm1(-dynamic), (1 - share) * torch.expm1(-static)
+    moving, still = (-torch.log1p(opacity.clamp(min=LEAST - 1)) for opacity in opacities)
+    return moving, still
 
 
 def blended(dynamic: Tensor, static: Tensor, ray: Tensor, rays: int) -> Blend:
@@ -72,8 +71,7 @@ def closed(blend: Blend, share: Tensor, ray: Tensor) -> Blend:
         share: (S,) v.
         ray: (S,) int64, ascending.
     """
-    following = torch.cat([ray[1:], ray.new_full((1,), -1)])[: len(ray)]
-    last = (ray != following).to(share)
+    last = last_of_ray(ray).to(share)
     rest = last * blend.transmittance[ray]
     ends = sum_by_ray(last, ray, len(blend.transmittance))
     return Blend(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
@@ -80,25 +80,19 @@ class ImagePriors:
         vectors = torch.zeros_like(batch.pixel)
         valid = torch.zeros_like(batch.time, dtype=torch.bool)
 
-        def take(views: Views, own: Tensor, row: Tensor) -> None:
-            flow = _flow(views, side)
-            if flow is not None:
+        for views, own, row in self._captures(batch):
+            if (flow := _flow(views, side)) is not None:
                 valid[own] = flow.valid.flatten()[row]
                 vectors[own] = flow.vectors.flatten(0, 2)[row]
-
-        self._look_up(batch, take)
         # What was observed where it is not valid may be anything, NaN included.
         return torch.where(valid[:, None], vectors, 0.0), valid
 
     def distance(self, batch: RayBatch) -> Tensor:
         """How far along a batch's rays, in their own units, surfaces are (R,); inf: unknown."""
         depth = torch.full_like(batch.time, torch.inf)
-
-        def take(views: Views, own: Tensor, row: Tensor) -> None:
+        for views, own, row in self._captures(batch):
             if views.depth is not None:
                 depth[own] = views.depth.flatten()[row]
-
-        self._look_up(batch, take)
         known = depth.isfinite()
         world = self.cameras.rays(batch.image, batch.pixel)
         points = world.origins + world.directions * torch.where(known, depth, 1.0)[:, None]
@@ -107,14 +101,14 @@ class ImagePriors:
         found = (away * along).sum(dim=1) / along.square().sum(dim=1)
         return torch.where(known, found, torch.inf)
 
-    def _look_up(self, batch: RayBatch, take: Callable[[Views, Tensor, Tensor], None]) -> None:
-        """Call ``take`` with each capture, its rays' numbers, and their pixels' row-major ones."""
+    def _captures(self, batch: RayBatch) -> Iterator[tuple[Views, Tensor, Tensor]]:
+        """Each capture's views, the batch's rays in it, and their pixels' numbers among all."""
         column, line = batch.pixel.long().unbind(1)
-        for one, offset in zip(self._views, self._offsets, strict=True):
-            own = (batch.image >= offset) & (batch.image < offset + len(one))
+        for views, offset in zip(self._views, self._offsets, strict=True):
+            own = (batch.image >= offset) & (batch.image < offset + len(views))
             ray = own.nonzero()[:, 0]
             image = batch.image[ray] - offset
-            take(one, ray, (image * one.height + line[ray]) * one.width + column[ray])
+            yield views, ray, (image * views.height + line[ray]) * views.width + column[ray]
 
 
 def _flow(views: Views, side: int) -> OpticalFlow | None:
