@@ -43,11 +43,6 @@ def test_a_frame_is_read_changed_and_written_back(store: FrameStore) -> None:
     assert torch.equal(store.to_time, forward)
 
 
-def test_the_frame_at_rest_cannot_be_trained(store: FrameStore) -> None:
-    with pytest.raises(IndexError, match="only 1 to 3"):
-        store.write(0, pair())
-
-
 def test_a_frame_starts_from_the_one_before_it_in_both_directions(store: FrameStore) -> None:
     before = both(store)
     store.copy_previous(2)

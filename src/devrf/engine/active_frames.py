@@ -21,8 +21,7 @@ from devrf.scenes.scene import Views
 class ActiveFrame:
     """Memory for a frame that is trained; one frame after another uses it.
 
-    The field itself may be kept on the host or in half precision; it knows what was learned once
-    that is written back.
+    The field knows what was learned once that is written back.
 
     Attributes:
         store: the displacements of all frames.

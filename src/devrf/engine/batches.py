@@ -1,8 +1,4 @@
-"""Which pixels an iteration draws, and the batch of rays that they become.
-
-A pool holds the pixels of some images that there is something to learn from: all of them, or those
-on the alpha mask and those whose rays hit something occupied.
-"""
+"""Which pixels an iteration draws, and the batch of rays that they become."""
 
 from __future__ import annotations
 
@@ -128,8 +124,7 @@ def rays_hit_occupied(
 ) -> Tensor:
     """Mask (K, H·W): the pixels of images whose rays pass near anything occupied.
 
-    One ray stands for a block of pixels, at a quarter of the cost:
-    :meth:`~devrf.rendering.occupancy.Occupancy.near` reaches far enough for its neighbours too.
+    One ray stands for a block of pixels: what is near it reaches far enough for its neighbours too.
 
     Args:
         cameras: all cameras, on the model's device.

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
+from devrf.engine.ddp import world_size
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.ops.trilinear import resample
@@ -101,9 +102,10 @@ class FrameStore(nn.Module):
 
         Does not wait for the device.
         """
-        source = (self.to_canonical[frame], self.to_time[frame])
-        if frame in self._fetched:
-            source = self._fetched.pop(frame)
+        source = self._fetched.pop(frame, None)
+        if source is None:
+            source = (self.to_canonical[frame], self.to_time[frame])
+        else:
             present = torch.cuda.current_stream(self.here.device)
             assert self._side is not None
             present.wait_stream(self._side)
@@ -118,14 +120,11 @@ class FrameStore(nn.Module):
 
         Does not wait for the device: call :meth:`synchronize` before the host reads them.
 
-        Raises:
-            IndexError: frame 0, which is the rest state, or a frame that does not exist.
+        Frame 0 is the rest state, and cannot be written.
         """
-        if not 1 <= frame < len(self.to_time):
-            last = len(self.to_time) - 1
-            raise IndexError(f"frame {frame} cannot be trained: only 1 to {last}")
-        for name, value in zip(NAMES, displacements, strict=True):
-            getattr(self, name)[frame].copy_(value, non_blocking=True)
+        assert 1 <= frame < len(self.to_time), f"frame {frame} cannot be trained"
+        self.to_canonical[frame].copy_(displacements[0], non_blocking=True)
+        self.to_time[frame].copy_(displacements[1], non_blocking=True)
         self._fetched.pop(frame, None)  # it holds the former values
 
     def synchronize(self) -> None:
@@ -154,8 +153,8 @@ class FrameStore(nn.Module):
     def copy_previous(self, frame: int) -> None:
         """Initialise ``frame`` from the frame before it, in both directions."""
         self.synchronize()
-        for name in NAMES:
-            getattr(self, name)[frame] = getattr(self, name)[frame - 1]
+        self.to_canonical[frame] = self.to_canonical[frame - 1]
+        self.to_time[frame] = self.to_time[frame - 1]
 
     @torch.no_grad()
     def resize(self, shape: Shape) -> None:
@@ -172,12 +171,7 @@ class FrameStore(nn.Module):
 
     @torch.no_grad()
     def offload(self, *, on_host: bool, half: bool) -> None:
-        """Choose where and how the displacements are kept.
-
-        Args:
-            on_host: on the host, in page-locked memory where CUDA is available.
-            half: in half precision: to 1/2048 of each value.
-        """
+        """Keep them on the host, page-locked where there is CUDA, or in half precision."""
         self.on_host, self._reserved = on_host, []
         for name in NAMES:
             frames = getattr(self, name)
@@ -196,12 +190,14 @@ class FrameStore(nn.Module):
         """Choose where the frames are kept, before the clock of training starts.
 
         Args:
-            store: on the device, on the host, or on the device if they fit there.
+            store: on the device, on the host, or on the device if they fit there; several
+                processes keep them on their devices.
             device: where they are learned.
             shape: of their grids in the end.
             half: whether in half precision.
             parallel: how many are learned at once.
         """
+        store = store if world_size() == 1 else "device"
         on_host = store == "host"
         if store == "auto" and device.type == "cuda":
             free, _ = torch.cuda.mem_get_info(device)
@@ -215,10 +211,7 @@ class FrameStore(nn.Module):
         self.reserve(shape)
 
     def reserve(self, shape: Shape) -> None:
-        """Lock memory for :meth:`resize` to ``shape`` now, if frames are kept in such memory.
-
-        It takes seconds for gigabytes.
-        """
+        """Lock memory for :meth:`resize` to ``shape`` now: for gigabytes it takes seconds."""
         kept = self.to_time
         if self.on_host and torch.cuda.is_available() and kept.shape[1:4] != shape:
             whole = (len(kept), *shape, 3)
@@ -260,19 +253,9 @@ class FrameStore(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
 
-def resident_bytes(frames: int, shape: Shape, half: bool) -> int:
-    """Bytes of T ``frames`` in both directions, on grids of ``shape``, or ``half`` of them."""
-    x, y, z = shape
-    return 2 * frames * x * y * z * DISPLACEMENT // (2 if half else 1)
-
-
-def active_bytes(shape: Shape) -> int:
-    """Bytes of an active frame on a grid of ``shape``."""
-    x, y, z = shape
-    return ACTIVE_GRIDS * x * y * z * DISPLACEMENT
-
-
 def fits_on_device(free: int, frames: int, shape: Shape, *, half: bool, parallel: int) -> bool:
     """Whether T ``frames``, ``parallel`` of them active, fit into ``free`` bytes of a GPU."""
-    needed = resident_bytes(frames, shape, half) + parallel * active_bytes(shape)
-    return needed <= FRAMES_SHARE * free
+    x, y, z = shape
+    grid = x * y * z * DISPLACEMENT
+    kept = 2 * frames * grid // (2 if half else 1)
+    return kept + parallel * ACTIVE_GRIDS * grid <= FRAMES_SHARE * free

@@ -11,14 +11,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, Protocol
 
+import torch
 from lightning import LightningModule
 from torch import Tensor
 
-from devrf.data.batch import Pixels
+from devrf.data.batch import Pixels, background_color
 from devrf.ops.adam import GridAdam
 from devrf.rendering.sample_capacity import SampleCapacity
 from devrf.rendering.view import Viewable
-from devrf.scenes.scene import CaptureName
+from devrf.scenes.scene import CaptureName, Scene, Views
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,6 +85,7 @@ class Learner(LightningModule, ABC):
         scene_model: what is learned.
         optimizer: steps over everything that is learned; the same object throughout.
         phase: the phase that grids and optimiser are ready for; None before the first.
+        generator: draws pixels, on the stage's device.
     """
 
     name: str
@@ -93,6 +95,8 @@ class Learner(LightningModule, ABC):
     scene_model: LearnedModel
     optimizer: GridAdam
     phase: Phase | None
+    generator: torch.Generator
+    _plain_background: Tensor | None = None
 
     @property
     @abstractmethod
@@ -171,3 +175,33 @@ class Learner(LightningModule, ABC):
         shape = "x".join(str(n) for n in self.resolution)
         place = ", ".join(part for part in (frames and in_words(frames), shape) if part)
         return f"iteration {iteration} of {self.total_iterations}{place and f' ({place})'}"
+
+    @property
+    def scene(self) -> Scene:
+        """The scene of the trainer's datamodule."""
+        scene: Scene = self.trainer.datamodule.scene  # type: ignore[attr-defined]
+        return scene
+
+    def training_views(self, capture: CaptureName) -> Views:
+        """The training views of a capture, on the stage's device."""
+        views: Views = self.trainer.datamodule.training_views(  # type: ignore[attr-defined]
+            capture, self.device
+        )
+        return views
+
+    @property
+    def scored_capture(self) -> CaptureName:
+        """The capture whose held-out views measure what was learned."""
+        return "dynamic" if self.capture == "both" else self.capture
+
+    def background(self, image: Tensor) -> Tensor:
+        """What is behind the pixels of ``image`` (R,): (3,), always the same tensor, if plain.
+
+        Else (R, 3), drawn with ``generator``.
+        """
+        name = self.scene.background
+        if name == "random":
+            return background_color(name, len(image), self.generator)
+        if self._plain_background is None or self._plain_background.device != image.device:
+            self._plain_background = background_color(name, 0, self.generator).to(image.device)
+        return self._plain_background

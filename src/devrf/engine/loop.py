@@ -65,10 +65,9 @@ class MetricAccumulator:
 class Loop:
     """Runs iterations: one optimiser step each, on one batch or on several independent ones.
 
-    Several batches are processed in parallel. When memory runs out, batches are divided into
-    micro-batches. With static shapes the lists of samples have a fixed length (their ``capacity``),
-    everything that outlives an iteration stays in the same memory, and nothing waits for the
-    device; on one GPU iterations are then replayed from a CUDA graph.
+    Several batches are processed in parallel. With static shapes the lists of samples have a fixed
+    length (their ``capacity``), everything that outlives an iteration stays in the same memory, and
+    nothing waits for the device; on one GPU iterations are then replayed from a CUDA graph.
 
     Attributes:
         graphs: ``off``: never capture iterations in a CUDA graph.

@@ -32,9 +32,7 @@ class MicroBatching:
     """
 
     MOST = 8
-
-    def __init__(self) -> None:
-        self.count = 1
+    count = 1
 
     def gradients(
         self, loss: Loss, pixels: Pixels, backward: Backward, divided: Callable[[], None]
@@ -98,6 +96,5 @@ class MicroBatching:
         self.count *= 2
         log.warning(
             "out of memory (%s): batches are split into %d micro-batches from now on",
-            numbers(said, device),
-            self.count,
+            *(numbers(said, device), self.count),
         )

@@ -24,7 +24,6 @@ from devrf.checkpoints.checkpoint import (
     metadata_in,
 )
 from devrf.checkpoints.progress import rng_state, set_rng_state
-from devrf.data.batch import background_color
 from devrf.engine.ddp import assert_replicas_equal, broadcast, check_strategy, rank
 from devrf.engine.learner import Learner
 from devrf.engine.loop import Loop
@@ -32,7 +31,6 @@ from devrf.errors import DevrfError
 from devrf.evaluation.held_out import score
 from devrf.ops.adam import GridAdam
 from devrf.rendering.renderer import Renderer
-from devrf.scenes.scene import CaptureName, Scene, Views
 from devrf.system.memory import OutOfMemoryError
 
 # Attributes of a stage that a progress file holds by name: where it is in its schedule.
@@ -51,9 +49,8 @@ class ScheduledStage(Learner):
         skipped: iterations left out because a phase had converged.
         record: what training took, once a ``TrainingRecord`` callback has measured it.
         earlier_records: the same for the stages that this one builds on, by name.
-        generator: draws pixels, on the stage's device. Its state at the beginning of a Lightning
-            step follows from the seed, the process, the iteration and the number of rollbacks.
-        seed: of the generator.
+        seed: of the generator, whose state at the beginning of a Lightning step follows from the
+            seed, the process, the iteration and the number of rollbacks.
         training_config: the settings that decide what is learned, by config key; empty for a
             stage that was not built from a config.
         earlier_configs: the same of the stages that this one builds on, by name.
@@ -83,39 +80,8 @@ class ScheduledStage(Learner):
         self.lr_scale = 1.0
         self.abort_reason: str | None = None
         self.logged: dict[str, Tensor] = {}
-        self._plain_background: Tensor | None = None
         self._progress: dict[str, Any] | None = None
         self._finished: dict[str, Any] | None = None
-
-    @property
-    def scene(self) -> Scene:
-        """The scene of the trainer's datamodule."""
-        scene: Scene = self.trainer.datamodule.scene  # type: ignore[attr-defined]
-        return scene
-
-    def training_views(self, capture: CaptureName) -> Views:
-        """The training views of a capture, on the stage's device."""
-        views: Views = self.trainer.datamodule.training_views(  # type: ignore[attr-defined]
-            capture, self.device
-        )
-        return views
-
-    @property
-    def scored_capture(self) -> CaptureName:
-        """The capture whose held-out views measure what was learned."""
-        return "dynamic" if self.capture == "both" else self.capture
-
-    def background(self, image: Tensor) -> Tensor:
-        """What is behind the pixels of ``image`` (R,): (3,), always the same tensor, if plain.
-
-        Else (R, 3), drawn with ``generator``.
-        """
-        name = self.scene.background
-        if name == "random":
-            return background_color(name, len(image), self.generator)
-        if self._plain_background is None or self._plain_background.device != image.device:
-            self._plain_background = background_color(name, 0, self.generator).to(image.device)
-        return self._plain_background
 
     def metadata(self) -> CheckpointMetadata:
         """The metadata of a checkpoint of this stage."""

@@ -36,9 +36,8 @@ log = logging.getLogger(__name__)
 class DeformationStage(VoxelStage):
     """Learns from the dynamic views how the scene deforms (docs/method.md#deformation-stage).
 
-    Coarse to fine (docs/method.md#coarse-to-fine), frames are learned one after another, or several
-    in parallel, each from batches of its own. Only their two slices are trained, and what
-    extensions add; the canonical field and all other frames are frozen.
+    Coarse to fine, frames are learned one after another, or several in parallel, each from batches
+    of its own. Only their two slices are trained, and what extensions add; all else is frozen.
 
     Attributes:
         weights: of the loss terms that count at the present level.
@@ -66,8 +65,7 @@ class DeformationStage(VoxelStage):
         """Build the stage; the defaults are the paper's for inward-facing scenes.
 
         Args:
-            rest: what the canonical stage learned (``CanonicalStage.result()`` or
-                ``load_checkpoint``); its fields are frozen.
+            rest: what the canonical stage learned; its fields are frozen.
             schedule: resolutions, iterations and frames.
             motion: learning rate and how batches are drawn.
             loss: weights of the loss terms; ``tv`` is the total variation of both fields.
@@ -88,10 +86,8 @@ class DeformationStage(VoxelStage):
         fields = still.architecture, still.canonical, still.occupancy, still.settings
         self.scene_model = DeVRFModel(*fields, space=still.space).requires_grad_(False)
         self.earlier_records = rest.metadata.records
-        placeholder = torch.zeros(2, 2, 2, 3, requires_grad=True)
-        self.optimizer = GridAdam(
-            [{"params": [placeholder], "lr": self.motion.learning_rate, "name": "motion"}]
-        )
+        placeholder, rate = torch.zeros(2, 2, 2, 3, requires_grad=True), self.motion.learning_rate
+        self.optimizer = GridAdam([{"params": [placeholder], "lr": rate, "name": "motion"}])
         self.active = ActiveFrames(self)
         self._convergence = Convergence()
 
@@ -126,14 +122,10 @@ class DeformationStage(VoxelStage):
         return self.phase_at(iteration).learning_rate_at(iteration)
 
     def setup(self, stage: str) -> None:
-        """Build the field at rest, at the coarsest resolution.
-
-        Raises:
-            DevrfError: the scene is at rest.
-        """
+        """Build the field at rest, at the coarsest resolution; refuse a scene that is at rest."""
         super().setup(stage)
         if not self.scene.moves:
-            raise DevrfError(f"{self.scene.name}: is at rest, so there is no motion to learn")
+            raise DevrfError(f"{self.scene.name}: is at rest; the canonical stage is all it takes")
         if self.scene.dynamic.train.by_moving_camera and self.motion_loss.leave_out("flow"):
             log.info("the camera moves, and so does all that it sees: the flow loss is left out")
         if self.scene_model.deformation is None:
@@ -145,19 +137,17 @@ class DeformationStage(VoxelStage):
 
     def _build_field(self) -> None:
         """The field over the canonical field's box; in contracted space, over the inner box."""
-        model, store, levels = self.scene_model, self.motion.store, self.schedule.levels
+        model, motion, levels = self.scene_model, self.motion, self.schedule.levels
         box, clock = model.space.inner(model.box), self.scene.clock
         voxels, still_outside = levels[0].side ** 3, box != model.box
         model.deformation = DeformationField(box, clock, voxels=voxels, still_outside=still_outside)
-        device = self.trainer.strategy.root_device
-        model.deformation.frames.keep(
-            # Several processes keep frames on their devices.
-            store if self.trainer.world_size == 1 else "device",
-            device,
-            box.grid_shape(levels[-1].side ** 3),
-            half=self.motion.stored_half(device),
-            parallel=self.schedule.max_parallel_frames(-1, len(clock)),
+        device, finest = self.trainer.strategy.root_device, box.grid_shape(levels[-1].side ** 3)
+        half, parallel = (
+            motion.stored_half(device),
+            self.schedule.max_parallel_frames(-1, len(clock)),
         )
+        frames = model.deformation.frames
+        frames.keep(motion.store, device, finest, half=half, parallel=parallel)
 
     def enter(self, phase: DeformationPhase) -> None:
         """Go to the phase's frames: grow the grids if a level begins, fresh Adam if asked for."""
@@ -189,6 +179,9 @@ class DeformationStage(VoxelStage):
             self._allocate(len(phase.frames))
         self.active.check_out(phase.frames)
         self._convergence.reset()
+        level = f"schedule.deformation.levels.{phase.level + 1}"
+        together = (f"{level}.parallel_frames",) if len(phase.frames) > 1 else ()
+        self.memory_keys = (f"{level}.side", "schedule.deformation.rays", *together)
 
     def _allocate(self, count: int) -> None:
         """Make memory for ``count`` active frames at the field's present resolution."""
@@ -297,13 +290,6 @@ class DeformationStage(VoxelStage):
         super().rollback(iteration, lr_scale)
         self._convergence.reset()
         self._update_occupancy()
-
-    @property
-    def memory_keys(self) -> tuple[str, ...]:  # type: ignore[override]
-        """The rays, the level's grids, and how many frames are learned together."""
-        level = f"schedule.deformation.levels.{1 if self.phase is None else self.phase.level + 1}"
-        together = (f"{level}.parallel_frames",) if len(self.active) > 1 else ()
-        return f"{level}.side", "schedule.deformation.rays", *together
 
     def phase_state(self) -> dict[str, Any]:
         """The state of each active frame, and its losses so far."""
