@@ -16,7 +16,6 @@ from devrf.methods.devrf.canonical_field import (
     ColorDecoder,
     SigmoidColor,
     VoxelGrid,
-    resample,
 )
 from devrf.ops.compositing import composite
 from devrf.rendering.occupancy import Occupancy
@@ -30,44 +29,16 @@ BOX = Box((-1.0, 0.0, 2.0), (3.0, 2.0, 3.0))
 PLANES, AHEAD = 16, Box((-1.5, -1.0, -1.0), (1.5, 1.0, 1.0))
 
 
-def linear(points: Tensor) -> Tensor:
-    """Two linear functions of the position."""
-    slope = torch.tensor([[1.0, -2.0], [0.5, 0.0], [3.0, 1.0]], dtype=points.dtype)
-    return points @ slope + 0.25
-
-
-def linear_grid(shape: tuple[int, int, int]) -> VoxelGrid:
-    grid = VoxelGrid(shape, 2)
+def test_resizing_keeps_a_linear_function_exactly(rng: torch.Generator) -> None:
+    slope = torch.tensor([[1.0, -2.0], [0.5, 0.0], [3.0, 1.0]])
+    grid, (low, high) = VoxelGrid((5, 4, 3), 2), BOX.corners(torch.zeros(()))
     with torch.no_grad():
-        grid.values.copy_(linear(BOX.grid_points(shape, grid.values)))
-    return grid
-
-
-def inside(count: int, rng: torch.Generator) -> Tensor:
-    low, high = BOX.corners(torch.zeros(()))
-    return low + (high - low) * torch.rand(count, 3, generator=rng)
-
-
-def test_a_linear_function_is_looked_up_exactly(rng: torch.Generator) -> None:
-    points = inside(100, rng)
-    torch.testing.assert_close(linear_grid((5, 4, 3))(points, BOX), linear(points))
-
-
-@pytest.mark.parametrize("shape", [(9, 7, 5), (3, 2, 2)])
-def test_resizing_keeps_a_linear_function_exactly(
-    shape: tuple[int, int, int], rng: torch.Generator
-) -> None:
-    grid, points = linear_grid((5, 4, 3)), inside(100, rng)
-    grid.resize(shape)
-    assert grid.shape == shape and grid.values.requires_grad and grid.values.is_leaf
-    torch.testing.assert_close(grid(points, BOX), linear(points))
-
-
-def test_doubling_cells_halves_the_steps_by_hand() -> None:
-    values = torch.zeros(3, 2, 2, 1)
-    values[1] = 2.0
-    resized = resample(values, (5, 2, 2))[:, 0, 0, 0]
-    torch.testing.assert_close(resized, torch.tensor([0.0, 1.0, 2.0, 1.0, 0.0]))
+        grid.values.copy_(BOX.grid_points((5, 4, 3), grid.values) @ slope + 0.25)
+    points = low + (high - low) * torch.rand(100, 3, generator=rng)
+    for shape in ((5, 4, 3), (9, 7, 5), (3, 2, 2)):
+        grid.resize(shape)
+        assert grid.shape == shape and grid.values.requires_grad and grid.values.is_leaf
+        torch.testing.assert_close(grid(points, BOX), points @ slope + 0.25)
 
 
 def test_a_resized_grid_lies_in_memory_as_a_new_one() -> None:
@@ -79,12 +50,6 @@ def test_a_resized_grid_lies_in_memory_as_a_new_one() -> None:
 
 def opacity(field: CanonicalField, delta: float) -> Tensor:
     return -torch.expm1(-field.optical_depth(torch.zeros(1, 3), delta))
-
-
-@pytest.mark.parametrize("alpha", [1e-6, 0.5])
-def test_an_untrained_field_has_its_initial_opacity_a_base_voxel(cube: Box, alpha: float) -> None:
-    field = CanonicalField(cube, SigmoidColor(), channels=3, voxels=64, alpha_init=alpha)
-    assert opacity(field, 1.0).item() == pytest.approx(alpha, rel=1e-3)
 
 
 def test_the_same_length_has_the_same_opacity_at_every_resolution(cube: Box) -> None:
@@ -153,22 +118,6 @@ def test_the_decoder_is_the_network_of_the_concatenated_input(rng: torch.Generat
     torch.testing.assert_close(decoder(features, dirs, ray), expected)
 
 
-def test_hidden_layers_may_work_in_fewer_digits(rng: torch.Generator) -> None:
-    decoder = ColorDecoder(channels=3, width=16, frequencies=2)
-    features, ray = torch.randn(50, 3, generator=rng), torch.arange(50) % 2
-    dirs = torch.nn.functional.normalize(torch.randn(2, 3, generator=rng), dim=1)
-    exact, rounded = (
-        decoder(features, dirs, ray, precision) for precision in (torch.float32, torch.bfloat16)
-    )
-    assert rounded.dtype == torch.float32 and not torch.equal(exact, rounded)
-    assert (rounded - exact).abs().max() < 2**-8
-    # More shades than eight digits have between a half and one.
-    assert len(rounded.unique()) == rounded.numel()
-    rounded.square().sum().backward()
-    assert decoder.hidden.weight.grad is not None
-    assert decoder.hidden.weight.grad.dtype == torch.float32
-
-
 def test_directions_can_be_forgotten_and_are_learned_when_they_are_let(
     rng: torch.Generator,
 ) -> None:
@@ -224,11 +173,3 @@ def test_samples_are_evenly_spaced_from_the_first_plane_to_the_last() -> None:
     assert len(samples) == (PLANES - 1) * 2 + 1
     depth = samples.points[:, 2]
     torch.testing.assert_close(depth, torch.linspace(-1, 1, len(samples)), atol=1e-5, rtol=0)
-
-
-def test_planes_stay_while_the_grid_grows_across() -> None:
-    field = planes(voxels=6 * 4 * PLANES)
-    assert field.density.shape == (6, 4, PLANES)
-    field.resize(12 * 8 * PLANES)
-    assert field.density.shape == (12, 8, PLANES)
-    assert field.step_in_base_voxels(0.5) == pytest.approx(0.5 * 256 / PLANES)

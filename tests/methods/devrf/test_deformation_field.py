@@ -9,7 +9,6 @@ from torch import Tensor
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.methods.devrf.deformation_field import DeformationField
-from devrf.scenes.procedural.robot import solid_motions
 
 CLOCK = FrameClock((0.0, 0.2, 0.6, 1.0))
 
@@ -94,22 +93,3 @@ def test_frames_that_rest_elsewhere_move_points_as_before(
     field.double()
     assert field.to_time is resting
     assert field.warp(x.double(), 0.77).dtype == torch.float64
-
-
-def test_a_rigid_part_goes_there_and_back_exactly(rng: torch.Generator) -> None:
-    # A rigid motion is linear in the position: no grid is too coarse for it.
-    box = Box((-1.4, -1.4, -1.4), (1.4, 1.4, 1.4))
-    motions = solid_motions(1.0, 1.0).float()
-    motion = motions[(motions[:, :, :3] - torch.eye(3)).norm(dim=(1, 2)).argmax()]
-    turn, way = motion[:, :3], motion[:, 3]
-    assert (turn - torch.eye(3)).norm() > 0.3
-    field = DeformationField(box, FrameClock((0.0, 1.0)), voxels=4**3)
-    grid = box.grid_points(field.shape, way)
-    field.to_time[1] = grid @ turn.T + way - grid
-    field.to_canonical[1] = (grid - way) @ turn - grid
-    rest = 0.4 * torch.rand(500, 3, generator=rng) - 0.2
-    seen = rest @ turn.T + way
-    assert box.contains(seen).all()
-    torch.testing.assert_close(field.unwarp(rest, 1.0), seen, atol=1e-5, rtol=0)
-    torch.testing.assert_close(field.warp(seen, 1.0), rest, atol=1e-5, rtol=0)
-    torch.testing.assert_close(field.unwarp(field.warp(seen, 1.0), 1.0), seen, atol=1e-5, rtol=0)

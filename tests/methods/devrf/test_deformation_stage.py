@@ -139,9 +139,7 @@ def test_each_level_has_its_weights_and_rates(
 
 def test_factors_are_those_of_terms(rest: LoadedCheckpoint) -> None:
     schedule = DeformationSchedule((Level(4, 2, weight_factors={"elastik": 1}),))
-    with pytest.raises(
-        DevrfError, match="1.weight_factors: elastik"
-    ):
+    with pytest.raises(DevrfError, match="1.weight_factors: elastik"):
         DeformationStage(rest, schedule)
 
 

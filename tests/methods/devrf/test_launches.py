@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 
 pytest.importorskip("triton")
 
@@ -37,25 +36,3 @@ def test_an_iteration_launches_no_more_than_it_did(launches: Any, stage: str) ->
     # frame on its way, this stays below 2 GB (docs/performance.md#memory).
     assert 0 < count.taken / 1e9 < 0.15
     assert (count.held + count.taken) / 1e9 - FRAMES_AT_REST[stage] <= MOST_GIGABYTES[stage]
-
-
-def test_views_and_memory_are_no_launches_and_bytes_are_those_read_and_written(
-    launches: Any,
-) -> None:
-    table, index, added = torch.zeros(100, 2), torch.tensor([3, 4, 4]), torch.ones(3, 2)
-    with launches.tracing() as trace:
-        rows = torch.empty(7, 2).t()[0] + 1  # reads and writes 7 floats
-        table.index_select(0, index)  # reads 3 int64 and 6 floats, writes 6 floats
-        table.index_add_(0, index, added)  # reads those and 6 floats, and adds to 6
-    assert rows.shape == (7,)
-    assert trace.count.torch == {"aten::add": 1, "aten::index_select": 1, "aten::index_add_": 1}
-    assert trace.count.moved == 4 * 14 + (24 + 4 * 12) + (24 + 4 * 18)
-
-
-def test_a_kernel_reads_eight_corners_of_a_grid_for_each_point(launches: Any) -> None:
-    from devrf.accel.trilinear import interpolate_kernel
-
-    trace, grid, points = launches.Tracing(), torch.zeros(50, 50, 50, 3), torch.zeros(10, 3)
-    trace.run(interpolate_kernel, 1, grid, points, torch.zeros(10, 3), 10)
-    assert trace.count.triton == {"interpolate_kernel": 1}
-    assert trace.count.moved == 8 * 10 * 12 + 2 * 10 * 12

@@ -89,15 +89,12 @@ def test_color_and_per_sample_color_by_hand(prediction: Prediction) -> None:
     assert prediction.output.sample_color.grad[0, 1].item() == pytest.approx(2 * 0.5 * -0.25 / 3)
 
 
-def test_entropy_by_hand(prediction: Prediction) -> None:
+def test_entropy_by_hand_and_with_finite_gradients_at_its_ends(prediction: Prediction) -> None:
     def entropy(p: float) -> float:
         return -(p * math.log(p) + (1 - p) * math.log(1 - p))
 
     expected = (entropy(0.25) + 0 + entropy(0.2)) / 3
     assert PHOTOMETRIC_TERMS["entropy"](prediction).item() == pytest.approx(expected, abs=1e-5)
-
-
-def test_entropy_has_finite_gradients_at_its_ends(prediction: Prediction) -> None:
     end = torch.tensor([0.0, 1.0, 1.0], requires_grad=True)
     output = replace(prediction.output, transmittance=end)
     PHOTOMETRIC_TERMS["entropy"](replace(prediction, output=output)).backward()
@@ -216,15 +213,12 @@ def test_flow_counts_valid_rays_even_those_that_see_nothing(by_hand: MotionPredi
 
 def test_without_observed_flow_or_samples_nothing_is_learned(by_hand: MotionPrediction) -> None:
     blind = replace(by_hand.batch, flow=None, flow_valid=None)
-    assert flow(replace(by_hand, batch=blind)).item() == 0
-    nothing = by_hand.batch.flow_valid
-    assert nothing is not None
-    masked = replace(by_hand.batch, flow_valid=torch.zeros_like(nothing))
-    assert flow(replace(by_hand, batch=masked)).item() == 0
+    masked = replace(by_hand.batch, flow_valid=torch.tensor([False, False]))
+    assert [flow(replace(by_hand, batch=batch)).item() for batch in (blind, masked)] == [0, 0]
     none = torch.zeros(0, 3)
     empty = seen(by_hand.batch, torch.zeros(0, dtype=torch.long), none, none, torch.zeros(0))
-    assert cycle(replace(by_hand, output=empty)).item() == 0
-    assert flow(replace(by_hand, output=empty)).item() == 0
+    without = replace(by_hand, output=empty)
+    assert cycle(without).item() == flow(without).item() == 0
 
 
 def exact(scene: Scene, recipe: ProceduralScene, frame: int) -> MotionPrediction:

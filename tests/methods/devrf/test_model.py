@@ -81,19 +81,6 @@ def test_deformed_occupancy_by_hand(model: DeVRFModel) -> None:
     assert found.box == model.canonical.box
 
 
-def test_depth_is_the_distance_of_the_face_and_zero_beside_it(model: DeVRFModel) -> None:
-    rays = Rays(
-        torch.tensor([[0.1, 0.0, 3.0], [-0.9, 0.0, 3.0]]),
-        *[torch.tensor([[0.0, 0.0, -1.0]] * 2)] * 2,
-    )
-    seen = picture(model, rays, 0.0)
-    # The block ends between the grid points 0.2 and 0.4 of z.
-    assert 2.6 <= seen.depth[0].item() <= 2.8
-    assert seen.depth[1].item() == 0
-    torch.testing.assert_close(seen.color[1], torch.ones(3))
-    assert seen.color[0, 0] > 0.99 and seen.color[0, 1] < 0.01
-
-
 @pytest.mark.parametrize("space", [WORLD, NormalizedDevice(8, 6, (40.0, 40.0), near=2.0)])
 def test_a_model_built_from_its_config_takes_its_state(model: DeVRFModel, space: Space) -> None:
     model.space = space

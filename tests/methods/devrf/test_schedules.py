@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from devrf.engine.learner import in_words
 from devrf.errors import DevrfError
 from devrf.methods.devrf.canonical_schedule import CanonicalPhase, CanonicalSchedule
 from devrf.methods.devrf.deformation_schedule import (
@@ -120,7 +119,6 @@ def test_frames_of_two_stretches_are_visited_together() -> None:
     # Frame 6 has not been learned at level 1 when frame 7 is.
     assert [p.has_previous for p in phases] == [True] * 13 + [False] + [True] * 6
     assert (schedule.max_parallel_frames(0, 14), schedule.max_parallel_frames(1, 14)) == (1, 2)
-    assert tuple(in_words(phases[k].frames) for k in (0, 14)) == ("frame 1", "frames 1, 8")
 
 
 def test_a_further_level_goes_backward_through_the_frames() -> None:
@@ -146,32 +144,6 @@ def test_a_further_level_goes_backward_through_the_frames() -> None:
     ]
     phases = deformation_phases(schedule, 5)
     assert not any(p.has_previous for p in phases[4:])
-
-
-@pytest.mark.parametrize(
-    ("frames", "at_once", "visits"),
-    [
-        (5, 4, [(2, 4), (1, 3)]),  # two frames a stretch: three are enough
-        (6, 4, [(2, 4), (1, 3, 5)]),
-        (7, 3, [(3, 6), (1, 4), (2, 5)]),  # the last stretch is frame 6 alone
-        (4, 9, [(2,), (1, 3)]),  # never neighbours
-        (2, 2, [(1,)]),  # one stretch, in which frame 0 idles
-    ],
-)
-def test_stretches_of_all_kinds(frames: int, at_once: int, visits: list[tuple[int, ...]]) -> None:
-    schedule = DeformationSchedule((Level(4, 1), Level(6, 3, parallel_frames=at_once)))
-    found = [visit for visit in course(schedule, frames) if visit[0] == 1]
-    assert [visited for _, visited, _, _ in found] == visits
-    assert schedule.max_parallel_frames(1, frames) == max(len(visit) for visit in visits)
-    assert schedule.total(frames) - frames == 3 * max(2, -(-frames // at_once))
-
-
-def test_without_coarse_to_fine_the_finest_level_says_how_many() -> None:
-    schedule = DeformationSchedule(
-        (Level(4, 2), Level(6, 1, parallel_frames=2)), coarse_to_fine=False
-    )
-    assert course(schedule, 4) == [(0, (2,), 0, 3), (0, (1, 3), 3, 6)]
-    assert not any(phase.init_from_previous for phase in deformation_phases(schedule, 4))
 
 
 @given(

@@ -109,23 +109,6 @@ def test_a_warp_looks_up_samples_elsewhere_but_leaves_them_in_place(cube: Box) -
     assert out.color[0, 0].item() == pytest.approx(1 / (1 + math.exp(-x - 0.3)), abs=1e-4)
 
 
-def test_without_gradients_each_sample_is_warped_once_and_looks_the_same(cube: Box) -> None:
-    field, warped = fog(cube, 0.3), []
-
-    def warp(points: Tensor) -> Tensor:
-        warped.append(len(points))
-        return points + 0.1
-
-    arguments = (along_x(0.0, 0.3), field, slab(cube), settings(1e-2), WHITE, warp)
-    learning = render(*arguments)
-    assert len(warped) == 2 and learning.color.requires_grad
-    with torch.no_grad():
-        looking = render(*arguments)
-    assert warped[2:] == warped[:1]
-    for name in ("color", "depth", "transmittance", "canonical", "weight", "sample_color"):
-        assert torch.equal(getattr(looking, name), getattr(learning, name))
-
-
 def test_gradients_of_field_and_warp(cube: Box, rng: torch.Generator) -> None:
     field = Architecture(search_alpha_init=0.2).search_field(cube, 27).double()
     color = torch.randn(3, 3, 3, 3, generator=rng, dtype=torch.float64)

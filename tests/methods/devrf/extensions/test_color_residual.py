@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -10,9 +10,8 @@ import pytest
 import torch
 from lightning import Trainer
 from lightning.pytorch.callbacks import LambdaCallback
-from torch import Tensor
 
-from devrf.checkpoints.checkpoint import LoadedCheckpoint, load_checkpoint, save_checkpoint
+from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
@@ -26,11 +25,13 @@ from devrf.methods.devrf.extensions.color_residual import (
     ResidualField,
     ResidualGrid,
 )
-from devrf.methods.devrf.settings import MotionSettings
+from devrf.methods.devrf.model import DeVRFModel
+from devrf.methods.devrf.settings import DEFORMATION_LOSS, MotionSettings
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene, Views
 
 SHORT = DeformationSchedule(levels=(Level(4, 6), Level(6, 6)), rays=128)
+TINY = DeformationSchedule(levels=(Level(4, 1), Level(6, 1, lr_factor=0.25)), rays=16)
 FAST = MotionSettings(learning_rate=5e-3, views="all", pixels="occupied")
 LEARNED: dict[str, Any] = {"learn": "always", "side": 6, "start_level": 1, "learning_rate": 0.1}
 CLOCK = FrameClock((0.0, 0.5, 1.0))
@@ -73,20 +74,14 @@ def test_it_is_added_before_the_sigmoid(decoder: torch.nn.Module) -> None:
     torch.testing.assert_close(torch.logit(seen) - torch.logit(rest), residual)
 
 
-def stage_with(rest: LoadedCheckpoint, schedule: DeformationSchedule = SHORT, **given: Any) -> Any:
-    extension = ColorResidual(**{**LEARNED, **given})
-    extensions = {NAME: extension}
-    return DeformationStage(rest, schedule, FAST, iterations_per_step=1, extensions=extensions)
-
-
-def noted(
-    trainer: Callable[..., Trainer], stage: Any, data: SceneDataModule, what: Callable[[], Any]
-) -> list[Any]:
-    """What is asked after each step of fitting a stage."""
-    seen: list[Any] = []
-    watch = LambdaCallback(on_train_batch_end=lambda *_: seen.append(what()))
-    trainer(watch, max_epochs=1).fit(stage, datamodule=data)
-    return seen
+def stage_with(
+    rest: LoadedCheckpoint,
+    schedule: DeformationSchedule = TINY,
+    loss: Mapping[str, float] = DEFORMATION_LOSS,
+    **given: Any,
+) -> DeformationStage:
+    extension = {NAME: ColorResidual(**{**LEARNED, **given})}
+    return DeformationStage(rest, schedule, FAST, loss, iterations_per_step=1, extensions=extension)
 
 
 def fading(scene: Scene) -> Scene:
@@ -102,40 +97,33 @@ def fading(scene: Scene) -> Scene:
     return replace(scene, dynamic=replace(scene.dynamic, train=train))
 
 
-def error(model: object, views: Views, image: int) -> float:
+def error(model: DeVRFModel, views: Views, image: int) -> float:
     """Mean squared error on the alpha mask of an image."""
-    seen: Tensor = Renderer(model).view(views.cameras, image, float(views.times[image]), 1.0).color  # type: ignore[arg-type]
+    seen = Renderer(model).view(views.cameras, image, float(views.times[image]), 1.0).color
     truth = views.pixels[image].float().view(-1, 4) / 255
     mask = truth[:, 3] > 0.99
     return float((seen.view(-1, 3)[mask] - truth[mask, :3]).square().mean())
 
 
-def test_what_grows_darker_is_learned_by_the_residual_alone(
+def test_what_grows_darker_is_learned_by_the_residual(
     rest: LoadedCheckpoint,
-    datamodule: SceneDataModule,
+    serve: Callable[[Scene], SceneDataModule],
     tiny_scene: Scene,
     trainer: Callable[..., Trainer],
 ) -> None:
-    scene, errors = fading(tiny_scene), {}
-    last = int((scene.dynamic.train.times == 1).nonzero()[0])
-    for learn in ("never", "always"):
-        stage = stage_with(rest, learn=learn)
-        trainer(max_epochs=1).fit(stage, datamodule=type(datamodule)(scene))  # type: ignore[call-arg]
-        errors[learn] = error(stage.scene_model, scene.dynamic.train, last)
-    assert errors["always"] < 0.5 * errors["never"]
-    assert stage.scene_model.color_residual is not None
-    values = stage.scene_model.color_residual.values
-    assert not values[0].any() and values[1:].mean() < 0
+    scene, stage = fading(tiny_scene), stage_with(rest, SHORT)
+    trainer(max_epochs=1).fit(stage, datamodule=serve(scene))
+    model, views = stage.scene_model, scene.dynamic.train
+    last, residual = int((views.times == 1).nonzero()[0]), model.color_residual
+    assert residual is not None
+    assert not residual.values[0].any() and residual.values[1:].mean() < 0
+    learned = error(model, views, last)
+    residual.values.zero_()
+    assert learned < 0.5 * error(model, views, last)
 
 
 @pytest.mark.parametrize(
-    ("drift", "if_steady", "first"),
-    [
-        (0.01, None, None),
-        (0.1, None, 0),
-        (None, 2, 1),
-        (0.1, 2, 0),
-    ],
+    ("drift", "if_static", "first"), [(0.01, None, None), (0.1, 2, 0), (None, 2, 1)]
 )
 def test_auto_learns_colours_that_drift_early_and_others_late(
     rest: LoadedCheckpoint,
@@ -143,90 +131,56 @@ def test_auto_learns_colours_that_drift_early_and_others_late(
     trainer: Callable[..., Trainer],
     monkeypatch: pytest.MonkeyPatch,
     drift: float | None,
-    if_steady: int | None,
+    if_static: int | None,
     first: int | None,
 ) -> None:
-    monkeypatch.setattr(
-        "devrf.methods.devrf.extensions.color_residual.color_drift", lambda views: drift
-    )
-    stage = stage_with(rest, learn="auto", start_level_static_color=if_steady)
-    seen = noted(trainer, stage, datamodule, lambda: NAME in stage.active[0].further)
-    model, groups = stage.scene_model, stage.optimizer.param_groups
-    assert (model.color_residual is not None) == (first is not None)
-    assert [group["name"] for group in groups][1:] == [NAME] * (first is not None)
-    assert [seen[0], seen[-1]] == [first is not None and level >= first for level in (0, 1)]
-
-
-def test_terms_count_less_at_levels_that_learn_colours_that_drift(
-    rest: LoadedCheckpoint,
-    datamodule: SceneDataModule,
-    trainer: Callable[..., Trainer],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(
-        "devrf.methods.devrf.extensions.color_residual.color_drift", lambda views: 0.1
-    )
-    chosen = ColorResidual(
-        "auto", side=6, start_level_static_color=2, loss_scale_if_color_drift={"cycle": 0.25}
-    )
-    schedule = replace(SHORT, levels=(Level(4, 6), Level(6, 6, weight_factors={"cycle": 2.0})))
-    stage = DeformationStage(
-        rest,
-        schedule,
-        FAST,
-        {"render": 1.0, "cycle": 1.0},
-        iterations_per_step=1,
-        extensions={NAME: chosen},
-    )
-    seen = noted(trainer, stage, datamodule, lambda: stage.weights["cycle"])
-    assert (seen[0], seen[-1]) == (1.0, 0.5)
+    monkeypatch.setattr(f"{ColorResidual.__module__}.color_drift", lambda views: drift)
+    schedule = replace(TINY, levels=(Level(4, 1), Level(6, 1, weight_factors={"cycle": 2.0})))
+    scale = {"cycle": 0.25}
+    given = {"start_level_static_color": if_static, "loss_scale_if_color_drift": scale}
+    stage = stage_with(rest, schedule, {"render": 1.0, "cycle": 1.0}, learn="auto", **given)
+    trainer(max_steps=1).fit(stage, datamodule=datamodule)
+    assert (stage.scene_model.color_residual is not None) == (first is not None)
+    groups = [group["name"] for group in stage.optimizer.param_groups]
+    assert groups[1:] == [NAME] * (first is not None)
+    (extension,) = stage.extensions
+    learned = [NAME in extension.frame_fields(stage, level) for level in (0, 1)]
+    assert learned == [first is not None and level >= first for level in (0, 1)]
+    # Where colours drift, terms count less from the level on that learns them.
+    factors = [0.25, 0.5] if first == 0 else [1.0, 2.0]
+    assert [stage.motion_loss.weights_at(level)["cycle"] for level in (0, 1)] == factors
 
 
 def test_its_rate_is_its_own_at_every_level(
     rest: LoadedCheckpoint, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
 ) -> None:
-    slower = replace(SHORT, levels=(Level(4, 6), Level(6, 6, lr_factor=0.25)))
-    stage = stage_with(rest, slower)
-    first, *_, last = noted(
-        trainer,
-        stage,
-        datamodule,
-        lambda: [float(group["lr"]) for group in stage.optimizer.param_groups],
+    stage, rates = stage_with(rest), []
+    watch = LambdaCallback(
+        on_train_batch_end=lambda *_: rates.append(
+            [float(group["lr"]) for group in stage.optimizer.param_groups]
+        )
     )
-    assert last[0] == pytest.approx(0.25 * first[0])
-    assert first[1] == last[1] == pytest.approx(0.1)
+    trainer(watch, max_epochs=1).fit(stage, datamodule=datamodule)
+    assert rates[-1][0] == pytest.approx(0.25 * rates[0][0])
+    assert rates[0][1] == rates[-1][1] == pytest.approx(0.1)
 
 
-def test_a_checkpoint_keeps_the_colours(
-    rest: LoadedCheckpoint,
-    datamodule: SceneDataModule,
-    tiny_scene: Scene,
-    trainer: Callable[..., Trainer],
-    tmp_path: object,
-) -> None:
-    stage, fit = stage_with(rest), trainer(max_epochs=1)
-    fit.fit(stage, datamodule=datamodule)
-    save_checkpoint(fit, path := tmp_path / "moving.ckpt")  # type: ignore[operator]
-    loaded = load_checkpoint(path, tiny_scene).model
-    assert loaded.color_residual is not None and loaded.color_residual.clock == stage.field.clock
-    views = tiny_scene.dynamic.train
-    before, after = (
-        Renderer(model).view(views.cameras, 5, 0.75, 1.0).color
-        for model in (stage.scene_model, loaded)
-    )
+def test_a_checkpoint_keeps_the_colours(moving: DeVRFModel, tiny_scene: Scene) -> None:
+    other = DeVRFModel.from_config(moving.config())
+    other.load_stored_state(moving.stored_state())
+    assert other.color_residual is not None and moving.color_residual is not None
+    assert other.color_residual.clock == moving.color_residual.clock
+    cameras = tiny_scene.dynamic.test.cameras
+    before, after = (Renderer(model).view(cameras, 0, 0.7, 1.0).color for model in (moving, other))
     torch.testing.assert_close(after, before, atol=5e-3, rtol=0)
-    loaded.color_residual.values.zero_()
-    plain = Renderer(loaded).view(views.cameras, 5, 0.75, 1.0).color
-    assert (plain - before).abs().max() > 0.02
+    other.color_residual.values.zero_()
+    assert (Renderer(other).view(cameras, 0, 0.7, 1.0).color - before).abs().max() > 0.02
 
 
-def test_wrong_settings_are_told() -> None:
-    with pytest.raises(DevrfError, match="color_residual"):
+def test_wrong_settings_are_told(rest: LoadedCheckpoint) -> None:
+    with pytest.raises(DevrfError, match="color_residual.side"):
         ColorResidual(side=1)
-
-
-def test_a_wrong_factor_is_told(rest: LoadedCheckpoint) -> None:
     with pytest.raises(DevrfError, match="flaw is no term of loss.deformation"):
         stage_with(rest, loss_scale_if_color_drift={"flaw": 0.1})
-    with pytest.raises(DevrfError, match="loss_scale_if_color_drift.flow: expected at least 0"):
+    with pytest.raises(DevrfError, match="loss_scale_if_color_drift.flow"):
         ColorResidual(loss_scale_if_color_drift={"flow": -1.0})

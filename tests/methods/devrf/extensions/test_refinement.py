@@ -20,9 +20,9 @@ from devrf.methods.devrf.settings import CanonicalRates, MotionSettings
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene
 
-SHORT = DeformationSchedule(levels=(Level(4, 8), Level(6, 4)), rays=256)
+SHORT = DeformationSchedule(levels=(Level(4, 6), Level(6, 3)), rays=128)
 FAST = MotionSettings(learning_rate=5e-3, views="all", pixels="occupied")
-REFINED = RefinementSchedule(30, rays=256, rates=CanonicalRates(0.05, 0.05, 5e-4), grow=1)
+REFINED = RefinementSchedule(15, rays=128, rates=CanonicalRates(0.05, 0.05, 5e-4), grow=1)
 
 
 def test_the_rates_fall_over_the_stage(rest: LoadedCheckpoint) -> None:
@@ -45,7 +45,7 @@ def test_the_field_learns_and_the_motion_stays(
     )
     trainer(max_epochs=1).fit(stage, datamodule=datamodule)
     refined = stage.scene_model
-    assert stage.iteration == 30 and stage.metadata().complete
+    assert stage.iteration == 15 and stage.metadata().complete
     for name in ("to_canonical", "to_time"):
         before, after = (getattr(model.deformation, name) for model in (plain, refined))
         assert torch.equal(before, after)

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-from typing import Any
-
 import pytest
 import torch
 
-from devrf.accel.graphs import Work
 from devrf.data.batch import PixelPool
 from devrf.data.flow import previous_images
 from devrf.geometry.box import Box
@@ -98,6 +94,8 @@ def test_a_pixel_ends_where_its_color_is_met(model: DeVRFModel, views: Views) ->
     )
     assert met.camera.tolist() == [3]
     assert met.pixel.tolist() == [[MIDDLE + 0.5, ROW + 0.5]]
+    # No frame is asked that has not been learned.
+    assert len(followed(model, views, MIDDLE, by_color=True, learned=1)) == 0
     nearest = followed(model, views, MIDDLE, by_color=False)
     assert nearest.canonical[:, 0].tolist() == pytest.approx([x_of(RIGHT)], abs=0.02)
 
@@ -113,14 +111,6 @@ def test_what_is_met_nowhere_or_cannot_be_followed_is_no_track(
     leads(views, 3, 14, -7)
     met = followed(model, views, 2, 12, 14, MIDDLE, by_color=True)
     assert met.pixel[:, 0].tolist() == [MIDDLE + 0.5]
-
-
-def test_no_frame_is_asked_that_has_not_been_learned(model: DeVRFModel, views: Views) -> None:
-    views.pixels[3, ROW, MIDDLE] = torch.tensor(RED)
-    leads(views, 3, MIDDLE, RIGHT)
-    leads(views, 2, RIGHT, LEFT)
-    assert len(followed(model, views, MIDDLE, by_color=True, learned=1)) == 0
-    assert len(followed(model, views, MIDDLE, by_color=True, learned=2)) == 1
 
 
 def test_points_are_those_that_had_moved_there(model: DeVRFModel, views: Views) -> None:
@@ -162,31 +152,6 @@ def test_three_views_of_a_shift_give_the_shift_and_the_way_back() -> None:
     assert not field.to_canonical[:2].any() and not field.to_time[:2].any()
     back = field.warp(tracks.canonical + SHIFT, 1.0)
     assert (back - tracks.canonical).norm(dim=1).median() < 0.03
-
-
-def test_steps_of_a_fit_can_be_replayed_and_give_the_same() -> None:
-    cameras, fields, done = three_cameras(), [], []
-
-    class Replaying:
-        """Runs the work again, as a graph does: on the same memory."""
-
-        def warm_up(self, work: Work) -> None:
-            done.append("warm")
-            work()
-
-        def capture(self, work: Work) -> Any:
-            done.append("captured")
-            return SimpleNamespace(replay=work)
-
-    capturer: Any = Replaying()
-    for each in (None, capturer):
-        fields.append(DeformationField(BOX, FrameClock((0.0, 1.0)), voxels=6**3))
-        start_from_tracks(fields[-1], 1, shifted_ball(cameras), cameras, steps=20, capturer=each)
-    assert done == ["warm", "warm", "warm", "captured"] * 2
-    for name in ("to_canonical", "to_time"):
-        found, expected = (getattr(field, name) for field in fields[::-1])
-        assert expected.abs().amax() > 0.05
-        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
 
 
 def test_without_tracks_the_frame_stays_where_the_one_before_is() -> None:
