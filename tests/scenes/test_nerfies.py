@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import shutil
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -64,6 +63,9 @@ def folder(tmp_path, ring_cameras, picture, write_camera) -> Folder:
 
 
 def test_points_fall_on_the_pixels_that_show_them(folder, balls_are_where_they_project):
+    half = NerfiesReader(folder.root, downscale=2).read().dynamic.train
+    assert (half.width, half.height) == (WIDTH // 2, HEIGHT // 2)
+    balls_are_where_they_project(half)
     scene = NerfiesReader(folder.root, downscale=1).read()
     assert scene.kind == "inward" and scene.name == "scene"
     for views in (scene.dynamic.train, scene.dynamic.test, scene.static.train, scene.static.test):
@@ -72,23 +74,6 @@ def test_points_fall_on_the_pixels_that_show_them(folder, balls_are_where_they_p
     distance = scene.dynamic.train.cameras.positions.norm(dim=1)
     torch.testing.assert_close(distance, torch.full((7,), 4.0))
     assert (scene.bounds.near, scene.bounds.far) == (0.5, 9.0)
-
-
-def test_smaller_images_are_used_where_they_are(folder, balls_are_where_they_project, message_of):
-    averaged = NerfiesReader(folder.root, downscale=2).read().dynamic.train
-    assert (averaged.width, averaged.height) == (WIDTH // 2, HEIGHT // 2)
-    balls_are_where_they_project(averaged)
-    (folder.root / "rgb/2x").mkdir()
-    for item in IDS:
-        image = iio.imread(folder.root / f"rgb/1x/{item}.png").astype(float)
-        small = image.reshape(HEIGHT // 2, 2, WIDTH // 2, 2, 4).mean(axis=(1, 3)).astype("uint8")
-        iio.imwrite(folder.root / f"rgb/2x/{item}.png", small)
-    shutil.rmtree(folder.root / "rgb/1x")
-    train = NerfiesReader(folder.root, downscale=2).read().dynamic.train
-    assert train.names[0] == "rgb/2x/000000.png"
-    torch.testing.assert_close(train.cameras.focal, averaged.cameras.focal)
-    assert NerfiesReader(folder.root, downscale=4).read().dynamic.train.width == WIDTH // 4
-    assert "no folder 1x (found: 2x)" in message_of(folder.root)
 
 
 def test_splits_times_and_the_stand_in_for_a_static_set(folder, caplog):

@@ -200,17 +200,6 @@ def test_the_static_cameras_are_centred_and_face_the_scene() -> None:
     assert bool((cameras.forwards[:, 2] < -0.98).all())
 
 
-def test_surfaces_lie_in_the_box_and_on_the_ndc_rays_of_their_pixels(scene: Scene) -> None:
-    assert (scene.bounds.near, scene.bounds.far) == (0.0, 1.0)
-    for views in (scene.static.train, scene.dynamic.train):
-        _, world, seen = pixel_rays(views)
-        device = scene.space.from_world(seen)
-        assert bool(scene.bounds.box.contains(device).all())
-        along = 1 + scene.space.near / seen[:, 2]  # type: ignore[attr-defined]
-        expected = scene.space.rays(world).at(torch.arange(len(world)), along)
-        torch.testing.assert_close(device, expected, atol=1e-4, rtol=0)
-
-
 ALONE = [Robot(), Flower(2.0)]
 SHAPES = [*ALONE, Surrounded(Plush(2.0), Backdrop())]
 each_alone = pytest.mark.parametrize("shape", ALONE, ids=repr)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -24,18 +25,13 @@ from devrf.scenes.bounds import (
 from devrf.scenes.scene import Bounds, Views
 from devrf.scenes.space import NEAR_SHARE, SHELL, inward_space
 
-RingCameras = Callable[..., Cameras]
-
-
-def moved(cameras: Cameras, offset: list[float]) -> Cameras:
-    pose = cameras.camera_to_world.clone()
-    pose[:, :, 3] += torch.tensor(offset)
-    return Cameras(pose, cameras.focal, cameras.center, cameras.width, cameras.height)
-
 
 def test_axes_meet_where_the_cameras_look(ring_cameras):
-    cameras = moved(ring_cameras(5, width=40, height=30, angle=0.7), [1.0, -2.0, 0.5])
-    torch.testing.assert_close(axes_meet(cameras), torch.tensor([1.0, -2.0, 0.5]))
+    cameras = ring_cameras(5, width=40, height=30, angle=0.7)
+    offset = torch.tensor([1.0, -2.0, 0.5])
+    pose = cameras.camera_to_world.clone()
+    pose[:, :, 3] += offset
+    torch.testing.assert_close(axes_meet(replace(cameras, camera_to_world=pose)), offset)
 
 
 def test_box_of_the_usual_synthetic_cameras(ring_cameras):
