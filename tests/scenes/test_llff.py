@@ -189,7 +189,7 @@ def stored(folder: Any, file: str) -> np.ndarray:
 @pytest.mark.parametrize(
     ("file", "where", "value", "said"),
     [
-        (STATIC, (1, 0), 1, "camera 1: its axes are no rotation"),
+        (STATIC, (1, 0), 1, "camera 1: is no rigid transform"),
         (POSES, (4, 2, 4), 0, "focal length 0"),
         (BOUNDS, (1, 0), -1, "camera 1: expected 0 < least depth"),
     ],

@@ -197,11 +197,9 @@ WIDEST = 1e3
 
 
 def reference_space(cameras: Cameras, near: float) -> NormalizedDevice:
-    """NDC of a camera at the origin with the mean focal lengths of ``cameras``.
+    """NDC of a camera at the origin with the mean focal lengths of the static ``cameras``.
 
-    Args:
-        cameras: the static cameras, whose average pose is the identity.
-        near: distance of the near plane, world units.
+    Their average pose is the identity; ``near`` is the distance of the near plane, world units.
     """
     fx, fy = cameras.focal.double().mean(dim=0).tolist()
     return NormalizedDevice(cameras.width, cameras.height, (fx, fy), near)
@@ -212,19 +210,10 @@ def forward_bounds(everyone: list[Views], space: NormalizedDevice, source: str) 
 
     Rays are straight in NDC too, so it is enough to follow the rays through the images'
     corners: ``origin`` on the near plane (z' = −1), ``origin + direction`` at infinity (z' = 1).
-    Hence near = 0 and far = 1, in multiples of an NDC ray's direction.
-
-    Args:
-        everyone: the views whose cameras count.
-        space: the scene's NDC.
-        source: where the room for motion comes from, for the log.
-
-    Raises:
-        DevrfError: a camera sees something that is not before the reference camera.
+    Hence near = 0 and far = 1, in multiples of an NDC ray's direction. ``source`` says where the
+    room for motion comes from. Errors are those of :func:`box_between`.
     """
-    return Bounds(
-        box_between(everyone, space), near=0.0, far=1.0, motion=None, scale=1.0, source=source
-    )
+    return Bounds(box_between(everyone, space), 0.0, 1.0, None, 1.0, source)
 
 
 def box_between(

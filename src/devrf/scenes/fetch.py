@@ -265,13 +265,14 @@ def _download(scene: PublishedScene, folder: Path, progress: bool) -> dict[str, 
 
 def _digest(files: dict[str, Path]) -> str:
     """The SHA-256 of an archive; of several files that of the lines that sha256sum prints."""
-    digests = {}
-    for name, path in files.items():
+
+    def of(path: Path) -> str:
         with path.open("rb") as file:
-            digests[name] = hashlib.file_digest(file, "sha256").hexdigest()
-    if list(digests) == [ARCHIVE]:
-        return digests[ARCHIVE]
-    lines = "".join(f"{digests[name]}  {name}\n" for name in sorted(digests))
+            return hashlib.file_digest(file, "sha256").hexdigest()
+
+    if list(files) == [ARCHIVE]:
+        return of(files[ARCHIVE])
+    lines = "".join(f"{of(files[name])}  {name}\n" for name in sorted(files))
     return hashlib.sha256(lines.encode()).hexdigest()
 
 

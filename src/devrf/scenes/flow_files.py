@@ -96,29 +96,31 @@ def read_flow(
     if not present:
         log.info("no optical flow: no NNN_%s.npz in %s", direction, folder)
         return None
-    if len(present) < len(files):
+    warn_of_missing(len(present), len(files), folder)
+    return stacked_flow(present, len(index), source_size, size)
+
+
+def warn_of_missing(present: int, expected: int, folder: Path) -> None:
+    """Log how many of the expected flow files are missing in ``folder``, if any."""
+    if present < expected:
         log.warning(
             "%d of %d flow files are missing in %s; those images go without flow",
-            len(files) - len(present),
-            len(files),
+            expected - present,
+            expected,
             folder,
         )
-    return stacked_flow(present, len(index), source_size, size)
 
 
 def stacked_flow(
     files: Mapping[int, Path], count: int, source_size: tuple[int, int], size: tuple[int, int]
 ) -> OpticalFlow:
-    """The flow of ``count`` images; those without a file have none.
+    """The flow of ``count`` images, in pixels of these; those without a file have none.
 
     Args:
         files: which image's flow is in which file; at least one.
         count: how many images there are.
         source_size: (width, height) of the images before downscaling.
         size: (width, height) after downscaling.
-
-    Returns:
-        Flow in pixels of the smaller images.
     """
     start = time.perf_counter()
     width, height = size
@@ -166,10 +168,7 @@ def content_key(views: Views, method: str) -> str:
 def load_flow(path: Path, key: str, shape: tuple[int, int, int]) -> OpticalFlow | None:
     """The flow stored at ``path``, or None when there is none for these images.
 
-    Args:
-        path: an npz written by :func:`save_flow`.
-        key: the :func:`content_key` that it must carry.
-        shape: (N, H, W) that it must have.
+    It must carry their :func:`content_key` and have the ``shape`` (N, H, W).
     """
     if not os.path.isfile(path):
         return None

@@ -18,7 +18,7 @@ from torch.nn.functional import pad
 
 from devrf.geometry.clock import FrameClock
 from devrf.scenes.flow_files import content_key, load_flow, save_flow
-from devrf.scenes.resampling import LONGEST_SIDE, area_average
+from devrf.scenes.resampling import area_average
 from devrf.scenes.scene import OpticalFlow, Views
 from devrf.scenes.validation import scene_error
 
@@ -126,18 +126,12 @@ def estimate_flow(
 
     Raises:
         DevrfError: the library or weights are missing, the images have no
-            two distinct times, or are too large.
+            two distinct times.
     """
     pairs = frame_pairs(views)
     if not pairs:
         raise scene_error(
             "data.flow", "no view has two consecutive frames to estimate flow between"
-        )
-    if max(views.width, views.height) > LONGEST_SIDE:
-        raise scene_error(
-            "data.flow",
-            f"cannot be estimated between images of more than {LONGEST_SIDE} px a side; use a "
-            "larger data.downscale, or set data.flow=none",
         )
     key = content_key(views, f"{method} forward" if forward else method)
     if cache is not None:

@@ -17,9 +17,6 @@ from devrf.scenes.validation import scene_error
 Array = npt.NDArray[np.float32]
 Pixels = npt.NDArray[np.uint8]
 
-# OpenCV addresses the pixels of an image to look up with 16 bits.
-LONGEST_SIDE = 2**15 - 2
-
 
 def area_average(image: Array, width: int, height: int) -> Array:
     """The mean of ``image`` over each cell of a coarser raster.
@@ -54,7 +51,7 @@ def look_up_pixels(image: Pixels, source: Array) -> Pixels:
     """An 8-bit image looked up elsewhere, bilinearly; colours are weighted by their alpha.
 
     Args:
-        image: (H, W, 1, 3 or 4) uint8, alpha not premultiplied; sides up to LONGEST_SIDE.
+        image: (H, W, 1, 3 or 4) uint8, alpha not premultiplied.
         source: (H', W', 2) x, y in pixels of ``image``, where a pixel's centre is at i + 0.5.
 
     Returns:
@@ -132,20 +129,13 @@ def as_pinhole(
         The pixels, and N lenses without distortion and skew.
 
     Raises:
-        DevrfError: a distortion is so strong that the image folds over, or the image is wider
-            or higher than 32,766 px.
+        DevrfError: a distortion is so strong that the image folds over.
     """
     height, width = pixels.shape[1:3]
     plain = list(lenses)
     for row, lens in enumerate(lenses):
         if lens.pinhole:
             continue
-        if max(width, height) > LONGEST_SIDE:
-            raise scene_error(
-                names[row],
-                f"{width}x{height} px, at most {LONGEST_SIDE} px a side can be undistorted; "
-                "use a larger data.downscale",
-            )
         view = _pinhole_view(lens, width, height)
         if view is None:
             raise scene_error(

@@ -104,14 +104,8 @@ def forward_facing_scene(
 ) -> Scene:
     """The scene of two captures whose static cameras have the identity as their average pose.
 
-    Its space is NDC of a camera at the origin that looks along −z.
-
-    Args:
-        name: the scene's name.
-        static: the scene at rest.
-        dynamic: the scene in motion; ``static`` itself where it is always at rest.
-        near: distance of the near plane from the average camera, world units.
-        background: what is behind alpha masks.
+    Its space is NDC of a camera at the origin that looks along −z, with the near plane ``near``
+    world units before it. Of a scene at rest both captures are one.
 
     Raises:
         DevrfError: a camera sees something that is not before the average camera.

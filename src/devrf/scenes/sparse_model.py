@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from devrf.geometry.box import Box
 from devrf.geometry.poses import average_pose, relative_to
 from devrf.scenes.bounds import nearest_point
 from devrf.scenes.files import decoding
@@ -281,13 +282,8 @@ def _inward(poses: Tensor, points: Tensor, near: float, far: float) -> World:
         for p in (2 * OUTLIERS, 100 - 2 * OUTLIERS)
     )
     margin = 0.1 * np.maximum(high - low, 0.1 * AROUND)
-    box = _corner(low - margin), _corner(high + margin)
-    return World(poses, points, "contracted", near, far, box)
-
-
-def _corner(values: npt.NDArray[np.float64]) -> Corner:
-    x, y, z = values.tolist()
-    return x, y, z
+    inner = Box.of((low - margin).tolist(), (high + margin).tolist())
+    return World(poses, points, "contracted", near, far, (inner.low, inner.high))
 
 
 def _moved(poses: Tensor, points: Tensor, frame: Tensor, scale: float) -> tuple[Tensor, Tensor]:

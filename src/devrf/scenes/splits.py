@@ -190,9 +190,7 @@ def load_views(split: Split, root: Path, downscale: int, masks: Masks = "none") 
         masks: what the masks that the file lists are taken for.
 
     Raises:
-        DevrfError: what :func:`devrf.scenes.images.load_images`,
-            :func:`devrf.scenes.resampling.as_pinhole` and :mod:`devrf.scenes.masks` raise, or
-            an image has not the shape that its camera is for.
+        DevrfError: an image, a mask or a lens is wrong, or they do not go together.
     """
     used = split.index
     files = [split.transforms.images[i] for i in used.tolist()]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -19,7 +20,7 @@ from torch import Tensor
 from devrf.scenes.files import Name, Number, Positive, Vector3, Vector4, inside, read_json
 from devrf.scenes.image_folders import Missing, present_images
 from devrf.scenes.lens import CameraKeys, Intrinsics, frame_intrinsics, intrinsics_of
-from devrf.scenes.validation import FARTHEST, in_reach, is_rotation, scene_error
+from devrf.scenes.validation import check_poses, scene_error
 
 TIME_TOLERANCE = 1e-6
 
@@ -151,27 +152,21 @@ def read_transforms(
             where[times.index(None)],
             'has no "time" although others have; give every frame its time, or none',
         )
+    poses = torch.tensor([frame.transform_matrix[:3] for frame in frames], dtype=torch.float64)
+    check_poses(poses, lambda index: f"{where[index]}: transform_matrix")
+    lenses = [frame_intrinsics(listing, f, at) for f, at in zip(frames, where, strict=True)]
+    shared = cache(lambda: intrinsics_of(listing, file))  # asked for only where it is needed
     transforms = Transforms(
         file,
-        _intrinsics(listing, frames, where, file),
+        tuple(own or shared() for own in lenses),
         tuple(images.values()),
-        _poses(frames, where).float(),
+        poses.float(),
         tuple(known) or None,
         tuple(_mask(frame, file, root) for frame in frames) if masked else None,
         skipped=len(listing.frames) - len(frames),
         bounds=listing.scene_bounds,
     )
     return listing, transforms
-
-
-def _intrinsics(
-    listing: TransformsFile, frames: list[Frame], where: list[str], file: Path
-) -> tuple[Intrinsics, ...]:
-    own = [frame_intrinsics(listing, f, at) for f, at in zip(frames, where, strict=True)]
-    if None not in own:
-        return tuple(lens for lens in own if lens is not None)
-    shared = intrinsics_of(listing, file)
-    return tuple(shared if lens is None else lens for lens in own)
 
 
 def _mask(frame: Frame, file: Path, root: Path) -> Path | None:
@@ -181,22 +176,3 @@ def _mask(frame: Frame, file: Path, root: Path) -> Path | None:
     if not os.path.isfile(path):
         raise scene_error(path, "no such mask; correct mask_path, or set data.masks=none")
     return path
-
-
-def _poses(frames: list[Frame], where: list[str]) -> Tensor:
-    """(N, 3, 4) float64 camera-to-world."""
-    poses = torch.tensor([frame.transform_matrix[:3] for frame in frames], dtype=torch.float64)
-    for bad, what in (
-        (
-            ~is_rotation(poses[:, :, :3]),
-            "is no rigid transform (scaled, sheared or mirrored axes); "
-            "give a rotation and a translation",
-        ),
-        (
-            ~in_reach(poses[:, :, 3]),
-            f"is farther than {FARTHEST:g} from the origin; give smaller world units",
-        ),
-    ):
-        if bool(bad.any()):
-            raise scene_error(where[int(bad.nonzero()[0])], f"transform_matrix {what}")
-    return poses

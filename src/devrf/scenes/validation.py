@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import reprlib
+from collections.abc import Callable
 from typing import Any
 
 import psutil
@@ -155,3 +156,21 @@ def in_reach(positions: Tensor) -> Tensor:
     """Which positions (..., 3), world units, can be computed with; false where one holds NaN."""
     near: Tensor = (positions.abs() <= FARTHEST).all(dim=-1)
     return near
+
+
+def check_poses(poses: Tensor, where: Callable[[int], object]) -> None:
+    """Check camera poses (N, 3, 4).
+
+    Args:
+        poses: camera-to-world, world units.
+        where: what the message says of the one at fault, by its position.
+
+    Raises:
+        DevrfError: one is no rigid transform, or too far from the origin to be computed with.
+    """
+    for good, what in (
+        (is_rotation(poses[:, :, :3]), "is no rigid transform (scaled, sheared or mirrored axes)"),
+        (in_reach(poses[:, :, 3]), f"is farther than {FARTHEST:g} from the origin"),
+    ):
+        if not bool(good.all()):
+            raise scene_error(where(int((~good).nonzero()[0])), f"{what}; correct the pose")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fnmatch
-import logging
 import os
 import re
 from collections.abc import Callable, Sequence
@@ -14,14 +13,12 @@ import torch
 from torch import Tensor
 
 from devrf.scenes.files import entries
-from devrf.scenes.flow_files import FlowDirection
+from devrf.scenes.flow_files import FlowDirection, warn_of_missing
 from devrf.scenes.image_folders import image_folder, listed_images
 from devrf.scenes.lens import Intrinsics
 from devrf.scenes.splits import Split
 from devrf.scenes.transforms import Transforms
 from devrf.scenes.validation import scene_error
-
-log = logging.getLogger(__name__)
 
 
 def dynamic_folders(root: Path) -> list[Path]:
@@ -197,13 +194,8 @@ def flow_files(
         for way in ways
     ]
     best = max(found, key=len)
-    if 0 < len(best) < len(shots):
-        log.warning(
-            "%d of %d flow files are missing in %s and its like; those images go without flow",
-            len(shots) - len(best),
-            len(shots),
-            views[0].flow,
-        )
+    if best:
+        warn_of_missing(len(best), len(shots), views[0].flow)
     return best
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from devrf.geometry.poses import average_pose, relative_to
 from devrf.scenes.files import Numbers, read_numbers
 from devrf.scenes.lens import Intrinsics
-from devrf.scenes.validation import FARTHEST, in_reach, is_rotation, scene_error
+from devrf.scenes.validation import FARTHEST, check_poses, in_reach, scene_error
 
 # The file of LLFF's cameras.
 POSES = "poses_bounds.npy"
@@ -167,18 +167,12 @@ def _posed_set(
     """The set, or DevrfError that names the file and the row at fault."""
     cameras = torch.from_numpy(np.ascontiguousarray(poses))
     ranges = torch.from_numpy(np.ascontiguousarray(bounds))
-    for good, where, what in (
-        (is_rotation(cameras[:, :, :3]), file, "its axes are no rotation (or of other order)"),
-        (in_reach(cameras[:, :, 3]), file, f"it is farther than {FARTHEST:g} from the origin"),
-        (
-            (ranges[:, 0] > 0) & (ranges[:, 0] < ranges[:, 1]),
+    check_poses(cameras, lambda row: f"{file}: camera {row}")
+    good = (ranges[:, 0] > 0) & (ranges[:, 0] < ranges[:, 1])
+    if not bool(good.all()):
+        raise scene_error(
             depths,
-            "expected 0 < least depth < largest depth",
-        ),
-    ):
-        if not bool(good.all()):
-            row = int((~good).nonzero()[0])
-            raise scene_error(
-                where, f"camera {row}: {what}; correct or leave out the image and its row"
-            )
+            f"camera {int((~good).nonzero()[0])}: expected 0 < least depth < largest depth; "
+            "correct or leave out the image and its row",
+        )
     return PosedSet(file, cameras, intrinsics, ranges)

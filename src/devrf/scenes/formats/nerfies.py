@@ -39,13 +39,7 @@ from devrf.scenes.reader import EstimatedFlow, Holdout, InwardReader, Time
 from devrf.scenes.scene import Capture, Scene
 from devrf.scenes.splits import every_nth
 from devrf.scenes.transforms import Transforms
-from devrf.scenes.validation import (
-    FARTHEST,
-    abbreviated,
-    in_reach,
-    is_rotation,
-    scene_error,
-)
+from devrf.scenes.validation import FARTHEST, abbreviated, check_poses, scene_error
 
 log = logging.getLogger(__name__)
 
@@ -94,13 +88,6 @@ def placed(
 
     Without alpha masks the scene is unbounded, or, where the cameras look in nearly one direction,
     the box is all that they see between near and far.
-
-    Args:
-        reader: the options.
-        folder: where the captures were read from.
-        world: what ``scene.json`` says.
-        static: the scene at rest.
-        dynamic: the scene in motion.
     """
     near = world.near if reader.near is None else reader.near
     far = world.far if reader.far is None else reader.far
@@ -151,12 +138,7 @@ _CAMERA = TypeAdapter(Camera)
 
 
 def read_camera(folder: Path, item: str, world: World) -> tuple[Tensor, Intrinsics]:
-    """The camera of image ``item``.
-
-    Args:
-        folder: the scene's folder.
-        item: the image's id.
-        world: the frame of reference.
+    """The camera of the image with the id ``item``.
 
     Returns:
         The camera-to-world transform (3, 4) float32 in OpenGL axes, world units, and the
@@ -168,19 +150,11 @@ def read_camera(folder: Path, item: str, world: World) -> tuple[Tensor, Intrinsi
     file = inside(folder, folder / "camera", f"{item}.json", folder / "dataset.json")
     camera = read_json(file, _CAMERA, "every image needs its camera; add it")
     world_to_camera = torch.tensor(camera.orientation, dtype=torch.float64)
-    if not bool(is_rotation(world_to_camera)):
-        raise scene_error(
-            file, "orientation is no rotation (scaled, sheared or mirrored axes); correct it"
-        )
     # OpenCV's y points down and its z ahead; ours point up and back.
     axes = world_to_camera.T * world_to_camera.new_tensor([1, -1, -1])
     where = (axes.new_tensor(camera.position) - axes.new_tensor(world.center)) * world.scale
-    if not bool(in_reach(where)):
-        raise scene_error(
-            file,
-            f"position is farther than {FARTHEST:g} from the scene's center, in units of "
-            "scene.json; correct it, or center and scale there",
-        )
+    pose = torch.cat([axes, where[:, None]], dim=1)
+    check_poses(pose[None], lambda _: f"{file}: orientation or position")
     focal = camera.focal_length
     intrinsics = Intrinsics(
         None,
@@ -190,7 +164,7 @@ def read_camera(folder: Path, item: str, world: World) -> tuple[Tensor, Intrinsi
         Distortion((*camera.radial_distortion, 0.0), camera.tangential_distortion),
         camera.skew,
     )
-    return torch.cat([axes, where[:, None]], dim=1).float(), intrinsics
+    return pose.float(), intrinsics
 
 
 Masks = Callable[[tuple[str, ...], ImageFolder], tuple[Path | None, ...]]

@@ -22,13 +22,9 @@ _NORMAL_STEP = 1e-3
 
 
 def shaded(shape: Shape, points: Tensor, time: float, light: float) -> Tensor:
-    """Colour (M, 3) of surface points: albedo, ambient light, and a wrapped diffuse lamp.
+    """Colour (M, 3) of surface ``points`` (M, 3): albedo, ambient light, a wrapped diffuse lamp.
 
-    Args:
-        shape: whose surface it is.
-        points: (M, 3) world units.
-        time: in [0, 1].
-        light: share of the lamp in the lighting, 0 (albedo alone) … 1.
+    ``light`` is the share of the lamp in the lighting, 0 (albedo alone) … 1.
     """
     albedo = shape.color(shape.material(points, time))
     if light == 0:
@@ -92,17 +88,8 @@ def backward_flow(
     """Exact optical flow of N fixed cameras from ``time`` to ``earlier``.
 
     The point that the ray through a pixel's centre meets is carried to the earlier time and
-    projected; it may be hidden there, or outside of the image.
-
-    Args:
-        shape: what is seen.
-        cameras: N cameras, world units.
-        depth: (N, H, W) distance along the rays through the pixels' centres, +inf on a miss.
-        time: of the images.
-        earlier: of the images before them.
-
-    Returns:
-        flow in pixels, 0 where nothing is seen, and valid wherever something is.
+    projected; it may be hidden there, or outside of the image. ``depth`` (N, H, W) is the distance
+    along the rays through the pixels' centres, +inf on a miss: there the flow is 0 and not valid.
     """
     valid = depth.isfinite()
     camera, row, column = valid.nonzero().unbind(-1)
@@ -116,11 +103,9 @@ def backward_flow(
 
 
 def forward_flow(shape: Shape, views: Views) -> OpticalFlow:
-    """Exact forward optical flow of the images of fixed cameras; the last frame's has none.
+    """Exact forward optical flow of ``views`` with depth, all fixed cameras at each frame.
 
-    Args:
-        shape: what is seen.
-        views: N images of a scene, all cameras at each of its frames, with depth.
+    The last frame has none.
     """
     assert views.depth is not None
     times = torch.unique(views.times)

@@ -43,15 +43,8 @@ def static_rig(
 ) -> tuple[Cameras, Cameras]:
     """Training and held-out cameras, spread evenly from the rig's lowest elevation upwards.
 
-    All are points of one Fibonacci lattice; the held-out ones lie evenly between the others.
-
-    Args:
-        train: number of training cameras.
-        test: number of held-out cameras.
-        width: image width in pixels.
-        height: image height in pixels.
-        reach: radius of the ball about the origin that every image must hold.
-        rig: how the cameras stand.
+    All are points of one Fibonacci lattice; the held-out ones lie evenly between the others. Every
+    image, ``width`` × ``height`` pixels, holds the ball of radius ``reach`` about the origin.
     """
     count = train + test
     index = torch.arange(count, dtype=torch.float64)
@@ -106,13 +99,7 @@ _UNEVEN = 0.05
 
 
 def facing_static_rig(count: int, *, width: int, height: int) -> Cameras:
-    """``count`` cameras evenly over an ellipse, whose average pose is the identity.
-
-    Args:
-        count: number of cameras.
-        width: image width in pixels.
-        height: image height in pixels.
-    """
+    """``count`` cameras evenly over an ellipse, whose average pose is the identity."""
     index = torch.arange(count, dtype=torch.float64)
     radius = ((index + 0.5) / count).sqrt()
     angle = math.pi * (3 - math.sqrt(5)) * index
@@ -122,13 +109,7 @@ def facing_static_rig(count: int, *, width: int, height: int) -> Cameras:
 
 
 def facing_dynamic_rig(train: int, *, width: int, height: int) -> tuple[Cameras, Cameras]:
-    """``train`` fixed cameras on an ellipse, and one held out near its middle.
-
-    Args:
-        train: number of cameras to learn from.
-        width: image width in pixels.
-        height: image height in pixels.
-    """
+    """``train`` fixed cameras on an ellipse, and one held out near its middle."""
     angle = math.pi / 4 + 2 * math.pi * torch.arange(train, dtype=torch.float64) / train
     level = torch.zeros_like(angle)
     around = torch.stack([_DYNAMIC[0] * angle.cos(), _DYNAMIC[1] * angle.sin(), level], dim=-1)
