@@ -177,12 +177,8 @@ def test_a_move_ends_the_finer_frame_but_not_a_coarse_one():
     assert not screen.scheduler.render_next(0)
     screen.between = lambda rows: None
     screen.render()
-    assert [(t, rows) for _, t, rows in screen.shown[1:]] == [
-        (0.2, 20),
-        (0.1, 20),
-        (0.1, 60),
-        (0.1, 100),
-    ]
+    shown = [(time, rows) for _, time, rows in screen.shown[1:]]
+    assert shown == [(0.2, 20), (0.1, 20), (0.1, 60), (0.1, 100)]
 
 
 def test_another_browsers_first_frame_comes_before_the_finer_of_one():
@@ -265,9 +261,6 @@ def test_keyframes_are_collected_saved_loaded_and_flown_through(moving, tiny_sce
         assert len(session._frusta._handles) == 10
     finally:
         session.close()
-
-
-# Settings.
 
 
 @pytest.mark.parametrize(

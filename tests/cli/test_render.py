@@ -207,7 +207,7 @@ def test_a_port_in_use_is_said_in_one_line(of_run, tmp_path, port):
         used = other.getsockname()[1]
         outcome = of_run("stage=view", f"viewer.port={used}")
     assert outcome.status == 2 and outcome.err.count("\n") == 1
-    assert outcome.err.startswith(f"devrf: viewer.port: {used} on 127.0.0.1 is in use")
+    assert outcome.err.startswith("devrf: viewer.port: ") and str(used) in outcome.err
     assert not list(tmp_path.iterdir())
 
 

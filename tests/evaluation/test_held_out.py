@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
-from lightning import Trainer
 
 from devrf.evaluation.held_out import score, truth_image
-from devrf.methods.devrf.canonical_stage import CanonicalStage
-from devrf.methods.devrf.model import DeVRFModel
 from devrf.metrics.image import psnr, ssim
 from devrf.rendering.renderer import Renderer
-from devrf.scenes.scene import Scene
 
 
-def test_truth_by_hand(tiny_scene: Scene) -> None:
+def test_truth_by_hand(tiny_scene):
     pixels = torch.tensor([[[[255, 0, 102, 51], [7, 7, 7, 0]]]], dtype=torch.uint8)
     views = replace(tiny_scene.dynamic.test, pixels=pixels)
     # alpha 0.2 on white: 0.8 + 0.2 · colour.
@@ -30,9 +24,7 @@ def test_truth_by_hand(tiny_scene: Scene) -> None:
     torch.testing.assert_close(truth_image(opaque, 0, "white")[0, 0, 2], torch.tensor(0.4))
 
 
-def test_only_pixels_that_count_are_scored(
-    learned: tuple[CanonicalStage, Trainer], tiny_scene: Scene
-) -> None:
+def test_only_pixels_that_count_are_scored(learned, tiny_scene):
     views, renderer = tiny_scene.dynamic.test, Renderer(learned[0].scene_model)
     valid_mask = torch.ones(len(views), 18, 24, dtype=torch.bool)
     whole = score(renderer, views, 1, "white")
@@ -54,9 +46,7 @@ def test_only_pixels_that_count_are_scored(
     assert rim.psnr == pytest.approx(psnr(whole.prediction[:1, :8], whole.truth[:1, :8]))
 
 
-def test_a_score_is_that_of_the_picture_at_the_views_time(
-    learned: tuple[CanonicalStage, Trainer], tiny_scene: Scene, reference: Callable[..., Any]
-) -> None:
+def test_a_score_is_that_of_the_picture_at_the_views_time(learned, tiny_scene, reference):
     views, model = tiny_scene.dynamic.test, learned[0].scene_model
     scored = score(Renderer(model), views, 2, "white")
     assert scored.name == views.names[2] and scored.time == 1.0
@@ -69,9 +59,7 @@ def test_a_score_is_that_of_the_picture_at_the_views_time(
     assert scored.rest_pose_psnr == scored.psnr
 
 
-def test_static_views_are_scored_at_rest_whatever_their_time(
-    moving: DeVRFModel, tiny_scene: Scene
-) -> None:
+def test_static_views_are_scored_at_rest_whatever_their_time(moving, tiny_scene):
     views, renderer = tiny_scene.dynamic.test, Renderer(moving)
     moved, rest = (score(renderer, views, 2, "white", time=time) for time in (None, 0.0))
     assert (moved.time, rest.time) == (1.0, 1.0)

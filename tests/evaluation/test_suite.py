@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
-from lightning import Trainer
 
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import score
@@ -18,9 +16,8 @@ from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
 from devrf.geometry.ndc import NormalizedDevice
-from devrf.geometry.space import WORLD, Space
+from devrf.geometry.space import WORLD
 from devrf.methods.devrf.architecture import Architecture
-from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.metrics.image import psnr_masked, ssim_masked
@@ -28,14 +25,14 @@ from devrf.metrics.lpips import TRUNKS
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.renderer import Renderer
 from devrf.rendering.sampling import RenderSettings
-from devrf.scenes.scene import OpticalFlow, Scene, Views
+from devrf.scenes.scene import OpticalFlow, Views
 
 HOST = torch.device("cpu")
 SIDE = 41
 
 
 @pytest.fixture
-def alex(tmp_path: Path) -> Path:
+def alex(tmp_path):
     """Some weights of the smaller network."""
     state = TRUNKS["alex"].build().state_dict()
     path = tmp_path / "alex.pth"
@@ -43,7 +40,7 @@ def alex(tmp_path: Path) -> Path:
     return path
 
 
-def slab(box: Box, settings: RenderSettings, space: Space = WORLD) -> DeVRFModel:
+def slab(box, settings, space=WORLD):
     """All of the box below z = −0.025, halfway between two grid points, is solid."""
     build = Architecture()
     field = build.search_field(box, SIDE**3)
@@ -53,7 +50,7 @@ def slab(box: Box, settings: RenderSettings, space: Space = WORLD) -> DeVRFModel
     return DeVRFModel(build, field, Occupancy.full((SIDE,) * 3, box), settings, space=space)
 
 
-def views(depth: torch.Tensor, z: float) -> Views:
+def views(depth, z):
     """One 8×8 image taken at height z, looking down."""
     pose = torch.eye(3, 4)
     pose[2, 3] = z
@@ -64,7 +61,7 @@ def views(depth: torch.Tensor, z: float) -> Views:
     )
 
 
-def test_depth_of_a_slab_by_hand(cube: Box) -> None:
+def test_depth_of_a_slab_by_hand(cube):
     model = slab(cube, RenderSettings(step=0.1, alpha_threshold=1e-4, near=0.0, far=9.0))
     images = views(torch.zeros(1, 8, 8), z=3.975)
     # A ray meets the face after 4 / cos of its angle.
@@ -78,7 +75,7 @@ def test_depth_of_a_slab_by_hand(cube: Box) -> None:
         assert found == pytest.approx(abs(off), abs=0.01)
 
 
-def test_depth_of_a_scene_in_ndc_is_in_world_units() -> None:
+def test_depth_of_a_scene_in_ndc_is_in_world_units():
     box = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
     # The mirrored slab is solid from z' = 0.025 on: 1 + 2·near/z, so from z = −4 / 0.975 on.
     space = NormalizedDevice(8, 8, (40.0, 40.0), near=2.0)
@@ -94,9 +91,7 @@ def test_depth_of_a_scene_in_ndc_is_in_world_units() -> None:
     assert found == pytest.approx(0.5, abs=0.03)
 
 
-def test_every_metric_of_a_learned_scene(
-    learned: tuple[CanonicalStage, Trainer], tiny_scene: Scene, alex: Path
-) -> None:
+def test_every_metric_of_a_learned_scene(learned, tiny_scene, alex):
     suite = Evaluation(lpips_network="alex", lpips_weights=alex).suite(HOST)
     held_out, model = tiny_scene.dynamic.test, learned[0].scene_model
     view = score(Renderer(model), held_out, 2, "white", suite)
@@ -120,7 +115,7 @@ def test_every_metric_of_a_learned_scene(
         ({"lpips_weights": "no.pth"}, "evaluation.lpips_weights: no file no.pth"),
     ],
 )
-def test_mistakes_are_named(wrong: dict[str, Any], message: str) -> None:
+def test_mistakes_are_named(wrong, message):
     with pytest.raises(DevrfError, match=message):
         Evaluation(**wrong).check()
 
@@ -130,7 +125,7 @@ SETTINGS = RenderSettings(step=0.1, alpha_threshold=1e-4, near=0.0, far=99.0)
 
 
 @pytest.fixture
-def block(cube: Box) -> DeVRFModel:
+def block(cube):
     """All below z = −0.05, halfway between two grid points, is solid.
 
     It moves by +0.2 along x until t = 0.5 and by +0.5 until t = 1.
@@ -149,7 +144,7 @@ def block(cube: Box) -> DeVRFModel:
     return DeVRFModel(build, canonical, Occupancy.full((GRID,) * 3, cube), SETTINGS, deformation)
 
 
-def filmed_from_above(flow: tuple[float, float]) -> Views:
+def filmed_from_above(flow):
     """Three frames of a camera 4 above the face that looks down; x is to the right, y up."""
     pose = torch.eye(3, 4)
     pose[2, 3] = 3.95
@@ -167,7 +162,7 @@ def filmed_from_above(flow: tuple[float, float]) -> Views:
     )
 
 
-def test_a_moving_block_by_hand(block: DeVRFModel) -> None:
+def test_a_moving_block_by_hand(block):
     # The face is 4 away, the lens has 40 px: 0.3 units along x are 3 px, and came from the left.
     views = filmed_from_above((-3.0, 1.0))
     seen = seen_flow(Renderer(block), views, 2, 1, torch.arange(64))
@@ -178,7 +173,7 @@ def test_a_moving_block_by_hand(block: DeVRFModel) -> None:
     assert flow_error(Renderer(block), views, 1) == pytest.approx(0, abs=0.015)
 
 
-def test_a_scene_without_motion_or_matter_shows_none(block: DeVRFModel) -> None:
+def test_a_scene_without_motion_or_matter_shows_none(block):
     views = filmed_from_above((-3.0, 4.0))
     block.deformation = None
     assert flow_error(Renderer(block), views, 2) == pytest.approx(5.0, abs=1e-3)
@@ -187,7 +182,7 @@ def test_a_scene_without_motion_or_matter_shows_none(block: DeVRFModel) -> None:
     assert flow_error(Renderer(block), views, 2) == pytest.approx(5.0)
 
 
-def test_flow_without_flow_or_an_earlier_frame_it_is_unknown(block: DeVRFModel) -> None:
+def test_flow_without_flow_or_an_earlier_frame_it_is_unknown(block):
     views, renderer = filmed_from_above((-3.0, 0.0)), Renderer(block)
     assert flow_error(renderer, views, 0) is None
     assert flow_error(renderer, replace(views, flow=None), 1) is None

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import logging
-from pathlib import Path
 from urllib.error import URLError
 
 import pytest
 import torch
-from torch import Tensor, nn
 from torchmetrics.functional.image import lpips as theirs
 
 from devrf.errors import DevrfError
-from devrf.metrics.lpips import TRUNKS, Lpips, Network, load_lpips, read_lpips
+from devrf.metrics.lpips import TRUNKS, Lpips, load_lpips, read_lpips
 
 
-def random_weights(network: Network, folder: Path) -> Path:
+def random_weights(network, folder):
     """A file with weights of a network, as torchvision names them, and a classifier's."""
     torch.manual_seed(3)
     state = TRUNKS[network].build().state_dict()
@@ -26,13 +24,13 @@ def random_weights(network: Network, folder: Path) -> Path:
 
 
 @pytest.fixture
-def pair(rng: torch.Generator) -> tuple[Tensor, Tensor]:
+def pair(rng):
     """Two images of 40×48 pixels."""
     return torch.rand(40, 48, 3, generator=rng), torch.rand(40, 48, 3, generator=rng)
 
 
 @pytest.fixture
-def empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def empty_cache(tmp_path, monkeypatch):
     """A torch cache without any weights: its folder of checkpoints."""
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path / "hub"))
     checkpoints = tmp_path / "hub" / "checkpoints"
@@ -41,12 +39,10 @@ def empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize("network", ["vgg", "alex"])
-def test_agrees_with_torchmetrics_on_the_same_layers(
-    network: Network, pair: tuple[Tensor, Tensor], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_agrees_with_torchmetrics_on_the_same_layers(network, pair, tmp_path, monkeypatch):
     ours = read_lpips(network, random_weights(network, tmp_path))
 
-    def features(net: str, pretrained: bool = False) -> nn.Sequential:
+    def features(net, pretrained=False):
         return ours.layers
 
     # Which layers are compared, the constants, the heads: all but the layers is theirs.
@@ -59,7 +55,7 @@ def test_agrees_with_torchmetrics_on_the_same_layers(
     assert ours(pair[0], pair[0]) == 0
 
 
-def test_only_what_lies_inside_the_mask_counts(pair: tuple[Tensor, Tensor], tmp_path: Path) -> None:
+def test_only_what_lies_inside_the_mask_counts(pair, tmp_path):
     lpips = read_lpips("alex", random_weights("alex", tmp_path))
     truth, other = pair
     mask = torch.zeros(40, 48, dtype=torch.bool)
@@ -71,7 +67,7 @@ def test_only_what_lies_inside_the_mask_counts(pair: tuple[Tensor, Tensor], tmp_
     assert lpips(other, truth, torch.zeros_like(mask)) is None
 
 
-def test_images_that_are_too_small_have_none(tmp_path: Path) -> None:
+def test_images_that_are_too_small_have_none(tmp_path):
     lpips = read_lpips("alex", random_weights("alex", tmp_path))
     side = TRUNKS["alex"].smallest
     enough, less = torch.rand(side, side, 3), torch.rand(side - 1, side + 9, 3)
@@ -80,9 +76,7 @@ def test_images_that_are_too_small_have_none(tmp_path: Path) -> None:
     assert lpips(less, less, torch.ones(less.shape[:2], dtype=torch.bool)) is None
 
 
-def test_without_weights_one_line_says_why(
-    empty_cache: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_without_weights_one_line_says_why(empty_cache, caplog):
     with caplog.at_level(logging.INFO):
         assert load_lpips() is None
     assert len(caplog.messages) == 1
@@ -92,12 +86,10 @@ def test_without_weights_one_line_says_why(
     assert isinstance(load_lpips("alex"), Lpips)
 
 
-def test_a_download_that_fails_is_told_in_one_line(
-    empty_cache: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_download_that_fails_is_told_in_one_line(empty_cache, caplog, monkeypatch):
     asked = []
 
-    def fails(url: str, *_: object) -> None:
+    def fails(url, *_):
         asked.append(url)
         raise URLError("no network")
 
@@ -108,7 +100,7 @@ def test_a_download_that_fails_is_told_in_one_line(
     assert len(caplog.messages) == 1 and "no network" in caplog.text
 
 
-def test_weights_that_are_given_must_fit(tmp_path: Path) -> None:
+def test_weights_that_are_given_must_fit(tmp_path):
     noise = tmp_path / "noise.pth"
     noise.write_bytes(b"not weights")
     for path in (noise, tmp_path / "no.pth", random_weights("alex", tmp_path)):

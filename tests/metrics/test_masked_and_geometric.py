@@ -12,7 +12,7 @@ from devrf.metrics.geometric import depth_error, end_point_error
 from devrf.metrics.image import psnr_masked, ssim, ssim_masked, ssim_within
 
 
-def test_masked_psnr_counts_the_masked_pixels_alone() -> None:
+def test_masked_psnr_counts_the_masked_pixels_alone():
     truth = torch.zeros(2, 2, 3)
     seen = torch.tensor([[0.1, 0.9], [0.3, 0.9]])[..., None].expand(2, 2, 3)
     mask = torch.tensor([[True, False], [True, False]])
@@ -21,7 +21,7 @@ def test_masked_psnr_counts_the_masked_pixels_alone() -> None:
     assert psnr_masked(seen, truth, torch.zeros(2, 2, dtype=torch.bool)) is None
 
 
-def test_masked_ssim_is_the_mean_over_windows_centred_in_the_mask(rng: torch.Generator) -> None:
+def test_masked_ssim_is_the_mean_over_windows_centred_in_the_mask(rng):
     a, b = torch.rand(2, 16, 14, 3, generator=rng)
     mask = torch.zeros(16, 14, dtype=torch.bool)
     mask[7, 8] = True
@@ -33,7 +33,7 @@ def test_masked_ssim_is_the_mean_over_windows_centred_in_the_mask(rng: torch.Gen
     assert ssim_masked(a, b, mask) is None
 
 
-def test_ssim_within_a_mask_knows_nothing_of_what_is_beyond(rng: torch.Generator) -> None:
+def test_ssim_within_a_mask_knows_nothing_of_what_is_beyond(rng):
     a, b = torch.rand(2, 20, 18, 3, generator=rng)
     mask = torch.zeros(20, 18, dtype=torch.bool)
     mask[3:16, 2:14] = True
@@ -45,7 +45,7 @@ def test_ssim_within_a_mask_knows_nothing_of_what_is_beyond(rng: torch.Generator
     assert ssim_within(a, b, mask) is None
 
 
-def test_depth_error_by_hand() -> None:
+def test_depth_error_by_hand():
     inf = math.inf
     truth = torch.tensor([[2.0, inf, 3.0], [4.0, 5.0, 6.0]])
     depth = torch.tensor([[2.5, 1.0, 2.0], [9.0, inf, 6.0]])
@@ -56,7 +56,7 @@ def test_depth_error_by_hand() -> None:
     assert depth_error(depth, opacity, torch.full((2, 3), inf)) is None
 
 
-def test_end_point_error_by_hand() -> None:
+def test_end_point_error_by_hand():
     truth = torch.tensor([[1.0, 1.0], [0.0, -2.0]])
     assert end_point_error(torch.zeros(2, 2), truth) == pytest.approx((2**0.5 + 2) / 2)
     assert end_point_error(truth[:0], truth[:0]) is None

@@ -7,7 +7,6 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from torch import Tensor
 
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
@@ -15,32 +14,27 @@ from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.deformation_field import GridWarp
 from devrf.methods.devrf.extensions.color_residual import ResidualGrid
-from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.volume_rendering import render
 from devrf.ops.dispatch import using
 from devrf.rendering import list_rendering as module
 from devrf.rendering.list_rendering import ListRenderer, render_static
 from devrf.rendering.occupancy import Occupancy
-from devrf.rendering.output import RenderedImage, VoxelOutput
 from devrf.rendering.renderer import Renderer
 from devrf.rendering.sample_capacity import SampleCapacity
 from devrf.rendering.sampling import RenderSettings, most_steps, steps_through
-from devrf.scenes.scene import Scene
 
 RAYS = 24
 SETTINGS = RenderSettings(step=0.5, alpha_threshold=0.02, near=0.2, far=9.0)
 WHITE = torch.ones(3)
-Same = Callable[[RenderedImage, RenderedImage], None]
-Picture = Callable[[DeVRFModel, Rays, float, torch.Tensor], RenderedImage]
 
 
 class World:
     """A random field in a box, partly occupied, that is seen through a warp."""
 
-    def __init__(self, dtype: torch.dtype, frames: int, planes: int | None = None) -> None:
+    def __init__(self, dtype, frames, planes=None):
         rng = torch.Generator().manual_seed(2)
 
-        def draw(*shape: int) -> Tensor:
+        def draw(*shape):
             return 2 * torch.rand(*shape, generator=rng, dtype=torch.float64) - 1
 
         box = Box((-1.0, -0.9, -0.8), (0.9, 1.0, 0.7))
@@ -66,11 +60,11 @@ class World:
         self.behind = draw(RAYS, 3).abs().to(dtype)
 
     @property
-    def leaves(self) -> list[Tensor]:
+    def leaves(self):
         residuals = [] if self.residual is None else [self.residual]
         return [*self.field.parameters(), *self.slices, *residuals]
 
-    def exactly(self) -> VoxelOutput:
+    def exactly(self):
         return render(
             self.rays,
             self.field,
@@ -81,7 +75,7 @@ class World:
             color_change=self.color_change,
         )
 
-    def listed(self, capacity: SampleCapacity) -> VoxelOutput:
+    def listed(self, capacity):
         return render_static(
             self.rays,
             self.field,
@@ -95,37 +89,37 @@ class World:
         )
 
 
-def ample() -> SampleCapacity:
+def ample():
     return SampleCapacity(RAYS, torch.device("cpu"))
 
 
-def fitting() -> SampleCapacity:
+def fitting():
     """Just enough: the interpreter takes its time over padding, too."""
     capacity = ample()
     capacity.visible = capacity.significant = 240
     return capacity
 
 
-def learn(output: VoxelOutput, leaves: list[Tensor]) -> list[Tensor]:
+def learn(output, leaves):
     """Gradients of :func:`worth`."""
     return list(torch.autograd.grad(worth(output), leaves))
 
 
-def worth(output: VoxelOutput) -> Tensor:
+def worth(output):
     """Something that every part of the output has a share in."""
     tilt = torch.linspace(-1, 1, RAYS, dtype=output.color.dtype)
     by_sample = output.weight * (output.sample_color.sum(1) + output.canonical.sum(1).square())
     return (output.color.sum(1) * tilt + output.transmittance * tilt).sum() + by_sample.sum()
 
 
-def kept(output: VoxelOutput) -> slice | Tensor:
+def kept(output):
     present = output.samples.present
     return slice(None) if present is None else present.nonzero()[:, 0]
 
 
 # How many slices the warp has: at rest, at a frame, between two.
 @pytest.mark.parametrize(("frames", "planes"), [(0, None), (1, 9), (2, None)])
-def test_lists_of_fixed_length_see_and_learn_the_same(frames: int, planes: int | None) -> None:
+def test_lists_of_fixed_length_see_and_learn_the_same(frames, planes):
     world = World(torch.float64, frames, planes)
     with using("torch"):
         exact, listed = world.exactly(), world.listed(ample())
@@ -143,7 +137,7 @@ def test_lists_of_fixed_length_see_and_learn_the_same(frames: int, planes: int |
         torch.testing.assert_close(ours, theirs, **close)
 
 
-def test_the_kernels_see_and_learn_the_same_and_add_to_gradients_in_place() -> None:
+def test_the_kernels_see_and_learn_the_same_and_add_to_gradients_in_place():
     pytest.importorskip("triton")
     world = World(torch.float32, 2)
     with using("torch"):
@@ -162,7 +156,7 @@ def test_the_kernels_see_and_learn_the_same_and_add_to_gradients_in_place() -> N
         torch.testing.assert_close(there, 1 + change, atol=1e-5, rtol=1e-4)
 
 
-def test_padding_is_no_sample_and_the_capacity_is_told() -> None:
+def test_padding_is_no_sample_and_the_capacity_is_told():
     world, capacity = World(torch.float64, 1), ample()
     with using("torch"):
         exact, listed = world.exactly(), world.listed(capacity)
@@ -180,9 +174,7 @@ def test_padding_is_no_sample_and_the_capacity_is_told() -> None:
     assert spare <= capacity.significant < spare + SampleCapacity.GRAIN
 
 
-def test_lists_that_are_too_short_lose_the_last_rays_alone_and_grow(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_lists_that_are_too_short_lose_the_last_rays_alone_and_grow(caplog):
     world, capacity = World(torch.float64, 1), ample()
     with using("torch"), caplog.at_level("INFO", logger="devrf"):
         exact = world.exactly()
@@ -202,14 +194,14 @@ def test_lists_that_are_too_short_lose_the_last_rays_alone_and_grow(
     assert sum("lists grow" in line for line in caplog.messages) == 1
 
 
-def test_no_ray_has_more_samples_than_is_said() -> None:
+def test_no_ray_has_more_samples_than_is_said():
     field: CanonicalField = World(torch.float64, 0).field
     rng = torch.Generator().manual_seed(0)
     directions = torch.nn.functional.normalize(torch.randn(500, 3, generator=rng), dim=1)
     low, high = field.box.corners(directions)
     rays = Rays(-3 * directions + (low + high) / 2, directions, directions)
 
-    def longest(step: float) -> int:
+    def longest(step):
         return most_steps(field.box, step=step, near=0.0, far=9.0)
 
     for step in (0.3, 0.01):
@@ -221,12 +213,12 @@ def test_no_ray_has_more_samples_than_is_said() -> None:
 
 
 @pytest.fixture
-def searches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+def searches(monkeypatch):
     """The capacity of each search for samples."""
     capacities: list[int] = []
     inner: Callable[..., object] = module.search
 
-    def counted(*arguments: object, capacity: int, **named: object) -> object:
+    def counted(*arguments, capacity, **named):
         capacities.append(capacity)
         return inner(*arguments, capacity=capacity, **named)
 
@@ -235,9 +227,7 @@ def searches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 @pytest.mark.parametrize("time", [0.0, 0.7])
-def test_what_the_renderer_shows(
-    moving: DeVRFModel, tiny_scene: Scene, time: float, same: Same, reference: Picture
-) -> None:
+def test_what_the_renderer_shows(moving, tiny_scene, time, same, reference):
     rays, view = tiny_scene.dynamic.test.cameras.image_rays(0), moving.at(time)
     renderer = ListRenderer(moving.canonical, moving.settings, half=True)  # not on a CPU
     colors = moving.color_change(time)
@@ -246,9 +236,7 @@ def test_what_the_renderer_shows(
     assert int((seen.opacity > 0.5).sum()) > 20
 
 
-def test_lists_grow_once_and_stay(
-    moving: DeVRFModel, tiny_scene: Scene, searches: list[int], same: Same
-) -> None:
+def test_lists_grow_once_and_stay(moving, tiny_scene, searches, same):
     rays = tiny_scene.dynamic.test.cameras.image_rays(0)
     renderer = ListRenderer(moving.canonical, moving.settings)
     first = renderer.picture(rays, moving.occupancy, None, WHITE)
@@ -257,7 +245,7 @@ def test_lists_grow_once_and_stay(
     assert searches[2:] == searches[1:2]
 
 
-def test_rays_that_meet_nothing(moving: DeVRFModel) -> None:
+def test_rays_that_meet_nothing(moving):
     up = torch.tensor([[0.0, 0.0, 1.0]]).expand(3, 3)
     rays = Rays(torch.tensor([[50.0, 0.0, 0.0]]).expand(3, 3), up, up)
     renderer = ListRenderer(moving.canonical, moving.settings)
@@ -268,9 +256,7 @@ def test_rays_that_meet_nothing(moving: DeVRFModel) -> None:
 
 
 @pytest.mark.skipif(os.environ["TRITON_INTERPRET"] != "1", reason="needs Triton's interpreter")
-def test_the_renderer_shows_the_same_with_triton(
-    moving: DeVRFModel, tiny_scene: Scene, searches: list[int], same: Same
-) -> None:
+def test_the_renderer_shows_the_same_with_triton(moving, tiny_scene, searches, same):
     pytest.importorskip("triton")
     renderer, cameras = Renderer(moving), tiny_scene.dynamic.test.cameras.resized(5, 4)
     with using("torch"):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 import torch
 
@@ -11,13 +9,13 @@ from devrf.geometry.box import Box
 from devrf.rendering.occupancy import Occupancy, bounding_box, dilate
 
 
-def single(shape: tuple[int, int, int], at: tuple[int, int, int]) -> torch.Tensor:
+def single(shape, at):
     mask = torch.zeros(shape, dtype=torch.bool)
     mask[at] = True
     return mask
 
 
-def test_a_point_is_looked_up_at_its_nearest_grid_point() -> None:
+def test_a_point_is_looked_up_at_its_nearest_grid_point():
     box = Box((0.0, 0.0, 0.0), (4.0, 3.0, 2.0))
     occupancy = Occupancy(single((5, 4, 3), (1, 2, 0)), box)
     points = torch.tensor(
@@ -26,7 +24,7 @@ def test_a_point_is_looked_up_at_its_nearest_grid_point() -> None:
     assert occupancy.at(points).tolist() == [True, True, False, False, False]
 
 
-def test_dilate_grows_a_cube_and_stops_at_the_border() -> None:
+def test_dilate_grows_a_cube_and_stops_at_the_border():
     grown = dilate(single((7, 6, 5), (3, 1, 4)), 2)
     expected = torch.zeros(7, 6, 5, dtype=torch.bool)
     expected[1:6, 0:4, 2:5] = True
@@ -34,7 +32,7 @@ def test_dilate_grows_a_cube_and_stops_at_the_border() -> None:
     assert torch.equal(dilate(expected, 0), expected)
 
 
-def test_nothing_within_reach_of_a_point_means_no_occupied_cell_is(rng: torch.Generator) -> None:
+def test_nothing_within_reach_of_a_point_means_no_occupied_cell_is(rng):
     # What strides along a ray rely on; a grid with cells of unequal sides, points outside too.
     box = Box((0.0, 0.0, 0.0), (1.0, 2.0, 4.0))
     occupancy = Occupancy(torch.rand(9, 9, 9, generator=rng) < 0.02, box)
@@ -59,16 +57,14 @@ def test_nothing_within_reach_of_a_point_means_no_occupied_cell_is(rng: torch.Ge
         ([], None),
     ],
 )
-def test_bounding_box_by_hand(cube: Box, cells: list[tuple[int, int, int]], expected: Any) -> None:
+def test_bounding_box_by_hand(cube, cells, expected):
     mask = torch.zeros(5, 5, 9, dtype=torch.bool)
     for cell in cells:
         mask[cell] = True
     assert bounding_box(mask, cube) == (expected and Box(*expected))
 
 
-def test_a_stored_mask_of_other_shape_and_box_loads_with_its_vicinity(
-    cube: Box, rng: torch.Generator
-) -> None:
+def test_a_stored_mask_of_other_shape_and_box_loads_with_its_vicinity(cube, rng):
     box = Box((-2.0, 0.0, 0.0), (2.0, 1.0, 3.0))
     stored = Occupancy(torch.rand(6, 4, 5, generator=rng) < 0.1, box)
     fresh = Occupancy.full((2, 2, 2), cube)

@@ -2,35 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import pytest
 import torch
-from torch import Tensor
 
-from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.geometry.box import Box
 from devrf.geometry.contraction import ContractedSpace
 from devrf.geometry.rays import Rays
-from devrf.geometry.space import WORLD, Space
+from devrf.geometry.space import WORLD
 from devrf.methods.devrf import view as module
-from devrf.methods.devrf.model import DeVRFModel
 from devrf.rendering.output import RenderedImage
 from devrf.rendering.renderer import MIN_CHUNK, Renderer, in_chunks
-from devrf.scenes.scene import Scene
 
 WHITE = torch.ones(3)
 RED, BLUE = torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 0, 1])
 NEAR, FAR = 0.5, 10.0
-Same = Callable[[RenderedImage, RenderedImage], None]
-Picture = Callable[[DeVRFModel, Rays, float, torch.Tensor], RenderedImage]
 
 
 @pytest.mark.parametrize("time", [0.0, 0.4, 0.55, 1.0])
-def test_it_renders_what_the_model_renders(
-    moving: DeVRFModel, tiny_scene: Scene, time: float, same: Same, reference: Picture
-) -> None:
+def test_it_renders_what_the_model_renders(moving, tiny_scene, time, same, reference):
     cameras = tiny_scene.dynamic.test.cameras
     seen = Renderer(moving).view(cameras, 1, time, 1.0)
     same(seen, reference(moving, cameras.image_rays(1), time, WHITE))
@@ -38,9 +27,7 @@ def test_it_renders_what_the_model_renders(
     assert not seen.color.requires_grad
 
 
-def test_the_views_of_the_last_times_are_cached(
-    moving: DeVRFModel, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_views_of_the_last_times_are_cached(moving, monkeypatch):
     looks: list[float] = []
     usual = module.deformed_occupancy
     monkeypatch.setattr(module, "deformed_occupancy", lambda *a: looks.append(1) or usual(*a))
@@ -54,7 +41,7 @@ def test_the_views_of_the_last_times_are_cached(
     assert len(looks) == 4
 
 
-def test_any_size_and_any_background(moving: DeVRFModel, tiny_scene: Scene) -> None:
+def test_any_size_and_any_background(moving, tiny_scene):
     cameras = tiny_scene.dynamic.test.cameras.resized(60, 45)
     seen = Renderer(moving).view(cameras, 0, 1.0, torch.tensor([0.0, 1.0, 0.0]))
     assert seen.color.shape == (60 * 45, 3) and seen.depth.shape == (60 * 45,)
@@ -64,12 +51,12 @@ def test_any_size_and_any_background(moving: DeVRFModel, tiny_scene: Scene) -> N
 
 
 @pytest.fixture
-def rays(rng: torch.Generator) -> Rays:
+def rays(rng):
     origins = torch.rand(1000, 3, generator=rng)
     return Rays(origins, origins, origins)
 
 
-def test_rays_come_in_order(rays: Rays) -> None:
+def test_rays_come_in_order(rays):
     assert [len(part) for part in in_chunks(lambda some: some, rays, 300)] == [300, 300, 300, 100]
     assert [len(part) for part in in_chunks(lambda some: some, rays[:0], 300)] == [0]
 
@@ -81,12 +68,10 @@ def test_rays_come_in_order(rays: Rays) -> None:
         (RuntimeError("ours"), [512]),
     ],
 )
-def test_errors_that_smaller_chunks_do_not_prevent(
-    rays: Rays, error: Exception, sizes: list[int]
-) -> None:
+def test_errors_that_smaller_chunks_do_not_prevent(rays, error, sizes):
     tried: list[int] = []
 
-    def render(some: Rays) -> None:
+    def render(some):
         tried.append(len(some))
         raise error
 
@@ -95,19 +80,13 @@ def test_errors_that_smaller_chunks_do_not_prevent(
     assert tried == sizes
 
 
-def test_an_image_is_the_same_with_less_memory(
-    rest: LoadedCheckpoint,
-    tiny_scene: Scene,
-    same: Same,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_an_image_is_the_same_with_less_memory(rest, tiny_scene, same, monkeypatch, caplog):
     rays = tiny_scene.static.test.cameras.image_rays(0)
     rays = rays[torch.arange(len(rays)).repeat(2)]
     whole = Renderer(rest.model).picture(rays, 0.0, 1.0)
     usual, tried = module.render, []
 
-    def render(some: Rays, *others: Any, **named: Any) -> Any:
+    def render(some, *others, **named):
         tried.append(len(some))
         if len(some) > 450:
             raise torch.OutOfMemoryError("CUDA out of memory.")
@@ -127,13 +106,13 @@ class Walls:
     device = torch.device("cpu")
     chunk, at_rest = 2, False
 
-    def __init__(self, space: Space = WORLD) -> None:
+    def __init__(self, space=WORLD):
         self.space = space
 
-    def at(self, time: float, *, half: bool = False) -> Walls:
+    def at(self, time, *, half=False):
         return self
 
-    def render(self, rays: Rays, background: Tensor) -> RenderedImage:
+    def render(self, rays, background):
         color, depth = background.repeat(len(rays), 1), torch.zeros(len(rays))
         for wall, paint in ((-0.5, BLUE), (0.5, RED)):
             distance = (rays.origins[:, 0] - wall) / -rays.directions[:, 0]
@@ -142,7 +121,7 @@ class Walls:
         return RenderedImage(color, depth, (depth > 0).float())
 
 
-def along(x: float) -> Rays:
+def along(x):
     """Rays from (x, 0, 0) and (x, 5, 0), which passes the box by, along −x."""
     ahead = torch.tensor([[-1.0, 0, 0]]).repeat(2, 1)
     return Rays(torch.tensor([[x, 0.0, 0.0], [x, 5.0, 0.0]]), ahead, ahead)
@@ -158,9 +137,7 @@ def along(x: float) -> Rays:
         (-0.3, 0.3, torch.ones(3), 0.0),  # between them; the blue one is behind the box
     ],
 )
-def test_what_is_outside_a_crop_is_left_out(
-    space: Space, low: float, high: float, color: Tensor, depth: float
-) -> None:
+def test_what_is_outside_a_crop_is_left_out(space, low, high, color, depth):
     crop = Box((low, -1.0, -1.0), (high, 1.0, 1.0))
     seen = Renderer(Walls(space)).picture(along(3.0), 0.0, 1.0, crop)
     torch.testing.assert_close(seen.color[0], color)
@@ -169,7 +146,7 @@ def test_what_is_outside_a_crop_is_left_out(
     assert seen.color[1].tolist() == [1, 1, 1] and float(seen.opacity[1]) == 0
 
 
-def test_a_distant_camera_is_cropped_to_the_box() -> None:
+def test_a_distant_camera_is_cropped_to_the_box():
     renderer, rays = Renderer(Walls()), along(30.0)
     assert float(renderer.picture(rays, 0.0, 1.0).opacity[0]) == 0  # beyond the far limit
     box = renderer.reach(rays.origins[0])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 import torch
-from torch import Tensor
 
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
@@ -15,7 +14,7 @@ from devrf.rendering.sampling import hits, march
 BOX = Box((-1.0, -0.5, 0.0), (1.0, 1.5, 1.0))
 
 
-def scattered_rays(count: int, rng: torch.Generator) -> Rays:
+def scattered_rays(count, rng):
     """Float64 rays from all around, some from inside, towards the box or past it."""
     origins = 2.5 * torch.randn(count, 3, generator=rng, dtype=torch.float64)
     targets = 1.3 * torch.randn(count, 3, generator=rng, dtype=torch.float64)
@@ -23,9 +22,7 @@ def scattered_rays(count: int, rng: torch.Generator) -> Rays:
     return Rays(origins, d, d)
 
 
-def slowly(
-    rays: Rays, occupancy: Occupancy, step: float, near: float, far: float
-) -> tuple[Tensor, Tensor]:
+def slowly(rays, occupancy, step, near, far):
     """Ray and distance of every sample entry + k·step that is in an occupied cell."""
     entry, leave = BOX.crossing(rays)
     entry, leave = entry.clamp(min=near), leave.clamp(max=far)
@@ -39,9 +36,7 @@ def slowly(
 
 
 @pytest.mark.parametrize(("share", "step"), [(0.0, 0.11), (0.02, 0.02), (0.3, 0.5), (1.0, 0.11)])
-def test_finds_exactly_the_samples_in_occupied_cells(
-    share: float, step: float, rng: torch.Generator
-) -> None:
+def test_finds_exactly_the_samples_in_occupied_cells(share, step, rng):
     rays = scattered_rays(300, rng)
     occupancy = Occupancy(torch.rand(9, 12, 5, generator=rng) < share, BOX)
     samples = march(rays, BOX, occupancy, step=step, near=0.3, far=6.0)
@@ -52,7 +47,7 @@ def test_finds_exactly_the_samples_in_occupied_cells(
     assert samples.rays == len(rays)
 
 
-def test_sample_places_by_hand(cube: Box) -> None:
+def test_sample_places_by_hand(cube):
     d = torch.tensor([[1.0, 0.0, 0.0]])
     rays = Rays(torch.tensor([[-3.0, 0.0, 0.0]]), d, d)
     samples = march(rays, cube, Occupancy.full((5, 5, 5), cube), step=0.5, near=0.0, far=9.0)
@@ -62,7 +57,7 @@ def test_sample_places_by_hand(cube: Box) -> None:
     assert near.distance.tolist() == [2.25, 2.75]
 
 
-def test_a_ray_that_march_samples_is_never_left_out(rng: torch.Generator) -> None:
+def test_a_ray_that_march_samples_is_never_left_out(rng):
     rays = scattered_rays(3000, rng)
     for share in (0.01, 0.1):
         occupancy = Occupancy(torch.rand(6, 7, 4, generator=rng) < share, BOX)
@@ -72,7 +67,7 @@ def test_a_ray_that_march_samples_is_never_left_out(rng: torch.Generator) -> Non
         assert not hit.all()
 
 
-def test_no_rays_and_missing_rays_give_no_samples(cube: Box) -> None:
+def test_no_rays_and_missing_rays_give_no_samples(cube):
     full = Occupancy.full((3, 3, 3), cube)
     none = Rays(*[torch.zeros(0, 3)] * 3)
     assert len(march(none, cube, full, step=0.1, near=0.0, far=9.0)) == 0
@@ -83,11 +78,11 @@ def test_no_rays_and_missing_rays_give_no_samples(cube: Box) -> None:
     assert hits(past, cube, full, near=0.0, far=9.0).tolist() == [False, False]
 
 
-def test_lists_grow_by_half_at_least_and_shrink_only_from_great_waste() -> None:
+def test_lists_grow_by_half_at_least_and_shrink_only_from_great_waste():
     capacity = SampleCapacity(64, torch.device("cpu"))
     capacity.visible, capacity.significant = 4096, 1024
 
-    def needing(visible: int, significant: int) -> tuple[int, int]:
+    def needing(visible, significant):
         capacity.note(torch.tensor(visible), torch.tensor(significant))
         capacity.poll(), capacity.poll()
         return capacity.visible, capacity.significant

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import socket
 from collections.abc import Sequence
 from contextlib import closing
@@ -12,6 +13,14 @@ from typing import Literal
 
 from devrf.errors import DevrfError
 
+
+def check_range(key: str, value: float | None, least: float, most: float = math.inf) -> None:
+    """Refuse a setting that is out of range, or not finite; None is in every range."""
+    if value is not None and not (least <= value <= most and math.isfinite(value)):
+        expected = f"at least {least:g}" if most == math.inf else f"{least:g} to {most:g}"
+        raise DevrfError(f"{key}: expected {expected}, not {value}")
+
+
 # capture.alpha_masks=subtract
 SUBTRACT = "subtract"
 
@@ -20,33 +29,7 @@ CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "O
 
 @dataclass(frozen=True)
 class CaptureSettings:
-    """Settings of ``stage=capture``.
-
-    Attributes:
-        static: a video, or a folder of photographs, of the scene at rest; None with one view: that
-            is a video by one moving camera, and is all there is.
-        views: videos by cameras that stand still while the scene moves; none: it is at rest.
-        into: the scene's folder.
-        frames: so many frames are picked from a moving camera's video, the sharpest of each
-            stretch; of a folder of photographs all are taken.
-        max_timesteps: at most so many times are taken from the fixed cameras' videos, evenly
-            spread.
-        size: images are written with at most so many pixels of the longer side.
-        camera: COLMAP's model of the lenses.
-        intrinsics: whether each video has a lens of its own (``separate``), or all have one.
-        matching: which frames are compared: all (``exhaustive``), or those of the static video
-            that follow one another, and the fixed views with all (``sequential``).
-        offsets: seconds between the first video's beginning and each one's, in the order of
-            ``views``, positive where it began later; None: found from the motion.
-        facing: from where the cameras look: from one side (``forward``), or from around
-            (``inward``); ``auto``: as their axes say.
-        test_view: which of the fixed views is held out, counted from 1; −1 is the last.
-        holdout: one frame of so many of a moving camera is held out; of a single fixed view, one
-            time.
-        alpha_masks: a folder of masks of all footage (:mod:`devrf.apps.capture.images`);
-            ``subtract``: none, but what moves before the fixed cameras says where the box is;
-            None: neither.
-    """
+    """Settings of ``stage=capture``; ``conf/capture/default.yaml`` says what each does."""
 
     static: str | Path | None = None
     views: Sequence[str | Path] = ()
@@ -87,12 +70,8 @@ class CaptureSettings:
                 "capture.static: needs a video, or a folder of photographs, of the scene at rest; "
                 "give capture.static=PATH (a moving camera's video alone is capture.views=[PATH])"
             )
-        least = {"frames": 3, "max_timesteps": 2, "size": 64, "holdout": 2}
-        for key, value in least.items():
-            if getattr(self, key) < value:
-                raise DevrfError(
-                    f"capture.{key}: expected at least {value}, not {getattr(self, key)}"
-                )
+        for key, least in (("frames", 3), ("max_timesteps", 2), ("size", 64), ("holdout", 2)):
+            check_range(f"capture.{key}", getattr(self, key), least)
         views = len(self.views)
         if self.offsets is not None and len(self.offsets) != views:
             raise DevrfError(
@@ -116,13 +95,7 @@ PublishedScenes = Literal["matching", "all", "none"]
 
 @dataclass(frozen=True)
 class ReportSettings:
-    """Settings of ``stage=report``.
-
-    Attributes:
-        runs: the folder below which finished runs are collected.
-        into: the folder that the report is written to; None: ``report`` in ``runs``.
-        published: which of the paper's rows to show: of the scenes that were run, all, or none.
-    """
+    """Settings of ``stage=report``; ``conf/report/default.yaml`` says what each does."""
 
     runs: str | Path = "outputs"
     into: str | Path | None = None
@@ -138,14 +111,7 @@ class ReportSettings:
 class ViewerSettings:
     """The page of ``stage=view``, and of ``viewer=true`` beside training.
 
-    Attributes:
-        host: the address to listen on; 127.0.0.1 can be reached from this machine alone.
-        port: of the page.
-        height: rows of a full picture, in pixels.
-        move_seconds: what a picture may take while the camera moves or time runs: it is rendered
-            as large as that allows.
-        training: whether a run shows its scene while it learns.
-        share: the most of a run's time that its pictures may take.
+    ``conf/viewer/default.yaml`` says what each setting does.
     """
 
     host: str = "127.0.0.1"
@@ -156,11 +122,10 @@ class ViewerSettings:
     share: float = 0.03
 
     def __post_init__(self) -> None:
-        ranges = {"port": (1, 65535), "height": (16, 4096), "move_seconds": (0.01, 10)}
-        for key, (least, most) in {**ranges, "share": (1e-6, 1)}.items():
-            if not least <= getattr(self, key) <= most:
-                given = f"{least} to {most}, not {getattr(self, key)}"
-                raise DevrfError(f"viewer.{key}: expected {given}")
+        check_range("viewer.port", self.port, 1, 65535)
+        check_range("viewer.height", self.height, 16, 4096)
+        check_range("viewer.move_seconds", self.move_seconds, 1e-3, 10)
+        check_range("viewer.share", self.share, 1e-6, 1)
 
     @property
     def address(self) -> str:

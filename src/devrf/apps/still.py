@@ -21,6 +21,7 @@ from devrf.apps.images import (
     side_by_side,
     write_image,
 )
+from devrf.apps.settings import check_range
 from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import HeldOutView, background_value, compare, truth_image
@@ -40,15 +41,7 @@ HEADINGS = ("truth", "rendered", "error: 0 to 0.25 or more", "depth: near is bri
 
 @dataclass(frozen=True)
 class StillSettings:
-    """The image that ``stage=still`` renders.
-
-    Attributes:
-        view: ``held_out`` for the first held-out camera of the moving scene, or the number of an
-            image of the static training set for that image's camera.
-        time: in [0, 1]; 0 is the rest state.
-        height: pixels; None for the captured images' height, but at least 400.
-        half: whether the colour network works in half precision, on a CUDA device only.
-    """
+    """Settings of ``stage=still``; ``conf/still/default.yaml`` says what each does."""
 
     view: Literal["held_out"] | int = "held_out"
     time: float = 0.5
@@ -56,10 +49,8 @@ class StillSettings:
     half: bool = False
 
     def __post_init__(self) -> None:
-        if not 0 <= self.time <= 1:
-            raise DevrfError(f"still.time: expected 0 to 1, not {self.time}")
-        if self.height is not None and self.height < 1:
-            raise DevrfError(f"still.height: expected at least 1, not {self.height}")
+        check_range("still.time", self.time, 0, 1)
+        check_range("still.height", self.height, 1)
 
     @property
     def name(self) -> str:
@@ -110,10 +101,8 @@ def still(
 class Preview(NamedTuple):
     """A held-out view as rendered so far.
 
-    Attributes:
-        images: (H, W', 3) in [0, 1] by name: ``view`` is the rendered image beside the truth and
-            the error, ``depth`` its depth.
-        psnr: dB, of the whole image, pixels that are not valid taken as right.
+    ``images`` (H, W', 3) are in [0, 1]: ``view`` is beside the truth and the error, ``depth`` its
+    depth. ``psnr`` in dB takes pixels that are not valid as right.
     """
 
     images: dict[str, Tensor]

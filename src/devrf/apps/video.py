@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from devrf.apps.images import image_grid, scaled
+from devrf.apps.settings import check_range
 from devrf.apps.still import sized, still
-from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value, truth_image
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
@@ -29,23 +29,7 @@ MIN_FRAMES = 8
 
 @dataclass(frozen=True)
 class VideoSettings:
-    """The videos that ``stage=render`` writes.
-
-    Attributes:
-        frames: images of each video, evenly spread over [0, 1]: times between the captured
-            frames are rendered like any other.
-        fps: images a second.
-        orbit_turns: how often the orbit goes round while time runs once.
-        orbit_elevation: degrees above the horizon.
-        height: of the rendered images in pixels; None for the captured images' height, but at
-            least 400.
-        max_seconds: what rendering a video may take; where it would take longer, fewer frames
-            are rendered, over the same duration. None: no limit.
-        half: whether the colour network works in half precision, on a CUDA device only.
-        path: a file of keyframes (:mod:`~devrf.apps.keyframes`), ``bullet_time`` or
-            ``time_freeze``: the one video to render; None: the held-out view and the orbit.
-        time: in [0, 1], when the last two of them stop.
-    """
+    """Settings of ``stage=render``; ``conf/video/default.yaml`` says what each does."""
 
     frames: int = 60
     fps: float = 20
@@ -58,12 +42,9 @@ class VideoSettings:
     time: float = 0.5
 
     def __post_init__(self) -> None:
-        if not 0 <= self.time <= 1:
-            raise DevrfError(f"video.time: expected 0 to 1, not {self.time}")
-        if self.height is not None and self.height < MIN_HEIGHT:
-            raise DevrfError(f"video.height: expected at least {MIN_HEIGHT}, not {self.height}")
-        if self.max_seconds is not None and not self.max_seconds > 0:
-            raise DevrfError(f"video.max_seconds: expected more than 0, not {self.max_seconds}")
+        check_range("video.time", self.time, 0, 1)
+        check_range("video.height", self.height, MIN_HEIGHT)
+        check_range("video.max_seconds", self.max_seconds, 1e-6)
 
     def sized(self, cameras: Cameras) -> Cameras:
         """Captured cameras with images of the video's size."""

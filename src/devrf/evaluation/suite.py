@@ -86,14 +86,7 @@ MEASURES: dict[str, Callable[[MetricInput], float | None]] = {
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The choice of metrics (config group ``evaluation``).
-
-    Attributes:
-        metrics: names of :data:`MEASURES`; fewer are quicker.
-        lpips_network: the network behind LPIPS.
-        lpips_weights: a file with that network's weights; None looks in torch's cache.
-        download: whether weights that are not there may be downloaded.
-    """
+    """The choice of metrics, names of :data:`MEASURES`; see ``conf/evaluation/default.yaml``."""
 
     metrics: Sequence[str] = tuple(MEASURES)
     lpips_network: Network = "vgg"

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import pytest
 import torch
-from torch import Tensor
 
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
@@ -18,7 +16,6 @@ from devrf.methods.devrf.model import DeVRFModel
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.sampling import RenderSettings
 
-Distance = Callable[[Tensor], Tensor]
 RADIUS = 0.5
 # s = log(eᵗ − 1) of the opacity 0.1 of a voxel: what the surface has by default.
 LEVEL = math.log(math.expm1(-math.log(0.9)))

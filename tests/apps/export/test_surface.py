@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import pytest
 import torch
 import trimesh
@@ -15,9 +13,6 @@ from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.contraction import ContractedSpace
 from devrf.geometry.ndc import NormalizedDevice
-from devrf.methods.devrf.model import DeVRFModel
-
-Build = Callable[..., DeVRFModel]
 
 
 def surface_of(model, cameras, **settings):

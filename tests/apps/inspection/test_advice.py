@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -11,9 +10,7 @@ import torch
 
 from devrf.apps.inspection.advice import advice_on
 from devrf.scenes.bounds import box_from_cameras
-from devrf.scenes.scene import OpticalFlow, Scene
-
-Spoil = Callable[[Scene], Scene]
+from devrf.scenes.scene import OpticalFlow
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +87,7 @@ def one_colour(scene):
 
 
 SETS = REST, REST_TEST, MOVING, _ = "static.train", "static.test", "dynamic.train", "dynamic.test"
-PROBLEMS: list[tuple[Spoil, str, str]] = [
+PROBLEMS = [
     (changed(REST_TEST, where(lambda v: v.times < 0)), "static test", "no view"),
     (changed(REST, turned(180)), "static train 003", "looks away"),
     (changed(REST, turned(75)), "static train 003", "in the picture"),

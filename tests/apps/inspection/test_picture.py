@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import imageio.v3 as iio
-import pytest
 import torch
 
 from devrf.apps.inspection.picture import (
@@ -15,30 +15,7 @@ from devrf.apps.inspection.picture import (
     shown,
     write_inspection_picture,
 )
-from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
-from devrf.geometry.ndc import NormalizedDevice
-from devrf.scenes.scene import Capture
-
-
-@pytest.fixture(scope="module")
-def forward_scene(tiny_scene):
-    """The tiny scene as if it lived in NDC, its cameras side by side."""
-
-    def facing(views):
-        pose = torch.eye(3, 4).repeat(len(views), 1, 1)
-        pose[:, 0, 3] = 0.1 * torch.arange(len(views))
-        return replace(views, cameras=replace(views.cameras, camera_to_world=pose))
-
-    box = Box((-1.2, -1.1, -1.0), (1.2, 1.1, 1.0))
-    return replace(
-        tiny_scene,
-        kind="forward",
-        space=NormalizedDevice(24, 18, (24.0, 24.0)),
-        bounds=replace(tiny_scene.bounds, box=box, motion=None),
-        static=Capture(*map(facing, (tiny_scene.static.train, tiny_scene.static.test))),
-        dynamic=Capture(*map(facing, (tiny_scene.dynamic.train, tiny_scene.dynamic.test))),
-    )
 
 
 def captions(figure):
@@ -81,7 +58,10 @@ def test_a_camera_is_a_pyramid_that_opens_where_it_looks():
     torch.testing.assert_close(lines[8, 1], torch.tensor([0.0, 1.4, -2.0]))
 
 
-def test_forward_facing_cameras_look_north(forward_scene):
+def test_forward_facing_cameras_look_north():
+    cameras = Cameras(torch.eye(3, 4).repeat(3, 1, 1), torch.ones(3, 2), torch.ones(3, 2), 2, 2)
+    views = SimpleNamespace(train=SimpleNamespace(cameras=cameras))
+    forward_scene = SimpleNamespace(kind="forward", static=views)
     east_north_up = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     torch.testing.assert_close(compass(forward_scene), east_north_up, atol=1e-5, rtol=0)
 

@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-from devrf.apps.report.plots import (
-    against_views,
-    plots,
-    psnr_against_seconds,
-    psnr_over_time,
-)
+from devrf.apps.report.plots import against_views, plots, psnr_against_seconds, psnr_over_time
 
 
 def curves(axes):

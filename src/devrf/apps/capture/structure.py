@@ -63,15 +63,8 @@ def reconstruct(
 ) -> Path:
     """Run structure from motion, and write the data base and the models to ``work``.
 
-    Args:
-        images: the folder of images.
-        work: what is there of an earlier run is replaced.
-        moving: the moving camera's images.
-        fixed: one image of each fixed view, all of the scene at rest.
-        settings: the lens model, whether lenses are shared, and what is compared.
-
-    Returns:
-        The folder of the largest model.
+    The moving camera's images and one of each ``fixed`` view, all of the scene at rest, are in the
+    folder ``images``. Returns the folder of the largest model.
 
     Raises:
         DevrfError: nothing could be matched.

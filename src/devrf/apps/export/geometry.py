@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -12,6 +11,7 @@ from typing import Literal, cast
 import torch
 from torch import Tensor
 
+from devrf.apps.settings import check_range
 from devrf.errors import DevrfError
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
@@ -24,29 +24,7 @@ Up = Literal["auto", "x", "y", "z", "-x", "-y", "-z"]
 
 @dataclass(frozen=True)
 class ExportSettings:
-    """The geometry that ``stage=export`` writes.
-
-    Attributes:
-        format: ``gltf`` (one .glb file that plays), ``usd`` (one file with time samples), ``ply``
-            or ``obj`` (a file a time).
-        content: ``surface``, one mesh that moves; ``points``, coloured points of each time;
-            ``auto`` takes the surface of a method that has one and knows where its points go.
-        threshold: opacity of one voxel, in (0, 1): the surface is where the field reaches it.
-        side: points of the sampled grid along the longest edge; None: those of the field.
-        faces: triangles to keep at most.
-        pieces: connected pieces with a smaller share of the largest one's faces are left out.
-        reach: how many times as far from the cameras as half of the surface a vertex may be.
-        colors: of a vertex: seen along its normal (``normal``), or the mean over directions from
-            which it can be seen (``mean``).
-        points: number of points at each time, at most.
-        times: times in [0, 1], ascending; None: the training frames', or as ``fps`` says.
-        fps: evenly spread times, so many a second; None: ``times``.
-        seconds: how long time 0 to 1 takes.
-        up: the axis of the capture's world that points up; ``auto``: the one nearest to the
-            cameras' mean.
-        metres: length of a unit of the capture's world.
-        into: the folder; None: ``export`` in the run's.
-    """
+    """Settings of ``stage=export``; ``conf/export/default.yaml`` says what each does."""
 
     format: Format = "gltf"
     content: Literal["auto", "surface", "points"] = "auto"
@@ -67,17 +45,12 @@ class ExportSettings:
     def __post_init__(self) -> None:
         if not 0 < self.threshold < 1:
             raise DevrfError(f"export.threshold: expected between 0 and 1, not {self.threshold}")
-        if self.side is not None and not 2 <= self.side <= 1024:
-            raise DevrfError(f"export.side: expected 2 to 1024, not {self.side}")
-        for name, least in (("faces", 4), ("points", 1)):
-            if getattr(self, name) < least:
-                raise DevrfError(f"export.{name}: expected at least {least}")
-        if not 0 <= self.pieces <= 1:
-            raise DevrfError(f"export.pieces: expected 0 to 1, not {self.pieces}")
+        check_range("export.side", self.side, 2, 1024)
+        check_range("export.faces", self.faces, 4)
+        check_range("export.points", self.points, 1)
+        check_range("export.pieces", self.pieces, 0, 1)
         for name in ("reach", "fps", "seconds", "metres"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise DevrfError(f"export.{name}: expected more than 0, not {value}")
+            check_range(f"export.{name}", getattr(self, name), 1e-6)
         if self.times is None:
             return
         if self.fps is not None:
@@ -189,17 +162,10 @@ SOLID = 0.5
 def seen_points(
     renderer: Renderer, cameras: Cameras, time: float, background: float, count: int
 ) -> tuple[Tensor, Tensor]:
-    """What the cameras see at ``time``: the points where their rays end, in the mean.
+    """Points (N, 3) that the cameras see at ``time``, world units, and their sRGB colours (N, 3).
 
-    Args:
-        renderer: of a learned scene.
-        cameras: world units; of many some, evenly chosen.
-        time: in [0, 1].
-        background: grey level.
-        count: of points, at most; of more some, evenly chosen.
-
-    Returns:
-        Points (N, 3) in the capture's world, and their sRGB colours (N, 3) in [0, 1].
+    They are where rays end, in the mean. Of many cameras (world units) some are taken, evenly
+    chosen, and of many points ``count``. ``background`` is a grey level.
     """
     some = cameras[_evenly(len(cameras), CAMERAS)].to(renderer.device)
     filled = len(_seen(renderer, some.of_height(FIRST), time, background)[0])

@@ -43,8 +43,8 @@ def write_gltf(
     there, and the animation goes from one to the next: linearly, as displacements are between
     frames. Its colours are light that the cameras saw, so its material is unlit.
 
-    Mesh and ``cameras``, one each by name, are in the capture's world, the file is in ``frame``;
-    principal points are taken to be the centres. Time 0 to 1 takes ``seconds``.
+    Mesh and ``cameras``, one each by name, are in the capture's world; principal points are taken
+    to be the centres. Time 0 to 1 takes ``seconds``.
     """
     content = _Content()
     vertices = frame.points(mesh.vertices)

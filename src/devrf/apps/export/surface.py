@@ -201,17 +201,12 @@ DIRECTIONS, WIDEST = 16, 60.0
 def vertex_colors(
     model: Renderable, points: Tensor, faces: Tensor, normals: Tensor, *, averaged: bool
 ) -> Tensor:
-    """RGB (V, 3) in [0, 1] of vertices.
+    """RGB (V, 3) in [0, 1] of vertices (V, 3) in the fields' space, seen from outside.
 
     A vertex lies where matter begins, and there the field's colours are not yet learned: its own
-    is that of a ray that goes straight in, Σ w_i c_i / Σ w_i (docs/method.md#compositing).
-
-    Args:
-        model: that has a surface.
-        points: (V, 3) in the fields' space.
-        faces: (F, 3) int64, counter-clockwise from outside in that space.
-        normals: (V, 3) unit normals, outward in the world.
-        averaged: over directions up to 60 degrees off the normal; False: along the normal.
+    is that of a ray that goes straight in, Σ w_i c_i / Σ w_i (docs/method.md#compositing), along
+    its unit normal (V, 3) of the world, or ``averaged`` over directions up to 60 degrees off it.
+    Faces (F, 3) are counter-clockwise from outside in the fields' space.
     """
     field = _field(model)
     low, _ = field.box.corners(points)

@@ -59,14 +59,10 @@ UNKNOWN = "–"
 
 @dataclass(frozen=True)
 class Column:
-    """A column of the paper's tables.
+    """A column of the tables, and the ``key`` of its values in a collection; times in seconds.
 
-    Attributes:
-        key: the column of a collection that holds its value; times are in seconds.
-        higher_is_better: else lower is.
-        digits: after the point; None: a time in the unit that reads best.
-        of_hardware: whether values of different devices cannot be compared.
-        why_missing: the explanation where no run has a value.
+    Without ``digits`` a value is a time in the unit that reads best. Values ``of_hardware`` of
+    different devices cannot be compared.
     """
 
     title: str

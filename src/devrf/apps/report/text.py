@@ -14,13 +14,7 @@ from devrf.apps.report.table import Block, Column, Table, published
 
 @dataclass(frozen=True)
 class Style:
-    """How a format writes text.
-
-    Attributes:
-        escape: makes plain text safe in it.
-        marks: formats of a cell: unmarked, best, second, third.
-        heading: format of the line above the published rows.
-    """
+    """How a format escapes text, writes an unmarked, best, second and third cell, and a heading."""
 
     escape: Callable[[str], str]
     marks: tuple[str, str, str, str]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -50,13 +49,7 @@ def in_browser(keyframe: Keyframe) -> tuple[np.ndarray, np.ndarray, float]:
 
 
 class Frustum(NamedTuple):
-    """A captured camera.
-
-    Attributes:
-        name: tells it from others; the same for a fixed camera at every time.
-        camera: one.
-        image: (H', W', 3) uint8, what it took; None where no image was read.
-    """
+    """A captured camera; a fixed one has one name at every time, ``image`` is (H', W', 3) uint8."""
 
     name: str
     camera: Cameras
@@ -67,33 +60,24 @@ def dynamic_frusta(scene: Scene, time: float) -> list[Frustum]:
     """The cameras that saw the scene move, at one of their images' times."""
     views = scene.dynamic.train
     images = ((views.times - time).abs() < scene.clock.TOLERANCE).nonzero()[:, 0].tolist()
-    chosen = [images[k] for k in evenly(len(images), MAX_FRUSTA)]
-    names = [f"moving/{int(views.view[k])}" for k in chosen]
-    return _frusta(names, views.cameras, chosen, scene, views)
+    return [
+        Frustum(f"moving/{views.view[k]}", views.cameras[[k]], _thumbnail(scene, views, k))
+        for k in (images[j] for j in evenly(len(images), MAX_FRUSTA))
+    ]
 
 
 def static_frusta(cameras: Cameras, scene: Scene | None) -> list[Frustum]:
     """The cameras that saw the scene at rest, with images if there is a scene."""
-    chosen = evenly(len(cameras), MAX_FRUSTA)
-    views = None if scene is None else scene.static.train
-    return _frusta([f"static/{k}" for k in chosen], cameras, chosen, scene, views)
-
-
-def _frusta(
-    names: Sequence[str],
-    cameras: Cameras,
-    chosen: Sequence[int],
-    scene: Scene | None,
-    views: Views | None,
-) -> list[Frustum]:
     frusta = []
-    for name, k in zip(names, chosen, strict=True):
-        image = None
-        if scene is not None and views is not None:
-            small = scaled(truth_image(views, k, scene.background), min(views.height, ROWS))
-            image = to_bytes(small)
-        frusta.append(Frustum(name, cameras[[k]], image))
+    for k in evenly(len(cameras), MAX_FRUSTA):
+        image = None if scene is None else _thumbnail(scene, scene.static.train, k)
+        frusta.append(Frustum(f"static/{k}", cameras[[k]], image))
     return frusta
+
+
+def _thumbnail(scene: Scene, views: Views, index: int) -> Tensor:
+    image = truth_image(views, index, scene.background)
+    return to_bytes(scaled(image, min(views.height, ROWS)))
 
 
 class FrustaLayer:

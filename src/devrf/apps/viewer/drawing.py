@@ -55,12 +55,9 @@ class Shot:
 
 @dataclass(frozen=True)
 class Frame:
-    """A finished frame.
+    """A frame (H, W, 3) uint8 on the host, and how long it took.
 
-    Attributes:
-        pixels: (H, W, 3) uint8, on the host.
-        depth: (H, W) distance along the camera's axis in world units; None if not asked for.
-        seconds: what rendering it took.
+    ``depth`` (H, W) is along the camera's axis in world units; None if not asked for.
     """
 
     pixels: Tensor
