@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import math
 import socket
 from collections.abc import Sequence
 from contextlib import closing
@@ -11,15 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from devrf.errors import DevrfError
-
-
-def check_range(key: str, value: float | None, least: float, most: float = math.inf) -> None:
-    """Refuse a setting that is out of range, or not finite; None is in every range."""
-    if value is not None and not (least <= value <= most and math.isfinite(value)):
-        expected = f"at least {least:g}" if most == math.inf else f"{least:g} to {most:g}"
-        raise DevrfError(f"{key}: expected {expected}, not {value}")
-
+from devrf.errors import DevrfError, expect
 
 # capture.alpha_masks=subtract
 SUBTRACT = "subtract"
@@ -71,7 +62,8 @@ class CaptureSettings:
                 "give capture.static=PATH (a moving camera's video alone is capture.views=[PATH])"
             )
         for key, least in (("frames", 3), ("max_timesteps", 2), ("size", 64), ("holdout", 2)):
-            check_range(f"capture.{key}", getattr(self, key), least)
+            value = getattr(self, key)
+            expect(value >= least, f"capture.{key}", f"at least {least}", value)
         views = len(self.views)
         if self.offsets is not None and len(self.offsets) != views:
             raise DevrfError(
@@ -122,10 +114,11 @@ class ViewerSettings:
     share: float = 0.03
 
     def __post_init__(self) -> None:
-        check_range("viewer.port", self.port, 1, 65535)
-        check_range("viewer.height", self.height, 16, 4096)
-        check_range("viewer.move_seconds", self.move_seconds, 1e-3, 10)
-        check_range("viewer.share", self.share, 1e-6, 1)
+        seconds, share = self.move_seconds, self.share
+        expect(1 <= self.port <= 65535, "viewer.port", "1 to 65535", self.port)
+        expect(16 <= self.height <= 4096, "viewer.height", "16 to 4096", self.height)
+        expect(0 < seconds <= 10, "viewer.move_seconds", "more than 0, at most 10", seconds)
+        expect(0 < share <= 1, "viewer.share", "more than 0, at most 1", share)
 
     @property
     def address(self) -> str:

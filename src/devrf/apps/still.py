@@ -21,9 +21,8 @@ from devrf.apps.images import (
     side_by_side,
     write_image,
 )
-from devrf.apps.settings import check_range
 from devrf.checkpoints.checkpoint import Viewpoints
-from devrf.errors import DevrfError
+from devrf.errors import DevrfError, expect
 from devrf.evaluation.held_out import HeldOutView, background_value, compare, truth_image
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
@@ -49,8 +48,8 @@ class StillSettings:
     half: bool = False
 
     def __post_init__(self) -> None:
-        check_range("still.time", self.time, 0, 1)
-        check_range("still.height", self.height, 1)
+        expect(0 <= self.time <= 1, "still.time", "0 to 1", self.time)
+        expect(self.height is None or self.height >= 1, "still.height", "at least 1", self.height)
 
     @property
     def name(self) -> str:

@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from devrf.apps.images import image_grid, scaled
-from devrf.apps.settings import check_range
 from devrf.apps.still import sized, still
+from devrf.errors import expect
 from devrf.evaluation.held_out import background_value, truth_image
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
@@ -42,9 +42,11 @@ class VideoSettings:
     time: float = 0.5
 
     def __post_init__(self) -> None:
-        check_range("video.time", self.time, 0, 1)
-        check_range("video.height", self.height, MIN_HEIGHT)
-        check_range("video.max_seconds", self.max_seconds, 1e-6)
+        height, most = self.height, self.max_seconds
+        expect(0 <= self.time <= 1, "video.time", "0 to 1", self.time)
+        high_enough = height is None or height >= MIN_HEIGHT
+        expect(high_enough, "video.height", f"at least {MIN_HEIGHT}", height)
+        expect(most is None or most > 0, "video.max_seconds", "more than 0", most)
 
     def sized(self, cameras: Cameras) -> Cameras:
         """Captured cameras with images of the video's size."""

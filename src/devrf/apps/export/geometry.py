@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -11,8 +12,7 @@ from typing import Literal, cast
 import torch
 from torch import Tensor
 
-from devrf.apps.settings import check_range
-from devrf.errors import DevrfError
+from devrf.errors import DevrfError, expect
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
 from devrf.methods.base import Renderable
@@ -43,22 +43,22 @@ class ExportSettings:
     into: str | Path | None = None
 
     def __post_init__(self) -> None:
-        if not 0 < self.threshold < 1:
-            raise DevrfError(f"export.threshold: expected between 0 and 1, not {self.threshold}")
-        check_range("export.side", self.side, 2, 1024)
-        check_range("export.faces", self.faces, 4)
-        check_range("export.points", self.points, 1)
-        check_range("export.pieces", self.pieces, 0, 1)
+        side_fits = self.side is None or 2 <= self.side <= 1024
+        expect(0 < self.threshold < 1, "export.threshold", "between 0 and 1", self.threshold)
+        expect(side_fits, "export.side", "2 to 1024", self.side)
+        expect(self.faces >= 4, "export.faces", "at least 4", self.faces)
+        expect(self.points >= 1, "export.points", "at least 1", self.points)
+        expect(0 <= self.pieces <= 1, "export.pieces", "0 to 1", self.pieces)
         for name in ("reach", "fps", "seconds", "metres"):
-            check_range(f"export.{name}", getattr(self, name), 1e-6)
+            value = getattr(self, name)
+            expect(value is None or 0 < value < math.inf, f"export.{name}", "more than 0", value)
         if self.times is None:
             return
         if self.fps is not None:
             raise DevrfError("export.times: export.fps also says which times; give one of them")
-        if not self.times or not all(a < b for a, b in pairwise([-1e-9, *self.times, 1 + 1e-9])):
-            raise DevrfError(
-                f"export.times: expected ascending times from 0 to 1, not {list(self.times)}"
-            )
+        rising = all(a < b for a, b in pairwise([-1e-9, *self.times, 1 + 1e-9]))
+        ascending = "ascending times from 0 to 1"
+        expect(len(self.times) > 0 and rising, "export.times", ascending, list(self.times))
 
     def export_times(self, clock: FrameClock) -> tuple[float, ...]:
         """The times to export, of a scene whose training frames have the clock's times."""
