@@ -21,7 +21,6 @@ from devrf.data.datamodule import SceneDataModule
 from devrf.engine.learner import ParallelBatch
 from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
-from devrf.methods.devrf.extensions.tracks import StartAlongFlow
 from devrf.methods.devrf.settings import MotionSettings
 
 GPU, CPU = torch.device("cuda"), torch.device("cpu")
@@ -165,22 +164,3 @@ def test_each_frame_has_a_copy_of_the_frame_before_it(
     # One by one; then in two phases: frame 2 alone, frames 1 and 3 in parallel.
     assert visited == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 1, 3)]
     assert stage.iteration == stage.total_iterations == 8 + 2
-
-
-def test_flow_initialises_only_frames_whose_predecessor_was_learned(
-    rest: LoadedCheckpoint,
-    four_frames: SceneDataModule,
-    trainer: Callable[..., Trainer],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    followed: list[int] = []
-    monkeypatch.setattr(
-        "devrf.methods.devrf.extensions.tracks.start_from_tracks",
-        lambda field, number, *rest, **options: followed.append(number),
-    )
-    stage = DeformationStage(
-        rest, TOGETHER, MotionSettings(), extensions={"tracks": StartAlongFlow("flow")}
-    )
-    trainer(max_epochs=1).fit(stage, datamodule=four_frames)
-    # Not frame 2, which comes first: flow leads there from frame 1, not yet learned.
-    assert followed == [1, 3]

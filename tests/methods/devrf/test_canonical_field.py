@@ -90,22 +90,6 @@ def test_clearing_leaves_almost_nothing_there_and_all_elsewhere(cube: Box) -> No
     assert field.density.values[3, 3, 3].item() == -60.0
 
 
-def test_a_stored_field_of_any_size_and_box_loads_bit_equal(
-    cube: Box, rng: torch.Generator
-) -> None:
-    stored = SMALL.radiance_field(Box((-1.0, -2.0, 0.0), (1.0, 0.0, 1.0)), 500, 4000)
-    torch.nn.init.normal_(stored.density.values, generator=rng)
-    torch.nn.init.normal_(stored.color.values, generator=rng)
-    fresh = SMALL.radiance_field(cube, 8, 8)
-    fresh.load_state_dict(stored.state_dict())
-    points, ray = torch.rand(20, 3, generator=rng) - 0.5, torch.arange(20)
-    dirs = torch.nn.functional.normalize(torch.randn(20, 3, generator=rng), dim=1)
-    assert torch.equal(fresh.rgb(points, dirs, ray), stored.rgb(points, dirs, ray))
-    assert torch.equal(fresh.optical_depth(points, 0.3), stored.optical_depth(points, 0.3))
-    assert fresh.box == stored.box
-    assert fresh.step_in_base_voxels(0.5) == stored.step_in_base_voxels(0.5)
-
-
 def test_the_decoder_is_the_network_of_the_concatenated_input(rng: torch.Generator) -> None:
     decoder = ColorDecoder(channels=3, width=6, frequencies=4)
     features, ray = torch.randn(5, 3, generator=rng), torch.tensor([0, 0, 1, 1, 1])

@@ -11,7 +11,6 @@ import torch
 from lightning import Trainer
 
 from devrf.data.rendered import RenderedDataModule
-from devrf.engine.active_frames import ActiveFrame
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.geometry.contraction import ContractedSpace
@@ -46,18 +45,12 @@ def test_displacements_are_zero_outside_where_they_are_asked_to_be() -> None:
     assert torch.equal(moved[2:], points[2:])
 
 
-def test_a_field_and_its_active_frame_agree_on_what_stays() -> None:
+def test_a_field_knows_that_what_is_outside_stays() -> None:
     clock = FrameClock((0.0, 1.0))
     field = DeformationField(SPACE.inner(), clock, voxels=27, still_outside=True)
     field.to_canonical[1:] = 0.25
     outside = torch.tensor([[1.3, 0.0, 0.0]])
     assert torch.equal(field.warp(outside, 1.0), outside)
-    frame = ActiveFrame.of(field.frames, Occupancy.full((4, 4, 4), SPACE.box), {})
-    frame.check_out(1)
-    assert (
-        torch.equal(field.warp_by(frame.backward)(outside), outside)
-        and frame.occupancy.box == SPACE.box
-    )
     again = DeformationField(Box((0.0,) * 3, (1.0,) * 3), clock, voxels=8)
     again.set_extra_state(field.get_extra_state())
     assert again.still_outside and again.box == SPACE.inner()
@@ -110,25 +103,17 @@ def test_a_checkpoint_keeps_the_outer_faces(model: DeVRFModel) -> None:
     torch.testing.assert_close(ours.color, theirs.color, atol=5e-3, rtol=0)
 
 
-def test_contracted_space_learns_directions_in_the_second_half_unless_told_otherwise() -> None:
-    schedule = CanonicalSchedule(search_iterations=5, iterations=60, upsample_at=())
-    assert schedule.learns_directions(5)
-    half = schedule.in_space(SPACE)
-    assert half.view_dependence_start == 30
-    assert [half.learns_directions(n) for n in (5, 34, 35)] == [False, False, True]
-    assert replace(schedule, view_dependence_start=0).in_space(SPACE).view_dependence_start == 0
-
-
-def test_grids_start_coarse_and_double_evenly_in_contracted_space() -> None:
-    # 50 · 1.2 = 60 voxels a side from 15: six upsample_at, over 600 of 800 iterations.
+def test_in_contracted_space_grids_start_coarse_and_directions_come_late() -> None:
+    # 50 · 1.2 = 60 voxels a side from 15: six doublings, over 600 of 800 iterations.
     schedule = CanonicalSchedule(
-        side=50, iterations=800, upsample_at=(10,), unbounded_initial_side=15
+        5, side=50, iterations=800, upsample_at=(10,), unbounded_initial_side=15
     )
-    grown = schedule.in_space(SPACE)
-    assert grown.upsample_at == (100, 200, 300, 400, 500, 600)
-    first = next(phase for phase in grown.phases if phase.kind == "fine")
-    assert first.voxels == pytest.approx(15**3, rel=1e-3)
-    assert replace(schedule, unbounded_initial_side=None).in_space(SPACE).upsample_at == (10,)
+    fitted = schedule.in_space(SPACE)
+    assert fitted.upsample_at == (100, 200, 300, 400, 500, 600)
+    assert fitted.phases[1].voxels == pytest.approx(15**3, rel=1e-3)
+    assert [fitted.learns_directions(n) for n in (5, 404, 405)] == [False, False, True]
+    given = replace(schedule, unbounded_initial_side=None, view_dependence_start=0).in_space(SPACE)
+    assert given.upsample_at == (10,) and given.learns_directions(5)
     assert schedule.in_space(WORLD) is schedule
 
 

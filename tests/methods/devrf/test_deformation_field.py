@@ -63,33 +63,3 @@ def test_resizing_keeps_a_linear_motion_exactly_and_frames_never_trained_zero(
             assert not field.to_canonical[frame].any()
         assert not field.to_time.any()
     assert field.shape == (4, 4, 4)
-
-
-def test_a_stored_field_of_other_shape_clock_and_box_loads_bit_equal(
-    field: DeformationField, rng: torch.Generator
-) -> None:
-    other = Box((0.0, 0.0, 0.0), (2.0, 1.0, 1.0))
-    fresh = DeformationField(other, FrameClock((0.0, 1.0)), voxels=1000)
-    fresh.load_state_dict(field.state_dict())
-    assert fresh.clock == CLOCK and fresh.box == field.box
-    x = points(50, rng)
-    for time in (0.0, 0.15, 0.6, 0.85, 1.0):
-        assert torch.equal(fresh.warp(x, time), field.warp(x, time))
-        assert torch.equal(fresh.unwarp(x, time), field.unwarp(x, time))
-
-
-def test_frames_that_rest_elsewhere_move_points_as_before(
-    field: DeformationField, rng: torch.Generator
-) -> None:
-    x, times = points(50, rng), (0.1, 0.2, 0.77)
-    expected = [(field.warp(x, t), field.blended(t)) for t in times]
-    field.frames.offload(on_host=True, half=True)
-    close = {"atol": 2e-3, "rtol": 1e-3}
-    for time, (moved, grid) in zip(times, expected, strict=True):
-        torch.testing.assert_close(field.warp(x, time), moved, **close)
-        torch.testing.assert_close(field.blended(time), grid, **close)
-    # Wherever the module goes, its frames stay as they are; points are moved as it works.
-    resting = field.to_time
-    field.double()
-    assert field.to_time is resting
-    assert field.warp(x.double(), 0.77).dtype == torch.float64

@@ -8,9 +8,8 @@ from typing import Any
 
 import pytest
 import torch
-from lightning import Callback, Trainer
+from lightning import Trainer
 from lightning.pytorch.callbacks import LambdaCallback
-from torch import Tensor
 
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
@@ -79,33 +78,28 @@ def test_a_whole_schedule_sees_the_motion_better_than_the_rest_pose(
     assert min(gains[2:]) > 0.5 and sum(gains[2:]) / 4 > 1
 
 
-class Peak(Callback):
-    """Puts a peak into Δ_f before the first step, and looks at the moments behind it."""
-
-    mean: Tensor
-    values: Tensor
-
-    def on_train_batch_start(self, trainer: Trainer, pl_module: Any, *args: Any) -> None:
-        pl_module.active[0].forward.data[1, 1, 1] = 0.5
-        self.values = pl_module.active[0].forward.detach().clone().requires_grad_()
-
-    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, *args: Any) -> None:
-        self.mean = pl_module.optimizer.state[pl_module.active[0].forward]["mean"].clone()
-
-
 def test_total_variation_alone_smooths_both_directions(
     rest: LoadedCheckpoint, datamodule: SceneDataModule, trainer: Callable[..., Trainer]
 ) -> None:
     # With "render" at a vanishing weight only the closed-form gradient moves Δ_f.
-    stage, peak = DeformationStage(rest, SHORT, loss={"render": 1e-20, "tv": 1.0}), Peak()
-    trainer(peak, max_steps=1).fit(stage, datamodule=datamodule)
-    forward = stage.field.to_time[1]
+    stage = DeformationStage(rest, SHORT, loss={"render": 1e-20, "tv": 1.0})
+    before, mean = [], []
+
+    def peak(*_: Any) -> None:
+        stage.active[0].forward.data[1, 1, 1] = 0.5
+        before.append(stage.active[0].forward.detach().clone())
+
+    def look(*_: Any) -> None:
+        mean.append(stage.optimizer.state[stage.active[0].forward]["mean"].clone())
+
+    watch = LambdaCallback(on_train_batch_start=peak, on_train_batch_end=look)
+    trainer(watch, max_steps=1).fit(stage, datamodule=datamodule)
+    forward, slope = stage.field.to_time[1], torch.zeros_like(before[0])
     assert forward[1, 1, 1, 0] < 0.5 and forward[0, 1, 1, 0] > 0
-    slope = torch.zeros_like(peak.values)
-    add_total_variation_gradient(peak.values.detach(), slope, 1.0)
+    add_total_variation_gradient(before[0], slope, 1.0)
     # The first step's mean is a tenth of the gradient.
     expected = 0.1 * slope * (max(stage.field.shape) / 128 / 256 / 6)
-    torch.testing.assert_close(peak.mean, expected)
+    torch.testing.assert_close(mean[0], expected)
 
 
 def test_each_level_has_its_weights_and_rates(

@@ -203,9 +203,6 @@ def test_flow_by_hand(by_hand: MotionPrediction) -> None:
     assert flow(by_hand).item() == pytest.approx(0.5, abs=1e-5)
     # As a mean over both components of the two samples on the ray whose flow is valid.
     assert flow(replace(by_hand, flow_mean="samples")).item() == pytest.approx(0.125, abs=1e-6)
-
-
-def test_flow_counts_valid_rays_even_those_that_see_nothing(by_hand: MotionPrediction) -> None:
     both = replace(by_hand.batch, flow_valid=torch.tensor([True, True]))
     # Ray 1: −10·0.2/2 = −1 along x, against (9, 9): 10 + 9, weight 1; now two rays.
     assert flow(replace(by_hand, batch=both)).item() == pytest.approx((0.5 + 19) / 2, abs=1e-4)

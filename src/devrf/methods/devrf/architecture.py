@@ -31,14 +31,12 @@ class Architecture:
         frequencies: octaves of the viewing direction that the decoder sees; 0 for the
             direction alone.
         alpha_init: opacity of a voxel of the radiance field before anything is learned.
-        contracted_opacity: opacity of a line through the whole box, along an edge, before anything
-            is learned; in contracted space it decides ``alpha_init``, whatever the resolution
-            (docs/method.md#scene-contraction).
-        search_alpha_init: the same in the coarse geometry search.
+        contracted_opacity: the same of a line through the whole box, along an edge; in contracted
+            space it decides ``alpha_init`` (docs/method.md#scene-contraction).
+        search_alpha_init: opacity of a voxel in the coarse geometry search.
         planes: planes of an NDC grid, one behind another; None: in NDC as many as the scene's
             views tell apart (:func:`fitted_to`), elsewhere cubic voxels.
-        aspect: in NDC, grid points across a unit of x to those across a unit of y: the width of
-            the images to their height makes voxels as square as pixels. The paper's is 1.
+        aspect: in NDC, grid points across a unit of x to those across a unit of y.
     """
 
     channels: int = 12
@@ -85,10 +83,8 @@ def fitted_to(
 ) -> tuple[CanonicalSchedule, Architecture]:
     """Schedule and architecture with the numbers that ``scene`` decides filled in.
 
-    In NDC, where no number of planes is given it becomes the one that the static views resolve,
-    and ``voxels_per_pixel`` becomes the ``side`` of a grid so fine (docs/method.md#forward-facing).
-    In contracted space sides are longer, grids start coarser, and directions are learned later
-    (docs/method.md#scene-contraction).
+    In NDC these are the planes that the static views resolve, and ``voxels_per_pixel`` as ``side``
+    (docs/method.md#forward-facing); in contracted space see docs/method.md#scene-contraction.
 
     Raises:
         DevrfError: the architecture has planes, and the scene is not in NDC.

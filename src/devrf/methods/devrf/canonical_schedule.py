@@ -33,33 +33,30 @@ class CanonicalPhase(Phase):
 class CanonicalSchedule:
     """The canonical stage's phases; the defaults are the paper's, inward-facing.
 
-    See docs/method.md#geometry-search and docs/method.md#radiance-field.
+    See docs/method.md#geometry-search, #radiance-field, #forward-facing and #scene-contraction.
 
     Attributes:
         search_iterations: length of the coarse geometry search; 0 leaves it out.
         search_side: the search grid has about search_side³ voxels.
-        visual_hull_init: begin with the visual hull of the static views, if the images have alpha
-            masks; then the search may be short, or left out.
+        visual_hull_init: begin with the visual hull of the static views, if they have alpha masks.
         iterations: length of the radiance field's learning.
         side: the final grid has about side³ voxels.
         upsample_at: iterations, from the search's end, at which the number of voxels doubles; it
             starts at side³ / 2^len(upsample_at).
         decay_iterations: after as many iterations the learning rates have fallen to a tenth.
         rays: of a batch.
-        min_views: cells that fewer training views have in the picture are empty from the
-            start; 1 keeps those that no camera sees as well.
+        min_views: cells that fewer training views have in the picture are empty from the start.
         dense_tv_iterations: so long, from the search's end, the total variation smooths all
             voxels; afterwards those that a batch has touched.
         voxels_per_pixel: in forward-facing scenes, grid points for each pixel of a row or column;
-            decides ``side``. None: ``side`` is as it says.
+            decides ``side``.
         view_dependence_start: so many iterations from the search's end colours do not depend on the
-            viewing direction. None: 0; in contracted space half of ``iterations``
-            (docs/method.md#scene-contraction).
+            viewing direction. None: 0; in contracted space half of ``iterations``.
         unbounded_initial_side: in contracted space the grid starts with about as many voxels
             along an edge, and doubles at equal intervals over the first three quarters of
             ``iterations`` in place of ``upsample_at``. None: ``upsample_at`` holds there, too.
-        crop: in forward-facing scenes, whether the grid, each time it grows, gives up the depths
-            at which the static views see nothing (docs/method.md#crop).
+        crop: in forward-facing scenes, whether the growing grid gives up depths at which the static
+            views see nothing (docs/method.md#crop).
     """
 
     search_iterations: int = 5000
@@ -122,11 +119,7 @@ class CanonicalSchedule:
         return iteration - self.search_iterations >= (self.view_dependence_start or 0)
 
     def in_space(self, space: Space) -> CanonicalSchedule:
-        """The same schedule with what contracted space changes (docs/method.md#scene-contraction).
-
-        Sides are longer by the space's factor; ``upsample_at`` and ``view_dependence_start`` are
-        filled in.
-        """
+        """The schedule with what contracted space changes (docs/method.md#scene-contraction)."""
         if space.is_linear:
             return self
         side, upsample_at = self.side * space.side_factor, self.upsample_at

@@ -21,18 +21,15 @@ class Level:
     """One resolution of the motion grids, and how the frames are learned at it.
 
     Attributes:
-        side: the motion grids have about side³ voxels. A level may have the side of the one before
-            it: the same grids are then gone through once more.
+        side: the motion grids have about side³ voxels, maybe as many as at the level before.
         iterations: share of each frame.
         lr_factor: of the learning rate; None: the schedule's ``decay`` to the power of how often
             the side has changed.
-        lr_final_factor: what the learning rate falls to in the course of a visit, exponentially,
-            as a factor.
+        lr_final_factor: what the learning rate falls to in a visit, exponentially.
         order: of the frames, in time; ``forward`` at the coarsest level.
         parallel_frames: K, how many frames may be learned in parallel; 1 at the coarsest level,
             where a frame starts from the one before it.
-        weight_factors: of the weights of ``loss.deformation``, by the term's name; 1 for terms
-            that are not named.
+        weight_factors: of the weights of ``loss.deformation``, by the term's name; else 1.
     """
 
     side: int
@@ -88,9 +85,8 @@ class DeformationSchedule:
     L = max(2, ⌈T / K⌉) frames, so that neighbours are never learned together. Visit j of the level,
     0 ≤ j < L, is to the j-th frame of every stretch: frames j, j + L, j + 2L, … without frame 0.
     An iteration is one optimiser step on all of them, each with a batch of its own, so a level
-    takes share · L iterations. The first frame of a stretch is learned before the frame before it;
-    that one is known from the level before. With a single stretch visit 0 would be empty, and
-    frame 1 gets its share as above.
+    takes share · L iterations. With a single stretch visit 0 would be empty, and frame 1 gets its
+    share as above.
 
     A level whose order is ``backward`` makes the same visits from the last to the first; where
     frame 0 is alone, its share goes to the last frame.

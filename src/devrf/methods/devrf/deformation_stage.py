@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from functools import cached_property
 from typing import Any
 
 import torch
@@ -13,7 +12,6 @@ from torch import Tensor
 from devrf.accel.graphs import Graphs
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import Pixels
-from devrf.data.flow import previous_images
 from devrf.engine.active_frames import ActiveFrames
 from devrf.engine.batches import frame_pools
 from devrf.engine.convergence import Convergence
@@ -21,33 +19,27 @@ from devrf.engine.learner import ParallelBatch
 from devrf.errors import DevrfError
 from devrf.methods.devrf.deformation_field import DeformationField, deformed_occupancy
 from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule
-from devrf.methods.devrf.extension import Extension, MotionLoss
+from devrf.methods.devrf.extension import Extension, MotionLoss, MotionStage
 from devrf.methods.devrf.losses import FlowMean, MotionPrediction
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import DEFORMATION_LOSS, MotionSettings, Precision
-from devrf.methods.devrf.voxel_stage import VoxelStage, weighted_loss
+from devrf.methods.devrf.voxel_stage import weighted_loss
 from devrf.ops.adam import GridAdam
-from devrf.scenes.scene import CaptureName, Views
+from devrf.scenes.scene import Views
 from devrf.system.profiling import span
 
 log = logging.getLogger(__name__)
 
 
-class DeformationStage(VoxelStage):
+class DeformationStage(MotionStage):
     """Learns from the dynamic views how the scene deforms (docs/method.md#deformation-stage).
 
     Coarse to fine, frames are learned one after another, or several in parallel, each from batches
     of its own. Only their two slices are trained, and what extensions add; all else is frozen.
-
-    Attributes:
-        weights: of the loss terms that count at the present level.
-        active: the frames that are trained.
     """
 
-    schedule: DeformationSchedule
     phase: DeformationPhase | None
     name = "deformation"
-    capture: CaptureName = "dynamic"
     rate_keys = "schedule.motion.learning_rate or the weights of loss.deformation"
 
     def __init__(
@@ -96,12 +88,6 @@ class DeformationStage(VoxelStage):
         """Check the loss, before what the stage builds on has been learned."""
         extensions = tuple(settings.get("extensions", {}).values())
         MotionLoss(settings["loss"], extensions, settings["schedule"])
-
-    @property
-    def field(self) -> DeformationField:
-        """The deformation field; the active frames' part of it may not be written back yet."""
-        assert self.scene_model.deformation is not None, "the stage has not been set up"
-        return self.scene_model.deformation
 
     @property
     def total_iterations(self) -> int:
@@ -220,16 +206,6 @@ class DeformationStage(VoxelStage):
         """Write the last frames back."""
         self.active.close()
         super().on_train_end()
-
-    @property
-    def views(self) -> Views:
-        """The dynamic training views, on the stage's device."""
-        return self.training_views(self.capture)
-
-    @cached_property
-    def previous_images(self) -> Tensor:
-        """(N,) for each image the same view's image one frame earlier; itself without one."""
-        return previous_images(self.views)
 
     def _update_occupancy(self) -> None:
         """Find the occupancy of each active frame under its present displacements."""

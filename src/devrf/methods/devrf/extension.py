@@ -8,68 +8,55 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Protocol
+from functools import cached_property
 
-import torch
 from torch import Tensor
 
+from devrf.data.flow import previous_images
 from devrf.engine.active_frames import ActiveFrame, ActiveFrames
 from devrf.engine.frame_store import FrameField
-from devrf.engine.loop import Loop
 from devrf.errors import DevrfError
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule
 from devrf.methods.devrf.losses import MOTION_TERMS, MotionPrediction, total_variation_weight
-from devrf.methods.devrf.model import DeVRFModel
+from devrf.methods.devrf.voxel_stage import VoxelStage
 from devrf.methods.weighted_loss import counted_weights
-from devrf.ops.adam import GridAdam
 from devrf.rendering.output import ColorChange
-from devrf.scenes.scene import Scene, Views
+from devrf.scenes.scene import CaptureName, Views
 
 # An unweighted loss term: prediction → ().
 MotionTerm = Callable[[MotionPrediction], Tensor]
 
 
-class MotionLearner(Protocol):
+class MotionStage(VoxelStage):
     """The deformation stage, as extensions see it.
 
     Attributes:
         schedule: levels, iterations and rays.
-        scene_model: what is learned.
-        generator: draws random numbers, on the stage's device.
-        optimizer: Adam; an extension that learns adds a group of its own.
-        active: the frames that are trained.
-        loop: carries iterations out.
         weights: of the loss terms that count at the present level.
+        active: the frames that are trained.
     """
 
     schedule: DeformationSchedule
-    scene_model: DeVRFModel
-    generator: torch.Generator
-    optimizer: GridAdam
-    active: ActiveFrames
-    loop: Loop
+    capture: CaptureName = "dynamic"
     weights: dict[str, float]
-
-    @property
-    def scene(self) -> Scene:
-        """The scene."""
-        ...
+    active: ActiveFrames
 
     @property
     def field(self) -> DeformationField:
         """The deformation field; the active frames' part may not be written back yet."""
-        ...
+        assert self.scene_model.deformation is not None, "the stage has not been set up"
+        return self.scene_model.deformation
 
     @property
     def views(self) -> Views:
         """The dynamic training views, on the stage's device."""
-        ...
+        return self.training_views("dynamic")
 
-    @property
+    @cached_property
     def previous_images(self) -> Tensor:
         """(N,) for each image the same view's image one frame earlier; itself without one."""
-        ...
+        return previous_images(self.views)
 
 
 class Extension:
@@ -93,25 +80,25 @@ class Extension:
         """The loss terms that :meth:`weight_factor` may change."""
         return ()
 
-    def setup(self, stage: MotionLearner) -> None:
+    def setup(self, stage: MotionStage) -> None:
         """Add fields to the model and groups to the optimiser, before learning starts."""
 
-    def frame_fields(self, stage: MotionLearner, level: int) -> Mapping[str, FrameField]:
+    def frame_fields(self, stage: MotionStage, level: int) -> Mapping[str, FrameField]:
         """Fields whose frames are learned at ``level`` as the displacements are, by name."""
         return {}
 
-    def begin_level(self, stage: MotionLearner, level: int) -> None:
+    def begin_level(self, stage: MotionStage, level: int) -> None:
         """Memory of the active frames is ready; give the optimiser what is learned of them."""
 
     def weight_factor(self, term: str, level: int) -> float:
         """Factor of the weight of any loss term at ``level``."""
         return 1.0
 
-    def changes(self, stage: MotionLearner, phase: DeformationPhase) -> bool:
+    def changes(self, stage: MotionStage, phase: DeformationPhase) -> bool:
         """Whether :meth:`initialise` changes the displacements of the phase's frames."""
         return False
 
-    def initialise(self, stage: MotionLearner, phase: DeformationPhase, frame: int) -> None:
+    def initialise(self, stage: MotionStage, phase: DeformationPhase, frame: int) -> None:
         """Give one of the phase's frames its first values, in the fields, before a visit."""
 
     def color_change(self, frame: ActiveFrame) -> ColorChange | None:

@@ -21,12 +21,10 @@ def possibly_occupied(
 ) -> Tensor:
     """Where something can be at rest: (X, Y, Z) bool on the host, on a grid over the scene's box.
 
-    It is found on ``device``; None: on the host.
-
-    Not nearer to a camera than its near plane: fog before a lens would explain its image
-    perfectly. Not where fewer than ``min_views`` cameras look, if there are so many: fog would
-    explain two images as well. ``carve`` leaves nothing outside the visual hull, if the images
-    have alpha masks and all show the rest state, and the box is not unbounded.
+    Not nearer to a camera than its near plane, and not where fewer than ``min_views`` cameras look,
+    if there are so many: fog would explain their images. ``carve`` leaves nothing outside the
+    visual hull, if the images have alpha masks and all show the rest state, and the box is not
+    unbounded. It is found on ``device``; None: on the host.
     """
     views, box, space = scene.static.train, scene.bounds.box, scene.space
     cameras = views.cameras if device is None else views.cameras.to(device)

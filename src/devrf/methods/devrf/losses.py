@@ -53,8 +53,7 @@ class MotionPrediction(Prediction):
         unwarp: canonical points q (M, 3) → q + Δ_f(q, t).
         unwarp_previous: q → q + Δ_f(q, t − 1), frozen.
         cameras: the cameras of the images that the batch was drawn from.
-        previous_image: (N,) int64, for each image the one that its flow leads to (the same view
-            one frame earlier), or the image itself where there is none.
+        previous_image: (N,) int64, for each image the same view's one frame earlier, or itself.
         forward_slice: (X, Y, Z, 3) Δ_f(·, t) itself, for terms that need no samples.
         box: where the slices live.
         space: the space that points are in.

@@ -58,23 +58,18 @@ class MotionSettings:
     """How the deformation field is learned, beside its schedule (docs/method.md#departures).
 
     Attributes:
-        learning_rate: base rate, in ``unit`` per step: how far a voxel moves at most
-            (docs/method.md#motion-learning-rate).
-        unit: ``world`` for world units; ``box`` for the longest edge of the fields' box, so
-            that one value serves scenes of any scale.
+        learning_rate: base rate, in ``unit`` per step: how far a voxel moves at most.
+        unit: ``world`` for world units; ``box`` for the longest edge of the fields' box.
         views: ``one`` draws a batch from one view of the frame, the views taking turns;
             ``all`` draws it from all of them.
         pixels: ``all`` draws from whole images; ``occupied`` from the pixels of the alpha mask
             and those whose rays hit what the present field has moved there.
         occupancy_every: iterations between updates of the frame's occupancy.
         store: where the displacements of all frames are kept while one is learned: ``device``,
-            ``host``, or ``auto``: on the device if they fit there beside all else. Each of
-            several processes keeps them on its device.
-        store_half: whether they are kept in half precision; ``auto``: on a GPU. Active frames
-            never are.
+            ``host``, or ``auto``: on the device if they fit there beside all else.
+        store_half: whether they are kept in half precision; ``auto``: on a GPU.
         adam_state: ``fresh`` begins each visit with a fresh Adam; ``carried`` goes on, above the
-            coarsest level, with Adam's state from the visit before
-            (docs/method.md#motion-learning-rate).
+            coarsest level, with Adam's state from the visit before.
         min_rel_improvement: a visit ends early when two Lightning steps have taken less than
             this share off its loss; None goes through the whole schedule.
     """

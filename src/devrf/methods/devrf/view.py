@@ -127,10 +127,6 @@ class CanonicalSurface:
     """The radiance field at rest, as :class:`~devrf.rendering.view.SurfaceField`.
 
     Opacities are those of a voxel of the full grid (docs/method.md#step-length).
-
-    Attributes:
-        field: the canonical field.
-        occupancy: where something is at rest; elsewhere nothing is rendered.
     """
 
     field: CanonicalField

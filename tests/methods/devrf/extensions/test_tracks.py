@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
 import torch
 
@@ -12,11 +15,17 @@ from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
 from devrf.methods.devrf.architecture import Architecture
 from devrf.methods.devrf.deformation_field import DeformationField
-from devrf.methods.devrf.extensions.tracks import FlowTracks, Tracks, start_from_tracks
+from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
+from devrf.methods.devrf.extensions.tracks import (
+    FlowTracks,
+    StartAlongFlow,
+    Tracks,
+    start_from_tracks,
+)
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.sampling import RenderSettings
-from devrf.scenes.scene import OpticalFlow, Views
+from devrf.scenes.scene import OpticalFlow, Scene, Views
 
 SIDE, WIDTH, HEIGHT = 21, 30, 10
 RED, GREEN, BLUE, BLACK = (255, 0, 0), (0, 255, 0), (0, 0, 255), (0, 0, 0)
@@ -161,3 +170,13 @@ def test_without_tracks_the_frame_stays_where_the_one_before_is() -> None:
     nothing = Tracks(torch.zeros(0, 3), torch.zeros(0, dtype=torch.long), torch.zeros(0, 2))
     start_from_tracks(field, 2, nothing, three_cameras())
     assert torch.equal(field.to_canonical[2], field.to_canonical[1])
+
+
+def test_flow_starts_only_frames_whose_predecessor_was_learned(tiny_scene: Scene) -> None:
+    # Of four frames number 2 first, then 1 and 3: flow leads to frame 1, not yet learned.
+    schedule = DeformationSchedule((Level(5, 4, parallel_frames=2),), coarse_to_fine=False)
+    phases = [schedule.phase(at, 4) for at in (0, 4)]
+    assert [phase.frames for phase in phases] == [(2,), (1, 3)]
+    stage: Any = SimpleNamespace(scene=tiny_scene)
+    assert [StartAlongFlow("flow").changes(stage, phase) for phase in phases] == [False, True]
+    assert not any(StartAlongFlow("previous").changes(stage, phase) for phase in phases)

@@ -19,7 +19,7 @@ from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.methods.devrf.canonical_field import look_up
 from devrf.methods.devrf.deformation_schedule import DeformationPhase
-from devrf.methods.devrf.extension import Extension, MotionLearner, MotionTerm
+from devrf.methods.devrf.extension import Extension, MotionStage, MotionTerm
 from devrf.methods.devrf.losses import MotionPrediction, total_variation_weight
 from devrf.methods.devrf.model import ColorField
 from devrf.rendering.output import ColorChange
@@ -149,7 +149,7 @@ class ColorResidual(Extension):
         """Those that ``loss_scale_if_color_drift`` names."""
         return self._scale_if_drift
 
-    def setup(self, stage: MotionLearner) -> None:
+    def setup(self, stage: MotionStage) -> None:
         """Build the residuals, zero, and their empty parameter group, if they are learned."""
         first, drifting = self._decide(stage.scene.dynamic.train)
         if first is None:
@@ -173,13 +173,13 @@ class ColorResidual(Extension):
         log.info("colours %s: their change is %s", how, learned)
         return first, drifting
 
-    def frame_fields(self, stage: MotionLearner, level: int) -> Mapping[str, FrameField]:
+    def frame_fields(self, stage: MotionStage, level: int) -> Mapping[str, FrameField]:
         """The residuals, if ``level`` learns them."""
         field = stage.scene_model.color_residual
         learned = self._first is not None and level >= self._first
         return {NAME: field} if learned and field is not None else {}
 
-    def begin_level(self, stage: MotionLearner, level: int) -> None:
+    def begin_level(self, stage: MotionStage, level: int) -> None:
         """Let the optimiser learn the active frames' residuals, (X, Y, Z, 3) each.
 
         Within a visit their rate falls as that of the displacements does; from level to level it
@@ -197,7 +197,7 @@ class ColorResidual(Extension):
         """Where a texture may slide over the surface, some terms tell less."""
         return 1.0 if self._first is None or level < self._first else self._scale.get(term, 1.0)
 
-    def initialise(self, stage: MotionLearner, phase: DeformationPhase, frame: int) -> None:
+    def initialise(self, stage: MotionStage, phase: DeformationPhase, frame: int) -> None:
         """At the first level that learns it, start a frame from the one visited before it."""
         field = stage.scene_model.color_residual
         if isinstance(field, ResidualField) and phase.level == self._first:

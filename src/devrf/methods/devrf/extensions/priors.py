@@ -5,15 +5,14 @@ See docs/method.md#elastic and docs/method.md#bending.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import ClassVar
+from collections.abc import Callable, Mapping
 
 import torch
 from torch import Tensor
 from torch.nn.functional import adaptive_max_pool3d, max_pool3d
 
 from devrf.geometry.box import Box
-from devrf.methods.devrf.extension import Extension, MotionLearner, MotionTerm
+from devrf.methods.devrf.extension import Extension, MotionStage, MotionTerm
 from devrf.methods.devrf.losses import MotionPrediction
 from devrf.rendering.occupancy import Occupancy
 
@@ -22,58 +21,6 @@ from devrf.rendering.occupancy import Occupancy
 TEARING = 0.1
 # ℓ of the bending energy, over which J's change is looked at, as a share of the box's longest edge.
 REACH = 1 / 20
-
-
-class MotionPrior(Extension):
-    """Adds an energy of the forward slice to the loss terms, where something is at rest.
-
-    Attributes:
-        name: of the loss term; ``loss.deformation`` has its weight.
-    """
-
-    name: ClassVar[str]
-
-    def __init__(self) -> None:
-        self._occupied: Tensor | None = None
-
-    def energy(self, displacement: Tensor, box: Box, occupied: Tensor) -> Tensor:
-        """The energy () of Δ (X, Y, Z, 3) over a box, in occupied cells (X−1, Y−1, Z−1)."""
-        raise NotImplementedError
-
-    @property
-    def terms(self) -> Mapping[str, MotionTerm]:
-        """The energy, under its name."""
-        return {self.name: self._term}
-
-    def begin_level(self, stage: MotionLearner, level: int) -> None:
-        """Find the cells of the level's grids that are occupied at rest."""
-        if self.name in stage.weights and len(stage.active):
-            field, occupancy = stage.field, stage.scene_model.occupancy
-            self._occupied = occupied_cells(occupancy, field.box, field.shape)
-
-    def _term(self, prediction: MotionPrediction) -> Tensor:
-        assert self._occupied is not None, "the level has not begun"
-        return self.energy(prediction.forward_slice, prediction.box, self._occupied)
-
-
-class Elastic(MotionPrior):
-    """Resists stretching; parts may tear off one another (docs/method.md#elastic)."""
-
-    name = "elastic"
-
-    def energy(self, displacement: Tensor, box: Box, occupied: Tensor) -> Tensor:
-        """:func:`elastic_energy`."""
-        return elastic_energy(displacement, box, occupied)
-
-
-class Bending(MotionPrior):
-    """Resists bending; parts may turn against one another (docs/method.md#bending)."""
-
-    name = "bending"
-
-    def energy(self, displacement: Tensor, box: Box, occupied: Tensor) -> Tensor:
-        """:func:`bending_energy`."""
-        return bending_energy(displacement, box, occupied)
 
 
 def elastic_energy(displacement: Tensor, box: Box, occupied: Tensor) -> Tensor:
@@ -170,3 +117,44 @@ def occupied_cells(occupancy: Occupancy, box: Box, shape: tuple[int, int, int]) 
     occupied = occupancy.at(points.view(-1, 3)).view(1, x, y, z)
     cells = [count - 1 for count in shape]
     return adaptive_max_pool3d(occupied.float(), cells)[0]
+
+
+class MotionPrior(Extension):
+    """Adds an energy of the forward slice to the loss terms, where something is at rest."""
+
+    def __init__(self, name: str, energy: Callable[[Tensor, Box, Tensor], Tensor]) -> None:
+        """An ``energy`` of Δ (X, Y, Z, 3), its box and the occupied cells (X−1, Y−1, Z−1).
+
+        ``loss.deformation`` has its weight under ``name``.
+        """
+        self.name, self.energy = name, energy
+        self._occupied: Tensor | None = None
+
+    @property
+    def terms(self) -> Mapping[str, MotionTerm]:
+        """The energy, under its name."""
+        return {self.name: self._term}
+
+    def begin_level(self, stage: MotionStage, level: int) -> None:
+        """Find the cells of the level's grids that are occupied at rest."""
+        if self.name in stage.weights and len(stage.active):
+            field, occupancy = stage.field, stage.scene_model.occupancy
+            self._occupied = occupied_cells(occupancy, field.box, field.shape)
+
+    def _term(self, prediction: MotionPrediction) -> Tensor:
+        assert self._occupied is not None, "the level has not begun"
+        return self.energy(prediction.forward_slice, prediction.box, self._occupied)
+
+
+class Elastic(MotionPrior):
+    """Resists stretching; parts may tear off one another (docs/method.md#elastic)."""
+
+    def __init__(self) -> None:
+        super().__init__("elastic", elastic_energy)
+
+
+class Bending(MotionPrior):
+    """Resists bending; parts may turn against one another (docs/method.md#bending)."""
+
+    def __init__(self) -> None:
+        super().__init__("bending", bending_energy)

@@ -1,8 +1,4 @@
-"""Frames that start where the observed optical flow leads (docs/method.md#flow-initialisation).
-
-Step 1 follows pixels back along the flow to the canonical points that they see; steps 2 and 3 move
-the frame before to where these points are seen now.
-"""
+"""Frames that start where the observed optical flow leads (docs/method.md#flow-initialisation)."""
 
 from __future__ import annotations
 
@@ -22,7 +18,7 @@ from devrf.geometry.cameras import Cameras
 from devrf.geometry.space import WORLD, Space
 from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformation_schedule import DeformationPhase
-from devrf.methods.devrf.extension import Extension, MotionLearner
+from devrf.methods.devrf.extension import Extension, MotionStage
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.volume_rendering import render
 from devrf.ops.compositing import sum_by_ray
@@ -34,6 +30,10 @@ from devrf.scenes.scene import Views
 LIKENESS = 0.15
 # Frames that a pixel is followed back at most; drift adds up, and memory holds so many occupancies.
 FARTHEST = 16
+# Tracks of a frame at most, chosen at random.
+MOST_TRACKS = 4096
+# Weight of differences between neighbouring voxels' changes in a fit.
+SMOOTHNESS = 0.01
 
 
 class StartAlongFlow(Extension):
@@ -52,11 +52,11 @@ class StartAlongFlow(Extension):
         self._init_from = init_from
         self._tracks: FlowTracks | None = None
 
-    def begin_level(self, stage: MotionLearner, level: int) -> None:
+    def begin_level(self, stage: MotionStage, level: int) -> None:
         """Forget what the level before has seen."""
         self._tracks = None
 
-    def changes(self, stage: MotionLearner, phase: DeformationPhase) -> bool:
+    def changes(self, stage: MotionStage, phase: DeformationPhase) -> bool:
         """At the coarsest level, where there is flow to follow to a frame that is known."""
         recorded = stage.scene.dynamic.train
         # What a moving camera sees moves with it.
@@ -64,7 +64,7 @@ class StartAlongFlow(Extension):
         asked = self._init_from != "previous" and known
         return asked and phase.level == 0 and phase.has_previous
 
-    def initialise(self, stage: MotionLearner, phase: DeformationPhase, frame: int) -> None:
+    def initialise(self, stage: MotionStage, phase: DeformationPhase, frame: int) -> None:
         """Fit the frame's displacements to where its pixels are followed back to."""
         if not self.changes(stage, phase):
             return
@@ -105,11 +105,7 @@ class Tracks:
 
 
 class FlowTracks:
-    """Follows pixels of a frame back to where the model, learned up to there, shows them.
-
-    One frame back may show something else: an occluder that has since moved away, or a part that
-    the model has lost there. Such a pixel goes on, frame by frame, to one where it was right.
-    """
+    """Follows pixels of a frame back to where the model, learned up to there, shows them."""
 
     def __init__(
         self, model: DeVRFModel, views: Views, previous: Tensor, *, by_color: bool
@@ -123,9 +119,7 @@ class FlowTracks:
             by_color: whether what is met must have the pixel's colour; else each pixel ends one
                 frame back, whatever it meets there.
         """
-        self.model = model
-        self.views = views
-        self.previous = previous
+        self.model, self.views, self.previous = model, views, previous
         self.likeness = LIKENESS if by_color else math.inf
         self.farthest = FARTHEST if by_color else 1
         self._occupancies: dict[int, Occupancy] = {}
@@ -138,7 +132,6 @@ class FlowTracks:
         generator: torch.Generator,
         *,
         learned: int,
-        most: int = 4096,
     ) -> Tracks:
         """Tracks Σ w_i q_i / Σ w_i to a frame.
 
@@ -147,13 +140,13 @@ class FlowTracks:
             pool: pixels of its images.
             generator: of the random choice, on the pool's device.
             learned: how many of the frames before it have been learned, or are at rest.
-            most: tracks at most, chosen at random.
         """
         views = self.views
         assert views.flow is not None
         valid = views.flow.valid.flatten()[pool.image.long() * self._area + pool.flat.long()]
         kept = valid.nonzero()[:, 0]
-        kept = kept[torch.randperm(len(kept), device=kept.device, generator=generator)[:most]]
+        order = torch.randperm(len(kept), device=kept.device, generator=generator)
+        kept = kept[order[:MOST_TRACKS]]
         here, flat = pool.image[kept].long(), pool.flat[kept].long()
         now = gather_batch(views, here, flat, torch.ones(3, device=here.device))
         place, waiting = now.pixel, torch.arange(len(here), device=here.device)
@@ -227,7 +220,6 @@ def start_from_tracks(
     tracks: Tracks,
     cameras: Cameras,
     space: Space = WORLD,
-    smoothness: float = 0.01,
     steps: int = 60,
     capturer: CudaGraphCapture | None = None,
 ) -> None:
@@ -243,7 +235,6 @@ def start_from_tracks(
         tracks: where canonical points are seen at that frame.
         cameras: all cameras.
         space: the space that the field lives in.
-        smoothness: weight of differences between neighbouring voxels' changes.
         steps: optimiser steps of each fit.
         capturer: captures a step of each fit in a CUDA graph; None: steps are done one by one.
     """
@@ -261,7 +252,7 @@ def start_from_tracks(
         pixel, _ = cameras.project(tracks.camera, space.to_world(points))
         return pixel - tracks.pixel
 
-    forward += _fit(misses, forward, scale, smoothness, steps, capturer)
+    forward += _fit(misses, forward, scale, steps, capturer)
     arrived = tracks.canonical + interpolate(forward, coords)
     there = field.box.to_grid(arrived, field.shape)
 
@@ -269,7 +260,7 @@ def start_from_tracks(
         returned = arrived + interpolate(backward + change, there)
         return (returned - tracks.canonical) * scale
 
-    backward += _fit(errs, backward, scale, smoothness, steps, capturer)
+    backward += _fit(errs, backward, scale, steps, capturer)
     field.frames.write(frame, (backward, forward))
 
 
@@ -289,7 +280,6 @@ def _fit(
     residual: Callable[[Tensor], Tensor],
     like: Tensor,
     scale: float,
-    smoothness: float,
     steps: int,
     capturer: CudaGraphCapture | None,
 ) -> Tensor:
@@ -299,7 +289,6 @@ def _fit(
         residual: change → residuals (N, 2 or 3) in pixels.
         like: a grid of the shape and device wanted.
         scale: pixels per unit of the grid's values.
-        smoothness: weight of the squared differences between neighbours, in pixels.
         steps: Adam steps; the rate falls linearly from half a pixel a step.
         capturer: as for :func:`start_from_tracks`.
     """
@@ -314,7 +303,7 @@ def _fit(
         missed = residual(change)
         error = torch.nn.functional.huber_loss(missed, torch.zeros_like(missed), delta=1.0)
         rough = sum(change.diff(dim=axis).square().sum() for axis in range(3)) * scale**2
-        total: Tensor = error + smoothness * rough / like.shape[:3].numel()
+        total: Tensor = error + SMOOTHNESS * rough / like.shape[:3].numel()
         total.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
 
