@@ -16,7 +16,6 @@ from devrf.data.flow import previous_images
 from devrf.engine.active_frames import ActiveFrame, ActiveFrames
 from devrf.engine.frame_store import FrameField
 from devrf.errors import DevrfError
-from devrf.methods.devrf.deformation_field import DeformationField
 from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule
 from devrf.methods.devrf.losses import MOTION_TERMS, MotionPrediction, total_variation_weight
 from devrf.methods.devrf.voxel_stage import VoxelStage
@@ -41,12 +40,6 @@ class MotionStage(VoxelStage):
     capture: CaptureName = "dynamic"
     weights: dict[str, float]
     active: ActiveFrames
-
-    @property
-    def field(self) -> DeformationField:
-        """The deformation field; the active frames' part may not be written back yet."""
-        assert self.scene_model.deformation is not None, "the stage has not been set up"
-        return self.scene_model.deformation
 
     @property
     def views(self) -> Views:

@@ -16,7 +16,7 @@ from devrf.engine.stage import ScheduledStage
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.space import WORLD
 from devrf.methods.devrf.canonical_field import CanonicalField
-from devrf.methods.devrf.deformation_field import GridWarp
+from devrf.methods.devrf.deformation_field import DeformationField, GridWarp
 from devrf.methods.devrf.losses import MotionPrediction, Prediction
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import CanonicalRates, Precision
@@ -65,6 +65,12 @@ class VoxelStage(ScheduledStage):
         """
         super().__init__(iterations_per_step, graphs)
         self.decoder_precision = decoder_precision
+
+    @property
+    def field(self) -> DeformationField:
+        """The deformation field; what active frames learn may not be written back yet."""
+        assert self.scene_model.deformation is not None, "the stage has not been set up"
+        return self.scene_model.deformation
 
     @property
     def static_shape(self) -> bool:

@@ -133,8 +133,7 @@ class RefinementStage(VoxelStage):
     def restore(self, phase: Phase, state: dict[str, Any]) -> None:
         """Go on with ``phase``: images and fields tell which pixels there are."""
         self.phase, model = phase, self.scene_model
-        assert model.deformation is not None
-        times, moving = model.deformation.clock.times, self.training_views("dynamic")
+        times, moving = self.field.clock.times, self.training_views("dynamic")
         self._static = static_pool(self.training_views("static"), model, model.occupancy)
         self._occupancies, self._pools = [], []
         for frame in range(1, len(times)):
@@ -186,10 +185,10 @@ class RefinementStage(VoxelStage):
             warp, occupancy, color_change = None, model.occupancy, None
             if shown is moving:
                 part = Pixels(part.image - len(static), part.flat, part.background)
-                assert moving.frames is not None and model.deformation is not None
+                assert moving.frames is not None
                 frame = int(moving.frames[part.image[0]])
-                time = model.deformation.clock.times[frame]
-                warp, color_change = model.deformation.warp_at(time), model.color_change(time)
+                time = self.field.clock.times[frame]
+                warp, color_change = self.field.warp_at(time), model.color_change(time)
                 occupancy = self._occupancies[frame - 1]
             seen = self.render_pixels(shown, part, occupancy, None, warp, color_change)
             with span("losses"):
