@@ -17,7 +17,6 @@ import pytest
 import torch
 
 from devrf.errors import DevrfError
-from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras, Distortion
 from devrf.scenes.export import export
 from devrf.scenes.lens import Lens
@@ -161,12 +160,6 @@ def ball_views() -> Callable[..., Views]:
         )
 
     return make
-
-
-@pytest.fixture
-def unit_box() -> Box:
-    """The cube from −1 to 1."""
-    return Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 
 
 @pytest.fixture

@@ -197,11 +197,6 @@ def test_fixed_views_without_times_have_to_take_turns(scene_folder, message_of):
     assert str(path) in message and "2 fixed views do not take turns" in message
 
 
-def test_views_that_are_not_there(scene_folder, single_folder, message_of):
-    assert "the set has 2 views" in message_of(scene_folder.root, train_views=3)
-    assert "needs fixed cameras" in message_of(single_folder, train_views=1)
-
-
 @pytest.mark.parametrize(
     ("options", "said"),
     [

@@ -6,7 +6,6 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
@@ -96,29 +95,6 @@ def test_what_is_exported_reads_back_the_same(facing: Scene, tmp_path: Path) -> 
     assert again.space == facing.space
     assert again.bounds.box.low == pytest.approx(facing.bounds.box.low, abs=1e-5)
     assert again.bounds.box.high == pytest.approx(facing.bounds.box.high, abs=1e-5)
-
-
-def test_the_layout_is_the_published_one(facing: Scene, tmp_path: Path):
-    export(facing, tmp_path / "plush")
-    root = tmp_path / "plush"
-    assert sorted(p.name for p in root.iterdir()) == ["dynamic_4views", "static"]
-    rows = np.load(root / "static" / "poses_bounds.npy")
-    assert rows.shape == (8, 17)
-    matrix = rows[:, :15].reshape(8, 3, 5)
-    focal = float(facing.static.train.cameras.focal[0, 0])
-    assert matrix[:, :, 4].tolist() == [[72, 96, pytest.approx(4 * focal)]] * 8
-    # The first image is held out; down is against the camera's y axis, right along its x axis.
-    first = facing.static.test.cameras.camera_to_world[0].numpy()
-    assert np.array_equal(matrix[0, :, 0], -first[:, 1].astype(float))
-    assert np.array_equal(matrix[0, :, 1], first[:, 0].astype(float))
-    assert rows[:, 15].tolist() == [pytest.approx(4 / 3)] * 8
-    moving = root / "dynamic_4views"
-    assert np.load(moving / "poses.npy").shape == (4, 3, 5)
-    assert np.load(moving / "poses.npy")[0, :, 4].tolist() == [18, 24, pytest.approx(focal)]
-    assert np.load(moving / "bds.npy").shape == (4, 2)
-    flows = sorted(p.name for p in (moving / "view2" / "images_4_flow").iterdir())
-    assert flows == ["001_bwd.npz", "002_bwd.npz"]
-    assert not (moving / "view4" / "images_4_flow").exists()
 
 
 def test_frames_without_times_have_to_be_evenly_spread(facing: Scene, tmp_path: Path) -> None:

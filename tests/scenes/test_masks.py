@@ -108,17 +108,6 @@ def test_any_grey_file_is_a_mask(root, kind):
     assert bool(valid[:, :, : WIDTH // 2].all()) and not bool(valid[:, :, WIDTH // 2 :].any())
 
 
-def test_a_mask_may_be_of_the_size_of_the_camera(root):
-    plain(root)
-    for k in range(9):
-        with Image.open(root / f"{k}.png") as image:
-            image.resize((WIDTH // 2, HEIGHT // 2)).save(root / f"{k}.png")
-    for masks in ("ignore", "alpha"):
-        train = NerfstudioReader(root, masks=masks).read().dynamic.train  # type: ignore[arg-type]
-        kept = train.pixels[..., 3] == 255 if train.valid_mask is None else train.valid_mask
-        assert torch.equal(kept[0, 0], torch.arange(WIDTH // 2) < WIDTH // 4)
-
-
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [

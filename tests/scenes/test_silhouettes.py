@@ -20,8 +20,8 @@ PLACES = torch.stack(
 )
 
 
-def test_box_holds_the_moving_ball_and_little_more(ball_views, unit_box):
-    box = motion_box(ball_views(PLACES, RADIUS), unit_box)
+def test_box_holds_the_moving_ball_and_little_more(ball_views, cube):
+    box = motion_box(ball_views(PLACES, RADIUS), cube)
     assert box is not None
     low, high = PLACES.amin(dim=0) - RADIUS, PLACES.amax(dim=0) + RADIUS
     assert bool(box.contains(torch.stack([low, high])).all())
@@ -31,45 +31,45 @@ def test_box_holds_the_moving_ball_and_little_more(ball_views, unit_box):
     assert float(slack_low.max()) < 0.3 and float(slack_high.max()) < 0.25
 
 
-def test_a_ball_far_smaller_than_a_grid_cell_is_not_lost(ball_views, unit_box):
+def test_a_ball_far_smaller_than_a_grid_cell_is_not_lost(ball_views, cube):
     place = torch.tensor([[0.31, 0.17, 0.23], [0.52, 0.17, 0.23]])
-    box = motion_box(ball_views(place, 0.05), unit_box, resolution=12)
+    box = motion_box(ball_views(place, 0.05), cube, resolution=12)
     assert box is not None and bool(box.contains(place).all())
 
 
-def test_a_ball_cut_off_by_one_image_is_kept_whole(ball_views, unit_box):
+def test_a_ball_cut_off_by_one_image_is_kept_whole(ball_views, cube):
     # Two of the cameras see as far as y = 1.93 only, the two others look along y.
     places = torch.tensor([[0.0, 0.0, 0.0], [0.0, 1.9, 0.0]])
     views = ball_views(places, RADIUS)
     alpha = views.pixels[..., 3]
     cut = alpha[:, :, [0, -1]].flatten(1).amax(dim=1) > 0
     assert bool(cut.any()) and not bool(cut.all())
-    box = motion_box(views, unit_box.scaled(1.6))
+    box = motion_box(views, cube.scaled(1.6))
     assert box is not None and box.high[1] >= 1.9 + RADIUS
 
 
-def test_what_does_not_count_rules_nothing_out(ball_views, unit_box):
+def test_what_does_not_count_rules_nothing_out(ball_views, cube):
     views = ball_views(PLACES, RADIUS)
-    box = motion_box(views, unit_box)
+    box = motion_box(views, cube)
     valid_mask = torch.ones(views.pixels.shape[:3], dtype=torch.bool)
-    assert motion_box(replace(views, valid_mask=valid_mask), unit_box) == box
+    assert motion_box(replace(views, valid_mask=valid_mask), cube) == box
     # Two of the four views see nothing that counts: the hull is that of the others, and larger.
     valid_mask[views.view < 2] = False
-    looser = motion_box(replace(views, valid_mask=valid_mask), unit_box)
+    looser = motion_box(replace(views, valid_mask=valid_mask), cube)
     assert box is not None and looser is not None
     assert all(a <= b for a, b in zip(looser.low, box.low, strict=True))
     assert all(a >= b for a, b in zip(looser.high, box.high, strict=True))
     assert looser != box
     valid_mask[:] = False
-    assert motion_box(replace(views, valid_mask=valid_mask), unit_box) is None
+    assert motion_box(replace(views, valid_mask=valid_mask), cube) is None
 
 
-def test_no_box_without_alpha_masks_or_without_two_cameras_at_every_time(ball_views, unit_box):
-    assert motion_box(ball_views(PLACES, RADIUS, channels=3), unit_box) is None
-    assert motion_box(ball_views(PLACES, RADIUS, count=1), unit_box) is None
+def test_no_box_without_alpha_masks_or_without_two_cameras_at_every_time(ball_views, cube):
+    assert motion_box(ball_views(PLACES, RADIUS, channels=3), cube) is None
+    assert motion_box(ball_views(PLACES, RADIUS, count=1), cube) is None
     whole = ball_views(PLACES, RADIUS)
     missing = whole[torch.arange(len(whole) - 3)]  # the last time keeps one view of four
-    assert motion_box(missing, unit_box) is None
+    assert motion_box(missing, cube) is None
 
 
 BOX = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))

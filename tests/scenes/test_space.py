@@ -42,8 +42,8 @@ def test_box_of_the_usual_synthetic_cameras(ring_cameras):
     assert box.high == pytest.approx((half,) * 3, abs=1e-5)
 
 
-def test_depth_range_holds_the_sphere_around_the_box(ring_cameras, unit_box):
-    near, far = depth_range(ring_cameras(4, width=8, height=8, angle=0.7), unit_box)
+def test_depth_range_holds_the_sphere_around_the_box(ring_cameras, cube):
+    near, far = depth_range(ring_cameras(4, width=8, height=8, angle=0.7), cube)
     assert near == pytest.approx(4 - math.sqrt(3), abs=1e-5)
     assert far == pytest.approx(4 + math.sqrt(3), abs=1e-5)
 

@@ -25,6 +25,8 @@ NEAR_SHARE = 0.02
 # Shortest edge of a box, as a share of its distance from the origin: in a float32 a thousand
 # steps along it are still a thousand places.
 LEAST_EDGE = 1e-4
+# What to do where the cameras do not say where the scene is.
+GIVE = "set data.box=[[x,y,z],[x,y,z]], data.near and data.far"
 
 
 def nearest_point(origins: Tensor, axes: Tensor, parallel: float) -> Tensor | None:
@@ -55,17 +57,9 @@ def axes_meet(cameras: Cameras) -> Tensor:
     origin, axis = cameras.positions.double(), cameras.forwards.double()
     point = nearest_point(origin, axis, NEARLY_PARALLEL)
     if point is None:
-        raise scene_error(
-            "data.box",
-            "the static cameras look in nearly one direction, so their axes do not "
-            "say where the scene is; set data.box=[[x,y,z],[x,y,z]], data.near and data.far",
-        )
+        raise scene_error("data.box", f"the static cameras look in nearly one direction; {GIVE}")
     if float(((point - origin) * axis).sum(dim=1).median()) <= 0:
-        raise scene_error(
-            "data.box",
-            "the static cameras look away from one another, expected cameras around "
-            "the scene; set data.box=[[x,y,z],[x,y,z]], data.near and data.far",
-        )
+        raise scene_error("data.box", f"the static cameras look away from one another; {GIVE}")
     return point.float()
 
 
@@ -110,9 +104,7 @@ def resolved_box(low: Tensor, high: Tensor) -> Box:
     if not (float((high - low).min()) > least and reach <= FARTHEST):
         raise scene_error(
             "data.box",
-            f"the cameras say that the scene lies between {low.tolist()} and "
-            f"{high.tolist()}, which single precision cannot hold; bring the scene nearer to the "
-            "origin, correct its unit, or set data.box=[[x,y,z],[x,y,z]]",
+            f"the cameras say {low.tolist()} to {high.tolist()}, too small or too far away; {GIVE}",
         )
     return Box.of(low, high)
 
@@ -183,8 +175,7 @@ def inward_bounds(
     if not 0 <= near < far <= 4 * FARTHEST:
         raise scene_error(
             "data.near, data.far",
-            f"expected 0 <= near < far, not {near:g} and {far:g}; "
-            "set both, in world units, or leave them null",
+            f"expected 0 <= near < far, not {near:g} and {far:g}; correct both",
         )
     return Bounds(box, near, far, motion, scale, source, limited)
 

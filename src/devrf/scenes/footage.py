@@ -102,9 +102,7 @@ def chosen(path: Path, positions: Sequence[int]) -> Iterator[tuple[int, Picture]
                 found, image = video.retrieve()
             if not found:
                 raise scene_error(
-                    path,
-                    f"ends after {position} frames, expected {last + 1} or more; convert it again, "
-                    "or ask for fewer",
+                    path, f"ends after {position} frames, expected {last + 1}; convert it again"
                 )
             if image is not None:
                 yield position, _rgb(image)

@@ -69,9 +69,7 @@ def image_folder(
         wanted = full if downscale == 1 else f"{reduced.format(downscale)} or {full}"
         found = ", ".join(sorted(path.name for path in folders.values())) or "none"
         raise scene_error(
-            parent,
-            f"no folder {wanted} (found: {found}); add it, or set data.downscale to a "
-            "factor that is there",
+            parent, f"no folder {wanted} (found: {found}); add it, or change data.downscale"
         )
     best = max(fitting)
     return ImageFolder(folders[best], downscale // best)

@@ -87,9 +87,7 @@ def without_static_set(train: Split, test: Split, static_until: float) -> Layout
     early, early_test = (split.where(split.times <= static_until + 1e-6) for split in (train, test))
     if len(early.index) == 0:
         raise scene_error(
-            train.transforms.file,
-            f"no image at a time of data.static_until={static_until:g} or "
-            "before to learn the static scene from; set it higher",
+            train.transforms.file, "no image is as early as data.static_until; set it higher"
         )
     if len(early_test.index) == 0:
         early_test = test
@@ -128,9 +126,7 @@ def fewer(layout: Layout, train_views: int | None, frames: int | None) -> tuple[
     train, test = first_views(layout.dynamic_train, train_views), layout.dynamic_test
     if len(distinct_times(train.used_times)) < 2:
         raise scene_error(
-            train.transforms.file,
-            "all dynamic images have one time, expected at least 2 "
-            "distinct times; give each frame its own",
+            train.transforms.file, "all dynamic images have one time; give each frame its own"
         )
     kept = None if frames is None else evenly_spread(train.used_times, frames)
     if kept is not None:

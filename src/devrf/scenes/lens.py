@@ -145,8 +145,7 @@ class Intrinsics:
         if not same_shape((width, height), (w, h)):
             raise scene_error(
                 where,
-                f"{width}x{height} px, but its camera is one for {w:g}x{h:g} px; crop or "
-                "turn the image back, or correct the camera's size",
+                f"{width}x{height} px, but its camera is one for {w:g}x{h:g} px; correct one",
             )
         if self.focal is not None:
             focal = self.focal

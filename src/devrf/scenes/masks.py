@@ -57,17 +57,12 @@ def read_mask(path: Path, image: tuple[int, int], camera: Size | None, name: obj
     if size != image and not full:
         raise scene_error(
             path,
-            f"{size[0]}x{size[1]} px, but its image {name} has {image[0]}x{image[1]} px; "
-            "give the mask in the image's size",
+            f"{size[0]}x{size[1]} px, but its image {name} has {image[0]}x{image[1]} px; resize it",
         )
     pixels = decode(path, header, "RGBA")
     spread = pixels[..., :3].max(axis=2) - pixels[..., :3].min(axis=2)
     if int(spread.max()) > GREY_NOISE or int(pixels[..., 3].min()) < WHITE:
-        raise scene_error(
-            path,
-            "a mask with colours or an alpha channel; give one channel, black where pixels "
-            "are left out, white elsewhere",
-        )
+        raise scene_error(path, "a mask with colours or an alpha channel; give one channel")
     grey = np.ascontiguousarray(pixels[..., :1])
     if int(grey.max()) == 1:
         grey *= WHITE
@@ -155,9 +150,7 @@ def valid_pixels(
     for k in masked:
         if not bool(valid_mask[k].any()):
             raise scene_error(
-                paths[k],
-                f"leaves nothing of {names[k]} to learn from; leave the image out, or "
-                "set data.masks=none",
+                paths[k], f"leaves nothing of {names[k]} to learn from; leave the image out"
             )
     share = 100 * float((~valid_mask).float().mean())
     log.info("masks of %d images leave out %.1f %% of the pixels of all", len(masked), share)

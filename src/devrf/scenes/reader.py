@@ -192,8 +192,7 @@ class PosedReader(InwardReader):
         if reader.near is None or reader.near <= 0:
             raise scene_error(
                 "data.near",
-                "data.space=ndc needs the distance of the near plane, above 0; give it in world "
-                "units, a little less than the depth of what is nearest",
+                "data.space=ndc needs a near plane; give its distance in world units, above 0",
             )
         name, captures = self.name_of(folder), centred(static, dynamic)
         return forward_facing_scene(name, *captures, reader.near, self.background)

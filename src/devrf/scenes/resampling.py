@@ -140,8 +140,7 @@ def as_pinhole(
         if view is None:
             raise scene_error(
                 names[row],
-                "the distortion (k1, k2, k3, p1, p2) is so strong that the image "
-                "folds over; correct it, or undistort the images first",
+                "the distortion is so strong that the image folds over; undistort it first",
             )
         plain[row], source = view
         pixels[row] = torch.from_numpy(look_up_pixels(pixels[row].numpy(), source.numpy()))

@@ -229,8 +229,8 @@ def normalised(model: SparseModel, facing: Facing = "auto") -> World:
     if len(depths) < LEAST_POINTS:
         raise scene_error(
             model.folder,
-            f"its images show {len(depths)} sparse points, expected {LEAST_POINTS} or more to say "
-            "where the scene is; take it with more texture in sight, or write points3D again",
+            f"its images show {len(depths)} sparse points, expected {LEAST_POINTS} or more; "
+            "film it with more texture in sight",
         )
     near, far = (float(np.percentile(depths.numpy(), p)) for p in (OUTLIERS, 100 - OUTLIERS))
     if facing == "auto":
@@ -239,9 +239,7 @@ def normalised(model: SparseModel, facing: Facing = "auto") -> World:
     here = bool(in_reach(world.poses[:, :, 3]).all())
     if not here or not 0 < world.near < world.far <= FARTHEST:  # NaN compares false
         raise scene_error(
-            model.folder,
-            f"its cameras and points are no scene that cameras look {facing} at (all at one place, "
-            "or far apart); run COLMAP's mapper again",
+            model.folder, f"its cameras do not look {facing} at a scene; run COLMAP's mapper again"
         )
     return world
 

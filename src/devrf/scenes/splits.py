@@ -127,8 +127,8 @@ def in_motion(transforms: Transforms) -> Split:
         if fixed and (len(order) % views or bool((camera != order % views).any())):
             raise scene_error(
                 transforms.file,
-                f"no times, and its {views} fixed views do not take turns; add "
-                "a time to every frame, or list all views of frame 0, then all of frame 1 …",
+                f"no times, and its {views} fixed views do not take turns; add a "
+                "time to every frame, or list all views of frame 0, then all of frame 1 …",
             )
         frames = order // step
         times = frames / frames.max().clamp(min=1)

@@ -89,8 +89,7 @@ def reduced_size(width: int, height: int, downscale: int, where: object) -> tupl
     if min(w, h) < MIN_SIDE:
         raise scene_error(
             where,
-            f"{width}x{height} px at data.downscale={downscale} leaves {w}x{h} px, at least "
-            f"{MIN_SIDE} px a side are needed; use a smaller data.downscale",
+            f"{w}x{h} px at data.downscale={downscale}, expected {MIN_SIDE} px or more; lower it",
         )
     return w, h
 

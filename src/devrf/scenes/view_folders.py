@@ -99,7 +99,7 @@ def view_folders(folder: Path, downscale: int) -> list[ViewFolder]:
             raise scene_error(
                 source.path,
                 f"has {len(images)} images, but {views[0].images[0].parent} has "
-                f"{len(views[0].images)}; each fixed camera needs one image a frame",
+                f"{len(views[0].images)}; each view needs one a frame",
             )
         if views and source.downscale != views[0].downscale:
             raise scene_error(
@@ -109,8 +109,7 @@ def view_folders(folder: Path, downscale: int) -> list[ViewFolder]:
     if min(len(views), len(views[0].images)) < 2:
         raise scene_error(
             folder,
-            f"has {len(views)} views of {len(views[0].images)} images, expected at least 2 views, "
-            "one of them to hold out, of at least 2 frames",
+            f"has {len(views)} views of {len(views[0].images)} images, expected 2 or more of both",
         )
     return views
 
@@ -128,8 +127,7 @@ def held_out_view(count: int, test_view: int) -> int:
     if test_view == 0 or not -count <= test_view <= count:
         raise scene_error(
             "data.test_view",
-            f"{test_view} is none of the {count} views view1 … view{count}; give 1 … {count}, or "
-            "-1 for the last one",
+            f"{test_view} is none of the {count} views; give 1 … {count}, or -1 for the last one",
         )
     return test_view - 1 if test_view > 0 else count + test_view
 

@@ -79,9 +79,7 @@ def _layout(
     if not os.path.isdir(static) and not dynamic_folders(root):
         if not os.path.isfile(root / "transforms_train.json"):
             raise scene_error(
-                root,
-                "expected static/ and dynamic_<V>views/, or transforms_train.json; "
-                "set data.root to the scene's folder",
+                root, "no static/ or transforms_train.json; set data.root to the scene's folder"
             )
         train, test = _train_and_test(root, root, missing)
         return one_capture(train, test, static_until), root / "train_flow"

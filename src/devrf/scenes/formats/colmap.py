@@ -85,9 +85,8 @@ def fixed_cameras(model: SparseModel, folder: Path, count: int) -> list[int]:
         if name not in known:
             raise scene_error(
                 model.folder,
-                f"poses no image {name}.png, nor one in a folder {name}, to say where the camera "
-                f"of {folder.name}/{name} stands; put its first frame among the images, and run "
-                "COLMAP again",
+                f"poses no image {name}.png, nor one in a folder {name}; put the first frame of "
+                f"{folder.name}/{name} among the images, and run COLMAP again",
             )
     return [known[name] for name in names]
 
@@ -130,9 +129,7 @@ class ColmapReader(PosedReader):
         place = model_folder(folder)
         if place is None:
             raise scene_error(
-                folder,
-                "no COLMAP model (looked for cameras and images, .bin or .txt, in sparse/0, sparse "
-                "and colmap/sparse/0); set data.root to the folder of sparse/ and images/",
+                folder, "no COLMAP model; set data.root to the folder of sparse/ and images/"
             )
         model = read_model(place)
         world = normalised(model, _facing(self.space))

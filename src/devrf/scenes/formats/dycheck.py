@@ -97,8 +97,7 @@ def _read_split(file: Path) -> dict[str, float]:
     if len(split.frame_names) != len(split.time_ids):
         raise scene_error(
             file,
-            f"{len(split.frame_names)} frame_names, but {len(split.time_ids)} time_ids; give each "
-            "image its time",
+            f"{len(split.frame_names)} frame_names, but {len(split.time_ids)} time_ids; correct it",
         )
     return dict(zip(split.frame_names, split.time_ids, strict=True))
 

@@ -123,8 +123,7 @@ class LlffReader(SceneReader):
         if len(cameras) < count:
             raise scene_error(
                 cameras.file,
-                f"has {len(cameras)} cameras, but there are {count} folders view1 … "
-                f"view{count}; the last rows are those of the fixed cameras",
+                f"has {len(cameras)} cameras, but there are {count} folders view1 …; add some",
             )
         unseen = held_out_view(count, self.test_view)
         moving_sets = fixed_views(
@@ -168,8 +167,7 @@ def _posed_images(folder: Path, source: Path) -> Transforms:
     if len(images) != len(posed):
         raise scene_error(
             posed.file,
-            f"has {len(posed)} cameras, but {source} has {len(images)} images; "
-            "remove the images without a camera, or write the cameras again",
+            f"has {len(posed)} cameras, but {source} has {len(images)} images; remove some",
         )
     if len(images) < 2:
         raise scene_error(source, "holds one image, expected at least one more to hold out")

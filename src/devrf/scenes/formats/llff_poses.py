@@ -16,7 +16,7 @@ from torch import Tensor
 from devrf.geometry.poses import average_pose, relative_to
 from devrf.scenes.files import Numbers, read_numbers
 from devrf.scenes.lens import Intrinsics
-from devrf.scenes.validation import FARTHEST, check_poses, in_reach, scene_error
+from devrf.scenes.validation import check_poses, in_reach, scene_error
 
 # The file of LLFF's cameras.
 POSES = "poses_bounds.npy"
@@ -59,16 +59,13 @@ class PosedSet:
         ):
             raise scene_error(
                 self.file,
-                "the cameras look in different directions, expected all of them to "
-                "face the scene from one side; use data=inward for cameras around a scene",
+                "its cameras do not face the scene from one side; use data=inward for others",
             )
         poses = relative_to(middle, self.poses)
         poses[:, :, 3] *= scale
         if not bool(in_reach(poses[:, :, 3]).all()):
             raise scene_error(
-                self.file,
-                f"the cameras are farther than {FARTHEST:g} times the least depth from "
-                "one another; correct positions and depths",
+                self.file, "its cameras are too far from one another; correct positions and depths"
             )
         return replace(self, poses=poses, bounds=self.bounds * scale)
 
@@ -87,9 +84,7 @@ def read_static_poses(folder: Path) -> PosedSet:
     rows = read_numbers(file, "the static cameras, (N, 17) or (N, 14)")
     if rows.ndim != 2 or rows.shape[1] not in (14, 17) or len(rows) == 0:
         raise scene_error(
-            file,
-            f"has shape {rows.shape}, expected (N, 17), or (N, 14) next to "
-            f"{inner.name}; write it again with LLFF's imgs2poses",
+            file, f"has shape {rows.shape}, expected (N, 17), or (N, 14); write it again"
         )
     if rows.shape[1] == 17:
         matrix = rows[:, :15].reshape(-1, 3, 5)
@@ -113,17 +108,11 @@ def read_dynamic_poses(folder: Path) -> PosedSet:
     file, depths = folder / "poses.npy", folder / "bds.npy"
     matrix = read_numbers(file, "the moving capture's cameras, (N, 3, 5)")
     if matrix.ndim != 3 or matrix.shape[1:] != (3, 5) or len(matrix) == 0:
-        raise scene_error(
-            file,
-            f"has shape {matrix.shape}, expected (N, 3, 5): axes [right, up, "
-            "back], position and [H, W, focal]; write it again",
-        )
+        raise scene_error(file, f"has shape {matrix.shape}, expected (N, 3, 5); write it again")
     bounds = read_numbers(depths, "least and largest depths, (N, 2)")
     if bounds.shape != (len(matrix), 2):
         raise scene_error(
-            depths,
-            f"has shape {bounds.shape}, expected ({len(matrix)}, 2): a row for "
-            f"each camera of {file.name}; write it again",
+            depths, f"has shape {bounds.shape}, expected ({len(matrix)}, 2); write it again"
         )
     intrinsics = _of_columns(file, matrix[:, :, 4])
     return _posed_set(file, matrix[:, :, :4], intrinsics, depths, bounds)
@@ -145,9 +134,7 @@ def _shared(file: Path) -> Intrinsics:
         case [h, w, fx, fy, cx, cy]:
             return _intrinsics(file, h, w, fx, fy, cx, cy)
     raise scene_error(
-        file,
-        f"holds {values.size} numbers, expected H, W, focal, cx, cy, or H, W, fx, fy, cx, cy; "
-        "write it again",
+        file, f"holds {values.size} numbers, expected H, W, focal(s), cx, cy; write it again"
     )
 
 
@@ -172,7 +159,7 @@ def _posed_set(
     if not bool(good.all()):
         raise scene_error(
             depths,
-            f"camera {int((~good).nonzero()[0])}: expected 0 < least depth < largest depth; "
-            "correct or leave out the image and its row",
+            f"camera {int((~good).nonzero()[0])}: expected 0 < least depth < largest "
+            "depth; correct it",
         )
     return PosedSet(file, cameras, intrinsics, ranges)

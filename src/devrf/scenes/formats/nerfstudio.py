@@ -86,20 +86,14 @@ def _layout(root: Path, options: NerfstudioReader) -> Layout:
     still, moving = root / "static" / FILE, root / "dynamic" / FILE
     if not os.path.isfile(still) and not os.path.isfile(moving):
         raise scene_error(
-            root,
-            f"expected {FILE}, or static/{FILE} (and dynamic/{FILE}); set data.root to the "
-            "scene's folder",
+            root, f"no {FILE}, nor static/{FILE}; set data.root to the scene's folder"
         )
     rest = _train_and_test(still, root, options)
     if not os.path.isfile(moving):
         return static_alone(*rest, f"there is no dynamic/{FILE}")
     motion = _train_and_test(moving, root, options)
     if motion[0].times is None:
-        raise scene_error(
-            moving,
-            'its frames have no "time", which a capture of a moving scene needs; '
-            "give every frame its time in [0, 1]",
-        )
+        raise scene_error(moving, 'its frames have no "time"; give every frame its time in [0, 1]')
     return Layout(at_rest(rest[0]), at_rest(rest[1]), in_motion(motion[0]), in_motion(motion[1]))
 
 
@@ -125,8 +119,7 @@ def _train_and_test(
         raise scene_error(
             file,
             f"{len(train)} images to learn from, {len(test)} held out, "
-            f"{len(set(train) & set(test))} of them both; expected at least one of each and none "
-            "twice: correct train_filenames and test_filenames",
+            f"{len(set(train) & set(test))} of them both; correct train_filenames, test_filenames",
         )
     return transforms[train], transforms[test]
 
@@ -142,8 +135,7 @@ def _listed(names: list[str] | None, split: str, transforms: Transforms, root: P
         if image not in position:
             raise scene_error(
                 transforms.file,
-                f"{split}_filenames lists {abbreviated(name)}, which is in none of the frames; "
-                "correct it",
+                f"{split}_filenames lists {abbreviated(name)}, which is in no frame; correct it",
             )
         found.append(position[image])
     return sorted(set(found))
@@ -165,9 +157,8 @@ def _one_file(train: Transforms, test: Transforms, static_until: float | None) -
     if not moving or not moving_test:
         raise scene_error(
             train.file,
-            f"{len(moving)} images to learn motion from and {len(moving_test)} held "
-            "out, expected at least one of each at a time above 0; correct the times, or "
-            "train_filenames and test_filenames",
+            f"{len(moving)} images to learn motion from and {len(moving_test)} held out; expected "
+            "one of each above time 0: correct the times, or train_filenames and test_filenames",
         )
     if not still_test:
         log.warning("no held-out image at time 0: the static scene is tested on one in training")

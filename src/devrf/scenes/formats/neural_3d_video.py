@@ -65,8 +65,7 @@ def camera_videos(folder: Path) -> CameraVideos:
     if len(found) < 2:
         raise scene_error(
             folder,
-            f"{len(found)} videos cam00.mp4, cam01.mp4, …, expected at least 2: one to learn from, "
-            "one to hold out; set data.root to the folder of poses_bounds.npy and the videos",
+            f"{len(found)} videos cam00.mp4, cam01.mp4, …, expected 2 or more; set data.root",
         )
     headers = {path: film_header(path) for path in found}
     first, header = next(iter(headers.items()))
@@ -74,8 +73,7 @@ def camera_videos(folder: Path) -> CameraVideos:
         if other != header or other.frames < 2:
             raise scene_error(
                 path,
-                f"{_in_words(other)}, but {first.name} has {_in_words(header)}; all videos show "
-                "the same moments, at least 2, in the same size: cut or convert them",
+                f"{_in_words(other)}, but {first.name} has {_in_words(header)}; cut or convert it",
             )
     return CameraVideos(tuple(found), tuple(found.values()), header)
 
@@ -156,9 +154,7 @@ class Neural3DVideoReader(SceneReader):
         if len(posed) != len(videos.paths):
             raise scene_error(
                 posed.file,
-                f"has {len(posed)} cameras, but there are {len(videos.paths)} videos "
-                f"{videos.paths[0].name} … {videos.paths[-1].name}; remove the videos without a "
-                "camera, or write the cameras again",
+                f"has {len(posed)} cameras, but there are {len(videos.paths)} videos; remove some",
             )
         posed = posed.normalised()
         test, train = self._split(videos)
@@ -184,8 +180,7 @@ class Neural3DVideoReader(SceneReader):
         if self.train_views is not None and self.train_views > len(train):
             raise scene_error(
                 "data.train_views",
-                f"{self.train_views} were asked for, but there are {len(train)} videos next to "
-                "the held-out one; ask for fewer",
+                f"there are {len(train)} videos next to the held-out one; ask for fewer",
             )
         return test, train[: self.train_views]
 
