@@ -11,7 +11,7 @@ import torch
 
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import score
-from devrf.evaluation.suite import MEASURES, Evaluation, flow_error, seen_flow
+from devrf.evaluation.suite import MEASURES, Evaluation, flow_error
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
@@ -165,8 +165,6 @@ def filmed_from_above(flow):
 def test_a_moving_block_by_hand(block):
     # The face is 4 away, the lens has 40 px: 0.3 units along x are 3 px, and came from the left.
     views = filmed_from_above((-3.0, 1.0))
-    seen = seen_flow(Renderer(block), views, 2, 1, torch.arange(64))
-    torch.testing.assert_close(seen, torch.tensor([-3.0, 0.0]).expand(64, 2), atol=0.015, rtol=0)
     assert flow_error(Renderer(block), views, 2) == pytest.approx(1.0, abs=0.015)
     # From rest to the first frame: 2 px.
     views = filmed_from_above((-2.0, 0.0))

@@ -140,7 +140,8 @@ class MetricSuite:
 def flow_error(renderer: Renderer, views: Views, index: int) -> float | None:
     """Mean end-point error in pixels of image ``index``'s backward flow, where that is known.
 
-    None without flow or an earlier frame, or if the method's views have no motion.
+    Rendered flow is 0 where opacity is below 0.5. None without flow or an earlier frame, or if the
+    method's views have no motion.
     """
     if views.flow is None:
         return None
@@ -148,20 +149,6 @@ def flow_error(renderer: Renderer, views: Views, index: int) -> float | None:
     flat = views.flow.valid[index].flatten().nonzero()[:, 0]
     if before == index or len(flat) == 0:
         return None
-    seen = seen_flow(renderer, views, index, before, flat)
-    if seen is None:
-        return None
-    return end_point_error(seen, views.flow.vectors[index].view(-1, 2)[flat])
-
-
-def seen_flow(
-    renderer: Renderer, views: Views, index: int, before: int, flat: Tensor
-) -> Tensor | None:
-    """The backward flow (P, 2) in pixels at some pixels of an image; 0 where opacity is below 0.5.
-
-    ``before`` is the same view's image one frame earlier; ``flat`` (P,) are row-major numbers of
-    the pixels. None if the method's views have no motion.
-    """
     pixels = pixel_positions(flat, views.width)
     rays = views.cameras.rays(torch.full_like(flat, index), pixels)
     time, earlier = float(views.times[index]), float(views.times[before])
@@ -169,4 +156,5 @@ def seen_flow(
     if flow is None:
         return None
     mean, mass = flow
-    return torch.where(mass[:, None] > SOLID, mean, torch.zeros_like(mean)).cpu()
+    rendered = torch.where(mass[:, None] > SOLID, mean, torch.zeros_like(mean)).cpu()
+    return end_point_error(rendered, views.flow.vectors[index].view(-1, 2)[flat])

@@ -107,8 +107,7 @@ class Renderer:
     def reach(self, position: Tensor) -> Box | None:
         """The scene's box, if a camera at ``position`` (3,) is so far off that it must be cropped.
 
-        Nothing is sampled beyond the far limit, which suits the captured cameras: from further
-        away rays have to begin at the box. None where the whole box is within the limit.
+        Nothing is sampled beyond the far limit: from further away rays have to begin at the box.
         """
         if not isinstance(self.model.space, WorldSpace):
             return None

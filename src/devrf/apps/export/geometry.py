@@ -16,6 +16,7 @@ from devrf.errors import DevrfError, expect
 from devrf.geometry.cameras import Cameras
 from devrf.geometry.clock import FrameClock
 from devrf.methods.base import Renderable
+from devrf.metrics.geometric import SOLID
 from devrf.rendering.renderer import Renderer, points_at_depth
 
 Format = Literal["gltf", "ply", "obj", "usd"]
@@ -155,8 +156,6 @@ CAMERAS = 24
 FIRST, LARGEST = 24, 2048
 # So many more pixels than the share that is filled asks for.
 SPARE = 1.3
-# What lets more light through shows no surface.
-SOLID = 0.5
 
 
 def seen_points(

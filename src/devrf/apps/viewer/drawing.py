@@ -15,14 +15,13 @@ from devrf.apps.keyframes import Keyframe, cameras_of
 from devrf.apps.settings import ViewerSettings
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
+from devrf.metrics.geometric import SOLID
 from devrf.rendering.output import RenderedImage
 from devrf.rendering.renderer import Renderer, points_at_depth
 from devrf.rendering.view import MovingView
 
 # Motion is shown as optical flow over so much time, and saturated at this share of the height.
 STEP, SATURATED = 0.05, 0.02
-# A pixel is something that is seen from this opacity on.
-SOLID = 0.5
 # Seconds that a block of rays should take: between blocks a frame can be given up.
 BLOCK_SECONDS, MIN_RAYS = 0.08, 512
 # In empty space nothing hides what is drawn into the scene.
