@@ -28,7 +28,7 @@ from devrf.scenes.footage import frame_count, is_folder, pictures
 from devrf.scenes.formats.nerfstudio import FILE
 from devrf.scenes.sparse_model import AROUND, SparseModel, World, normalised
 from devrf.scenes.splits import every_nth
-from devrf.system.files import write_json
+from devrf.system.files import make_folder, write_json
 from devrf.system.progress import followed
 
 log = logging.getLogger(__name__)
@@ -107,13 +107,10 @@ def kept(file: Path, source: Any, make: Callable[[], dict[str, Any]]) -> dict[st
     """What ``make`` returns, or what the JSON ``file`` keeps that it made from the same source."""
     key = _digest(source)
     if file.is_file():
-        try:
-            stored = json.loads(file.read_text())
-            if stored["key"] == key:
-                log.info("%s: found before", file.stem)
-                return dict(stored["result"])
-        except (ValueError, KeyError, TypeError):
-            log.warning("%s: damaged; it is made again", file)
+        stored = json.loads(file.read_text())
+        if stored["key"] == key:
+            log.info("%s: found before", file.stem)
+            return dict(stored["result"])
     result = make()
     write_json(file, {"key": key, "result": result})
     return result
@@ -149,12 +146,7 @@ def _surveyed(path: Path, work: Path) -> Survey:
         raise DevrfError(f"{path}: no such video; correct capture.static or capture.views")
     # Before a folder is made: a first frame that cannot be read ends here.
     next(pictures(path))
-    try:
-        work.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DevrfError(
-            f"{work}: cannot be made ({error.strerror}); give capture.into another folder"
-        ) from None
+    make_folder(work)
 
     def make() -> dict[str, Any]:
         frames = followed(pictures(path), frame_count(path), f"looking at {path.name}")

@@ -129,56 +129,31 @@ def canonical_surface(model: Renderable, cameras: Cameras, settings: ExportSetti
     Raises:
         DevrfError: there is no surface at that threshold, or none within reach.
     """
-    space = model.space
-    mesh = isosurface(model, entries(model, cameras), settings.threshold, settings.side)
-    mesh = _within_reach(mesh, space, cameras, settings.reach)
-    mesh = _decimated(_large_pieces(mesh, settings.pieces), settings.faces)
-    points, faces = torch.from_numpy(mesh[0]), torch.from_numpy(mesh[1])
-    seen = faces.flip(1) if _mirrors(space, _field(model).box) else faces
-    normals = vertex_normals(space.to_world(points), seen)
-    colors = vertex_colors(model, points, faces, normals, averaged=settings.colors == "mean")
-    return Surface(points, seen, colors)
+    import trimesh  # an extra
 
-
-def _within_reach(mesh: Mesh, space: Space, cameras: Cameras, reach: float) -> Mesh:
-    """The faces all of whose vertices are near enough: endless spaces hold what is at infinity."""
-    points, faces = mesh
-    world = space.to_world(torch.from_numpy(points))
-    away = (world - cameras.positions.mean(dim=0)).norm(dim=1)
-    near = (away <= reach * away.median()).numpy()
-    return _kept(mesh, near[faces].all(axis=1))
-
-
-def _large_pieces(mesh: Mesh, share: float) -> Mesh:
-    """The mesh without connected pieces that have a smaller share of the largest one's faces."""
-    import trimesh
-
-    whole = trimesh.Trimesh(*mesh, process=False)
-    piece = trimesh.graph.connected_component_labels(whole.face_adjacency, len(mesh[1]))
-    faces = np.bincount(piece)
-    return _kept(mesh, (faces >= share * faces.max())[piece])
-
-
-def _kept(mesh: Mesh, chosen: npt.NDArray[np.bool_]) -> Mesh:
-    """The ``chosen`` (F,) faces, and the vertices that they have."""
-    points, faces = mesh
-    if not chosen.any():
+    space, outside = model.space, entries(model, cameras)
+    points, faces = isosurface(model, outside, settings.threshold, settings.side)
+    mesh = trimesh.Trimesh(points, faces, process=False)
+    # Unbounded spaces reach to infinity: of a face all vertices have to be near enough.
+    away = (space.to_world(torch.from_numpy(points)) - cameras.positions.mean(dim=0)).norm(dim=1)
+    near = (away <= settings.reach * away.median()).numpy()[faces].all(axis=1)
+    if not near.any():
         raise DevrfError(
             "export.reach: no face of the surface is within reach; give a larger number"
         )
-    used, renumbered = np.unique(faces[chosen], return_inverse=True)
-    return points[used], renumbered.reshape(-1, 3).astype(np.int64)
-
-
-def _decimated(mesh: Mesh, faces: int) -> Mesh:
-    """The mesh with at most about ``faces`` faces, by quadric edge collapse."""
-    import trimesh
-
-    if len(mesh[1]) <= faces:
-        return mesh
-    whole = trimesh.Trimesh(*mesh, process=False)
-    fewer = whole.simplify_quadric_decimation(face_count=faces)
-    return np.asarray(fewer.vertices, np.float32), np.asarray(fewer.faces, np.int64)
+    mesh.update_faces(near)
+    piece = trimesh.graph.connected_component_labels(mesh.face_adjacency, len(mesh.faces))
+    sizes = np.bincount(piece)
+    mesh.update_faces((sizes >= settings.pieces * sizes.max())[piece])
+    mesh.remove_unreferenced_vertices()
+    if len(mesh.faces) > settings.faces:
+        mesh = mesh.simplify_quadric_decimation(face_count=settings.faces)
+    vertices = torch.from_numpy(np.array(mesh.vertices, np.float32))
+    triangles = torch.from_numpy(np.array(mesh.faces, np.int64))
+    seen = triangles.flip(1) if _mirrors(space, _field(model).box) else triangles
+    normals = vertex_normals(space.to_world(vertices), seen)
+    colors = vertex_colors(model, vertices, triangles, normals, averaged=settings.colors == "mean")
+    return Surface(vertices, seen, colors)
 
 
 def _mirrors(space: Space, box: Box) -> bool:

@@ -38,10 +38,9 @@ def box_middle(scene: Scene) -> Tensor:
 
 
 def common_up(cameras: Cameras) -> Tensor | None:
-    """The direction (3,) that is up for cameras held level; None where they do not agree.
+    """The direction (3,) most nearly at right angles to all x axes of cameras held level.
 
-    A camera may look up or down, but its own x axis stays level: up is the direction most
-    nearly at right angles to all x axes.
+    None where they do not agree.
     """
     pose = cameras.camera_to_world.double().cpu()
     mean = pose[:, :, 1].mean(dim=0)
