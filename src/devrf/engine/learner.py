@@ -15,7 +15,7 @@ import torch
 from lightning import LightningModule
 from torch import Tensor
 
-from devrf.data.batch import Pixels, background_color
+from devrf.data.batch import Pixels
 from devrf.ops.adam import GridAdam
 from devrf.rendering.sample_capacity import SampleCapacity
 from devrf.rendering.view import Viewable
@@ -96,7 +96,6 @@ class Learner(LightningModule, ABC):
     optimizer: GridAdam
     phase: Phase | None
     generator: torch.Generator
-    _plain_background: Tensor | None = None
 
     @property
     @abstractmethod
@@ -193,15 +192,3 @@ class Learner(LightningModule, ABC):
     def scored_capture(self) -> CaptureName:
         """The capture whose held-out views measure what was learned."""
         return "dynamic" if self.capture == "both" else self.capture
-
-    def background(self, image: Tensor) -> Tensor:
-        """What is behind the pixels of ``image`` (R,): (3,), always the same tensor, if plain.
-
-        Else (R, 3), drawn with ``generator``.
-        """
-        name = self.scene.background
-        if name == "random":
-            return background_color(name, len(image), self.generator)
-        if self._plain_background is None or self._plain_background.device != image.device:
-            self._plain_background = background_color(name, 0, self.generator).to(image.device)
-        return self._plain_background

@@ -24,6 +24,7 @@ from devrf.checkpoints.checkpoint import (
     metadata_in,
 )
 from devrf.checkpoints.progress import rng_state, set_rng_state
+from devrf.data.batch import background_color
 from devrf.engine.ddp import assert_replicas_equal, broadcast, check_strategy, rank
 from devrf.engine.learner import Learner
 from devrf.engine.loop import Loop
@@ -80,8 +81,23 @@ class ScheduledStage(Learner):
         self.lr_scale = 1.0
         self.abort_reason: str | None = None
         self.logged: dict[str, Tensor] = {}
+        self._plain_background: Tensor | None = None
         self._progress: dict[str, Any] | None = None
         self._finished: dict[str, Any] | None = None
+
+    def background(self, image: Tensor) -> Tensor:
+        """What is behind the pixels of ``image`` (R,): (3,), always the same tensor, if plain.
+
+        Else (R, 3), drawn with ``generator``.
+        """
+        plain = self._plain_background
+        if plain is None or plain.device != image.device:
+            name = self.scene.background
+            if name == "random":
+                return background_color(name, len(image), self.generator)
+            plain = background_color(name, 0, self.generator).to(image.device)
+            self._plain_background = plain
+        return plain
 
     def metadata(self) -> CheckpointMetadata:
         """The metadata of a checkpoint of this stage."""
