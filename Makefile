@@ -2,7 +2,8 @@
 # make test         install with the development tools, then lint, types, architecture, tests
 # make docs         build the documentation into site/; needs no network once installed
 # make house        lines and files of each folder, the longest files, circles of imports
-# make gpu-check    install into .venv and check what this machine's GPU does, in minutes
+# make gpu-check    install into .venv and check what this machine's GPU does, in minutes;
+#                   with INSTALL_FIRST=no by $(PYTHON) and the packages that it has
 # make fuzz         what is too long for make test: the readers' fuzz tests with 100 000 inputs
 #                   (make test has 100), the kernels at many sizes and compiled for two GPUs
 # make format       format the code and mend what the linter can
@@ -44,8 +45,8 @@ docs: $(VENV)/.installed-dev
 house: $(VENV)/.installed-dev
 	$(BIN)/python benchmarks/house.py
 
-gpu-check: $(VENV)/.installed
-	$(BIN)/python -m devrf stage=selfcheck
+gpu-check: $(if $(filter no,$(INSTALL_FIRST)),,$(VENV)/.installed)
+	$(if $(filter no,$(INSTALL_FIRST)),PYTHONPATH=src:$(PYTHONPATH) $(PYTHON),$(BIN)/python) -m devrf stage=selfcheck
 
 fuzz: $(VENV)/.installed-dev
 	DEVRF_FUZZ_INPUTS=100000 DEVRF_ALL_LAUNCHES=1 $(PYTEST) tests/scenes/test_damaged_files.py tests/accel

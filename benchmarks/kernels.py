@@ -24,15 +24,20 @@ from devrf.ops.adam_step import (
     add_total_variation_gradient,
     smooth_adam_step,
 )
+from devrf.ops.color_network import ColorNetwork, listed_colors
 from devrf.ops.compositing import composite_colors, composite_segments
 from devrf.ops.dispatch import Kind, triton_runs, using
-from devrf.ops.search import Thresholds, find_samples
+from devrf.ops.motion import ListedSamples, SeenEarlier, motion_sum
+from devrf.ops.photometric import photometric_sum
+from devrf.ops.search import PackedSamples, Thresholds, find_samples, select_listed
 from devrf.ops.trilinear import interpolate
 from devrf.ops.warped_depth import warped_depth
 
 BOX = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 CHANNELS = 12
 SAMPLES_PER_RAY = 32
+# Of these, how many are coloured, and the colour network's hidden units and octaves.
+COLORED_PER_RAY, WIDTH, OCTAVES = 16, 128, 4
 
 
 def main() -> None:
@@ -67,6 +72,18 @@ def milliseconds(work: Callable[[], object], kind: Kind, seconds: float) -> floa
         return 1000 * float(timer.blocked_autorange(min_run_time=seconds).median)
 
 
+def difference(work: Callable[[], object]) -> list[float]:
+    """The largest difference of each gradient in both implementations, relative to its largest."""
+    kinds: tuple[Kind, ...] = ("torch", "triton")
+    results = []
+    for kind in kinds:
+        with using(kind):
+            result = work()
+        results.append(result if isinstance(result, tuple) else ())
+    pairs = [(a, b) for a, b in zip(*results, strict=True) if isinstance(a, Tensor)]
+    return [float((a - b).abs().max() / a.abs().max().clamp(min=1e-30)) for a, b in pairs]
+
+
 def operations(side: int, rays: int, device: torch.device) -> Mapping[str, Callable[[], object]]:
     """The operations by name, each on tensors of its own.
 
@@ -94,7 +111,7 @@ def operations(side: int, rays: int, device: torch.device) -> Mapping[str, Calla
     rule = AdamRule(torch.tensor(1e-3, device=device), torch.tensor(9.0, device=device))
     common: dict[str, Any] = {"box": BOX, "shift": -2.0, "delta": 0.5}
 
-    def search() -> object:
+    def search() -> PackedSamples:
         return find_samples(
             -1.5 * directions,
             directions,
@@ -111,6 +128,48 @@ def operations(side: int, rays: int, device: torch.device) -> Mapping[str, Calla
             **common,
         )
 
+    colored = rays * COLORED_PER_RAY
+    own = torch.arange(rays, device=device).repeat_interleave(COLORED_PER_RAY)
+    starts = torch.arange(rays + 1, device=device) * COLORED_PER_RAY
+    encoded = 3 + 6 * OCTAVES
+    sizes = (
+        (WIDTH, CHANNELS),
+        (WIDTH,),
+        (WIDTH, encoded),
+        (WIDTH, WIDTH),
+        (WIDTH,),
+        (3, WIDTH),
+        (3,),
+    )
+    network = [draw(*size) / 8 for size in sizes]
+    octaves = 2.0 ** torch.arange(OCTAVES, device=device)
+    zeros = torch.zeros(rays, dtype=torch.long, device=device)
+    pose = torch.eye(3, 4, device=device)[None] + torch.tensor([0.0, 0, 0, 4], device=device)
+    seen = SeenEarlier(
+        *(draw(rays, 2), zeros == 0, draw(rays, 2), zeros, zeros[:1]),
+        *(pose, draw(1, 2) + 400, draw(1, 2) + 200),
+    )
+
+    def motion(forward: Tensor, canonical: Tensor, weight: Tensor) -> Tensor:
+        present = torch.ones(colored, dtype=torch.bool, device=device)
+        listed = ListedSamples(points[:colored], canonical, weight, own, present)
+        options: dict[str, Any] = {"box": BOX, "over_samples": False}
+        return motion_sum(listed, forward, slices, seen, (1.0, 1.0), **options).total
+
+    def photometric(image: Tensor, end: Tensor, color: Tensor) -> Tensor:
+        known = depth[:colored], color, starts, image.detach() / 2, None, (1.0, 0.1, 0.1, 0.0)
+        return photometric_sum(image, end, *known).total
+
+    def colors_in(precision: torch.dtype) -> Callable[[], object]:
+        def rgb(grid: Tensor, at: Tensor, *weights: Tensor) -> Tensor:
+            known = directions, own, starts, ColorNetwork(*[*weights, octaves]), precision
+            return listed_colors(grid, at, BOX, *known)
+
+        return with_gradients(rgb, features, points[:colored], *network)
+
+    half = torch.bfloat16 if device.type == "cuda" else torch.float16
+    precisions = {"float32": torch.float32, "half": half}
+    listed = search()
     return {
         "interpolate": with_gradients(interpolate, features, coords),
         "warped_depth": with_gradients(
@@ -119,6 +178,13 @@ def operations(side: int, rays: int, device: torch.device) -> Mapping[str, Calla
             slices,
         ),
         "find_samples": search,
+        "select_listed": with_gradients(
+            lambda canonical, weight: select_listed(listed, canonical, weight, colored).canonical,
+            *(points, depth),
+        ),
+        **{f"listed_colors {name}": colors_in(kind) for name, kind in precisions.items()},
+        "motion_sum": with_gradients(motion, slices, points[:colored], depth[:colored]),
+        "photometric_sum": with_gradients(photometric, colors[:rays], left, colors[:colored]),
         "composite_segments": with_gradients(lambda tau: composite_segments(tau, first)[0], depth),
         "composite_colors": with_gradients(
             lambda weights, colors: composite_colors(weights, colors, depth, first, left, left[:3])[
@@ -140,7 +206,7 @@ def with_gradients(operation: Callable[..., Tensor], *given: Tensor) -> Callable
     leaves = [tensor.clone().requires_grad_() for tensor in given]
 
     def work() -> object:
-        return torch.autograd.grad(operation(*leaves).sum(), leaves)
+        return torch.autograd.grad(operation(*leaves).sum(), leaves, allow_unused=True)
 
     return work
 

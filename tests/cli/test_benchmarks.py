@@ -72,7 +72,26 @@ def test_rendering_learns_first_what_no_checkpoint_has(benchmark, tmp_path, tiny
 
 def test_every_operation(benchmark):
     found = benchmark("kernels", "--side=6", "--rays=4", "--seconds=0.01")
-    assert len(found["rows"]) == 8 and all(row["torch ms"] > 0 for row in found["rows"])
+    assert len(found["rows"]) == 13 and all(row["torch ms"] > 0 for row in found["rows"])
+
+
+def test_the_report_of_a_gpu_records_what_fails_and_goes_on(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(FOLDER)
+    report = importlib.import_module("gpu_report")
+
+    def broken(into):
+        yield {"found": 1}
+        raise ValueError("out of order")
+
+    steps = {"machine": (1, report.machine), "broken": (1, broken), "later": (1, broken)}
+    monkeypatch.setattr(report, "STEPS", steps)
+    report.make(tmp_path, "machine")
+    with pytest.raises(ValueError, match="out of order"):
+        report.make(tmp_path, "broken")
+    report.write_report(tmp_path)
+    page = (tmp_path / "REPORT.md").read_text()
+    assert "## machine: done" in page and "## broken: failed" in page and "## later: left" in page
+    assert '"found": 1' in page and "ValueError: out of order" in page
 
 
 def test_a_part_counts_without_the_parts_inside_it(monkeypatch):

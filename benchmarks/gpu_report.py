@@ -1,0 +1,300 @@
+"""Everything that one visit to a GPU should tell, the most telling first, written as it is found.
+
+Each step runs in a process of its own: what fails is recorded with its traceback, and the rest goes
+on. A second call with the same ``--into`` makes the steps that are left, then those that failed.
+Without a GPU all runs at tiny sizes: whether the script works is known before the visit.
+"""
+
+from __future__ import annotations
+
+import harness  # isort: skip: how threads wait is set before torch is loaded
+
+import argparse
+import json
+import platform
+import subprocess
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from functools import partial
+from importlib import import_module
+from importlib.metadata import distributions
+from itertools import product
+from pathlib import Path
+
+import kernels
+import rendering
+import torch
+import training
+from instruments import Row, Stopwatch, launched, timed_kernels
+from torch.profiler import profile
+
+from devrf import selfcheck
+from devrf.cli.context import RunContext
+from devrf.cli.run import run_stage
+from devrf.evaluation.held_out import background_value
+from devrf.ops import color_network
+from devrf.ops.dispatch import Kind, reaches, using
+from devrf.rendering.renderer import Renderer
+from devrf.system.device import wait
+from devrf.system.files import write_json
+
+HERE = Path(__file__).resolve()
+DEVICE = torch.device("cuda", 0) if torch.cuda.is_available() else torch.device("cpu")
+GPU = DEVICE.type == "cuda"
+# The embedded scene as large as the paper's: 100 views at rest, 4 of 50 frames, 400 × 400 pixels.
+SIZE, VIEWS, FRAMES = (400, 100, 50) if GPU else (24, 6, 3)
+SCENE = [
+    *("data=procedural", "data.supersample=1", f"data.width={SIZE}", f"data.height={SIZE}"),
+    *(f"data.static_views={VIEWS}", f"data.frames={FRAMES}"),
+]
+TINY = ["field.width=16", "schedule.canonical.side=16", "schedule.canonical.search_side=12"]
+TINY += ["schedule.canonical.rays=128", "schedule.deformation.rays=128"]
+
+
+def shortened(search: int, fine: int, frame: int) -> list[str]:
+    """Overrides of the paper's schedule: iterations of the search, the field, and each frame."""
+    key, levels = "schedule.canonical", range(1, 6)
+    given = [
+        *(f"{key}.search_iterations={search}", f"{key}.visual_hull_init=true"),
+        *(f"{key}.iterations={fine}", f"{key}.decay_iterations={fine}"),
+        f"{key}.upsample_at=[{','.join(str(fine * k // 20) for k in (1, 2, 3, 4))}]",
+        *(f"schedule.deformation.levels.{k}.iterations={frame}" for k in levels),
+    ]
+    sides = (f"schedule.deformation.levels.{k}.side={k + 2}" for k in levels)
+    return given if GPU else [*given, *sides, *TINY]
+
+
+def run_of(into: Path, name: str, *overrides: str) -> RunContext:
+    """A run of ``experiment=paper_inward`` on the report's scene, in a folder of its own."""
+    root = (into / "root.txt").read_text() if (into / "root.txt").exists() else into / "scene"
+    common = ["experiment=paper_inward", f"data.root={root}", f"hydra.run.dir={into / name}"]
+    device = ["memory_check=false"] if GPU else ["trainer=cpu", *shortened(0, 40, 2)]
+    return harness.open_run([*common, *device, *overrides])
+
+
+def machine(into: Path) -> Iterator[Row]:
+    """Device, driver, versions and revision."""
+    packages = sorted(f"{each.metadata['Name']} {each.version}" for each in distributions())
+    yield {"platform": platform.platform(), "python": sys.version, "packages": packages}
+    yield {"revision": said(["git", "-C", str(HERE.parent), "rev-parse", "HEAD"])}
+    device = str(torch.cuda.get_device_properties(DEVICE)) if GPU else "no GPU"
+    yield {"driver": said(["nvidia-smi"]), "cuda": torch.version.cuda, "device": device}
+
+
+def said(command: list[str]) -> str:
+    """What a command prints, or why it could not be run."""
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    except OSError as error:
+        return str(error)
+    return done.stdout + done.stderr
+
+
+def checks(into: Path) -> Iterator[Row]:
+    """The self-check: a verdict for each kernel, capture, resume and picture."""
+    for name, verdict, figures in selfcheck.run_checks(DEVICE, 0):
+        yield {"check": name, "verdict": verdict, "figures": figures}
+
+
+def tests(into: Path) -> Iterator[Row]:
+    """``pytest -m gpu`` of the kernels and graphs, where pytest is installed."""
+    command = ["env", "TRITON_INTERPRET=0", sys.executable, "-m", "pytest", "-q", "-m", "gpu"]
+    folders = (str(HERE.parents[1] / "tests" / name) for name in ("accel", "engine"))
+    yield {"tests": said([*command, "-p", "no:cacheprovider", *folders]).splitlines()[-60:]}
+
+
+def scene(into: Path) -> Iterator[Row]:
+    """Write the embedded scene, so that each step reads it; or note where the given one is."""
+    began = time.perf_counter()
+    where = [f"data.export={into / 'scene'}", f"hydra.run.dir={into / 'make'}"]
+    run = harness.open_run([*SCENE, "stage=prepare", *where])
+    run_stage(run.config, run.folder)
+    yield {"seconds": time.perf_counter() - began, "views": run.scene.static.train.pixels.shape}
+
+
+def operations(into: Path, block: int | None = None) -> Iterator[Row]:
+    """Each operation at the paper's size in both implementations, and what its kernels take.
+
+    With ``block`` the colour network alone, in blocks of so many samples, and ``decode`` beside it.
+    """
+    both = reaches(DEVICE)
+    if block is not None and both:
+        for name in ("color_layers", "color_network"):
+            module = import_module(f"devrf.accel.{name}")
+            module.BLOCK = type(module.BLOCK)(block)  # type: ignore[attr-defined]
+    side, rays, seconds = (160, 8192, 0.5) if GPU else (6, 4, 0.01)
+    for name, work in kernels.operations(side, rays, DEVICE).items():
+        if block is not None and not name.startswith("listed_colors"):
+            continue
+        found: dict[str, Row] = {}
+        row: Row = {"operation": name, "torch ms": kernels.milliseconds(work, "torch", seconds)}
+        if both:
+            with launched(found), using("triton"):
+                work()
+            row["triton ms"] = kernels.milliseconds(work, "triton", seconds)
+            row["off"] = kernels.difference(work)
+            if block is not None:
+                fused = color_network.WIDEST.copy()
+                color_network.WIDEST.clear()
+                row["decode ms"] = kernels.milliseconds(work, "triton", seconds)
+                color_network.WIDEST.update(fused)
+        yield row
+        yield from timed_kernels(work, found, DEVICE)
+
+
+def learned(into: Path, name: str, overrides: Sequence[str] = ()) -> Iterator[Row]:
+    """Learn both stages: seconds, milliseconds by resolution, memory, PSNR on held-out views."""
+    for stage in ("canonical", "deformation", "evaluate"):
+        run = run_of(into, name, *overrides, f"stage={stage}")
+        began = time.perf_counter()
+        with Stopwatch(DEVICE) as watch:
+            run_stage(run.config, run.folder)
+        seconds = time.perf_counter() - began
+        peaks = torch.cuda.max_memory_allocated(), torch.cuda.max_memory_reserved()
+        yield {"stage": stage, "all seconds": seconds, "bytes allocated, reserved": peaks}
+        if stage != "evaluate":
+            yield from watch.rows()
+    yield json.loads((run.folder / "metrics.json").read_text())
+
+
+def parts(into: Path) -> Iterator[Row]:
+    """Eager iterations at each resolution of the learned scene, by part, and their kernels."""
+    run, tables, usual = run_of(into, "paper"), [], training.parts
+
+    def noted(work: Callable[[], None], *, cuda: bool) -> dict[str, float]:
+        with profile(record_shapes=False) as profiled:
+            work()
+        order = "self_cuda_time_total" if cuda else "self_cpu_time_total"
+        tables.append(profiled.key_averages().table(sort_by=order, row_limit=40))
+        return usual(work, cuda=cuda)
+
+    training.parts = noted
+    stored, seconds = harness.learned_scene(run), 1.0 if GPU else 0.01
+    with harness.implementation(run):
+        for rows in (training.canonical_rows, training.deformation_rows):
+            yield from rows(run, stored, seconds)
+    (into / "profile.txt").write_text("\n\n".join(tables))
+
+
+def frames(into: Path) -> Iterator[Row]:
+    """Frames a second at a new time and again at the same, and what a frame launches."""
+    run = run_of(into, "paper")
+    began, stored = time.perf_counter(), harness.learned_scene(run)
+    loaded = time.perf_counter() - began
+    model = stored.model.to_view(run.device)
+    yield {"seconds to load": loaded, "and to unpack": time.perf_counter() - began - loaded}
+    views, background = run.scene.dynamic.test, background_value(run.scene.background)
+    kinds: tuple[Kind, ...] = ("auto", "torch")
+    for kind, half in product(kinds, (False, True)):
+        renderer = Renderer(model, half=half)
+        with using(kind):
+            row = rendering.frames_a_second(renderer, views, min(5, len(views)), background)
+            with profile() as profiled:
+                renderer.view(views.cameras, 0, float(views.times[-1]), background)
+                wait(DEVICE)
+        on_device = [event for event in profiled.events() if event.device_type.name == "CUDA"]
+        yield {"kernels": kind, "half": half, **row, "launches": len(on_device)}
+
+
+TENTH = shortened(500, 2000, 20) if GPU else []
+# Each with the minutes that it may take, in the order in which they tell most.
+STEPS: dict[str, tuple[float, Callable[[Path], Iterator[Row]]]] = {
+    "machine": (1, machine),
+    "checks": (6, checks),
+    "scene": (8, scene),
+    "paper": (15, partial(learned, name="paper")),
+    "operations": (6, operations),
+    "frames": (5, frames),
+    "parts": (5, parts),
+    **{f"color-{size}": (2, partial(operations, block=size)) for size in (32, 64, 128)},
+    **{
+        name: (6, partial(learned, name=name, overrides=[*TENTH, *overrides]))
+        for name, overrides in {
+            "as-it-is": [],
+            "50-a-step": [f"{key}.iterations_per_step=50" for key in ("canonical", "deformation")],
+            "frames-on-device": ["schedule.motion.store=device"],
+            "without-graphs": ["graphs=off"],
+            "in-pytorch": ["kernels=torch"],
+        }.items()
+    },
+    "tests": (6, tests),
+    "fast": (15, partial(learned, name="fast", overrides=["schedule=fast"] if GPU else [])),
+    "best": (40, partial(learned, name="best", overrides=["schedule=best"] if GPU else [])),
+}
+
+
+def main() -> None:
+    """Make the steps that are left for as long as is given, each in a process of its own."""
+    arguments = argparse.ArgumentParser(description=__doc__)
+    arguments.add_argument("--into", type=Path, default=Path("gpu_report"), help="a folder")
+    arguments.add_argument("--minutes", type=float, default=25.0, help="for all steps together")
+    arguments.add_argument("--root", type=Path, help="a scene from disk; else the embedded one")
+    arguments.add_argument("--steps", nargs="*", default=[*STEPS], help="these alone")
+    arguments.add_argument("--run", help=argparse.SUPPRESS)
+    given = arguments.parse_args()
+    into: Path = given.into.absolute()
+    into.mkdir(parents=True, exist_ok=True)
+    if given.run:
+        make(into, given.run)
+        return
+    if given.root:
+        (into / "root.txt").write_text(str(given.root.absolute()))
+    end = time.monotonic() + 60 * given.minutes
+    # What has failed, or was cut short, is tried again once the rest is there.
+    for name in sorted(given.steps, key=lambda name: record(into, name)["status"] != "left"):
+        left = end - time.monotonic()
+        if record(into, name)["status"] == "done" or left < 5:
+            continue
+        began, command = time.monotonic(), [sys.executable, str(HERE), "--into", str(into)]
+        with (into / f"{name}.log").open("w") as output, suppress(subprocess.TimeoutExpired):
+            limit = min(left, 60 * STEPS[name][0])
+            subprocess.run(
+                [*command, "--run", name], stdout=output, stderr=output, timeout=limit, check=False
+            )
+        print(
+            f"{name}: {record(into, name)['status']}, {time.monotonic() - began:.0f} s", flush=True
+        )
+        write_report(into)
+
+
+def make(into: Path, name: str) -> None:
+    """Make one step, and write what is found after each row."""
+    rows: list[Row] = []
+
+    def write(status: str) -> None:
+        write_json(into / f"{name}.json", {"status": status, "rows": rows})
+
+    write("cut short")
+    try:
+        for row in STEPS[name][1](into):
+            rows.append(row)
+            write("cut short")
+    except BaseException:
+        rows.append({"failed": traceback.format_exc()})
+        write("failed")
+        raise
+    write("done")
+
+
+def record(into: Path, name: str) -> Row:
+    """What is known of a step."""
+    path = into / f"{name}.json"
+    known: Row = json.loads(path.read_text()) if path.exists() else {"status": "left", "rows": []}
+    return known
+
+
+def write_report(into: Path) -> None:
+    """One page of all that has been found."""
+    lines = []
+    for name in STEPS:
+        known = record(into, name)
+        lines += [f"## {name}: {known['status']}", ""]
+        lines += [f"- {json.dumps(row)}" for row in known["rows"]] + [""]
+    (into / "REPORT.md").write_text("\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()

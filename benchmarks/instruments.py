@@ -1,0 +1,165 @@
+"""Notes what a run does while it does it: launches of kernels, and seconds by what they go to."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from statistics import median
+from typing import Any
+
+import torch
+from launches import Tracing
+from torch.profiler import profile
+
+from devrf.accel.graphs import CudaGraphCapture
+from devrf.engine.stage import ScheduledStage
+from devrf.methods.devrf.canonical_stage import CanonicalStage
+from devrf.methods.devrf.deformation_stage import DeformationStage
+from devrf.ops.dispatch import using
+from devrf.system.device import wait
+
+Row = dict[str, Any]
+# Methods that are timed, with what is nested in them, by what their seconds go to.
+TIMED = {
+    "warm-up": (CudaGraphCapture, "warm_up"),
+    "capture": (CudaGraphCapture, "capture"),
+    "iterations": (ScheduledStage, "training_step"),
+    "logging": (ScheduledStage, "_log"),
+    "visits, canonical": (CanonicalStage, "enter"),
+    "visits, deformation": (DeformationStage, "enter"),
+    "packing": (ScheduledStage, "on_train_end"),
+}
+# Every so many replays of a graph are timed on the device.
+SAMPLED = 20
+
+
+@contextmanager
+def launched(found: dict[str, Row]) -> Iterator[None]:
+    """Note in ``found`` what each kernel takes, by its name and constants, and the MB it moves."""
+    from devrf.accel import blocks
+
+    usual, counted = blocks.run, Tracing()
+
+    def run(kernel: Any, programs: int, *args: Any, **constants: Any) -> None:
+        before, began = counted.count.moved, time.perf_counter()
+        handle = kernel[(programs,)](*args, **constants, enable_fp_fusion=True)
+        first = 1000 * (time.perf_counter() - began)  # compiles, unless it is in Triton's cache
+        counted.run(kernel, programs, *args, **constants)
+        name = kernel.fn.__name__
+        row = found.setdefault(f"{name} {constants}", {"kernel": name, "first ms": first})
+        row |= {"constants": str(constants), "MB": (counted.count.moved - before) / 1e6}
+        row |= {key: getattr(handle, key, None) for key in ("n_regs", "n_spills")}
+
+    blocks.run = run
+    try:
+        yield
+    finally:
+        blocks.run = usual
+
+
+def timed_kernels(
+    work: Callable[[], object], found: dict[str, Row], device: torch.device
+) -> Iterator[Row]:
+    """The rows of :func:`launched`, with microseconds by the profiler, and GB/s."""
+    if not found:
+        return
+    with profile() as profiled, using("triton"):
+        for _ in range(10):
+            work()
+        wait(device)
+    spent = {event.key: event.device_time_total / 10 for event in profiled.key_averages()}
+    for row in found.values():
+        row["us"] = spent.get(row["kernel"])
+        row["GB/s"] = 1000 * row["MB"] / row["us"] if row["us"] else None
+        yield row
+
+
+class Stopwatch:
+    """Within its context, times what stages do; on a GPU also graphs on the device.
+
+    Attributes:
+        stage: the stage that was learned last.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self.stage: ScheduledStage | None = None
+        self._device, self._usual = device, dict[tuple[type, str], Any]()
+        self._seconds: dict[str, float] = defaultdict(float)
+        # By resolution: seconds, iterations, and events around replays of graphs.
+        self._levels: dict[tuple[int, ...], list[Any]] = {}
+        self._since, self._iteration, self._replays = time.perf_counter(), 0, 0
+
+    def __enter__(self) -> Stopwatch:
+        for label, (owner, name) in TIMED.items():
+            self._replace(owner, name, self._timed(label, getattr(owner, name)))
+        self._replace(torch.cuda.CUDAGraph, "replay", self._sampled(torch.cuda.CUDAGraph.replay))
+        self._since = time.perf_counter()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.stage is not None:
+            self._mark()
+        for (owner, name), usual in self._usual.items():
+            setattr(owner, name, usual)
+
+    def rows(self) -> Iterator[Row]:
+        """Seconds by what they went to; then milliseconds of an iteration by resolution."""
+        loop = self.stage.loop if self.stage is not None else None
+        counts = {key: getattr(loop, key, 0) for key in ("num_captures", "num_short_lists")}
+        yield {"seconds": dict(self._seconds), **counts, "replays": self._replays}
+        for shape, (seconds, iterations, events) in self._levels.items():
+            device = [begin.elapsed_time(end) for begin, end in events]
+            row = {
+                "grid": shape,
+                "iterations": iterations,
+                "ms": 1000 * seconds / max(iterations, 1),
+            }
+            yield row | {"replay ms on the device": median(device) if device else None}
+
+    def _replace(self, owner: type, name: str, function: Any) -> None:
+        self._usual[owner, name] = getattr(owner, name)
+        setattr(owner, name, function)
+
+    def _timed(self, label: str, usual: Any) -> Any:
+        def method(own: Any, *args: Any, **options: Any) -> Any:
+            if label.startswith("visits") and own is self.stage:
+                self._mark()
+            began = time.perf_counter()
+            try:
+                return usual(own, *args, **options)
+            finally:
+                self._seconds[label] += time.perf_counter() - began
+                if label.startswith("visits"):
+                    self.stage, self._since = own, time.perf_counter()
+
+        return method
+
+    def _mark(self) -> None:
+        """Add what has passed since the last visit began to the resolution's time."""
+        stage = self.stage
+        assert stage is not None
+        wait(self._device)
+        level = self._levels.setdefault(tuple(stage.resolution), [0.0, 0, []])
+        level[0] += time.perf_counter() - self._since
+        level[1] += stage.iteration - self._iteration
+        self._since, self._iteration = time.perf_counter(), stage.iteration
+
+    def _sampled(self, usual: Any) -> Any:
+        def replay(graph: Any) -> None:
+            self._replays += 1
+            if self._replays % SAMPLED or self.stage is None:
+                usual(graph)
+                return
+            begin, end = (
+                torch.cuda.Event(enable_timing=True)  # type: ignore[no-untyped-call]
+                for _ in range(2)
+            )
+            begin.record()
+            usual(graph)
+            end.record()
+            shape = tuple(self.stage.resolution)
+            self._levels.setdefault(shape, [0.0, 0, []])[2].append((begin, end))
+
+        return replay
