@@ -216,7 +216,7 @@ def box_between(
         everyone: the views whose cameras count.
         space: the scene's NDC.
         front: z' of the nearest points, −1 at the near plane.
-        back: z' of the furthest points, 1 at infinity.
+        back: z' of the furthest, 1 at infinity.
 
     Raises:
         DevrfError: a camera sees something that is not before the reference camera.

@@ -42,12 +42,8 @@ Content = TypeVar("Content")
 def decoding(path: Path, what: str, remedy: str) -> Iterator[None]:
     """The place where a library decodes ``path``: what it raises becomes a DevrfError.
 
-    Nothing else belongs into its block.
-
-    Args:
-        path: the file.
-        what: what the file should be, in words.
-        remedy: what to do when it is not.
+    ``what`` says what the file should be, ``remedy`` what to do when it is not. Nothing else
+    belongs into its block.
     """
     try:
         yield

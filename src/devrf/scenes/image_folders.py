@@ -53,7 +53,7 @@ def image_folder(
         parent: where the folders are.
         downscale: integer factor ≥ 1.
         full: name of the folder of full-size images.
-        reduced: name of a folder of smaller images, ``{}`` in place of the factor.
+        reduced: that of a folder of smaller ones, ``{}`` in place of the factor.
 
     Raises:
         DevrfError: there is none.
@@ -76,15 +76,10 @@ def image_folder(
 
 
 def listed_images(folder: Path, *, by_number: bool = False) -> list[Path]:
-    """The image files in ``folder``, at least one, in order of their names.
+    """The image files in ``folder``, at least one, else DevrfError, in order of their names.
 
-    Args:
-        folder: an existing folder.
-        by_number: count runs of digits as numbers, so that 10.png comes after 9.png; else
-            character by character, which is the order of COLMAP's poses.
-
-    Raises:
-        DevrfError: it holds no image.
+    ``by_number`` counts runs of digits as numbers, so that 10.png comes after 9.png; else names are
+    compared by characters, which is the order of COLMAP's poses.
     """
     found = [
         path

@@ -141,23 +141,13 @@ def _turn(orientation: int, stored: Size, camera: Size | None) -> tuple[int, boo
 
 
 def image_size(path: Path, camera: Size | None = None) -> tuple[int, int]:
-    """(width, height) of an image file, from its header; else DevrfError.
-
-    Args:
-        path: the file.
-        camera: as for :func:`read_header`.
-    """
+    """(width, height) of an image file, from its header; see :func:`read_header`."""
     header = read_header(path, camera)
     return header.width, header.height
 
 
 def decode(path: Path, header: Header, mode: str) -> npt.NDArray[np.uint8]:
-    """The pixels (H, W, …) of a file whose header has been read.
-
-    Args:
-        path: the file.
-        header: what it claimed to be.
-        mode: Pillow's name of what to convert to: RGB, RGBA.
+    """The pixels (H, W, …) of a file whose header has been read, in Pillow's mode RGB or RGBA.
 
     Raises:
         DevrfError: it is damaged, or not what it claimed to be.
@@ -200,10 +190,7 @@ class Loaded:
 def in_threads(work: Callable[[int], object], items: Iterable[int], size: Size) -> None:
     """Do ``work`` for each item, a few at a time: decoding leaves Python's lock.
 
-    Args:
-        work: what to do.
-        items: what to do it with.
-        size: (width, height) of the images that it decodes.
+    ``size`` is the (width, height) of the images that it decodes.
     """
     most = _IN_FLIGHT // (8 * max(1, int(size[0] * size[1])))
     with ThreadPoolExecutor(max(1, min(8, os.cpu_count() or 1, most))) as pool:
@@ -218,9 +205,6 @@ def load_images(
     finish: Finish | None = None,
 ) -> Loaded:
     """Read images of one size, a few at a time.
-
-    A file's EXIF orientation turns its image only where its camera asks for that
-    (:mod:`devrf.scenes.images`).
 
     Args:
         paths: at least one existing file, 8 bits a channel, with or without alpha.

@@ -53,13 +53,7 @@ class Layout:
 
 
 def static_alone(train: Transforms, test: Transforms, why: str) -> Layout:
-    """The layout of a scene at rest, whose images all show one moment.
-
-    Args:
-        train: the images to learn from.
-        test: the held-out images.
-        why: what says so, for the log.
-    """
+    """The layout of a scene at rest, whose images all show one moment; ``why`` is for the log."""
     log.info("%s: %s: all images show one moment, the scene is at rest", train.file, why)
     train_set, test_set = at_one_moment(train), at_one_moment(test)
     return Layout(train_set, test_set, train_set, test_set)
@@ -74,12 +68,7 @@ def one_capture(train: Transforms, test: Transforms, static_until: float) -> Lay
 
 
 def without_static_set(train: Split, test: Split, static_until: float) -> Layout:
-    """The layout of one capture in motion, whose early images count as static.
-
-    Args:
-        train: the images to learn from.
-        test: the held-out images.
-        static_until: the latest time of an image that counts as static.
+    """The layout of one capture in motion, whose images up to ``static_until`` count as static.
 
     Raises:
         DevrfError: no image to learn from is that early.

@@ -76,10 +76,7 @@ def cutting_out(
 ) -> Finish | None:
     """What makes masks the alpha of their images, the lesser of the two; None: no masks.
 
-    Args:
-        paths: N masks.
-        cameras: N sizes that the cameras are for, or None.
-        names: N images, for messages.
+    Arguments are those of :func:`valid_pixels`.
 
     Raises:
         DevrfError: some images have a mask and some have not; later, what :func:`read_mask` raises.

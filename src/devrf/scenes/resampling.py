@@ -36,13 +36,7 @@ def area_average(image: Array, width: int, height: int) -> Array:
 def shrink_pixels(image: Pixels, width: int, height: int) -> Pixels:
     """An 8-bit image averaged over areas; colours are weighted by their alpha.
 
-    Args:
-        image: (H, W, 1, 3 or 4) uint8, alpha not premultiplied.
-        width: columns of the result.
-        height: rows of the result.
-
-    Returns:
-        (height, width, 1, 3 or 4) uint8, alpha not premultiplied; black where alpha is 0.
+    Images (H, W, 1, 3 or 4) are uint8, their alpha not premultiplied; black where alpha is 0.
     """
     return _weighted_by_alpha(image, lambda values: area_average(values, width, height))
 

@@ -117,13 +117,7 @@ def checked_box(value: object) -> Box:
 
 
 def check_memory(needed: int, where: object, what: str) -> None:
-    """DevrfError when ``what`` takes more bytes than the machine has.
-
-    Args:
-        needed: bytes.
-        where: the file or folder that asks for them.
-        what: what they are for, in words.
-    """
+    """DevrfError when ``what``, which ``where`` asks for, takes more bytes than the machine has."""
     there = psutil.virtual_memory().total
     if needed > there:
         raise scene_error(

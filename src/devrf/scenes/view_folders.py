@@ -115,14 +115,9 @@ def view_folders(folder: Path, downscale: int) -> list[ViewFolder]:
 
 
 def held_out_view(count: int, test_view: int) -> int:
-    """The position of the held-out one of ``count`` views.
+    """The position of the held-out one of ``count`` views, by its number; else DevrfError.
 
-    Args:
-        count: how many there are.
-        test_view: its number, from 1 on; −1 is the last one.
-
-    Raises:
-        DevrfError: there is no such view.
+    Numbers count from 1 on; −1 is the last one.
     """
     if test_view == 0 or not -count <= test_view <= count:
         raise scene_error(

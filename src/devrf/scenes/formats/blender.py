@@ -47,49 +47,44 @@ class BlenderReader(InwardReader):
     def read(self) -> Scene:
         """See :meth:`devrf.scenes.reader.SceneReader.read`."""
         folder = scene_folder(self.root)
-        layout, flow_folder = _layout(folder, self.dynamic, self.static_until, self.missing)
-        layout, thinned = fewer(layout, self.train_views, self.frames)
+        layout, thinned, flow_folder = self._layout(folder)
         static, dynamic = load_layout(layout, folder, self.downscale)
-        if not layout.moves:
-            return self.scene(folder, static, dynamic)
-        if self.wants_flow_files and thinned:
-            log.info("flow files dropped: data.frames=%s leaves out neighbours", self.frames)
-        elif self.wants_flow_files and layout.dynamic_train.transforms.skipped:
-            log.info("flow files dropped: they are numbered by images of which some are absent")
-        elif self.wants_flow_files:
-            flow = _flow(dynamic.train, layout.dynamic_train, flow_folder, "bwd")
-            dynamic = replace(dynamic, train=replace(dynamic.train, flow=flow))
+        if layout.moves and self.wants_flow_files:
+            if thinned:
+                log.info("flow files dropped: data.frames=%s leaves out neighbours", self.frames)
+            elif layout.dynamic_train.transforms.skipped:
+                log.info("flow files dropped: they are numbered by images of which some are absent")
+            else:
+                flow = _flow(dynamic.train, layout.dynamic_train, flow_folder, "bwd")
+                dynamic = replace(dynamic, train=replace(dynamic.train, flow=flow))
         return self.scene(folder, static, dynamic)
 
     def forward_flow(self, views: Views) -> OpticalFlow | None:
         """See :meth:`devrf.scenes.reader.SceneReader.forward_flow`."""
-        folder = scene_folder(self.root)
-        layout, flow_folder = _layout(folder, self.dynamic, self.static_until, self.missing)
-        layout, thinned = fewer(layout, self.train_views, self.frames)
+        layout, thinned, flow_folder = self._layout(scene_folder(self.root))
         if thinned or not layout.moves or layout.dynamic_train.transforms.skipped:
             return None
         return _flow(views, layout.dynamic_train, flow_folder, "fwd")
 
-
-def _layout(
-    root: Path, dynamic: str | None, static_until: float, missing: Missing
-) -> tuple[Layout, Path]:
-    """The splits, and the folder where flow files would lie."""
-    static = root / "static"
-    if not os.path.isdir(static) and not dynamic_folders(root):
-        if not os.path.isfile(root / "transforms_train.json"):
-            raise scene_error(
-                root, "no static/ or transforms_train.json; set data.root to the scene's folder"
-            )
-        train, test = _train_and_test(root, root, missing)
-        return one_capture(train, test, static_until), root / "train_flow"
-    existing_folder(static)
-    if dynamic is None and not dynamic_folders(root):
-        why = "there is no folder dynamic_<V>views"
-        return static_alone(*_train_and_test(static, root, missing), why), root
-    moving = chosen_dynamic(root, dynamic)
-    rest, motion = (_train_and_test(folder, root, missing) for folder in (static, moving))
-    return Layout(*map(at_rest, rest), *map(in_motion, motion)), moving / "train_flow"
+    def _layout(self, root: Path) -> tuple[Layout, bool, Path]:
+        """The splits, whether times were left out, and the folder where flow files would lie."""
+        static, flow_folder = root / "static", root / "train_flow"
+        if not os.path.isdir(static) and not dynamic_folders(root):
+            if not os.path.isfile(root / "transforms_train.json"):
+                raise scene_error(
+                    root, "no static/ or transforms_train.json; set data.root to the scene's folder"
+                )
+            layout = one_capture(*_train_and_test(root, root, self.missing), self.static_until)
+        elif self.dynamic is None and not dynamic_folders(root):
+            rest = _train_and_test(static, root, self.missing)
+            layout = static_alone(*rest, "there is no folder dynamic_<V>views")
+        else:
+            moving = chosen_dynamic(root, self.dynamic)
+            rest = _train_and_test(existing_folder(static), root, self.missing)
+            motion = _train_and_test(moving, root, self.missing)
+            layout = Layout(*map(at_rest, rest), *map(in_motion, motion))
+            flow_folder = moving / "train_flow"
+        return *fewer(layout, self.train_views, self.frames), flow_folder
 
 
 def _train_and_test(folder: Path, root: Path, missing: Missing) -> tuple[Transforms, Transforms]:

@@ -61,11 +61,8 @@ def block_starts(shape: Shape, cameras: Cameras, time: float, reach: float) -> T
     within s·θ of its axis. From a free point at distance d to the surface all of them may go
     on to (s + d) / (1 + θ).
 
-    Args:
-        shape: what to meet.
-        cameras: N cameras outside of the shape, world units.
-        time: in [0, 1].
-        reach: radius of a ball about the origin that holds the shape at ``time``.
+    The N cameras are outside of the shape, and ``reach`` is the radius of a ball about the origin
+    that holds it at ``time``, world units.
     """
     columns, rows = -(-cameras.width // BLOCK), -(-cameras.height // BLOCK)
     y, x = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
