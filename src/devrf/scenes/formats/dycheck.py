@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import logging
 import os
+from collections.abc import Sequence
 from dataclasses import KW_ONLY
-from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import BaseModel, Field, TypeAdapter
 from pydantic.dataclasses import dataclass
 
-from devrf.scenes.files import Ids, Number, inside, read_json, scene_folder
-from devrf.scenes.formats.nerfies import ItemsReader, read_items
+from devrf.scenes.files import Ids, Number, inside, read_json
+from devrf.scenes.formats.nerfies import ItemsReader, Listed
 from devrf.scenes.image_folders import Downscale, ImageFolder
 from devrf.scenes.images import image_at
-from devrf.scenes.reader import Holdout
-from devrf.scenes.scene import Scene
 from devrf.scenes.splits import every_nth
 from devrf.scenes.validation import abbreviated, scene_error
 
@@ -49,46 +47,53 @@ class DycheckReader(ItemsReader):
     direction, the box is all that they see between near and far. Depth is left alone.
 
     Attributes:
-        holdout: where ``val.json`` lists no image, one of so many training images is held out.
         masks: ``ignore``: what ``covisible/`` says that training has hardly seen is not scored;
             ``none``: all of the held-out images is.
     """
 
+    listing: ClassVar[str] = SPLITS
+
     _: KW_ONLY
     downscale: Downscale = "up_to_2"
-    holdout: Holdout = 8
     masks: Literal["ignore", "none"] = "ignore"
 
-    def read(self) -> Scene:
-        """See :meth:`devrf.scenes.reader.SceneReader.read`."""
-        folder = scene_folder(self.root)
-        moments, *split = _splits(folder, self.holdout)
-        masks = None if self.masks == "none" else partial(_covisible, folder)
+    def listed(self, folder: Path) -> Listed:
+        """The images in both splits."""
+        learned, held_out = (_read_split(folder / name) for name in (TRAIN, VAL))
+        both = [name for name in learned if name in held_out]
+        if both:
+            raise scene_error(
+                folder / VAL,
+                f"lists {abbreviated(both[0])}, as {TRAIN} does; list it in one of them",
+            )
+        least, count = 1 if held_out else 2, len(learned)
+        if count < least:
+            raise scene_error(
+                folder / TRAIN, f"lists {count} images, expected at least {least}; add some"
+            )
+        if held_out:
+            items = [*learned, *held_out]
+            return items, list(range(count)), list(range(count, len(items)))
+        log.info("%s lists no image: one of %d training images is held out", VAL, self.holdout)
+        return list(learned), *every_nth(count, self.holdout)
 
-        def times(items: tuple[str, ...]) -> list[float]:
-            return [moments[item] for item in items]
+    def moments(self, folder: Path, ids: Sequence[str]) -> Sequence[float]:
+        """The times in both splits."""
+        taken = {**_read_split(folder / TRAIN), **_read_split(folder / VAL)}
+        return [taken[item] for item in ids]
 
-        return read_items(self, folder / SPLITS, list(moments), (split[0], split[1]), times, masks)
-
-
-def _splits(folder: Path, holdout: int) -> tuple[dict[str, float], list[int], list[int]]:
-    """When each image was taken, and the positions of those to learn from and those held out."""
-    learned, held_out = (_read_split(folder / name) for name in (TRAIN, VAL))
-    both = [name for name in learned if name in held_out]
-    if both:
-        raise scene_error(
-            folder / VAL, f"lists {abbreviated(both[0])}, as {TRAIN} does; list it in one of them"
-        )
-    least = 1 if held_out else 2
-    if len(learned) < least:
-        raise scene_error(
-            folder / TRAIN, f"lists {len(learned)} images, expected at least {least}; add some"
-        )
-    moments, count = {**learned, **held_out}, len(learned)
-    if held_out:
-        return moments, list(range(count)), list(range(count, len(moments)))
-    log.info("%s lists no image: one of %d training images is held out", VAL, holdout)
-    return moments, *every_nth(count, holdout)
+    def masks_of(
+        self, folder: Path, ids: Sequence[str], images: ImageFolder
+    ) -> tuple[Path | None, ...] | None:
+        """The mask of each image that has one: at the size of the images, or at full size."""
+        if self.masks == "none":
+            return None
+        for size in (images.path.name, "1x"):
+            place = Path(COVISIBLE, size, "val")
+            if os.path.isdir(folder / place):
+                files = (inside(folder, folder, f"{place}/{item}", folder / SPLITS) for item in ids)
+                return tuple(map(image_at, files))
+        return (None,) * len(ids)
 
 
 def _read_split(file: Path) -> dict[str, float]:
@@ -100,21 +105,3 @@ def _read_split(file: Path) -> dict[str, float]:
             f"{len(split.frame_names)} frame_names, but {len(split.time_ids)} time_ids; correct it",
         )
     return dict(zip(split.frame_names, split.time_ids, strict=True))
-
-
-def _covisible(
-    folder: Path, items: tuple[str, ...], images: ImageFolder
-) -> tuple[Path | None, ...]:
-    """The mask of each image that has one: at the size of the images, or at full size."""
-    places = [
-        Path(COVISIBLE, size, "val")
-        for size in dict.fromkeys((images.path.name, "1x"))
-        if os.path.isdir(folder / COVISIBLE / size / "val")
-    ]
-    if not places:
-        return (None,) * len(items)
-
-    def mask(item: str) -> Path | None:
-        return image_at(inside(folder, folder, f"{places[0]}/{item}", folder / SPLITS))
-
-    return tuple(map(mask, items))

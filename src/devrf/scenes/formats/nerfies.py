@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from abc import abstractmethod
+from collections.abc import Sequence
 from dataclasses import KW_ONLY, replace
-from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import torch
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field, TypeAdapter
@@ -35,6 +35,7 @@ from devrf.scenes.image_folders import (
 )
 from devrf.scenes.layout import fewer, load_layout, one_capture
 from devrf.scenes.lens import Intrinsics
+from devrf.scenes.masks import Masks
 from devrf.scenes.reader import EstimatedFlow, Holdout, InwardReader, Time
 from devrf.scenes.scene import Capture, Scene
 from devrf.scenes.splits import every_nth
@@ -47,19 +48,6 @@ log = logging.getLogger(__name__)
 SCENE = "scene.json"
 
 Length = Annotated[Positive, Field(le=FARTHEST)]
-
-
-@dataclass(frozen=True)
-class ItemsReader(InwardReader):
-    """Options of layouts that keep a camera file for each image, and have no static set.
-
-    Attributes:
-        static_until: the latest time of an image that counts as static.
-    """
-
-    _: KW_ONLY
-    flow: EstimatedFlow = "auto"
-    static_until: Time = 1.0
 
 
 class World(BaseModel):
@@ -167,64 +155,79 @@ def read_camera(folder: Path, item: str, world: World) -> tuple[Tensor, Intrinsi
     return pose.float(), intrinsics
 
 
-Masks = Callable[[tuple[str, ...], ImageFolder], tuple[Path | None, ...]]
+# N ids, and the positions of those to learn from and of those held out.
+Listed = tuple[list[str], list[int], list[int]]
 
 
-def read_items(
-    reader: ItemsReader,
-    listing: Path,
-    items: Sequence[str],
-    split: tuple[list[int], list[int]],
-    times: Callable[[tuple[str, ...]], Sequence[float]],
-    masks: Masks | None = None,
-) -> Scene:
-    """The scene of listed images, with a camera file each.
+@dataclass(frozen=True)
+class ItemsReader(InwardReader):
+    """Reads layouts that keep a camera file for each image, and have no static set.
 
-    Args:
-        reader: the options.
-        listing: what lists the images, in the scene's folder.
-        items: N ids.
-        split: positions of those to learn from, and of those held out.
-        times: gives the times of ids on some scale: the first becomes 0, the last 1.
-        masks: gives the mask of each id; what it leaves out is ignored. None: no masks.
-
-    Raises:
-        DevrfError: an image, its camera, or ``scene.json`` is missing or wrong.
+    Attributes:
+        holdout: where no list says what is held out, one of so many images is.
+        static_until: the latest time of an image that counts as static.
     """
-    folder = scene_folder(reader.root)
-    world = read_json(
-        folder / SCENE, _WORLD, "it says where the scene is; set data.root to its folder"
-    )
-    names = {"full": "1x", "reduced": "{}x"}
-    factor = folder_factor(folder / "rgb", reader.downscale, **names)
-    images = image_folder(folder / "rgb", factor, **names)
-    files = [f"rgb/{images.path.name}/{item}" for item in items]
-    present = present_images(files, listing, folder, reader.missing)
-    ids = tuple(items[position] for position in present)
-    place = {position: k for k, position in enumerate(present)}
-    train, test = ([place[p] for p in part if p in place] for part in split)
-    if not train or not test:
-        raise scene_error(
-            listing, "all images to learn from, or all that are held out, are absent; add them"
+
+    listing: ClassVar[str]
+
+    _: KW_ONLY
+    flow: EstimatedFlow = "auto"
+    holdout: Holdout = 8
+    static_until: Time = 1.0
+
+    @abstractmethod
+    def listed(self, folder: Path) -> Listed:
+        """What ``listing``, in the scene's folder, lists."""
+
+    @abstractmethod
+    def moments(self, folder: Path, ids: Sequence[str]) -> Sequence[float]:
+        """When images were taken, on some scale."""
+
+    def masks_of(
+        self, folder: Path, ids: Sequence[str], images: ImageFolder
+    ) -> tuple[Path | None, ...] | None:
+        """The masks of images; what they leave out is ignored. None: no masks."""
+        return None
+
+    def read(self) -> Scene:
+        """See :meth:`devrf.scenes.reader.SceneReader.read`."""
+        folder = scene_folder(self.root)
+        items, *split = self.listed(folder)
+        listing = folder / self.listing
+        world = read_json(
+            folder / SCENE, _WORLD, "it says where the scene is; set data.root to its folder"
         )
-    cameras = [read_camera(folder, item, world) for item in ids]
-    moments = times(ids)
-    first, span = min(moments), (max(moments) - min(moments)) or 1.0
-    posed = Transforms(
-        listing,
-        tuple(intrinsics for _, intrinsics in cameras),
-        tuple(present.values()),
-        torch.stack([pose for pose, _ in cameras]),
-        tuple((moment - first) / span for moment in moments),
-        None if masks is None else masks(ids, images),
-    )
-    layout = one_capture(posed[train], posed[test], reader.static_until)
-    layout, _ = fewer(layout, None, reader.frames)
-    captures = load_layout(layout, folder, images.downscale, "none" if masks is None else "ignore")
-    return placed(reader, folder, world, *captures)
+        names = {"full": "1x", "reduced": "{}x"}
+        factor = folder_factor(folder / "rgb", self.downscale, **names)
+        images = image_folder(folder / "rgb", factor, **names)
+        files = [f"rgb/{images.path.name}/{item}" for item in items]
+        present = present_images(files, listing, folder, self.missing)
+        ids = [items[position] for position in present]
+        place = {position: k for k, position in enumerate(present)}
+        train, test = ([place[p] for p in part if p in place] for part in split)
+        if not train or not test:
+            raise scene_error(
+                listing, "all images to learn from, or all that are held out, are absent; add them"
+            )
+        cameras = [read_camera(folder, item, world) for item in ids]
+        moments, masks = self.moments(folder, ids), self.masks_of(folder, ids, images)
+        first, span = min(moments), (max(moments) - min(moments)) or 1.0
+        posed = Transforms(
+            listing,
+            tuple(intrinsics for _, intrinsics in cameras),
+            tuple(present.values()),
+            torch.stack([pose for pose, _ in cameras]),
+            tuple((moment - first) / span for moment in moments),
+            masks,
+        )
+        layout = one_capture(posed[train], posed[test], self.static_until)
+        layout, _ = fewer(layout, None, self.frames)
+        ignored: Masks = "none" if masks is None else "ignore"
+        captures = load_layout(layout, folder, images.downscale, ignored)
+        return placed(self, folder, world, *captures)
 
 
-DATASET, METADATA = "dataset.json", "metadata.json"
+METADATA = "metadata.json"
 
 
 class _Dataset(BaseModel):
@@ -258,25 +261,23 @@ class NerfiesReader(ItemsReader):
     they are undistorted. With one time for all of them the scene is at rest.
     Without alpha masks the scene is unbounded, or, where the cameras look in
     nearly one direction, the box is all that they see between near and far.
-
-    Attributes:
-        holdout: without ``val_ids``, one of so many images is held out.
     """
+
+    listing: ClassVar[str] = "dataset.json"
 
     _: KW_ONLY
     downscale: Downscale = "up_to_4"
-    holdout: Holdout = 8
 
-    def read(self) -> Scene:
-        """See :meth:`devrf.scenes.reader.SceneReader.read`."""
-        folder = scene_folder(self.root)
-        items, *split = _items(folder / DATASET, self.holdout)
-        times = partial(_times, folder / METADATA)
-        return read_items(self, folder / DATASET, items, (split[0], split[1]), times)
+    def listed(self, folder: Path) -> Listed:
+        """The ids in ``dataset.json``."""
+        return _items(folder / self.listing, self.holdout)
+
+    def moments(self, folder: Path, ids: Sequence[str]) -> Sequence[float]:
+        """The times in ``metadata.json``."""
+        return _times(folder / METADATA, ids)
 
 
-def _items(file: Path, holdout: int) -> tuple[list[str], list[int], list[int]]:
-    """The ids of the images, and the positions of those to learn from and those held out."""
+def _items(file: Path, holdout: int) -> Listed:
     listed = read_json(file, _DATASET, "it lists the images; add it")
     ids, train, val = listed.ids or [], listed.train_ids or [], listed.val_ids or []
     items = ids or list(dict.fromkeys(train + val))
