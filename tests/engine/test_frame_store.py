@@ -73,27 +73,6 @@ def test_offloaded_frames_stay_as_they_are_and_are_read_in_single_precision(
     assert store.to_time.shape == (4, 5, 5, 5, 3) and store.to_time.dtype == dtype
 
 
-def test_memory_is_locked_before_it_is_needed_and_once(
-    store: FrameStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    locked: list[tuple[int, ...]] = []
-
-    def page_locked(shape: tuple[int, ...], dtype: torch.dtype) -> torch.Tensor:
-        locked.append(shape)
-        return torch.empty(shape, dtype=dtype)
-
-    monkeypatch.setattr("devrf.engine.frame_store.page_locked", page_locked)
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    store.offload(on_host=True, half=True)
-    locked.clear()
-    store.reserve((9, 9, 9))
-    assert locked == [(4, 9, 9, 9, 3)] * 2
-    store.resize((5, 5, 5))
-    store.resize((9, 9, 9))
-    assert locked[2:] == [(4, 5, 5, 5, 3)] * 2 and not store._reserved
-    assert store.to_time.data_ptr() != store.to_canonical.data_ptr()
-
-
 def test_a_stored_state_of_another_shape_is_taken(store: FrameStore) -> None:
     other = FrameStore(2, (5, 5, 5))
     other.load_state_dict(store.state_dict())

@@ -127,3 +127,27 @@ def test_points_go_where_the_forward_displacements_lead(model: DeVRFModel) -> No
     moved = model.forward_map(0.25)(points)
     torch.testing.assert_close(moved, torch.tensor([[0.2, 0.2, 0.3]]))
     assert not moved.requires_grad
+
+
+def test_a_finished_checkpoint_is_small_and_shows_the_same(model: DeVRFModel) -> None:
+    stored = model.stored_state()
+    after = DeVRFModel.from_config(model.config())
+    after.load_stored_state(stored)
+    for time in (0.5, 0.8):  # at a frame, and between two
+        seen, expected = (picture(each, looking_down(191), time) for each in (after, model))
+        torch.testing.assert_close(seen.color, expected.color, atol=5e-3, rtol=0)
+        # Where the block was at rest, and between its places, points must not lead back to it.
+        occupied, truth = after.occupancy_at(time).mask, model.occupancy_at(time).mask
+        assert not (occupied & ~dilate(truth, 1)).any()
+    packed = stored["canonical.color.values"]
+    assert sum(v.nbytes for v in packed.values() if torch.is_tensor(v)) < (
+        0.3 * model.canonical.color.values.nbytes
+    )
+
+
+def test_what_half_precision_cannot_hold_stays_as_it_is(model: DeVRFModel) -> None:
+    with torch.no_grad():
+        model.canonical.density.values[5, 5, 5] = 1e5
+    after = DeVRFModel.from_config(model.config())
+    after.load_stored_state(model.stored_state())
+    assert torch.equal(after.canonical.density.values, model.canonical.density.values)

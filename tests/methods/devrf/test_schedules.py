@@ -143,25 +143,6 @@ def test_a_further_level_goes_backward_through_the_frames() -> None:
 
 
 @given(
-    st.integers(0, 50),
-    st.lists(st.integers(1, 199), max_size=5, unique=True).map(sorted),
-    st.integers(7, 60),
-)
-def test_canonical_phases_tile_every_schedule(
-    search: int, upsample_at: list[int], side: int
-) -> None:
-    schedule = CanonicalSchedule(search, 10, False, 200, side, upsample_at)
-    phases = in_order(schedule.phase, schedule.total)
-    edges = [0, *([search] if search else []), *(search + d for d in upsample_at), search + 200]
-    assert [(p.start, p.stop) for p in phases] == list(zip(edges, edges[1:], strict=False))
-    for phase in phases:
-        for at in (phase.start, phase.stop - 1):
-            assert schedule.phase(at) == phase
-    assert phases[-1].voxels == side**3
-    assert schedule.phase(schedule.total + 7) == phases[-1]
-
-
-@given(
     st.lists(
         st.tuples(st.integers(2, 99), st.integers(1, 9), st.integers(1, 15)),
         min_size=1,

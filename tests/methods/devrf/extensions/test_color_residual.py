@@ -23,7 +23,6 @@ from devrf.methods.devrf.extensions.color_residual import (
     NAME,
     ColorResidual,
     ResidualField,
-    ResidualGrid,
 )
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import DEFORMATION_LOSS, MotionSettings
@@ -52,16 +51,6 @@ def test_the_residual_is_blended_between_frames_and_absent_at_rest(field: Residu
         residual = field.at(time)
         assert residual is not None
         torch.testing.assert_close(residual(point), torch.tensor([[red, 0.0, 0.0]]))
-
-
-def test_the_residual_is_interpolated_in_space(cube: Box) -> None:
-    grid = torch.zeros(3, 3, 3, 3)
-    grid[1, 1, 1, 2] = 8.0
-    residual = ResidualGrid(grid, cube)
-    middle = torch.tensor([cube.low]) + 0.5 * torch.tensor([cube.size])
-    # Half a cell away along each axis: an eighth.
-    away = middle + 0.25 * torch.tensor([cube.size])
-    torch.testing.assert_close(residual(torch.cat([middle, away]))[:, 2], torch.tensor([8.0, 1.0]))
 
 
 @pytest.mark.parametrize("decoder", [SigmoidColor(), ColorDecoder(3, 8)], ids=["plain", "network"])
