@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import gc
 import logging
-import math
 import os
 import re
 import signal
@@ -24,7 +23,6 @@ os.environ.setdefault("TRITON_INTERPRET", "1")
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -34,6 +32,7 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult, ConfigSource
 from hypothesis import settings
 from lightning import Callback, Trainer
+from scipy.spatial.transform import Rotation
 
 from devrf.apps.video_file import write_pictures
 from devrf.callbacks import GridUpscaling, LearningRateDecay
@@ -200,15 +199,9 @@ def tiny_toy() -> Scene:
 
 
 @pytest.fixture(scope="session")
-def tiny_room_recipe(tiny_recipe: ProceduralScene) -> ProceduralScene:
-    """How the tiny room is made."""
-    return replace(tiny_recipe, surroundings="room")
-
-
-@pytest.fixture(scope="session")
-def tiny_room(tiny_room_recipe: ProceduralScene) -> Scene:
+def tiny_room(tiny_recipe: ProceduralScene) -> Scene:
     """The tiny scene in a room: an unbounded scene whose images have no alpha masks."""
-    return tiny_room_recipe()
+    return replace(tiny_recipe, surroundings="room")()
 
 
 def sparse_model(
@@ -230,12 +223,9 @@ def sparse_model(
     lines = []
     for k, pose in enumerate(cameras.camera_to_world.double()):
         turn = (pose[:, :3] * pose.new_tensor([1, -1, -1])).T
-        x, y, z = cv2.Rodrigues(turn.numpy())[0][:, 0].tolist()
-        angle = math.sqrt(x * x + y * y + z * z)
-        share = math.sin(angle / 2) / angle if angle else 0.5
-        quaternion = (math.cos(angle / 2), x * share, y * share, z * share)
+        x, y, z, w = Rotation.from_matrix(turn.numpy()).as_quat().tolist()
         moved = (-turn @ pose[:, 3]).tolist()
-        lines.append(" ".join(map(repr, (k + 1, *quaternion, *moved, 1))) + f" {names[k]}")
+        lines.append(" ".join(map(repr, (k + 1, w, x, y, z, *moved, 1))) + f" {names[k]}")
         lines.append(" ".join(f"0.5 0.5 {number}" for number in range(len(points))))
     (folder / "images.txt").write_text("\n".join(lines) + "\n")
     rows = [f"{n} {x!r} {y!r} {z!r} 9 9 9 0.5" for n, (x, y, z) in enumerate(points.tolist())]
@@ -289,14 +279,6 @@ class GivenScene(SceneDataModule):
 def serve() -> Callable[[Scene], SceneDataModule]:
     """``serve(scene)``: a datamodule of a scene that is there already."""
     return GivenScene
-
-
-@pytest.fixture(scope="session")
-def dark_scene(tiny_scene: Scene) -> Scene:
-    """The tiny scene with black static training images and no depth: nothing to learn from."""
-    train = tiny_scene.static.train
-    dark = replace(train, pixels=torch.zeros_like(train.pixels), depth=None)
-    return replace(tiny_scene, static=replace(tiny_scene.static, train=dark))
 
 
 @pytest.fixture

@@ -62,12 +62,13 @@ def test_a_killed_run_goes_on_to_the_same_weights(
 
 
 def test_dynamic_never_reads_the_static_set(
-    ray_stage: Make, fit: Fit, serve: Callable[[Scene], SceneDataModule], tiny_scene: Scene,
-    dark_scene: Scene,
+    ray_stage: Make, fit: Fit, serve: Callable[[Scene], SceneDataModule], tiny_scene: Scene
 ) -> None:  # fmt: skip
     """It learns the same, in the same box, where static images are black."""
-    stages = []
-    for scene in (tiny_scene, dark_scene):
+    static, stages = tiny_scene.static, []
+    black = replace(static.train, pixels=torch.zeros_like(static.train.pixels), depth=None)
+    dark = replace(tiny_scene, static=replace(static, train=black))
+    for scene in (tiny_scene, dark):
         torch.manual_seed(0)
         stages.append(fit(ray_stage(DNeRF(TINY), "dynamic"), data=serve(scene)))
     assert_same_weights(*stages)

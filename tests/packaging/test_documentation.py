@@ -34,42 +34,32 @@ CHOICES += ["logger=wandb", "method=nerfies", "method=nsff", "method=hypernerf"]
 CHOICES += ["method=dnerf", "method=neural_volumes"]
 
 
-# Of the commands without a placeholder that a reader has to fill in.
-COMMANDS = sorted(
-    {
-        command
-        for page in PAGES
-        for command in COMMAND.findall(page.read_text())
-        if not re.search("NAME|CHOICE|PROTOCOL|hparams_search", command)
-    }
-)
-
-
-@pytest.fixture(params=PAGES, ids=lambda path: path.stem)
-def page(request) -> Path:
-    return request.param
+def commands() -> list[str]:
+    """Those without a placeholder to fill in; of several that choose and set the same, one."""
+    different: dict[frozenset[str], str] = {}
+    for page in PAGES:
+        for command in COMMAND.findall(page.read_text()):
+            if not re.search("NAME|CHOICE|PROTOCOL|hparams_search", command):
+                words = (re.sub(r"(.*\..*)=.*", r"\1", word) for word in command.split())
+                different.setdefault(frozenset(words), command)
+    return sorted(different.values())
 
 
 def spans(page: Path) -> list[str]:
     return SPAN.findall(re.sub(r"```.*?```", "", page.read_text(), flags=re.S))
 
 
-def test_tests_exist(page):
-    for file, name in TEST.findall(page.read_text()):
-        source = (REPOSITORY / file).read_text()
-        assert not name or f"def {name}(" in source, f"{file} has no {name}"
-
-
-def test_files_exist(page):
-    paths = [s for s in spans(page) if re.fullmatch(r"[\w./]+(\.\w+|/)", s) and "/" in s]
-    named = [s for s in paths if s.startswith(ROOTS) or (PACKAGE / s.split("/")[0]).is_dir()]
-    missing = [s for s in named if "NAME" not in s and not (REPOSITORY / s).exists()]
-    assert not [s for s in missing if not (PACKAGE / s).exists()]
-
-
-def test_links_lead_somewhere(page):
-    links = LINK.findall(page.read_text())
-    assert not [link for link in links if not (page.parent / link).exists()]
+def test_tests_files_and_links_exist():
+    for page in PAGES:
+        for file, name in TEST.findall(page.read_text()):
+            source = (REPOSITORY / file).read_text()
+            assert not name or f"def {name}(" in source, f"{page.name}: {file} has no {name}"
+        paths = [s for s in spans(page) if re.fullmatch(r"[\w./]+(\.\w+|/)", s) and "/" in s]
+        named = [s for s in paths if s.startswith(ROOTS) or (PACKAGE / s.split("/")[0]).is_dir()]
+        missing = [s for s in named if "NAME" not in s and not (REPOSITORY / s).exists()]
+        assert not [s for s in missing if not (PACKAGE / s).exists()], page.name
+        links = LINK.findall(page.read_text())
+        assert not [link for link in links if not (page.parent / link).exists()], page.name
 
 
 def test_docstrings_cite_anchors_of_the_method():
@@ -80,7 +70,7 @@ def test_docstrings_cite_anchors_of_the_method():
         assert set(cited) <= set(anchors), source
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", commands())
 def test_commands_compose(command, composed, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scene").mkdir()

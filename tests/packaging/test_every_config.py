@@ -139,13 +139,10 @@ def test_the_command_line_overrides_the_ablation_and_that_the_experiment(compose
 @pytest.mark.parametrize(
     ("overrides", "folder"),
     [
-        ([], "outputs/robot/quickstart"),
         (["data.shape=flower", "experiment=quickstart"], "outputs/flower/quickstart"),
         (["data=inward", "data.root=/scenes/my scene"], "outputs/my_scene/quickstart"),
         (["data=inward", "data.root=x", "data.name=y"], "outputs/y/quickstart"),
-        (["ablation=base"], "outputs/robot/quickstart-base"),
-        (["protocol=joint"], "outputs/robot/quickstart-devrf-joint"),
-        (["data=inward"], "outputs/scene/quickstart"),
+        (["ablation=base", "protocol=joint"], "outputs/robot/quickstart-base-devrf-joint"),
         (["stage=report", "report.into=there"], "there"),
         (["stage=report", "report.runs=no such folder"], "outputs/report"),
     ],
@@ -168,27 +165,3 @@ def test_every_ablation_is_in_a_table_of_both_embedded_scenes(composed):
         rows += hydra.sweeper.params["ablation"].split(",")
     assert sorted(rows) == sorted(NAMES["ablation"])
     assert rows == list(ABLATIONS)  # a report has a name for each, in this order
-
-
-# What each row of the quality table changes of the row above it.
-ADDED = {
-    "along_flow": {"extensions"},
-    "changing_colors": {"extensions"},
-    "elastic": {"deformation", "loss"},
-    "more_sweeps": {"deformation"},
-    "finishing": {"deformation", "motion"},
-    "refinement": {"refinement"},
-    "shading": {"extensions"},
-    "tracks": {"deformation", "extensions"},
-    "best": {"canonical", "rates", "deformation", "refinement", "loss", "sampling", "field"},
-}
-
-
-def test_each_row_of_the_quality_table_adds_one_thing(composed):
-    rows = []
-    for row in ("paper_terms", *ADDED):
-        config = composed("experiment=quickstart", f"ablation={row}")
-        beside = {part: config[part] for part in ("loss", "sampling", "field")}
-        rows.append({**config.schedule, **beside})
-    for name, before, after in zip(ADDED, rows, rows[1:], strict=False):
-        assert {key for key in before if before[key] != after[key]} == ADDED[name], name

@@ -8,8 +8,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 import devrf
 
 APP = """
@@ -44,39 +42,25 @@ hydra:
 """
 
 
-@pytest.fixture
-def application(tmp_path: Path):
-    """``application(*arguments)``: the config that another application composes."""
+def test_groups_resolvers_and_choices_are_there(tmp_path: Path) -> None:
     (tmp_path / "configs" / "local").mkdir(parents=True)
     (tmp_path / "app.py").write_text(APP)
     (tmp_path / "configs" / "app.yaml").write_text(CONFIG)
     (tmp_path / "configs" / "local" / "mine.yaml").write_text("name: theirs\n")
     source = str(Path(devrf.__file__).parents[1])
     path = os.pathsep.join(filter(None, [source, os.environ.get("PYTHONPATH")]))
-
-    def run(*arguments: str) -> dict:
-        done = subprocess.run(
-            [sys.executable, "app.py", *arguments],
-            cwd=tmp_path,
-            text=True,
-            capture_output=True,
-            env={**os.environ, "PYTHONPATH": path},
-            timeout=60,
-            check=False,
-        )
-        assert done.returncode == 0, done.stderr
-        return json.loads(done.stdout)
-
-    return run
-
-
-def test_groups_resolvers_and_choices_are_there(application):
-    config = application()
-    assert config["scene"]["_target_"] == "devrf.data.rendered.ProceduralDataModule"
+    done = subprocess.run(
+        [sys.executable, "app.py", "data@scene=inward", "scene.root=/scenes/suzanne"],
+        cwd=tmp_path,
+        text=True,
+        capture_output=True,
+        env={**os.environ, "PYTHONPATH": path},
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    config = json.loads(done.stdout)
+    assert config["scene"]["_target_"] == "devrf.data.recorded.InwardFacingDataModule"
     assert config["schedule"]["canonical"]["side"] == 160
     assert config["loss"]["deformation"]["elastic"] == 0.05  # a row, not a file
-    assert (config["run"], config["label"]) == ("theirs-base", "robot")
-    config = application("data@scene=inward", "scene.root=/scenes/suzanne", "schedule=quick")
-    assert config["scene"]["_target_"] == "devrf.data.recorded.InwardFacingDataModule"
-    assert config["label"] == "suzanne"
-    assert config["schedule"]["canonical"]["side"] < 160
+    assert (config["run"], config["label"]) == ("theirs-base", "suzanne")

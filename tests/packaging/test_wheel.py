@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 import sys
 import tarfile
@@ -107,23 +106,6 @@ def test_an_installed_devrf_learns_a_scene_from_any_folder(environment, tmp_path
     assert str(REPOSITORY) not in where
     assert all(part.startswith(str(environment)) for part in where.split())
     arguments = ["stage=canonical", "hydra.run.dir=run", *TINY]
-    done = run(python, "-m", "devrf", *arguments, folder=tmp_path)
+    done = run(environment / "bin" / "devrf", *arguments, folder=tmp_path)
     assert done.stderr == ""
     assert (tmp_path / "run" / "checkpoints" / "canonical.ckpt").is_file()
-
-
-def test_the_command_is_installed(environment, tmp_path):
-    assert shutil.which("devrf", path=environment / "bin")
-    done = run(environment / "bin" / "devrf", "--help", folder=tmp_path)
-    assert "stage=deformation" in done.stdout
-
-
-def test_another_application_finds_the_installed_configs(environment, tmp_path):
-    script = (
-        "from hydra import compose, initialize_config_dir\n"
-        f"with initialize_config_dir({str(tmp_path)!r}, version_base='1.3'):\n"
-        "    print(compose('app'))\n"
-    )
-    (tmp_path / "app.yaml").write_text("defaults: [_self_, data@scene: procedural]\n")
-    done = run(environment / "bin" / "python", "-c", script, folder=tmp_path)
-    assert "devrf.data.rendered.ProceduralDataModule" in done.stdout

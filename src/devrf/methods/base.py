@@ -1,11 +1,9 @@
 """What every method is: a scene that can be rendered, and, of most, a module that learns from rays.
 
-A method's module is configured by ``conf/method/<name>.yaml``; which data trains which of its
-parts is said by ``conf/protocol/*.yaml``. :class:`RayTrainable` methods are learned by
-``methods.ray_stage``; DeVRF has stages of its own (``methods.devrf``), and is :class:`Renderable`
-alone. Everything that shows a learned scene (videos, stills, evaluation) asks for
-:meth:`Renderable.at`; exports also for :meth:`Renderable.surface` and
-:meth:`Renderable.forward_map`, which a method may have.
+:class:`RayTrainable` methods are learned by ``methods.ray_stage``; DeVRF has stages of its own
+(``methods.devrf``), and is :class:`Renderable` alone. Everything that shows a learned scene
+(videos, stills, evaluation) asks for :meth:`Renderable.at`; exports also for
+:meth:`Renderable.surface` and :meth:`Renderable.forward_map`, which a method may have.
 """
 
 from __future__ import annotations
@@ -192,12 +190,8 @@ class RayTrainable(Renderable):
         A method that wants its parts learned at different rates adds ``rate``: a factor of the
         configured learning rate.
         """
-        groups = []
-        for name, parameters in self.parts().items():
-            free = [one for one in parameters if one.requires_grad]
-            if free:
-                groups.append({"name": name, "params": free})
-        return groups
+        parts = {n: [p for p in own if p.requires_grad] for n, own in self.parts().items()}
+        return [{"name": name, "params": free} for name, free in parts.items() if free]
 
     def freeze(self, parts: Sequence[str]) -> None:
         """Keep some parts as they are, and let the others learn.
@@ -208,16 +202,16 @@ class RayTrainable(Renderable):
         Raises:
             DevrfError: the method has no such part.
         """
-        own, kept = self.parts(), set[str]()
+        own, frozen = self.parts(), set[str]()
         for name in parts:
             matching = fnmatch.filter(own, name)
             if not matching:
                 known = ", ".join(own)
                 raise DevrfError(f"protocol: {self.name} has no part {name!r}; it has {known}")
-            kept |= set(matching)
+            frozen.update(matching)
         for name, parameters in own.items():
             for parameter in parameters:
-                parameter.requires_grad_(name not in kept)
+                parameter.requires_grad_(name not in frozen)
 
     def follow(self, step: ProtocolStage) -> None:
         """Called when a stage of a protocol begins: keeps its frozen parts as they are."""

@@ -20,7 +20,7 @@ from devrf.methods.base import RayTrainable
 from devrf.methods.protocol import ProtocolStage
 from devrf.methods.weighted_loss import counted_weights, visibility, weighted_sum
 from devrf.ops.adam import GridAdam
-from devrf.scenes.scene import CaptureName, Scene, Views
+from devrf.scenes.scene import Views
 from devrf.scenes.space import dynamic_only
 from devrf.system.profiling import span
 
@@ -134,7 +134,9 @@ class RayStage(ScheduledStage):
         super().setup(stage)
         self.trainer.datamodule.provide(self.scene_model.priors)  # type: ignore[attr-defined]
         if not self._ready:
-            self.scene_model.setup(self._scene_of_stage())
+            # A protocol without a stage that learns from the static set does not look at it.
+            alone = self.capture == "dynamic" and self.step_of_protocol.builds_on is None
+            self.scene_model.setup(dynamic_only(self.scene) if alone else self.scene)
             self._ready = True
         self.scene_model.follow(self.step_of_protocol)
         if hasattr(self, "optimizer"):
@@ -146,15 +148,11 @@ class RayStage(ScheduledStage):
         first, second = schedule.betas
         self.optimizer = GridAdam(groups, betas=(first, second), eps=schedule.eps)
 
-    def _scene_of_stage(self) -> Scene:
-        """The scene; without its static set if no stage of the protocol learns from it."""
-        alone = self.capture == "dynamic" and self.step_of_protocol.builds_on is None
-        return dynamic_only(self.scene) if alone else self.scene
-
     def enter(self, phase: Phase) -> None:
         """Gather the pixels to draw from."""
         self.phase = phase
-        views = [self.training_views(name) for name in self._captures]
+        static = [self.training_views("static")] if self.capture != "dynamic" else []
+        views = static + ([self.training_views("dynamic")] if self.capture != "static" else [])
         self.pools = [FramePool.of(one) for one in views]
         self.scene_model.learn_from(views, self.weights)
         groups = self.optimizer.param_groups
@@ -162,10 +160,6 @@ class RayStage(ScheduledStage):
         self._rays = self.schedule.rays if fewer is None or self.scene_model.has_hull else fewer
         learned = [parameter for group in groups for parameter in group["params"]]
         self.loop.bind(self._rays, [learned], self.optimizer, static_shape=False)
-
-    @property
-    def _captures(self) -> tuple[CaptureName, ...]:
-        return ("static", "dynamic") if self.capture == "both" else (self.capture,)
 
     def prepare(self) -> None:
         """Let the model follow the schedule."""
@@ -178,9 +172,8 @@ class RayStage(ScheduledStage):
         """
         with span("batch"):
             rays = rays_per_rank(self._rays)
-            counts = [rays]
-            if len(self.pools) > 1:
-                counts = [round(rays * self.static_share), rays - round(rays * self.static_share)]
+            static = round(rays * self.static_share)
+            counts = [static, rays - static] if len(self.pools) > 1 else [rays]
             images, flats, offset = [], [], 0
             left = self.schedule.times_per_batch
             for pool, count in zip(self.pools, counts, strict=True):

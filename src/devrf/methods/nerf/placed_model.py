@@ -31,6 +31,7 @@ class PlacedModel(RayTrainable):
 
     Attributes:
         settings_class: what :attr:`settings` are: sizes and sampling.
+        remembered: the names of attributes that a checkpoint holds beside these.
         placement: the maps from the fields' space (world units, NDC or contracted) to normalised
             space, where the box's longest edge is 2, and back.
         occupancy: where something may be at each frame.
@@ -38,6 +39,7 @@ class PlacedModel(RayTrainable):
     """
 
     settings_class: ClassVar[type[Any]]
+    remembered: ClassVar[tuple[str, ...]] = ()
     settings: Any
 
     def __init__(self, settings: Any) -> None:
@@ -72,6 +74,7 @@ class PlacedModel(RayTrainable):
             "space": space_config(self.space),
             "limits": list(self.depth_limits),
             "times": list(self.clock.times),
+            **{name: getattr(self, name) for name in self.remembered},
         }
 
     @classmethod
@@ -81,6 +84,8 @@ class PlacedModel(RayTrainable):
         near, far = config["limits"]
         model.set_place(Box.of(*config["box"]), space_from(config["space"]), (near, far))
         model.set_times(tuple(config["times"]))
+        for name in cls.remembered:
+            setattr(model, name, config[name])
         return model
 
 

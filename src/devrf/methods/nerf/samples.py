@@ -157,11 +157,3 @@ def flattened(rays: Rays, distance: Tensor, far: Tensor) -> RaySamples:
     stretch = torch.cat([distance[:, 1:], far[:, None]], dim=1) - distance
     ray = torch.arange(len(rays), device=distance.device).repeat_interleave(distance.shape[1])
     return RaySamples.at(rays, ray, distance.reshape(-1), stretch.reshape(-1).clamp(min=0))
-
-
-def evenly(
-    rays: Rays, box: Box, depths: tuple[float, float], count: int, *, jitter: bool
-) -> RaySamples:
-    """``count`` samples of each ray, one in each of equal stretches of its way through a box."""
-    near, far = limits(rays, box, depths)
-    return flattened(rays, stratified(near, far, count, jitter=jitter), far)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
@@ -116,6 +116,7 @@ class Nerfies(DeformableField):
     name: ClassVar[str] = "nerfies"
     losses: ClassVar[tuple[str, ...]] = ("color", "elastic")
     settings_class: ClassVar[type[FieldSettings]] = NerfiesSettings
+    remembered: ClassVar[tuple[str, ...]] = ("rest_is_canonical",)
     settings: NerfiesSettings
 
     def __init__(self, settings: NerfiesSettings | None = None, ambient: int = 0) -> None:
@@ -134,17 +135,6 @@ class Nerfies(DeformableField):
         """Take the frames' times, and draw a code for each."""
         super().set_times(times)
         self.codes = TimeCodes(times, self.settings.code).to(self.device)
-
-    def config(self) -> dict[str, Any]:
-        """As for all, and whether time 0 is the canonical state."""
-        return {**super().config(), "rest_is_canonical": self.rest_is_canonical}
-
-    @classmethod
-    def from_config(cls, config: Mapping[str, Any]) -> Self:
-        """Networks of the same sizes in the same place."""
-        model = super().from_config(config)
-        model.rest_is_canonical = config["rest_is_canonical"]
-        return model
 
     def follow(self, step: ProtocolStage) -> None:
         """What is learned from the static images alone is the canonical state."""

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from typing import Any, ClassVar, Self
+from collections.abc import Collection, Iterable, Sequence
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -17,12 +17,12 @@ from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.rays import Rays
 from devrf.geometry.space import Space
 from devrf.methods.nerf.placed_model import NeuralField
-from devrf.methods.nerf.samples import RaySamples, accumulated, evenly
+from devrf.methods.nerf.samples import accumulated, flattened, limits, stratified
 from devrf.methods.nsff.fields import TwoFields, with_time
 from devrf.methods.nsff.losses import TERMS, missing_terms
 from devrf.methods.nsff.priors import ImagePriors
 from devrf.methods.nsff.renders import BlendedOutput, Renders
-from devrf.methods.nsff.settings import NSFFSettings, Warmup
+from devrf.methods.nsff.settings import NSFFSettings
 from devrf.rendering.output import RenderOutput
 from devrf.scenes.scene import Scene, Views
 
@@ -33,13 +33,20 @@ REACH_IN_NDC, REACH_IN_A_BOX = 1.0, 0.2
 
 
 class NSFF(NeuralField):
-    """S(x, d) → σ_s, c_s, v and D(x, t, d) → σ_d, c_d, f±, o±, composited in one pass."""
+    """S(x, d) → σ_s, c_s, v and D(x, t, d) → σ_d, c_d, f±, o±, composited in one pass.
+
+    Attributes:
+        fields: S and D.
+        times: (T,) of the frames.
+        cut_out: whether alpha masks cut the scene out.
+    """
 
     name: ClassVar[str] = "nsff"
     losses: ClassVar[tuple[str, ...]] = tuple(TERMS)
     protocols: ClassVar[tuple[str, ...]] = ("joint", "dynamic")
     priors: ClassVar[tuple[str, ...]] = ("forward_flow",)
     settings_class = NSFFSettings
+    remembered: ClassVar[tuple[str, ...]] = ("cut_out",)
     settings: NSFFSettings
     times: Tensor
 
@@ -47,7 +54,7 @@ class NSFF(NeuralField):
         """Build the networks, as published if no settings are given."""
         super().__init__(settings or NSFFSettings())
         self.fields = TwoFields(self.settings)
-        self._step, self._absent, self._cut_out = 0, frozenset[str](), True
+        self._step, self._absent, self.cut_out = 0, frozenset[str](), True
         self._images: ImagePriors | None = None
         self.place()
 
@@ -65,20 +72,7 @@ class NSFF(NeuralField):
     def setup(self, scene: Scene) -> None:
         """As of every method, and whether alpha masks cut the scene out."""
         super().setup(scene)
-        self._cut_out = scene.static.train.cut_out or scene.dynamic.train.cut_out
-
-    def config(self) -> dict[str, Any]:
-        """As for all, and whether alpha masks cut the scene out."""
-        return {**super().config(), "cut_out": self._cut_out}
-
-    @classmethod
-    def from_config(cls, config: Mapping[str, Any]) -> Self:
-        """Networks of the same sizes in the same place."""
-        settings = config["settings"]
-        warmup = Warmup(**settings["warmup"])
-        model = super().from_config({**config, "settings": {**settings, "warmup": warmup}})
-        model._cut_out = config["cut_out"]
-        return model
+        self.cut_out = scene.static.train.cut_out or scene.dynamic.train.cut_out
 
     def parts(self) -> dict[str, Iterable[nn.Parameter]]:
         """The two fields."""
@@ -101,20 +95,14 @@ class NSFF(NeuralField):
         """N₀."""
         return self.settings.warmup.steps(len(self.clock))
 
-    @property
-    def _endless(self) -> bool:
-        """Whether the last sample of a ray stands for all behind it."""
-        return not (self._cut_out and self.space.is_linear)
-
     def learn_from(self, views: Sequence[Views], terms: Collection[str]) -> None:
         """Look for priors; what is missing is said, and its terms are left out."""
         self._images = ImagePriors(views, self.space)
         missing = missing_terms(self._images, terms, additive=self.fields.additive)
         self._absent = frozenset(missing)
-        if "flow" in terms and sum(self._images.has_flow) == 1:
-            missing["half of flow"] = (
-                f"no {'backward' if self._images.has_flow[0] else 'forward'} flow"
-            )
+        forward, backward = self._images.has_flow
+        if "flow" in terms and forward != backward:
+            missing["half of flow"] = f"no {'backward' if forward else 'forward'} flow"
         if self.settings.hard_rays and self._images.moving is None:
             missing["hard_rays"] = "no motion masks"
         if missing:
@@ -123,17 +111,25 @@ class NSFF(NeuralField):
 
     def further_pixels(self, generator: torch.Generator) -> tuple[Tensor, Tensor] | None:
         """In the first N₀ iterations, pixels that move."""
-        count = rays_per_rank(self.settings.hard_rays) if self.settings.hard_rays else 0
-        images = self._images
-        if images is None or images.moving is None or not count or self._step >= self._first:
+        moving = None if self._images is None else self._images.moving
+        if moving is None or not self.settings.hard_rays or self._step >= self._first:
             return None
-        return images.moving.draw(count, generator)
+        return moving.draw(rays_per_rank(self.settings.hard_rays), generator)
 
     def render_rays(
         self, rays: Rays, time: Tensor, background: Tensor, *, jitter: bool = False
     ) -> BlendedOutput:
         """As of every method, and what it was made of."""
-        samples = self._samples(rays, time, jitter=jitter)
+        if self.settings.sampling == "occupancy":
+            samples = self.march(rays, time, jitter=jitter)
+        else:
+            near, far = limits(rays, self.box, self.depth_limits)
+            distance = stratified(near, far, self.settings.samples, jitter=jitter)
+            samples = flattened(rays, distance, far)
+        # Where masks cut the scene out it ends with its box; else the last sample is all behind it.
+        endless = not (self.cut_out and self.space.is_linear)
+        samples = samples.endless() if endless else samples
+        samples = samples.scaled(self.placement.half_edge)
         ray, fields = samples.ray, self.fields
         points = self.placement.normalised(samples.points)
         static = fields.static.at(points, rays.viewdirs, ray)
@@ -143,7 +139,7 @@ class NSFF(NeuralField):
             fields.optical_depth(dynamic.raw, samples.length, noise),
             fields.optical_depth(static.raw, samples.length, noise),
         )
-        blend = fields.blended(*depths, static.blend, ray, len(rays), endless=self._endless)
+        blend = fields.blended(*depths, static.blend, ray, len(rays), endless=endless)
         weight = blend.dynamic + blend.static
         color = blend.dynamic[:, None] * dynamic.color + blend.static[:, None] * static.color
         output = accumulated(samples, weight, color, blend.transmittance, background)
@@ -158,17 +154,6 @@ class NSFF(NeuralField):
             depths=depths,
             blend=blend,
         )
-
-    def _samples(self, rays: Rays, time: Tensor, *, jitter: bool) -> RaySamples:
-        """Samples, their lengths in normalised units; without masks the last one is endless."""
-        s = self.settings
-        if s.sampling == "occupancy":
-            samples = self.march(rays, time, jitter=jitter)
-        else:
-            samples = evenly(rays, self.box, self.depth_limits, s.samples, jitter=jitter)
-        if self._endless:
-            samples = samples.endless()
-        return samples.scaled(self.placement.half_edge)
 
     def loss_terms(
         self, output: RenderOutput, batch: RayBatch, names: Collection[str]

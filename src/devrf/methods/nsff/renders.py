@@ -172,13 +172,7 @@ class Renders:
     ) -> Warp:
         """One frame further to each ray's ``side`` (R,) from ``frame`` (R,), where there is one.
 
-        Args:
-            side: (R,).
-            frame: (R,).
-            there: (R,) whether that frame exists.
-            kept: (K,) samples of the rays whose frame exists.
-            points: (K, 3) where they are in that frame.
-            dynamic: the dynamic field there.
+        Of ``frame`` the others tell what a :class:`Warp` would.
         """
         samples, count = self.output.samples, len(self.times)
         frame = frame + torch.where(side == FORWARD, 1, -1)
@@ -211,8 +205,8 @@ class Renders:
         static, v = self.output.depths[1][kept], self.output.static.blend[kept]
         blend = self.fields.blended(depth, static, v, ray, self.rays, endless=False)
         color = self._color(blend.dynamic, found.color, ray, blend.transmittance)
-        still = blend.static[:, None] * self.output.static.color[kept]
-        return color + sum_by_ray(still, ray, self.rays), blend.dynamic
+        behind = blend.static[:, None] * self.output.static.color[kept]
+        return color + sum_by_ray(behind, ray, self.rays), blend.dynamic
 
     def _color(self, weight: Tensor, color: Tensor, ray: Tensor, end: Tensor) -> Tensor:
         seen = sum_by_ray(weight[:, None] * color, ray, self.rays)

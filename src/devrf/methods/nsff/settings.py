@@ -75,6 +75,8 @@ class NSFFSettings(PlacedSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if isinstance(self.warmup, dict):  # as a checkpoint has it
+            object.__setattr__(self, "warmup", Warmup(**self.warmup))
         self.expect_at_least(2, "samples")
         self.expect_at_least(0, "hard_rays", "density_noise")
         reach = self.flow_reach
