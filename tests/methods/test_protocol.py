@@ -25,20 +25,15 @@ def test_stages_keep_their_order() -> None:
 @pytest.mark.parametrize(
     ("stages", "said"),
     [
-        ({"a": {**STATIC, "builds_on": "b"}, "b": MOVING}, r"stages\.a\.builds_on: .* not 'b'"),
-        ({"a": {"capture": "all"}}, r"stages\.a\.capture: expected static, dynamic or both"),
-        ({"a": {**STATIC, "iterations": 0}}, r"stages\.a\.iterations: expected a share above 0"),
+        ({"a": {**STATIC, "builds_on": "b"}, "b": MOVING}, r"stages\.a\.builds_on: .*'b'"),
+        ({"a": {"capture": "all"}}, r"stages\.a\.capture: .*'all'"),
+        ({"a": {**STATIC, "iterations": 0}}, r"stages\.a\.iterations: .*0"),
         ({"a": {**STATIC, "frames": 3}}, r"stages: .*'frames'"),
     ],
 )
 def test_what_cannot_be_is_named(stages: dict[str, dict[str, object]], said: str) -> None:
     with pytest.raises(DevrfError, match=f"protocol.{said}"):
         Protocol("mine", stages)
-
-
-def test_a_joint_batch_has_rays_of_both_captures() -> None:
-    with pytest.raises(DevrfError, match="protocol.static_share: expected between 0 and 1"):
-        Protocol("joint", {"joint": {"capture": "both"}}, static_share=1.0)
 
 
 @pytest.mark.parametrize(

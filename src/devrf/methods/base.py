@@ -66,8 +66,7 @@ class Renderable(nn.Module, ABC):
     def surface(self) -> SurfaceField | None:
         """The scene at rest as a field of which a surface can be taken; None: there is none.
 
-        Exports ask for it, and for :meth:`forward_map`; of a method that has not both they take
-        what :meth:`at` shows.
+        Of a method that has not this and :meth:`forward_map` exports take what :meth:`at` shows.
         """
         return None
 
@@ -149,8 +148,7 @@ class RayTrainable(Renderable):
         """Look at the images whose rays will be rendered; called when a stage begins or goes on.
 
         Args:
-            views: on the model's device; :attr:`devrf.data.batch.RayBatch.image` numbers their
-                images through, in this order.
+            views: on the model's device; a batch numbers their images through, in this order.
             terms: the loss terms that count.
         """
 
@@ -187,8 +185,7 @@ class RayTrainable(Renderable):
     def param_groups(self) -> list[dict[str, Any]]:
         """Groups for an optimiser: ``name`` and ``params`` of each part that is not frozen.
 
-        A method that wants its parts learned at different rates adds ``rate``: a factor of the
-        configured learning rate.
+        A method may add ``rate`` to a group: a factor of the configured learning rate.
         """
         parts = {n: [p for p in own if p.requires_grad] for n, own in self.parts().items()}
         return [{"name": name, "params": free} for name, free in parts.items() if free]

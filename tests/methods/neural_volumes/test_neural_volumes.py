@@ -76,5 +76,5 @@ def test_what_it_cannot_learn_from_is_refused(
     ):
         with pytest.raises(DevrfError, match=said):
             NeuralVolumes(TINY).setup(scene)
-    with pytest.raises(DevrfError, match=r"settings\.encoder_views: .* robot has 2"):
+    with pytest.raises(DevrfError, match=r"settings\.encoder_views: .*2, as robot"):
         NeuralVolumes(replace(TINY, encoder_views=3)).setup(tiny_scene)

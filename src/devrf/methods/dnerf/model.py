@@ -34,12 +34,7 @@ class TranslationField(nn.Module):
         nn.init.zeros_(self.output.bias)
 
     def forward(self, points: Tensor, time: Tensor) -> Tensor:
-        """Displacements (S, 3) to canonical space.
-
-        Args:
-            points: (S, 3) in normalised space.
-            time: (S,) in [0, 1]; where it is 0 nothing is displaced.
-        """
+        """Displacements (S, 3) to canonical space of points (S, 3) at times (S,) in [0, 1]."""
         moving = (time > 0).nonzero()[:, 0]
         place, when = points.index_select(0, moving), time.index_select(0, moving)
         encoded = torch.cat([self.encode_position(place), self.encode_time(when[:, None])], dim=-1)

@@ -9,7 +9,6 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor, nn
 
-from devrf.errors import expect
 from devrf.methods.nerf.networks import (
     SinusoidalEncoding,
     TimeCodes,
@@ -76,14 +75,11 @@ class HyperNeRFSettings(NerfiesSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.expect_at_least(1, "ambient", "ambient_bands")
-        self.expect_at_least(0, "ambient_delay", "ambient_window")
-        expect(
-            self.ambient_delay + self.ambient_window <= 1,
-            f"{self.key}.ambient_window",
-            f"at most 1 with ambient_delay ({self.ambient_delay})",
-            self.ambient_window,
-        )
+        self.check_least(1, "ambient", "ambient_bands")
+        self.check_least(0, "ambient_delay", "ambient_window")
+        delay = self.ambient_delay
+        together = delay + self.ambient_window <= 1
+        self.check("ambient_window", together, f"at most 1 with ambient_delay ({delay})")
 
 
 class HyperNeRF(Nerfies):

@@ -11,8 +11,27 @@ Initialisation = Literal["uniform", "glorot"]
 Precision = Literal["auto", "float32", "bfloat16"]
 
 
+class CheckedSettings:
+    """Settings of a method that refuse what cannot be."""
+
+    key: ClassVar[str] = "ray_stage.model.settings"
+
+    def check(self, name: str, holds: bool, expected: str) -> None:
+        """Refuse the setting ``name`` unless a condition ``holds``.
+
+        Raises:
+            DevrfError: it does not.
+        """
+        expect(holds, f"{self.key}.{name}", expected, getattr(self, name))
+
+    def check_least(self, least: int, *names: str) -> None:
+        """Refuse settings that are less; raises as :meth:`check`."""
+        for name in names:
+            self.check(name, getattr(self, name) >= least, f"at least {least}")
+
+
 @dataclass(frozen=True)
-class PlacedSettings:
+class PlacedSettings(CheckedSettings):
     """What D-NeRF, Nerfies, HyperNeRF and NSFF have in common.
 
     Attributes:
@@ -33,8 +52,6 @@ class PlacedSettings:
             is left out after this share of a stage; None: never (occupancy).
     """
 
-    key: ClassVar[str] = "ray_stage.model.settings"
-
     width: int = 256
     depth: int = 8
     skip: int | None = 5
@@ -49,20 +66,9 @@ class PlacedSettings:
     empty_from: float | None = 0.25
 
     def __post_init__(self) -> None:
-        self.expect_at_least(2, "width", "depth", "steps", "occupancy_side")
+        self.check_least(2, "width", "depth", "steps", "occupancy_side")
         share = self.empty_from
-        holds = share is None or 0 <= share <= 1
-        expect(holds, f"{self.key}.empty_from", "0 to 1, or null", share)
-
-    def expect_at_least(self, least: int, *names: str) -> None:
-        """Refuse settings of these names that are less.
-
-        Raises:
-            DevrfError: one is.
-        """
-        for name in names:
-            given = getattr(self, name)
-            expect(given >= least, f"{self.key}.{name}", f"at least {least}", given)
+        self.check("empty_from", share is None or 0 <= share <= 1, "0 to 1, or null")
 
 
 @dataclass(frozen=True)
@@ -85,7 +91,8 @@ class FieldSettings(PlacedSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.expect_at_least(2, "coarse", "fine")
-        none = self.separate_coarse and self.sampling == "occupancy"
-        expected = "false, as sampling=occupancy has no coarse samples"
-        expect(not none, f"{self.key}.separate_coarse", expected, self.separate_coarse)
+        self.check_least(2, "coarse", "fine")
+        possible = self.sampling == "hierarchical" or not self.separate_coarse
+        self.check(
+            "separate_coarse", possible, "false, as sampling=occupancy has no coarse samples"
+        )

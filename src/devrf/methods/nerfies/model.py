@@ -10,7 +10,6 @@ import torch
 from torch import Tensor, nn
 
 from devrf.data.batch import RayBatch
-from devrf.errors import expect
 from devrf.geometry.poses import rigid_motion
 from devrf.methods.nerf.deformable import DeformableField
 from devrf.methods.nerf.networks import (
@@ -52,15 +51,7 @@ class RigidWarp(nn.Module):
             nn.init.zeros_(head.bias)
 
     def forward(self, points: Tensor, code: Tensor) -> Tensor:
-        """Where points lead.
-
-        Args:
-            points: (S, 3) in normalised space.
-            code: (S, code) ω of each one's time.
-
-        Returns:
-            (S, 3) in normalised space.
-        """
+        """Where points (S, 3) of normalised space lead; ``code`` (S, code) is of their times."""
         window = octave_window(self.opened, self.bands)
         x = self.trunk(torch.cat([self.encode(points, window), code], dim=-1))
         rotation, velocity = self.rotation(x), self.velocity(x)
@@ -99,8 +90,8 @@ class NerfiesSettings(FieldSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        expect(0 <= self.window <= 1, f"{self.key}.window", "a share from 0 to 1", self.window)
-        self.expect_at_least(0, "elastic_rays")
+        self.check("window", 0 <= self.window <= 1, "a share from 0 to 1")
+        self.check_least(0, "elastic_rays")
 
 
 class Nerfies(DeformableField):

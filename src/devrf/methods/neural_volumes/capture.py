@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from devrf.errors import DevrfError
-from devrf.methods.neural_volumes.settings import KEY, NeuralVolumesSettings
+from devrf.methods.neural_volumes.settings import NeuralVolumesSettings
 from devrf.scenes.scene import Scene, Views
 
 
@@ -49,11 +49,10 @@ def encoder_images(scene: Scene, settings: NeuralVolumesSettings) -> Tensor:
     views, wanted = scene.dynamic.train, settings.encoder_views
     assert views.frames is not None
     cameras = cameras_of_every_frame(views)
-    if len(cameras) < wanted:
-        raise DevrfError(
-            f"{KEY}.encoder_views: expected {wanted} fixed training cameras with an image of every "
-            f"frame, and {scene.name} has {len(cameras)}; set it no higher, or give more cameras"
-        )
+    expected = (
+        f"at most {len(cameras)}, as {scene.name} has so many fixed training cameras with an "
+    )
+    settings.check("encoder_views", wanted <= len(cameras), expected + "image of every frame")
     height, width = settings.encoder_size
     scale = min(1.0, height / views.height, width / views.width)
     rows, columns = round(views.height * scale), round(views.width * scale)

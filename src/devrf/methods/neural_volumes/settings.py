@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from devrf.errors import expect
-
-KEY = "ray_stage.model.settings"
+from devrf.methods.nerf.settings import CheckedSettings
 
 
 @dataclass(frozen=True)
-class NeuralVolumesSettings:
+class NeuralVolumesSettings(CheckedSettings):
     """Sizes and sampling; the defaults are the published ones (docs/methods/neural_volumes.md).
 
     Attributes:
@@ -51,23 +49,17 @@ class NeuralVolumesSettings:
     occupancy_side: int = 128
 
     def __post_init__(self) -> None:
-        least = {"code": 1, "encoder_views": 1, "encoder_width": 1, "warp_width": 1, "maps": 1}
-        for name, smallest in {**least, "occupancy_side": 2}.items():
-            self._expect(name, getattr(self, name) >= smallest, f"at least {smallest}")
+        self.check_least(1, "code", "encoder_views", "encoder_width", "warp_width", "maps")
+        self.check_least(2, "occupancy_side")
         for name in ("density_scale", "step", "warp_scale"):
-            self._expect(name, getattr(self, name) > 0, "more than 0")
+            self.check(name, getattr(self, name) > 0, "more than 0")
         for name in ("encoder_channels", "template_channels"):
             channels = getattr(self, name)
-            self._expect(name, channels and min(channels) >= 1, "one or more numbers above 0")
+            self.check(name, channels and min(channels) >= 1, "one or more numbers above 0")
         side, multiple = self.warp_side, 2 ** len(self.encoder_channels)
-        self._expect("warp_side", side >= 2 and not side & (side - 1), "a power of two")
-        holds = len(self.encoder_size) == 2 and all(
-            edge >= multiple and edge % multiple == 0 for edge in self.encoder_size
-        )
-        self._expect("encoder_size", holds, f"two multiples of {multiple}")
-
-    def _expect(self, name: str, holds: bool, expected: str) -> None:
-        expect(holds, f"{KEY}.{name}", expected, getattr(self, name))
+        self.check("warp_side", side >= 2 and not side & (side - 1), "a power of two")
+        fits = [edge >= multiple and edge % multiple == 0 for edge in self.encoder_size]
+        self.check("encoder_size", fits == [True, True], f"two multiples of {multiple}")
 
     @property
     def warp_channels(self) -> list[int]:

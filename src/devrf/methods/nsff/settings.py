@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import ClassVar, Literal
 
-from devrf.errors import expect
-from devrf.methods.nerf.settings import PlacedSettings
+from devrf.methods.nerf.settings import CheckedSettings, PlacedSettings
 
 
 @dataclass(frozen=True)
-class Warmup:
+class Warmup(CheckedSettings):
     """N₀ iterations in which motion is begun, as data (docs/methods/nsff.md#schedule).
 
     Attributes:
@@ -21,6 +20,8 @@ class Warmup:
         prior_decay: by what depth and flow priors are divided after each N₀.
     """
 
+    key: ClassVar[str] = f"{CheckedSettings.key}.warmup"
+
     steps_per_frame: int = 1000
     min_frames: int = 30
     max_frames: int = 250
@@ -28,13 +29,9 @@ class Warmup:
     prior_decay: float = 10.0
 
     def __post_init__(self) -> None:
-        key, most = "ray_stage.model.settings.warmup", self.max_frames
-        expect(
-            self.steps_per_frame >= 1, f"{key}.steps_per_frame", "at least 1", self.steps_per_frame
-        )
-        holds = 1 <= self.min_frames <= most
-        expect(holds, f"{key}.min_frames", f"1 … max_frames ({most})", self.min_frames)
-        expect(self.prior_decay >= 1, f"{key}.prior_decay", "at least 1", self.prior_decay)
+        self.check_least(1, "steps_per_frame", "prior_decay")
+        most = self.max_frames
+        self.check("min_frames", 1 <= self.min_frames <= most, f"1 … max_frames ({most})")
 
     def steps(self, frames: int) -> int:
         """N₀ of a scene of so many frames."""
@@ -77,7 +74,6 @@ class NSFFSettings(PlacedSettings):
         super().__post_init__()
         if isinstance(self.warmup, dict):  # as a checkpoint has it
             object.__setattr__(self, "warmup", Warmup(**self.warmup))
-        self.expect_at_least(2, "samples")
-        self.expect_at_least(0, "hard_rays", "density_noise")
-        reach = self.flow_reach
-        expect(reach is None or reach > 0, f"{self.key}.flow_reach", "more than 0", reach)
+        self.check_least(2, "samples")
+        self.check_least(0, "hard_rays", "density_noise")
+        self.check("flow_reach", self.flow_reach is None or self.flow_reach > 0, "more than 0")
