@@ -18,12 +18,7 @@ from torch.utils.benchmark import Timer
 
 from devrf.cli.messages import report_user_errors
 from devrf.geometry.box import Box
-from devrf.ops.adam_step import (
-    AdamRule,
-    adam_step,
-    add_total_variation_gradient,
-    smooth_adam_step,
-)
+from devrf.ops.adam_step import AdamRule, adam_step, add_total_variation_gradient
 from devrf.ops.color_network import ColorNetwork, listed_colors
 from devrf.ops.compositing import composite_colors, composite_segments
 from devrf.ops.dispatch import Kind, triton_runs, using
@@ -106,7 +101,7 @@ def operations(side: int, rays: int, device: torch.device) -> Mapping[str, Calla
     depth, colors, left = draw(samples).abs(), draw(samples, 3), draw(rays).abs()
     directions = torch.nn.functional.normalize(draw(rays, 3), dim=1)
     count = torch.full((rays,), 2 * side, device=device)
-    grid, spare, gradient, mean = (draw(*shape, 3) for _ in range(4))
+    grid, gradient, mean = (draw(*shape, 3) for _ in range(3))
     square = draw(*shape, 3).square()
     rule = AdamRule(torch.tensor(1e-3, device=device), torch.tensor(9.0, device=device))
     common: dict[str, Any] = {"box": BOX, "shift": -2.0, "delta": 0.5}
@@ -195,9 +190,6 @@ def operations(side: int, rays: int, device: torch.device) -> Mapping[str, Calla
         ),
         "add_total_variation_gradient": lambda: add_total_variation_gradient(grid, gradient, 1e-6),
         "adam_step": lambda: adam_step(grid, gradient, mean, square, rule, clear=False),
-        "smooth_adam_step": lambda: smooth_adam_step(
-            grid, spare, gradient, mean, square, rule, smoothing=1e-6
-        ),
     }
 
 

@@ -197,7 +197,9 @@ def small_scene(device: torch.device, seed: int = 0) -> SmallScene:
     levels = [replace(level, iterations=10) for level in PAPER_LEVELS]
     levels[2] = replace(levels[2], parallel_frames=4)
     at_rest = replace(short(CanonicalSchedule(), 250), search_iterations=20)
-    sizes = at_rest, DeformationSchedule(levels), Architecture(), Sampling()
+    # Fog that twenty iterations of the search can clear.
+    architecture = Architecture(search_alpha_init=1e-2)
+    sizes = at_rest, DeformationSchedule(levels), architecture, Sampling()
     return SmallScene(device, *sizes, 96, 24, 9, seed)
 
 

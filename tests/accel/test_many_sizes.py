@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from devrf.geometry.box import Box
-from devrf.ops.adam_step import AdamRule, adam_step, add_total_variation_gradient, smooth_adam_step
+from devrf.ops.adam_step import AdamRule, adam_step, add_total_variation_gradient
 from devrf.ops.check import Draw
 from devrf.ops.color_network import ColorNetwork, listed_colors
 from devrf.ops.compositing import composite, composite_segments
@@ -208,28 +208,22 @@ def test_colors(draw: Draw, agree: Both, octaves: int, frozen: Sequence[int], ke
 
 @pytest.mark.parametrize("paced", [False, True])
 @pytest.mark.parametrize("skip_zero", [False, True])
-@pytest.mark.parametrize("smooth", [False, True])
 @pytest.mark.parametrize("shape", [(3, 2, 4, 1), (2, 3, 50, 3), (2, 2, 400, 3)])
 def test_adam(
-    draw: Draw, agree: Both, shape: tuple[int, ...], smooth: bool, skip_zero: bool, paced: bool
+    draw: Draw, agree: Both, shape: tuple[int, ...], skip_zero: bool, paced: bool
 ) -> None:
     start, factors = 2 * draw(*shape), draw(*shape[:3], 1).abs() if paced else None
     # About half of the entries without a gradient, others in each step.
     gradients = [draw(*shape).clamp(min=0) for _ in range(2)]
 
     def work() -> Sequence[Tensor]:
-        values, other = start.clone(), torch.empty_like(start)
-        mean, square = torch.zeros_like(start), torch.zeros_like(start)
+        values, mean, square = start.clone(), torch.zeros_like(start), torch.zeros_like(start)
         for number, gradient in enumerate(gradients, start=1):
             rate, step = torch.tensor([0.1, number], device=start.device)
             rule = AdamRule(rate, step, skip_zero=skip_zero, per_voxel_lr=factors)
             grad = gradient.clone()
-            if smooth:
-                smooth_adam_step(values, other, grad, mean, square, rule, smoothing=0.3)
-                values, other = other, values
-            else:
-                add_total_variation_gradient(values, grad, 0.3, touched_only=skip_zero)
-                adam_step(values, grad, mean, square, rule)
+            add_total_variation_gradient(values, grad, 0.3, touched_only=skip_zero)
+            adam_step(values, grad, mean, square, rule)
             assert not grad.any()
         return values, mean, square
 

@@ -4,16 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-import pytest
 import torch
 from torch import Tensor
 
-from devrf.ops.adam_step import (
-    AdamRule,
-    adam_step,
-    add_total_variation_gradient,
-    smooth_adam_step,
-)
+from devrf.ops.adam_step import AdamRule, adam_step, add_total_variation_gradient
 
 
 def rule(step: int = 1, **options: Any) -> AdamRule:
@@ -33,32 +27,6 @@ def test_a_step_clears_the_gradient_unless_told_otherwise() -> None:
         adam_step(values, gradient, torch.zeros(3), torch.zeros(3), rule(), clear=clear)
         torch.testing.assert_close(values, torch.tensor([-0.1, 0.1, 0.0]))
         assert gradient.any() != clear
-
-
-def test_smoothing_pulls_at_a_peak_and_its_neighbours_by_their_old_values() -> None:
-    values, into, gradient = peak(), torch.empty(2, 2, 2, 1), torch.zeros(2, 2, 2, 1)
-    mean, square = torch.zeros_like(values), torch.zeros_like(values)
-    smooth_adam_step(values, into, gradient, mean, square, rule(), smoothing=0.5)
-    assert torch.equal(values, peak())
-    # At the peak 0.5·3, at each of its three neighbours −0.5; a tenth of it is the mean.
-    assert mean[1, 1, 1].item() == pytest.approx(0.15)
-    assert mean[0, 1, 1].item() == mean[1, 0, 1].item() == pytest.approx(-0.05)
-    assert mean[0, 0, 0].item() == 0
-    assert into[1, 1, 1].item() == pytest.approx(4.9)
-    assert into[0, 1, 1].item() == pytest.approx(0.1)
-
-
-def test_smoothing_of_what_is_touched_leaves_the_rest() -> None:
-    values, into, gradient = peak(), torch.empty(2, 2, 2, 1), torch.zeros(2, 2, 2, 1)
-    gradient[1, 1, 1] = 1.0
-    mean, square = torch.zeros_like(values), torch.zeros_like(values)
-    tensors = (values, into, gradient, mean, square)
-    smooth_adam_step(*tensors, rule(skip_zero=True), smoothing=0.5)
-    assert mean[1, 1, 1].item() == pytest.approx(0.25)
-    assert mean.count_nonzero() == 1 and not gradient.any()
-    expected = peak()
-    expected[1, 1, 1] = 4.9
-    torch.testing.assert_close(into, expected)
 
 
 def total_variation(grid: Tensor) -> Tensor:

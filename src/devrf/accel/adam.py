@@ -1,4 +1,4 @@
-"""Adam in one pass over a tensor, with or without a grid's total variation; and that alone.
+"""Adam in one pass over a tensor, or over several; the gradient of a grid's total variation.
 
 Each number is read and written once: value, gradient and two moments in, value and two moments
 out. Gradients are zeroed only where they were not zero; with ``SKIP_ZERO`` the moments, too, are
@@ -17,7 +17,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from devrf.accel.blocks import launch, opacity
+from devrf.accel.blocks import blocks, launch, opacity
 
 THREADS = 128
 # Numbers of a program at most: 8 for each of its 128 threads.
@@ -25,32 +25,22 @@ LARGEST = 1024
 
 
 def adam_step(
-    values: Tensor,
-    into: Tensor,
-    gradient: Tensor,
-    mean: Tensor,
-    square: Tensor,
-    rule: Any,
-    *,
-    clear: bool = True,
-    smoothing: float = 0.0,
+    values: Tensor, gradient: Tensor, mean: Tensor, square: Tensor, rule: Any, *, clear: bool
 ) -> None:
-    """As devrf.ops.adam_step.adam_step; as smooth_adam_step if ``into`` is not ``values``."""
-    smooth, factors = into is not values, rule.per_voxel_lr
-    length = _row(values) if smooth else values.numel()
+    """As devrf.ops.adam_step.adam_step."""
+    length, factors = values.numel(), rule.per_voxel_lr
     launch(
         adam_kernel,
-        _programs(values, length),
-        *(values, into, gradient, mean, square),
+        blocks(length, LARGEST),
+        *(values, gradient, mean, square),
         *(values if factors is None else factors.contiguous(), rule.rate, rule.step),
-        *(length, *(values.shape[:2] if smooth else (1, 1)), *_numbers(rule), smoothing),
+        *(length, *_numbers(rule)),
         PER_VOXEL_LR=factors is not None,
         SKIP_ZERO=rule.skip_zero,
         CLEAR=clear,
-        SMOOTH=smooth,
-        CHANNELS=values.shape[-1] if smooth or factors is not None else 1,
+        CHANNELS=1 if factors is None else values.shape[-1],
         WIDE=_is_wide(values),
-        BLOCK=_block(length),
+        BLOCK=LARGEST,
     )
 
 
@@ -96,31 +86,17 @@ def add_total_variation_gradient(
     grid: Tensor, gradient: Tensor, weight: float, *, touched_only: bool = False
 ) -> None:
     """As devrf.ops.adam_step.add_total_variation_gradient."""
-    length = _row(grid)
+    length = grid.shape[2] * grid.shape[3]
+    block = min(LARGEST, max(THREADS, int(triton.next_power_of_2(length))))
     launch(
         total_variation_kernel,
-        _programs(grid, length),
+        grid.numel() // max(length, 1) * blocks(length, block),
         *(grid, gradient, length, *grid.shape[:2], weight),
         TOUCHED_ONLY=touched_only,
         CHANNELS=grid.shape[3],
         WIDE=_is_wide(grid),
-        BLOCK=_block(length),
+        BLOCK=block,
     )
-
-
-def _row(grid: Tensor) -> int:
-    """Numbers in a row of a grid (X, Y, Z, C) along z."""
-    return grid.shape[2] * grid.shape[3]
-
-
-def _block(length: int) -> int:
-    """Numbers of a program, for rows of that length."""
-    return min(LARGEST, max(THREADS, int(triton.next_power_of_2(length))))
-
-
-def _programs(values: Tensor, length: int) -> int:
-    """How many programs go over all rows, each over a piece of one."""
-    return values.numel() // max(length, 1) * int(triton.cdiv(length, _block(length)))
 
 
 def _is_wide(values: Tensor) -> bool:
@@ -129,36 +105,10 @@ def _is_wide(values: Tensor) -> bool:
 
 
 @triton.jit
-def piece(length, WIDE: tl.constexpr, BLOCK: tl.constexpr):
-    """This program's row, and its numbers within the row.
-
-    A program stays in one row: no division for each number, except by constants.
-    """
-    program = tl.program_id(0).to(tl.int64) if WIDE else tl.program_id(0)
-    pieces = tl.cdiv(length, BLOCK)
-    return program // pieces, (program % pieces) * BLOCK + tl.arange(0, BLOCK)
-
-
-@triton.jit
 def pull(values, at, own, stride, there):
     """clamp(v − v', −1, 1) for the neighbour ``stride`` further on, 0 where there is none."""
     other = tl.load(values + at + stride, mask=there, other=0.0)
     return tl.where(there, tl.minimum(tl.maximum(own - other, -1.0), 1.0), 0.0)
-
-
-@triton.jit
-def slope_of_variation(values, at, own, here, row, number, length, x, y, CHANNELS: tl.constexpr):
-    """Σ over the six neighbours of clamp(v − v', −1, 1)."""
-    # Broadcast to the block here: Triton's interpreter cannot broadcast a boolean scalar.
-    i = row // y + number * 0
-    j = row % y + number * 0
-    total = pull(values, at, own, CHANNELS, here & (number + CHANNELS < length))
-    total += pull(values, at, own, -CHANNELS, here & (number >= CHANNELS))
-    total += pull(values, at, own, length, here & (j < y - 1))
-    total += pull(values, at, own, -length, here & (j > 0))
-    total += pull(values, at, own, y * length, here & (i < x - 1))
-    total += pull(values, at, own, -y * length, here & (i > 0))
-    return total
 
 
 @triton.jit(do_not_specialize=["x", "y"])
@@ -174,15 +124,28 @@ def total_variation_kernel(
     WIDE: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """gradient += weight · Σ clamp(v − v', −1, 1)."""
-    row, number = piece(length, WIDE, BLOCK)
+    """gradient += weight · Σ clamp(v − v', −1, 1) over the six neighbours.
+
+    A program stays in one row along z: no division for each number, except by constants.
+    """
+    program = tl.program_id(0).to(tl.int64) if WIDE else tl.program_id(0)
+    pieces = tl.cdiv(length, BLOCK)
+    row, number = program // pieces, (program % pieces) * BLOCK + tl.arange(0, BLOCK)
     here = number < length
     at = row * length + number
     before = tl.load(gradient + at, mask=here, other=0.0)
     if TOUCHED_ONLY:
         here = here & (before != 0.0)
     own = tl.load(values + at, mask=here, other=0.0)
-    slope = slope_of_variation(values, at, own, here, row, number, length, x, y, CHANNELS)
+    # Broadcast to the block here: Triton's interpreter cannot broadcast a boolean scalar.
+    i = row // y + number * 0
+    j = row % y + number * 0
+    slope = pull(values, at, own, CHANNELS, here & (number + CHANNELS < length))
+    slope += pull(values, at, own, -CHANNELS, here & (number >= CHANNELS))
+    slope += pull(values, at, own, length, here & (j < y - 1))
+    slope += pull(values, at, own, -length, here & (j > 0))
+    slope += pull(values, at, own, y * length, here & (i < x - 1))
+    slope += pull(values, at, own, -y * length, here & (i > 0))
     tl.store(gradient + at, before + weight * slope, mask=here)
 
 
@@ -203,10 +166,9 @@ def moved(g, mean, square, rate, step, at, here, share1, share2, decay1, decay2,
     return size * m / (tl.sqrt(s / opacity(time * decay2)) + eps)
 
 
-@triton.jit(do_not_specialize=["x", "y"])
+@triton.jit
 def adam_kernel(
     values,
-    into,
     gradient,
     mean,
     square,
@@ -214,42 +176,32 @@ def adam_kernel(
     rate,
     step,
     length,
-    x,
-    y,
     share1,
     share2,
     decay1,
     decay2,
     eps,
-    smoothing,
     PER_VOXEL_LR: tl.constexpr,
     SKIP_ZERO: tl.constexpr,
     CLEAR: tl.constexpr,
-    SMOOTH: tl.constexpr,
     CHANNELS: tl.constexpr,
     WIDE: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
     """One step; the numbers of its rule as for :func:`moved`."""
-    row, number = piece(length, WIDE, BLOCK)
-    here = number < length
-    at = row * length + number
+    program = tl.program_id(0).to(tl.int64) if WIDE else tl.program_id(0)
+    at = program * BLOCK + tl.arange(0, BLOCK)
+    here = at < length
     g = tl.load(gradient + at, mask=here, other=0.0)
     touched = here & (g != 0.0)
     active = touched if SKIP_ZERO else here
-    # Smoothed values go to another tensor, all of which is written.
-    written = here if SMOOTH else active
-    own = tl.load(values + at, mask=written, other=0.0)
+    own = tl.load(values + at, mask=active, other=0.0)
     if CLEAR:
         tl.store(gradient + at, tl.zeros((BLOCK,), dtype=tl.float32), mask=touched)
-    if SMOOTH:
-        g += smoothing * slope_of_variation(
-            values, at, own, active, row, number, length, x, y, CHANNELS
-        )
     move = moved(g, mean, square, rate, step, at, active, share1, share2, decay1, decay2, eps)
     if PER_VOXEL_LR:
         move *= tl.load(per_voxel_lr + at // CHANNELS, mask=active, other=0.0)
-    tl.store(into + at, tl.where(active, own - move, own), mask=written)
+    tl.store(values + at, own - move, mask=active)
 
 
 @triton.jit

@@ -9,13 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from devrf.ops.adam_step import (
-    AdamRule,
-    adam_steps,
-    add_total_variation_gradient,
-    smooth_adam_step,
-)
-from devrf.ops.dispatch import accelerated
+from devrf.ops.adam_step import AdamRule, adam_steps, add_total_variation_gradient
 
 
 class GridAdam(torch.optim.Optimizer):
@@ -58,7 +52,6 @@ class GridAdam(torch.optim.Optimizer):
         self._rates: dict[int, Tensor] = {}
         # The number that each of these holds.
         self._filled: dict[Tensor, float] = {}
-        self._spare: dict[Tensor, Tensor] = {}
         self._work = self.apply
         super().__init__(params, defaults)
 
@@ -102,7 +95,6 @@ class GridAdam(torch.optim.Optimizer):
         steps = [self._state_of(parameter)["steps"] for group in learned for parameter in group]
         if steps:
             torch._foreach_add_(steps, 1)
-        smoothed: list[Tensor] = []
         for number, (group, parameters) in enumerate(zip(self.param_groups, learned, strict=True)):
             rate = group["lr"] if isinstance(group["lr"], Tensor) else self._rates.get(number)
             options = {name: group[name] for name in ("betas", "eps", "skip_zero", "per_voxel_lr")}
@@ -110,26 +102,14 @@ class GridAdam(torch.optim.Optimizer):
             if not taken:
                 continue
             assert rate is not None
-            rules = [AdamRule(rate, step, **options) for *_, step in taken]
-            tensors = [four for *four, _ in taken]
-            smoothing, touched_only = group["smoothing"], group["touched_only"]
-            if smoothing and not touched_only and accelerated("adam", *tensors[0]):
-                for each, rule in zip(tensors, rules, strict=True):
-                    values, gradient, mean, square = each
-                    spare = self._spare_of(values)
-                    smooth_adam_step(
-                        values, spare, gradient, mean, square, rule, smoothing=smoothing
-                    )
-                    smoothed.append(values)
-                continue
-            if smoothing:
-                for values, gradient, *_ in tensors:
+            if group["smoothing"]:
+                touched_only = group["touched_only"]
+                for values, gradient, *_ in taken:
                     add_total_variation_gradient(
-                        values, gradient, smoothing, touched_only=touched_only
+                        values, gradient, group["smoothing"], touched_only=touched_only
                     )
-            adam_steps(tensors, rules, clear=self.keeps_gradients)
-        if smoothed:
-            torch._foreach_copy_(smoothed, [self._spare_of(values) for values in smoothed])
+            rules = [AdamRule(rate, step, **options) for *_, step in taken]
+            adam_steps([four for *four, _ in taken], rules, clear=self.keeps_gradients)
 
     def _learned(self, group: dict[str, Any]) -> list[Tensor]:
         """The group's parameters that have a gradient, or get one from their total variation."""
@@ -157,12 +137,6 @@ class GridAdam(torch.optim.Optimizer):
             state["mean"] = torch.zeros_like(parameter)
             state["square"] = torch.zeros_like(parameter)
         return state
-
-    def _spare_of(self, parameter: Tensor) -> Tensor:
-        """A buffer for the parameter's smoothed values."""
-        if parameter not in self._spare:
-            self._spare[parameter] = torch.empty_like(parameter, requires_grad=False)
-        return self._spare[parameter]
 
     def zero_grad(self, set_to_none: bool = True) -> None:
         """Remove all gradients; with ``keeps_gradients`` set them to zero."""
@@ -204,7 +178,6 @@ class GridAdam(torch.optim.Optimizer):
         """
         for old in self.param_groups[group]["params"]:
             self.state.pop(old, None)
-            self._spare.pop(old, None)
         self.param_groups[group]["params"] = list(parameters)
         self.param_groups[group].update({"per_voxel_lr": None, **settings})
         if self.keeps_gradients:

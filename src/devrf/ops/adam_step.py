@@ -1,4 +1,4 @@
-"""One step of Adam on one tensor, and the total variation of a grid, also in the same pass.
+"""One step of Adam on one tensor or several, and the gradient of a grid's total variation.
 
 The learning rate and the step number are tensors on the device: a captured CUDA graph uses their
 present values.
@@ -62,7 +62,7 @@ def adam_step(
     tensors = (values, gradient, mean, square)
     contiguous = all(tensor.is_contiguous() for tensor in tensors)
     if contiguous and (kernels := accelerated("adam", *tensors)):
-        kernels.adam_step(values, *tensors, rule, clear=clear)
+        kernels.adam_step(*tensors, rule, clear=clear)
         return
     _step(values, gradient, mean, square, rule)
     if clear:
@@ -74,61 +74,23 @@ def adam_steps(
 ) -> None:
     """As :func:`adam_step` for each of several tensors, whose rules differ in ``step`` alone.
 
-    Triton steps them in a single launch, unless a rule has options, or gradients are made anew at
-    each step: their addresses are kept.
+    Triton steps a network's weights in a single launch, unless a rule has options, or gradients are
+    made anew at each step: their addresses are kept.
 
     Args:
         tensors: values, gradient and both moments of each.
         rules: the settings of each.
         clear: whether to set the gradients to zero afterwards.
     """
-    plain = not (rules[0].skip_zero or rules[0].per_voxel_lr is not None) if rules else False
     every = [tensor for four in tensors for tensor in four]
-    contiguous = all(tensor.is_contiguous() for tensor in every)
-    several = len(tensors) > 1 and plain and clear and contiguous
+    weights = all(tensor.dim() < 3 and tensor.is_contiguous() for tensor in every)
+    plain = all(not rule.skip_zero and rule.per_voxel_lr is None for rule in rules)
+    several = len(tensors) > 1 and weights and plain and clear
     if several and (kernels := accelerated("adam", *every)):
         kernels.adam_steps(tensors, rules)
         return
     for (values, gradient, mean, square), rule in zip(tensors, rules, strict=True):
         adam_step(values, gradient, mean, square, rule, clear=clear)
-
-
-def smooth_adam_step(
-    values: Tensor,
-    into: Tensor,
-    gradient: Tensor,
-    mean: Tensor,
-    square: Tensor,
-    rule: AdamRule,
-    *,
-    smoothing: float,
-) -> None:
-    """As :func:`adam_step`, with the gradient of the total variation added in the same pass.
-
-    That gradient depends on the neighbours' old values, so the new values are written to a second
-    tensor. This moves fewer bytes than a separate pass for the total variation.
-
-    Args:
-        values: (X, Y, Z, C), contiguous; read only.
-        into: another tensor of the same shape for the new values, written everywhere.
-        gradient: the same shape; zero afterwards.
-        mean: first moments, the same shape, changed in place.
-        square: second moments, likewise.
-        rule: the settings; ``skip_zero`` refers to ``gradient`` alone.
-        smoothing: weight of the total variation, as for :func:`add_total_variation_gradient`.
-    """
-    tensors = (values, into, gradient, mean, square)
-    contiguous = all(tensor.is_contiguous() for tensor in tensors)
-    if contiguous and (kernels := accelerated("adam", *tensors)):
-        kernels.adam_step(*tensors, rule, smoothing=smoothing)
-        return
-    smooth = torch.zeros_like(gradient)
-    add_total_variation_gradient(values, smooth, smoothing)
-    if rule.skip_zero:
-        smooth *= gradient != 0
-    into.copy_(values)
-    _step(into, gradient + smooth, mean, square, rule)
-    gradient.zero_()
 
 
 def add_total_variation_gradient(

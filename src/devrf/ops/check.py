@@ -12,13 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from devrf.ops.adam_step import (
-    AdamRule,
-    adam_step,
-    adam_steps,
-    add_total_variation_gradient,
-    smooth_adam_step,
-)
+from devrf.ops.adam_step import AdamRule, adam_step, adam_steps, add_total_variation_gradient
 from devrf.ops.color_network import ColorNetwork, listed_colors
 from devrf.ops.compositing import composite_colors, composite_segments
 from devrf.ops.corners import Triple
@@ -262,11 +256,9 @@ def adam_and_variation(draw: Draw) -> Results:
             draw(1)[0].abs(), 2 + draw(1)[0].abs(), (0.9, 0.99), 1e-8, skip_zero, factors
         )
         moments = draw(4, 3, 5, 3), draw(4, 3, 5, 3).square() + 0.1
-        again, smooth = draw(4, 3, 5, 3).clamp(min=0), torch.zeros_like(grid)
         results.append(gradient.clone())
         adam_step(grid, gradient, *moments, rule)
-        smooth_adam_step(grid, smooth, again, *moments, rule, smoothing=0.3)
-        results += [grid, smooth, gradient, again, *moments]
+        results += [grid, gradient, *moments]
     several = [[*(draw(size) for _ in range(3)), draw(size).square()] for size in (7, 1500)]
     rate, steps = draw(1)[0].abs(), [torch.full_like(draw(1)[0], k).double() for k in (1, 3)]
     adam_steps(several, [AdamRule(rate, step) for step in steps])
