@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from functools import partial
 
 import pytest
 import torch
@@ -11,9 +12,8 @@ import torch
 from devrf.geometry.box import Box
 from devrf.geometry.rays import Rays
 from devrf.methods.devrf.architecture import Architecture
-from devrf.methods.devrf.canonical_field import CanonicalField
+from devrf.methods.devrf.canonical_field import CanonicalField, look_up
 from devrf.methods.devrf.deformation_field import GridWarp
-from devrf.methods.devrf.extensions.color_residual import ResidualGrid
 from devrf.methods.devrf.volume_rendering import render
 from devrf.ops.dispatch import using
 from devrf.rendering import list_rendering as module
@@ -51,7 +51,9 @@ class World:
         self.warp = GridWarp(self.slices, box, 0.3 if frames == 2 else 0.0)
         # Colours change while something moves.
         self.residual = (draw(3, 4, 3, 3)).to(dtype).requires_grad_() if frames else None
-        self.color_change = None if self.residual is None else ResidualGrid(self.residual, box)
+        self.color_change = (
+            None if self.residual is None else partial(look_up, self.residual, box=box)
+        )
         origins = torch.tensor([[-3.0, 0.0, 0.0]]) + 0.3 * draw(RAYS, 3)
         directions = torch.nn.functional.normalize(
             torch.tensor([[1.0, 0.0, 0.0]]) + 0.25 * draw(RAYS, 3), dim=1

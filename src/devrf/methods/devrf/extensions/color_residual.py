@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import torch
@@ -31,23 +31,6 @@ log = logging.getLogger(__name__)
 NAME = "color_residual"
 
 
-@dataclass(frozen=True)
-class ResidualGrid:
-    """q → A(q), trilinear in space.
-
-    Attributes:
-        grid: (X, Y, Z, 3) logits.
-        box: where the grid lives, in canonical space; outside it A is as on its border.
-    """
-
-    grid: Tensor
-    box: Box
-
-    def __call__(self, points: Tensor) -> Tensor:
-        """A (M, 3) at canonical ``points`` (M, 3); differentiable in the grid and the points."""
-        return look_up(self.grid, points, self.box)
-
-
 class ResidualField(ColorField, StoredShape):
     """Residuals A_t (T, X, Y, Z, 3) over a box: c = sigmoid(decoder(f(q), d) + A_t(q)).
 
@@ -68,15 +51,15 @@ class ResidualField(ColorField, StoredShape):
         super().__init__(box, clock)
         self.register_buffer("values", torch.zeros(len(clock), *box.grid_shape(voxels), 3))
 
-    def at(self, time: float) -> ResidualGrid | None:
-        """q → A(q) at ``time`` in [0, 1]; None where it is zero everywhere."""
+    def at(self, time: float) -> ColorChange | None:
+        """q → A_t(q) at ``time`` in [0, 1], trilinear in space; None where it is zero."""
         moment = self.clock.at(time)
         if moment.after == 0:
             return None
         grid = self.values[moment.before]
         if moment.weight:
             grid = grid.lerp(self.values[moment.after], moment.weight)
-        return ResidualGrid(grid, self.box)
+        return partial(look_up, grid, box=self.box)
 
     @torch.no_grad()
     def copy_neighbours(self, frames: Sequence[int], *, after: bool = False) -> None:
@@ -207,7 +190,7 @@ class ColorResidual(Extension):
         """q → A_t(q), as learned so far."""
         if NAME not in frame.further:
             return None
-        return ResidualGrid(frame.further[NAME], frame.fields[NAME].box)
+        return partial(look_up, frame.further[NAME], box=frame.fields[NAME].box)
 
 
 def squared_residual(prediction: MotionPrediction) -> Tensor:
