@@ -11,7 +11,7 @@ from hydra.utils import get_class, instantiate
 from omegaconf import OmegaConf
 
 from devrf.apps.report.labels import ABLATIONS
-from devrf.cli.config import group_choices
+from devrf.cli.config import config_folder, group_choices
 from devrf.cli.config_check import check_config
 from devrf.cli.context import RunContext
 from devrf.data.datamodule import SceneDataModule
@@ -40,11 +40,14 @@ def rooted(composed, folder, *overrides):
     return composed(*overrides, f"data.root={folder}/scene")
 
 
-# What is learned is not DeVRF's two stages; or it is no choice by itself.
-OTHERS = ("method", "comparison=", "hydra/", "schedule/")
+# What is learned is not DeVRF's two stages, or it is no choice by itself, or in every config.
+OTHERS = ("method", "comparison=", "hydra/", "schedule/", "protocol=", "profile=")
+CHOSEN = [
+    name for name in CHOICES if not name.startswith(OTHERS) and name.split("=")[1] != "default"
+]
 
 
-@pytest.mark.parametrize("choice", [name for name in CHOICES if not name.startswith(OTHERS)])
+@pytest.mark.parametrize("choice", CHOSEN)
 def test_it_composes_and_builds(composed, tmp_path, choice):
     needed = NEEDS.get(choice)
     if needed and importlib.util.find_spec(needed) is None:
@@ -61,28 +64,27 @@ def test_it_composes_and_builds(composed, tmp_path, choice):
     assert instantiate(config.video).frames > 0
 
 
-@pytest.mark.parametrize("protocol", NAMES["protocol"])
 @pytest.mark.parametrize("method", NAMES["method"])
-def test_a_method_learns_by_the_protocols_that_it_has_stages_for(
-    composed, tmp_path, method, protocol
-):
-    config = composed(f"method={method}", f"protocol={protocol}")
-    check_config(config)
-    run = RunContext(config, tmp_path)
-    assert (config.method, run.protocol.name) == (method, protocol)
-    assert run.learning_stages
-    learns = True
-    if "ray_stage" in config:
-        known = get_class(config.ray_stage.model._target_).protocols
-        learns = known is None or protocol in known
-    for step in run.protocol.steps:
-        if not learns or run.stage_key(step.name) not in config:
-            refused = f"protocol: method={method} does not learn by protocol={protocol}"
-            with pytest.raises(DevrfError, match=refused):
-                run.stage_builder(step.name)
-            continue
-        if step.builds_on is None:
-            assert isinstance(run.stage_builder(step.name)(), ScheduledStage)
+def test_a_method_learns_by_the_protocols_that_it_has_stages_for(composed, tmp_path, method):
+    for profile in ("fast", "small"):
+        config = composed(f"method={method}", f"profile={profile}")
+        check_config(config)
+        if "ray_stage" in config:
+            instantiate(config.ray_stage.model.settings, _convert_="all")
+            instantiate(config.ray_stage.schedule, _convert_="all")
+    for protocol in NAMES["protocol"]:
+        config.protocol = OmegaConf.load(config_folder() / f"protocol/{protocol}.yaml")
+        run = RunContext(config, tmp_path)
+        learns = True
+        if "ray_stage" in config:
+            known = get_class(config.ray_stage.model._target_).protocols
+            learns = known is None or protocol in known
+        for step in run.protocol.steps:
+            if not learns or run.stage_key(step.name) not in config:
+                with pytest.raises(DevrfError, match=f"method={method} .* protocol={protocol}"):
+                    run.stage_builder(step.name)
+            elif step.builds_on is None:
+                assert isinstance(run.stage_builder(step.name)(), ScheduledStage)
 
 
 @pytest.mark.parametrize("row", NAMES["comparison"])
@@ -105,14 +107,6 @@ def test_a_table_compares_rows_that_there_are(composed, table):
     if "table" in table:
         assert len(swept.comparison.split(",")) == 13  # 12 of the peers, and DeVRF
     assert {*swept.get("data", "procedural").split(",")} <= {*NAMES["data"]}
-
-
-@pytest.mark.parametrize("name", NAMES["method/profile"])
-def test_a_method_is_built_in_each_of_its_sizes(composed, tmp_path, name):
-    method, _, profile = name.rpartition("_")
-    config = composed(f"method={method}", "protocol=joint", f"profile={profile}")
-    check_config(config)
-    assert isinstance(RunContext(config, tmp_path).stage_builder("joint")(), ScheduledStage)
 
 
 @pytest.mark.parametrize("page", sorted({scene.collection.page for scene in catalogue()}))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 from hydra.utils import instantiate
@@ -18,15 +17,6 @@ from devrf.methods.devrf.deformation_stage import DeformationStage
 
 EXTENSIONS = "devrf.methods.devrf.extensions"
 QUICK = [f"schedule.deformation.levels.{number}.iterations=1" for number in (1, 2, 3)]
-
-
-def test_the_stage_knows_no_extension() -> None:
-    folder = Path(sys.modules["devrf.methods.devrf"].__path__[0])
-    for module in ("extension", "deformation_stage", "model", "losses", "volume_rendering"):
-        text = (folder / f"{module}.py").read_text()
-        assert "devrf.extensions" not in text, module
-        for name in ("tracks", "elastic", "bending", "residual_grid", "refine"):
-            assert name not in text.lower(), (module, name)
 
 
 @pytest.mark.parametrize(

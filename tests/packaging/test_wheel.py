@@ -15,21 +15,10 @@ import pytest
 from devrf.cli.config import config_folder
 
 REPOSITORY = Path(__file__).parents[2]
-TINY = [
-    "data.width=24",
-    "data.height=20",
-    "data.static_views=6",
-    "data.static_test_views=2",
-    "data.train_views=2",
-    "data.frames=3",
-    "data.supersample=1",
-    "field.width=16",
-    "schedule.canonical.iterations=6",
-    "schedule.canonical.side=16",
-    "schedule.canonical.search_side=16",
-    "schedule.canonical.upsample_at=[2]",
-    "schedule.canonical.rays=64",
-]
+SCENE = "width=24 height=20 static_views=6 static_test_views=2 train_views=2 frames=3 supersample=1"
+SCHEDULE = "iterations=6 side=16 search_side=16 upsample_at=[2] rays=64"
+TINY = ["field.width=16", *(f"data.{word}" for word in SCENE.split())]
+TINY += [f"schedule.canonical.{word}" for word in SCHEDULE.split()]
 
 
 def run(*command: object, folder: Path) -> subprocess.CompletedProcess[str]:
