@@ -98,7 +98,7 @@ def test_a_description_is_read_without_tensors(path: Path) -> None:
 def test_damage_is_noticed(path: Path) -> None:
     whole, noise = path.read_bytes(), random.Random(0)
     data = int.from_bytes(whole[:8], "little") + 8
-    for place in (*range(8, 100), *(noise.randrange(data, len(whole)) for _ in range(30))):
+    for place in (*range(8, 100, 5), *(noise.randrange(data, len(whole)) for _ in range(10))):
         altered = bytearray(whole)
         altered[place] ^= 1 << noise.randrange(8)
         refusal(path, bytes(altered))

@@ -1,4 +1,4 @@
-"""Grids in half precision, in full detail only near matter."""
+"""Grids in half precision, in full detail only near occupied space."""
 
 from __future__ import annotations
 

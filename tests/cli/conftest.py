@@ -162,33 +162,27 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Ou
     yield folder / "outputs" / "robot" / "quickstart", outcome
 
 
-def environment(**more: str) -> dict[str, str]:
+def environment() -> dict[str, str]:
     """This process's environment, with the package on Python's path."""
     path = [str(Path(package.__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
     own = {"PYTHONPATH": os.pathsep.join(path), "OMP_NUM_THREADS": "1", "HYDRA_FULL_ERROR": "0"}
-    return {**os.environ, **own, **more}
+    return {**os.environ, **own}
 
 
 @pytest.fixture(scope="session")
-def start() -> Callable[..., subprocess.Popen[str]]:
-    """``start(folder, *arguments, **variables)``: Python in a process of its own."""
+def python() -> Callable[..., Outcome]:
+    """``python(folder, *arguments)``: what Python in a process of its own came to."""
 
-    def popen(folder: Path, *arguments: str, **more: str) -> subprocess.Popen[str]:
-        pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-        command = [sys.executable, *arguments]
-        return subprocess.Popen(command, cwd=folder, env=environment(**more), text=True, **pipes)
-
-    return popen
-
-
-@pytest.fixture(scope="session")
-def python(start: Callable[..., subprocess.Popen[str]]) -> Callable[..., Outcome]:
-    """``python(folder, *arguments, **variables)``: what that process came to."""
-
-    def run(*arguments: Any, **more: str) -> Outcome:
-        with start(*arguments, **more) as process:
-            out, err = process.communicate(timeout=300)
-        return Outcome(process.returncode, out, err)
+    def run(folder: Path, *arguments: str) -> Outcome:
+        done = subprocess.run(
+            [sys.executable, *arguments],
+            cwd=folder,
+            env=environment(),
+            capture_output=True,
+            text=True,
+            timeout=300,
+        )
+        return Outcome(done.returncode, done.stdout, done.stderr)
 
     return run
 

@@ -110,19 +110,10 @@ def test_a_part_counts_without_the_parts_inside_it(monkeypatch):
     assert spent["losses"] >= 9 and spent["warp"] >= 39 and spent["backward"] == 0
 
 
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
-        (["data.widht=3"], "data.widht: no such key; did you mean data.width?"),
-        (["ckpt=no.ckpt"], "no.ckpt: no such checkpoint"),
-        (["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2"], "leave out trainer=ddp"),
-    ],
-)
-def test_what_cannot_be_measured_is_said_in_one_line(
-    benchmark, tmp_path, tiny, capsys, arguments, expected
-):
+def test_what_cannot_be_measured_is_said_in_one_line(benchmark, tmp_path, capsys):
+    two = ("trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2")
     with pytest.raises(SystemExit) as stop:
-        benchmark("training", *tiny, *arguments)
+        benchmark("training", *two)
     said = capsys.readouterr().err
-    assert stop.value.code == 2 and said.count("\n") == 1 and expected in said
+    assert stop.value.code == 2 and said.count("\n") == 1 and "leave out trainer=ddp" in said
     assert not list(tmp_path.iterdir())

@@ -127,12 +127,7 @@ def test_values_of_each_type(hint, fitting, wrong):
     ("arguments", "expected"),
     [
         (["logger=tensorboard"], ("logger=tensorboard: tensorboard", "tensorboard", "logger=csv")),
-        (
-            ["data=inward", "data.root=nowhere", "data.flow=raft"],
-            ("data.flow=raft: torchvision", "raft", "data.flow=dis"),
-        ),
         (["stage=export"], ("stage=export: skimage", "export", "stage=render")),
-        (["stage=view"], ("stage=view: viser", "viewer", "stage=render")),
         (["viewer=true"], ("viewer=true: viser", "viewer", "viewer=false")),
     ],
 )

@@ -5,14 +5,12 @@ from __future__ import annotations
 import csv
 import re
 import sys
-from pathlib import Path
 
 import pytest
 import torch
 
-from devrf.checkpoints.checkpoint_file import read_checkpoint_file
 from devrf.cli import memory
-from devrf.cli.memory import PROGRAM, Needs, StageNeeds, tensor_bytes
+from devrf.cli.memory import StageNeeds, tensor_bytes
 from devrf.scenes.scene import Scene
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="memory as Linux limits and counts it")
@@ -21,17 +19,9 @@ NEEDS = re.compile(
 )
 
 
-def test_what_is_needed_by_hand() -> None:
-    stage = StageNeeds({"images": 50, "grid": 100, "rays": 800}, "rays", 40)
+def test_what_is_needed_by_hand(tiny_scene: Scene) -> None:
+    stage = StageNeeds({"images": 50, "grid": 100, "schedule.rays": 800}, 40)
     assert (stage.peak(), stage.peak(8)) == (950, 250)
-    needs = Needs(1000, {"one": stage, "other": StageNeeds({"rays": 8}, "rays", 60)})
-    # Beside a GPU the host holds what was learned and its checkpoint.
-    assert needs.host(alone=False) == PROGRAM + 1000 + 2 * 60
-    assert needs.host(alone=True) == PROGRAM + 1000 + 1.3 * 950
-    assert needs.rows()[-1] == ("checkpoint", 60)
-
-
-def test_tensors_of_views_by_hand(tiny_scene: Scene) -> None:
     moving = tiny_scene.dynamic.train
     assert moving.flow is not None
     assert tensor_bytes(moving.flow) == (2 * 4 + 1) * len(moving) * 24 * 18
@@ -45,21 +35,20 @@ def test_the_needs_are_told_first(trained) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "key", "change"),
+    ("argument", "key", "change"),
     [
-        (["schedule.canonical.side=9000"], "schedule.canonical.side", r"side=\d{3,4},"),
-        (["schedule.canonical.rays=1000000000"], "schedule.canonical.rays", r"rays=\d{6,9},"),
+        ("schedule.canonical.side=9000", "schedule.canonical.side", r"side=\d{3,4},"),
         (
-            ["schedule.deformation.levels.2={side:9000,iterations:1}"],
+            "schedule.deformation.levels.2={side:9000,iterations:1}",
             "schedule.deformation.levels.2.side",
             r"levels.2.side=\d{3,4},",
         ),
     ],
 )
 def test_what_cannot_be_is_refused_with_a_change_that_fits(
-    devrf, tiny, tmp_path, arguments, key, change
+    devrf, tiny, tmp_path, argument, key, change
 ) -> None:
-    outcome = devrf(*tiny, *arguments, "hydra.run.dir=run")
+    outcome = devrf(*tiny, argument, "hydra.run.dir=run")
     assert outcome.status == 2 and outcome.err.count("\n") == 1
     assert outcome.err.startswith(f"devrf: {key}: the run needs about ")
     assert re.search(rf"lack of host memory: give \S*{change} or try all the same", outcome.err)
@@ -78,13 +67,11 @@ def test_little_memory_refuses_what_is_not_finished_and_changes_nothing(
 ) -> None:
     command = (*tiny, "stage=canonical", "hydra.run.dir=run")
     monkeypatch.setattr(memory, "free_host_memory", lambda: -(10**12))
-    outcome = devrf(*command)
-    assert outcome.status == 2 and "lack of host memory" in outcome.err
-    assert not (tmp_path / "run").exists()
     assert devrf(*command, "memory_check=false").status == 0
     # What is learned already needs nothing.
     assert devrf(*command).status == 0
-    assert devrf(*command, "resume=false").status == 2
+    outcome = devrf(*command, "resume=false")
+    assert outcome.status == 2 and "lack of host memory" in outcome.err
     assert (tmp_path / "run" / "checkpoints" / "canonical.ckpt").is_file()
     assert not (tmp_path / "run" / "previous-1").exists()
 
@@ -98,12 +85,6 @@ def test_running_out_of_memory_is_one_line(devrf, tiny, monkeypatch) -> None:
     assert outcome.status == 2 and outcome.err.count("\n") == 1
     assert outcome.err.startswith("devrf: stage=canonical: out of memory (3.0 GiB more asked, ")
     assert "lower schedule.canonical.rays" in outcome.err
-
-
-def canonical_colors(folder: Path) -> torch.Tensor:
-    content = read_checkpoint_file(folder / "run" / "checkpoints" / "canonical.ckpt")
-    colors: torch.Tensor = content["state_dict"]["scene_model.canonical.color.values"]
-    return colors
 
 
 # Half of the fields and a small part of a batch fit into the memory left to the program.
@@ -121,21 +102,6 @@ def test_a_stage_learns_in_parts_where_memory_is_short(warm, tiny, tmp_path) -> 
     outcome = warm(tmp_path, *tiny, *LARGE, most_memory=300 * 2**20)
     assert outcome.status == 0, outcome.out
     assert "out of memory (" in outcome.out
-    outcome = warm(tmp_path / "free", *tiny, *LARGE)
-    assert outcome.status == 0 and "out of memory" not in outcome.out
-    limited, free = canonical_colors(tmp_path), canonical_colors(tmp_path / "free")
-    torch.testing.assert_close(limited, free, rtol=1e-3, atol=1e-4)
-
-
-@linux
-def test_a_stage_that_not_even_parts_fit_for_ends_saved(warm, tiny, tmp_path) -> None:
-    command = (*tiny, *LARGE, "schedule.canonical.rays=400000")
-    outcome = warm(tmp_path, *command, most_memory=200 * 2**20)
-    assert outcome.status == 2, outcome.out
-    said = outcome.out.splitlines()[-1]
-    assert said.startswith("devrf: canonical stage: out of memory (") and " GiB free on cpu" in said
-    assert "schedule.canonical.rays" in said and "the same command goes on" in said
-    assert list((tmp_path / "run" / "checkpoints").glob("canonical-progress-*.ckpt"))
 
 
 @linux
@@ -145,27 +111,20 @@ def test_the_estimate_is_near_what_is_taken(warm, tiny, tmp_path) -> None:
         "field.width=128",
         "data.width=96",
         "data.height=96",
-        "data.frames=2",
+        "stage=canonical",
         "schedule.canonical.side=80",
         "schedule.canonical.rays=4096",
         "schedule.canonical.iterations=2",
         "schedule.canonical.upsample_at=[1]",
-        "schedule.deformation.levels.1={side:56,iterations:1}",
-        "schedule.deformation.levels.2=null",
-        "schedule.deformation.rays=4096",
         "hydra.run.dir=run",
         "callbacks.checkpoint.every_seconds=0",
         "callbacks.checkpoint.share=1.0",
         "trainer.log_every_n_steps=1",
     )
-    for stage in ("canonical", "deformation"):
-        outcome = warm(tmp_path, *command, f"stage={stage}")
-        assert outcome.status == 0, outcome.out
-        said = NEEDS.search(outcome.out)
-        assert said is not None
-        path = tmp_path / "run" / "logs" / stage / "metrics.csv"
-        with path.open(newline="") as file:
-            rows = list(csv.DictReader(file))
-        column = next(name for name in rows[0] if name.endswith("/peak_host_gb"))
-        taken = max(float(row[column]) for row in rows)
-        assert 0.6 < float(said.group(1)) / taken < 1.7, (stage, said.group(1), taken)
+    outcome = warm(tmp_path, *command)
+    assert outcome.status == 0, outcome.out
+    said = NEEDS.search(outcome.out)
+    assert said is not None
+    with (tmp_path / "run" / "logs" / "canonical" / "metrics.csv").open(newline="") as file:
+        taken = max(float(row["static/peak_host_gb"]) for row in csv.DictReader(file))
+    assert 0.6 < float(said.group(1)) / taken < 1.7, (said.group(1), taken)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -14,23 +15,15 @@ from devrf.cli.run import STEPS as TAKEN
 MISTAKES = {
     "misspelt key": (["data.widht=3"], "data.widht: no such key; did you mean data.width?"),
     "appended unknown root key": (["+sede=3"], "sede: no such key; did you mean seed?"),
-    "unknown option": (["data=legoo"], "data=legoo: no such option; choose one of"),
     "forward-facing field of an inward-facing scene": (
         ["field=forward_small", "stage=canonical"],
         "field.planes=48: planes are of forward-facing scenes, and this scene is not",
     ),
-    "unreadable override": (["data.box=[[1"], "data.box=[[1: not understood"),
     "missing root": (["data=inward"], "data.root: required; give data.root=PATH"),
     "protocol of another method": (
         ["protocol=joint"],
         "protocol: method=devrf does not learn by protocol=joint",
     ),
-    "unknown metric": (["evaluation.metrics=[lpisp]"], "evaluation.metrics: no metric 'lpisp'"),
-    "missing weights": (
-        ["evaluation.lpips_weights=no.pth"],
-        "evaluation.lpips_weights: no file no.pth",
-    ),
-    "word for a number": (["data.width=abc"], "data.width: expected a valid integer, not 'abc'"),
     "seed out of range": (["seed=-1"], "seed: expected 0 to"),
     "a level without a side": (
         ["schedule.deformation.levels.4={iterations:2}", "schedule.deformation.levels.3=null"],
@@ -40,25 +33,18 @@ MISTAKES = {
         ["+schedule.deformation.levels.3.sides=4"],
         "schedule.deformation.levels.3.sides: no such key; did you mean",
     ),
-    "word for parallel frames": (
-        ["schedule.deformation.levels.2.parallel_frames=many"],
-        "schedule.deformation.levels.2.parallel_frames: expected a valid integer",
-    ),
+    "part that is not there": (["data._target_=devrf.nothing"], "data._target_: cannot load"),
     "parallel frames where they start from one another": (
         ["schedule.deformation.levels.1.parallel_frames=2"],
         "schedule.deformation.levels.1.parallel_frames: expected 1 at the first level",
     ),
     "unknown loss term": (["+loss.deformation.foo=1"], "unknown term 'foo'"),
-    "unknown trainer setting": (["+trainer.max_step=3"], "did you mean trainer.max_steps?"),
     "unknown accelerator": (["trainer.accelerator=abacus"], "trainer: "),
     "several devices, each for itself": (
         ["trainer.devices=2"],
         "trainer.devices: 2 processes need trainer=ddp",
     ),
-    "part that is not there": (["data._target_=devrf.nothing"], "data._target_: cannot load"),
-    "unknown objective": (["objective=deformation.pnsr"], "objective: deformation has no 'pnsr'"),
     "scoring before training": (["stage=evaluate"], "canonical.ckpt: no such checkpoint"),
-    "moving before the rest state": (["stage=deformation"], "canonical.ckpt: no such checkpoint"),
     "missing checkpoint": (["stage=render", "ckpt=no.ckpt"], "no.ckpt: no such checkpoint"),
     "checkpoint where none is used": (["ckpt=no.ckpt"], "ckpt: stage=pipeline starts from nothing"),
     "no folder to prepare": (
@@ -103,27 +89,25 @@ def test_a_file_where_the_run_folder_should_be(devrf, tmp_path, tiny):
     assert (outcome.status, outcome.err) == (2, f"devrf: {Path('taken/run')}: Not a directory\n")
 
 
-@pytest.mark.parametrize("folder", ["/proc/run", "x" * 300])
-@pytest.mark.parametrize("stage", ["canonical", "prepare", "report"])
-def test_a_folder_that_cannot_be_made(devrf, tmp_path, tiny, trained, stage, folder):
-    command = {
-        "canonical": [*tiny, f"hydra.run.dir={folder}"],
-        "prepare": [*tiny, f"data.export={folder}"],
-        "report": [f"report.runs={trained[0]}", f"report.into={folder}"],
-    }
-    outcome = devrf(f"stage={stage}", *command[stage])
+@pytest.mark.parametrize(
+    ("stage", "key", "folder"),
+    [("canonical", "hydra.run.dir", "/proc/run"), ("prepare", "data.export", "x" * 300)],
+)
+def test_a_folder_that_cannot_be_made(devrf, tiny, stage, key, folder):
+    outcome = devrf(*tiny, f"stage={stage}", f"{key}={folder}")
     assert outcome.status == 2
     assert outcome.err.count("\n") == 1
     assert outcome.err.startswith("devrf: ") and folder in outcome.err
 
 
-def test_results_of_an_earlier_run_survive_a_mistake(devrf, tmp_path, tiny):
-    assert devrf(*tiny, "stage=canonical", "hydra.run.dir=run").status == 0
-    before = (tmp_path / "run" / "checkpoints" / "canonical.ckpt").read_bytes()
-    assert devrf(*tiny, "stage=deformation", "hydra.run.dir=run", "data.frames=1").status == 2
+def test_results_of_an_earlier_run_survive_a_mistake(devrf, tmp_path, tiny, trained):
+    checkpoint = tmp_path / "run" / "checkpoints" / "canonical.ckpt"
+    checkpoint.parent.mkdir(parents=True)
+    shutil.copy(trained[0] / "checkpoints" / "canonical.ckpt", checkpoint)
+    before = checkpoint.read_bytes()
     anew = ("stage=canonical", "resume=false", "field=forward_small")
     assert devrf(*tiny, "hydra.run.dir=run", *anew).status == 2
-    assert (tmp_path / "run" / "checkpoints" / "canonical.ckpt").read_bytes() == before
+    assert checkpoint.read_bytes() == before
 
 
 def test_help_names_stages_groups_and_examples(devrf):
@@ -140,31 +124,21 @@ def test_as_a_process_of_its_own(python, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_fault_as_a_process_of_its_own(python, tmp_path):
-    script = (
-        "import devrf.cli.main, devrf.__main__\n"
-        "devrf.cli.main.check_extras = lambda config: 1 / 0\n"
-        "devrf.__main__.entry()\n"
-    )
-    done = python(tmp_path, "-c", script, "stage=prepare")
-    assert done.status == 1
-    assert "Traceback" in done.err
-    assert done.err.strip().endswith("ZeroDivisionError: division by zero")
+def test_a_fault_of_the_program_keeps_its_traceback(devrf, monkeypatch):
+    monkeypatch.setattr("devrf.cli.main.check_extras", lambda config: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        devrf("stage=prepare")
 
 
 @pytest.mark.parametrize(
     ("argument", "meant"),
     [
         ("train", "stage=pipeline"),
-        ("reprot", "stage=report"),
-        ("download", "stage=fetch"),
         ("quickstart", "experiment=quickstart"),
         ("fox", "data.root=fox"),
         ("experiment=quickstrat", "experiment=quickstart"),
         ("stage=train", "stage=pipeline"),
-        ("data=inwrad", "data=inward"),
         ("kernels=tritn", "kernels=triton"),
-        ("objective=dynamic.pnsr", "objective=dynamic.psnr"),
         ("evaluation.metrics=[lpisp]", "lpips"),
     ],
 )
@@ -177,9 +151,8 @@ def test_the_closest_is_named(devrf, tmp_path, argument, meant):
     assert outcome.err.endswith(f"did you mean {meant}?\n")
 
 
-@pytest.mark.parametrize("argument", ["xyzzy", "kernels=xyzzy"])
-def test_nothing_is_guessed_from_afar(devrf, argument):
-    outcome = devrf(argument)
+def test_nothing_is_guessed_from_afar(devrf):
+    outcome = devrf("kernels=xyzzy")
     assert outcome.status == 2 and "did you mean" not in outcome.err
 
 

@@ -55,10 +55,7 @@ def test_outputs_are_reported_by_default_and_no_scene_is_read(devrf, tmp_path, f
     ("arguments", "expected"),
     [
         (["report.runs=nowhere"], "report.runs: no folder nowhere"),
-        (["report.runs=empty"], "report.runs: no finished run below empty"),
         (["report.runs=empty", "report.into=there"], "report.runs: no finished run below empty"),
-        (["report.published=some"], "report.published: expected 'matching', 'all' or 'none'"),
-        (["report.folder=x"], "report.folder: no such key"),
         (["ckpt=x"], "ckpt: stage=report starts from nothing"),
     ],
 )
@@ -72,35 +69,12 @@ def test_a_mistake_is_one_line_and_leaves_nothing(devrf, tmp_path, arguments, ex
 
 
 def test_one_command_makes_the_ablation_table(devrf, tmp_path, tiny):
-    outcome = devrf(
-        "experiment=ablation_table", *tiny, "ablation=base,full", "hydra.sweep.dir=sweep"
-    )
+    quick = ("ablation=full", "evaluation.metrics=[]", "video.frames=1")
+    outcome = devrf("experiment=ablation_table", *tiny, *quick, "hydra.sweep.dir=sweep")
     assert (outcome.status, outcome.err) == (0, "")
     assert outcome.out.splitlines()[-1] == "report written to sweep/report/report.md"
     jobs = {path.parent.name for path in (tmp_path / "sweep").glob("*/metrics.json")}
-    assert jobs == {"0_robot", "1_robot", "2_flower", "3_flower"}
+    assert jobs == {"0_robot", "1_flower"}
     text = (tmp_path / "sweep" / "report" / "report.md").read_text("utf-8")
-    assert "4 finished runs below `sweep`" in text
     assert "## robot" in text and "## flower" in text
     assert not (tmp_path / "outputs").exists()
-
-
-def test_equal_runs_are_one_row_whatever_was_typed(devrf, tmp_path, trained):
-    shutil.copytree(trained[0], tmp_path / "outputs" / "one")
-    # The defaults typed out, another seed, and an archived run of the first.
-    typed = (
-        "experiment=quickstart",
-        "sampling=quick",
-        "seed=1",
-        "video.frames=2",
-        "video.height=40",
-    )
-    afresh = (*typed, "evaluation.metrics=[]", "resume=false")
-    assert devrf("hydra.run.dir=outputs/one", *afresh).status == 0
-    checkpoint = "ckpt=outputs/one/checkpoints/deformation.ckpt"
-    scored = ("hydra.run.dir=outputs/scored", "evaluation.metrics=[]")
-    assert devrf("stage=evaluate", checkpoint, *scored).status == 0
-    outcome = devrf("stage=report")
-    assert (outcome.status, outcome.err) == (0, "")
-    assert "(n = 2)" in outcome.out and outcome.out.count("Ours w/ c2f") == 1
-    assert "Counted once, as last scored elsewhere with the same checkpoint: one." in outcome.out

@@ -61,9 +61,7 @@ def test_what_decides_nothing_may_change(again):
 @pytest.mark.parametrize(
     ("arguments", "key", "before", "now"),
     [
-        (["loss.fine.color=2"], "loss.fine.color", "1.0", "2"),
         (["schedule.canonical.upsample_at=[3]"], "schedule.canonical.upsample_at", "[2]", "[3]"),
-        (["seed=1"], "seed", "0", "1"),
         (
             ["schedule.extensions.tracks.init_from=previous"],
             "schedule.extensions.tracks.init_from",
@@ -90,7 +88,7 @@ def test_a_deformation_cares_for_its_own_settings_only(again):
 
 def test_beginning_afresh_keeps_the_old_run_whole(again, run):
     before = contents(run)
-    outcome = again("resume=false", "seed=1")
+    outcome = again("resume=false", "seed=1", "stage=canonical")
     assert (outcome.status, outcome.err) == (0, "")
     assert f"what was in {run} is kept in {run}/previous-1" in outcome.out
     kept = contents(run / "previous-1")
@@ -99,21 +97,11 @@ def test_beginning_afresh_keeps_the_old_run_whole(again, run):
     assert OmegaConf.load(run / "previous-1" / "checkpoints" / "config.yaml").seed == 0
     assert OmegaConf.load(run / "checkpoints" / "config.yaml").seed == 1
     assert "previous" not in (run / "run.log").read_text().replace(str(run / "previous-1"), "")
-    assert again("resume=false", "seed=2", "stage=canonical").status == 0
+    # Another seed, another field. What a stage builds on is needed and stays.
+    assert contents(run / "checkpoints")["canonical.ckpt"] != kept["checkpoints/canonical.ckpt"]
+    assert again("resume=false", "seed=1", "stage=deformation").status == 0
     assert contents(run / "previous-1") == kept
-    assert (run / "previous-2" / "metrics.json").is_file()
-
-
-def test_a_deformation_learned_afresh_keeps_its_canonical_field(again, run):
-    before = contents(run / "checkpoints")
-    outcome = again(
-        "resume=false", "stage=deformation", "schedule.extensions.tracks.init_from=previous"
-    )
-    assert (outcome.status, outcome.err) == (0, "")
-    assert contents(run / "previous-1" / "checkpoints") == before
-    now = contents(run / "checkpoints")
-    assert now["canonical.ckpt"] == before["canonical.ckpt"]
-    assert now["deformation.ckpt"] != before["deformation.ckpt"]
+    assert (run / "checkpoints" / "canonical.ckpt").is_file()
 
 
 def learned_another_day(path: Path, to: Path) -> None:
@@ -142,18 +130,6 @@ def test_a_canonical_field_that_is_given_belongs_to_the_deformation(devrf, tiny,
     outcome = devrf(*command, "ckpt=other.ckpt")
     assert outcome.status == 2
     assert outcome.err.startswith("devrf: ckpt: ")
-    # What it was learned on is no field of this folder: it is scored as it is.
-    assert devrf(*tiny, "stage=evaluate", "hydra.run.dir=moved").status == 0
-
-
-def test_a_finished_checkpoint_that_is_damaged_is_refused(again, run):
-    path = run / "checkpoints" / "canonical.ckpt"
-    altered = bytearray(path.read_bytes())
-    altered[len(altered) // 2] ^= 1
-    path.write_bytes(altered)
-    outcome = again()
-    assert outcome.status == 2
-    assert outcome.err.startswith(f"devrf: {path}: damaged: altered since it was written")
 
 
 @pytest.fixture

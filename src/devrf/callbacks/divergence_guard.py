@@ -34,22 +34,13 @@ CLEAR, BLOCKED = 0.8, 0.5
 def emptied(seen: float, most: float, expected: float) -> bool:
     """Whether what should be seen was there and is gone.
 
-    Args:
-        seen: the mean opacity of rays.
-        most: the highest mean opacity so far.
-        expected: what it should be.
+    All are mean opacities of rays: ``seen`` now, the highest so far, and what it should be.
     """
     return expected > FAINT and most > THERE * expected and seen < GONE * expected
 
 
 def filled(seen: float, least: float, expected: float) -> bool:
-    """Whether light that should pass did so, and no longer does.
-
-    Args:
-        seen: the mean opacity of rays.
-        least: the lowest mean opacity so far.
-        expected: what it should be.
-    """
+    """Whether light that should pass did so, and no longer does; ``least``: the lowest so far."""
     clear = 1 - expected
     return clear > FAINT and 1 - least > CLEAR * clear and 1 - seen < BLOCKED * clear
 

@@ -30,12 +30,7 @@ class LiveView(Callback):
     """
 
     def __init__(self, session: Session, share: float) -> None:
-        """Show each stage on one page.
-
-        Args:
-            session: the page.
-            share: the most of a stage's time that pictures may take.
-        """
+        """``share`` is the most of a stage's time that pictures may take."""
         self.session, self.share = session, share
         self.seconds = 0.0
         self._began = self._last = 0.0

@@ -5,13 +5,12 @@ from __future__ import annotations
 import importlib
 import sys
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from lightning import Trainer
 from lightning.fabric.plugins import CheckpointIO
-from torch import nn
 
 from devrf.checkpoints.checkpoint_file import (
     read_checkpoint_file,
@@ -58,10 +57,6 @@ class CheckpointMetadata:
     command: list[str] | None = None
     complete: bool = True
 
-    def as_data(self) -> dict[str, Any]:
-        """Plain data, for a checkpoint."""
-        return asdict(self)
-
 
 @dataclass(frozen=True)
 class Viewpoints:
@@ -82,10 +77,6 @@ class Viewpoints:
         """The viewpoints of a scene."""
         return cls(scene.static.train.cameras, scene.dynamic.test.cameras[[0]], scene.background)
 
-    def as_data(self) -> dict[str, Any]:
-        """Plain data and tensors, for a checkpoint."""
-        return asdict(self)
-
 
 @dataclass(frozen=True)
 class LoadedCheckpoint:
@@ -93,7 +84,7 @@ class LoadedCheckpoint:
 
     Attributes:
         metadata: which scene, and how it was learned.
-        model: the scene, ready to render: a :class:`~devrf.methods.base.Renderable`.
+        model: a :class:`~devrf.methods.base.Renderable`.
         viewpoints: where the scene was seen from; None where the file does not say.
     """
 
@@ -125,28 +116,18 @@ class ChecksummedCheckpointIO(CheckpointIO):
 def save_checkpoint(trainer: Trainer, path: Path, *, weights_only: bool = True) -> None:
     """Write what the trainer's stage has learned; an earlier file stays until the new is whole.
 
-    Args:
-        trainer: has the stage.
-        path: the file.
-        weights_only: False adds all that is needed to go on learning from there.
+    ``weights_only=False`` adds all that is needed to go on learning from there. From now on the
+    trainer writes and reads files of this format.
 
     Raises:
         OSError: the file cannot be written.
     """
-    strategy = trainer.strategy
-    usual, strategy.checkpoint_io = strategy.checkpoint_io, ChecksummedCheckpointIO()
-    try:
-        trainer.save_checkpoint(path, weights_only=weights_only)
-    finally:
-        strategy.checkpoint_io = usual
+    trainer.strategy.checkpoint_io = ChecksummedCheckpointIO()
+    trainer.save_checkpoint(path, weights_only=weights_only)
 
 
 def load_checkpoint(path: Path, scene: Scene | None = None) -> LoadedCheckpoint:
-    """Read a learned scene, on the host.
-
-    Args:
-        path: a checkpoint of any stage.
-        scene: the scene it must belong to; None takes any.
+    """Read a learned scene, on the host, from a checkpoint of any stage; None takes any scene.
 
     Raises:
         DevrfError: no such file, a damaged one, not a devrf checkpoint, one of another format, or
@@ -158,9 +139,15 @@ def load_checkpoint(path: Path, scene: Scene | None = None) -> LoadedCheckpoint:
     metadata = metadata_in(path, data)
     if scene is not None:
         check_scene(path, metadata, scene)
-    state = data.get("state_dict")
-    model = _model(path, metadata, state if isinstance(state, dict) else {})
-    return LoadedCheckpoint(metadata, model, _viewpoints(path, data))
+    model_class = _model_class(path, metadata)
+    try:
+        state = {k.removeprefix(MODEL): v for k, v in data["state_dict"].items() if MODEL in k}
+        model = model_class.from_config(metadata.model)
+        model.load_stored_state(state)
+        viewpoints = None if "viewpoints" not in data else _viewpoints(**data["viewpoints"])
+    except (RuntimeError, LookupError, ValueError, TypeError, AttributeError):
+        raise DevrfError(f"{path}: its fields do not fit its description; train again") from None
+    return LoadedCheckpoint(metadata, model, viewpoints)
 
 
 def check_scene(path: Path, metadata: CheckpointMetadata, scene: Scene) -> None:
@@ -201,27 +188,10 @@ def metadata_in(path: Path, data: dict[str, Any]) -> CheckpointMetadata:
         ) from None
 
 
-def _viewpoints(path: Path, data: dict[str, Any]) -> Viewpoints | None:
-    """The viewpoints in the content of a checkpoint; None where it has none."""
-    stored = data.get("viewpoints")
-    if stored is None:
-        return None
-    try:
-        static, held_out = Cameras(**stored["static"]), Cameras(**stored["held_out"])
-        return Viewpoints(static, held_out, stored["background"])
-    except (TypeError, LookupError) as error:
-        raise DevrfError(f"{path}: its cameras are not as devrf writes them ({error})") from None
-
-
-def _model(path: Path, metadata: CheckpointMetadata, state: dict[str, Any]) -> nn.Module:
-    """The model that the metadata describe, with the stored state."""
-    own = {str(k).removeprefix(MODEL): v for k, v in state.items() if str(k).startswith(MODEL)}
-    try:
-        model: nn.Module = _model_class(path, metadata).from_config(metadata.model)
-        model.load_stored_state(own)  # type: ignore[operator]
-    except (RuntimeError, KeyError, ValueError, TypeError, AttributeError):
-        raise DevrfError(f"{path}: its fields do not fit its description; train again") from None
-    return model
+def _viewpoints(
+    static: dict[str, Any], held_out: dict[str, Any], background: Background
+) -> Viewpoints:
+    return Viewpoints(Cameras(**static), Cameras(**held_out), background)
 
 
 def _model_class(path: Path, metadata: CheckpointMetadata) -> Any:

@@ -154,10 +154,7 @@ def _data(tensor: Tensor) -> memoryview:
 def _flatten(value: Any, tensors: dict[str, Tensor], name: str = "") -> Any:
     """Nested data as JSON, with objects for tensors, dicts, tuples and sets.
 
-    Args:
-        value: nested dicts, lists, tuples and sets of tensors, numbers, strings and None.
-        tensors: gets the tensors in ``value``, each by its path from the outermost dict.
-        name: the path of ``value``.
+    ``tensors`` gets the tensors in ``value``, each by its path (``name``) from the outermost dict.
 
     Raises:
         TypeError: there is something else in it.

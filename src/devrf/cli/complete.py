@@ -43,10 +43,7 @@ NOT_PASSED = ("_target_", "reader", "flow_cache")
 
 
 def completed(arguments: Sequence[str]) -> list[str]:
-    """The command line that Hydra composes for what was typed.
-
-    Args:
-        arguments: of the command line, without the program's name.
+    """The command line that Hydra composes for what was typed, without the program's name.
 
     Raises:
         DevrfError: a scene's folder cannot be recognised, or an experiment has no one form for all
@@ -139,19 +136,22 @@ def _form(name: str, scene: str | None, known: set[str]) -> str:
     return next((f"{name}_{kind}" for kind in kinds if f"{name}_{kind}" in known), name)
 
 
+def _defaults(group: str, option: str) -> list[Any]:
+    """The defaults list of a group's option; empty where there is none."""
+    path = config_folder() / group / f"{option}.yaml"
+    content: Any = OmegaConf.load(path) if path.is_file() else rows(group).get(option, {})
+    return list(content.get("defaults", []))
+
+
 def _reader(option: str) -> str:
     """The reader that an option of ``data`` goes back to: ``inward`` of ``lego``."""
-    path = config_folder() / "data" / f"{option}.yaml"
-    content: Any = OmegaConf.load(path) if path.is_file() else {}
-    below = [entry for entry in content.get("defaults", []) if isinstance(entry, str)]
+    below = [entry for entry in _defaults("data", option) if isinstance(entry, str)]
     return _reader(below[0]) if below else option
 
 
 def _reads_files(experiment: str) -> bool:
     """Whether an experiment chooses a reader of files itself."""
-    path = config_folder() / "experiment" / f"{experiment}.yaml"
-    content: Any = OmegaConf.load(path) if path.is_file() else rows("experiment").get(experiment)
-    defaults = [] if content is None else content.get("defaults", [])
+    defaults = _defaults("experiment", experiment)
     for entry in defaults:
         if not isinstance(entry, str) and "override /data" in entry:
             return _reader(entry["override /data"]) not in EMBEDDED

@@ -56,27 +56,13 @@ def group_choices() -> dict[str, list[str]]:
     """The names that each ``group=NAME`` takes: its files, and its rows."""
     names: dict[str, list[str]] = {}
     for path in sorted(config_folder().glob("*/**/*.yaml")):
-        group = path.relative_to(config_folder()).parent.as_posix()
-        if group.startswith("rows"):
-            group = path.relative_to(config_folder() / "rows").with_suffix("").as_posix()
+        place = path.relative_to(config_folder())
+        if place.parts[0] == "rows":
+            group = place.relative_to("rows").with_suffix("").as_posix()
             names.setdefault(group, []).extend(map(str, rows(group)))
         else:
-            names.setdefault(group, []).append(path.stem)
+            names.setdefault(place.parent.as_posix(), []).append(path.stem)
     return names
-
-
-def register_rows() -> None:
-    """Make each row of a file in ``conf/rows`` a choice of the group that the file is named after.
-
-    A group whose choices take a few lines each is one such table in place of a folder of files.
-    """
-    folder, store = config_folder() / "rows", ConfigStore.instance()
-    for path in sorted(folder.rglob("*.yaml")):
-        group = path.relative_to(folder).with_suffix("").as_posix()
-        at_root = path.read_text("utf-8").startswith("# @package _global_")
-        package = "_global_" if at_root else None
-        for name, row in rows(group).items():
-            store.store(str(name), row, group, package, "devrf")
 
 
 def known_stages() -> list[str]:
@@ -108,12 +94,7 @@ def scene_folder_name(scene: str) -> str:
     return re.sub(r"[^\w.-]+", "_", scene) or "scene"
 
 
-def run_name(
-    experiment: str | None,
-    ablation: str | None,
-    method: str = "devrf",
-    protocol: str = "two_stage",
-) -> str:
+def run_name(experiment: str | None, ablation: str | None, method: str, protocol: str) -> str:
     """The run's folder name: the experiment, and what else was chosen beside the usual.
 
     Without an experiment the config is that of ``experiment=quickstart``: they are one run.
@@ -163,10 +144,19 @@ def _of_sweep(mode: Any) -> bool:
 
 
 def register_config() -> None:
-    """Make the resolvers ``${devrf.scene_name:…}`` … and the rows known to Hydra."""
+    """Make the resolvers ``${devrf.scene_name:…}`` … and the rows known to Hydra.
+
+    Each row of a file in ``conf/rows`` is a choice of the group that the file is named after.
+    """
     for word in (scene_name, run_name, run_folder, config_record, tracked_name, tracked_group):
         OmegaConf.register_new_resolver(f"devrf.{word.__name__}", word, replace=True)
-    register_rows()
+    folder = config_folder() / "rows"
+    for path in sorted(folder.rglob("*.yaml")):
+        group = path.relative_to(folder).with_suffix("").as_posix()
+        at_root = path.read_text("utf-8").startswith("# @package _global_")
+        for name, row in rows(group).items():
+            package = "_global_" if at_root else None
+            ConfigStore.instance().store(str(name), row, group, package, "devrf")
 
 
 def choices() -> dict[str, str | None]:

@@ -32,14 +32,8 @@ ROOT: dict[str, Any] = {
     "graphs": Literal["auto", "off"],
     "decoder_precision": Literal["auto", "float32", "bfloat16"],
 }
-# Keys that were renamed, and their new names.
+# Keys that were renamed, and their new names; what is below them has kept its name.
 RENAMED = {
-    "callbacks.health.every_iterations": "callbacks.divergence_guard.every_iterations",
-    "callbacks.health.rate_factor": "callbacks.divergence_guard.rate_factor",
-    "callbacks.saving.every_seconds": "callbacks.checkpoint.every_seconds",
-    "callbacks.saving.share": "callbacks.checkpoint.share",
-    "callbacks.saving.folder": "callbacks.checkpoint.folder",
-    "callbacks.curve.folder": "callbacks.training_curve.folder",
     "capture.mattes": "capture.alpha_masks",
     "capture.moments": "capture.max_timesteps",
     "schedule.deformation.sides": "schedule.deformation.levels.N.side",
@@ -175,8 +169,9 @@ def _check_value(where: str, value: object, hint: Any) -> None:
 
 def unknown_key(where: str, known: Iterable[object]) -> DevrfError:
     """The error for a key that does not exist, with the closest one that does."""
-    if where in RENAMED:
-        return DevrfError(f"{where}: renamed; write {RENAMED[where]}=VALUE")
+    for old, new in RENAMED.items():
+        if f"{where}.".startswith(f"{old}."):
+            return DevrfError(f"{where}: renamed; write {new}{where.removeprefix(old)}=VALUE")
     name = where.rpartition(".")[2]
     meant = did_you_mean(name, (k for k in known if k != "**"), where[: -len(name)])
     return DevrfError(f"{where}: no such key{meant or '; --cfg job shows every key there is'}")
@@ -223,26 +218,26 @@ def check_extras(config: DictConfig) -> None:
     Raises:
         DevrfError: naming the setting and the extra to install.
     """
+    needs = []  # packages, the setting, the extra, and what to set instead
     if "TensorBoard" in config.logger.get("_target_", ""):
-        _need("tensorboard", "logger=tensorboard", "tensorboard", "logger=csv")
+        needs.append(("tensorboard", "logger=tensorboard", "tensorboard", "logger=csv"))
     if config.stage == "view":
-        _need("viser", "stage=view", "viewer", "stage=render")
+        needs.append(("viser", "stage=view", "viewer", "stage=render"))
     if config.viewer.get("training") is True:
-        _need("viser", "viewer=true", "viewer", "viewer=false")
+        needs.append(("viser", "viewer=true", "viewer", "viewer=false"))
     # Flow that was estimated before is read from its file.
     cache = config.data.get("flow_cache")
     if config.data.get("flow") == "raft" and not (cache and Path(cache).is_file()):
-        _need("torchvision", "data.flow=raft", "raft", "data.flow=dis")
+        needs.append(("torchvision", "data.flow=raft", "raft", "data.flow=dis"))
     if config.stage == "export":
-        for package in ("skimage", "trimesh", "fast_simplification"):
-            _need(package, "stage=export", "export", "stage=render")
+        packages = "skimage trimesh fast_simplification"
+        needs.append((packages, "stage=export", "export", "stage=render"))
         if config.export.format == "usd":
-            _need("pxr", "export.format=usd", "export", "export.format=gltf")
-
-
-def _need(package: str, setting: str, extra: str, instead: str) -> None:
-    if find_spec(package) is None:
-        raise DevrfError(
-            f'{setting}: {package} is not installed; run pip install "devrf[{extra}]", or set '
-            f"{instead}"
-        )
+            needs.append(("pxr", "export.format=usd", "export", "export.format=gltf"))
+    for packages, setting, extra, instead in needs:
+        for package in packages.split():
+            if find_spec(package) is None:
+                raise DevrfError(
+                    f"{setting}: {package} is not installed; run pip install "
+                    f'"devrf[{extra}]", or set {instead}'
+                )

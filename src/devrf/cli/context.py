@@ -48,19 +48,12 @@ class RunContext:
     def __init__(self, config: DictConfig, folder: Path) -> None:
         self.config = config
         self.folder = folder
-        self._began = time.perf_counter()
-        self._stepping = False
-
-    def begin_step(self) -> None:
-        """Start the clock of a step; that of the first has run since the run began."""
-        if self._stepping:
-            self._began = time.perf_counter()
-        self._stepping = True
+        self.step_began = time.perf_counter()
 
     @property
     def step_seconds(self) -> float:
-        """Wall clock since the present step began."""
-        return round(time.perf_counter() - self._began, 2)
+        """Wall clock since the step before ended; of the first step, since the run began."""
+        return round(time.perf_counter() - self.step_began, 2)
 
     @cached_property
     def datamodule(self) -> SceneDataModule:
@@ -221,10 +214,7 @@ class RunContext:
         return self.folder / "checkpoints" / f"{name}.ckpt"
 
     def checkpoint(self, name: str | None = None) -> Path:
-        """The checkpoint ``ckpt``, else the run's own.
-
-        Args:
-            name: a stage; None: the last stage that has a checkpoint.
+        """The checkpoint ``ckpt``, else the run's own of a stage; by default, of the last stage.
 
         Raises:
             DevrfError: there is none.
@@ -245,9 +235,7 @@ class RunContext:
     def load(self, name: str | None = None, *, unread: bool = False) -> LoadedCheckpoint:
         """Load :meth:`checkpoint`; one that builds on another than the run's is passed over.
 
-        Args:
-            name: as of :meth:`checkpoint`.
-            unread: whether any scene's checkpoint is taken, so that the scene is not read.
+        With ``unread`` any scene's is taken, so that the scene is not read.
         """
         path, scene = self.checkpoint(name), None if unread else self.scene
         loaded = load_checkpoint(path, scene)

@@ -51,35 +51,25 @@ def evaluate(run: RunContext) -> list[Path]:
     # A single stage's training stands in the dynamic section, where there is one.
     rest = next((step.name for step in run.protocol.steps if step.capture == "static"), None)
     moved = model.moves and last != rest
-    static = mean_scores(frames["static"])
-    sections: dict[str, Any] = {"static": static}
-    size = {"checkpoint_mb": round(run.checkpoint(last).stat().st_size / 1e6, 3)}
+    static: dict[str, Any] = mean_scores(frames["static"])
+    sections = {"static": static}
     if rest is not None or not moved:
-        stage = rest or last
-        own = {**static, **_training(records, stage), **({} if moved else size)}
-        sections["static"] = sections[stage] = own
+        sections["static"] = sections[rest or last] = static | _training(records, rest or last)
     if moved:
         frames["dynamic"] = _score(run, model, "dynamic", suite)
-        dynamic = sections["dynamic"] = {
-            **dynamic_scores(frames["dynamic"], run.scene.clock),
-            **_training(records, last),
-            **size,
-        }
-        if rest is not None:
-            sections[last] = dynamic
+        dynamic = dynamic_scores(frames["dynamic"], run.scene.clock) | _training(records, last)
+        sections |= {"dynamic": dynamic, **({} if rest is None else {last: dynamic})}
+    size = round(run.checkpoint(last).stat().st_size / 1e6, 3)
+    sections["dynamic" if moved else "static"]["checkpoint_mb"] = size
     write_frames(run.folder / "frames.csv", frames)
+    protocol = loaded.metadata.protocol or run.protocol.name
+    head = {"scene": run.scene.name, "method": model.name, "protocol": protocol}
+    at_rest = {} if run.scene.moves else {"at_rest": True}
     ran = {**provenance(model.size, run.device), **_origin(run, loaded.metadata)}
-    head: dict[str, Any] = {
-        "scene": run.scene.name,
-        "method": model.name,
-        "protocol": loaded.metadata.protocol or run.protocol.name,
-    }
-    if not run.scene.moves:
-        head["at_rest"] = True
-    write_json(run.folder / "metrics.json", {**head, **sections, "run": ran})
+    write_json(run.folder / "metrics.json", {**head, **at_rest, **sections, "run": ran})
     _tell(run, sections, frames)
-    sheets = [_sheet(run, capture) for capture in frames]
-    return [run.folder / "metrics.json", run.folder / "frames.csv", *sheets]
+    written = ("metrics.json", "frames.csv", *(f"images/{capture}.png" for capture in frames))
+    return [run.folder / name for name in written]
 
 
 def _tell(
@@ -104,10 +94,7 @@ def _tell(
         tracker.show_table("frames", frame_rows(frames))
 
 
-Records = Mapping[str, TrainingFigures]
-
-
-def _training(records: Records, stage: str) -> TrainingFigures:
+def _training(records: Mapping[str, TrainingFigures], stage: str) -> TrainingFigures:
     return {name: records.get(stage, {}).get(name) for name in TRAINING}
 
 
@@ -139,10 +126,6 @@ def _origin(run: RunContext, described: CheckpointMetadata) -> dict[str, Any]:
     }
 
 
-def _sheet(run: RunContext, capture: str) -> Path:
-    return run.folder / "images" / f"{capture}.png"
-
-
 def _score(
     run: RunContext, model: Renderable, capture: CaptureName, suite: MetricSuite
 ) -> list[HeldOutView]:
@@ -151,7 +134,7 @@ def _score(
     time = 0.0 if capture == "static" else None
     renderer = Renderer(model)
     scored = [score(renderer, views, k, background, suite, time=time) for k in range(len(views))]
-    sheet = write_contact_sheet(_sheet(run, capture), scored)
+    sheet = write_contact_sheet(run.folder / "images" / f"{capture}.png", scored)
     for tracker in run.trackers:
         tracker.show_image(f"held_out/{capture}", sheet)
     return scored

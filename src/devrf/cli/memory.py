@@ -1,6 +1,6 @@
 """Whether memory and disk suffice for a run: an estimate of what is large, before it begins.
 
-Counted are the images, the fields with their gradients and Adam's moments, and a batch. The rest is
+Counted are the images, the fields with their gradients and Adam's state, and a batch. The rest is
 small beside them; where memory runs out all the same, batches are split
 (:mod:`devrf.engine.micro_batching`).
 """
@@ -26,10 +26,10 @@ from devrf.system.memory import free_host_memory, free_memory, gib, is_oom, numb
 
 # Python and its libraries on the host; measured, as is what the C library keeps of freed memory.
 PROGRAM, FRAGMENTATION = 600_000_000, 1.3
-# Values, gradients, two moments of Adam, and the copy that a rollback returns to.
+# Values, gradients, Adam's two means, and the copy that a rollback returns to.
 LEARNED = 5
-# Three progress files, each with values and two moments, are there at once.
-PROGRESS = 9
+# A checkpoint, and three progress files at once, each with values and Adam's two means.
+FILES = 10
 # Measured around a free-standing object: the share of a ray's samples that are occupied, and of
 # these the share whose colour counts once surfaces have formed.
 OCCUPIED, COLOURED = 0.3, 0.25
@@ -42,45 +42,35 @@ class StageNeeds:
     """What a stage needs, in bytes.
 
     Attributes:
-        parts: on the device that trains, by the config key that changes them most.
-        rays: the key of the batch among them.
+        parts: on the device that trains, by the config key that changes them most: the batch by
+            that of its rays.
         learned: the values of the fields.
     """
 
     parts: Mapping[str, float]
-    rays: str
     learned: float
 
     def peak(self, pieces: int = 1) -> float:
         """Bytes on the device, with each batch taken in ``pieces``."""
-        return sum(self.parts.values()) - self.parts[self.rays] * (1 - 1 / pieces)
+        batch = sum(size for key, size in self.parts.items() if key.endswith(".rays"))
+        return sum(self.parts.values()) - batch * (1 - 1 / pieces)
 
 
-@dataclass(frozen=True)
-class Needs:
-    """What a run needs in bytes: ``scene``, all its images, and its stages by name."""
+def host_bytes(run: RunContext, stages: Iterable[StageNeeds], *, on_host: bool) -> float:
+    """Bytes that stages need of the host, which trains (``on_host``) or holds what a GPU learns."""
+    held = (FRAGMENTATION * s.peak() if on_host else 2 * s.learned for s in stages)
+    return PROGRAM + tensor_bytes(run.scene.captures.values()) + max(held)
 
-    scene: int
-    stages: Mapping[str, StageNeeds]
 
-    def host(self, *, alone: bool) -> float:
-        """Bytes on the host, which trains ``alone`` or beside a GPU."""
-        held = (FRAGMENTATION * s.peak() if alone else 2 * s.learned for s in self.stages.values())
-        return PROGRAM + self.scene + max(held)
-
-    @property
-    def checkpoint(self) -> float:
-        """Bytes of the largest stage's learned values."""
-        return max(stage.learned for stage in self.stages.values())
-
-    def rows(self) -> list[tuple[str, float]]:
-        """A table of names and bytes."""
-        return [
-            *((f"GPU, {name} stage", stage.peak()) for name, stage in self.stages.items()),
-            ("host, beside a GPU", self.host(alone=False)),
-            ("host, without a GPU", self.host(alone=True)),
-            ("checkpoint", self.checkpoint),
-        ]
+def needs_table(run: RunContext) -> list[tuple[str, float]]:
+    """What the configured run needs, for people: names and bytes."""
+    stages = needs(run)
+    return [
+        *((f"GPU, {name} stage", stage.peak()) for name, stage in stages.items()),
+        ("host, beside a GPU", host_bytes(run, stages.values(), on_host=False)),
+        ("host, without a GPU", host_bytes(run, stages.values(), on_host=True)),
+        ("checkpoint", max(stage.learned for stage in stages.values())),
+    ]
 
 
 def tensor_bytes(value: object) -> int:
@@ -94,13 +84,12 @@ def tensor_bytes(value: object) -> int:
     return 0
 
 
-def needs(run: RunContext) -> Needs:
-    """What the configured run needs; several processes share a batch."""
+def needs(run: RunContext) -> dict[str, StageNeeds]:
+    """What each stage of the configured run needs; several processes share a batch."""
     processes = int(getattr(run.strategy, "world_size", 1))
     stages = (_of_devrf if "canonical" in run.config else _of_rays)(run, processes)
     # A scene at rest that the protocol has no stage for can be looked at all the same.
-    names = run.stages_with_images or run.learning_stages
-    return Needs(tensor_bytes(run.scene.captures.values()), {name: stages[name] for name in names})
+    return {name: stages[name] for name in run.stages_with_images or run.learning_stages}
 
 
 def _of_rays(run: RunContext, processes: int) -> dict[str, StageNeeds]:
@@ -116,13 +105,12 @@ def _of_rays(run: RunContext, processes: int) -> dict[str, StageNeeds]:
         "ray_stage.model.settings.width": LEARNED * learned,
         "ray_stage.schedule.rays": rays * 128 * 12 * outputs,
     }
-    stage = StageNeeds(parts, "ray_stage.schedule.rays", learned)
-    return dict.fromkeys(run.learning_stages, stage)
+    return dict.fromkeys(run.learning_stages, StageNeeds(parts, learned))
 
 
 def _of_devrf(run: RunContext, processes: int) -> dict[str, StageNeeds]:
     """DeVRF's fields at their final resolution: grids of about side³ voxels in any box."""
-    scene, config = run.scene, run.config
+    scene, config, images = run.scene, run.config, _key_of_images(run)
     canonical = instantiate(config.canonical, _convert_="all")
     schedule, sizes = fitted_to(scene, canonical.schedule, canonical.architecture)
     moving = instantiate(config.deformation.schedule, _convert_="all")
@@ -133,7 +121,7 @@ def _of_devrf(run: RunContext, processes: int) -> dict[str, StageNeeds]:
     along = 2 / 3 * schedule.side * OCCUPIED if sizes.planes is None else sizes.planes
     ray = along / canonical.sampling.step * sample / processes
     at_rest = {
-        _key_of_images(run): tensor_bytes(scene.static.train),
+        images: tensor_bytes(scene.static.train),
         "schedule.canonical.side": LEARNED * values,
         "schedule.canonical.rays": schedule.rays * ray,
     }
@@ -142,17 +130,16 @@ def _of_devrf(run: RunContext, processes: int) -> dict[str, StageNeeds]:
     active = moving.max_parallel_frames(len(moving.levels) - 1, frames)
     held = active if config.schedule.motion.store == "host" else frames
     in_motion = {
-        _key_of_images(run): tensor_bytes(scene.dynamic.train),
+        images: tensor_bytes(scene.dynamic.train),
         "schedule.canonical.side": values,
         f"schedule.deformation.levels.{last}.side": frame * (held + LEARNED * active),
         "schedule.deformation.rays": active * moving.rays * COLOURED * ray,
     }
-    rays, learned = "schedule.deformation.rays", values + frames * frame
     refined = {**in_motion, "schedule.canonical.side": LEARNED * values}
     return {
-        "canonical": StageNeeds(at_rest, "schedule.canonical.rays", values),
-        "deformation": StageNeeds(in_motion, rays, learned),
-        "refinement": StageNeeds(refined, rays, learned),
+        "canonical": StageNeeds(at_rest, values),
+        "deformation": StageNeeds(in_motion, values + frames * frame),
+        "refinement": StageNeeds(refined, values + frames * frame),
     }
 
 
@@ -161,26 +148,22 @@ def _key_of_images(run: RunContext) -> str:
 
 
 def check_memory(run: RunContext, names: Sequence[str]) -> str:
-    """Compare what stages need with what there is; both, in one line.
-
-    Args:
-        run: the run; its scene is read.
-        names: of the stages that are to be learned.
+    """Compare what the stages ``names`` need with what there is; both, in one line.
 
     Raises:
         DevrfError: memory or disk cannot suffice.
     """
     every = needs(run)
-    of_run = Needs(every.scene, {name: every.stages[name] for name in names})
-    stage = max(of_run.stages.values(), key=StageNeeds.peak)
+    stages = [every[name] for name in names]
+    stage = max(stages, key=StageNeeds.peak)
     on_gpu = run.device.type == "cuda"
-    host = of_run.host(alone=not on_gpu)
+    host = host_bytes(run, stages, on_host=not on_gpu)
     host *= 1 if on_gpu else int(getattr(run.strategy, "num_processes", 1))
-    kept = sum(file.stat().st_size for file in run.folder.glob("checkpoints/*.ckpt"))
-    disk, room = (
-        (PROGRESS + 1) * of_run.checkpoint,
-        free_disk(run.folder) + kept * run.config.resume,
-    )
+    disk = FILES * max(one.learned for one in stages)
+    room = free_disk(run.folder)
+    if run.config.resume:  # what is there is replaced
+        room += sum(file.stat().st_size for file in run.folder.glob("checkpoints/*.ckpt"))
+    # What, needed, needed at least, there.
     compared = [
         ("host memory", host, host, free_host_memory() + own_memory()),
         ("disk", disk, disk, room),
@@ -191,8 +174,8 @@ def check_memory(run: RunContext, names: Sequence[str]) -> str:
     said = ", ".join(f"{gib(n)} of {gib(there)} GiB of {what}" for what, n, _, there in compared)
     for what, _, least, there in compared:
         if least > there:
-            key = max(stage.parts, key=lambda key: stage.parts[key])
-            share = 1 - (1 - there / least) * stage.peak() / stage.parts[key]
+            key, part = max(stage.parts.items(), key=lambda item: item[1])
+            share = 1 - (1 - there / least) * stage.peak() / part
             raise DevrfError(
                 f"{key}: the run needs about {said}; it would end for lack of {what}: give "
                 f"{_smaller(run, key, share)}, or try all the same with memory_check=false"

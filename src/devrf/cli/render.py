@@ -3,34 +3,20 @@
 from __future__ import annotations
 
 import logging
-import time
-from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from threading import Event
 
 from hydra.utils import instantiate
-from torch import Tensor
 
 from devrf.apps.export.geometry import ExportSettings
 from devrf.apps.export.scene import export_scene
 from devrf.apps.images import to_bytes, write_image
-from devrf.apps.keyframes import cameras_of, read_path
+from devrf.apps.render import videos
 from devrf.apps.settings import ViewerSettings
 from devrf.apps.still import StillSettings, still
-from devrf.apps.video import (
-    VideoSettings,
-    bullet_time,
-    focus_distance,
-    held_out_images,
-    held_out_pictures,
-    orbit,
-    orbit_pictures,
-    spiral,
-    time_freeze,
-)
+from devrf.apps.video import VideoSettings
 from devrf.apps.video_file import write_pictures
 from devrf.checkpoints.checkpoint import CheckpointMetadata, Viewpoints, check_scene
 from devrf.cli.context import RunContext
@@ -38,88 +24,32 @@ from devrf.cli.restore_config import parsed, value
 from devrf.cli.resume import deciding_settings
 from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value
-from devrf.geometry.cameras import Cameras
 from devrf.rendering.renderer import Renderer
-from devrf.scenes.scene import Scene, Views
+from devrf.scenes.scene import Scene
 from devrf.system.process import handle_signals
 from devrf.system.progress import followed
 
 log = logging.getLogger(__name__)
 
-# What video.path may be beside a file.
-PRESETS = {"bullet_time": bullet_time, "time_freeze": time_freeze}
 # Times whose views stay at hand in the viewer: both ends, the rest state, and where time runs.
 CACHED = 6
 
 
 def render(run: RunContext) -> list[Path]:
-    """Film the held-out views over time, and an orbit (or a spiral) while time runs.
-
-    With ``video.path`` that path alone is filmed.
-
-    Returns:
-        The videos.
-    """
-    film: VideoSettings = instantiate(run.config.video)
-    path = None if film.path in (None, *PRESETS) else read_path(Path(str(film.path)))
+    """Write the videos that ``video`` asks for; return their files."""
+    settings: VideoSettings = instantiate(run.config.video)
     stored, scene = run.load(), run.scene
-    renderer = Renderer(stored.model.to_view(run.device), half=film.half)
-    behind = background_value(scene.background)
-    views = (scene.dynamic if scene.moves else scene.static).test
-    if path is not None:
-        film = replace(film, frames=path.frames, fps=path.fps)
-    film, captured = _within_limit(film, renderer, views), film.sized(scene.static.train.cameras)
-    forward = scene.kind == "forward"
-
-    def ring(settings: VideoSettings) -> Cameras:
-        if forward:
-            focus = focus_distance(renderer, scene.static.train.cameras)
-            return spiral(captured, focus, settings)
-        return orbit(captured, renderer.model.box, settings)
-
-    if path is not None:
-        keyframes = path.sampled(film.frames)
-        cameras = cameras_of(keyframes, path.aspect, captured.height)
-        shown = orbit_pictures(renderer, cameras, behind, [frame.time for frame in keyframes])
-        return [_write(run, film, Path(str(film.path)).stem, shown)]
-    if film.path is not None:
-        cameras, times = PRESETS[film.path](ring, film.time, film)
-        return [_write(run, film, film.path, orbit_pictures(renderer, cameras, behind, times))]
-    images = held_out_images(views, film.frames)
-    shown = held_out_pictures(renderer, views, images, film, scene.background)
-    held_out = _write(run, film, "held_out", shown)
-    shown = orbit_pictures(renderer, ring(film), behind)
-    return [held_out, _write(run, film, "spiral" if forward else "orbit", shown)]
-
-
-def _within_limit(film: VideoSettings, renderer: Renderer, views: Views) -> VideoSettings:
-    """The settings, with fewer frames where ``video.max_seconds`` would not suffice."""
-    if film.max_seconds is None:
-        return film
-    cameras = film.sized(views.cameras[[0]])
-    began = time.perf_counter()
-    still(renderer, cameras, 0.5, 1.0)
-    seconds = time.perf_counter() - began
-    fewer = film.within_limit(seconds)
-    if fewer.frames < film.frames:
-        log.warning(
-            "videos have %d frames, not %d: rendering one takes %.1f s; video.max_seconds=null "
-            "renders all, a lower video.height is faster",
-            fewer.frames,
-            film.frames,
-            seconds,
-        )
-    return fewer
-
-
-def _write(run: RunContext, film: VideoSettings, name: str, images: Iterator[Tensor]) -> Path:
-    path = run.folder / "videos" / f"{name}.mp4"
-    pictures = (to_bytes(image).numpy() for image in images)
-    write_pictures(path, followed(pictures, film.frames, f"{name}.mp4"), film.fps)
-    log.info("video written to %s", path)
-    for tracker in run.trackers:
-        tracker.show_video(f"videos/{name}", path)
-    return path
+    renderer = Renderer(stored.model.to_view(run.device), half=settings.half)
+    paths = []
+    for video in videos(renderer, scene, settings):
+        path = run.folder / "videos" / f"{video.name}.mp4"
+        pictures = (to_bytes(picture).numpy() for picture in video.pictures)
+        write_pictures(path, followed(pictures, video.frames, path.name), video.fps)
+        log.info("video written to %s", path)
+        for tracker in run.trackers:
+            tracker.show_video(f"videos/{video.name}", path)
+        paths.append(path)
+    return paths
 
 
 def picture(run: RunContext) -> None:

@@ -58,8 +58,8 @@ def values(overrides: Sequence[Override], key: str) -> list[str]:
 
 def value(overrides: Sequence[Override], key: str) -> str | None:
     """The last value of ``key``; None where there is none, or several."""
-    several = values(overrides, key)
-    return several[0] if len(several) == 1 else None
+    found = values(overrides, key)
+    return found[0] if len(found) == 1 else None
 
 
 def recorded(overrides: Iterable[str]) -> list[str]:
@@ -77,7 +77,7 @@ def recorded(overrides: Iterable[str]) -> list[str]:
             continue
         path = None if override.is_delete() else override.value()
         if key in RELATIVE and isinstance(path, str) and "${" not in path:
-            text = f"{key}={_quoted(str(Path(path).expanduser().absolute()))}"
+            text = f"{key}={in_quotes(str(Path(path).expanduser().absolute()))}"
         kept.append(text)
     return kept
 
@@ -85,11 +85,6 @@ def recorded(overrides: Iterable[str]) -> list[str]:
 def _root(key: str) -> str:
     """The first part of a key: ``data`` of ``data.root``."""
     return re.split("[./]", key)[0]
-
-
-def _quoted(text: str) -> str:
-    """A value as Hydra's grammar takes it literally, in quotes where it needs them."""
-    return text if re.fullmatch(r"[A-Za-z0-9_./-]+", text) else in_quotes(text)
 
 
 def log_source() -> None:
@@ -121,15 +116,15 @@ def of_named_run(typed: Sequence[Override], multirun: bool) -> list[str]:
             "settings are those typed, and the defaults"
         )
         return []
-    first, *others = [command or [] for command in commands]
-    shared = [text for text in first if all(text in other for other in others)]
+    known = [command or [] for command in commands]
+    shared = [text for text in known[0] if all(text in command for command in known)]
     put = _beside(typed, shared, source)
     if multirun:
         # The sweep is the one that is typed, not that of an experiment.
         return put if values(typed, "hparams_search") else [*put, "hydra.sweeper.params=null"]
     put.append("hydra.mode=RUN")
     if folder is None and value(typed, "stage") in OF_A_CHECKPOINT:
-        put.append(f"hydra.run.dir={_quoted(str(_folder_for(checkpoints[0])))}")
+        put.append(f"hydra.run.dir={in_quotes(str(_folder_for(checkpoints[0])))}")
     return put
 
 

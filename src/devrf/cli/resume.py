@@ -9,8 +9,8 @@ Each checkpoint holds the settings that decided what was learned:
 
 Settings of logging, scoring, rendering, the device and the place of the data may differ.
 
-What a pipeline has scored and filmed is not done again either: a step notes the files it wrote and
-what it made them with (checkpoint, settings, data, logger, version).
+What a pipeline has scored and rendered is not done again either: a step notes the files it wrote,
+and what it made them with (checkpoint, settings, data, logger, version).
 """
 
 from __future__ import annotations

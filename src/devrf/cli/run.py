@@ -6,10 +6,10 @@ import gc
 import json
 import logging
 import os
+import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,15 +19,14 @@ from hydra.utils import instantiate
 from lightning import seed_everything
 from omegaconf import DictConfig
 
-from devrf.apps.keyframes import read_path
+from devrf.apps.render import camera_path
 from devrf.apps.settings import ViewerSettings
-from devrf.apps.video import VideoSettings
 from devrf.cli.config import OF_A_CHECKPOINT, in_search, in_sweep, meant_stage
 from devrf.cli.context import RunContext
 from devrf.cli.evaluate import TRAINING, evaluate
 from devrf.cli.memory import check_memory, shortage_in_words
 from devrf.cli.preparation import capture, fetch, inspect, prepare, say_next, selfcheck
-from devrf.cli.render import PRESETS, export, picture, render, view
+from devrf.cli.render import export, picture, render, view
 from devrf.cli.resume import beginning, done, note_done
 from devrf.cli.run_folder import archive_previous
 from devrf.cli.sweep import report
@@ -41,6 +40,7 @@ log = logging.getLogger(__name__)
 
 # Does its work; returns the files it wrote, where these need not be made again.
 Step = Callable[[RunContext], Sequence[Path] | None]
+Names = tuple[str, ...]
 
 # What devrf.cli.config.STEPS names.
 STEPS: dict[str, Step] = {
@@ -56,7 +56,7 @@ STEPS: dict[str, Step] = {
     "capture": capture,
     "selfcheck": selfcheck,
 }
-PIPELINE = ("evaluate", "render")
+AFTER_LEARNING = ("evaluate", "render")
 # Steps for which the run's scene and stages need not be right.
 APART = {"report", "fetch", "capture", "selfcheck"}
 # What a run's folder may hold that a person looks at first, and what to try next.
@@ -76,41 +76,26 @@ _IGNORED = "many workers|LeafSpec|GPU available but not used|Experiment logs dir
 warnings.filterwarnings("ignore", message=f".*({_IGNORED})")
 
 
-@dataclass(frozen=True)
-class Plan:
-    """What ``stage=…`` asks for.
+def plan(stage: str, protocol: Sequence[str]) -> tuple[Names, Names]:
+    """The protocol's stages that ``stage`` asks to learn, and the steps after them.
 
-    Attributes:
-        learning: stages of the protocol, learned by all processes.
-        further: steps after them, of rank 0 alone.
-    """
-
-    learning: tuple[str, ...]
-    further: tuple[str, ...]
-
-
-def plan(stage: str, protocol: Sequence[str]) -> Plan:
-    """The steps of ``stage``; ``protocol`` names the stages that learn.
+    All processes learn; rank 0 alone takes the other steps.
 
     Raises:
         DevrfError: there is no such stage.
     """
     if stage == "pipeline":
-        return Plan(tuple(protocol), PIPELINE)
+        return tuple(protocol), AFTER_LEARNING
     if stage in protocol:
-        return Plan((stage,), ())
+        return (stage,), ()
     if stage in STEPS:
-        return Plan((), (stage,))
+        return (), (stage,)
     known = ", ".join(["pipeline", *protocol, *STEPS])
     raise DevrfError(f"stage: expected one of {known}, not {stage!r}{meant_stage(stage)}")
 
 
 def run_stage(config: DictConfig, folder: Path) -> float | None:
-    """Do what ``stage=…`` asks for, in the run's folder.
-
-    Args:
-        config: a composed config (``conf/config.yaml``).
-        folder: the run's folder.
+    """Do what ``stage=…`` of a composed config asks for, in the run's folder.
 
     Returns:
         The objective; None where nothing was scored.
@@ -119,47 +104,42 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
         DevrfError: the input is wrong.
     """
     run = RunContext(config, folder)
-    asked = plan(config.stage, run.learning_stages)
-    _check(run, asked)
+    learning, steps = plan(config.stage, run.learning_stages)
+    _check(run, learning, steps)
     several = isinstance(run.strategy, ManualDDP)
-    if not several and _all_done(run, asked):
-        return _ended(run, asked)
-    if asked.learning and run.leads:
-        asked = _begin(run, asked)
+    if not several and _all_done(run, learning, steps):
+        return _ended(run, steps)
     ended = False
     try:
-        if asked.learning:
+        if learning:
+            if run.leads:
+                _prepare_to_learn(run, learning, steps)
             with launch_workers(run, learn_all) if several else nullcontext():
-                _learn(run, asked)
-        if not asked.learning or run.leads:
-            for name in asked.further:
-                if not (asked.learning and _is_done(run, name)):
+                _learn(run, learning)
+        if not learning or run.leads:
+            for name in steps:
+                if not (learning and _is_done(run, name)):
                     _take(run, name, STEPS[name])
         ended = True
     finally:
         run.close(failed=not ended)
-    return _ended(run, asked) if "evaluate" in asked.further and run.leads else None
+    return _ended(run, steps) if "evaluate" in steps and run.leads else None
 
 
-def _begin(run: RunContext, asked: Plan) -> Plan:
-    """Look at scene, memory and what earlier commands left, before anything is learned.
-
-    Returns:
-        The plan without stages that learn motion, for a scene at rest.
-    """
-    left = replace(asked, learning=run.learnable(asked.learning))
-    if left != asked:
-        steps = ", ".join(left.learning + left.further)
-        log.info("%s is at rest: %s; no motion is learned", run.scene.name, steps)
+def _prepare_to_learn(run: RunContext, asked: Names, steps: Names) -> None:
+    """Look at scene, memory and what earlier commands left, before anything is learned."""
+    learning = run.learnable(asked)
+    if learning != asked:
+        left = ", ".join(learning + steps)
+        log.info("%s is at rest: %s; no motion is learned", run.scene.name, left)
     resume = run.config.resume
-    names = [name for name in left.learning if not (resume and run.own_checkpoint(name).is_file())]
+    names = [name for name in learning if not (resume and run.own_checkpoint(name).is_file())]
     needed = check_memory(run, names) if names and run.config.memory_check else None
     if not resume:
-        below = run.protocol[left.learning[0]].builds_on
+        below = run.protocol[learning[0]].builds_on
         archive_previous(run.folder, *([] if below is None else [run.own_checkpoint(below)]))
     if needed is not None:
         log.info("%s", needed)
-    return left
 
 
 def _is_done(run: RunContext, name: str) -> bool:
@@ -170,23 +150,23 @@ def _is_done(run: RunContext, name: str) -> bool:
     return bool(files)
 
 
-def _all_done(run: RunContext, asked: Plan) -> bool:
+def _all_done(run: RunContext, learning: Names, steps: Names) -> bool:
     """Whether nothing of a pipeline is left to do, so that its scene need not be read; says so."""
-    if asked.further != PIPELINE or not run.config.resume:
+    if steps != AFTER_LEARNING or not run.config.resume:
         return False
-    learned = all(run.own_checkpoint(name).is_file() for name in asked.learning)
-    if not (learned and all(done(run, name) for name in PIPELINE)):
+    learned = all(run.own_checkpoint(name).is_file() for name in learning)
+    if not (learned and all(done(run, name) for name in steps)):
         return False
     # Refuses other settings than those that it was learned with.
-    if not all(beginning(run, name).finished for name in asked.learning):
+    if not all(beginning(run, name).finished for name in learning):
         return False
-    return all(_is_done(run, name) for name in PIPELINE)
+    return all(_is_done(run, name) for name in steps)
 
 
-def _ended(run: RunContext, asked: Plan) -> float | None:
+def _ended(run: RunContext, steps: Names) -> float | None:
     """The objective; a pipeline ends with its results, and what to try next."""
     folder = run.folder
-    if asked.further == PIPELINE and not in_sweep():
+    if steps == AFTER_LEARNING and not in_sweep():
         results = ", ".join(name for name in RESULTS if (folder / name).exists())
         place = Path(os.path.relpath(folder)) if folder.is_relative_to(Path.cwd()) else folder
         log.info("results: %s (%s)", place, results)
@@ -199,11 +179,11 @@ def learn_all(config: DictConfig, folder: Path) -> None:
     """Learn the stages of ``stage=…`` in another process than rank 0; the config is checked."""
     run = RunContext(config, folder)
     with launch_workers(run, learn_all):
-        _learn(run, plan(config.stage, run.learning_stages))
+        _learn(run, plan(config.stage, run.learning_stages)[0])
 
 
-def _learn(run: RunContext, asked: Plan) -> None:
-    for name in run.learnable(asked.learning):
+def _learn(run: RunContext, learning: Names) -> None:
+    for name in run.learnable(learning):
         _take(run, name, partial(learn, name=name))
         # What a stage's trainer holds in circles would count as the next stage's memory.
         gc.collect()
@@ -213,48 +193,42 @@ def _learn(run: RunContext, asked: Plan) -> None:
 
 def _take(run: RunContext, name: str, step: Step) -> None:
     seed_everything(run.config.seed, verbose=False)
-    run.begin_step()
     with using(run.config.kernels), shortage_in_words(name, run):
         files = step(run)
     note_done(run, name, files or ())
+    run.step_began = time.perf_counter()
 
 
-def _check(run: RunContext, asked: Plan) -> None:
+def _check(run: RunContext, learning: Names, steps: Names) -> None:
     """Find errors in the config of every step before the first begins."""
     config = run.config
-    begins = asked.learning and run.protocol[asked.learning[0]].builds_on is None
-    if config.ckpt is not None and (begins or not {*asked.further} <= {*OF_A_CHECKPOINT}):
+    begins = learning and run.protocol[learning[0]].builds_on is None
+    if config.ckpt is not None and (begins or not {*steps} <= {*OF_A_CHECKPOINT}):
         raise DevrfError(
             f"ckpt: stage={config.stage} starts from nothing; with ckpt=PATH give a stage that "
             "builds on another, stage=evaluate, render, still, view or export"
         )
-    if not asked.learning and not APART.isdisjoint(asked.further):
+    if not learning and not APART.isdisjoint(steps):
         return
     _ = run.datamodule
     for name in run.learning_stages:
         run.stage_builder(name)
     run.evaluation.check()
     check_objective(config.objective, run.evaluation.metrics)
-    if in_search() and "evaluate" not in asked.further:
+    if in_search() and "evaluate" not in steps:
         raise DevrfError(
             f"stage: a search needs the objective, which stage={config.stage} does not score"
         )
-    film: VideoSettings = instantiate(config.video)
-    if film.path not in (None, *PRESETS):
-        _ = read_path(Path(str(film.path))).frames
+    camera_path(instantiate(config.video))
     instantiate(config.still)
     instantiate(config.export)
     viewer: ViewerSettings = instantiate(config.viewer)
-    if run.leads and ("view" in asked.further or (viewer.training and asked.learning)):
+    if run.leads and ("view" in steps or (viewer.training and learning)):
         viewer.check_free()
 
 
 def check_objective(key: str, metrics: Sequence[str]) -> None:
-    """Check that metrics.json will have ``key``.
-
-    Args:
-        key: ``SECTION.NAME``, such as ``dynamic.psnr``.
-        metrics: ``evaluation.metrics``.
+    """Check that metrics.json will have ``key``, with these ``evaluation.metrics``.
 
     Raises:
         DevrfError: it will not.

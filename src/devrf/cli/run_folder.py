@@ -78,12 +78,7 @@ def working_in(folder: Path, config: DictConfig, key: str) -> Iterator[None]:
     """While the block lasts, no other process works in a run's folder.
 
     A folder that holds no results is removed if the block ends in a user error; that of a sweep's
-    job stays, for the record of its failure.
-
-    Args:
-        folder: the run's folder.
-        config: a composed config.
-        key: the setting that chooses another folder, for the message.
+    job stays, for the record of its failure. ``key`` is the setting that chooses another folder.
 
     Raises:
         DevrfError: another process works there.
@@ -176,11 +171,7 @@ def remove_if_only(folder: Path, names: set[str]) -> None:
 def archive_previous(folder: Path, *needed: Path) -> None:
     """Move the results of earlier commands into ``previous-<n>/`` within the run's folder.
 
-    ``.hydra`` and the lock are the present command's and stay.
-
-    Args:
-        folder: the run's folder.
-        needed: files that the present command needs: they are copied back.
+    ``.hydra`` and the lock are the present command's and stay. Files that it needs are copied back.
     """
     old = [p for p in folder.iterdir() if p.name not in AT_FIRST and p.name[:9] != "previous-"]
     if not old:

@@ -108,7 +108,7 @@ class SweepMonitor(Callback):
         """Note what the sweep's folder holds before the first job."""
         self.folder = Path(config.hydra.sweep.dir)
         self.was_there = self.folder.exists()
-        self.earlier = self._stamps()
+        self.earlier = self._records()
         SweepMonitor.started = self
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
@@ -119,8 +119,7 @@ class SweepMonitor(Callback):
 
     def name_failures(self) -> bool:
         """Print which jobs failed, if any did."""
-        now = self._stamps()
-        failed = [str(path.parent) for path in sorted(now) if now[path] != self.earlier.get(path)]
+        failed = sorted(job for job, _ in self._records() - self.earlier)
         if failed:
             print(
                 f"devrf: jobs failed: {', '.join(failed)}; {FAILURE} in each folder below "
@@ -129,10 +128,10 @@ class SweepMonitor(Callback):
             )
         return bool(failed)
 
-    def _stamps(self) -> dict[Path, int]:
-        """When each record of a failure was written, in nanoseconds."""
-        records = self.folder.rglob(FAILURE)
-        return {path.relative_to(self.folder): path.stat().st_mtime_ns for path in records}
+    def _records(self) -> set[tuple[str, int]]:
+        """The folder of each record of a failure, and when it was written, in nanoseconds."""
+        files = self.folder.rglob(FAILURE)
+        return {(str(f.parent.relative_to(self.folder)), f.stat().st_mtime_ns) for f in files}
 
 
 def name_failures(error: Exception) -> None:

@@ -11,6 +11,7 @@ run's files, lock and signals.
 
 from __future__ import annotations
 
+import atexit
 import logging
 import multiprocessing
 import os
@@ -18,18 +19,22 @@ import signal
 import socket
 import sys
 import threading
-import traceback
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext, suppress
 from multiprocessing.connection import wait
-from multiprocessing.context import SpawnProcess
-from multiprocessing.queues import SimpleQueue
 from pathlib import Path
+from queue import Empty, Queue
 from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
+from torch.multiprocessing.spawn import (
+    ProcessContext,
+    ProcessException,
+    ProcessExitedException,
+    start_processes,
+)
 
 from devrf.cli.context import RunContext
 from devrf.cli.messages import is_user_error, one_line
@@ -38,10 +43,6 @@ from devrf.errors import DevrfError
 from devrf.system.process import tune_for_cpu
 
 Work = Callable[[DictConfig, Path], None]
-# Failures of other processes, the first one first: whether it is a user error, and its one line or
-# else the traceback.
-Reports = SimpleQueue[tuple[bool, str]]
-
 # Seconds that a process has to end, or to notice that another has ended.
 GRACE = 10.0
 
@@ -51,11 +52,8 @@ def launch_workers(run: RunContext, work: Work) -> Iterator[None]:
     """While the block lasts, all processes that ``trainer`` asks for take part.
 
     Rank 0 reads the scene first: errors in it are reported once, and the others find the optical
-    flow that it has estimated and stored.
-
-    Args:
-        run: of this process.
-        work: what the others do with the composed config and the run's folder; importable by name.
+    flow that it has estimated and stored. They do ``work``, which they import by its name, with the
+    composed config and the run's folder.
 
     Raises:
         DevrfError: the processes cannot be started, or a user error ended one of them.
@@ -113,36 +111,30 @@ def _others(run: RunContext, work: Work, count: int) -> Iterator[None]:
         MASTER_ADDR="127.0.0.1", MASTER_PORT=str(port), NODE_RANK="0", WORLD_SIZE=str(count)
     )
     config = OmegaConf.to_container(run.config, resolve=True)
-    spawn = multiprocessing.get_context("spawn")
-    reports: Reports = spawn.SimpleQueue()
-    arguments = (work, config, run.folder, reports)
-    children: list[SpawnProcess] = []
+    with _signals_blocked():
+        others: ProcessContext = start_processes(  # type: ignore[no-untyped-call]
+            _take_part, (work, config, run.folder), count - 1, join=False, daemon=True
+        )
+    os.environ["LOCAL_RANK"] = "0"
+    failures: Queue[Exception] = Queue()
     over = threading.Event()
+    watcher = threading.Thread(target=_watch, args=(others, failures, over), daemon=True)
+    watcher.start()
     try:
-        for rank in range(1, count):
-            os.environ["LOCAL_RANK"] = str(rank)
-            child = spawn.Process(target=_take_part, args=arguments, daemon=True)
-            with _signals_blocked():
-                child.start()
-            children.append(child)
-        os.environ["LOCAL_RANK"] = "0"
-        for child in children:
-            watched = (child, children, reports, over)
-            threading.Thread(target=_watch, args=watched, daemon=True).start()
         yield
-        for child in children:
-            child.join(GRACE)
+        watcher.join(GRACE)
     except Exception as error:
         if is_user_error(error):
             raise
-        # If another process has ended, this one only notices a broken connection.
-        wait([child.sentinel for child in children], timeout=1.0)
-        raise _failure(children, reports) or error  # noqa: B904 - its cause is over there
+        # If another process has failed, this one only notices a broken connection.
+        with suppress(Empty):
+            raise failures.get(timeout=GRACE) from None
+        raise
     finally:
-        for child in children:
-            child.kill()
-            child.join()
         over.set()
+        for process in others.processes:
+            process.kill()
+        watcher.join()
 
 
 @contextmanager
@@ -162,46 +154,47 @@ def _signals_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _failure(children: Sequence[SpawnProcess], reports: Reports) -> Exception | None:
-    """The first error that was reported, else that of an exit status, if any."""
-    if not reports.empty():
-        user_error, text = reports.get()
-        return DevrfError(text) if user_error else RuntimeError(text)
-    for rank, child in enumerate(children, 1):
-        if status := child.exitcode:
-            how = f"was ended by signal {-status}" if status < 0 else f"ended with {status}"
-            return DevrfError(
-                f"trainer.devices: the process of rank {rank} {how}; was memory short?"
-            )
-    return None
-
-
-def _watch(
-    child: SpawnProcess, children: Sequence[SpawnProcess], reports: Reports, over: threading.Event
-) -> None:
-    """End this process if ``child`` has failed and this one does not notice.
+def _watch(others: ProcessContext, failures: Queue[Exception], over: threading.Event) -> None:
+    """Wait for the others; end this process if one has failed and this one does not notice.
 
     Between CPUs a connection breaks at once; a GPU may wait for the lost process for half an hour.
     """
-    wait([child.sentinel])
-    if child.exitcode == 0 or over.wait(GRACE):
-        return
-    failure = _failure(children, reports)
-    print(f"devrf: {failure or 'ended'}", file=sys.stderr, flush=True)
-    os._exit(2 if isinstance(failure, DevrfError) else 1)
+    try:
+        while not others.join(grace_period=0.0):
+            pass
+    except ProcessException as error:
+        failure = _failure(error)
+        failures.put(failure)
+        if not over.wait(GRACE):
+            print(f"devrf: {failure}", file=sys.stderr, flush=True)
+            os._exit(2 if isinstance(failure, DevrfError) else 1)
 
 
-def _take_part(work: Work, config: Any, folder: Path, reports: Reports) -> None:
+def _failure(error: ProcessException) -> Exception:
+    """What ended another process: a user error in its one line, or else its traceback."""
+    if isinstance(error, ProcessExitedException):
+        return DevrfError(
+            f"trainer.devices: the process of rank {error.error_index + 1} ended by "
+            f"{error.signal_name or f'exit status {error.exit_code}'}; was memory short?"
+        )
+    last = error.msg.rstrip().rpartition("\n")[2]
+    _, own, line = last.partition(f"{DevrfError.__module__}.{DevrfError.__name__}: ")
+    return DevrfError(line) if own else RuntimeError(error.msg)
+
+
+def _take_part(index: int, work: Work, config: Any, folder: Path) -> None:
     """The whole life of another process."""
+    os.environ["LOCAL_RANK"] = str(index + 1)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     _silence_logs()
     tune_for_cpu()
     try:
         work(OmegaConf.create(config), folder)
-    except BaseException as error:
-        user_error = isinstance(error, Exception) and is_user_error(error)
-        reports.put((user_error, one_line(error) if user_error else traceback.format_exc()))
-        sys.exit(1)
+    except Exception as error:
+        atexit.register(os._exit, 1)  # without the slow end of torch: rank 0 waits for it
+        if is_user_error(error):
+            raise DevrfError(one_line(error)) from None
+        raise
 
 
 def _end_with_parent() -> None:

@@ -6,6 +6,7 @@ iteration is carried out is in :mod:`devrf.engine.loop`.
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -279,8 +280,8 @@ class ScheduledStage(Learner):
 
         Without the optimiser's state a checkpoint is for rendering, not for resuming.
         """
-        checkpoint["devrf"] = self.metadata().as_data()
-        checkpoint["viewpoints"] = Viewpoints.of(self.scene).as_data()
+        checkpoint["devrf"] = asdict(self.metadata())
+        checkpoint["viewpoints"] = asdict(Viewpoints.of(self.scene))
         if "optimizer_states" in checkpoint:
             checkpoint["progress"] = {
                 "stage": self.name,

@@ -16,9 +16,8 @@ def make_folder(folder: Path) -> None:
     """Make ``folder``, and those above it, where they are not there.
 
     Raises:
-        OSError: naming the first folder that cannot be made. Where the system holds no folders of
-            users, as ``/proc``, it says that a file is missing; here it is a PermissionError, so
-            that a missing file stays a fault of the program.
+        OSError: naming the first folder that cannot be made; below ``/proc``, where the system says
+            that a file is missing, a PermissionError: a missing file is a fault of the program.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)

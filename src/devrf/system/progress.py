@@ -20,11 +20,7 @@ def followed(
 ) -> Iterator[Item]:
     """The items, with a bar on a terminal, else a line of the log every so often.
 
-    Args:
-        items: made one by one as they are asked for.
-        total: how many there are.
-        name: what they make, for the bar and the lines.
-        line_every_seconds: between two lines.
+    ``name`` is what they make, for the bar and the lines.
     """
     console = Console()
     if console.is_terminal:
