@@ -33,6 +33,7 @@ TWO_CASES = [*CASES["warped_depth"], *CASES["compositing"]]
 POINTERS = {
     torch.float32: "*fp32",
     torch.float64: "*fp64",
+    torch.float16: "*fp16",
     torch.int32: "*i32",
     torch.int64: "*i64",
     torch.uint8: "*u8",
