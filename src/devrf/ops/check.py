@@ -94,10 +94,10 @@ def compare(case: Case, device: torch.device) -> tuple[float, float]:
 
 
 def interpolation(draw: Draw) -> Results:
-    """Rows with and without vector loads; half of the points outside."""
+    """Rows with and without vector loads; half of the points outside, in several blocks."""
     results: Results = ()
     for channels in (3, 12):
-        grid, coords = draw.leaf(4, 3, 5, channels), (2 + 3 * draw(50, 3)).requires_grad_()
+        grid, coords = draw.leaf(4, 3, 5, channels), (2 + 3 * draw(150, 3)).requires_grad_()
         results += draw.gradients((interpolate(grid, coords),), grid, coords)
     return results
 
@@ -107,7 +107,7 @@ def warped_depths(draw: Draw) -> Results:
     results: Results = ()
     for frames in (0, 1, 2):
         density, slices = draw.leaf(4, 3, 5, 1), [draw.leaf(3, 4, 3, 3) for _ in range(frames)]
-        moved = warped_depth(draw(50, 3), density, slices, 0.3, box=BOX, shift=-1.0, delta=0.5)
+        moved = warped_depth(draw(150, 3), density, slices, 0.3, box=BOX, shift=-1.0, delta=0.5)
         results += draw.gradients(moved, density, *slices)
     return results
 
