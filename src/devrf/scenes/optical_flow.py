@@ -145,13 +145,9 @@ def estimate_flow(
     flow = OpticalFlow(torch.zeros((*count, 2)), torch.zeros(count, dtype=torch.bool))
     for done, pair in enumerate(pairs):
         image, other = pair[::-1] if forward else pair
-        now, then = _on_white(views.pixels[image]), _on_white(views.pixels[other])
-        there, back = between(now, then), between(then, now)
-        valid = consistent(there, back)
-        if views.has_alpha:
-            valid &= views.pixels[image, ..., 3].cpu() > ALPHA_THRESHOLD
+        vectors, valid = flow_between(views, image, other, between)
         flow.valid[image] = valid
-        flow.vectors[image] = there * valid[..., None]
+        flow.vectors[image] = vectors * valid[..., None]
         if (done + 1) % 100 == 0:
             log.info("optical flow: %d of %d pairs", done + 1, len(pairs))
     log.info(
@@ -163,6 +159,16 @@ def estimate_flow(
     if cache is not None:
         save_flow(cache, key, flow)
     return flow
+
+
+def flow_between(views: Views, image: int, other: int, between: Estimator) -> tuple[Tensor, Tensor]:
+    """Flow (H, W, 2) of an image to another, in pixels, and where it is valid, (H, W) bool."""
+    now, then = _on_white(views.pixels[image]), _on_white(views.pixels[other])
+    there, back = between(now, then), between(then, now)
+    valid = consistent(there, back)
+    if views.has_alpha:
+        valid &= views.pixels[image, ..., 3].cpu() > ALPHA_THRESHOLD
+    return there, valid
 
 
 def frame_pairs(views: Views) -> list[tuple[int, int]]:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch.nn.functional import interpolate
 
 from devrf.apps.inspection.advice import advice_on
 from devrf.scenes.bounds import box_from_cameras
@@ -131,3 +132,17 @@ def test_a_box_that_is_only_guessed(healthy):
     (advice,) = advice_on(without_alpha(healthy, guess))
     assert "data.box=" in advice.remedy
     assert advice_on(without_alpha(healthy, guess.scaled(0.9))) == []
+
+
+@pytest.mark.parametrize(("pixels", "far"), [(1, False), (9, True)])
+def test_large_motion_without_flow_is_said(healthy, pixels, far):
+    train = healthy.dynamic.train
+    noise = torch.rand(1, 3, 96, 96, generator=torch.Generator().manual_seed(0))
+    texture = interpolate(interpolate(noise, size=24, mode="area"), size=96, mode="bicubic")
+    texture = (255 * texture[0].clamp(0, 1)).byte().permute(1, 2, 0)
+    frames = train.frames * pixels
+    images = torch.stack([texture.roll(int(step), dims=1) for step in frames])
+    moving = replace(train, pixels=images, flow=None)
+    scene = replace(healthy, dynamic=replace(healthy.dynamic, train=moving))
+    said = [advice for advice in advice_on(scene) if advice.where == "optical flow"]
+    assert [f"{pixels} px" in advice.what for advice in said] == [True] * far

@@ -8,11 +8,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from devrf.apps.images import evenly
 from devrf.apps.inspection.layout import box_middle, box_points, widest_gap
 from devrf.errors import DevrfError
 from devrf.geometry.clock import FrameClock
 from devrf.scenes.bounds import box_from_cameras
-from devrf.scenes.optical_flow import frame_pairs
+from devrf.scenes.optical_flow import estimator, flow_between, frame_pairs
 from devrf.scenes.scene import Scene, Views
 
 # Largest gap between neighbouring static views, as seen from the box's middle, in degrees.
@@ -26,6 +27,11 @@ FLAT = 2
 OPAQUE = 127
 # Share of the pixels (in the alpha mask, where there is one) that the flow should cover at least.
 MIN_FLOW = 0.02
+# Motion from a frame to the next, as a share of the image's longer side, that a frame's learning
+# may not follow without optical flow.
+FAR = 0.05
+# Pairs of frames in which motion is looked for.
+SAMPLED_PAIRS = 6
 # Masks of passers-by rarely leave out more than this share of the pixels.
 MUCH_MASKED = 0.5
 
@@ -249,9 +255,16 @@ def _times(scene: Scene) -> Iterator[Advice]:
 
 def _flow(scene: Scene) -> Iterator[Advice]:
     views, flow = scene.dynamic.train, scene.dynamic.train.flow
-    if flow is None:
-        return
     longest = max(views.width, views.height)
+    if flow is None:
+        length = 0.0 if views.by_moving_camera else _frame_to_frame(views)
+        if length > FAR * longest:
+            yield Advice(
+                "optical flow",
+                f"none, though parts move by {length:.0f} px from frame to frame, of {longest}",
+                "film more frames a second, or try data.flow=dis, which estimates it",
+            )
+        return
     long, broken, covered = [], [], []
     for k, _ in frame_pairs(views):
         vectors, valid = flow.vectors[k], flow.valid[k]
@@ -280,3 +293,15 @@ def _flow(scene: Scene) -> Iterator[Advice]:
             f"valid on {100 * share:.1f} % of {where}",
             "check its masks, or set data.flow=dis to estimate it",
         )
+
+
+def _frame_to_frame(views: Views) -> float:
+    """How far parts move between two frames, in pixels: of a few pairs, the 99th percentile."""
+    longest, between = 0.0, estimator("dis")
+    pairs = frame_pairs(views)
+    for image, earlier in (pairs[k] for k in evenly(len(pairs), SAMPLED_PAIRS)):
+        vectors, valid = flow_between(views, image, earlier, between)
+        lengths = vectors[valid].norm(dim=-1)
+        if len(lengths):
+            longest = max(longest, float(lengths.quantile(0.99)))
+    return longest
