@@ -87,12 +87,14 @@ class HyperNeRF(Nerfies):
 
     Attributes:
         opened: () β, how many octaves of w enter T; stored with the weights.
+        slicing: H; or a w for each frame.
     """
 
     name: ClassVar[str] = "hypernerf"
     settings_class: ClassVar[type[FieldSettings]] = HyperNeRFSettings
     settings: HyperNeRFSettings
     opened: Tensor
+    slicing: SlicingSurface | TimeCodes
 
     def __init__(self, settings: HyperNeRFSettings | None = None) -> None:
         """Build the networks, as published if no settings are given."""
@@ -109,7 +111,7 @@ class HyperNeRF(Nerfies):
         """Take the frames' times, and draw a code for each, and a w if that is the frame's."""
         super().set_times(times)
         if self.settings.slicing == "plane":
-            self.planes = TimeCodes(times, self.settings.ambient).to(self.device)
+            self.slicing = TimeCodes(times, self.settings.ambient).to(self.device)
 
     def follow(self, step: ProtocolStage) -> None:
         """Static images alone do not open ambient space."""
@@ -127,11 +129,10 @@ class HyperNeRF(Nerfies):
     def bend(self, points: Tensor, time: Tensor) -> tuple[Tensor, Tensor | None]:
         """W(x, ω) and γ_β(w)."""
         code = self.codes(time)
-        w = self.planes(time) if self.settings.slicing == "plane" else self.slicing(points, code)
+        w = self.slicing(time) if self.settings.slicing == "plane" else self.slicing(points, code)
         window = octave_window(self.opened, self.settings.ambient_bands)
         return self.warp(points, code), self.encode(w, window)
 
     def parts(self) -> dict[str, Iterable[nn.Parameter]]:
         """Those of Nerfies; what slices; and, apart from T, the weights by which w enters it."""
-        slicing = self.planes if self.settings.slicing == "plane" else self.slicing
-        return {**super().parts(), "ambient": slicing.parameters()}
+        return {**super().parts(), "ambient": self.slicing.parameters()}
