@@ -74,7 +74,7 @@ def test_a_protocol_trains_scores_and_films(devrf, tmp_path, request, method, pr
         ("dnerf", ["+ray_stage.loss.elastic=1"], "ray_stage.loss: unknown term 'elastic'"),
         ("hypernerf", [f"{SETTINGS}.slicing=line"], "slicing: expected"),
         ("nsff", ["protocol=two_stage"], "method=nsff does not learn by protocol=two_stage"),
-        ("neural_volumes", ["data.train_views=1"], "expected 2 fixed training cameras"),
+        ("neural_volumes", ["data.train_views=1"], "encoder_views: expected at most 1"),
     ],
 )
 def test_what_cannot_be_is_said_in_one_line(devrf, tiny_data, method, asked, said):
