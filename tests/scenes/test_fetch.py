@@ -13,7 +13,14 @@ import pytest
 
 from devrf.cli.config import config_folder
 from devrf.errors import DevrfError
-from devrf.scenes.fetch import Collection, PublishedScene, _unpacked, catalogue, published_scene
+from devrf.scenes.fetch import (
+    MARKERS,
+    Collection,
+    PublishedScene,
+    _unpacked,
+    catalogue,
+    published_scene,
+)
 
 SCENES = catalogue()
 
@@ -29,7 +36,7 @@ def test_each_scene_has_a_layout_and_addresses():
         assert (config_folder() / "data" / f"{scene.collection.data}.yaml").is_file()
         for url in scene.downloads.values():
             assert url.startswith("https://") and not set("{} ") & set(url)
-        assert scene.is_archive or scene.marker in scene.downloads
+        assert scene.is_archive or MARKERS[scene.collection.data] in scene.downloads
         assert set(scene.collection.sha256) <= set(scene.collection.scenes)
 
 

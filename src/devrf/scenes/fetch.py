@@ -108,11 +108,6 @@ class PublishedScene:
         """Whether one archive is fetched, to be unpacked."""
         return not self.collection.files
 
-    @property
-    def marker(self) -> str:
-        """The file by which its folder is known."""
-        return MARKERS[self.collection.data]
-
 
 def catalogue(file: str | Path | None = None) -> list[PublishedScene]:
     """The scenes of a catalogue; None: devrf's own.
@@ -141,12 +136,12 @@ def published_scene(name: str, file: str | Path | None = None) -> PublishedScene
         DevrfError: it has none of that name.
     """
     scenes = {scene.name: scene for scene in catalogue(file)}
-    if name not in scenes:
-        meant = did_you_mean(name, scenes, "scene=")
-        raise DevrfError(
-            f"scene: stage=fetch knows no {name!r}; choose one of {', '.join(scenes)}{meant}"
-        )
-    return scenes[name]
+    if name in scenes:
+        return scenes[name]
+    meant = did_you_mean(name, scenes, "scene=")
+    raise DevrfError(
+        f"scene: stage=fetch knows no {name!r}; choose one of {', '.join(scenes)}{meant}"
+    )
 
 
 @dataclass(frozen=True)
@@ -188,13 +183,7 @@ def fetch_scene(scene: PublishedScene, into: Path, sha256: str | None, progress:
     """Download a scene to ``into``/<its name>, which appears when it is whole and checked.
 
     Files that have come are kept beside it until all are there: the same command goes on with the
-    others.
-
-    Args:
-        scene: which.
-        into: the folder below which it is put.
-        sha256: the checksum to insist on; None: the catalogue's, if it has one.
-        progress: whether to show a bar.
+    others. ``sha256`` is the checksum to insist on; None: the catalogue's, if it has one.
 
     Raises:
         DevrfError: it cannot be fetched, or is not what was expected.
@@ -265,14 +254,12 @@ def _download(scene: PublishedScene, folder: Path, progress: bool) -> dict[str, 
 
 def _digest(files: dict[str, Path]) -> str:
     """The SHA-256 of an archive; of several files that of the lines that sha256sum prints."""
+    import pooch
 
-    def of(path: Path) -> str:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-
+    digests = {name: str(pooch.file_hash(str(path))) for name, path in files.items()}
     if list(files) == [ARCHIVE]:
-        return of(files[ARCHIVE])
-    lines = "".join(f"{of(files[name])}  {name}\n" for name in sorted(files))
+        return digests[ARCHIVE]
+    lines = "".join(f"{digests[name]}  {name}\n" for name in sorted(files))
     return hashlib.sha256(lines.encode()).hexdigest()
 
 
@@ -290,14 +277,15 @@ def _unpacked(scene: PublishedScene, work: Path) -> Path:
             "again"
         ) from None
     folder = scene.collection.folder and scene.collection.folder.format(scene=scene.name)
+    marker = MARKERS[scene.collection.data]
     found = [
         path.parent
-        for path in sorted(place.rglob(scene.marker))
+        for path in sorted(place.rglob(marker))
         if "__MACOSX" not in path.parts and folder in (None, path.parent.name)
     ]
     if not found:
         raise DevrfError(
-            f"{archive}: holds no {folder or 'folder'} with {scene.marker}; what is "
+            f"{archive}: holds no {folder or 'folder'} with {marker}; what is "
             "published has changed: unpack it by hand"
         )
     return min(found, key=lambda path: len(path.parts))

@@ -41,10 +41,7 @@ class DycheckReader(ItemsReader):
     """Reads ``splits/train.json``, ``splits/val.json``, ``scene.json``, ``camera/``, ``rgb/<n>x/``.
 
     One moving camera is learned from, others are held out. Times are the ``time_ids`` of the
-    splits, brought to [0, 1]; there is no static set. World, near and far are those of
-    ``scene.json``; images come from ``rgb/<downscale>x``, or from a larger folder and are made
-    smaller. Without alpha masks the scene is unbounded, or, where the cameras look in nearly one
-    direction, the box is all that they see between near and far. Depth is left alone.
+    splits, brought to [0, 1]. Depth is left alone.
 
     Attributes:
         masks: ``ignore``: what ``covisible/`` says that training has hardly seen is not scored;

@@ -72,11 +72,7 @@ _WORLD = TypeAdapter(World)
 def placed(
     reader: InwardReader, folder: Path, world: World, static: Capture, dynamic: Capture
 ) -> Scene:
-    """The scene of two captures, near and far as the options or else the world have them.
-
-    Without alpha masks the scene is unbounded, or, where the cameras look in nearly one direction,
-    the box is all that they see between near and far.
-    """
+    """The scene of two captures, near and far as the options or else the world have them."""
     near = world.near if reader.near is None else reader.near
     far = world.far if reader.far is None else reader.far
     options, cameras = replace(reader, near=near, far=far), static.train.cameras
@@ -129,8 +125,7 @@ def read_camera(folder: Path, item: str, world: World) -> tuple[Tensor, Intrinsi
     """The camera of the image with the id ``item``.
 
     Returns:
-        The camera-to-world transform (3, 4) float32 in OpenGL axes, world units, and the
-        intrinsics in pixels of the full image.
+        Camera-to-world (3, 4) float32, OpenGL axes, world units; intrinsics of the full image.
 
     Raises:
         DevrfError: the file is missing, or a value in it is wrong.
@@ -162,6 +157,11 @@ Listed = tuple[list[str], list[int], list[int]]
 @dataclass(frozen=True)
 class ItemsReader(InwardReader):
     """Reads layouts that keep a camera file for each image, and have no static set.
+
+    World units are those of ``scene.json``: (position − center) · scale; it gives near and far,
+    too. Images come from ``rgb/<downscale>x``, or from a larger folder and are made smaller.
+    Without alpha masks the scene is unbounded, or, where the cameras look in nearly one direction,
+    the box is all that they see between near and far.
 
     Attributes:
         holdout: where no list says what is held out, one of so many images is.
@@ -227,9 +227,6 @@ class ItemsReader(InwardReader):
         return placed(self, folder, world, *captures)
 
 
-METADATA = "metadata.json"
-
-
 class _Dataset(BaseModel):
     """``dataset.json``: the ids of the images; numbers are taken for text."""
 
@@ -255,12 +252,8 @@ _MOMENTS = TypeAdapter(dict[str, _Moment])
 class NerfiesReader(ItemsReader):
     """Reads ``dataset.json``, ``metadata.json``, ``scene.json``, ``camera/`` and ``rgb/<n>x/``.
 
-    World units are those of ``scene.json``: (position − center) · scale; it gives near and far,
-    too. The time of an image is its ``time_id`` (HyperNeRF), else its ``warp_id``, brought to
-    [0, 1]. Images come from ``rgb/<downscale>x``, or from a larger folder and are made smaller;
-    they are undistorted. With one time for all of them the scene is at rest.
-    Without alpha masks the scene is unbounded, or, where the cameras look in
-    nearly one direction, the box is all that they see between near and far.
+    The time of an image is its ``time_id`` (HyperNeRF), else its ``warp_id``, brought to [0, 1].
+    Images are undistorted. With one time for all of them the scene is at rest.
     """
 
     listing: ClassVar[str] = "dataset.json"
@@ -270,55 +263,46 @@ class NerfiesReader(ItemsReader):
 
     def listed(self, folder: Path) -> Listed:
         """The ids in ``dataset.json``."""
-        return _items(folder / self.listing, self.holdout)
+        file = folder / self.listing
+        listed = read_json(file, _DATASET, "it lists the images; add it")
+        ids, train, val = listed.ids or [], listed.train_ids or [], listed.val_ids or []
+        items = ids or list(dict.fromkeys(train + val))
+        position = {item: i for i, item in enumerate(items)}
+        unknown = [item for item in train + val if item not in position]
+        if unknown:
+            raise scene_error(
+                file, f'{abbreviated(unknown[0])} is in train_ids or val_ids, but not in "ids"'
+            )
+        if not val:
+            chosen = [position[item] for item in train or items]
+            if len(chosen) < 2:
+                raise scene_error(
+                    file, f"lists {len(chosen)} images to learn from, none in val_ids; add some"
+                )
+            learn, held_out = every_nth(len(chosen), self.holdout)
+            return items, [chosen[i] for i in learn], [chosen[i] for i in held_out]
+        both = set(train) & set(val)
+        if both:
+            log.warning("%s: %d images of val_ids are in train_ids too; held out", file, len(both))
+        learned = [position[item] for item in train or items if item not in set(val)]
+        if not learned:
+            raise scene_error(
+                file, "all images are held out by val_ids; list some in train_ids only"
+            )
+        return items, learned, [position[item] for item in val]
 
     def moments(self, folder: Path, ids: Sequence[str]) -> Sequence[float]:
-        """The times in ``metadata.json``."""
-        return _times(folder / METADATA, ids)
-
-
-def _items(file: Path, holdout: int) -> Listed:
-    listed = read_json(file, _DATASET, "it lists the images; add it")
-    ids, train, val = listed.ids or [], listed.train_ids or [], listed.val_ids or []
-    items = ids or list(dict.fromkeys(train + val))
-    position = {item: i for i, item in enumerate(items)}
-    unknown = [item for item in train + val if item not in position]
-    if unknown:
-        raise scene_error(
-            file, f'{abbreviated(unknown[0])} is in train_ids or val_ids, but not in "ids"'
-        )
-    if not val:
-        chosen = [position[item] for item in train] or list(range(len(items)))
-        if len(chosen) < 2:
-            raise scene_error(
-                file, f"lists {len(chosen)} images to learn from, none in val_ids; add some"
-            )
-        learn, held_out = every_nth(len(chosen), holdout)
-        return items, [chosen[i] for i in learn], [chosen[i] for i in held_out]
-    held = set(val)
-    both = [item for item in train if item in held]
-    if both:
-        log.warning("%s: %d images of val_ids are in train_ids too; held out", file, len(both))
-    learned = [position[item] for item in train or items if item not in held]
-    if not learned:
-        raise scene_error(file, "all images are held out by val_ids; list some in train_ids only")
-    return items, learned, [position[item] for item in val]
-
-
-def _times(file: Path, items: Sequence[str]) -> tuple[float, ...]:
-    """When each image was taken, on the scale of the file."""
-    moments = read_json(
-        file,
-        _MOMENTS,
-        "it says when each image was taken; add it, with one time_id for all of a scene at rest",
-    )
-    for item in items:
-        if item not in moments:
-            raise scene_error(file, f"says nothing of image {abbreviated(item)}; add its warp_id")
-    taken = [moments[item].time_id for item in items]
-    if None in taken:
-        taken = [moments[item].warp_id for item in items]
-    if None in taken:
-        item = items[taken.index(None)]
-        raise scene_error(file, f"image {abbreviated(item)} has no warp_id; add it")
-    return tuple(time for time in taken if time is not None)
+        """The times in ``metadata.json``: all ``time_id``, or else all ``warp_id``."""
+        file = folder / "metadata.json"
+        purpose = "it says when each image was taken; add it, with one time_id for all at rest"
+        moments = read_json(file, _MOMENTS, purpose)
+        absent = [item for item in ids if item not in moments]
+        if absent:
+            raise scene_error(file, f"lacks image {abbreviated(absent[0])}; add its warp_id")
+        times = [moments[item].time_id for item in ids]
+        if None in times:
+            times = [moments[item].warp_id for item in ids]
+        if None in times:
+            item = ids[times.index(None)]
+            raise scene_error(file, f"image {abbreviated(item)} has no warp_id; add it")
+        return [time for time in times if time is not None]

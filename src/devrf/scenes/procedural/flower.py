@@ -14,19 +14,28 @@ from devrf.scenes.procedural.solids import (
     Paint,
     PaintedParts,
     Rgb,
-    blade,
     rounded_box,
     rounded_cylinder,
-    sphere,
 )
 
 # Share of the opening that a petal turns by at its hinge; the rest builds up towards its tip.
 _AT_HINGE = 0.6
 
 
+def _frame(azimuth: float, elevation: float, out: float, up: float) -> tuple[Tensor, Tensor]:
+    """Axes (3, 3) as columns (along, across, normal) and hinge (3,) of a blade, float64.
+
+    Its hinge is ``out`` from the z axis in the direction ``azimuth`` and ``up`` above the origin.
+    """
+    around = rotation((0, 0, 1), azimuth)
+    hinge = around @ torch.tensor([out, 0, 0], dtype=torch.float64)
+    hinge = hinge + torch.tensor([0, 0, up], dtype=torch.float64)
+    return around @ rotation((0, 1, 0), -elevation), hinge
+
+
 @dataclass(frozen=True)
 class Blade:
-    """A pointed lens that starts at its hinge; lengths in world units.
+    """A pointed lens that starts at its hinge, where two equal discs overlap; world units.
 
     Attributes:
         half_length: half of its length.
@@ -40,7 +49,14 @@ class Blade:
 
     def distance(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         """Distance (M,) of points along, across and above it."""
-        return blade(x - self.half_length, y, z, self.half_length, self.half_width, self.thickness)
+        a, b = self.half_length, self.half_width
+        # A disc with its centre on the y axis that passes the tip (a, 0) and the side (0, b).
+        offset = (a**2 - b**2) / (2 * b)
+        ax, ay = (x - a).abs(), y.abs()
+        on_arc = torch.hypot(ax, ay + offset) - (offset + b)
+        facing_arc = (ay + offset) * a >= offset * ax
+        lens = torch.where(facing_arc, on_arc, torch.hypot(ax - a, ay))
+        return torch.hypot(lens.clamp_min(0), z) - self.thickness
 
 
 @dataclass(frozen=True)
@@ -60,11 +76,6 @@ class Leaf:
     elevation: float
     blade: Blade
     paint: Paint
-
-    def frame(self) -> tuple[Tensor, Tensor]:
-        """Axes (3, 3) as columns (along, across, normal) and hinge (3,), float64."""
-        axes = rotation((0, 0, 1), self.azimuth) @ rotation((0, 1, 0), -self.elevation)
-        return axes, torch.tensor([0, 0, self.height], dtype=torch.float64)
 
 
 @dataclass(frozen=True)
@@ -92,13 +103,6 @@ class Whorl:
     opening: float
     blade: Blade
     paints: tuple[Paint, Paint]
-
-    def frame(self, petal: int) -> tuple[Tensor, Tensor]:
-        """Axes (3, 3) as columns (along, across, normal) and hinge (3,) at rest, float64."""
-        around = rotation((0, 0, 1), petal * 2 * math.pi / self.count)
-        hinge = around @ torch.tensor([self.hinge, 0, 0], dtype=torch.float64)
-        hinge = hinge + torch.tensor([0, 0, HEAD], dtype=torch.float64)
-        return around @ rotation((0, 1, 0), -self.elevation), hinge
 
     def nearest(self, points: Tensor) -> Tensor:
         """Number (M,) of the petal whose sector holds each point (M, 3).
@@ -203,17 +207,18 @@ _STEM_MIDDLE, _STEM_HALF = (HEAD + BASE) / 2, (HEAD - BASE) / 2
 
 def _painted() -> PaintedParts:
     """The paints of all parts in the order of their numbers."""
-    upright = torch.eye(3, dtype=torch.float64)
-    heights = (POT_CENTER, _STEM_MIDDLE, HEAD)
-    frames = [(upright, torch.tensor([0, 0, h], dtype=torch.float64)) for h in heights]
-    frames += [leaf.frame() for leaf in LEAVES]
+    frames = [_frame(0, 0, 0, height) for height in (POT_CENTER, _STEM_MIDDLE, HEAD)]
     paints = [POT_PAINT, STEM_PAINT, HEART_PAINT]
-    paints += [leaf.paint for leaf in LEAVES]
+    for leaf in LEAVES:
+        frames.append(_frame(leaf.azimuth, leaf.elevation, 0, leaf.height))
+        paints.append(leaf.paint)
     for whorl in WHORLS:
-        frames += [whorl.frame(k) for k in range(whorl.count)]
-        paints += [whorl.paints[k % 2] for k in range(whorl.count)]
+        for k in range(whorl.count):
+            azimuth = k * 2 * math.pi / whorl.count
+            frames.append(_frame(azimuth, whorl.elevation, whorl.hinge, HEAD))
+            paints.append(whorl.paints[k % 2])
     axes, origins = zip(*frames, strict=True)
-    return PaintedParts(paints, torch.stack(axes), torch.stack(origins))
+    return PaintedParts(paints, torch.stack(origins), torch.stack(axes))
 
 
 _PAINTED = _painted()
@@ -276,11 +281,9 @@ class Flower:
             (HEART, HEART, HEART),
         ]
         middle = [(0.0, 0.0, 0.0)] * len(half)
-        blades = [leaf.blade for leaf in LEAVES]
-        for whorl in WHORLS:
-            blades += [whorl.blade] * whorl.count
-        for each in blades:
-            a, b, t = each.half_length, each.half_width, each.thickness
+        petals = [whorl.blade for whorl in WHORLS for _ in range(whorl.count)]
+        for blade in [leaf.blade for leaf in LEAVES] + petals:
+            a, b, t = blade.half_length, blade.half_width, blade.thickness
             half.append((a + t, b + t, t))
             # A blade's frame starts at its hinge.
             middle.append((a, 0.0, 0.0))
@@ -297,7 +300,7 @@ class Flower:
         x, y, z = unbent.unbind(-1)
         r = STEM_RADIUS
         stem = rounded_box(x, y, z - _STEM_MIDDLE, (r, r, _STEM_HALF), r)
-        heart = sphere(x, y, z - HEAD, HEART)
+        heart = length(unbent - unbent.new_tensor([0.0, 0.0, HEAD])) - HEART
         leaves = []
         for number, leaf in enumerate(LEAVES, start=FIRST_LEAF):
             axes, hinge = _PAINTED.rotation[number], _PAINTED.origin[number]

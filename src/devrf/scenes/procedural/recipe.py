@@ -25,7 +25,7 @@ from devrf.scenes.procedural.rigs import (
     static_rig,
 )
 from devrf.scenes.procedural.robot import Robot
-from devrf.scenes.procedural.solids import BoundedShape, Shape
+from devrf.scenes.procedural.solids import Shape
 from devrf.scenes.procedural.surroundings import REACH, STEPS, Backdrop, Room, Surrounded
 from devrf.scenes.scene import Bounds, Scene
 from devrf.scenes.space import inward_space
@@ -176,7 +176,7 @@ class ProceduralScene(Recipe):
         room = Room(floor=where.motion.low[2], weave=self.texture == "fine")
         return Surrounded(shape, room, where.reach)
 
-    def model(self) -> BoundedShape:
+    def model(self) -> Robot | Flower:
         """The moving shape itself."""
         return Robot(self.speed) if self.shape == "robot" else Flower(self.speed)
 

@@ -50,21 +50,8 @@ class Shape(Protocol):
         ...
 
 
-class BoundedShape(Shape, Protocol):
-    """A shape that ends somewhere."""
-
-    def outline(self) -> Material:
-        """Material points around every part, so that their bounding box holds the object."""
-        ...
-
-
 # Lengths that a caller may give as a number, or as a tensor of one length for each primitive.
 Length = float | Tensor
-
-
-def sphere(x: Tensor, y: Tensor, z: Tensor, radius: Length) -> Tensor:
-    """A ball of ``radius`` about the origin."""
-    return (x * x + y * y + z * z).sqrt() - radius
 
 
 def rounded_box(
@@ -88,27 +75,6 @@ def rounded_cylinder(
     across, up = torch.hypot(x, y) - (radius - rounding), z.abs() - (half_height - rounding)
     outside = torch.hypot(across.clamp_min(0), up.clamp_min(0))
     return outside + torch.maximum(across, up).clamp_max(0) - rounding
-
-
-def blade(
-    x: Tensor, y: Tensor, z: Tensor, half_length: float, half_width: float, thickness: float
-) -> Tensor:
-    """A leaf: a pointed lens in the x-y plane, inflated by ``thickness``.
-
-    The lens is where two equal discs overlap; its tips are at x = ± half_length, its sides at
-    y = ± half_width.
-    """
-    # A disc with its centre on the y axis that passes the tip (a, 0) and the side (0, b).
-    offset = (half_length**2 - half_width**2) / (2 * half_width)
-    radius = offset + half_width
-    ax, ay = x.abs(), y.abs()
-    facing_arc = (ay + offset) * half_length >= offset * ax
-    lens = torch.where(
-        facing_arc,
-        torch.hypot(ax, ay + offset) - radius,
-        torch.hypot(ax - half_length, ay),
-    )
-    return torch.hypot(lens.clamp_min(0), z) - thickness
 
 
 Xyz = tuple[float, float, float]
@@ -146,13 +112,16 @@ class PaintedParts:
         origin: (K, 3) origin of each part at rest, world units.
     """
 
-    def __init__(self, paints: Sequence[Paint], rotation: Tensor, origin: Tensor) -> None:
-        """The table of ``paints`` (K of them) in frames (K, 3, 3), (K, 3)."""
+    def __init__(
+        self, paints: Sequence[Paint], origin: Tensor, rotation: Tensor | None = None
+    ) -> None:
+        """The table of ``paints`` (K of them); without ``rotation`` all parts are upright."""
 
         def table(rows: list[tuple[float, ...]]) -> Tensor:
             return torch.tensor(rows, dtype=torch.float64)
 
-        self.rotation = rotation
+        upright = torch.eye(3, dtype=torch.float64).repeat(len(paints), 1, 1)
+        self.rotation = upright if rotation is None else rotation
         self.origin = origin
         self._base = table([p.base for p in paints])
         self._accent = table([p.accent for p in paints])
@@ -173,7 +142,7 @@ class PaintedParts:
         return torch.lerp(self._base.to(rest)[part], self._accent.to(rest)[part], share)
 
     def outline(self, half: Tensor, middle: Tensor) -> Material:
-        """A grid of points over the boxes around the parts.
+        """A grid of points over the boxes around the parts, so that theirs holds the object.
 
         Args:
             half: (K, 3) half edges along the parts' axes, world units.
@@ -212,22 +181,20 @@ class SolidTable:
 
     Attributes:
         center: (K, 3) float64 centres as the solids give them.
-        half: (K, 3) float32 outer half edges.
         painted: their textures, in the world.
     """
 
     def __init__(self, solids: Sequence[Solid], base: Xyz = (0.0, 0.0, 0.0)) -> None:
         """Tables of ``solids`` whose centres are relative to ``base`` (world units)."""
         self.center = torch.tensor([s.center for s in solids], dtype=torch.float64)
-        self.half = torch.tensor([s.half for s in solids])
+        self._half = torch.tensor([s.half for s in solids])
         self._rounding = torch.tensor([s.rounding for s in solids])[:, None]
-        upright = torch.eye(3, dtype=torch.float64).repeat(len(solids), 1, 1)
         origin = self.center + torch.tensor(base, dtype=torch.float64)
-        self.painted = PaintedParts([s.paint for s in solids], upright, origin)
+        self.painted = PaintedParts([s.paint for s in solids], origin)
 
     def distances(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         """Distance (K, M) to each solid of coordinates (K, M) about its centre, along its axes."""
-        a, b, c = self.half.to(x).T[..., None]
+        a, b, c = self._half.to(x).T[..., None]
         return rounded_box(x, y, z, (a, b, c), self._rounding.to(x))
 
     def distances_of(self, points: Tensor) -> Tensor:
@@ -236,4 +203,4 @@ class SolidTable:
 
     def outline(self) -> Material:
         """Points around the solids at rest."""
-        return self.painted.outline(self.half, torch.zeros_like(self.half))
+        return self.painted.outline(self._half, torch.zeros_like(self._half))

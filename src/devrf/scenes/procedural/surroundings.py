@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -22,24 +22,6 @@ from devrf.scenes.procedural.solids import (
 )
 
 
-class Surroundings(Protocol):
-    """Things around a shape, which stand still.
-
-    Attributes:
-        parts: how many things there are; each is a part.
-    """
-
-    parts: ClassVar[int]
-
-    def distances(self, points: Tensor) -> Tensor:
-        """Lower bounds (K, M) of the distances of ``points`` (M, 3) to the K parts."""
-        ...
-
-    def color(self, material: Material) -> Tensor:
-        """Albedo (M, 3) in [0, 1] of material of the parts, whatever it is for other material."""
-        ...
-
-
 @dataclass(frozen=True)
 class Surrounded:
     """A :class:`~devrf.scenes.procedural.solids.Shape` among still surroundings.
@@ -54,7 +36,7 @@ class Surrounded:
     """
 
     shape: Shape
-    surroundings: Surroundings
+    surroundings: Backdrop | Room
     reach: float | None = None
 
     def distance(self, points: Tensor, time: float) -> Tensor:
@@ -226,10 +208,10 @@ _FURNITURE = (
     _box((-1.5, -4.95, 2.8), (1.0, 0.08, 0.7), SAGE, LINEN, 1.2, 0.04),
 )
 _TABLE = SolidTable(_FURNITURE)
-_PAPER = PaintedParts(
-    _SURFACES,
-    torch.eye(3, dtype=torch.float64).repeat(len(_SURFACES), 1, 1),
-    torch.zeros(len(_SURFACES), 3, dtype=torch.float64),
+# The pattern of floor, ceiling and walls starts at the world's origin.
+_PAINTED = PaintedParts(
+    [*_SURFACES, *(solid.paint for solid in _FURNITURE)],
+    torch.cat([torch.zeros(len(_SURFACES), 3, dtype=torch.float64), _TABLE.center]),
 )
 
 
@@ -259,12 +241,10 @@ class Room:
     def color(self, material: Material) -> Tensor:
         """The paper or the paint (M, 3)."""
         lifted = material.rest - material.rest.new_tensor([0.0, 0.0, self.floor])
-        furniture = (material.part - len(_SURFACES)).clamp(0, len(_FURNITURE) - 1)
-        painted = _TABLE.painted.color(Material(lifted, furniture))
-        papered = _PAPER.color(Material(lifted, material.part.clamp(max=len(_SURFACES) - 1)))
+        painted = _PAINTED.color(Material(lifted, material.part.clamp(max=self.parts - 1)))
         # A slow wave of brightness along each axis makes repeats of the pattern differ.
         slow = (lifted * lifted.new_tensor([0.55, 0.71, 0.83]) + 0.4).cos().mean(dim=-1)
-        papered = papered * (0.82 + 0.18 * slow)[:, None]
+        papered = painted * (0.82 + 0.18 * slow)[:, None]
         color = torch.where((material.part < len(_SURFACES))[:, None], papered, painted)
         if not self.weave:
             return color
