@@ -33,7 +33,7 @@ defaults:
   - schedule: paper_inward
   - loss: best
   - local: mine
-run: ${devrf.run_name:${local.name},base}
+run: ${devrf.run_name:${local.name},base,devrf,two_stage}
 label: ${devrf.scene_name:${scene}}
 hydra:
   output_subdir: null
