@@ -15,7 +15,7 @@ from kornia.geometry.conversions import (
     quaternion_to_rotation_matrix,
     rotation_matrix_to_quaternion,
 )
-from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, TypeAdapter, ValidationError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, ValidationError
 from torch import Tensor
 
 from devrf.errors import DevrfError
@@ -196,9 +196,6 @@ class _PathFile(BaseModel):
     fps: Positive = 24.0
 
 
-_FILE = TypeAdapter(_PathFile)
-
-
 def read_path(file: Path) -> CameraPath:
     """The camera path in a file.
 
@@ -211,13 +208,13 @@ def read_path(file: Path) -> CameraPath:
     Raises:
         DevrfError: there is no such file, or it is no camera path.
     """
-    return _path(read_json(file, _FILE, "give video.path a file that the viewer saved"), file)
+    return _path(read_json(file, _PathFile, "give video.path a file that the viewer saved"), file)
 
 
 def path_from(content: bytes, name: str) -> CameraPath:
     """As :func:`read_path`, from the ``content`` of a file called ``name``."""
     try:
-        return _path(_FILE.validate_json(content), name)
+        return _path(_PathFile.model_validate_json(content), name)
     except ValidationError as error:
         raise first_error(error, f"{name}: ") from None
 

@@ -30,15 +30,10 @@ GIVE = "set data.box=[[x,y,z],[x,y,z]], data.near and data.far"
 
 
 def nearest_point(origins: Tensor, axes: Tensor, parallel: float) -> Tensor | None:
-    """The point (3,) nearest to N axes (N, 3) through ``origins`` (N, 3), by least squares.
+    """The point (3,) nearest to N lines through ``origins`` (N, 3) along unit ``axes`` (N, 3).
 
-    Solves Σ (I − d dᵀ) p = Σ (I − d dᵀ) o for axes through o along d.
-
-    Args:
-        origins: a point of each axis.
-        axes: unit directions.
-        parallel: the mean square sine of the angle between the axes and their common direction
-            from which on there is such a point; with less, None.
+    By least squares: solves Σ (I − d dᵀ) p = Σ (I − d dᵀ) o. None where the mean square sine of the
+    angle between the axes and their common direction is below ``parallel``.
     """
     across = torch.eye(3, dtype=axes.dtype) - axes[:, :, None] * axes[:, None, :]
     normal = across.mean(dim=0)
@@ -145,12 +140,9 @@ def inward_bounds(
 ) -> Bounds:
     """Bounds in the world of a scene that its cameras look in at.
 
-    Arguments are those of :func:`devrf.scenes.space.inward_space`. With ``bound_scale="auto"``
-    silhouettes say where it moves, where there are alpha masks; else the given box, or a fixed
-    scale, leaves room.
-
-    Raises:
-        DevrfError: the cameras do not say where the scene is, or near ≥ far.
+    Arguments and errors are those of :func:`devrf.scenes.space.inward_space`. With
+    ``bound_scale="auto"`` silhouettes say where it moves, where there are alpha masks; else the
+    given box, or a fixed scale, leaves room.
     """
     given = box is not None
     scale = FALLBACK_BOUND_SCALE if bound_scale == "auto" else float(bound_scale)
@@ -199,10 +191,9 @@ def reference_space(cameras: Cameras, near: float) -> NormalizedDevice:
 def forward_bounds(everyone: list[Views], space: NormalizedDevice, source: str) -> Bounds:
     """The box that holds all that cameras see from the near plane to infinity, in NDC.
 
-    Rays are straight in NDC too, so it is enough to follow the rays through the images'
-    corners: ``origin`` on the near plane (z' = −1), ``origin + direction`` at infinity (z' = 1).
-    Hence near = 0 and far = 1, in multiples of an NDC ray's direction. ``source`` says where the
-    room for motion comes from. Errors are those of :func:`box_between`.
+    Rays are straight in NDC too: ``origin`` is on the near plane (z' = −1), ``origin + direction``
+    at infinity (z' = 1); hence near = 0 and far = 1. ``source`` says where the room for motion
+    comes from. Errors are those of :func:`box_between`.
     """
     return Bounds(box_between(everyone, space), 0.0, 1.0, None, 1.0, source)
 
@@ -210,13 +201,9 @@ def forward_bounds(everyone: list[Views], space: NormalizedDevice, source: str) 
 def box_between(
     everyone: list[Views], space: NormalizedDevice, front: float = -1.0, back: float = 1.0
 ) -> Box:
-    """The box, in NDC, of what cameras see from one depth to another.
+    """The box, in NDC, of what cameras see from z' = ``front`` to ``back``.
 
-    Args:
-        everyone: the views whose cameras count.
-        space: the scene's NDC.
-        front: z' of the nearest points, −1 at the near plane.
-        back: z' of the furthest, 1 at infinity.
+    −1 is the near plane, 1 infinity.
 
     Raises:
         DevrfError: a camera sees something that is not before the reference camera.

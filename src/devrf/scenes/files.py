@@ -11,7 +11,7 @@ from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
+from pydantic import AfterValidator, BaseModel, Field, ValidationError
 
 from devrf.errors import DevrfError
 from devrf.scenes.validation import LARGEST, abbreviated, first_error, scene_error
@@ -35,7 +35,7 @@ def _distinct(ids: list[str]) -> list[str]:
 
 Ids = Annotated[list[Name], Field(fail_fast=True), AfterValidator(_distinct)]
 
-Content = TypeVar("Content")
+Content = TypeVar("Content", bound=BaseModel)
 
 
 @contextmanager
@@ -88,18 +88,10 @@ def entries(folder: Path) -> list[Path]:
 
 
 def inside(root: Path, folder: Path, name: str, file: Path) -> Path:
-    """Where ``name``, text in a file, leads: somewhere below ``root``.
+    """Where ``name``, text in ``file``, leads from ``folder``: a path somewhere below ``root``.
 
     ``..`` is taken out of the text itself; links that lie in the scene's folder are followed.
-
-    Args:
-        root: the scene's folder.
-        folder: the folder, ``root`` or below, that the name is relative to.
-        name: the text.
-        file: the file that it came from, for the message.
-
-    Returns:
-        A path that starts with ``root``; whether there is such a file is not looked up.
+    Whether there is such a file is not looked up.
 
     Raises:
         DevrfError: the name leads outside, or no file can have it.
@@ -119,13 +111,8 @@ def inside(root: Path, folder: Path, name: str, file: Path) -> Path:
     return root / inner
 
 
-def read_json(file: Path, kind: TypeAdapter[Content], purpose: str) -> Content:
-    """The content of a JSON file that holds one object.
-
-    Args:
-        file: where it is.
-        kind: what the object must be.
-        purpose: what the file is needed for, for the message when it is missing.
+def read_json(file: Path, kind: type[Content], purpose: str) -> Content:
+    """The content of a JSON file that holds one object; ``purpose`` says what it is needed for.
 
     Raises:
         DevrfError: there is no such file, it is no JSON, a key is missing or its value wrong.
@@ -133,7 +120,7 @@ def read_json(file: Path, kind: TypeAdapter[Content], purpose: str) -> Content:
     try:
         # Some editors begin a file with a byte order mark.
         data = existing_file(file, purpose).read_bytes().removeprefix(codecs.BOM_UTF8)
-        return kind.validate_json(data)
+        return kind.model_validate_json(data)
     except OSError as error:
         raise scene_error(file, f"cannot be read ({error.strerror}); {purpose}") from None
     except ValidationError as error:
@@ -141,11 +128,7 @@ def read_json(file: Path, kind: TypeAdapter[Content], purpose: str) -> Content:
 
 
 def read_numbers(path: Path, expected: str) -> Numbers:
-    """The array in ``path``, in double precision.
-
-    Args:
-        path: an ``.npy`` file.
-        expected: what it should hold, in words, for the message.
+    """The array in an ``.npy`` file, in double precision; ``expected`` says what it should hold.
 
     Raises:
         DevrfError: there is no such file, it is damaged, or holds no numbers, or NaN or infinity.

@@ -24,7 +24,6 @@ from devrf.system.files import atomic_write
 
 log = logging.getLogger(__name__)
 
-
 REMEDY = "compute the flow again, or set data.flow=none"
 # Backward or forward: what a file's name ends with.
 FlowDirection = Literal["bwd", "fwd"]
@@ -35,16 +34,13 @@ _BYTES = 9
 def read_flow_file(
     path: Path, width: int, height: int
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
-    """One image's flow.
+    """The flow of one image of ``width`` × ``height`` pixels, before downscaling.
 
-    Args:
-        path: an npz with ``flow`` (H, W, 2), pixels, x then y, and ``mask`` (H, W).
-        width: columns of the image it belongs to, before downscaling.
-        height: rows of that image.
+    The npz has ``flow`` (H, W, 2), pixels, x then y, and ``mask`` (H, W).
 
     Returns:
-        vectors (H, W, 2) and valid (H, W); false where masked out, NaN, infinite or longer than
-        the image's sides together, where the vectors are 0.
+        vectors (H, W, 2) and valid (H, W); false where masked out, NaN, infinite or longer than the
+        image's sides together, where the vectors are 0.
 
     Raises:
         DevrfError: not an npz, an array is missing, or an array is of another size.
@@ -74,18 +70,18 @@ def read_flow(
     size: tuple[int, int],
     direction: FlowDirection = "bwd",
 ) -> OpticalFlow | None:
-    """The backward flow of N images, or the forward one.
+    """The backward flow (``fwd``: forward) of N images in ``<index>_<direction>.npz``.
 
     Args:
-        folder: where the ``<index>_bwd.npz`` lie.
+        folder: where the files lie.
         index: N positions in the list of frames, which the files are numbered by.
         expected: N flags: whether the image has an earlier frame (a later one), and so a file.
         source_size: (width, height) of the images before downscaling.
-        size: (width, height) after downscaling.
-        direction: ``fwd`` reads ``<index>_fwd.npz``.
+        size: (width, height) after downscaling: the flow's pixels.
+        direction: which of both.
 
     Returns:
-        Flow in pixels of the smaller images, or None when not one expected file is there.
+        None when not one expected file is there.
     """
     files = {
         row: folder / f"{number:03d}_{direction}.npz"
@@ -114,13 +110,10 @@ def warn_of_missing(present: int, expected: int, folder: Path) -> None:
 def stacked_flow(
     files: Mapping[int, Path], count: int, source_size: tuple[int, int], size: tuple[int, int]
 ) -> OpticalFlow:
-    """The flow of ``count`` images, in pixels of these; those without a file have none.
+    """The flow of ``count`` images; those without one of the ``files`` (at least one) have none.
 
-    Args:
-        files: which image's flow is in which file; at least one.
-        count: how many images there are.
-        source_size: (width, height) of the images before downscaling.
-        size: (width, height) after downscaling.
+    ``source_size`` is their (width, height) before downscaling, ``size`` after it: the flow's
+    pixels.
     """
     start = time.perf_counter()
     width, height = size

@@ -69,10 +69,7 @@ def frame_count(path: Path) -> int:
 def pictures(path: Path) -> Iterator[tuple[float, Picture]]:
     """Time in seconds since the first frame, and each frame, turned as its file says.
 
-    Of photographs the times are their positions.
-
-    Raises:
-        DevrfError: there is no such file, or it cannot be read as footage.
+    Of photographs the times are their positions. DevrfError when it is no footage.
     """
     if is_folder(path):
         for position, file in enumerate(listed_images(path)):
@@ -85,9 +82,7 @@ def pictures(path: Path) -> Iterator[tuple[float, Picture]]:
 def chosen(path: Path, positions: Sequence[int]) -> Iterator[tuple[int, Picture]]:
     """The frames at ``positions``, ascending, each with its position; no others are kept.
 
-    Raises:
-        DevrfError: there is no such file, it cannot be read as footage, or it ends before the last
-            position.
+    DevrfError when it is no footage, or ends before the last position.
     """
     wanted, last = set(positions), max(positions)
     if is_folder(path):

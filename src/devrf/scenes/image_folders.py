@@ -19,7 +19,6 @@ from devrf.scenes.validation import scene_error
 
 log = logging.getLogger(__name__)
 
-
 _DIGITS = re.compile(r"(\d+)")
 
 
@@ -47,16 +46,8 @@ def image_folder(
     """The folder in ``parent`` that saves most of the work of making images smaller.
 
     That is ``images_<downscale>``, else the largest factor that divides ``downscale``, down to
-    ``images`` itself; the rest is left to area averages.
-
-    Args:
-        parent: where the folders are.
-        downscale: integer factor ≥ 1.
-        full: name of the folder of full-size images.
-        reduced: that of a folder of smaller ones, ``{}`` in place of the factor.
-
-    Raises:
-        DevrfError: there is none.
+    ``images`` itself; the rest is left to area averages. ``full`` and ``reduced`` are the folders'
+    names, ``{}`` in place of the factor. DevrfError when there is none.
     """
     pattern = re.compile(re.escape(reduced).replace(r"\{\}", r"([1-9]\d{0,3})"))
     folders = {}
@@ -117,11 +108,8 @@ def whole_factor(downscale: int | str, side_at: Callable[[int], int | None]) -> 
     """The factor by which images are made smaller.
 
     A number is obeyed. ``up_to_<N>`` takes the largest factor up to N at which the shorter side
-    keeps 64 pixels, or else the one that leaves the most.
-
-    Args:
-        downscale: an option of that name.
-        side_at: the shorter side in pixels at a factor, None where it cannot be had.
+    keeps 64 pixels, or else the one that leaves the most. ``side_at`` gives the shorter side in
+    pixels at a factor, None where it cannot be had.
     """
     if isinstance(downscale, int):
         return downscale
@@ -148,11 +136,7 @@ def whole_factor(downscale: int | str, side_at: Callable[[int], int | None]) -> 
 def folder_factor(
     parent: Path, downscale: int | str, *, full: str = "images", reduced: str = "images_{}"
 ) -> int:
-    """:func:`whole_factor` for images in folders of several sizes; arguments as image_folder's.
-
-    Raises:
-        DevrfError: a folder holds no image, or one that cannot be read.
-    """
+    """:func:`whole_factor` for images in folders of several sizes; arguments as image_folder's."""
 
     def side_at(factor: int) -> int | None:
         try:
@@ -170,7 +154,7 @@ Missing = Literal["error", "skip"]
 def present_images(
     names: Sequence[str], file: Path, root: Path, missing: Missing
 ) -> dict[int, Path]:
-    """The existing images that a file lists, by their positions in the list.
+    """The existing images that ``file`` lists, by their positions in the list.
 
     Args:
         names: of N images, relative to the file's folder, with or without their suffix.
@@ -179,8 +163,7 @@ def present_images(
         missing: whether absent images are an error, or left out with one warning.
 
     Raises:
-        DevrfError: an image is absent and must not be, or all are; the line has the first one and
-            their number.
+        DevrfError: an image is absent and must not be, or all are.
     """
     places = [inside(root, file.parent, name, file) for name in names]
     found = {k: image for k, place in enumerate(places) if (image := image_at(place)) is not None}

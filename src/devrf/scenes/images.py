@@ -29,7 +29,6 @@ from devrf.scenes.validation import check_memory, reduced_size, same_shape, scen
 
 log = logging.getLogger(__name__)
 
-
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 # By content, not by name. Pillow reads many more formats, some by starting other programs.
 FORMATS = ("PNG", "JPEG", "WEBP")
@@ -91,9 +90,7 @@ def _open(path: Path) -> Image.Image:
 def read_header(path: Path, camera: Size | None = None) -> Header:
     """What an image file claims to be.
 
-    Args:
-        path: the file.
-        camera: (width, height) of the images that its camera is for; None: unknown.
+    ``camera`` is the (width, height) of the images that its camera is for; None: unknown.
 
     Raises:
         DevrfError: it is no image with 8 bits a channel, or one that Pillow takes for too large.
@@ -208,17 +205,16 @@ def load_images(
 
     Args:
         paths: at least one existing file, 8 bits a channel, with or without alpha.
-        downscale: integer factor ≥ 1; each side becomes floor(side / downscale), by area
-            averages of premultiplied colours.
-        cameras: (width, height) of the images that each camera is for, of any scale; None where
-            it is unknown, or of all.
-        finish: what to make of each RGBA image, by its position, before it is made smaller;
-            images without alpha come to it opaque.
+        downscale: integer factor ≥ 1; each side becomes floor(side / downscale), by area averages
+            of premultiplied colours.
+        cameras: (width, height) of the images that each camera is for, of any scale; None where it
+            is unknown, or of all.
+        finish: what to make of each RGBA image, by its position, before it is made smaller; images
+            without alpha come to it opaque.
 
     Raises:
-        DevrfError: a file cannot be read, differs in size from
-            the first one, or would fall under 8 px a side; or there are more than fit into
-            memory.
+        DevrfError: a file cannot be read, differs in size from the first one, or would fall under 8
+            px a side; or there are more than fit into memory.
     """
     start = time.perf_counter()
     headers = _headers(paths, cameras or [None] * len(paths))

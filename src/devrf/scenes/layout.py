@@ -95,10 +95,8 @@ def without_static_set(train: Split, test: Split, static_until: float) -> Layout
 def fewer(layout: Layout, train_views: int | None, frames: int | None) -> tuple[Layout, bool]:
     """The layout with fewer dynamic views and times, and whether times were left out.
 
-    Args:
-        layout: the whole.
-        train_views: train on the first so many dynamic views; None: all.
-        frames: keep so many times, evenly spread, first and last included; None: all.
+    It keeps the first ``train_views`` dynamic views and ``frames`` times, evenly spread, first and
+    last included; None: all.
 
     Raises:
         DevrfError: the dynamic images have one time only, or fewer views; or there are none.
@@ -132,14 +130,11 @@ def load_layout(
     masks: Masks = "none",
     dynamic_downscale: int | None = None,
 ) -> tuple[Capture, Capture]:
-    """The static and the dynamic capture, images read.
+    """The static and the dynamic capture, images read from below the scene's folder ``root``.
 
-    Args:
-        layout: which images.
-        root: the scene's folder.
-        downscale: as :class:`devrf.scenes.reader.SceneReader` has it.
-        masks: as for :func:`devrf.scenes.splits.load_views`.
-        dynamic_downscale: of the dynamic images, where they are not of the size of the static ones.
+    ``downscale`` is as :class:`devrf.scenes.reader.SceneReader` has it, ``masks`` as for
+    :func:`devrf.scenes.splits.load_views`; ``dynamic_downscale`` is that of the dynamic images,
+    where they are not of the size of the static ones.
     """
     factor = whole_factor(downscale, partial(_shorter_side, layout.static_train))
     moving = factor if dynamic_downscale is None else dynamic_downscale

@@ -36,17 +36,14 @@ GREY_NOISE = 16
 
 
 def read_mask(path: Path, image: tuple[int, int], camera: Size | None, name: object) -> Grey:
-    """One mask, at the size of its image.
+    """One mask (H, W) uint8, at the size of its image.
 
     Args:
-        path: a file of 8 bits a channel that is grey and opaque. Labels 0 and 1 are black
-            and white.
+        path: a file of 8 bits a channel that is grey and opaque. Labels 0 and 1 are black and
+            white.
         image: (width, height) of the image's file.
         camera: (width, height) that its camera is for; a mask may be given at that size, too.
         name: the image, for messages.
-
-    Returns:
-        (H, W) uint8.
 
     Raises:
         DevrfError: the file cannot be read, has another size, or is not grey.
@@ -109,7 +106,7 @@ def valid_pixels(
     lenses: Sequence[Lens],
     names: Sequence[Path],
 ) -> Tensor | None:
-    """Which pixels are valid, after downscaling and undistortion; None: all of them.
+    """Which pixels (N, H, W) are valid, after downscaling and undistortion; None: all of them.
 
     A pixel is valid if all source pixels that it is made of are.
 
@@ -120,9 +117,6 @@ def valid_pixels(
         cameras: N sizes that the cameras are for, or None.
         lenses: N, in pixels of the smaller images, before undistortion.
         names: N images, for messages.
-
-    Returns:
-        (N, H, W) bool.
 
     Raises:
         DevrfError: what :func:`read_mask` raises, a mask leaves nothing, or there is too little

@@ -86,10 +86,9 @@ class SceneReader(Options, ABC):
         """
 
     def forward_flow(self, views: Views) -> OpticalFlow | None:
-        """Forward flow from the scene's files; None where there are none, or no place for them.
+        """Forward flow of the dynamic training ``views`` of :meth:`read`, from the scene's files.
 
-        Args:
-            views: the dynamic training views, as :meth:`read` gave them.
+        None where there are none, or no place for them.
 
         Raises:
             DevrfError: a file is wrong; the message names it.
@@ -104,6 +103,28 @@ class SceneReader(Options, ABC):
     def name_of(self, folder: Path) -> str:
         """The scene's name, its folder's where none was given."""
         return self.name or folder.resolve().name
+
+
+@dataclass(frozen=True)
+class FixedViewsReader(SceneReader):
+    """Options of layouts with folders ``dynamic_<V>views/view1`` … of fixed cameras.
+
+    Images come from ``images_<downscale>`` where it is there; else larger ones are made smaller.
+
+    Attributes:
+        dynamic: which ``dynamic_*views`` folder, where there are several.
+        test_view: the fixed view to hold out: 4 is ``view4``, −1 the last, −2 the last but one.
+        train_views: train on the first so many of the views that are not held out; None: all.
+        holdout: every ``holdout``-th static image, in the order of their names, is held out, the
+            first one included.
+    """
+
+    _: KW_ONLY
+    dynamic: str | None = None
+    downscale: Downscale = "up_to_4"
+    test_view: Annotated[int, Field(strict=True)] = -1
+    holdout: Holdout = 8
+    train_views: Count | None = None
 
 
 @dataclass(frozen=True)
@@ -169,14 +190,9 @@ class PosedReader(InwardReader):
         stated: SceneBounds | None,
         source: str,
     ) -> Scene:
-        """The scene of two captures.
+        """The scene of two captures, which for a scene always at rest are one.
 
-        Args:
-            folder: where they were read from.
-            static: the scene at rest.
-            dynamic: the scene in motion; ``static`` itself where it is always at rest.
-            stated: where the scene is, if that is known.
-            source: what states it, in words.
+        ``stated`` says where it is, if that is known, and ``source``, in words, who states it.
 
         Raises:
             DevrfError: the options, or the cameras, do not say where it is.

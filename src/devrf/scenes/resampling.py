@@ -19,15 +19,9 @@ Pixels = npt.NDArray[np.uint8]
 
 
 def area_average(image: Array, width: int, height: int) -> Array:
-    """The mean of ``image`` over each cell of a coarser raster.
+    """The mean of ``image`` (H, W, C ≤ 4) float32 over each cell of a coarser raster.
 
-    Args:
-        image: (H, W, C) float32, at most 4 channels.
-        width: number of columns of the result, ≤ W; need not divide it.
-        height: number of rows of the result, ≤ H; need not divide it.
-
-    Returns:
-        (height, width, C) float32; cells of W/width × H/height source pixels, fractions included.
+    Cells of the result (height, width, C) are W/width × H/height source pixels, fractions included.
     """
     mean = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
     return np.asarray(mean, dtype=np.float32).reshape(height, width, image.shape[2])
@@ -42,15 +36,11 @@ def shrink_pixels(image: Pixels, width: int, height: int) -> Pixels:
 
 
 def look_up_pixels(image: Pixels, source: Array) -> Pixels:
-    """An 8-bit image looked up elsewhere, bilinearly; colours are weighted by their alpha.
+    """An 8-bit image (H, W, 1, 3 or 4) looked up elsewhere, bilinearly; colours weighted by alpha.
 
-    Args:
-        image: (H, W, 1, 3 or 4) uint8, alpha not premultiplied.
-        source: (H', W', 2) x, y in pixels of ``image``, where a pixel's centre is at i + 0.5.
-
-    Returns:
-        (H', W', 1, 3 or 4) uint8, alpha not premultiplied; black where alpha is 0. Places outside
-        take the nearest pixel of the border.
+    ``source`` (H', W', 2) is x, y in pixels of ``image``, where a pixel's centre is at i + 0.5.
+    Alpha is not premultiplied; black where it is 0. Places outside take the nearest pixel of the
+    border.
     """
     x, y = (np.ascontiguousarray(source[..., axis] - np.float32(0.5)) for axis in (0, 1))
 
@@ -78,18 +68,12 @@ def _weighted_by_alpha(image: Pixels, linear: Callable[[Array], Array]) -> Pixel
 def shrink_flow(
     vectors: Array, valid: npt.NDArray[np.bool_], width: int, height: int
 ) -> tuple[Array, npt.NDArray[np.bool_]]:
-    """Optical flow of a smaller image.
-
-    Args:
-        vectors: (H, W, 2) pixels of the large image, x then y.
-        valid: (H, W) which of them to trust.
-        width: columns of the result.
-        height: rows of the result.
+    """Optical flow (H, W, 2) of a smaller image of ``width`` × ``height`` pixels, x then y.
 
     Returns:
-        vectors (height, width, 2) in pixels of the small image, the mean of the trusted ones
-        with x scaled by width/W and y by height/H; and valid (height, width), true where at
-        least half of the area was trusted. Vectors are 0 where not valid.
+        vectors (height, width, 2) in pixels of the small image, the mean of the ``valid`` (H, W)
+        ones with x scaled by width/W and y by height/H; and valid (height, width), true where at
+        least half of the area was. Vectors are 0 where not valid.
     """
     rows, columns = valid.shape
     weight = valid.astype(np.float32)[..., None]

@@ -134,7 +134,7 @@ def _pixel_index(views: Views, image: int, points: Tensor) -> Array:
 def visual_hull(
     views: Views, box: Box, shape: tuple[int, int, int], device: torch.device | None = None
 ) -> Tensor:
-    """The visual hull of one state of the scene, on a grid.
+    """The visual hull (X, Y, Z) bool of one state of the scene, on a grid.
 
     A grid point is outside when any view that has it in the picture sees no alpha mask within half
     a grid cell of it; so the hull holds everything, and more where no view looks, or where its
@@ -145,9 +145,6 @@ def visual_hull(
         box: where the grid is, world units; its corners sit on the box's corners.
         shape: grid points along x, y, z.
         device: where to work, one image after another; None: where the views are.
-
-    Returns:
-        (X, Y, Z) bool on that device.
     """
     cameras = views.cameras if device is None else views.cameras.to(device)
     points = box.grid_points(shape, cameras.focal).reshape(-1, 3)

@@ -27,7 +27,6 @@ from devrf.scenes.validation import scene_error
 
 log = logging.getLogger(__name__)
 
-
 SpaceChoice = Literal["auto", "world", "contracted"]
 
 # Thickness of the shell in half edges of the inner box, as in the paper of contraction. In a

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import torch
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from torch import Tensor
 
 from devrf.scenes.files import Name, Number, Positive, Vector3, Vector4, inside, read_json
@@ -86,9 +86,6 @@ class TransformsFile(CameraKeys):
     scene_bounds: SceneBounds | None = None
 
 
-_FILE = TypeAdapter(TransformsFile)
-
-
 @dataclass(frozen=True)
 class Transforms:
     """The posed images of one split, in the order of the file.
@@ -129,19 +126,16 @@ class Transforms:
 def read_transforms(
     file: Path, root: Path, *, masked: bool = False, missing: Missing = "error"
 ) -> tuple[TransformsFile, Transforms]:
-    """What a transforms file says, and the posed images that it lists.
+    """What a transforms file below ``root``, the scene's folder, says, and its posed images.
 
-    Args:
-        file: where it is; its image paths are relative to its folder.
-        root: the scene's folder, which no image path may leave.
-        masked: whether ``mask_path`` is followed, too.
-        missing: as for :func:`devrf.scenes.image_folders.present_images`.
+    ``masked``: whether ``mask_path`` is followed, too; ``missing``: as for
+    :func:`devrf.scenes.image_folders.present_images`.
 
     Raises:
         DevrfError: the file or an image is missing, a value is wrong (NaN, a time outside [0, 1], a
             negative focal length …), a pose is no rigid transform, or only some frames have a time.
     """
-    listing = read_json(file, _FILE, "every capture needs its posed images")
+    listing = read_json(file, TransformsFile, "every capture needs its posed images")
     images = present_images([one.file_path for one in listing.frames], file, root, missing)
     frames = [listing.frames[index] for index in images]
     where = [f"{file}: frames[{index}]" for index in images]

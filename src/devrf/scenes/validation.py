@@ -152,11 +152,7 @@ def in_reach(positions: Tensor) -> Tensor:
 
 
 def check_poses(poses: Tensor, where: Callable[[int], object]) -> None:
-    """Check camera poses (N, 3, 4).
-
-    Args:
-        poses: camera-to-world, world units.
-        where: what the message says of the one at fault, by its position.
+    """Check camera-to-world poses (N, 3, 4); ``where`` names the one at fault by its position.
 
     Raises:
         DevrfError: one is no rigid transform, or too far from the origin to be computed with.

@@ -132,12 +132,8 @@ def fixed_views(
 ) -> tuple[Split, Split]:
     """What fixed cameras saw, to learn from and held out: all at the first frame, then at the next.
 
-    Args:
-        views: V folders, in the order of their numbers.
-        posed_by: the file of the cameras, for messages.
-        poses: (V, 3, 4) camera-to-world.
-        lenses: V intrinsics.
-        test: the position of the held-out view.
+    The V ``views`` have ``poses`` (V, 3, 4), camera-to-world, and ``lenses``, both from the file
+    ``posed_by``; ``test`` is the position of the held-out one.
     """
     frames = len(views[0].images)
 

@@ -5,9 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import KW_ONLY
 from pathlib import Path, PurePosixPath
-from typing import Annotated
 
-from pydantic import Field
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
@@ -21,7 +19,7 @@ from devrf.scenes.image_folders import (
 )
 from devrf.scenes.images import image_at
 from devrf.scenes.layout import Layout, fewer, load_layout, static_alone
-from devrf.scenes.reader import Count, EstimatedFlow, Holdout, PosedReader
+from devrf.scenes.reader import EstimatedFlow, FixedViewsReader, PosedReader
 from devrf.scenes.scene import Scene
 from devrf.scenes.sparse_model import (
     Facing,
@@ -46,16 +44,7 @@ IMAGES = "images"
 
 
 def images_of(model: SparseModel, root: Path, factor: int) -> ImageFolder:
-    """Where the images are, and by how much they are yet to be made smaller.
-
-    Args:
-        model: what poses them.
-        root: the scene's folder.
-        factor: by how much they are made smaller in all.
-
-    Raises:
-        DevrfError: there is no such folder.
-    """
+    """Where the model's images are, to be made smaller by ``factor`` in all; else DevrfError."""
     source = image_folder(root, factor)
     # Smaller images that LLFF's tools have written have names of their own.
     renamed = image_at(source.path / model.images[0].name) is None
@@ -67,13 +56,8 @@ def images_of(model: SparseModel, root: Path, factor: int) -> ImageFolder:
 def fixed_cameras(model: SparseModel, folder: Path, count: int) -> list[int]:
     """The positions in the model of an image by each of ``count`` fixed cameras.
 
-    Args:
-        model: poses, among others, an image of each: ``view1.png``, or in ``view1/``.
-        folder: ``dynamic_<V>views``.
-        count: how many there are.
-
-    Raises:
-        DevrfError: a camera has no pose.
+    The model poses, among others, ``view1.png`` or an image in ``view1/``; ``folder`` is
+    ``dynamic_<V>views``, for the DevrfError where a camera has no pose.
     """
     known: dict[str, int] = {}
     for position, image in enumerate(model.images):
@@ -92,25 +76,19 @@ def fixed_cameras(model: SparseModel, folder: Path, count: int) -> list[int]:
 
 
 @dataclass(frozen=True)
-class ColmapReader(PosedReader):
+class ColmapReader(PosedReader, FixedViewsReader):
     """Reads COLMAP's ``sparse/0`` (or ``sparse``), binary or as text, and ``images/``.
 
     The scene is at rest, unless there are folders ``dynamic_<V>views/view1`` … of fixed cameras, as
     in DeVRF's forward-facing layout; the model then poses an image of each, ``view1.png`` or in
-    ``view1/`` (:mod:`devrf.scenes.formats.colmap`).
+    ``view1/``.
 
-    The world is that of :func:`devrf.scenes.sparse_model.normalised`, as ``stage=capture`` has it:
-    of cameras around a scene z points up and the middle of what they look at is the origin; cameras
-    that all look within 45° of one direction make a forward-facing scene. The sparse points say
-    near and far, and the box where the cameras' axes do not meet. Lenses are undistorted. Images
-    come from ``images_<downscale>`` where it is there; else larger ones are made smaller.
+    The world is that of :func:`devrf.scenes.sparse_model.normalised`: of cameras around a scene z
+    points up and the middle of what they look at is the origin; cameras that all look within 45° of
+    one direction make a forward-facing scene. The sparse points say near and far, and the box where
+    the cameras' axes do not meet. Lenses are undistorted.
 
     Attributes:
-        dynamic: which ``dynamic_*views`` folder, where there are several.
-        test_view: the fixed view to hold out: 4 is ``view4``, −1 the last, −2 the last but one.
-        train_views: train on the first so many of the views that are not held out; None: all.
-        holdout: one of so many static images is held out, in the order of their names, the first
-            included.
         space: as of :class:`~devrf.scenes.reader.PosedReader`; with alpha masks ``auto`` is
             ``world`` instead of ``contracted``.
     """
@@ -118,10 +96,6 @@ class ColmapReader(PosedReader):
     _: KW_ONLY
     downscale: Downscale = "up_to_4"
     flow: EstimatedFlow = "auto"
-    dynamic: str | None = None
-    test_view: Annotated[int, Field(strict=True)] = -1
-    train_views: Count | None = None
-    holdout: Holdout = 8
 
     def read(self) -> Scene:
         """See :meth:`devrf.scenes.reader.SceneReader.read`."""

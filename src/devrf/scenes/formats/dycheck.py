@@ -9,7 +9,7 @@ from dataclasses import KW_ONLY
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import BaseModel, Field, TypeAdapter
+from pydantic import BaseModel, Field
 from pydantic.dataclasses import dataclass
 
 from devrf.scenes.files import Ids, Number, inside, read_json
@@ -21,7 +21,6 @@ from devrf.scenes.validation import abbreviated, scene_error
 
 log = logging.getLogger(__name__)
 
-
 SPLITS, COVISIBLE = "splits", "covisible"
 TRAIN, VAL = f"{SPLITS}/train.json", f"{SPLITS}/val.json"
 
@@ -31,9 +30,6 @@ class _Split(BaseModel):
 
     frame_names: Ids
     time_ids: Annotated[list[Number], Field(fail_fast=True)]
-
-
-_SPLIT = TypeAdapter(_Split)
 
 
 @dataclass(frozen=True)
@@ -95,7 +91,7 @@ class DycheckReader(ItemsReader):
 
 def _read_split(file: Path) -> dict[str, float]:
     """The time of each image, by its name."""
-    split = read_json(file, _SPLIT, "it lists images and their times; add it")
+    split = read_json(file, _Split, "it lists images and their times; add it")
     if len(split.frame_names) != len(split.time_ids):
         raise scene_error(
             file,

@@ -6,18 +6,16 @@ import logging
 import os
 from dataclasses import KW_ONLY, replace
 from pathlib import Path
-from typing import Annotated
 
-from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from devrf.scenes.files import Positive, existing_folder, scene_folder
 from devrf.scenes.flow_files import FlowDirection, stacked_flow
 from devrf.scenes.formats.llff_poses import POSES, read_dynamic_poses, read_static_poses
-from devrf.scenes.image_folders import Downscale, folder_factor, image_folder, listed_images
+from devrf.scenes.image_folders import folder_factor, image_folder, listed_images
 from devrf.scenes.images import image_size
 from devrf.scenes.layout import Layout, fewer, load_layout, static_alone, without_static_set
-from devrf.scenes.reader import Count, Holdout, SceneReader, Time
+from devrf.scenes.reader import FixedViewsReader, Time
 from devrf.scenes.scene import OpticalFlow, Scene, Views
 from devrf.scenes.space import forward_facing_scene
 from devrf.scenes.splits import (
@@ -44,35 +42,25 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class LlffReader(SceneReader):
+class LlffReader(FixedViewsReader):
     """Reads a scene that cameras face from one side.
 
     Three layouts: ``static/`` and ``dynamic_<V>views/``; LLFF's ``poses_bounds.npy`` and images in
     ``root`` itself, or in ``static/`` alone: a scene at rest; or the same as a video by one camera
     (NR-NeRF), each image a time of its own, in the order of their names.
 
-    The world's unit is 0.75 of the least depth of the static cameras, their average pose its
-    origin and axes (x right, y up, −z forward). The scene's space is NDC of that camera. Images
-    come from ``images_<downscale>`` where it is there; else larger ones are made smaller.
+    The world's unit is 0.75 of the least depth of the static cameras, their average pose its origin
+    and axes (x right, y up, −z forward). The scene's space is NDC of that camera.
 
     Attributes:
-        dynamic: which ``dynamic_*views`` folder, where there are several.
-        test_view: the fixed view to hold out: 4 is ``view4``, −1 the last, −2 the last but one.
-        holdout: every ``holdout``-th static image is held out, the first one included.
-        near: distance of the near plane from the average camera, in the world's unit; the
-            nearest point of the static scene is at 1/0.75.
-        train_views: train on the first so many of the views that are not held out; None: all.
+        near: distance of the near plane from the average camera, in the world's unit; the nearest
+            point of the static scene is at 1/0.75.
         monocular: whether LLFF's images are a video; None: where NR-NeRF's ``precomputed.json`` is.
         static_until: of a video, the latest time of an image that counts as static.
     """
 
     _: KW_ONLY
-    dynamic: str | None = None
-    downscale: Downscale = "up_to_4"
-    test_view: Annotated[int, Field(strict=True)] = -1
-    holdout: Holdout = 8
     near: Positive = 1.0
-    train_views: Count | None = None
     monocular: bool | None = None
     static_until: Time = 1.0
 

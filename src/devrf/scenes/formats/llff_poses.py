@@ -46,9 +46,7 @@ class PosedSet:
     def normalised(self) -> PosedSet:
         """The set in units of 0.75 · its least depth, its average pose the identity.
 
-        Raises:
-            DevrfError: the cameras look in such different directions that there is no average, or
-                are far away from one another.
+        DevrfError when the cameras look in too different directions, or are too far apart.
         """
         scale = 1 / (BOUND_FACTOR * float(self.bounds[:, 0].min()))
         middle = average_pose(self.poses)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, ClassVar
 
 import torch
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field, TypeAdapter
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, RootModel
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 
@@ -44,9 +44,6 @@ from devrf.scenes.validation import FARTHEST, abbreviated, check_poses, scene_er
 
 log = logging.getLogger(__name__)
 
-
-SCENE = "scene.json"
-
 Length = Annotated[Positive, Field(le=FARTHEST)]
 
 
@@ -64,9 +61,6 @@ class World(BaseModel):
     scale: Length
     near: Length
     far: Length
-
-
-_WORLD = TypeAdapter(World)
 
 
 def placed(
@@ -118,20 +112,14 @@ class Camera(BaseModel):
     )
 
 
-_CAMERA = TypeAdapter(Camera)
-
-
 def read_camera(folder: Path, item: str, world: World) -> tuple[Tensor, Intrinsics]:
-    """The camera of the image with the id ``item``.
-
-    Returns:
-        Camera-to-world (3, 4) float32, OpenGL axes, world units; intrinsics of the full image.
+    """Camera-to-world (3, 4) float32, OpenGL axes, world units, and intrinsics of the full image.
 
     Raises:
-        DevrfError: the file is missing, or a value in it is wrong.
+        DevrfError: the camera file of the image with the id ``item`` is missing or wrong.
     """
     file = inside(folder, folder / "camera", f"{item}.json", folder / "dataset.json")
-    camera = read_json(file, _CAMERA, "every image needs its camera; add it")
+    camera = read_json(file, Camera, "every image needs its camera; add it")
     world_to_camera = torch.tensor(camera.orientation, dtype=torch.float64)
     # OpenCV's y points down and its z ahead; ours point up and back.
     axes = world_to_camera.T * world_to_camera.new_tensor([1, -1, -1])
@@ -195,7 +183,7 @@ class ItemsReader(InwardReader):
         items, *split = self.listed(folder)
         listing = folder / self.listing
         world = read_json(
-            folder / SCENE, _WORLD, "it says where the scene is; set data.root to its folder"
+            folder / "scene.json", World, "it says where the scene is; set data.root to its folder"
         )
         names = {"full": "1x", "reduced": "{}x"}
         factor = folder_factor(folder / "rgb", self.downscale, **names)
@@ -244,8 +232,7 @@ class _Moment(BaseModel):
     warp_id: Number | None = None
 
 
-_DATASET = TypeAdapter(_Dataset)
-_MOMENTS = TypeAdapter(dict[str, _Moment])
+_Moments = RootModel[dict[str, _Moment]]
 
 
 @dataclass(frozen=True)
@@ -264,7 +251,7 @@ class NerfiesReader(ItemsReader):
     def listed(self, folder: Path) -> Listed:
         """The ids in ``dataset.json``."""
         file = folder / self.listing
-        listed = read_json(file, _DATASET, "it lists the images; add it")
+        listed = read_json(file, _Dataset, "it lists the images; add it")
         ids, train, val = listed.ids or [], listed.train_ids or [], listed.val_ids or []
         items = ids or list(dict.fromkeys(train + val))
         position = {item: i for i, item in enumerate(items)}
@@ -295,7 +282,7 @@ class NerfiesReader(ItemsReader):
         """The times in ``metadata.json``: all ``time_id``, or else all ``warp_id``."""
         file = folder / "metadata.json"
         purpose = "it says when each image was taken; add it, with one time_id for all at rest"
-        moments = read_json(file, _MOMENTS, purpose)
+        moments = read_json(file, _Moments, purpose).root
         absent = [item for item in ids if item not in moments]
         if absent:
             raise scene_error(file, f"lacks image {abbreviated(absent[0])}; add its warp_id")

@@ -29,7 +29,6 @@ from devrf.scenes.validation import abbreviated, scene_error
 
 log = logging.getLogger(__name__)
 
-
 FILE = "transforms.json"
 # So many images at time 0 are a static set: from fewer no field can be learned.
 _SEVERAL = 3

@@ -32,7 +32,6 @@ from devrf.scenes.validation import check_memory, reduced_size, scene_error
 
 log = logging.getLogger(__name__)
 
-
 _VIDEO = re.compile(r"cam(\d{1,6})\.mp4", re.IGNORECASE)
 
 
@@ -85,13 +84,9 @@ def _in_words(header: FilmHeader) -> str:
 def read_frames(
     paths: Sequence[Path], frames: Sequence[int], filmed: Size, downscale: int
 ) -> Tensor:
-    """The chosen frames of some videos; of others nothing is kept in memory.
+    """The chosen ``frames`` (T, ascending) of K videos; of others nothing is kept in memory.
 
-    Args:
-        paths: K videos.
-        frames: T positions of frames, ascending.
-        filmed: width and height of the frames in pixels.
-        downscale: integer factor ≥ 1; each side becomes floor(side / downscale), by area averages.
+    ``filmed`` is their (width, height); sides become floor(side / ``downscale``), by area averages.
 
     Returns:
         (T · K, H, W, 3) uint8: all videos at the first frame, then all at the next.

@@ -149,11 +149,8 @@ class Filming:
     ) -> Capture:
         """All fixed cameras at frame 0, then all at frame 1, …, with the exact backward flow.
 
-        Args:
-            train: V cameras to learn from.
-            test: held-out cameras.
-            frames: number of frames T ≥ 2, at times k / (T − 1).
-            unseen: frames that the cameras to learn from leave out.
+        Of ``frames`` ≥ 2 frames, at times k / (T − 1), the cameras to learn from leave out
+        ``unseen``.
         """
         every = range(frames)
         seen = [frame for frame in every if frame not in unseen]

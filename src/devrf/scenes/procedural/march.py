@@ -57,12 +57,9 @@ def trace(
 def block_starts(shape: Shape, cameras: Cameras, time: float, reach: float) -> Tensor:
     """Distances (N, H, W) before which no ray through a pixel meets the shape; +inf: never.
 
-    A cone around a block of pixels, of angle θ, holds all its rays: at distance s they are
-    within s·θ of its axis. From a free point at distance d to the surface all of them may go
-    on to (s + d) / (1 + θ).
-
-    The N cameras are outside of the shape, and ``reach`` is the radius of a ball about the origin
-    that holds it at ``time``, world units.
+    A cone around a block of pixels, of angle θ, holds all its rays: at distance s they are within
+    s·θ of its axis. From a free point at distance d to the surface all of them may go on to (s + d)
+    / (1 + θ). ``reach`` is as of :func:`trace`.
     """
     columns, rows = -(-cameras.width // BLOCK), -(-cameras.height // BLOCK)
     y, x = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
