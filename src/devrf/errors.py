@@ -14,29 +14,7 @@ class DevrfError(Exception):
     """
 
 
-def expect(holds: bool, key: str, expected: str, given: object) -> None:
-    """Refuse the value ``given`` of a config key unless a condition ``holds``.
-
-    Raises:
-        DevrfError: it does not; the message says what was ``expected``.
-    """
-    if not holds:
-        raise DevrfError(f"{key}: expected {expected}, not {given}")
-
-
-def did_you_mean(word: object, known: Iterable[object], before: str = "") -> str:
-    """The end of a message that names the closest of the known words, empty where none is close.
-
-    Args:
-        word: what was given.
-        known: what there is.
-        before: what is written before the word: ``data=``.
-    """
-    close = difflib.get_close_matches(str(word), [str(one) for one in known], n=1)
-    return f"; did you mean {before}{close[0]}?" if close else ""
-
-
-def require(met: bool, key: str, expected: str, value: object) -> None:
+def expect(met: bool, key: str, expected: str, value: object) -> None:
     """Refuse the ``value`` of a config key unless the condition is ``met``.
 
     Args:
@@ -50,3 +28,15 @@ def require(met: bool, key: str, expected: str, value: object) -> None:
     """
     if not met:
         raise DevrfError(f"{key}: expected {expected}, not {value}")
+
+
+def did_you_mean(word: object, known: Iterable[object], before: str = "") -> str:
+    """The end of a message that names the closest of the known words, empty where none is close.
+
+    Args:
+        word: what was given.
+        known: what there is.
+        before: what is written before the word: ``data=``.
+    """
+    close = difflib.get_close_matches(str(word), [str(one) for one in known], n=1)
+    return f"; did you mean {before}{close[0]}?" if close else ""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from devrf.errors import DevrfError, require
+from devrf.errors import DevrfError, expect
 from devrf.geometry.box import Box
 from devrf.geometry.ndc import NormalizedDevice
 from devrf.geometry.space import Space
@@ -50,7 +50,7 @@ class Architecture:
 
     def __post_init__(self) -> None:
         good = 0 < self.contracted_opacity < 1
-        require(good, "field.contracted_opacity", "between 0 and 1", self.contracted_opacity)
+        expect(good, "field.contracted_opacity", "between 0 and 1", self.contracted_opacity)
 
     def in_space(self, space: Space, side: float) -> Architecture:
         """The sizes that hold in ``space`` for a grid of ``side`` voxels along an edge."""

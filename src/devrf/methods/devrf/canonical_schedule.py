@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 from devrf.engine.learner import Phase
-from devrf.errors import DevrfError, require
+from devrf.errors import DevrfError, expect
 from devrf.geometry.space import Space
 
 # The least value of the schedule's numbers.
@@ -79,9 +79,9 @@ class CanonicalSchedule:
         key, limit = "schedule.canonical", self.voxels_per_pixel
         for name, least in LEAST.items():
             value = getattr(self, name)
-            require(value is None or value >= least, f"{key}.{name}", f"at least {least}", value)
+            expect(value is None or value >= least, f"{key}.{name}", f"at least {least}", value)
         fits = limit is None or 0 < limit <= 4
-        require(fits, f"{key}.voxels_per_pixel", "above 0, at most 4, or null", limit)
+        expect(fits, f"{key}.voxels_per_pixel", "above 0, at most 4, or null", limit)
         doublings, edges = len(self.upsample_at), [0, *self.upsample_at, self.iterations]
         if self.side**3 < 8 * 2**doublings:
             raise DevrfError(
@@ -90,7 +90,7 @@ class CanonicalSchedule:
             )
         ascend = all(a < b for a, b in pairwise(edges))
         between = f"ascending numbers between 0 and iterations ({self.iterations})"
-        require(ascend, f"{key}.upsample_at", between, list(self.upsample_at))
+        expect(ascend, f"{key}.upsample_at", between, list(self.upsample_at))
         offset, phases = self.search_iterations, []
         if offset:
             voxels = self.search_side**3

@@ -10,7 +10,7 @@ from itertools import accumulate, pairwise
 from typing import Any, Literal, get_args
 
 from devrf.engine.learner import Phase
-from devrf.errors import DevrfError, require
+from devrf.errors import DevrfError, expect
 
 # In time, from a visit of a level to the next.
 Order = Literal["forward", "backward"]
@@ -138,17 +138,17 @@ class DeformationSchedule:
 
     def __post_init__(self) -> None:
         key = "schedule.deformation"
-        require(len(self.levels) > 0, f"{key}.levels", "at least one", "none")
-        require(self.rays >= 1, f"{key}.rays", "at least 1", self.rays)
-        require(self.decay > 0, f"{key}.decay", "more than 0", self.decay)
+        expect(len(self.levels) > 0, f"{key}.levels", "at least one", "none")
+        expect(self.rays >= 1, f"{key}.rays", "at least 1", self.rays)
+        expect(self.decay > 0, f"{key}.decay", "more than 0", self.decay)
         for number, level in enumerate(self.levels, 1):
             _check_level(f"{key}.levels.{number}", level)
         first, last = self.levels[0], self.levels[-1]
         together = first.parallel_frames if self.coarse_to_fine else 1
         why = "at the first level, where a frame starts from the one before it"
-        require(together == 1, f"{key}.levels.1.parallel_frames", f"1 {why}", together)
+        expect(together == 1, f"{key}.levels.1.parallel_frames", f"1 {why}", together)
         forward = first.order == "forward"
-        require(forward, f"{key}.levels.1.order", f"forward {why}", first.order)
+        expect(forward, f"{key}.levels.1.order", f"forward {why}", first.order)
         if not self.coarse_to_fine:
             iterations = sum(level.iterations for level in self.levels)
             finest = replace(last, iterations=iterations, lr_factor=None, order="forward")
@@ -210,11 +210,11 @@ def _check_level(key: str, level: Level) -> None:
     """Check what holds for every level; ``key`` is that of its row."""
     for name, least in (("side", 2), ("iterations", 1), ("parallel_frames", 1)):
         value = getattr(level, name)
-        require(value >= least, f"{key}.{name}", f"at least {least}", value)
+        expect(value >= least, f"{key}.{name}", f"at least {least}", value)
     for name in ("lr_factor", "lr_final_factor"):
         factor = getattr(level, name)
-        require(factor is None or factor > 0, f"{key}.{name}", "more than 0", factor)
+        expect(factor is None or factor > 0, f"{key}.{name}", "more than 0", factor)
     known = level.order in get_args(Order)
-    require(known, f"{key}.order", "forward or backward", level.order)
+    expect(known, f"{key}.order", "forward or backward", level.order)
     for term, weight in level.weight_factors.items():
-        require(weight >= 0, f"{key}.weight_factors.{term}", "at least 0", weight)
+        expect(weight >= 0, f"{key}.weight_factors.{term}", "at least 0", weight)

@@ -7,7 +7,7 @@ from typing import Literal
 
 import torch
 
-from devrf.errors import require
+from devrf.errors import expect
 
 # What the colour network computes in.
 Precision = Literal["auto", "float32", "bfloat16"]
@@ -87,7 +87,7 @@ class MotionSettings:
     def __post_init__(self) -> None:
         gain = self.min_rel_improvement
         key = "schedule.motion.min_rel_improvement"
-        require(gain is None or 0 < gain <= 1, key, "above 0, at most 1, or null", gain)
+        expect(gain is None or 0 < gain <= 1, key, "above 0, at most 1, or null", gain)
 
     def stored_half(self, device: torch.device) -> bool:
         """Whether frames are kept in half precision while a stage learns on ``device``."""

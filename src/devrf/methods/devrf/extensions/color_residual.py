@@ -14,7 +14,7 @@ from devrf.checkpoints.stored_grids import StoredShape
 from devrf.data.color_change import CHANGING, color_drift
 from devrf.engine.active_frames import ActiveFrame
 from devrf.engine.frame_store import FrameField
-from devrf.errors import require
+from devrf.errors import expect
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.methods.devrf.canonical_field import look_up
@@ -101,17 +101,17 @@ class ColorResidual(Extension):
             tv: weight of their total variation.
         """
         key, static = "schedule.extensions.color_residual", start_level_static_color
-        require(start_level >= 1, f"{key}.start_level", "at least 1", start_level)
+        expect(start_level >= 1, f"{key}.start_level", "at least 1", start_level)
         good = static is None or static >= 1
-        require(good, f"{key}.start_level_static_color", "at least 1, or null", static)
-        require(side >= 2, f"{key}.side", "at least 2", side)
-        require(learning_rate > 0, f"{key}.learning_rate", "above 0", learning_rate)
+        expect(good, f"{key}.start_level_static_color", "at least 1, or null", static)
+        expect(side >= 2, f"{key}.side", "at least 2", side)
+        expect(learning_rate > 0, f"{key}.learning_rate", "above 0", learning_rate)
         self._learn, self._side, self._learning_rate = learn, side, learning_rate
         self._start, self._start_if_static = start_level, start_level_static_color
         self._scale_if_drift = loss_scale_if_color_drift or {}
         for name, factor in self._scale_if_drift.items():
             place = f"{key}.loss_scale_if_color_drift.{name}"
-            require(factor >= 0, place, "at least 0", factor)
+            expect(factor >= 0, place, "at least 0", factor)
         self._residual, self._tv = residual, tv
         # Once set up: the first level that learns it, from 0; factors of weights from it on.
         self._first: int | None = None

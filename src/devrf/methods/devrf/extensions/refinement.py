@@ -16,7 +16,7 @@ from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import PixelPool, Pixels
 from devrf.engine.batches import frame_pools, static_pool
 from devrf.engine.learner import ParallelBatch, Phase
-from devrf.errors import require
+from devrf.errors import expect
 from devrf.methods.devrf.losses import PHOTOMETRIC_TERMS, Prediction
 from devrf.methods.devrf.settings import FINE_LOSS, CanonicalRates, Precision
 from devrf.methods.devrf.voxel_stage import VoxelStage, field_optimizer, weighted_loss
@@ -53,9 +53,9 @@ class RefinementSchedule:
         key, share = "refinement.schedule", self.static_share
         for name, least in (("iterations", 0), ("rays", 1), ("grow", 0)):
             value = getattr(self, name)
-            require(value >= least, f"{key}.{name}", f"at least {least}", value)
-        require(0 < share < 1, f"{key}.static_share", "between 0 and 1", share)
-        require(0 < self.decay <= 1, f"{key}.decay", "above 0, at most 1", self.decay)
+            expect(value >= least, f"{key}.{name}", f"at least {least}", value)
+        expect(0 < share < 1, f"{key}.static_share", "between 0 and 1", share)
+        expect(0 < self.decay <= 1, f"{key}.decay", "above 0, at most 1", self.decay)
 
 
 class RefinementStage(VoxelStage):
