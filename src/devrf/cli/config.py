@@ -150,13 +150,20 @@ def register_config() -> None:
     """
     for word in (scene_name, run_name, run_folder, config_record, tracked_name, tracked_group):
         OmegaConf.register_new_resolver(f"devrf.{word.__name__}", word, replace=True)
+    store = ConfigStore.instance()
+    # Hydra copies its sources, the store among them, for each group that --help lists.
+    store.__deepcopy__ = _present_store  # type: ignore[attr-defined]
     folder = config_folder() / "rows"
     for path in sorted(folder.rglob("*.yaml")):
         group = path.relative_to(folder).with_suffix("").as_posix()
         at_root = path.read_text("utf-8").startswith("# @package _global_")
         for name, row in rows(group).items():
             package = "_global_" if at_root else None
-            ConfigStore.instance().store(str(name), row, group, package, "devrf")
+            store.store(str(name), row, group, package, "devrf")
+
+
+def _present_store(memo: dict[int, Any]) -> ConfigStore:
+    return ConfigStore.instance()
 
 
 def choices() -> dict[str, str | None]:
