@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import re
 import shlex
@@ -17,17 +16,10 @@ from omegaconf.errors import OmegaConfBaseException
 from devrf.cli.config import group_choices, meant_stage
 from devrf.cli.config_check import unknown_key
 from devrf.errors import DevrfError, did_you_mean
+from devrf.system.files import REFUSED
 
 # Read at import: the entry point sets the variable, so that Hydra raises its errors.
 FULL_ERRORS = os.environ.get("HYDRA_FULL_ERROR", "0") != "0"
-
-# Errors of a disk, its permissions, or a path that was given. A missing file may be a fault of the
-# program instead.
-REFUSED = {
-    *(errno.EACCES, errno.EPERM, errno.EROFS),
-    *(errno.ENOSPC, errno.EDQUOT, errno.EIO),
-    *(errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG, errno.ELOOP),
-}
 
 # Options that Hydra's plugins for sweeps add to its groups.
 PLUGINS = {
@@ -51,6 +43,17 @@ def report_user_errors() -> Iterator[None]:
             raise
         print(f"devrf: {one_line(error)}", file=sys.stderr)
         raise SystemExit(2) from None
+
+
+@contextmanager
+def as_own_errors() -> Iterator[None]:
+    """Turn an error that the user can correct, of whatever library, into a DevrfError."""
+    try:
+        yield
+    except Exception as error:
+        if isinstance(error, DevrfError) or not is_user_error(error):
+            raise
+        raise DevrfError(one_line(error)) from error
 
 
 def is_user_error(error: Exception) -> bool:

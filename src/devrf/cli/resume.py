@@ -30,9 +30,9 @@ from devrf.checkpoints.checkpoint_file import digest_of, read_checkpoint_file
 from devrf.checkpoints.progress import progress_files
 from devrf.cli.config_check import REFERENCE
 from devrf.cli.context import GIVEN_REST, OWN_REST, RunContext
-from devrf.cli.run_folder import PLACE
 from devrf.errors import DevrfError
 from devrf.system.files import write_json
+from devrf.system.folder_lock import PLACE
 
 log = logging.getLogger(__name__)
 

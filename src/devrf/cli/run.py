@@ -9,7 +9,7 @@ import os
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from hydra.utils import instantiate
 from lightning import seed_everything
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from devrf.apps.render import camera_path
 from devrf.apps.settings import ViewerSettings
@@ -25,14 +25,15 @@ from devrf.cli.config import OF_A_CHECKPOINT, in_search, in_sweep, meant_stage
 from devrf.cli.context import RunContext
 from devrf.cli.evaluate import TRAINING, evaluate
 from devrf.cli.memory import check_memory, shortage_in_words
+from devrf.cli.messages import as_own_errors
 from devrf.cli.preparation import capture, fetch, inspect, prepare, say_next, selfcheck
 from devrf.cli.render import export, picture, render, view
 from devrf.cli.resume import beginning, done, note_done
 from devrf.cli.run_folder import archive_previous
 from devrf.cli.sweep import report
 from devrf.cli.train import learn
-from devrf.cli.workers import launch_workers
 from devrf.engine.ddp import ManualDDP
+from devrf.engine.workers import launch_workers
 from devrf.errors import DevrfError, did_you_mean
 from devrf.ops.dispatch import using
 
@@ -114,8 +115,7 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
         if learning:
             if run.leads:
                 _prepare_to_learn(run, learning, steps)
-            with launch_workers(run, learn_all) if several else nullcontext():
-                _learn(run, learning)
+            _learn(run, learning)
         if not learning or run.leads:
             for name in steps:
                 if not (learning and _is_done(run, name)):
@@ -175,20 +175,28 @@ def _ended(run: RunContext, steps: Names) -> float | None:
     return objective(run.config.objective, json.loads((folder / "metrics.json").read_text()))
 
 
-def learn_all(config: DictConfig, folder: Path) -> None:
+def learn_beside(config: dict[str, Any], folder: Path) -> None:
     """Learn the stages of ``stage=…`` in another process than rank 0; the config is checked."""
-    run = RunContext(config, folder)
-    with launch_workers(run, learn_all):
-        _learn(run, plan(config.stage, run.learning_stages)[0])
+    run = RunContext(OmegaConf.create(config), folder)
+    _learn(run, plan(run.config.stage, run.learning_stages)[0])
 
 
 def _learn(run: RunContext, learning: Names) -> None:
-    for name in run.learnable(learning):
-        _take(run, name, partial(learn, name=name))
-        # What a stage's trainer holds in circles would count as the next stage's memory.
-        gc.collect()
-        if run.device.type == "cuda":
-            torch.cuda.empty_cache()
+    """Learn stages, together with the other processes where the trainer asks for them."""
+    strategy = run.strategy
+    together: AbstractContextManager[None] = nullcontext()
+    if isinstance(strategy, ManualDDP):
+        if run.leads:
+            _ = run.scene  # its errors are reported once, and its estimated flow is stored
+        plain = OmegaConf.to_container(run.config, resolve=True)
+        together = launch_workers(strategy, learn_beside, (plain, run.folder))
+    with together, as_own_errors():
+        for name in run.learnable(learning):
+            _take(run, name, partial(learn, name=name))
+            # What a stage's trainer holds in circles would count as the next stage's memory.
+            gc.collect()
+            if run.device.type == "cuda":
+                torch.cuda.empty_cache()
 
 
 def _take(run: RunContext, name: str, step: Step) -> None:

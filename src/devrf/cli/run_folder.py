@@ -1,49 +1,37 @@
-"""A run's folder: one process at a time, nothing left of a mistaken run, earlier results kept.
-
-The lock is the system's on an open file, so it ends with its process. A file beside it tells other
-processes which one that is.
-"""
+"""A run's folder: one process at a time, nothing left of a mistaken run, earlier results kept."""
 
 from __future__ import annotations
 
 import logging
 import os
 import shutil
-import socket
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from devrf.cli.config import in_sweep
-from devrf.cli.messages import REFUSED, is_user_error, report_user_errors
-from devrf.errors import DevrfError
+from devrf.cli.messages import is_user_error, report_user_errors
 from devrf.system.files import make_folder
+from devrf.system.folder_lock import PLACE, lock_folder, release_folder
 
 log = logging.getLogger(__name__)
 
-# Within the run's folder; the lock file stays there, empty.
-PLACE = ".devrf"
-LOCK, OWNER = "lock", "process.txt"
 # Made in the folder before the config is checked.
 AT_FIRST = {".hydra", PLACE}
 # Environment variables in which torchrun and SLURM number the processes that they start.
 RANKS = ("RANK", "SLURM_PROCID")
 
-# Hydra writes before it calls the program, so its callback locks, and the program uses that lock.
-_held: dict[Path, FileLock] = {}
-
 
 class RunFolderLock(Callback):
     """Hydra callback that locks the folder of a run or sweep before anything is written there.
 
+    Hydra writes before it calls the program, which then uses this lock.
     Hydra ignores what a callback raises, except an exit: errors are reported here.
     """
 
@@ -61,16 +49,16 @@ class RunFolderLock(Callback):
         with report_user_errors():
             make_folder(folder)  # as Hydra does next, with a traceback where it cannot
             if _locks(config):
-                _lock(folder, "hydra.run.dir")
+                lock_folder(folder, "hydra.run.dir")
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Lock the folder of a sweep; each of its jobs locks its own."""
         with report_user_errors():
-            _lock(Path(config.hydra.sweep.dir), "hydra.sweep.dir")
+            lock_folder(Path(config.hydra.sweep.dir), "hydra.sweep.dir")
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Release the sweep's folder."""
-        _release(Path(config.hydra.sweep.dir))
+        release_folder(Path(config.hydra.sweep.dir))
 
 
 @contextmanager
@@ -84,7 +72,7 @@ def working_in(folder: Path, config: DictConfig, key: str) -> Iterator[None]:
         DevrfError: another process works there.
     """
     if _locks(config):
-        _lock(folder, key)
+        lock_folder(folder, key)
     was_new = not in_sweep() and _holds_at_most(folder, AT_FIRST)
     try:
         yield
@@ -93,7 +81,7 @@ def working_in(folder: Path, config: DictConfig, key: str) -> Iterator[None]:
             remove_if_only(folder, {*AT_FIRST, "run.log"})
         raise
     finally:
-        _release(folder)
+        release_folder(folder)
 
 
 def _locks(config: DictConfig) -> bool:
@@ -105,42 +93,6 @@ def _locks(config: DictConfig) -> bool:
     worker = any(os.environ.get(name, "0") != "0" for name in RANKS)
     together = worker and config.trainer.get("strategy") is not None
     return config.stage not in ("report", "fetch", "view") and not together
-
-
-def _lock(folder: Path, key: str) -> None:
-    """Lock a folder unless this process has done so; a file system without locks is told."""
-    if folder.resolve() in _held:
-        return
-    place = folder / PLACE
-    make_folder(place)
-    lock, owner = FileLock(place / LOCK), place / OWNER
-    try:
-        lock.acquire(timeout=0)
-    except Timeout:
-        which = ""
-        with suppress(OSError):  # the other process may not have written it yet
-            which = f" ({owner.read_text()})"
-        raise DevrfError(
-            f"{folder}: another devrf process{which} works in this folder; wait for it, or use "
-            f"{key}=FOLDER"
-        ) from None
-    except (NotImplementedError, OSError) as error:
-        if isinstance(error, OSError) and error.errno in REFUSED:
-            raise
-        log.warning(
-            "%s: its file system has no locks; see that no other process works there", folder
-        )
-        return
-    _held[folder.resolve()] = lock
-    since = datetime.now().astimezone().isoformat(" ", "seconds")
-    owner.write_text(f"pid {os.getpid()} on {socket.gethostname()}, since {since}")
-
-
-def _release(folder: Path) -> None:
-    lock = _held.pop(folder.resolve(), None)
-    if lock is not None:
-        (folder / PLACE / OWNER).unlink(missing_ok=True)
-        lock.release()
 
 
 def _holds_at_most(folder: Path, names: set[str]) -> bool:

@@ -11,6 +11,14 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+# Errors of a disk, its permissions, or a path that was given. A missing file may be a fault of the
+# program instead.
+REFUSED = {
+    *(errno.EACCES, errno.EPERM, errno.EROFS),
+    *(errno.ENOSPC, errno.EDQUOT, errno.EIO),
+    *(errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG, errno.ELOOP),
+}
+
 
 def make_folder(folder: Path) -> None:
     """Make ``folder``, and those above it, where they are not there.

@@ -1,8 +1,8 @@
 """The processes that learn one scene together: started, watched, and ended with this one.
 
 Rank 0 is the process that the user started. It alone composes the config, writes files and logs;
-the others get the composed config and take part in the stages that learn. Where a launcher such as
-torchrun has started all of them, none is started here.
+the others take part in the stages that learn. Where a launcher such as torchrun has started all of
+them, none is started here.
 
 Lightning's own launchers do not fit: one runs the command line again in each process, which would
 compose every job of a sweep anew; the other moves rank 0 to a process of its own, away from the
@@ -20,15 +20,13 @@ import socket
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from multiprocessing.connection import wait
-from pathlib import Path
 from queue import Empty, Queue
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
 from torch.multiprocessing.spawn import (
     ProcessContext,
     ProcessException,
@@ -36,31 +34,26 @@ from torch.multiprocessing.spawn import (
     start_processes,
 )
 
-from devrf.cli.context import RunContext
-from devrf.cli.messages import is_user_error, one_line
 from devrf.engine.ddp import ManualDDP
 from devrf.errors import DevrfError
 from devrf.system.process import tune_for_cpu
 
-Work = Callable[[DictConfig, Path], None]
+Work = Callable[..., None]
 # Seconds that a process has to end, or to notice that another has ended.
 GRACE = 10.0
 
 
 @contextmanager
-def launch_workers(run: RunContext, work: Work) -> Iterator[None]:
-    """While the block lasts, all processes that ``trainer`` asks for take part.
+def launch_workers(strategy: ManualDDP, work: Work, arguments: Sequence[Any]) -> Iterator[None]:
+    """While the block lasts, all processes that the trainer's ``strategy`` asks for take part.
 
-    Rank 0 reads the scene first: errors in it are reported once, and the others find the optical
-    flow that it has estimated and stored. They do ``work``, which they import by its name, with the
-    composed config and the run's folder.
+    The others do ``work``, a function that they import by its name, with ``arguments``, which are
+    pickled. A mistake of the user is a :class:`DevrfError`, there and in the block.
 
     Raises:
-        DevrfError: the processes cannot be started, or a user error ended one of them.
+        DevrfError: the processes cannot be started, or such a mistake ended one of them.
         RuntimeError: another error of another process, with its traceback.
     """
-    strategy = run.strategy
-    assert isinstance(strategy, ManualDDP)
     environment = strategy.cluster_environment
     assert environment is not None
     outside = environment.creates_processes_externally
@@ -70,11 +63,9 @@ def launch_workers(run: RunContext, work: Work) -> Iterator[None]:
         environment.validate_settings(strategy.num_processes, strategy.num_nodes)
     except (RuntimeError, ValueError) as error:
         raise DevrfError(f"trainer.devices: {error}") from None
-    if run.leads:
-        _ = run.scene
-    else:
+    if not strategy.is_global_zero:
         _silence_logs()
-    others = nullcontext() if outside else _others(run, work, strategy.num_processes)
+    others = nullcontext() if outside else _others(work, arguments, strategy.num_processes)
     with _restored(), others:
         strategy.setup_environment()
         strategy.barrier("the scene is read")
@@ -102,7 +93,7 @@ def _leave_group() -> None:
 
 
 @contextmanager
-def _others(run: RunContext, work: Work, count: int) -> Iterator[None]:
+def _others(work: Work, arguments: Sequence[Any], count: int) -> Iterator[None]:
     """Processes 1 to ``count`` - 1, which end with this block, by force if necessary."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -110,10 +101,9 @@ def _others(run: RunContext, work: Work, count: int) -> Iterator[None]:
     os.environ.update(
         MASTER_ADDR="127.0.0.1", MASTER_PORT=str(port), NODE_RANK="0", WORLD_SIZE=str(count)
     )
-    config = OmegaConf.to_container(run.config, resolve=True)
     with _signals_blocked():
         others: ProcessContext = start_processes(  # type: ignore[no-untyped-call]
-            _take_part, (work, config, run.folder), count - 1, join=False, daemon=True
+            _take_part, (work, arguments), count - 1, join=False, daemon=True
         )
     os.environ["LOCAL_RANK"] = "0"
     failures: Queue[Exception] = Queue()
@@ -123,9 +113,9 @@ def _others(run: RunContext, work: Work, count: int) -> Iterator[None]:
     try:
         yield
         watcher.join(GRACE)
-    except Exception as error:
-        if is_user_error(error):
-            raise
+    except DevrfError:
+        raise
+    except Exception:
         # If another process has failed, this one only notices a broken connection.
         with suppress(Empty):
             raise failures.get(timeout=GRACE) from None
@@ -182,18 +172,16 @@ def _failure(error: ProcessException) -> Exception:
     return DevrfError(line) if own else RuntimeError(error.msg)
 
 
-def _take_part(index: int, work: Work, config: Any, folder: Path) -> None:
+def _take_part(index: int, work: Work, arguments: Sequence[Any]) -> None:
     """The whole life of another process."""
     os.environ["LOCAL_RANK"] = str(index + 1)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     _silence_logs()
     tune_for_cpu()
     try:
-        work(OmegaConf.create(config), folder)
-    except Exception as error:
+        work(*arguments)
+    except Exception:
         atexit.register(os._exit, 1)  # without the slow end of torch: rank 0 waits for it
-        if is_user_error(error):
-            raise DevrfError(one_line(error)) from None
         raise
 
 
