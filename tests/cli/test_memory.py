@@ -9,8 +9,8 @@ import sys
 import pytest
 import torch
 
+from devrf.apps.inspection.needs import StageNeeds, tensor_bytes
 from devrf.cli import memory
-from devrf.cli.memory import StageNeeds, tensor_bytes
 from devrf.scenes.scene import Scene
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="memory as Linux limits and counts it")

@@ -13,11 +13,12 @@ from rich.console import Console
 from rich.filesize import decimal
 
 from devrf.apps.capture.pipeline import scene_from_footage
+from devrf.apps.inspection.needs import needs_table
 from devrf.apps.inspection.report import as_text, inspection_text
 from devrf.apps.settings import CaptureSettings
 from devrf.cli.config import config_folder
 from devrf.cli.context import RunContext
-from devrf.cli.memory import needs_table
+from devrf.cli.memory import needs
 from devrf.engine.ddp import ManualDDP
 from devrf.errors import DevrfError
 from devrf.scenes.export import export
@@ -93,7 +94,7 @@ def inspect(run: RunContext) -> None:
     # Only this step draws with matplotlib.
     from devrf.apps.inspection.picture import write_inspection_picture
 
-    rows = [(name, decimal(round(size))) for name, size in needs_table(run)]
+    rows = [(name, decimal(round(size))) for name, size in needs_table(run.scene, needs(run))]
     report = inspection_text(run.scene, rows)
     console = Console()
     if console.is_terminal:
