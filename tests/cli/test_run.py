@@ -13,8 +13,8 @@ import pytest
 
 from devrf import selfcheck
 from devrf.checkpoints.checkpoint_file import read_checkpoint_file, write_checkpoint_file
-from devrf.cli.run import check_objective, objective
 from devrf.errors import DevrfError
+from devrf.evaluation.objective import check_objective, objective
 from devrf.scenes.export import export
 from devrf.scenes.procedural import ProceduralScene
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from textwrap import wrap
 from typing import Literal, NamedTuple
@@ -30,6 +32,8 @@ from devrf.metrics.image import psnr
 from devrf.rendering.renderer import Renderer
 from devrf.rendering.view import Viewable
 from devrf.scenes.scene import Background, Views
+
+log = logging.getLogger(__name__)
 
 # Pictures of small images are rendered at this height, in pixels, unless another is asked for.
 READABLE = 400
@@ -95,6 +99,15 @@ def still(
     depth, opacity = image.depth.view(shape).cpu(), image.opacity.view(shape).cpu()
     color = image.color.view(*shape, 3).clamp(0, 1).cpu()
     return color, depth_colors(depth, opacity, near, far)
+
+
+def write_still(path: Path, color: Tensor, depth: Tensor) -> None:
+    """Write a picture and its ``<name>_depth``, with a number where files of that name are."""
+    names = (path.with_stem(f"{path.stem}_{k}") for k in count(2))
+    free = path if not path.exists() else next(name for name in names if not name.exists())
+    for place, image in ((free, color), (free.with_stem(f"{free.stem}_depth"), depth)):
+        write_image(place, image)
+        log.info("picture written to %s", place)
 
 
 class Preview(NamedTuple):

@@ -21,6 +21,7 @@ from devrf.checkpoints.checkpoint_file import digest_of
 from devrf.cli.config import choices, overrides
 from devrf.cli.context import GIVEN_REST, OWN_REST, RunContext
 from devrf.evaluation.held_out import HeldOutView, score
+from devrf.evaluation.objective import TRAINING
 from devrf.evaluation.suite import MetricSuite
 from devrf.methods.base import Renderable
 from devrf.rendering.renderer import Renderer
@@ -31,8 +32,6 @@ log = logging.getLogger(__name__)
 
 # Held-out images of the dynamic capture at times that a training view has, and at others.
 OF_TIMES = ("training_times", "novel_times")
-# Figures of the training, from the checkpoint, that stand beside the scores.
-TRAINING = ("seconds", "iterations", "iterations_per_second", "peak_gpu_gb", "num_rollbacks")
 # How iterations were carried out: which kernels and graphs really ran.
 EXECUTION = ("kernels", "startup_seconds", "graph_captures", "short_lists", "peak_reserved_gb")
 

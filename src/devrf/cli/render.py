@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import logging
 from contextlib import closing
-from itertools import count
 from pathlib import Path
-from threading import Event
 
 from hydra.utils import instantiate
 
 from devrf.apps.export.geometry import ExportSettings
 from devrf.apps.export.scene import export_scene
-from devrf.apps.images import to_bytes, write_image
+from devrf.apps.images import to_bytes
 from devrf.apps.render import videos
 from devrf.apps.settings import ViewerSettings
-from devrf.apps.still import StillSettings, still
+from devrf.apps.still import StillSettings, still, write_still
 from devrf.apps.video import VideoSettings
 from devrf.apps.video_file import write_pictures
 from devrf.checkpoints.checkpoint import CheckpointMetadata, Viewpoints, check_scene
@@ -26,13 +24,9 @@ from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene
-from devrf.system.process import handle_signals
 from devrf.system.progress import followed
 
 log = logging.getLogger(__name__)
-
-# Times whose views stay at hand in the viewer: both ends, the rest state, and where time runs.
-CACHED = 6
 
 
 def render(run: RunContext) -> list[Path]:
@@ -66,10 +60,7 @@ def picture(run: RunContext) -> None:
     camera = settings.camera(viewpoints)
     renderer = Renderer(stored.model.to_view(run.device), half=settings.half)
     color, depth = still(renderer, camera, settings.time, background_value(viewpoints.background))
-    path = _unused(run.folder / "images" / f"{settings.name}.png")
-    for place, image in ((path, color), (path.with_stem(f"{path.stem}_depth"), depth)):
-        write_image(place, image)
-        log.info("picture written to %s", place)
+    write_still(run.folder / "images" / f"{settings.name}.png", color, depth)
 
 
 def _is_its_data(run: RunContext, metadata: CheckpointMetadata) -> bool:
@@ -82,15 +73,8 @@ def _is_its_data(run: RunContext, metadata: CheckpointMetadata) -> bool:
     return root is None or (before is not None and Path(root).resolve() == Path(before).resolve())
 
 
-def _unused(path: Path) -> Path:
-    """The path, with a number where a file of that name is there: ``NAME_2.png``."""
-    names = (path.with_stem(f"{path.stem}_{k}") for k in count(2))
-    return path if not path.exists() else next(name for name in names if not name.exists())
-
-
 def view(run: RunContext) -> None:
     """Show the run's checkpoint on a page until a signal arrives."""
-    from devrf.apps.viewer.drawing import Drawing
     from devrf.apps.viewer.session import Session  # an extra
 
     settings: ViewerSettings = instantiate(run.config.viewer)
@@ -105,16 +89,9 @@ def view(run: RunContext) -> None:
         log.warning("%s; its training cameras are shown without pictures", error)
     viewpoints = stored.viewpoints if scene is None else Viewpoints.of(scene)
     assert viewpoints is not None
-    renderer = Renderer(stored.model.to_view(run.device), times=CACHED)
-    drawing, stop = Drawing(renderer, background_value(viewpoints.background)), Event()
-    with (
-        handle_signals(lambda _: stop.set()),
-        closing(Session(settings, viewpoints, scene, run.folder, stop)) as session,
-    ):
-        session.present(drawing)
-        log.info("the scene is at %s; Ctrl-C ends the viewer", settings.address)
-        session.serve()
-    log.info("the viewer has ended")
+    model = stored.model.to_view(run.device)
+    with closing(Session(settings, viewpoints, scene, run.folder)) as session:
+        session.serve(model, background_value(viewpoints.background))
 
 
 def export(run: RunContext) -> None:

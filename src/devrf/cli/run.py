@@ -8,7 +8,7 @@ import logging
 import os
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
@@ -23,7 +23,7 @@ from devrf.apps.render import camera_path
 from devrf.apps.settings import ViewerSettings
 from devrf.cli.config import OF_A_CHECKPOINT, in_search, in_sweep, meant_stage
 from devrf.cli.context import RunContext
-from devrf.cli.evaluate import TRAINING, evaluate
+from devrf.cli.evaluate import evaluate
 from devrf.cli.memory import check_memory, shortage_in_words
 from devrf.cli.messages import as_own_errors
 from devrf.cli.preparation import capture, fetch, inspect, prepare, say_next, selfcheck
@@ -34,7 +34,8 @@ from devrf.cli.sweep import report
 from devrf.cli.train import learn
 from devrf.engine.ddp import ManualDDP
 from devrf.engine.workers import launch_workers
-from devrf.errors import DevrfError, did_you_mean
+from devrf.errors import DevrfError
+from devrf.evaluation.objective import check_objective, objective
 from devrf.ops.dispatch import using
 
 log = logging.getLogger(__name__)
@@ -63,12 +64,6 @@ APART = {"report", "fetch", "capture", "selfcheck"}
 # What a run's folder may hold that a person looks at first, and what to try next.
 RESULTS = ("metrics.json", "images", "videos/orbit.mp4", "videos/spiral.mp4", "checkpoints")
 NEXT = ("stage=still still.time=0.35 still.height=400", "stage=render video.frames=120")
-
-# Numbers of both sections of metrics.json, and of the dynamic one. Their second names are those of
-# DeVRF's stages.
-OF_BOTH = ("psnr", "ssim", *TRAINING, "checkpoint_mb")
-OF_MOTION = ("rest_pose_psnr",)
-STATIC, DYNAMIC = ("static", "canonical"), ("dynamic", "deformation")
 
 # Lightning's messages on accelerators, tips and data loaders say nothing about this run.
 for _name in ("lightning.pytorch", "lightning.fabric"):
@@ -233,31 +228,3 @@ def _check(run: RunContext, learning: Names, steps: Names) -> None:
     viewer: ViewerSettings = instantiate(config.viewer)
     if run.leads and ("view" in steps or (viewer.training and learning)):
         viewer.check_free()
-
-
-def check_objective(key: str, metrics: Sequence[str]) -> None:
-    """Check that metrics.json will have ``key``, with these ``evaluation.metrics``.
-
-    Raises:
-        DevrfError: it will not.
-    """
-    section, _, name = key.partition(".")
-    if section not in (*STATIC, *DYNAMIC):
-        raise DevrfError(f"objective: expected static.NAME or dynamic.NAME, not {key!r}")
-    known = [*OF_BOTH, *metrics, *(OF_MOTION if section in DYNAMIC else ())]
-    if name not in known:
-        raise DevrfError(
-            f"objective: {section} has no {name!r}; choose from {', '.join(known)}"
-            f"{did_you_mean(name, known, f'objective={section}.')}"
-        )
-
-
-def objective(key: str, found: Mapping[str, Any]) -> float | None:
-    """The number ``key`` of metrics.json; None where it could not be measured.
-
-    The static section stands in for a missing dynamic one.
-    """
-    section, _, name = key.partition(".")
-    section = "static" if section in STATIC else "dynamic"
-    value: float | None = found.get(section, found["static"]).get(name)
-    return value

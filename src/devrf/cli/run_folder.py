@@ -6,7 +6,7 @@ import logging
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from devrf.cli.config import in_sweep
 from devrf.cli.messages import is_user_error, report_user_errors
-from devrf.system.files import make_folder
+from devrf.system.files import close_logs, holds_at_most, make_folder, remove_if_only
 from devrf.system.folder_lock import PLACE, lock_folder, release_folder
 
 log = logging.getLogger(__name__)
@@ -73,7 +73,7 @@ def working_in(folder: Path, config: DictConfig, key: str) -> Iterator[None]:
     """
     if _locks(config):
         lock_folder(folder, key)
-    was_new = not in_sweep() and _holds_at_most(folder, AT_FIRST)
+    was_new = not in_sweep() and holds_at_most(folder, AT_FIRST)
     try:
         yield
     except Exception as error:
@@ -95,31 +95,6 @@ def _locks(config: DictConfig) -> bool:
     return config.stage not in ("report", "fetch", "view") and not together
 
 
-def _holds_at_most(folder: Path, names: set[str]) -> bool:
-    return folder.is_dir() and {path.name for path in folder.iterdir()} <= names
-
-
-def remove_if_only(folder: Path, names: set[str]) -> None:
-    """Remove ``folder`` if it holds nothing but ``names``, and then empty parents.
-
-    The working folder and all above it stay; so do the parents of a folder elsewhere.
-    """
-    if not _holds_at_most(folder, names):
-        return
-    _close_logs()
-    for path in map(folder.joinpath, names):
-        if path.is_dir():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            path.unlink(missing_ok=True)
-    here, folder = Path.cwd(), folder.resolve()
-    if here.is_relative_to(folder):
-        return
-    with suppress(OSError):  # the first that is not empty
-        for path in [folder, *(path for path in folder.parents if here in path.parents)]:
-            path.rmdir()
-
-
 def archive_previous(folder: Path, *needed: Path) -> None:
     """Move the results of earlier commands into ``previous-<n>/`` within the run's folder.
 
@@ -128,7 +103,7 @@ def archive_previous(folder: Path, *needed: Path) -> None:
     old = [p for p in folder.iterdir() if p.name not in AT_FIRST and p.name[:9] != "previous-"]
     if not old:
         return
-    _close_logs()
+    close_logs()
     taken = [int(p.name[9:]) for p in folder.glob("previous-*") if p.name[9:].isdigit()]
     previous = folder / f"previous-{max(taken, default=0) + 1}"
     previous.mkdir()
@@ -140,10 +115,3 @@ def archive_previous(folder: Path, *needed: Path) -> None:
             path.parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(moved, path)
     log.info("what was in %s is kept in %s", folder, previous)
-
-
-def _close_logs() -> None:
-    """Close the log files; one that is written to again is opened anew."""
-    for handler in logging.getLogger().handlers:
-        if isinstance(handler, logging.FileHandler):
-            handler.close()

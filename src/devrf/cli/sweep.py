@@ -18,9 +18,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from devrf.cli.config import choices, overrides
 from devrf.cli.messages import is_user_error, one_line
-from devrf.cli.run_folder import remove_if_only
 from devrf.errors import DevrfError
-from devrf.system.files import write_json
+from devrf.system.files import remove_if_only, write_json
 from devrf.system.folder_lock import PLACE
 from devrf.system.process import forget_peak_memory
 

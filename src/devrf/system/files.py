@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import logging
 import os
 import shutil
 from collections.abc import Iterator
@@ -80,3 +81,36 @@ def free_disk(folder: Path) -> int:
     """Bytes that can be written to ``folder``, which need not exist yet."""
     there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     return shutil.disk_usage(there).free
+
+
+def holds_at_most(folder: Path, names: set[str]) -> bool:
+    """Whether nothing is in ``folder`` but ``names``."""
+    return folder.is_dir() and {path.name for path in folder.iterdir()} <= names
+
+
+def remove_if_only(folder: Path, names: set[str]) -> None:
+    """Remove ``folder`` if it holds nothing but ``names``, and then empty parents.
+
+    The working folder and all above it stay; so do the parents of a folder elsewhere.
+    """
+    if not holds_at_most(folder, names):
+        return
+    close_logs()
+    for path in map(folder.joinpath, names):
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+    here, folder = Path.cwd(), folder.resolve()
+    if here.is_relative_to(folder):
+        return
+    with suppress(OSError):  # the first that is not empty
+        for path in [folder, *(path for path in folder.parents if here in path.parents)]:
+            path.rmdir()
+
+
+def close_logs() -> None:
+    """Close the log files; one that is written to again is opened anew."""
+    for handler in logging.getLogger().handlers:
+        if isinstance(handler, logging.FileHandler):
+            handler.close()

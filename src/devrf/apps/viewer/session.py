@@ -20,9 +20,15 @@ from devrf.apps.viewer.controls import Controls
 from devrf.apps.viewer.drawing import Drawing, Frame, RenderScheduler
 from devrf.apps.viewer.paths import PathPanel, distance_ahead, known_paths
 from devrf.checkpoints.checkpoint import Viewpoints
+from devrf.rendering.renderer import Renderer
 from devrf.rendering.view import Viewable
 from devrf.scenes.scene import Scene
+from devrf.system.process import handle_signals
 
+log = logging.getLogger(__name__)
+
+# Times whose views stay at hand: both ends, the rest state, and where time runs.
+CACHED = 6
 # Seconds between looks at the clock while nothing is to be rendered.
 TICK = 0.02
 # Of JPEG frames: those of a moving scene are small.
@@ -43,12 +49,11 @@ class Session:
         viewpoints: Viewpoints,
         scene: Scene | None,
         folder: Path,
-        stop: threading.Event | None = None,
     ) -> None:
         """Open the page; there is nothing on it before :meth:`present`.
 
         The cameras have pictures if there is a ``scene``. Saved paths go below the run's
-        ``folder``. ``stop`` ends :meth:`serve` within the time of a block of rays.
+        ``folder``.
 
         Raises:
             DevrfError: the address is in use, or not this machine's.
@@ -56,7 +61,7 @@ class Session:
         self.settings, self.viewpoints = settings, viewpoints
         self.scheduler: RenderScheduler | None = None
         self.frames = 0
-        self._stop = stop or threading.Event()
+        self._stop = threading.Event()
         self._flight: tuple[CameraPath, float] | None = None
         self._ticked = time.monotonic()
         self.server = _open_server(settings)
@@ -84,10 +89,14 @@ class Session:
         self.controls.offer(drawing)
         self.refresh()
 
-    def serve(self) -> None:
-        """Render what is asked for until it is stopped, from the calling thread."""
-        while not self._stop.is_set():
-            self.step(TICK)
+    def serve(self, model: Viewable, background: float) -> None:
+        """Show a model until a signal arrives, which ends within the time of a block of rays."""
+        with handle_signals(lambda _: self._stop.set()):
+            self.present(Drawing(Renderer(model, times=CACHED), background))
+            log.info("the scene is at %s; Ctrl-C ends the viewer", self.settings.address)
+            while not self._stop.is_set():
+                self.step(TICK)
+        log.info("the viewer has ended")
 
     def step(self, timeout: float) -> bool:
         """Let time run, and render one frame, waiting ``timeout`` seconds for its cause."""

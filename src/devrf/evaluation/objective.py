@@ -1,0 +1,44 @@
+"""The number of ``metrics.json`` that a search for settings looks at."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from devrf.errors import DevrfError, did_you_mean
+
+# Figures of the training, from the checkpoint, that stand beside the scores.
+TRAINING = ("seconds", "iterations", "iterations_per_second", "peak_gpu_gb", "num_rollbacks")
+# Numbers of both sections of metrics.json, and of the dynamic one. Their second names are those of
+# DeVRF's stages.
+OF_BOTH = ("psnr", "ssim", *TRAINING, "checkpoint_mb")
+OF_MOTION = ("rest_pose_psnr",)
+STATIC, DYNAMIC = ("static", "canonical"), ("dynamic", "deformation")
+
+
+def check_objective(key: str, metrics: Sequence[str]) -> None:
+    """Check that metrics.json will have ``key``, with these ``evaluation.metrics``.
+
+    Raises:
+        DevrfError: it will not.
+    """
+    section, _, name = key.partition(".")
+    if section not in (*STATIC, *DYNAMIC):
+        raise DevrfError(f"objective: expected static.NAME or dynamic.NAME, not {key!r}")
+    known = [*OF_BOTH, *metrics, *(OF_MOTION if section in DYNAMIC else ())]
+    if name not in known:
+        raise DevrfError(
+            f"objective: {section} has no {name!r}; choose from {', '.join(known)}"
+            f"{did_you_mean(name, known, f'objective={section}.')}"
+        )
+
+
+def objective(key: str, found: Mapping[str, Any]) -> float | None:
+    """The number ``key`` of metrics.json; None where it could not be measured.
+
+    The static section stands in for a missing dynamic one.
+    """
+    section, _, name = key.partition(".")
+    section = "static" if section in STATIC else "dynamic"
+    value: float | None = found.get(section, found["static"]).get(name)
+    return value
