@@ -50,13 +50,13 @@ def session(moving, tiny_scene, tmp_path):
 
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port = probe.getsockname()[1]
-    stop, settings = threading.Event(), ViewerSettings(port=port, height=48)
-    served = Session(settings, Viewpoints.of(tiny_scene), tiny_scene, tmp_path, stop)
+    settings = ViewerSettings(port=port, height=48)
+    served = Session(settings, Viewpoints.of(tiny_scene), tiny_scene, tmp_path)
     served.present(Drawing(Renderer(moving, times=6), 1.0))
     thread = threading.Thread(target=served.serve, daemon=True)
     thread.start()
     yield served
-    stop.set()
+    served.stop()
     thread.join(10)
     served.close()
     assert not thread.is_alive()

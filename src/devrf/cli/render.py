@@ -24,9 +24,13 @@ from devrf.errors import DevrfError
 from devrf.evaluation.held_out import background_value
 from devrf.rendering.renderer import Renderer
 from devrf.scenes.scene import Scene
+from devrf.system.process import handle_signals
 from devrf.system.progress import followed
 
 log = logging.getLogger(__name__)
+
+# Times whose views stay at hand in the viewer: both ends, the rest state, and where time runs.
+CACHED = 6
 
 
 def render(run: RunContext) -> list[Path]:
@@ -75,6 +79,7 @@ def _is_its_data(run: RunContext, metadata: CheckpointMetadata) -> bool:
 
 def view(run: RunContext) -> None:
     """Show the run's checkpoint on a page until a signal arrives."""
+    from devrf.apps.viewer.drawing import Drawing
     from devrf.apps.viewer.session import Session  # an extra
 
     settings: ViewerSettings = instantiate(run.config.viewer)
@@ -89,9 +94,13 @@ def view(run: RunContext) -> None:
         log.warning("%s; its training cameras are shown without pictures", error)
     viewpoints = stored.viewpoints if scene is None else Viewpoints.of(scene)
     assert viewpoints is not None
-    model = stored.model.to_view(run.device)
-    with closing(Session(settings, viewpoints, scene, run.folder)) as session:
-        session.serve(model, background_value(viewpoints.background))
+    renderer = Renderer(stored.model.to_view(run.device), times=CACHED)
+    with (
+        closing(Session(settings, viewpoints, scene, run.folder)) as session,
+        handle_signals(lambda _: session.stop()),
+    ):
+        session.present(Drawing(renderer, background_value(viewpoints.background)))
+        session.serve()
 
 
 def export(run: RunContext) -> None:

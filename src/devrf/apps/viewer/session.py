@@ -20,15 +20,11 @@ from devrf.apps.viewer.controls import Controls
 from devrf.apps.viewer.drawing import Drawing, Frame, RenderScheduler
 from devrf.apps.viewer.paths import PathPanel, distance_ahead, known_paths
 from devrf.checkpoints.checkpoint import Viewpoints
-from devrf.rendering.renderer import Renderer
 from devrf.rendering.view import Viewable
 from devrf.scenes.scene import Scene
-from devrf.system.process import handle_signals
 
 log = logging.getLogger(__name__)
 
-# Times whose views stay at hand: both ends, the rest state, and where time runs.
-CACHED = 6
 # Seconds between looks at the clock while nothing is to be rendered.
 TICK = 0.02
 # Of JPEG frames: those of a moving scene are small.
@@ -89,14 +85,16 @@ class Session:
         self.controls.offer(drawing)
         self.refresh()
 
-    def serve(self, model: Viewable, background: float) -> None:
-        """Show a model until a signal arrives, which ends within the time of a block of rays."""
-        with handle_signals(lambda _: self._stop.set()):
-            self.present(Drawing(Renderer(model, times=CACHED), background))
-            log.info("the scene is at %s; Ctrl-C ends the viewer", self.settings.address)
-            while not self._stop.is_set():
-                self.step(TICK)
+    def serve(self) -> None:
+        """Render what is asked for until :meth:`stop`, from the calling thread."""
+        log.info("the scene is at %s; Ctrl-C ends the viewer", self.settings.address)
+        while not self._stop.is_set():
+            self.step(TICK)
         log.info("the viewer has ended")
+
+    def stop(self) -> None:
+        """End :meth:`serve`, within the time of a block of rays."""
+        self._stop.set()
 
     def step(self, timeout: float) -> bool:
         """Let time run, and render one frame, waiting ``timeout`` seconds for its cause."""
@@ -111,7 +109,7 @@ class Session:
 
     def close(self) -> None:
         """Take the page from the network."""
-        self._stop.set()
+        self.stop()
         with _quiet():
             self.server.stop()
 
