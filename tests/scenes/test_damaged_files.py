@@ -6,14 +6,12 @@ Sixty inputs in all, or as many as DEVRF_FUZZ_INPUTS says, shared out among the 
 from __future__ import annotations
 
 import copy
-import io
 import json
 import os
 import shutil
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
@@ -60,18 +58,6 @@ def damaged_bytes(draw: DrawFn, data: bytes) -> bytes:
         chunk = draw(st.binary(min_size=1, max_size=8))
         return data[:at] + chunk + data[at + len(chunk) :]
     return data[:at] + data[at:end] * (2 if change == "repeat" else 0) + data[end:]
-
-
-@st.composite
-def edited_array(draw: DrawFn, values: np.ndarray) -> np.ndarray:
-    """``values`` with a number put in its place, perhaps of another shape or type."""
-    values = values.astype(np.float64)
-    values.flat[draw(st.integers(0, values.size - 1))] = draw(st.sampled_from(NUMBERS))
-    if draw(st.integers(0, 3)) == 0:
-        values = values[: draw(st.integers(0, 5))]
-    kind = draw(st.sampled_from(["f8"] * 4 + ["f4", "i4", "c16", "U8", "?"]))
-    with np.errstate(all="ignore"):
-        return values.astype(kind)
 
 
 def check_message(error: DevrfError, folder: Path) -> None:
@@ -138,10 +124,6 @@ def changes(draw: DrawFn, whole: Path) -> tuple[Path, bytes | str]:
         return file, b"" if change == "empty" else change
     if file.suffix == ".json" and draw(st.booleans()):
         return file, draw(edited_json(json.loads(data))).encode("utf-8", "surrogatepass")
-    if file.suffix == ".npy" and draw(st.booleans()):
-        stream = io.BytesIO()
-        np.save(stream, draw(edited_array(np.load(whole / file))))
-        return file, stream.getvalue()
     return file, draw(damaged_bytes(data))
 
 

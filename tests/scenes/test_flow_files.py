@@ -6,11 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from devrf.errors import DevrfError
-from devrf.scenes.flow_files import read_flow, read_flow_file
-from devrf.scenes.resampling import area_average, shrink_flow, shrink_pixels
+from devrf.scenes.flow_files import read_flow_file
+from devrf.scenes.resampling import area_average, shrink_flow
 
 
 def write_flow(path: Path, vectors: np.ndarray, mask: np.ndarray) -> None:
@@ -43,11 +42,6 @@ def test_area_averages_count_fractions_of_cells():
     np.testing.assert_allclose(area_average(row, width=2, height=1)[0, :, 0], [1, 5], rtol=1e-6)
 
 
-def test_colours_behind_a_clear_matte_do_not_bleed_in():
-    image = np.array([[[200, 0, 0, 255], [0, 255, 0, 0]]], dtype=np.uint8)
-    np.testing.assert_array_equal(shrink_pixels(image, 1, 1)[0, 0], [200, 0, 0, 128])
-
-
 def test_masked_nan_and_infinite_vectors_are_invalid_and_zero(tmp_path):
     vectors = np.ones((3, 5, 2), dtype=np.float32)
     vectors[0, 0, 1], vectors[1, 2, 0] = np.nan, np.inf
@@ -57,16 +51,6 @@ def test_masked_nan_and_infinite_vectors_are_invalid_and_zero(tmp_path):
     read, valid = read_flow_file(tmp_path / "f.npz", width=5, height=3)
     assert {tuple(p) for p in np.argwhere(~valid)} == {(0, 0), (1, 2), (2, 4)}
     assert (read[~valid] == 0).all() and (read[valid] == 1).all()
-
-
-def test_files_are_found_by_their_place_in_the_list(tmp_path):
-    for index in (4, 5):
-        vectors = np.full((8, 12, 2), float(index), dtype=np.float32)
-        write_flow(tmp_path / f"{index:03d}_bwd.npz", vectors, np.ones((8, 12), bool))
-    flow = read_flow(tmp_path, [0, 4, 5], [False, True, True], (12, 8), (6, 2))
-    assert flow is not None
-    assert not flow.valid[0].any() and flow.valid[1:].all()
-    assert torch.equal(flow.vectors[:, 0, 0], torch.tensor([[0.0, 0], [2, 1], [2.5, 1.25]]))
 
 
 def test_wrong_arrays_are_named(tmp_path):

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from PIL import ExifTags, Image, ImageOps
 
-from devrf.apps.inspection.advice import advice_on
 from devrf.errors import DevrfError
-from devrf.scenes.formats.nerfstudio import NerfstudioReader
 from devrf.scenes.images import decode, image_size, load_images, read_header
 
 WIDE, HIGH = (24, 16), (16, 24)
@@ -63,37 +59,3 @@ def test_a_set_is_of_one_size_once_it_is_turned(tmp_path, caplog):
     assert "1 of them turned as their EXIF orientation says" in caplog.text
     with pytest.raises(DevrfError, match="1.jpg: 16x24 px, but .*0.jpg of the same set has 24x16"):
         load_images(paths, 1)
-
-
-def capture(folder: Path, orientation: int, **shared: float) -> None:
-    """A scene of nine photos from a ring, a time on each."""
-    frames = []
-    for k in range(9):
-        photo(folder / f"{k}.jpg", orientation, HIGH, k)
-        angle = torch.tensor(0.7 * k)
-        x, z = torch.sin(angle), torch.cos(angle)
-        pose = torch.eye(4)
-        pose[:3, :3] = torch.stack(
-            [torch.stack([z, z * 0, -x]), torch.eye(3)[1], torch.stack([x, z * 0, z])], dim=1
-        )
-        pose[:3, 3] = torch.stack([4 * x, z * 0, 4 * z])
-        frames.append(
-            {
-                "file_path": f"{k}.jpg",
-                "transform_matrix": pose.tolist(),
-                "time": k / 8,
-            }
-        )
-    content = {"fl_x": 20.0, "cx": 13.0, "cy": 8.0, **shared, "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(content))
-
-
-def test_inspecting_names_the_files_of_which_nobody_can_tell(tmp_path):
-    capture(tmp_path, 6)
-    scene = NerfstudioReader(tmp_path).read()
-    assert (scene.dynamic.train.width, scene.dynamic.train.height) == HIGH
-    said = [str(advice) for advice in advice_on(scene) if "EXIF" in advice.what]
-    assert len(said) == 1
-    assert said[0].startswith("0.jpg, 1.jpg, 2.jpg and 6 more: its EXIF orientation says")
-    capture(tmp_path, 1)
-    assert not [a for a in advice_on(NerfstudioReader(tmp_path).read()) if "EXIF" in a.what]

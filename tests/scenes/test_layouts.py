@@ -4,18 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
 import torch
 
 from devrf.data.recorded import READERS
-
-
-@pytest.mark.parametrize("choice", READERS)
-def test_each_layout_gives_a_scene(choice, write_layout, tmp_path):
-    write_layout(choice, tmp_path / "scene")
-    scene = READERS[choice](tmp_path / "scene").read()
-    assert scene.name == "scene" and scene.moves is (choice != "colmap")
-    assert scene.kind == ("forward" if choice in ("forward", "neural_3d_video") else "inward")
 
 
 def test_the_layouts_say_the_same(tiny_scene, write_layout, tmp_path):

@@ -208,7 +208,6 @@ def test_a_fixed_camera_that_looks_elsewhere(llff_folder, message_of):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"holdout": 1}, "data.holdout"),
         ({"train_views": 3}, "the set has 2 views"),
         ({"test_view": 4}, "none of the 3 views"),
     ],

@@ -120,6 +120,7 @@ def test_any_grey_file_is_a_mask(root, kind):
             lambda r: paint(r, 1, np.stack([half(), half(), 255 - half()], axis=2)),
             "masks/1.png: a mask with colours or an alpha channel",
         ),
+        (lambda r: paint(r, 4, 0 * half()), "masks/4.png: leaves nothing"),
     ],
 )
 def test_wrong_masks(root, spoil, said):
@@ -127,12 +128,6 @@ def test_wrong_masks(root, spoil, said):
     with pytest.raises(DevrfError) as caught:
         NerfstudioReader(root).read()
     assert said in str(caught.value) and "\n" not in str(caught.value)
-
-
-def test_a_mask_that_leaves_nothing(root):
-    paint(root, 4, 0 * half())
-    with pytest.raises(DevrfError, match="masks/4.png: leaves nothing"):
-        NerfstudioReader(root).read()
 
 
 def test_inspecting_says_how_much_they_cover(root, caplog):

@@ -7,8 +7,6 @@ from dataclasses import replace
 
 import torch
 
-from devrf.geometry.box import Box
-from devrf.geometry.cameras import Cameras
 from devrf.scenes.scene import Views
 from devrf.scenes.silhouettes import motion_box, visual_hull
 
@@ -72,33 +70,14 @@ def test_no_box_without_alpha_masks_or_without_two_cameras_at_every_time(ball_vi
     assert motion_box(missing, cube) is None
 
 
-BOX = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 CENTER = torch.tensor([0.2, -0.1, 0.15])
 BALL = 0.4
 
 
-def masks_of_a_ball(width: int = 72, height: int = 56) -> Views:
-    """Exact alpha masks of a ball from twelve directions, non-square."""
-    angle = torch.arange(12) * (2 * torch.pi / 12)
-    height_of = 1.5 * torch.sin(3 * angle)
-    positions = torch.stack([4 * angle.cos(), 4 * angle.sin(), height_of], dim=1)
-    cameras = Cameras.looking_at(
-        positions, torch.zeros(12, 3), focal=70.0, width=width, height=height
-    )
-    pixels = torch.zeros(12, height, width, 4, dtype=torch.uint8)
-    for k in range(12):
-        rays = cameras.image_rays(k)
-        along = ((CENTER - rays.origins) * rays.directions).sum(dim=1)
-        miss = (rays.at(torch.arange(len(rays)), along) - CENTER).norm(dim=1)
-        pixels[k, :, :, 3] = 255 * (miss < BALL).view(height, width)
-    count = torch.arange(12)
-    return Views(pixels, cameras, torch.zeros(12), count, tuple("abcdefghijkl"))
-
-
-def test_hull_holds_the_ball_and_little_more():
+def test_hull_holds_the_ball_and_little_more(ball_views, cube):
     shape = (33, 33, 33)
-    hull = visual_hull(masks_of_a_ball(), BOX, shape)
-    distance = (BOX.grid_points(shape, torch.zeros(1)) - CENTER).norm(dim=-1)
+    hull = visual_hull(ball_views(CENTER[None], BALL, count=12), cube, shape)
+    distance = (cube.grid_points(shape, torch.zeros(1)) - CENTER).norm(dim=-1)
     assert hull[distance < BALL].all()
-    # A pixel is 0.06 wide here, a cell 0.06: no more than a few of both may be added.
+    # A cell is 0.06 wide; the cameras, all a little above, leave most below the ball.
     assert not hull[distance > BALL + 0.3].any()

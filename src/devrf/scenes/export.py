@@ -27,10 +27,7 @@ _WRITE_HINT = "give data.export another folder"
 
 @contextmanager
 def whole_folder(folder: Path) -> Iterator[Path]:
-    """A folder to write into that becomes ``folder`` at the end, if nothing fails.
-
-    Args:
-        folder: a new or an empty folder; folders above it are made.
+    """A folder to write into that becomes ``folder``, new or empty, if nothing fails.
 
     Raises:
         DevrfError: it is in use, or it cannot be written.
@@ -63,10 +60,8 @@ _VALIDATION_VIEWS = 4
 def export(scene: Scene, folder: Path) -> None:
     """Write ``scene`` for ``data=inward`` or ``data=forward`` to read, as its kind says.
 
-    Args:
-        scene: an embedded one: all images of one focal length, their principal points in the
-            middle; fixed cameras stand still, and one of them is held out.
-        folder: a new or an empty folder.
+    It is an embedded one: all images of one focal length, their principal points in the middle;
+    fixed cameras stand still, and one of them is held out. ``folder`` is a new or an empty one.
 
     Raises:
         DevrfError: the folder is in use or cannot be written, or a frame is left out by some views

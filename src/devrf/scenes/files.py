@@ -42,8 +42,7 @@ Content = TypeVar("Content", bound=BaseModel)
 def decoding(path: Path, what: str, remedy: str) -> Iterator[None]:
     """The place where a library decodes ``path``: what it raises becomes a DevrfError.
 
-    ``what`` says what the file should be, ``remedy`` what to do when it is not. Nothing else
-    belongs into its block.
+    ``what`` says what the file should be, ``remedy`` what to do when it is not.
     """
     try:
         yield

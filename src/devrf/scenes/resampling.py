@@ -95,16 +95,13 @@ def as_pinhole(
 ) -> tuple[Tensor, tuple[Lens, ...]]:
     """Undistort the images that need it, bilinearly.
 
-    The principal point stays and the focal lengths grow just enough that every pixel has been
-    seen by the lens: there are no empty borders to learn from.
+    The principal point stays and the focal lengths grow just enough that every pixel has been seen
+    by the lens: there are no empty borders to learn from.
 
     Args:
         pixels: (N, H, W, 1, 3 or 4) uint8, alpha not premultiplied; changed in place.
-        lenses: N, in pixels of these images.
+        lenses: N, in pixels of these images; those returned have no distortion and skew.
         names: N, for messages.
-
-    Returns:
-        The pixels, and N lenses without distortion and skew.
 
     Raises:
         DevrfError: a distortion is so strong that the image folds over.

@@ -34,35 +34,6 @@ PARAMETERS = {
 
 
 @dataclass(frozen=True)
-class ModelCamera:
-    """An entry of ``cameras``.
-
-    Attributes:
-        model: one of :data:`PARAMETERS`.
-        size: width and height of its images in pixels.
-        parameters: in the order of :data:`PARAMETERS`, pixels; (0, 0) is the outer corner of the
-            first pixel.
-    """
-
-    model: str
-    size: tuple[int, int]
-    parameters: tuple[float, ...]
-
-    @property
-    def keys(self) -> dict[str, float]:
-        """The camera as a frame of a transforms file has it: ``fl_x``, ``cx``, ``k1``."""
-        given = dict(zip(PARAMETERS[self.model], self.parameters, strict=True))
-        fx, fy = (given.pop(name, given.get("f", 0.0)) for name in ("fx", "fy"))
-        given.pop("f", None)
-        return {"fl_x": fx, "fl_y": fy, "w": self.size[0], "h": self.size[1], **given}
-
-    @property
-    def intrinsics(self) -> Intrinsics:
-        """The camera as the readers have it."""
-        return intrinsics_of(CameraKeys.model_construct(None, **self.keys), self.model)
-
-
-@dataclass(frozen=True)
 class ModelImage:
     """An entry of ``images``.
 
@@ -87,14 +58,15 @@ class SparseModel:
 
     Attributes:
         folder: where it is from.
-        cameras: by their numbers.
+        cameras: by their numbers, in the keys of a transforms file (``fl_x``, ``cx``, ``k1``);
+            pixels, (0, 0) is the outer corner of the first one.
         images: N of them.
         points: (P, 3) float64, world units.
         numbers: (P,) int64 ascending, the numbers of the points.
     """
 
     folder: Path
-    cameras: dict[int, ModelCamera]
+    cameras: dict[int, dict[str, float]]
     images: tuple[ModelImage, ...]
     points: npt.NDArray[np.float64]
     numbers: npt.NDArray[np.int64]
@@ -114,6 +86,14 @@ class SparseModel:
         # COLMAP's y points down and its z ahead; ours point up and back.
         axes = to_camera.mT * to_camera.new_tensor([1, -1, -1])
         return torch.cat([axes, -(to_camera.mT @ moved[:, :, None])], dim=2)
+
+    @property
+    def intrinsics(self) -> list[Intrinsics]:
+        """N, as the readers have them."""
+        cameras = [self.cameras[image.camera] for image in self.images]
+        return [
+            intrinsics_of(CameraKeys.model_construct(None, **keys), self.folder) for keys in cameras
+        ]
 
     def depths(self, image: int) -> Tensor:
         """(K,) float64: how far along its axis the points of an image are, world units."""
@@ -138,8 +118,7 @@ def read_model(folder: Path) -> SparseModel:
     """The sparse model in a folder, as pycolmap reads it: binary where both forms are there.
 
     Raises:
-        DevrfError: pycolmap is not installed, a file is missing or damaged, or a camera's model is
-            not supported.
+        DevrfError: without pycolmap, of a missing or damaged file, or of a camera's model.
     """
     if find_spec("pycolmap") is None:
         raise scene_error(folder, 'pycolmap reads it; run pip install "devrf[capture]"')
@@ -157,7 +136,7 @@ def read_model(folder: Path) -> SparseModel:
     return SparseModel(folder, cameras, ordered, points.reshape(-1, 3), numbers)
 
 
-def _camera(folder: Path, camera: Any) -> ModelCamera:
+def _camera(folder: Path, camera: Any) -> dict[str, float]:
     model = str(camera.model_name)
     if model not in PARAMETERS:
         raise scene_error(
@@ -165,7 +144,10 @@ def _camera(folder: Path, camera: Any) -> ModelCamera:
             f"camera model {model} is not supported, only {', '.join(PARAMETERS)}; run COLMAP's "
             "image_undistorter, and give its folder",
         )
-    return ModelCamera(model, (camera.width, camera.height), tuple(camera.params.tolist()))
+    given = dict(zip(PARAMETERS[model], camera.params.tolist(), strict=True))
+    focal = given.pop("f", 0.0)
+    fx, fy = (given.pop(name, focal) for name in ("fx", "fy"))
+    return {"fl_x": fx, "fl_y": fy, "w": camera.width, "h": camera.height, **given}
 
 
 def _image(image: Any) -> ModelImage:

@@ -27,11 +27,9 @@ log = logging.getLogger(__name__)
 def every_nth(count: int, holdout: int, start: int | None = None) -> tuple[list[int], list[int]]:
     """The positions to learn from and those to hold out, of ``count`` ≥ 2 images.
 
-    Args:
-        count: how many images there are.
-        holdout: every ``holdout``-th (≥ 2) is held out; of fewer images the last one is.
-        start: the first to hold out: 0 for images at rest, as LLFF's scenes are scored; None: the
-            last of the first run, since a sequence begins at rest.
+    Every ``holdout``-th (≥ 2) is held out, of fewer images the last one; ``start`` is the first: 0
+    for images at rest, as LLFF's scenes are scored; None: the last of the first run, since a
+    sequence begins at rest.
     """
     start = holdout - 1 if start is None else start
     held_out = list(range(start, count, holdout)) or [count - 1]
@@ -179,15 +177,10 @@ def at_times(split: Split, times: Tensor) -> Split:
 
 
 def load_views(split: Split, root: Path, downscale: int, masks: Masks = "none") -> Views:
-    """Read the used images of a split; cameras are pinholes of the smaller images.
+    """Read the used images of a split, made smaller by ``downscale``; their cameras are pinholes.
 
-    Images of a lens with distortion are undistorted, and masks with them.
-
-    Args:
-        split: which images, with which cameras.
-        root: the scene's folder.
-        downscale: integer factor ≥ 1 by which images are made smaller.
-        masks: what the masks that the file lists are taken for.
+    Images of a lens with distortion are undistorted, and masks with them. ``root`` is the scene's
+    folder, ``masks`` what the masks that the file lists are taken for.
 
     Raises:
         DevrfError: an image, a mask or a lens is wrong, or they do not go together.

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from devrf.scenes.files import entries
 from devrf.scenes.flow_files import FlowDirection, warn_of_missing
-from devrf.scenes.image_folders import image_folder, listed_images
+from devrf.scenes.image_folders import ImageFolder, image_folder, listed_images
 from devrf.scenes.lens import Intrinsics
 from devrf.scenes.splits import Split
 from devrf.scenes.transforms import Transforms
@@ -56,18 +56,10 @@ _DIGITS = re.compile(r"\d+")
 
 
 @dataclass(frozen=True)
-class ViewFolder:
-    """What one fixed camera recorded.
-
-    Attributes:
-        images: T files in order of time.
-        downscale: integer factor by which they are yet to be made smaller.
-        flow: the folder where optical flow of these files would lie.
-    """
+class ViewFolder(ImageFolder):
+    """What one fixed camera recorded: T ``images`` in order of time."""
 
     images: list[Path]
-    downscale: int
-    flow: Path
 
 
 def view_folders(folder: Path, downscale: int) -> list[ViewFolder]:
@@ -98,14 +90,14 @@ def view_folders(folder: Path, downscale: int) -> list[ViewFolder]:
         if views and len(images) != len(views[0].images):
             raise scene_error(
                 source.path,
-                f"has {len(images)} images, but {views[0].images[0].parent} has "
+                f"has {len(images)} images, but {views[0].path} has "
                 f"{len(views[0].images)}; each view needs one a frame",
             )
         if views and source.downscale != views[0].downscale:
             raise scene_error(
-                path, f"no folder {views[0].images[0].parent.name} as the other views have; add it"
+                path, f"no folder {views[0].path.name} as the other views have; add it"
             )
-        views.append(ViewFolder(images, source.downscale, source.flow))
+        views.append(ViewFolder(source.path, source.downscale, images))
     if min(len(views), len(views[0].images)) < 2:
         raise scene_error(
             folder,

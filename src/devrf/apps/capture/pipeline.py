@@ -211,7 +211,7 @@ def _around_motion(
         return world
     place = {image.name: k for k, image in enumerate(model.images)}
     first = [place[video.names[0]] for video in fixed]
-    lenses = [model.cameras[model.images[k].camera].keys for k in first]
+    lenses = [model.cameras[model.images[k].camera] for k in first]
     around = Box.of([-AROUND] * 3, [AROUND] * 3)
     names = [video.names for video in fixed]
     box = box_of_motion(images, names, world.poses[first], lenses, around)
@@ -236,7 +236,7 @@ def _frames(
 
     def add(name: str, camera: str, time: float, held_out: bool) -> None:
         k, path = place[camera], f"{IMAGES}/{name}"
-        lens = model.cameras[model.images[k].camera].keys
+        lens = model.cameras[model.images[k].camera]
         pose = [*world.poses[k].tolist(), [0.0, 0.0, 0.0, 1.0]]
         frames.append({"file_path": path, "time": time, **lens, "transform_matrix": pose})
         if held_out:

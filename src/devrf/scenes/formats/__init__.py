@@ -29,13 +29,7 @@ class KnownLayout:
 
     def missing(self, root: Path) -> list[str]:
         """Those of ``files`` that are not in ``root``."""
-        return [name for name in self.files if not _is_there(root, name)]
-
-
-def _is_there(root: Path, name: str) -> bool:
-    if "*" not in name:
-        return os.path.isfile(root / name)
-    return any(os.path.isfile(path) for path in root.glob(name))
+        return [name for name in self.files if not any(map(os.path.isfile, root.glob(name)))]
 
 
 # Folders that hold files of several layouts have that of the first: of two captures before one,
@@ -56,11 +50,7 @@ LAYOUTS = (
 
 
 def recognise(root: str | Path) -> KnownLayout:
-    """The layout of the scene in the folder ``root``.
-
-    Raises:
-        DevrfError: no such folder, or none of the layouts; the message says what each lacks.
-    """
+    """The layout of the scene in ``root``; if none fits, DevrfError says what each lacks."""
     folder = scene_folder(root)
     fitting = [layout for layout in LAYOUTS if not layout.missing(folder)]
     if not fitting:

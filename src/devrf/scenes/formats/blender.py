@@ -16,7 +16,7 @@ from devrf.scenes.images import image_size
 from devrf.scenes.layout import Layout, fewer, load_layout, one_capture, static_alone
 from devrf.scenes.reader import Count, InwardReader, Time
 from devrf.scenes.scene import OpticalFlow, Scene, Views
-from devrf.scenes.splits import Split, at_rest, in_motion
+from devrf.scenes.splits import at_rest, in_motion
 from devrf.scenes.transforms import Transforms, read_transforms
 from devrf.scenes.validation import scene_error
 from devrf.scenes.view_folders import chosen_dynamic, dynamic_folders
@@ -47,24 +47,17 @@ class BlenderReader(InwardReader):
     def read(self) -> Scene:
         """See :meth:`devrf.scenes.reader.SceneReader.read`."""
         folder = scene_folder(self.root)
-        layout, thinned, flow_folder = self._layout(folder)
-        static, dynamic = load_layout(layout, folder, self.downscale)
-        if layout.moves and self.wants_flow_files:
-            if thinned:
-                log.info("flow files dropped: data.frames=%s leaves out neighbours", self.frames)
-            elif layout.dynamic_train.transforms.skipped:
-                log.info("flow files dropped: they are numbered by images of which some are absent")
-            else:
-                flow = _flow(dynamic.train, layout.dynamic_train, flow_folder, "bwd")
-                dynamic = replace(dynamic, train=replace(dynamic.train, flow=flow))
+        found = self._layout(folder)
+        static, dynamic = load_layout(found[0], folder, self.downscale)
+        if found[0].moves and self.wants_flow_files:
+            flow = self._flow(dynamic.train, *found, "bwd")
+            dynamic = replace(dynamic, train=replace(dynamic.train, flow=flow))
         return self.scene(folder, static, dynamic)
 
     def forward_flow(self, views: Views) -> OpticalFlow | None:
         """See :meth:`devrf.scenes.reader.SceneReader.forward_flow`."""
-        layout, thinned, flow_folder = self._layout(scene_folder(self.root))
-        if thinned or not layout.moves or layout.dynamic_train.transforms.skipped:
-            return None
-        return _flow(views, layout.dynamic_train, flow_folder, "fwd")
+        found = self._layout(scene_folder(self.root))
+        return self._flow(views, *found, "fwd") if found[0].moves else None
 
     def _layout(self, root: Path) -> tuple[Layout, bool, Path]:
         """The splits, whether times were left out, and the folder where flow files would lie."""
@@ -86,6 +79,31 @@ class BlenderReader(InwardReader):
             flow_folder = moving / "train_flow"
         return *fewer(layout, self.train_views, self.frames), flow_folder
 
+    def _flow(
+        self, views: Views, layout: Layout, thinned: bool, folder: Path, direction: FlowDirection
+    ) -> OpticalFlow | None:
+        """The flow files of the dynamic training views, if they are of these images."""
+        split = layout.dynamic_train
+        if thinned:
+            log.info("flow files dropped: data.frames=%s leaves out neighbours", self.frames)
+            return None
+        if split.transforms.skipped:
+            log.info("flow files dropped: they are numbered by images of which some are absent")
+            return None
+        if any(not known.distortion.none for known in split.transforms.intrinsics):
+            log.warning("flow files in %s left out: they are of images before undistortion", folder)
+            return None
+        used, first, last = int(split.index[0]), split.times.min(), split.times.max()
+        expected = views.times > first + 1e-6 if direction == "bwd" else views.times < last - 1e-6
+        return read_flow(
+            folder,
+            split.index.tolist(),
+            expected.tolist(),
+            image_size(split.transforms.images[used], split.transforms.intrinsics[used].size),
+            (views.width, views.height),
+            direction,
+        )
+
 
 def _train_and_test(folder: Path, root: Path, missing: Missing) -> tuple[Transforms, Transforms]:
     """The images of a capture to learn from, and those held out."""
@@ -93,20 +111,3 @@ def _train_and_test(folder: Path, root: Path, missing: Missing) -> tuple[Transfo
     held_out = val if os.path.isfile(val) and not os.path.isfile(test) else test
     _, train = read_transforms(folder / "transforms_train.json", root, missing=missing)
     return train, read_transforms(held_out, root, missing=missing)[1]
-
-
-def _flow(views: Views, split: Split, folder: Path, direction: FlowDirection) -> OpticalFlow | None:
-    first, last = split.times.min(), split.times.max()
-    if any(not known.distortion.none for known in split.transforms.intrinsics):
-        log.warning("flow files in %s left out: they are of images before undistortion", folder)
-        return None
-    used = int(split.index[0])
-    expected = views.times > first + 1e-6 if direction == "bwd" else views.times < last - 1e-6
-    return read_flow(
-        folder,
-        split.index.tolist(),
-        expected.tolist(),
-        image_size(split.transforms.images[used], split.transforms.intrinsics[used].size),
-        (views.width, views.height),
-        direction,
-    )

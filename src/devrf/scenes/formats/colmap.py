@@ -107,8 +107,9 @@ class ColmapReader(PosedReader, FixedViewsReader):
             )
         model = read_model(place)
         world = normalised(model, _facing(self.space))
-        size = model.cameras[model.images[0].camera].size
-        factor = whole_factor(self.downscale, lambda factor: min(size) // factor)
+        camera = model.cameras[model.images[0].camera]
+        side = int(min(camera["w"], camera["h"]))
+        factor = whole_factor(self.downscale, lambda factor: side // factor)
         source = images_of(model, folder, factor)
         layout, smaller = self._layout(folder, model, world.poses, source.path, factor)
         layout, _ = fewer(layout, self.train_views, self.frames)
@@ -120,7 +121,7 @@ class ColmapReader(PosedReader, FixedViewsReader):
         self, folder: Path, model: SparseModel, poses: Tensor, source: Path, factor: int
     ) -> tuple[Layout, int | None]:
         """The splits, and by what the images of fixed views are yet to be made smaller."""
-        lenses = [model.cameras[image.camera].intrinsics for image in model.images]
+        lenses = model.intrinsics
         names = [os.path.relpath(source / image.name, model.folder) for image in model.images]
         present = present_images(names, model.folder / "images", folder, self.missing)
         if len(present) < 2:

@@ -71,12 +71,10 @@ class PosedSet:
 def read_static_poses(folder: Path) -> PosedSet:
     """The cameras of ``poses_bounds.npy``: (N, 17), or (N, 14) next to ``hwf_cxcy.npy``.
 
-    A row is a 3×5 matrix (axes [down, right, back], position, [H, W, focal]) or a 3×4 one
-    without the last column, then least and largest depth. ``hwf_cxcy.npy`` holds H, W, focal;
-    or H, W, focal, cx, cy; or H, W, fx, fy, cx, cy; for all images.
-
-    Raises:
-        DevrfError: a file is missing or damaged, or holds something else.
+    A row is a 3×5 matrix (axes [down, right, back], position, [H, W, focal]) or a 3×4 one without
+    the last column, then least and largest depth. ``hwf_cxcy.npy`` holds H, W, focal; or H, W,
+    focal, cx, cy; or H, W, fx, fy, cx, cy; for all images. DevrfError when a file is missing or
+    holds something else.
     """
     file, inner = folder / POSES, folder / "hwf_cxcy.npy"
     rows = read_numbers(file, "the static cameras, (N, 17) or (N, 14)")
@@ -98,10 +96,8 @@ def read_static_poses(folder: Path) -> PosedSet:
 def read_dynamic_poses(folder: Path) -> PosedSet:
     """The cameras of ``poses.npy`` (N, 3, 5) and ``bds.npy`` (N, 2).
 
-    A matrix holds axes [right, up, back], position, [H, W, focal].
-
-    Raises:
-        DevrfError: a file is missing or damaged, or holds something else.
+    A matrix holds axes [right, up, back], position, [H, W, focal]. DevrfError when a file is
+    missing or holds something else.
     """
     file, depths = folder / "poses.npy", folder / "bds.npy"
     matrix = read_numbers(file, "the moving capture's cameras, (N, 3, 5)")

@@ -39,26 +39,26 @@ _AT_REST = 1e-6
 class NerfstudioReader(PosedReader):
     """Reads ``transforms.json`` and images.
 
-    The file may lie in ``root``, with a ``time`` in [0, 1] on every frame, or in
-    ``root/static`` and, with times, in ``root/dynamic``. Without times, or without
-    ``root/dynamic``, the scene is at rest. Cameras may stand still or move.
-    Held-out images are those in ``test_filenames`` (else ``val_filenames``), else every
-    ``holdout``-th. Images are undistorted; the world is that of the file's poses.
+    The file may lie in ``root``, with a ``time`` in [0, 1] on every frame, or in ``root/static``
+    and, with times, in ``root/dynamic``. Without times, or without ``root/dynamic``, the scene is
+    at rest. Cameras may stand still or move. Held-out images are those in ``test_filenames`` (else
+    ``val_filenames``), else every ``holdout``-th. Images are undistorted; the world is that of the
+    file's poses.
 
-    A frame's ``mask_path`` is a grey image of the size of the image or of its camera, black
-    where pixels are left out. In nerfstudio's meaning these pixels say nothing (people who walk
-    by): ``ignore`` neither learns from them nor scores them, and the fields show there what
-    other images say. ``alpha`` takes them for background (a person who was cut out), as an
-    alpha channel would be taken: that also shows where the scene is and where it moves.
+    A frame's ``mask_path`` is a grey image of the size of the image or of its camera, black where
+    pixels are left out.
 
     Attributes:
         train_views: train on the first so many dynamic views; None: all.
         holdout: without lists in the file, one of so many images is held out.
-        static_until: in one file, the latest time of an image that counts as static; None: 0
-            where several images are of time 0, else 1.
-        masks: what the masks of the frames are taken for; ``none`` leaves them alone.
-        space: as of :class:`~devrf.scenes.reader.PosedReader`; a file of ``stage=capture``
-            says itself (``scene_bounds``) what ``auto`` is.
+        static_until: in one file, the latest time of an image that counts as static; None: 0 where
+            several images are of time 0, else 1.
+        masks: what the masks are taken for. ``ignore``, nerfstudio's meaning: their pixels (people
+            who walk by) are neither learned from nor scored. ``alpha``: they are background, as of
+            a person who was cut out; that also shows where the scene is and where it moves.
+            ``none``: they are left alone.
+        space: as of :class:`~devrf.scenes.reader.PosedReader`; a file of ``stage=capture`` says
+            itself (``scene_bounds``) what ``auto`` is.
     """
 
     _: KW_ONLY

@@ -71,12 +71,10 @@ class Bending:
     def __init__(
         self, ramp: tuple[float, float], turns: tuple[tuple[int, int, Swing], ...]
     ) -> None:
-        """Bend between the distances ``ramp``.
+        """Bend between the distances ``ramp`` (start and end, world units).
 
-        Args:
-            ramp: start and end, world units.
-            turns: in the order in which they are made, each from one axis (0, 1, 2) towards
-                another, with its angle in radians.
+        Each of ``turns``, in the order in which they are made, is from one axis (0, 1, 2) towards
+        another, with its angle in radians.
         """
         self._ramp = ramp
         self._turns = turns

@@ -122,8 +122,6 @@ def _one_thread() -> Iterator[None]:
 class ProceduralScene(Recipe):
     """An object with cameras all around it, in world units about the origin.
 
-    The other numbers are those of :class:`~devrf.scenes.procedural.recipe.Recipe`.
-
     Attributes:
         shape: ``robot`` (rigid parts, large fast motion) or ``flower`` (non-rigid).
         static_test_views: held-out views of the scene at rest.
@@ -196,8 +194,7 @@ class ProceduralForwardScene(Recipe):
 
     The world is the one that :class:`devrf.scenes.formats.llff.LlffReader` makes: the static
     cameras' average pose is the identity, and nothing is nearer to a camera than 1/0.75. Besides
-    ``static_views`` to learn from there are held-out ones, one in eight of all. The other
-    numbers are those of :class:`~devrf.scenes.procedural.recipe.Recipe`.
+    ``static_views`` to learn from there are held-out ones, one in eight of all.
 
     Attributes:
         name: the scene's name.

@@ -26,13 +26,9 @@ from devrf.scenes.procedural.solids import (
 class Surrounded:
     """A :class:`~devrf.scenes.procedural.solids.Shape` among still surroundings.
 
-    The first parts are those of the surroundings; the shape's own follow.
-
-    Attributes:
-        shape: what stands in the middle, and moves.
-        surroundings: what stands still.
-        reach: radius of a ball about the origin that holds the shape at all times, world units;
-            None: its distance is cheap enough everywhere.
+    The first parts are those of the surroundings; the shape's own follow. ``reach`` is the radius
+    of a ball about the origin that holds the moving shape at all times, world units; None: its
+    distance is cheap enough everywhere.
     """
 
     shape: Shape
