@@ -55,7 +55,7 @@ def scene_columns(run: Path) -> tuple[list[list[Tensor]], list[str]]:
     ]
     renderer, columns = Renderer(model), []
     for cameras, time, _ in shots:
-        pixels = filming.pictures(cameras, time).pixels[0].float() / 255
+        pixels = filming.pictures(cameras, time)[0][0].float() / 255
         truth = 1 + pixels[..., 3:] * (pixels[..., :3] - 1)
         columns.append([truth, *still(renderer, cameras, time, 1.0)])
     return cut(columns), [heading for _, _, heading in shots]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,8 +13,6 @@ import torch
 from PIL import Image
 
 from devrf.apps.inspection.advice import advice_on
-from devrf.apps.inspection.picture import shown
-from devrf.apps.inspection.report import image_facts
 from devrf.errors import DevrfError
 from devrf.scenes.formats.nerfstudio import NerfstudioReader
 
@@ -56,11 +53,11 @@ def half(value: int = 255) -> np.ndarray:
     return values
 
 
-def plain(root: Path, masks: list[np.ndarray] | None = None) -> None:
-    """No distortion, and masks of one's own for all images."""
+def plain(root: Path) -> None:
+    """No distortion, and masks of one half for all images."""
     edit(root, lambda c: [c.pop(key) for key in ("k1", "k2", "k3", "p1", "p2")])
     for k in range(9):
-        paint(root, k, half() if masks is None else masks[k])
+        paint(root, k, half())
 
 
 @pytest.mark.parametrize("downscale", [1, 3])
@@ -128,19 +125,6 @@ def test_wrong_masks(root, spoil, said):
     with pytest.raises(DevrfError) as caught:
         NerfstudioReader(root).read()
     assert said in str(caught.value) and "\n" not in str(caught.value)
-
-
-def test_inspecting_says_how_much_they_cover(root, caplog):
-    plain(root, [255 - half() if k == 3 else half() for k in range(9)])
-    with caplog.at_level(logging.INFO):
-        scene = NerfstudioReader(root).read()
-    assert "masks of 8 images leave out 50.0 % of the pixels of all" in caplog.text
-    assert image_facts(scene)[0][4:6] == ("no", "leave out 50 %")
-    assert not [advice for advice in advice_on(scene) if "masks" in advice.what]
-    image, pixels = shown(scene.dynamic.train, 0), scene.dynamic.train.pixels[0].numpy()
-    assert (image[:, :40] == pixels[:, :40]).all() and (image[:, 40:] >= 232).all()
-    matte = NerfstudioReader(root, masks="alpha").read()
-    assert image_facts(matte)[0][4:6] == ("cover 50 %", "no")
 
 
 def test_masks_that_cut_out_the_subject_are_told_from_others(root):

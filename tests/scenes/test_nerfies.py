@@ -36,9 +36,7 @@ class Folder:
         self.root = root
 
     def write(self, name: str, content: Any) -> None:
-        file = self.root / name
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(json.dumps(content))
+        (self.root / name).write_text(json.dumps(content))
 
     def edit(self, name: str, change: Callable[[dict[str, Any]], object]) -> None:
         content = json.loads((self.root / name).read_text())

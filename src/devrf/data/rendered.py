@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from devrf.data.datamodule import SceneDataModule
-from devrf.scenes.procedural.filming import forward_flow
+from devrf.scenes.procedural.filming import exact_flow
 from devrf.scenes.procedural.recipe import ProceduralScene, Recipe
 from devrf.scenes.scene import Scene
 
@@ -36,7 +36,8 @@ class RenderedDataModule(SceneDataModule):
         scene, train = self.scene, self.scene.dynamic.train
         wanted = "forward_flow" in priors and train.forward_flow is None
         if wanted and isinstance(self.recipe, Recipe):
-            train = replace(train, forward_flow=forward_flow(self.recipe.filmed(), train))
+            flow = exact_flow(self.recipe.filmed(), train, forward=True)
+            train = replace(train, forward_flow=flow)
             self.replace(replace(scene, dynamic=replace(scene.dynamic, train=train)))
 
 

@@ -97,21 +97,18 @@ def _write_capture(capture: Capture, folder: Path) -> None:
 
 
 def _write_split(views: Views, split: str, folder: Path) -> None:
-    (folder / split).mkdir(parents=True)
-    frames: list[dict[str, Any]] = []
-    for k, (pixels, pose, time) in enumerate(
-        zip(views.pixels, views.cameras.camera_to_world, views.times.tolist(), strict=True)
-    ):
-        name = f"r_{k:03d}"
-        iio.imwrite(folder / split / f"{name}.png", pixels.cpu().numpy())
-        frames.append(
-            {
-                "file_path": f"./{split}/{name}",
-                "time": time,
-                # A float32 becomes the float64 of the same value, which JSON keeps digit for digit.
-                "transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]],
-            }
+    _write_images(views, range(len(views)), folder / split, "r_")
+    frames = [
+        {
+            "file_path": f"./{split}/r_{k:03d}",
+            "time": time,
+            # A float32 becomes the float64 of the same value, which JSON keeps digit for digit.
+            "transform_matrix": [*pose.tolist(), [0.0, 0.0, 0.0, 1.0]],
+        }
+        for k, (pose, time) in enumerate(
+            zip(views.cameras.camera_to_world, views.times.tolist(), strict=True)
         )
+    ]
     focal = float(views.cameras.focal[0, 0])
     angle = 2 * math.atan(views.width / 2 / focal)
     content = {"camera_angle_x": angle, "frames": frames}
@@ -215,7 +212,7 @@ def _double(poses: Tensor) -> Numbers:
     return array
 
 
-def _write_images(views: Views, numbers: Iterable[int], folder: Path) -> None:
+def _write_images(views: Views, numbers: Iterable[int], folder: Path, prefix: str = "") -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for k, pixels in zip(numbers, views.pixels, strict=True):
-        iio.imwrite(folder / f"{k:03d}.png", pixels.cpu().numpy())
+        iio.imwrite(folder / f"{prefix}{k:03d}.png", pixels.cpu().numpy())

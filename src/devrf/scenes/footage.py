@@ -50,14 +50,8 @@ def film_header(path: Path) -> FilmHeader:
         DevrfError: there is no such file, or it cannot be read as a video.
     """
     with _opened(path) as video:
-        width, height, frames = (
-            int(video.get(key))
-            for key in (
-                cv2.CAP_PROP_FRAME_WIDTH,
-                cv2.CAP_PROP_FRAME_HEIGHT,
-                cv2.CAP_PROP_FRAME_COUNT,
-            )
-        )
+        keys = cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_COUNT
+        width, height, frames = (int(video.get(key)) for key in keys)
     return FilmHeader((width, height), frames)
 
 

@@ -114,27 +114,23 @@ def read_dynamic_poses(folder: Path) -> PosedSet:
 
 def _of_columns(file: Path, columns: Numbers) -> tuple[Intrinsics, ...]:
     """The intrinsics in columns H, W, focal (N, 3)."""
-    return tuple(_intrinsics(file, h, w, f, f, w / 2, h / 2) for h, w, f in columns.tolist())
+    return tuple(_intrinsics(file, *row) for row in columns.tolist())
 
 
 def _shared(file: Path) -> Intrinsics:
     """The intrinsics in ``hwf_cxcy.npy``."""
     values = read_numbers(file, "H, W, focal, cx, cy next to a poses_bounds.npy of (N, 14)")
-    match values.flatten()[:7].tolist():
-        case [h, w, focal]:
-            return _intrinsics(file, h, w, focal, focal, w / 2, h / 2)
-        case [h, w, focal, cx, cy]:
-            return _intrinsics(file, h, w, focal, focal, cx, cy)
-        case [h, w, fx, fy, cx, cy]:
-            return _intrinsics(file, h, w, fx, fy, cx, cy)
-    raise scene_error(
-        file, f"holds {values.size} numbers, expected H, W, focal(s), cx, cy; write it again"
-    )
+    if values.size not in (3, 5, 6):
+        raise scene_error(
+            file, f"holds {values.size} numbers, expected H, W, focal(s), cx, cy; write it again"
+        )
+    return _intrinsics(file, *values.flatten().tolist())
 
 
-def _intrinsics(
-    file: Path, h: float, w: float, fx: float, fy: float, cx: float, cy: float
-) -> Intrinsics:
+def _intrinsics(file: Path, h: float, w: float, fx: float, *more: float) -> Intrinsics:
+    """Of H, W, focal; H, W, focal, cx, cy; or H, W, fx, fy, cx, cy."""
+    fy = more[0] if len(more) == 3 else fx
+    cx, cy = more[-2:] or (w / 2, h / 2)
     if min(h, w) < 1 or min(fx, fy) <= 0:
         raise scene_error(
             file, f"height {h:g}, width {w:g} or focal length {fx:g} is not above 0; correct it"

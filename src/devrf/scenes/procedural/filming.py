@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -84,39 +84,30 @@ def moved(shape: Shape, points: Tensor, time: float, to: float) -> Tensor:
     return shape.forward(shape.material(points, time), to)
 
 
-def backward_flow(
-    shape: Shape, cameras: Cameras, depth: Tensor, time: float, earlier: float
-) -> OpticalFlow:
-    """Exact optical flow of N fixed cameras from ``time`` to ``earlier``.
+def exact_flow(shape: Shape, views: Views, *, forward: bool = False) -> OpticalFlow:
+    """Exact backward (or forward) flow of ``views`` with depth, all fixed cameras at each frame.
 
-    The point that the ray through a pixel's centre meets is carried to the earlier time and
-    projected; it may be hidden there, or outside of the image. ``depth`` (N, H, W) is the distance
-    along the rays through the pixels' centres, +inf on a miss: there the flow is 0 and not valid.
-    """
-    valid = depth.isfinite()
-    camera, row, column = valid.nonzero().unbind(-1)
-    pixels = torch.stack([column, row], dim=-1).to(depth) + 0.5
-    rays = cameras.rays(camera, pixels)
-    points = rays.at(torch.arange(len(rays)), depth[valid])
-    before, _ = cameras.project(camera, moved(shape, points, time, earlier))
-    flow = depth.new_zeros(*depth.shape, 2)
-    flow[valid] = before - pixels
-    return OpticalFlow(flow, valid)
-
-
-def forward_flow(shape: Shape, views: Views) -> OpticalFlow:
-    """Exact forward optical flow of ``views`` with depth, all fixed cameras at each frame.
-
-    The last frame has none.
+    The point that the ray through a pixel's centre meets is carried to the frame before (after)
+    and projected; it may be hidden there, or outside of the image. Where the ray meets nothing,
+    and in the first (last) frame, the flow is 0 and not valid.
     """
     assert views.depth is not None
-    times = torch.unique(views.times)
+    times = torch.unique(views.times).tolist()
+    pairs = zip(times, times[1:], strict=False) if forward else zip(times[1:], times, strict=False)
     vectors = views.depth.new_zeros(*views.depth.shape, 2)
     valid = torch.zeros_like(views.depth, dtype=torch.bool)
-    for time, later in zip(times, times[1:], strict=False):
+    for time, other in pairs:
         at = (views.times == time).nonzero()[:, 0]
-        flow = backward_flow(shape, views.cameras[at], views.depth[at], float(time), float(later))
-        vectors[at], valid[at] = flow.vectors, flow.valid
+        cameras, depth = views.cameras[at], views.depth[at]
+        met = depth.isfinite()
+        camera, row, column = met.nonzero().unbind(-1)
+        pixels = torch.stack([column, row], dim=-1).to(depth) + 0.5
+        rays = cameras.rays(camera, pixels)
+        points = rays.at(torch.arange(len(rays)), depth[met])
+        there, _ = cameras.project(camera, moved(shape, points, time, other))
+        flow = depth.new_zeros(*depth.shape, 2)
+        flow[met] = there - pixels
+        vectors[at], valid[at] = flow, met
     return OpticalFlow(vectors, valid)
 
 
@@ -166,14 +157,9 @@ class Filming:
 
     def _moving(self, cameras: Cameras, shown: Sequence[int], frames: int, split: str) -> Views:
         times = torch.tensor(shown) / (frames - 1)
-        clock: list[float] = times.tolist()
-        pixels, depths = zip(*(self.pictures(cameras, time) for time in clock), strict=True)
-        nowhere = torch.zeros_like(depths[0])
-        flows = [OpticalFlow(torch.stack([nowhere, nowhere], dim=-1), nowhere.bool())]
-        for earlier, time, depth in zip(clock, clock[1:], depths[1:], strict=False):
-            flows.append(backward_flow(self.shape, cameras, depth, time, earlier))
+        pixels, depths = zip(*(self.pictures(cameras, t) for t in times.tolist()), strict=True)
         view = torch.arange(len(cameras)).repeat(len(shown))
-        return Views(
+        views = Views(
             torch.cat(pixels),
             cameras[view],
             times.repeat_interleave(len(cameras)),
@@ -183,12 +169,9 @@ class Filming:
                 for frame in shown
                 for v in range(len(cameras))
             ),
-            flow=OpticalFlow(
-                torch.cat([flow.vectors for flow in flows]),
-                torch.cat([flow.valid for flow in flows]),
-            ),
             depth=torch.cat(depths),
         )
+        return replace(views, flow=exact_flow(self.shape, views))
 
     def pictures(self, cameras: Cameras, time: float) -> tuple[Tensor, Tensor]:
         """One image from each of N ``cameras`` at ``time``.

@@ -162,7 +162,6 @@ BROWN: Rgb = (0.35, 0.17, 0.08)
 LEAF_GREEN: Rgb = (0.12, 0.48, 0.20)
 SPRING: Rgb = (0.62, 0.82, 0.28)
 TERRACOTTA: Rgb = (0.78, 0.36, 0.20)
-BLUE: Rgb = (0.13, 0.35, 0.62)
 
 # A petal's paint starts at its hinge: cos is 1 there, so that the accent glows at the heart.
 OUTER = Whorl(
