@@ -172,6 +172,15 @@ def metadata_of(path: Path) -> CheckpointMetadata:
     return metadata_in(path, read_description(path))
 
 
+def latest_checkpoint(run: Path) -> Path | None:
+    """The checkpoint or progress file of the latest stage in a run's folder; None without one."""
+    latest: list[tuple[int, int, Path]] = []
+    for path in (run / "checkpoints").glob("*.ckpt"):
+        with suppress(DevrfError, OSError):
+            latest.append((len(metadata_of(path).records), path.stat().st_mtime_ns, path))
+    return max(latest)[2] if latest else None
+
+
 def metadata_in(path: Path, data: dict[str, Any]) -> CheckpointMetadata:
     """The metadata in the content of a checkpoint.
 

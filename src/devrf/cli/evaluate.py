@@ -37,14 +37,15 @@ EXECUTION = ("kernels", "startup_seconds", "graph_captures", "short_lists", "pea
 
 
 def evaluate(run: RunContext) -> list[Path]:
-    """Score what was learned on held-out views; write metrics and contact sheets.
-
-    Returns:
-        The files.
-    """
+    """Score what was learned on held-out views; return the files: metrics and contact sheets."""
     loaded = run.load()
-    model, records = loaded.model.to_view(run.device), loaded.metadata.records
+    model = loaded.model.to_view(run.device)
     suite = run.evaluation.suite(run.device)
+
+    def training(stage: str) -> TrainingFigures:
+        record = loaded.metadata.records.get(stage, {})
+        return {name: record.get(name) for name in TRAINING}
+
     frames: dict[str, list[HeldOutView]] = {"static": _score(run, model, "static", suite)}
     last = loaded.metadata.stage
     # A single stage's training stands in the dynamic section, where there is one.
@@ -53,10 +54,10 @@ def evaluate(run: RunContext) -> list[Path]:
     static: dict[str, Any] = mean_scores(frames["static"])
     sections = {"static": static}
     if rest is not None or not moved:
-        sections["static"] = sections[rest or last] = static | _training(records, rest or last)
+        sections["static"] = sections[rest or last] = static | training(rest or last)
     if moved:
         frames["dynamic"] = _score(run, model, "dynamic", suite)
-        dynamic = dynamic_scores(frames["dynamic"], run.scene.clock) | _training(records, last)
+        dynamic = dynamic_scores(frames["dynamic"], run.scene.clock) | training(last)
         sections |= {"dynamic": dynamic, **({} if rest is None else {last: dynamic})}
     size = round(run.checkpoint(last).stat().st_size / 1e6, 3)
     sections["dynamic" if moved else "static"]["checkpoint_mb"] = size
@@ -91,10 +92,6 @@ def _tell(
         tracker.conclude({name: score for name, score in scores.items() if score is not None})
         tracker.show_table("metrics", [{"section": name, **own} for name, own in shown.items()])
         tracker.show_table("frames", frame_rows(frames))
-
-
-def _training(records: Mapping[str, TrainingFigures], stage: str) -> TrainingFigures:
-    return {name: records.get(stage, {}).get(name) for name in TRAINING}
 
 
 def _origin(run: RunContext, described: CheckpointMetadata) -> dict[str, Any]:

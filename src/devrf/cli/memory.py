@@ -1,10 +1,9 @@
-"""Whether memory and disk suffice for a run, before it begins, and what to say where they end."""
+"""Whether memory and disk suffice for a run, before it begins."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 
 import torch
 from hydra.utils import instantiate
@@ -15,7 +14,7 @@ from devrf.cli.context import RunContext
 from devrf.engine.micro_batching import MicroBatching
 from devrf.errors import DevrfError
 from devrf.system.files import free_disk
-from devrf.system.memory import free_host_memory, free_memory, gib, is_oom, numbers, own_memory
+from devrf.system.memory import free_host_memory, free_memory, gib, own_memory
 
 # A checkpoint, and three progress files at once, each with values and Adam's two means.
 FILES = 10
@@ -93,20 +92,3 @@ def _smaller(run: RunContext, key: str, share: float) -> str:
     power = POWER.get(key.rpartition(".")[2], 1)
     scaled = value * share ** (1 / power)
     return f"{key}={math.ceil(scaled) if power < 0 else max(math.floor(scaled), 1)}"
-
-
-@contextmanager
-def shortage_in_words(name: str, run: RunContext) -> Iterator[None]:
-    """Raise a DevrfError where memory runs out in the step ``name``."""
-    try:
-        yield
-    except (RuntimeError, MemoryError) as error:
-        if not is_oom(error):
-            raise
-        rays = f"schedule.{name}.rays"
-        known = OmegaConf.select(run.config, rays) is not None
-        hint = f"lower {rays}" if known else "free some of it, or use a larger machine"
-        raise DevrfError(
-            f"stage={name}: out of memory ({numbers(str(error), run.device)}); {hint}; what was "
-            "written before stays"
-        ) from error

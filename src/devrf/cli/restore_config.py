@@ -104,8 +104,10 @@ def of_named_run(typed: Sequence[Override], multirun: bool) -> list[str]:
         return _of_sweep(typed, Path(sweep))
     source = ", ".join(map(str, checkpoints))
     if folder is not None and not checkpoints and not multirun:
+        from devrf.checkpoints.checkpoint import latest_checkpoint  # loads torch
+
         source = folder
-        if (last := _last_checkpoint(Path(folder))) is not None:
+        if (last := latest_checkpoint(Path(folder))) is not None:
             checkpoints = [last]
     commands = [_command(path) for path in checkpoints if path.is_file()]
     if not commands or len(commands) < len(checkpoints):
@@ -164,13 +166,13 @@ def _folder_for(checkpoint: Path) -> Path:
     Into the folder of its run if it is the last of it, else into a folder below that has the
     checkpoint's name; of a file that stands alone, into ``outputs/<scene>/<name>``.
     """
+    from devrf.checkpoints.checkpoint import latest_checkpoint, metadata_of
+
     if checkpoint.parent.name == "checkpoints":
         run = checkpoint.parent.parent
-        last = _last_checkpoint(run)
+        last = latest_checkpoint(run)
         same = last is not None and last.resolve() == checkpoint.resolve()
         return run if same else run / checkpoint.stem
-    from devrf.checkpoints.checkpoint import metadata_of
-
     return Path("outputs") / scene_folder_name(metadata_of(checkpoint).scene) / checkpoint.stem
 
 
@@ -183,14 +185,3 @@ def _command(checkpoint: Path) -> list[str] | None:
         command = metadata_of(checkpoint).command
         return None if command is None else recorded(command)
     return None
-
-
-def _last_checkpoint(run: Path) -> Path | None:
-    """The checkpoint or progress file of the latest stage in a run's folder."""
-    latest: list[tuple[int, int, Path]] = []
-    for path in (run / "checkpoints").glob("*.ckpt"):
-        from devrf.checkpoints.checkpoint import metadata_of
-
-        with suppress(DevrfError, OSError):
-            latest.append((len(metadata_of(path).records), path.stat().st_mtime_ns, path))
-    return max(latest)[2] if latest else None

@@ -24,7 +24,7 @@ from devrf.apps.settings import ViewerSettings
 from devrf.cli.config import OF_A_CHECKPOINT, in_search, in_sweep, meant_stage
 from devrf.cli.context import RunContext
 from devrf.cli.evaluate import evaluate
-from devrf.cli.memory import check_memory, shortage_in_words
+from devrf.cli.memory import check_memory
 from devrf.cli.messages import as_own_errors
 from devrf.cli.preparation import capture, fetch, inspect, prepare, say_next, selfcheck
 from devrf.cli.render import export, picture, render, view
@@ -37,6 +37,7 @@ from devrf.engine.workers import launch_workers
 from devrf.errors import DevrfError
 from devrf.evaluation.objective import check_objective, objective
 from devrf.ops.dispatch import using
+from devrf.system.memory import shortage_in_words
 
 log = logging.getLogger(__name__)
 
@@ -101,7 +102,8 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
     """
     run = RunContext(config, folder)
     learning, steps = plan(config.stage, run.learning_stages)
-    _check(run, learning, steps)
+    with shortage_in_words(config.stage, run.device, None):  # of networks that are too wide
+        _check(run, learning, steps)
     several = isinstance(run.strategy, ManualDDP)
     if not several and _all_done(run, learning, steps):
         return _ended(run, steps)
@@ -196,7 +198,9 @@ def _learn(run: RunContext, learning: Names) -> None:
 
 def _take(run: RunContext, name: str, step: Step) -> None:
     seed_everything(run.config.seed, verbose=False)
-    with using(run.config.kernels), shortage_in_words(name, run):
+    rays = f"schedule.{name}.rays"
+    known = OmegaConf.select(run.config, rays) is not None
+    with using(run.config.kernels), shortage_in_words(name, run.device, rays if known else None):
         files = step(run)
     note_done(run, name, files or ())
     run.step_began = time.perf_counter()

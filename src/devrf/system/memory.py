@@ -6,7 +6,7 @@ import gc
 import mmap
 import re
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from math import prod
 from pathlib import Path
 
@@ -99,6 +99,27 @@ def free_cache(device: torch.device) -> None:
     gc.collect()
     if device.type == "cuda":
         torch.cuda.empty_cache()
+
+
+@contextmanager
+def shortage_in_words(stage: str, device: torch.device, rays: str | None) -> Iterator[None]:
+    """Raise a DevrfError where memory runs out in a stage; ``rays`` is a key that may be lowered.
+
+    Raises:
+        DevrfError: it did.
+    """
+    try:
+        yield
+    except DevrfError:
+        raise
+    except Exception as error:
+        if not is_oom(error) and not (error.__cause__ and is_oom(error.__cause__)):
+            raise
+        hint = f"lower {rays}" if rays else "free some of it, or use a larger machine"
+        raise DevrfError(
+            f"stage={stage}: out of memory ({numbers(str(error), device)}); {hint}; what was "
+            "written before stays"
+        ) from error
 
 
 def numbers(said: str, device: torch.device) -> str:
