@@ -87,8 +87,8 @@ def test_running_out_of_memory_is_one_line(devrf, tiny, monkeypatch) -> None:
     assert "lower schedule.canonical.rays" in outcome.err
 
 
-def test_networks_too_wide_to_build_are_one_line(devrf, tiny) -> None:
-    outcome = devrf(*tiny, "method=dnerf", "ray_stage.model.settings.width=400000")
+def test_networks_too_wide_to_build_are_one_line(devrf, tiny_data) -> None:
+    outcome = devrf(*tiny_data, "method=dnerf", "ray_stage.model.settings.width=400000")
     assert outcome.status == 2 and outcome.err.count("\n") == 1
     assert "out of memory" in outcome.err
 
