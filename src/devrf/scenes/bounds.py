@@ -46,8 +46,7 @@ def nearest_point(origins: Tensor, axes: Tensor, parallel: float) -> Tensor | No
 def axes_meet(cameras: Cameras) -> Tensor:
     """The point (3,) nearest to all optical axes, by least squares.
 
-    Raises:
-        DevrfError: the axes are nearly parallel, or meet behind the cameras.
+    DevrfError if the axes are nearly parallel, or meet behind the cameras.
     """
     origin, axis = cameras.positions.double(), cameras.forwards.double()
     point = nearest_point(origin, axis, NEARLY_PARALLEL)
@@ -90,8 +89,7 @@ def box_from_cameras(cameras: Cameras) -> Box:
 def resolved_box(low: Tensor, high: Tensor) -> Box:
     """The box between two corners (3,), world units, that a float32 can tell apart.
 
-    Raises:
-        DevrfError: it is too small for its distance from the origin, or too large.
+    DevrfError if it is too small for its distance from the origin, or too large.
     """
     reach = float(torch.maximum(low.abs(), high.abs()).max())
     least = max(LEAST_EDGE * reach, 1 / FARTHEST)

@@ -110,11 +110,7 @@ class PublishedScene:
 
 
 def catalogue(file: str | Path | None = None) -> list[PublishedScene]:
-    """The scenes of a catalogue; None: devrf's own.
-
-    Raises:
-        DevrfError: it cannot be read, or has another form.
-    """
+    """The scenes of a catalogue (None: devrf's own); DevrfError if it cannot be read."""
     path = OWN if file is None else Path(file).expanduser()
     try:
         listed = tomllib.loads(path.read_text())
@@ -130,11 +126,7 @@ def catalogue(file: str | Path | None = None) -> list[PublishedScene]:
 
 
 def published_scene(name: str, file: str | Path | None = None) -> PublishedScene:
-    """The scene ``name`` of a catalogue.
-
-    Raises:
-        DevrfError: it has none of that name.
-    """
+    """The scene ``name`` of a catalogue; DevrfError if it has none of that name."""
     scenes = {scene.name: scene for scene in catalogue(file)}
     if name in scenes:
         return scenes[name]
@@ -162,11 +154,7 @@ class Fetched:
 
 
 def fetched_before(scene: PublishedScene, into: Path) -> Fetched | None:
-    """The scene, if it is in its place already.
-
-    Raises:
-        DevrfError: something else has its place.
-    """
+    """The scene, if it is in its place already; DevrfError if something else is there."""
     path = into / scene.name
     if not path.exists():
         return None

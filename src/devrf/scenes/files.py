@@ -63,7 +63,7 @@ def scene_folder(root: str | Path) -> Path:
 
 
 def existing_folder(folder: Path) -> Path:
-    """``folder`` itself, or DevrfError when there is no such folder."""
+    """``folder`` itself, or DevrfError if there is no such folder."""
     if not os.path.isdir(folder):  # unlike Path.is_dir it raises on nothing
         raise scene_error(folder, "no such folder; set data.root to the scene's folder")
     return folder
@@ -77,7 +77,7 @@ def existing_file(file: Path, purpose: str) -> Path:
 
 
 def entries(folder: Path) -> list[Path]:
-    """What lies in ``folder``, in order of names; DevrfError when that may not be known."""
+    """What lies in ``folder``, in order of names; DevrfError if that may not be known."""
     try:
         return sorted(folder.iterdir())
     except OSError as error:

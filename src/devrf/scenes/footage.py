@@ -63,7 +63,7 @@ def frame_count(path: Path) -> int:
 def pictures(path: Path) -> Iterator[tuple[float, Picture]]:
     """Time in seconds since the first frame, and each frame, turned as its file says.
 
-    Of photographs the times are their positions. DevrfError when it is no footage.
+    Of photographs the times are their positions. DevrfError if it is no footage.
     """
     if is_folder(path):
         for position, file in enumerate(listed_images(path)):
@@ -76,7 +76,7 @@ def pictures(path: Path) -> Iterator[tuple[float, Picture]]:
 def chosen(path: Path, positions: Sequence[int]) -> Iterator[tuple[int, Picture]]:
     """The frames at ``positions``, ascending, each with its position; no others are kept.
 
-    DevrfError when it is no footage, or ends before the last position.
+    DevrfError if it is no footage, or ends before the last position.
     """
     wanted, last = set(positions), max(positions)
     if is_folder(path):

@@ -47,7 +47,7 @@ def image_folder(
 
     That is ``images_<downscale>``, else the largest factor that divides ``downscale``, down to
     ``images`` itself; the rest is left to area averages. ``full`` and ``reduced`` are the folders'
-    names, ``{}`` in place of the factor. DevrfError when there is none.
+    names, ``{}`` in place of the factor. DevrfError if there is none.
     """
     pattern = re.compile(re.escape(reduced).replace(r"\{\}", r"([1-9]\d{0,3})"))
     folders = {}

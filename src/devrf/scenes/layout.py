@@ -70,8 +70,7 @@ def one_capture(train: Transforms, test: Transforms, static_until: float) -> Lay
 def without_static_set(train: Split, test: Split, static_until: float) -> Layout:
     """The layout of one capture in motion, whose images up to ``static_until`` count as static.
 
-    Raises:
-        DevrfError: no image to learn from is that early.
+    DevrfError if no image to learn from is that early.
     """
     early, early_test = (split.where(split.times <= static_until + 1e-6) for split in (train, test))
     if len(early.index) == 0:

@@ -104,7 +104,7 @@ def forward_facing_scene(
     """The scene of two captures whose static cameras have the identity as their average pose.
 
     Its space is NDC of a camera at the origin that looks along −z, with the near plane ``near``
-    world units before it. DevrfError when a camera sees something that is not before that one.
+    world units before it. DevrfError if a camera sees something that is not before that one.
     """
     space = reference_space(static.train.cameras, near)
     # The captures of a scene at rest, and of a video, share images.
@@ -145,7 +145,7 @@ def centred(static: Capture, dynamic: Capture) -> tuple[Capture, Capture]:
 def dynamic_only(scene: Scene) -> Scene:
     """The scene without its static set: the dynamic images of time 0 stand in for it.
 
-    Bounds are found anew, from the dynamic training cameras alone; DevrfError when these do not
+    Bounds are found anew, from the dynamic training cameras alone; DevrfError if these do not
     tell.
     """
     views, held_out = scene.dynamic.train, scene.dynamic.test

@@ -198,7 +198,7 @@ class World:
 def normalised(model: SparseModel, facing: Facing = "auto") -> World:
     """The scene of a model in a world of its own origin, axes and unit.
 
-    ``facing`` says from where the cameras look. DevrfError when points or cameras do not tell.
+    ``facing`` says from where the cameras look. DevrfError if points or cameras do not tell.
     """
     poses, points = model.poses, torch.from_numpy(model.points)
     depths = torch.cat([model.depths(k) for k in range(len(model.images))])

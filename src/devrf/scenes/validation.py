@@ -84,7 +84,7 @@ def _shortened(text: str, most: int) -> str:
 
 
 def reduced_size(width: int, height: int, downscale: int, where: object) -> tuple[int, int]:
-    """(width, height) // downscale, or DevrfError when a side falls under 8 px."""
+    """(width, height) // downscale, or DevrfError if a side falls under 8 px."""
     w, h = width // downscale, height // downscale
     if min(w, h) < MIN_SIDE:
         raise scene_error(
@@ -117,7 +117,7 @@ def checked_box(value: object) -> Box:
 
 
 def check_memory(needed: int, where: object, what: str) -> None:
-    """DevrfError when ``what``, which ``where`` asks for, takes more bytes than the machine has."""
+    """DevrfError if ``what``, which ``where`` asks for, takes more bytes than the machine has."""
     there = psutil.virtual_memory().total
     if needed > there:
         raise scene_error(

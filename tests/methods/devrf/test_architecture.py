@@ -34,7 +34,7 @@ def test_planes_are_four_pixels_of_parallax_apart(apart: float, near: float, pla
 @pytest.fixture(scope="module")
 def forward_scene() -> Scene:
     size = {"width": 24, "height": 18, "static_views": 6, "train_views": 1}
-    return ProceduralForwardScene(**size, frames=2, supersample=1).render()
+    return ProceduralForwardScene(**size, frames=2, supersample=1)()
 
 
 def test_the_grid_has_so_many_points_to_a_pixel(forward_scene: Scene) -> None:

@@ -46,7 +46,7 @@ class PosedSet:
     def normalised(self) -> PosedSet:
         """The set in units of 0.75 · its least depth, its average pose the identity.
 
-        DevrfError when the cameras look in too different directions, or are too far apart.
+        DevrfError if the cameras look in too different directions, or are too far apart.
         """
         scale = 1 / (BOUND_FACTOR * float(self.bounds[:, 0].min()))
         middle = average_pose(self.poses)
@@ -73,7 +73,7 @@ def read_static_poses(folder: Path) -> PosedSet:
 
     A row is a 3×5 matrix (axes [down, right, back], position, [H, W, focal]) or a 3×4 one without
     the last column, then least and largest depth. ``hwf_cxcy.npy`` holds H, W, focal; or H, W,
-    focal, cx, cy; or H, W, fx, fy, cx, cy; for all images. DevrfError when a file is missing or
+    focal, cx, cy; or H, W, fx, fy, cx, cy; for all images. DevrfError if a file is missing or
     holds something else.
     """
     file, inner = folder / POSES, folder / "hwf_cxcy.npy"
@@ -96,7 +96,7 @@ def read_static_poses(folder: Path) -> PosedSet:
 def read_dynamic_poses(folder: Path) -> PosedSet:
     """The cameras of ``poses.npy`` (N, 3, 5) and ``bds.npy`` (N, 2).
 
-    A matrix holds axes [right, up, back], position, [H, W, focal]. DevrfError when a file is
+    A matrix holds axes [right, up, back], position, [H, W, focal]. DevrfError if a file is
     missing or holds something else.
     """
     file, depths = folder / "poses.npy", folder / "bds.npy"

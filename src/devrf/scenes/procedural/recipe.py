@@ -41,6 +41,21 @@ Speed = Annotated[float, Field(strict=True, ge=0, le=2)]
 Texture = Literal["soft", "fine"]
 
 
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """PyTorch on one thread inside, on as many as before afterwards.
+
+    Rendering is thousands of small operations: a second thread gains little, and where the cores
+    are shared with others it waits at each of them, which makes a scene take minutes.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
 @dataclass(frozen=True)
 class Recipe(Options, ABC):
     """Calling a recipe renders its scene. The same recipe always gives the same scene.
@@ -89,33 +104,13 @@ class Recipe(Options, ABC):
         _, held_out = every_nth(self.frames, self.novel_times_every)
         return [frame for frame in held_out if frame < self.frames - 1]
 
+    @abstractmethod
     def __call__(self) -> Scene:
         """Render everything."""
-        with _one_thread():
-            return self.render()
-
-    @abstractmethod
-    def render(self) -> Scene:
-        """The scene."""
 
     @abstractmethod
     def filmed(self) -> Shape:
         """All that the cameras see, for exact answers at any point and time."""
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """PyTorch on one thread inside, on as many as before afterwards.
-
-    Rendering is thousands of small operations: a second thread gains little, and where the cores
-    are shared with others it waits at each of them, which makes a scene take minutes.
-    """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 @dataclass(frozen=True)
@@ -137,8 +132,9 @@ class ProceduralScene(Recipe):
     surroundings: Literal["none", "room"] = "none"
     texture: Texture = "soft"
 
-    def render(self) -> Scene:
-        """The scene."""
+    @_one_thread()
+    def __call__(self) -> Scene:
+        """Render everything."""
         where = extent(self.model())
         inside = self.surroundings == "room"
         rig, surface = HAND_HELD if inside else STUDIO, self.filmed()
@@ -184,8 +180,6 @@ _REACH = 9.0
 # One static view in so many is held out, the first one included, as readers of LLFF do.
 HOLDOUT = 8
 NEAR = 1.0
-# Rays that creep past the toy have to reach the wall: with 256 steps a few in a million do not.
-_STEPS = 400
 
 
 @dataclass(frozen=True)
@@ -209,9 +203,10 @@ class ProceduralForwardScene(Recipe):
     static_views: Count = 20
     frames: Frames = 12
 
-    def render(self) -> Scene:
-        """The scene."""
-        film = Filming(self.filmed(), _REACH, self.supersample, self.light, _STEPS, opaque=True)
+    @_one_thread()
+    def __call__(self) -> Scene:
+        """Render everything."""
+        film = Filming(self.filmed(), _REACH, self.supersample, self.light, STEPS, opaque=True)
         size = {"width": self.width, "height": self.height}
         # Of each eight views seven are learned from.
         held_out = -(-self.static_views // (HOLDOUT - 1))

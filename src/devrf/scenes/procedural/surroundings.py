@@ -154,7 +154,7 @@ _ROOM_HALF, _HEIGHT = (6.0, 5.0), 5.2
 REACH = 10.0
 # Fine paint: so much of it is the mural, its waves so much longer than on the wall it was made for.
 _MURAL, _LONGER = 0.6, 1.6
-# Rays that creep past furniture have to reach a wall.
+# Rays that creep past toy or furniture have to reach a wall; in 256 steps not all do.
 STEPS = 400
 
 WOOD: Rgb = (0.62, 0.43, 0.26)

@@ -35,7 +35,7 @@ BOX = Box((-1.5, -1.0, -1.0), (1.5, 1.0, 1.0))
 @pytest.fixture(scope="module")
 def forward_scene() -> Scene:
     size = {"width": 24, "height": 18, "static_views": 7, "train_views": 2}
-    return ProceduralForwardScene(**size, frames=2, supersample=1).render()
+    return ProceduralForwardScene(**size, frames=2, supersample=1)()
 
 
 def test_specks_and_fog_do_not_count() -> None:
