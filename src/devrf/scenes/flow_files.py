@@ -178,11 +178,7 @@ def load_flow(path: Path, key: str, shape: tuple[int, int, int]) -> OpticalFlow 
 
 
 def save_flow(path: Path, key: str, flow: OpticalFlow) -> None:
-    """Write ``flow`` to ``path`` at once: a reader sees the whole file or none.
-
-    Raises:
-        DevrfError: the file cannot be written.
-    """
+    """Write ``flow`` to ``path``, whole or not at all; DevrfError if it cannot be written."""
     try:
         with atomic_write(path) as partial:
             np.savez_compressed(

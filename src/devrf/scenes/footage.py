@@ -44,11 +44,7 @@ class FilmHeader:
 
 
 def film_header(path: Path) -> FilmHeader:
-    """What the video at ``path`` says of itself, no frame decoded.
-
-    Raises:
-        DevrfError: there is no such file, or it cannot be read as a video.
-    """
+    """What a video says of itself, no frame decoded; DevrfError if it is none."""
     with _opened(path) as video:
         keys = cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_COUNT
         width, height, frames = (int(video.get(key)) for key in keys)

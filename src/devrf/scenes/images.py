@@ -146,8 +146,7 @@ def image_size(path: Path, camera: Size | None = None) -> tuple[int, int]:
 def decode(path: Path, header: Header, mode: str) -> npt.NDArray[np.uint8]:
     """The pixels (H, W, …) of a file whose header has been read, in Pillow's mode RGB or RGBA.
 
-    Raises:
-        DevrfError: it is damaged, or not what it claimed to be.
+    DevrfError if it is damaged, or not what it claimed to be.
     """
     with _open(path) as image, decoding(path, "image", "replace the file"):
         converted: Image.Image = image.convert(mode)

@@ -169,8 +169,7 @@ class Intrinsics:
 def intrinsics_of(camera: CameraKeys, where: object) -> Intrinsics:
     """The intrinsics that the keys of a file, or of one of its frames, state.
 
-    Raises:
-        DevrfError: ``where`` has no focal length, or an angle out of range.
+    DevrfError if ``where`` has no focal length, or an angle out of range.
     """
     c = camera
     distortion = Distortion((c.k1, c.k2, c.k3, c.k4), (c.p1, c.p2))

@@ -73,10 +73,7 @@ def cutting_out(
 ) -> Finish | None:
     """What makes masks the alpha of their images, the lesser of the two; None: no masks.
 
-    Arguments are those of :func:`valid_pixels`.
-
-    Raises:
-        DevrfError: some images have a mask and some have not; later, what :func:`read_mask` raises.
+    Arguments are those of :func:`valid_pixels`; DevrfError if only some images have a mask.
     """
     masks = [path for path in paths if path is not None]
     if not masks:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import KW_ONLY, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -11,6 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, PlainValidator
 from pydantic.dataclasses import dataclass
 
+from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.scenes.files import Number
 from devrf.scenes.image_folders import Downscale, Missing
@@ -38,15 +38,12 @@ def _bound_scale(value: object) -> object:
     return value
 
 
-def _box(value: Any) -> list[list[float]] | None:
-    if value is None:
-        return None
-    box = checked_box(value)
-    return [list(box.low), list(box.high)]
+def _box(value: Any) -> Box | None:
+    return value if value is None or isinstance(value, Box) else checked_box(value)
 
 
 BoundScale = Annotated[float | str, PlainValidator(_bound_scale)]
-Corners = Annotated[Sequence[Sequence[float]] | None, PlainValidator(_box)]
+BoxOption = Annotated[Box | None, PlainValidator(_box)]
 
 
 @dataclass(frozen=True)
@@ -81,17 +78,13 @@ class SceneReader(Options, ABC):
     def read(self) -> Scene:
         """Read the scene, with flow from files where they are asked for.
 
-        Raises:
-            DevrfError: a file is wrong, or does not go with an option; the message names it.
+        DevrfError if a file is wrong, or does not go with an option; the message names it.
         """
 
     def forward_flow(self, views: Views) -> OpticalFlow | None:
         """Forward flow of the dynamic training ``views`` of :meth:`read`, from the scene's files.
 
-        None where there are none, or no place for them.
-
-        Raises:
-            DevrfError: a file is wrong; the message names it.
+        None where there are none, or no place for them; DevrfError if a file is wrong.
         """
         return None
 
@@ -148,7 +141,7 @@ class InwardReader(SceneReader):
     bound_scale: BoundScale = "auto"
     near: Number | None = None
     far: Number | None = None
-    box: Corners = None
+    box: BoxOption = None
     missing: Missing = "error"
     space: SpaceChoice = "auto"
 
@@ -162,7 +155,7 @@ class InwardReader(SceneReader):
             bound_scale=self.bound_scale,
             near=self.near,
             far=self.far,
-            box=None if self.box is None else checked_box(self.box),
+            box=self.box,
         )
         name = self.name_of(folder)
         return Scene(name, "inward", static, dynamic, bounds, self.background, space)
@@ -221,7 +214,9 @@ def _with_bounds(options: PosedReader, stated: SceneBounds | None) -> PosedReade
     space = stated.space if options.space == "auto" else options.space
     if (space == "ndc") != (stated.space == "ndc"):  # in another world, or of other meaning
         return replace(options, space=space)
-    box = stated.box if options.box is None and options.space == "auto" else options.box
+    box = options.box
+    if box is None and stated.box is not None and options.space == "auto":
+        box = checked_box(stated.box)
     near = stated.near if options.near is None else options.near
     far = stated.far if options.far is None else options.far
     return replace(options, space=space, near=near, far=far, box=box)

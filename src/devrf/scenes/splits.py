@@ -108,11 +108,9 @@ def in_motion(transforms: Transforms) -> Split:
     """A split of a scene in motion.
 
     Cameras are fixed when each distinct pose took two images or more on average; otherwise the
-    camera moves and each image is its own view. Without times in the file, the images of V
-    fixed views are time-major (frame = position // V) and those of a moving camera consecutive.
-
-    Raises:
-        DevrfError: there are no times and the fixed views do not take turns.
+    camera moves and each image is its own view. Without times in the file, the images of V fixed
+    views are time-major (frame = position // V; DevrfError if the views do not take turns) and
+    those of a moving camera consecutive.
     """
     order = torch.arange(len(transforms.images))
     camera = distinct_poses(transforms.poses)

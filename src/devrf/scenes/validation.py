@@ -100,10 +100,9 @@ def same_shape(one: tuple[float, float], other: tuple[float, float]) -> bool:
 
 
 def checked_box(value: object) -> Box:
-    """The box of ``[[x, y, z], [x, y, z]]``: its low and high corner in world units.
+    """The box of its low and high corner, ``[[x, y, z], [x, y, z]]`` in world units.
 
-    Raises:
-        DevrfError: it is something else, or holds no volume.
+    DevrfError if it is something else, or holds no volume.
     """
     try:
         low, high = ([float(v) for v in corner] for corner in value)  # type: ignore[attr-defined]

@@ -33,8 +33,7 @@ def dynamic_folders(root: Path) -> list[Path]:
 def chosen_dynamic(root: Path, chosen: str | None) -> Path:
     """The one of :func:`dynamic_folders` called ``chosen``, or (None) the only one.
 
-    Raises:
-        DevrfError: there is none, none of that name, or several to choose from.
+    DevrfError if there is none, none of that name, or several to choose from.
     """
     folders = dynamic_folders(root)
     names = ", ".join(folder.name for folder in folders)
@@ -65,9 +64,8 @@ class ViewFolder(ImageFolder):
 def view_folders(folder: Path, downscale: int) -> list[ViewFolder]:
     """The folders of V fixed cameras, in order of their numbers.
 
-    Raises:
-        DevrfError: there are none, a number is left out or written with a zero in front, or
-            they hold different numbers of images or fewer than two.
+    DevrfError if there are none, a number is left out or written with a zero in front, or they hold
+    different numbers of images or fewer than two.
     """
     numbered: dict[int, Path] = {}
     for path in entries(folder):

@@ -138,11 +138,7 @@ VIDEO = "precomputed.json"
 
 
 def static_folder(root: Path) -> Path:
-    """Where a scene's static cameras and images are: ``static/``, or ``root`` itself.
-
-    Raises:
-        DevrfError: neither is there.
-    """
+    """Where the static cameras and images are: ``static/`` or ``root`` itself; else DevrfError."""
     static = root / "static"
     if not os.path.isdir(static) and os.path.isfile(root / POSES) and not dynamic_folders(root):
         return root

@@ -76,8 +76,7 @@ def placed(
     # Without alpha masks the backdrop is to be learned too.
     seen = box_of_frusta(cameras, near, far)
     scale = FALLBACK_BOUND_SCALE if reader.bound_scale == "auto" else reader.bound_scale
-    box = [seen.low, seen.high]
-    options = replace(options, box=box, space="world", bound_scale=scale)
+    options = replace(options, box=seen, space="world", bound_scale=scale)
     scene = options.scene(folder, static, dynamic)
     why = "data.space=world" if reader.space == "world" else "the cameras look in one direction"
     bounds = replace(scene.bounds, reason=why, box_source="all that the cameras see up to far")

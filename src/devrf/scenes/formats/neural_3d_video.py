@@ -53,8 +53,7 @@ class CameraVideos:
 def camera_videos(folder: Path) -> CameraVideos:
     """The videos in a folder; their frames are not read yet.
 
-    Raises:
-        DevrfError: there are fewer than two, one cannot be read, or they differ in length or size.
+    DevrfError if they are fewer than two, one cannot be read, or they differ in length or size.
     """
     found = {
         path: int(match[1])
