@@ -201,10 +201,8 @@ def box_between(
 ) -> Box:
     """The box, in NDC, of what cameras see from z' = ``front`` to ``back``.
 
-    −1 is the near plane, 1 infinity.
-
-    Raises:
-        DevrfError: a camera sees something that is not before the reference camera.
+    −1 is the near plane, 1 infinity. DevrfError if a camera sees something that is not before the
+    reference camera.
     """
     ends = torch.cat([_seen(views, space, (front, back)) for views in everyone])
     low, high = ends.amin(dim=0).tolist(), ends.amax(dim=0).tolist()

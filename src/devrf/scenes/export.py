@@ -29,8 +29,7 @@ _WRITE_HINT = "give data.export another folder"
 def whole_folder(folder: Path) -> Iterator[Path]:
     """A folder to write into that becomes ``folder``, new or empty, if nothing fails.
 
-    Raises:
-        DevrfError: it is in use, or it cannot be written.
+    DevrfError if it is in use, or cannot be written.
     """
     folder = folder.expanduser().absolute()
     if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
@@ -62,10 +61,8 @@ def export(scene: Scene, folder: Path) -> None:
 
     It is an embedded one: all images of one focal length, their principal points in the middle;
     fixed cameras stand still, and one of them is held out. ``folder`` is a new or an empty one.
-
-    Raises:
-        DevrfError: the folder is in use or cannot be written, or a frame is left out by some views
-            of a forward-facing scene.
+    DevrfError if it is in use or cannot be written, or a frame is left out by some views of a
+    forward-facing scene.
     """
     write = _export_blender if scene.kind == "inward" else _export_llff
     write(scene, folder)

@@ -90,10 +90,8 @@ def inside(root: Path, folder: Path, name: str, file: Path) -> Path:
     """Where ``name``, text in ``file``, leads from ``folder``: a path somewhere below ``root``.
 
     ``..`` is taken out of the text itself; links that lie in the scene's folder are followed.
-    Whether there is such a file is not looked up.
-
-    Raises:
-        DevrfError: the name leads outside, or no file can have it.
+    Whether there is such a file is not looked up. DevrfError if the name leads outside, or no file
+    can have it.
     """
     if "\0" in name:
         raise scene_error(file, f"{abbreviated(name)} is not a path; correct it")
@@ -113,8 +111,7 @@ def inside(root: Path, folder: Path, name: str, file: Path) -> Path:
 def read_json(file: Path, kind: type[Content], purpose: str) -> Content:
     """The content of a JSON file that holds one object; ``purpose`` says what it is needed for.
 
-    Raises:
-        DevrfError: there is no such file, it is no JSON, a key is missing or its value wrong.
+    DevrfError if there is no such file, it is no JSON, a key is missing or its value wrong.
     """
     try:
         # Some editors begin a file with a byte order mark.
@@ -129,8 +126,7 @@ def read_json(file: Path, kind: type[Content], purpose: str) -> Content:
 def read_numbers(path: Path, expected: str) -> Numbers:
     """The array in an ``.npy`` file, in double precision; ``expected`` says what it should hold.
 
-    Raises:
-        DevrfError: there is no such file, it is damaged, or holds no numbers, or NaN or infinity.
+    DevrfError if there is no such file, it is damaged, or holds no numbers, or NaN or infinity.
     """
     existing_file(path, f"expected {expected}")
     with decoding(path, "npy file", "write it again"), path.open("rb") as stream:

@@ -91,9 +91,7 @@ def read_header(path: Path, camera: Size | None = None) -> Header:
     """What an image file claims to be.
 
     ``camera`` is the (width, height) of the images that its camera is for; None: unknown.
-
-    Raises:
-        DevrfError: it is no image with 8 bits a channel, or one that Pillow takes for too large.
+    DevrfError if it is no image with 8 bits a channel, or one that Pillow takes for too large.
     """
     with _open(path) as image:
         if image.mode in DEEP_MODES:

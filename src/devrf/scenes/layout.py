@@ -95,10 +95,8 @@ def fewer(layout: Layout, train_views: int | None, frames: int | None) -> tuple[
     """The layout with fewer dynamic views and times, and whether times were left out.
 
     It keeps the first ``train_views`` dynamic views and ``frames`` times, evenly spread, first and
-    last included; None: all.
-
-    Raises:
-        DevrfError: the dynamic images have one time only, or fewer views; or there are none.
+    last included; None: all. DevrfError if the dynamic images have one time only, or fewer views;
+    or there are none.
     """
     if not layout.moves:
         for key, asked in (("train_views", train_views), ("frames", frames)):

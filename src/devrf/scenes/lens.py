@@ -137,9 +137,8 @@ class Intrinsics:
     def lens(self, width: int, height: int, where: object) -> Lens:
         """The lens in pixels of a file of ``width`` × ``height`` pixels.
 
-        Raises:
-            DevrfError: ``where``, the file, has another shape than its camera, or a camera of
-                which it can show nothing.
+        DevrfError if ``where``, the file, has another shape than its camera, or a camera of which
+        it can show nothing.
         """
         w, h = (width, height) if self.size is None else self.size
         if not same_shape((width, height), (w, h)):

@@ -186,9 +186,7 @@ class PosedReader(InwardReader):
         """The scene of two captures, which for a scene always at rest are one.
 
         ``stated`` says where it is, if that is known, and ``source``, in words, who states it.
-
-        Raises:
-            DevrfError: the options, or the cameras, do not say where it is.
+        DevrfError if neither options nor cameras do.
         """
         reader = _with_bounds(self, stated)
         if reader.space != "ndc":

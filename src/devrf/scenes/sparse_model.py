@@ -117,8 +117,7 @@ def model_folder(root: Path) -> Path | None:
 def read_model(folder: Path) -> SparseModel:
     """The sparse model in a folder, as pycolmap reads it: binary where both forms are there.
 
-    Raises:
-        DevrfError: without pycolmap, of a missing or damaged file, or of a camera's model.
+    DevrfError without pycolmap, of a missing or damaged file, or of a camera's model.
     """
     if find_spec("pycolmap") is None:
         raise scene_error(folder, 'pycolmap reads it; run pip install "devrf[capture]"')

@@ -178,10 +178,8 @@ def load_views(split: Split, root: Path, downscale: int, masks: Masks = "none") 
     """Read the used images of a split, made smaller by ``downscale``; their cameras are pinholes.
 
     Images of a lens with distortion are undistorted, and masks with them. ``root`` is the scene's
-    folder, ``masks`` what the masks that the file lists are taken for.
-
-    Raises:
-        DevrfError: an image, a mask or a lens is wrong, or they do not go together.
+    folder, ``masks`` what the masks that the file lists are taken for. DevrfError if an image, a
+    mask or a lens is wrong, or they do not go together.
     """
     used = split.index
     files = [split.transforms.images[i] for i in used.tolist()]

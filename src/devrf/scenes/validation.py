@@ -153,8 +153,7 @@ def in_reach(positions: Tensor) -> Tensor:
 def check_poses(poses: Tensor, where: Callable[[int], object]) -> None:
     """Check camera-to-world poses (N, 3, 4); ``where`` names the one at fault by its position.
 
-    Raises:
-        DevrfError: one is no rigid transform, or too far from the origin to be computed with.
+    DevrfError if one is no rigid transform, or too far from the origin to be computed with.
     """
     for good, what in (
         (is_rotation(poses[:, :, :3]), "is no rigid transform (scaled, sheared or mirrored axes)"),

@@ -114,8 +114,7 @@ class Camera(BaseModel):
 def read_camera(folder: Path, item: str, world: World) -> tuple[Tensor, Intrinsics]:
     """Camera-to-world (3, 4) float32, OpenGL axes, world units, and intrinsics of the full image.
 
-    Raises:
-        DevrfError: the camera file of the image with the id ``item`` is missing or wrong.
+    DevrfError if the camera file of the image with the id ``item`` is missing or wrong.
     """
     file = inside(folder, folder / "camera", f"{item}.json", folder / "dataset.json")
     camera = read_json(file, Camera, "every image needs its camera; add it")
