@@ -13,12 +13,12 @@ import torch
 from launches import Tracing
 from torch.profiler import profile
 
-from devrf.accel.graphs import CudaGraphCapture
 from devrf.engine.stage import ScheduledStage
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.ops.dispatch import using
 from devrf.system.device import wait
+from devrf.system.graphs import CudaGraphCapture
 
 Row = dict[str, Any]
 # Methods that are timed, with what is nested in them, by what their seconds go to.

@@ -24,7 +24,6 @@ import torch
 from lightning import Callback, Trainer, seed_everything
 from lightning.pytorch.callbacks import LambdaCallback
 
-from devrf.accel.graphs import Graphs
 from devrf.callbacks import GridUpscaling, LearningRateDecay, PeriodicCheckpoint, StopOnSignal
 from devrf.checkpoints.checkpoint import ChecksummedCheckpointIO, LoadedCheckpoint
 from devrf.checkpoints.progress import progress_files
@@ -37,12 +36,12 @@ from devrf.methods.devrf.canonical_schedule import CanonicalSchedule
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import PAPER_LEVELS, DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
-from devrf.methods.devrf.extensions.tracks import StartAlongFlow
 from devrf.methods.devrf.settings import MotionSettings, Precision, Sampling
 from devrf.ops.check import CASES, Case, compare
 from devrf.ops.dispatch import Kind, reaches, using
 from devrf.rendering.renderer import Renderer
 from devrf.system.device import wait
+from devrf.system.graphs import Graphs
 
 log = logging.getLogger(__name__)
 
@@ -121,6 +120,9 @@ class SmallScene:
         if name == "canonical":
             return CanonicalStage(self.at_rest, self.architecture, sampling=self.sampling, **how)
         settings = MotionSettings(5e-3, unit="box", store="host")
+        # Imported here: every command loads this module, and an extension may be taken out.
+        from devrf.methods.devrf.extensions.tracks import StartAlongFlow
+
         along = {"tracks": StartAlongFlow("flow")}
         rest = copy.deepcopy(self.canonical)
         return DeformationStage(rest, self.in_motion, settings, extensions=along, **how)

@@ -11,12 +11,12 @@ import pytest
 import torch
 
 from devrf import selfcheck
-from devrf.accel.graphs import CudaGraphCapture, Work
 from devrf.engine.loop import Loop
 from devrf.errors import DevrfError
 from devrf.methods.devrf.voxel_stage import VoxelStage
 from devrf.rendering.sample_capacity import SampleCapacity
 from devrf.selfcheck import EXACT, FAST, SmallScene, capture, rendering, resume, small_scene
+from devrf.system.graphs import CudaGraphCapture, Work
 from devrf.system.memory import free_cache
 
 GPU = torch.device("cuda", 0)

@@ -9,7 +9,7 @@ import sys
 import pytest
 import torch
 
-from devrf.apps.inspection.needs import StageNeeds, tensor_bytes
+from devrf.apps.needs import StageNeeds, tensor_bytes
 from devrf.cli import memory
 from devrf.scenes.scene import Scene
 

@@ -16,7 +16,6 @@ import pytest
 import torch
 from lightning import Trainer
 
-from devrf.accel.graphs import CudaGraphCapture, GraphedStep, Work
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.stage import ScheduledStage
@@ -29,6 +28,7 @@ from devrf.methods.devrf.settings import MotionSettings
 from devrf.ops.dispatch import Kind, using
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.sample_capacity import SampleCapacity
+from devrf.system.graphs import CudaGraphCapture, GraphedStep, Work
 
 pytest.importorskip("triton")
 

@@ -14,7 +14,6 @@ from lightning import Trainer
 from lightning.pytorch.callbacks import LambdaCallback
 from torch.profiler import ProfilerActivity, profile
 
-from devrf.accel.streams import StreamParallel
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import Pixels
 from devrf.data.datamodule import SceneDataModule
@@ -22,6 +21,7 @@ from devrf.engine.learner import ParallelBatch
 from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
 from devrf.methods.devrf.settings import MotionSettings
+from devrf.system.streams import StreamParallel
 
 GPU, CPU = torch.device("cuda"), torch.device("cpu")
 

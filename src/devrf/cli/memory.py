@@ -9,7 +9,7 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from devrf.apps.inspection.needs import StageNeeds, host_bytes, needs_of_devrf, needs_of_networks
+from devrf.apps.needs import StageNeeds, host_bytes, needs_of_devrf, needs_of_networks
 from devrf.cli.context import RunContext
 from devrf.engine.micro_batching import MicroBatching
 from devrf.errors import DevrfError

@@ -13,8 +13,8 @@ from rich.console import Console
 from rich.filesize import decimal
 
 from devrf.apps.capture.pipeline import scene_from_footage
-from devrf.apps.inspection.needs import needs_table
 from devrf.apps.inspection.report import as_text, inspection_text
+from devrf.apps.needs import needs_table
 from devrf.apps.settings import CaptureSettings
 from devrf.cli.config import config_folder
 from devrf.cli.context import RunContext

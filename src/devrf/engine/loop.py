@@ -10,8 +10,6 @@ import torch
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
 
-from devrf.accel.graphs import CudaGraphCapture, GraphedStep, Graphs
-from devrf.accel.streams import StreamParallel
 from devrf.data.batch import Pixels
 from devrf.engine.ddp import average, average_gradients, rays_per_rank, world_size
 from devrf.engine.learner import Learner, ParallelBatch
@@ -19,8 +17,10 @@ from devrf.engine.micro_batching import MicroBatching
 from devrf.ops.adam import GridAdam
 from devrf.rendering.sample_capacity import SampleCapacity
 from devrf.system.device import wait
+from devrf.system.graphs import CudaGraphCapture, GraphedStep, Graphs
 from devrf.system.memory import OutOfMemoryError
 from devrf.system.profiling import measured, span
+from devrf.system.streams import StreamParallel
 
 
 def take(batch: ParallelBatch, drawn: Pixels) -> None:

@@ -15,7 +15,6 @@ import torch
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
 
-from devrf.accel.graphs import Graphs
 from devrf.checkpoints.checkpoint import (
     MODEL,
     CheckpointMetadata,
@@ -33,6 +32,7 @@ from devrf.errors import DevrfError
 from devrf.evaluation.held_out import score
 from devrf.ops.adam import GridAdam
 from devrf.rendering.renderer import Renderer
+from devrf.system.graphs import Graphs
 from devrf.system.memory import OutOfMemoryError
 
 # Attributes of a stage that a progress file holds by name: where it is in its schedule.

@@ -9,7 +9,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from devrf.accel.graphs import Graphs
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import PixelPool, Pixels
 from devrf.engine.batches import static_pool
@@ -32,6 +31,7 @@ from devrf.methods.weighted_loss import counted_weights
 from devrf.rendering.occupancy import Occupancy, bounding_box, dilate
 from devrf.rendering.sampling import RenderSettings
 from devrf.scenes.scene import CaptureName, Views
+from devrf.system.graphs import Graphs
 from devrf.system.profiling import span
 
 log = logging.getLogger(__name__)

@@ -9,7 +9,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from devrf.accel.graphs import Graphs
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.batch import Pixels
 from devrf.engine.active_frames import ActiveFrames
@@ -26,6 +25,7 @@ from devrf.methods.devrf.settings import DEFORMATION_LOSS, MotionSettings, Preci
 from devrf.methods.devrf.voxel_stage import weighted_loss
 from devrf.ops.adam import GridAdam
 from devrf.scenes.scene import Views
+from devrf.system.graphs import Graphs
 from devrf.system.profiling import span
 
 log = logging.getLogger(__name__)

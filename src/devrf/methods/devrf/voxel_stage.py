@@ -9,7 +9,6 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from devrf.accel.graphs import Graphs
 from devrf.data.batch import PixelPool, Pixels, RayBatch
 from devrf.engine.batches import gather_batch
 from devrf.engine.stage import ScheduledStage
@@ -33,6 +32,7 @@ from devrf.rendering.output import ColorChange, VoxelOutput
 from devrf.rendering.sample_capacity import SampleCapacity
 from devrf.scenes.scene import Views
 from devrf.system.device import multiplies_bfloat16
+from devrf.system.graphs import Graphs
 from devrf.system.profiling import span
 
 Predicted = TypeVar("Predicted", bound=Prediction)

@@ -10,7 +10,6 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from devrf.accel.graphs import CudaGraphCapture, GraphedStep
 from devrf.data.batch import PixelPool, all_pixels
 from devrf.engine.batches import gather_batch, images_of
 from devrf.engine.ddp import broadcast
@@ -25,6 +24,7 @@ from devrf.ops.compositing import sum_by_ray
 from devrf.ops.trilinear import interpolate
 from devrf.rendering.occupancy import Occupancy
 from devrf.scenes.scene import Views
+from devrf.system.graphs import CudaGraphCapture, GraphedStep
 
 # By how much a channel of a pixel may differ from what the model shows where it was, to be it.
 LIKENESS = 0.15

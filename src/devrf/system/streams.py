@@ -42,7 +42,7 @@ class StreamParallel:
         if len(pieces) == 1 or device.type != "cuda" or measured():
             return [piece() for piece in pieces]
         while len(self._streams) < len(pieces) - 1:
-            self._streams.append(torch.cuda.Stream(device))
+            self._streams.append(torch.cuda.Stream(device))  # type: ignore[no-untyped-call]
         present, streams = torch.cuda.current_stream(device), self._streams[: len(pieces) - 1]
         for stream in streams:
             stream.wait_stream(present)

@@ -28,7 +28,7 @@ class CudaGraphCapture:
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
-        self._side = torch.cuda.Stream(device)
+        self._side = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
 
     def warm_up(self, work: Work) -> None:
         """Run ``work`` before its capture, on the side stream.
