@@ -162,13 +162,13 @@ class DeformationSchedule:
         sides = [row.side for row in self.levels[: level + 1]]
         return self.decay ** sum(a != b for a, b in pairwise(sides))
 
-    def visits(self, level: int, frames: int) -> int:
-        """L of T = ``frames`` frames: visits of a level, and the distance of parallel frames."""
+    def _stretch(self, level: int, frames: int) -> int:
+        """L of T = ``frames`` frames."""
         return max(2, -(-frames // self.levels[level].parallel_frames))
 
     def max_parallel_frames(self, level: int, frames: int) -> int:
         """The most of T = ``frames`` frames that a level learns in parallel."""
-        return len(range(1, frames, self.visits(level, frames)))
+        return len(range(1, frames, self._stretch(level, frames)))
 
     def total(self, frames: int) -> int:
         """Iterations of the whole stage for T = ``frames`` frames, frame 0 included."""
@@ -180,30 +180,37 @@ class DeformationSchedule:
 
     def _lengths(self, frames: int) -> list[int]:
         """Iterations of each level."""
-        return [row.iterations * self.visits(k, frames) for k, row in enumerate(self.levels)]
+        return [row.iterations * self._stretch(k, frames) for k, row in enumerate(self.levels)]
 
     def phase(self, iteration: int, frames: int) -> DeformationPhase:
         """The visit that ``iteration`` belongs to; the last one from the end on."""
         begins = [0, *self.growths(frames)]
         level = bisect_right(begins, iteration) - 1
-        begin, apart, row = begins[level], self.visits(level, frames), self.levels[level]
-        first = 1 if apart == frames else 0  # frame 0 alone
-        visit = min(max((iteration - begin) // row.iterations, first), apart - 1)
-        backward = row.order == "backward"
-        place = first + apart - 1 - visit if backward else visit
+        begin, row, stretch = begins[level], self.levels[level], self._stretch(level, frames)
+        visits, backward = _visits(frames, stretch), row.order == "backward"
+        unvisited = stretch - len(visits)  # the first visit takes the share of frame 0 alone, too
+        visit = min(max((iteration - begin) // row.iterations - unvisited, 0), len(visits) - 1)
+        visited = tuple(visits[-1 - visit if backward else visit])
         return DeformationPhase(
             kind=f"level {level + 1}",
-            start=begin + (0 if visit == first else visit * row.iterations),
-            stop=begin + (visit + 1) * row.iterations,
-            frames=tuple(range(place or apart, frames, apart)),
+            start=begin + (unvisited + visit if visit else 0) * row.iterations,
+            stop=begin + (unvisited + visit + 1) * row.iterations,
+            frames=visited,
             level=level,
             side=row.side,
             learning_rate_factor=self.learning_rate_factor(level),
             lr_final_factor=row.lr_final_factor,
-            init_from_previous=self.coarse_to_fine and level == 0 and visit > 1,
-            has_previous=visit > 0 and not backward,
+            init_from_previous=self.coarse_to_fine and level == 0 and visit > 0,
+            has_previous=not backward and (visit > 0 or visited == (1,)),
             backward=backward,
         )
+
+
+def _visits(frames: int, stretch: int) -> list[range]:
+    """The frames of each visit: of 6 in stretches of 3, frame 3, then 1 and 4, then 2 and 5."""
+    # Visit 0 leaves out frame 0.
+    visits = [range(place or stretch, frames, stretch) for place in range(stretch)]
+    return visits if visits[0] else visits[1:]
 
 
 def _check_level(key: str, level: Level) -> None:
