@@ -10,6 +10,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.utils import get_class, instantiate
 from omegaconf import OmegaConf
 
+from devrf.apps.fetch import catalogue
 from devrf.apps.report.labels import ABLATIONS
 from devrf.cli.config import config_folder, group_choices
 from devrf.cli.config_check import check_config
@@ -20,7 +21,6 @@ from devrf.errors import DevrfError
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
 from devrf.methods.devrf.deformation_stage import DeformationStage
-from devrf.scenes.fetch import catalogue
 
 NAMES = group_choices()
 CHOICES = [f"{group}={name}" for group, names in NAMES.items() for name in names]

@@ -15,6 +15,7 @@ from hydra.plugins.completion_plugin import DefaultCompletionPlugin
 from omegaconf import DictConfig
 
 import devrf
+from devrf.apps.fetch import catalogue
 from devrf.cli.complete import completed, with_recognised_data
 from devrf.cli.config import config_folder, in_sweep, known_stages, register_config
 from devrf.cli.config_check import ROOT, check_config, check_extras, choices_of
@@ -22,7 +23,6 @@ from devrf.cli.messages import report_user_errors
 from devrf.cli.restore_config import log_source
 from devrf.cli.run_folder import working_in
 from devrf.cli.sweep import forget_failure, name_failures, run_job
-from devrf.scenes.fetch import catalogue
 from devrf.system.process import Interrupted, end_at_once, handle_signals, importing, tune_for_cpu
 
 # Without `=` among the shell's word breaks the whole of KEY=VALUE is one word. Other commands of

@@ -13,6 +13,13 @@ from rich.console import Console
 from rich.filesize import decimal
 
 from devrf.apps.capture.pipeline import scene_from_footage
+from devrf.apps.fetch import (
+    RECORD,
+    FetchSettings,
+    fetch_scene,
+    fetched_before,
+    published_scene,
+)
 from devrf.apps.inspection.report import as_text, inspection_text
 from devrf.apps.needs import needs_table
 from devrf.apps.settings import CaptureSettings
@@ -22,13 +29,6 @@ from devrf.cli.memory import needs
 from devrf.engine.ddp import ManualDDP
 from devrf.errors import DevrfError
 from devrf.scenes.export import export
-from devrf.scenes.fetch import (
-    RECORD,
-    FetchSettings,
-    fetch_scene,
-    fetched_before,
-    published_scene,
-)
 from devrf.system.files import write_json
 
 log = logging.getLogger(__name__)

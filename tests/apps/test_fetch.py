@@ -11,9 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from devrf.cli.config import config_folder
-from devrf.errors import DevrfError
-from devrf.scenes.fetch import (
+from devrf.apps.fetch import (
     MARKERS,
     Collection,
     PublishedScene,
@@ -21,6 +19,8 @@ from devrf.scenes.fetch import (
     catalogue,
     published_scene,
 )
+from devrf.cli.config import config_folder
+from devrf.errors import DevrfError
 
 SCENES = catalogue()
 
