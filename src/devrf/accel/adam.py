@@ -105,10 +105,10 @@ def _is_wide(values: Tensor) -> bool:
 
 
 @triton.jit
-def pull(values, at, own, stride, there):
+def pull(values, at, value, stride, mask):
     """clamp(v − v', −1, 1) for the neighbour ``stride`` further on, 0 where there is none."""
-    other = tl.load(values + at + stride, mask=there, other=0.0)
-    return tl.where(there, tl.minimum(tl.maximum(own - other, -1.0), 1.0), 0.0)
+    other = tl.load(values + at + stride, mask=mask, other=0.0)
+    return tl.where(mask, tl.minimum(tl.maximum(value - other, -1.0), 1.0), 0.0)
 
 
 @triton.jit(do_not_specialize=["x", "y"])
@@ -131,36 +131,36 @@ def total_variation_kernel(
     program = tl.program_id(0).to(tl.int64) if WIDE else tl.program_id(0)
     pieces = tl.cdiv(length, BLOCK)
     row, number = program // pieces, (program % pieces) * BLOCK + tl.arange(0, BLOCK)
-    here = number < length
+    mask = number < length
     at = row * length + number
-    before = tl.load(gradient + at, mask=here, other=0.0)
+    before = tl.load(gradient + at, mask=mask, other=0.0)
     if TOUCHED_ONLY:
-        here = here & (before != 0.0)
-    own = tl.load(values + at, mask=here, other=0.0)
+        mask = mask & (before != 0.0)
+    value = tl.load(values + at, mask=mask, other=0.0)
     # Broadcast to the block here: Triton's interpreter cannot broadcast a boolean scalar.
     i = row // y + number * 0
     j = row % y + number * 0
-    slope = pull(values, at, own, CHANNELS, here & (number + CHANNELS < length))
-    slope += pull(values, at, own, -CHANNELS, here & (number >= CHANNELS))
-    slope += pull(values, at, own, length, here & (j < y - 1))
-    slope += pull(values, at, own, -length, here & (j > 0))
-    slope += pull(values, at, own, y * length, here & (i < x - 1))
-    slope += pull(values, at, own, -y * length, here & (i > 0))
-    tl.store(gradient + at, before + weight * slope, mask=here)
+    slope = pull(values, at, value, CHANNELS, mask & (number + CHANNELS < length))
+    slope += pull(values, at, value, -CHANNELS, mask & (number >= CHANNELS))
+    slope += pull(values, at, value, length, mask & (j < y - 1))
+    slope += pull(values, at, value, -length, mask & (j > 0))
+    slope += pull(values, at, value, y * length, mask & (i < x - 1))
+    slope += pull(values, at, value, -y * length, mask & (i > 0))
+    tl.store(gradient + at, before + weight * slope, mask=mask)
 
 
 @triton.jit
-def moved(g, mean, square, rate, step, at, here, share1, share2, decay1, decay2, eps):
+def moved(g, mean, square, rate, step, at, mask, share1, share2, decay1, decay2, eps):
     """How far Adam moves the numbers at ``at`` against their gradients; updates their moments.
 
     share = 1 − β, decay = −log β, so that 1 − βᵗ = opacity(t·decay).
     """
-    m = tl.load(mean + at, mask=here, other=0.0)
-    s = tl.load(square + at, mask=here, other=0.0)
+    m = tl.load(mean + at, mask=mask, other=0.0)
+    s = tl.load(square + at, mask=mask, other=0.0)
     m += share1 * (g - m)
     s += share2 * (g * g - s)
-    tl.store(mean + at, m, mask=here)
-    tl.store(square + at, s, mask=here)
+    tl.store(mean + at, m, mask=mask)
+    tl.store(square + at, s, mask=mask)
     time = tl.load(step).to(tl.float32)
     size = tl.load(rate).to(tl.float32) / opacity(time * decay1)
     return size * m / (tl.sqrt(s / opacity(time * decay2)) + eps)
@@ -191,17 +191,17 @@ def adam_kernel(
     """One step; the numbers of its rule as for :func:`moved`."""
     program = tl.program_id(0).to(tl.int64) if WIDE else tl.program_id(0)
     at = program * BLOCK + tl.arange(0, BLOCK)
-    here = at < length
-    g = tl.load(gradient + at, mask=here, other=0.0)
-    touched = here & (g != 0.0)
-    active = touched if SKIP_ZERO else here
-    own = tl.load(values + at, mask=active, other=0.0)
+    mask = at < length
+    g = tl.load(gradient + at, mask=mask, other=0.0)
+    touched = mask & (g != 0.0)
+    active = touched if SKIP_ZERO else mask
+    value = tl.load(values + at, mask=active, other=0.0)
     if CLEAR:
         tl.store(gradient + at, tl.zeros((BLOCK,), dtype=tl.float32), mask=touched)
     move = moved(g, mean, square, rate, step, at, active, share1, share2, decay1, decay2, eps)
     if PER_VOXEL_LR:
         move *= tl.load(per_voxel_lr + at // CHANNELS, mask=active, other=0.0)
-    tl.store(values + at, own - move, mask=active)
+    tl.store(values + at, value - move, mask=active)
 
 
 @triton.jit
@@ -212,15 +212,15 @@ def adam_several_kernel(
     program = tl.program_id(0)
     tensor = tl.load(pieces + program * 3)
     at = tl.load(pieces + program * 3 + 1) + tl.arange(0, BLOCK)
-    here = at < tl.load(pieces + program * 3 + 2)
-    own = addresses + tensor * 5
-    values = tl.load(own).to(tl.pointer_type(tl.float32))
-    gradient = tl.load(own + 1).to(tl.pointer_type(tl.float32))
-    mean = tl.load(own + 2).to(tl.pointer_type(tl.float32))
-    square = tl.load(own + 3).to(tl.pointer_type(tl.float32))
-    step = tl.load(own + 4).to(tl.pointer_type(tl.float64))
-    g = tl.load(gradient + at, mask=here, other=0.0)
-    tl.store(gradient + at, tl.zeros((BLOCK,), dtype=tl.float32), mask=here & (g != 0.0))
-    move = moved(g, mean, square, rate, step, at, here, share1, share2, decay1, decay2, eps)
-    before = tl.load(values + at, mask=here, other=0.0)
-    tl.store(values + at, before - move, mask=here)
+    mask = at < tl.load(pieces + program * 3 + 2)
+    record = addresses + tensor * 5
+    values = tl.load(record).to(tl.pointer_type(tl.float32))
+    gradient = tl.load(record + 1).to(tl.pointer_type(tl.float32))
+    mean = tl.load(record + 2).to(tl.pointer_type(tl.float32))
+    square = tl.load(record + 3).to(tl.pointer_type(tl.float32))
+    step = tl.load(record + 4).to(tl.pointer_type(tl.float64))
+    g = tl.load(gradient + at, mask=mask, other=0.0)
+    tl.store(gradient + at, tl.zeros((BLOCK,), dtype=tl.float32), mask=mask & (g != 0.0))
+    move = moved(g, mean, square, rate, step, at, mask, share1, share2, decay1, decay2, eps)
+    before = tl.load(values + at, mask=mask, other=0.0)
+    tl.store(values + at, before - move, mask=mask)

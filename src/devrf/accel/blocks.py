@@ -48,21 +48,21 @@ def padding_programs(places: int) -> int:
 
 
 def gradient_target(
-    leaf: Tensor, needed: bool, kept: Tensor | None
+    leaf: Tensor, needed: bool, accumulated: Tensor | None
 ) -> tuple[Tensor, Tensor | None, bool]:
     """Where a kernel adds a leaf's gradient, what autograd is given of it, and whether it is added.
 
     Args:
         leaf: what the gradient belongs to; any pointer serves where none is added.
         needed: whether autograd asks for it.
-        kept: the gradient that the leaf has already, which is added to in place; or None.
+        accumulated: the gradient that the leaf has already, which is added to in place; or None.
     """
-    if kept is not None:
-        return kept, None, True
+    if accumulated is not None:
+        return accumulated, None, True
     if not needed:
         return leaf, None, False
-    own = torch.zeros_like(leaf)
-    return own, own, True
+    gradient = torch.zeros_like(leaf)
+    return gradient, gradient, True
 
 
 @triton.jit
@@ -73,20 +73,20 @@ def padding_places(number, used, places):
 
 
 @triton.jit
-def load_vectors(vectors, at, here):
-    """The components x, y, z of vectors that begin at places ``at``; 0 where not ``here``."""
-    x = tl.load(vectors + at, mask=here, other=0.0)
-    y = tl.load(vectors + at + 1, mask=here, other=0.0)
-    z = tl.load(vectors + at + 2, mask=here, other=0.0)
+def load_vectors(vectors, at, mask):
+    """The components x, y, z of vectors that begin at places ``at``; 0 where not ``mask``."""
+    x = tl.load(vectors + at, mask=mask, other=0.0)
+    y = tl.load(vectors + at + 1, mask=mask, other=0.0)
+    z = tl.load(vectors + at + 2, mask=mask, other=0.0)
     return x, y, z
 
 
 @triton.jit
-def store_vectors(vectors, at, x, y, z, here):
+def store_vectors(vectors, at, x, y, z, mask):
     """The reverse of :func:`load_vectors`."""
-    tl.store(vectors + at, x, mask=here)
-    tl.store(vectors + at + 1, y, mask=here)
-    tl.store(vectors + at + 2, z, mask=here)
+    tl.store(vectors + at, x, mask=mask)
+    tl.store(vectors + at + 1, y, mask=mask)
+    tl.store(vectors + at + 2, z, mask=mask)
 
 
 @triton.jit
@@ -163,19 +163,19 @@ def corner_slopes(value, fx, fy, fz, CORNER: tl.constexpr):
 
 
 @triton.jit
-def scalar_at(grid, axes, px, py, pz, here):
+def scalar_at(grid, axes, px, py, pz, mask):
     """Trilinear value of a grid (X, Y, Z, 1)."""
     first, along_x, along_y, fx, fy, fz = cell(axes, px, py, pz)
     value = fx * 0.0
     for corner in tl.static_range(8):
         row = corner_row(first, along_x, along_y, corner)
         weight = corner_weight(fx, fy, fz, corner)
-        value += weight * tl.load(grid + row, mask=here, other=0.0)
+        value += weight * tl.load(grid + row, mask=mask, other=0.0)
     return value
 
 
 @triton.jit
-def scalar_and_slopes(grid, axes, px, py, pz, here):
+def scalar_and_slopes(grid, axes, px, py, pz, mask):
     """Trilinear value of a grid (X, Y, Z, 1), and its slopes per unit of length along x, y, z."""
     first, along_x, along_y, fx, fy, fz = cell(axes, px, py, pz)
     value = fx * 0.0
@@ -183,7 +183,7 @@ def scalar_and_slopes(grid, axes, px, py, pz, here):
     over_y = fx * 0.0
     over_z = fx * 0.0
     for corner in tl.static_range(8):
-        at = tl.load(grid + corner_row(first, along_x, along_y, corner), mask=here, other=0.0)
+        at = tl.load(grid + corner_row(first, along_x, along_y, corner), mask=mask, other=0.0)
         value += corner_weight(fx, fy, fz, corner) * at
         dx, dy, dz = corner_slopes(at, fx, fy, fz, corner)
         over_x += dx
@@ -193,27 +193,27 @@ def scalar_and_slopes(grid, axes, px, py, pz, here):
 
 
 @triton.jit
-def scatter_scalars(into, axes, px, py, pz, change, here):
+def scatter_scalars(into, axes, px, py, pz, change, mask):
     """Add gradients at positions to the eight corners' rows of a grid (X, Y, Z, 1)."""
     first, along_x, along_y, fx, fy, fz = cell(axes, px, py, pz)
     # Padding has no gradient; atomic additions of its zeros to one place would be serialised.
-    here = here & (change != 0.0)
+    mask = mask & (change != 0.0)
     for corner in tl.static_range(8):
         row = corner_row(first, along_x, along_y, corner)
         part = corner_weight(fx, fy, fz, corner) * change
-        tl.atomic_add(into + row, part, mask=here, sem="relaxed")
+        tl.atomic_add(into + row, part, mask=mask, sem="relaxed")
 
 
 @triton.jit
-def displaced(before, after, weight, axes, px, py, pz, here, SLICES: tl.constexpr):
+def displaced(before, after, weight, axes, px, py, pz, mask, SLICES: tl.constexpr):
     """Positions moved by one grid (X, Y, Z, 3) of displacements, or by two that are blended."""
     first, along_x, along_y, fx, fy, fz = cell(axes, px, py, pz)
     for corner in tl.static_range(8):
         place = corner_row(first, along_x, along_y, corner) * 3
         part = corner_weight(fx, fy, fz, corner)
-        dx, dy, dz = load_vectors(before, place, here)
+        dx, dy, dz = load_vectors(before, place, mask)
         if SLICES == 2:
-            ex, ey, ez = load_vectors(after, place, here)
+            ex, ey, ez = load_vectors(after, place, mask)
             dx += weight * (ex - dx)
             dy += weight * (ey - dy)
             dz += weight * (ez - dz)
@@ -224,19 +224,19 @@ def displaced(before, after, weight, axes, px, py, pz, here, SLICES: tl.constexp
 
 
 @triton.jit
-def scatter_vectors(into, weight, axes, px, py, pz, gx, gy, gz, here):
+def scatter_vectors(into, weight, axes, px, py, pz, gx, gy, gz, mask):
     """Add ``weight`` times gradients at positions to the corners' rows of a grid (X, Y, Z, 3)."""
     first, along_x, along_y, fx, fy, fz = cell(axes, px, py, pz)
     gx = gx * weight
     gy = gy * weight
     gz = gz * weight
-    here = here & ((gx != 0.0) | (gy != 0.0) | (gz != 0.0))
+    mask = mask & ((gx != 0.0) | (gy != 0.0) | (gz != 0.0))
     for corner in tl.static_range(8):
         place = corner_row(first, along_x, along_y, corner) * 3
         part = corner_weight(fx, fy, fz, corner)
-        tl.atomic_add(into + place, part * gx, mask=here, sem="relaxed")
-        tl.atomic_add(into + place + 1, part * gy, mask=here, sem="relaxed")
-        tl.atomic_add(into + place + 2, part * gz, mask=here, sem="relaxed")
+        tl.atomic_add(into + place, part * gx, mask=mask, sem="relaxed")
+        tl.atomic_add(into + place + 1, part * gy, mask=mask, sem="relaxed")
+        tl.atomic_add(into + place + 2, part * gz, mask=mask, sem="relaxed")
 
 
 # The hardware's exponential has a relative error of about 1e-7, its logarithm an absolute one of

@@ -30,15 +30,15 @@ def product(left, right, PRECISION: tl.constexpr):
 @triton.jit
 def load_tile(matrix, row, column, rows, COLUMNS: tl.constexpr):
     """Rows and columns of a matrix (rows, COLUMNS); 0 beyond it."""
-    there = (row < rows)[:, None] & (column < COLUMNS)[None, :]
-    return tl.load(matrix + row[:, None] * COLUMNS + column[None, :], mask=there, other=0.0)
+    mask = (row < rows)[:, None] & (column < COLUMNS)[None, :]
+    return tl.load(matrix + row[:, None] * COLUMNS + column[None, :], mask=mask, other=0.0)
 
 
 @triton.jit
 def store_tile(matrix, row, column, rows, values, COLUMNS: tl.constexpr):
     """The reverse of :func:`load_tile`."""
-    there = (row < rows)[:, None] & (column < COLUMNS)[None, :]
-    tl.store(matrix + row[:, None] * COLUMNS + column[None, :], values, mask=there)
+    mask = (row < rows)[:, None] & (column < COLUMNS)[None, :]
+    tl.store(matrix + row[:, None] * COLUMNS + column[None, :], values, mask=mask)
 
 
 @triton.jit(do_not_specialize=["rays"])
@@ -69,25 +69,25 @@ def directions_kernel(
     values = tl.where(wanted, tl.where((column < 3)[None, :], along, waves), 0.0)
     store_tile(encoded, ray, column, rays, values, DIRECTIONS)
     weight = load_tile(v1, unit, column, WIDTH, DIRECTIONS)
-    given = product(values, tl.trans(weight), encoded.dtype.element_ty)
-    store_tile(from_ray, ray, unit, rays, given, WIDTH)
+    first_layer = product(values, tl.trans(weight), encoded.dtype.element_ty)
+    store_tile(from_ray, ray, unit, rays, first_layer, WIDTH)
 
 
 @triton.jit
 def lower_units(
     features,
     from_ray,
-    own,
+    ray,
     w1,
     b1,
     CHANNELS: tl.constexpr,
     WIDTH: tl.constexpr,
     UNITS: tl.constexpr,
 ):
-    """What the first layer gives of samples on rays ``own``, (BLOCK, UNITS)."""
+    """What the first layer gives of samples on rays ``ray``, (BLOCK, UNITS)."""
     unit = tl.arange(0, UNITS)
     known = unit < WIDTH
-    row = from_ray + own[:, None] * WIDTH + unit[None, :]
+    row = from_ray + ray[:, None] * WIDTH + unit[None, :]
     directions = tl.load(row, mask=known[None, :], other=0.0)
     weight = load_tile(w1, unit, tl.arange(0, features.shape[1]), WIDTH, CHANNELS)
     x = directions + product(features, tl.trans(weight), directions.dtype)

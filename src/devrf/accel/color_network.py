@@ -55,12 +55,12 @@ class ListedColors(torch.autograd.Function):
         ray: Tensor,
         first: Tensor,
         precision: torch.dtype,
-        kept: Sequence[Tensor | None],
+        accumulated: Sequence[Tensor | None],
         *weights: Tensor,
     ) -> Tensor:
         """Colours (S, 3) of S places; ``weights`` in the order of ``ColorNetwork``.
 
-        ``kept``: the gradients that grid and weights have already.
+        ``accumulated``: the gradients that grid and weights have already.
         """
         points, grid, viewdirs, ray = (t.contiguous() for t in (points, grid, viewdirs, ray))
         w1, b1, v1, w2, b2, w3, b3 = (weight.contiguous() for weight in weights)
@@ -93,7 +93,7 @@ class ListedColors(torch.autograd.Function):
         )
         known = points, grid, axes, from_ray, ray, first, *layers
         ctx.save_for_backward(*known, features, colors, encoded, v1)
-        ctx.kept = kept
+        ctx.accumulated = accumulated
         return colors
 
     @staticmethod
@@ -103,7 +103,7 @@ class ListedColors(torch.autograd.Function):
         points, grid, _, _, ray, first, w1, b1, w2, b2, w3, b3 = known
         leaves = grid, w1, b1, v1, w2, b2, w3, b3
         needs = ctx.needs_input_grad[1], *ctx.needs_input_grad[9:]
-        targets = [*map(gradient_target, leaves, needs, ctx.kept)]
+        targets = [*map(gradient_target, leaves, needs, ctx.accumulated)]
         (into_grid, _, adds), of_w1, of_b1, of_v1, of_w2, *of_others = targets
         moves, learns = ctx.needs_input_grad[0], any(added for *_, added in targets[1:])
         moved, rows = torch.empty_like(points), len(points) if learns else 0
@@ -166,12 +166,12 @@ def color_network_kernel(
     green = tl.zeros((BLOCK,), dtype=tl.float32)
     blue = tl.zeros((BLOCK,), dtype=tl.float32)
     if begin < listed:
-        here = place < listed
-        px, py, pz = load_vectors(points, at, here)
-        found = rows_between(grid, axes, px, py, pz, here, CHANNELS, PADDED, BLOCK)
-        store_tile(features, place, tl.arange(0, PADDED), places, found, CHANNELS)
-        own = tl.load(ray + place, mask=here, other=0)
-        lower = lower_units(found, from_ray, own, w1, b1, CHANNELS, WIDTH, UNITS)
+        mask = place < listed
+        px, py, pz = load_vectors(points, at, mask)
+        feature = rows_between(grid, axes, px, py, pz, mask, CHANNELS, PADDED, BLOCK)
+        store_tile(features, place, tl.arange(0, PADDED), places, feature, CHANNELS)
+        sample_ray = tl.load(ray + place, mask=mask, other=0)
+        lower = lower_units(feature, from_ray, sample_ray, w1, b1, CHANNELS, WIDTH, UNITS)
         for start in range(0, UNITS, SHARE):
             unit = start + tl.arange(0, SHARE)
             upper, _ = upper_units(lower, w2, b2, unit, WIDTH)
@@ -180,9 +180,9 @@ def color_network_kernel(
             red += tl.sum(upper * of_red, axis=1)
             green += tl.sum(upper * of_green, axis=1)
             blue += tl.sum(upper * of_blue, axis=1)
-        red = tl.where(here, sigmoid(red + tl.load(b3)), 0.0)
-        green = tl.where(here, sigmoid(green + tl.load(b3 + 1)), 0.0)
-        blue = tl.where(here, sigmoid(blue + tl.load(b3 + 2)), 0.0)
+        red = tl.where(mask, sigmoid(red + tl.load(b3)), 0.0)
+        green = tl.where(mask, sigmoid(green + tl.load(b3 + 1)), 0.0)
+        blue = tl.where(mask, sigmoid(blue + tl.load(b3 + 2)), 0.0)
     else:
         nothing = tl.zeros((BLOCK, PADDED), dtype=tl.float32)
         store_tile(features, place, tl.arange(0, PADDED), places, nothing, CHANNELS)
@@ -234,21 +234,21 @@ def color_backward_kernel(
     place = begin + tl.arange(0, BLOCK)
     at = place.to(tl.int64) * 3
     listed = tl.load(first + rays)
-    here = place < listed
+    mask = place < listed
     below_unit = tl.arange(0, UNITS)
     gx = tl.zeros((BLOCK,), dtype=tl.float32)
     gy = tl.zeros((BLOCK,), dtype=tl.float32)
     gz = tl.zeros((BLOCK,), dtype=tl.float32)
-    red, green, blue = load_vectors(colors, at, here)
-    to_red, to_green, to_blue = load_vectors(upstream, at, here)
+    red, green, blue = load_vectors(colors, at, mask)
+    to_red, to_green, to_blue = load_vectors(upstream, at, mask)
     red = to_red * red * (1.0 - red)
     green = to_green * green * (1.0 - green)
     blue = to_blue * blue * (1.0 - blue)
     if begin < listed:
         channel = tl.arange(0, PADDED)
-        found = load_tile(features, place, channel, listed, CHANNELS)
-        own = tl.load(ray + place, mask=here, other=0)
-        lower = lower_units(found, from_ray, own, w1, b1, CHANNELS, WIDTH, UNITS)
+        feature = load_tile(features, place, channel, listed, CHANNELS)
+        sample_ray = tl.load(ray + place, mask=mask, other=0)
+        lower = lower_units(feature, from_ray, sample_ray, w1, b1, CHANNELS, WIDTH, UNITS)
         below = tl.zeros((BLOCK, UNITS), dtype=tl.float32)
         for start in range(0, UNITS, SHARE):
             unit = start + tl.arange(0, SHARE)
@@ -277,10 +277,10 @@ def color_backward_kernel(
             store_tile(lowers, place, below_unit, places, lower, WIDTH)
             store_tile(to_lowers, place, below_unit, places, below, WIDTH)
         weight = load_tile(w1, below_unit, channel, WIDTH, CHANNELS)
-        px, py, pz = load_vectors(points, at, here)
+        px, py, pz = load_vectors(points, at, mask)
         change = product(below, weight, lower.dtype)
         gx, gy, gz = spread_rows(
-            grid, axes, into_grid, change, px, py, pz, here, NEEDS_GRID, NEEDS_POINTS, CHANNELS
+            grid, axes, into_grid, change, px, py, pz, mask, NEEDS_GRID, NEEDS_POINTS, CHANNELS
         )
     else:
         if NEEDS_WEIGHTS:

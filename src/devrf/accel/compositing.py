@@ -68,13 +68,13 @@ class CompositeColors(torch.autograd.Function):
     """As devrf.ops.compositing.composite_colors."""
 
     @staticmethod
-    def forward(ctx: Any, *given: Tensor) -> tuple[Tensor, Tensor]:
-        given = tuple(tensor.contiguous() for tensor in given)
-        weights, colors, _, first, _, background = given
+    def forward(ctx: Any, *tensors: Tensor) -> tuple[Tensor, Tensor]:
+        tensors = tuple(tensor.contiguous() for tensor in tensors)
+        weights, colors, _, first, _, background = tensors
         rays = len(first) - 1
         ctx.apart = 0 if background.dim() == 1 else 3
         image, depth = colors.new_empty(rays, 3), colors.new_empty(rays)
-        launch(colors_kernel, rays, *given, image, depth, ctx.apart, num_warps=1)
+        launch(colors_kernel, rays, *tensors, image, depth, ctx.apart, num_warps=1)
         ctx.save_for_backward(weights, colors, first, background)
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(depth)
@@ -111,12 +111,12 @@ def composite_kernel(depth, first, weights, transmittance, ends, rays, places):
         gone = 0.0
         while start < stop:
             at = start + lane
-            here = at < stop
-            tau = tl.load(depth + at, mask=here, other=0.0)
-            previous = tl.load(depth + at - 1, mask=here & (lane > 0), other=0.0)
+            mask = at < stop
+            tau = tl.load(depth + at, mask=mask, other=0.0)
+            previous = tl.load(depth + at - 1, mask=mask & (lane > 0), other=0.0)
             left = tl.exp(-(gone + tl.cumsum(previous, 0)))
-            tl.store(transmittance + at, left, mask=here)
-            tl.store(weights + at, left * opacity(tau), mask=here)
+            tl.store(transmittance + at, left, mask=mask)
+            tl.store(weights + at, left * opacity(tau), mask=mask)
             gone += tl.sum(tau, 0)
             start += LANES
         tl.store(ends + ray, tl.exp(-gone))
@@ -139,15 +139,15 @@ def composite_backward_kernel(
         start = begin + (tl.cdiv(stop - begin, LANES) - 1) * LANES
         while start >= begin:
             at = start + lane
-            here = at < stop
-            gradient = tl.load(weights_gradient + at, mask=here, other=0.0)
-            weight = tl.load(weights + at, mask=here, other=0.0)
-            left = tl.load(transmittance + at, mask=here, other=0.0) - weight
-            beyond = here & (at + 1 < stop) & (lane < LANES - 1)
+            mask = at < stop
+            gradient = tl.load(weights_gradient + at, mask=mask, other=0.0)
+            weight = tl.load(weights + at, mask=mask, other=0.0)
+            left = tl.load(transmittance + at, mask=mask, other=0.0) - weight
+            beyond = mask & (at + 1 < stop) & (lane < LANES - 1)
             follower = tl.load(weights_gradient + at + 1, mask=beyond, other=0.0)
             follower *= tl.load(weights + at + 1, mask=beyond, other=0.0)
             behind = last + tl.cumsum(follower, 0, reverse=True)
-            tl.store(into + at, gradient * left - behind, mask=here)
+            tl.store(into + at, gradient * left - behind, mask=mask)
             last += tl.sum(gradient * weight, 0)
             start -= LANES
     else:
@@ -172,13 +172,13 @@ def colors_kernel(weights, colors, distance, first, transmittance, background, i
     mass = 0.0
     while start < stop:
         at = start + lane
-        here = at < stop
-        weight = tl.load(weights + at, mask=here, other=0.0)
-        r, g, b = load_vectors(colors, at * 3, here)
+        mask = at < stop
+        weight = tl.load(weights + at, mask=mask, other=0.0)
+        r, g, b = load_vectors(colors, at * 3, mask)
         red += tl.sum(weight * r, 0)
         green += tl.sum(weight * g, 0)
         blue += tl.sum(weight * b, 0)
-        reached += tl.sum(weight * tl.load(distance + at, mask=here, other=0.0), 0)
+        reached += tl.sum(weight * tl.load(distance + at, mask=mask, other=0.0), 0)
         mass += tl.sum(weight, 0)
         start += LANES
     left = tl.load(transmittance + ray)
@@ -218,11 +218,11 @@ def colors_backward_kernel(
         lane = tl.arange(0, LANES)
         while start < stop:
             at = start + lane
-            here = at < stop
-            weight = tl.load(weights + at, mask=here, other=0.0)
-            r, g, b = load_vectors(colors, at * 3, here)
-            tl.store(into_weights + at, red * r + green * g + blue * b, mask=here)
-            store_vectors(into_colors, at * 3, red * weight, green * weight, blue * weight, here)
+            mask = at < stop
+            weight = tl.load(weights + at, mask=mask, other=0.0)
+            r, g, b = load_vectors(colors, at * 3, mask)
+            tl.store(into_weights + at, red * r + green * g + blue * b, mask=mask)
+            store_vectors(into_colors, at * 3, red * weight, green * weight, blue * weight, mask)
             start += LANES
     else:
         place, empty = padding_places(program - rays, tl.load(first + rays), places)

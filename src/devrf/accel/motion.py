@@ -43,35 +43,35 @@ class Motion(torch.autograd.Function):
         weight: Tensor,
         forward: Tensor,
         known: Sequence[Tensor],
-        seen: Sequence[Tensor] | None,
+        earlier: Sequence[Tensor] | None,
         weights: Sequence[float],
         over_samples: bool,
         ndc: tuple[float, float, float] | None,
-        kept: Tensor | None,
+        accumulated: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
         """The sum and the terms; an argument that is None is not there.
 
         ``known``: points, ray and present of the samples; Δ_f of the frame before; axes of both.
-        ``seen``: the fields of ``SeenEarlier``. ``kept``: the gradient that ``forward`` has.
+        ``earlier``: fields of ``SeenEarlier``. ``accumulated``: the gradient that ``forward`` has.
         """
         # Any pointers stand in for what was not seen.
-        valid = known[2] if seen is None else seen[1]
-        given = tuple(
+        valid = known[2] if earlier is None else earlier[1]
+        tensors = tuple(
             (tensor.view(torch.uint8) if tensor.dtype == torch.bool else tensor).contiguous()
-            for tensor in (canonical, weight, forward, *known, *(seen or [valid] * 8))
+            for tensor in (canonical, weight, forward, *known, *(earlier or [valid] * 8))
         )
-        ctx.kinds = {"FLOW": seen is not None, "NDC": ndc is not None}
-        ctx.numbers, ctx.weights, ctx.kept = ndc or (1.0, 1.0, 1.0), weights, kept
+        ctx.kinds = {"FLOW": earlier is not None, "NDC": ndc is not None}
+        ctx.numbers, ctx.weights, ctx.accumulated = ndc or (1.0, 1.0, 1.0), weights, accumulated
         count, programs = len(canonical), blocks(len(canonical))
         parts, sums = canonical.new_empty(programs, 4), canonical.new_empty(5)
-        launch(motion_kernel, programs, *given, parts, count, *ctx.numbers, **ctx.kinds)
+        launch(motion_kernel, programs, *tensors, parts, count, *ctx.numbers, **ctx.kinds)
         launch(
             finish_motion_kernel,
             1,
             *(parts, valid.view(torch.uint8), sums, programs, len(valid), *weights),
-            OVER_RAYS=seen is not None and not over_samples,
+            OVER_RAYS=earlier is not None and not over_samples,
         )
-        ctx.save_for_backward(*given, sums)
+        ctx.save_for_backward(*tensors, sums)
         ctx.set_materialize_grads(False)
         terms = sums[:2]
         ctx.mark_non_differentiable(terms)
@@ -80,13 +80,13 @@ class Motion(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor, _: None) -> tuple[Tensor | None, ...]:
-        canonical, weight, forward, *_known, sums = given = ctx.saved_tensors
-        into, gradient, adds = gradient_target(forward, ctx.needs_input_grad[2], ctx.kept)
+        canonical, weight, forward, *_known, sums = tensors = ctx.saved_tensors
+        into, gradient, adds = gradient_target(forward, ctx.needs_input_grad[2], ctx.accumulated)
         moved, changed = torch.empty_like(canonical), torch.empty_like(weight)
         launch(
             motion_backward_kernel,
             blocks(len(canonical)),
-            *(*given, upstream.contiguous(), moved, changed, into),
+            *(*tensors, upstream.contiguous(), moved, changed, into),
             *(len(canonical), *ctx.numbers, *ctx.weights),
             NEEDS_FORWARD=adds,
             **ctx.kinds,
@@ -110,53 +110,53 @@ def to_world(x, y, z, slope_x, slope_y, near, NDC: tl.constexpr):
 
 
 @triton.jit
-def local_axis(pose, x, y, z, here):
+def local_axis(pose, x, y, z, mask):
     """A camera's own axis, the column at ``pose``, times world coordinates from its centre."""
-    along = tl.load(pose, mask=here, other=0.0) * x
-    along += tl.load(pose + 4, mask=here, other=0.0) * y
-    return along + tl.load(pose + 8, mask=here, other=0.0) * z
+    along = tl.load(pose, mask=mask, other=0.0) * x
+    along += tl.load(pose + 4, mask=mask, other=0.0) * y
+    return along + tl.load(pose + 8, mask=mask, other=0.0) * z
 
 
 @triton.jit
-def world_axis(pose, x, y, z, here):
+def world_axis(pose, x, y, z, mask):
     """The reverse: a world axis, the row at ``pose``, times coordinates in the camera's axes."""
-    along = tl.load(pose, mask=here, other=0.0) * x
-    along += tl.load(pose + 1, mask=here, other=0.0) * y
-    return along + tl.load(pose + 2, mask=here, other=0.0) * z
+    along = tl.load(pose, mask=mask, other=0.0) * x
+    along += tl.load(pose + 1, mask=mask, other=0.0) * y
+    return along + tl.load(pose + 2, mask=mask, other=0.0) * z
 
 
 @triton.jit
-def missed_flow(x, y, z, ray, image, vectors, pixel, previous, poses, focal, center, here):
+def missed_flow(x, y, z, ray, image, vectors, pixel, previous, poses, focal, center, mask):
     """Induced minus observed flow of world points, and what their gradient needs."""
-    camera = tl.load(previous + tl.load(image + ray, mask=here, other=0), mask=here, other=0)
+    camera = tl.load(previous + tl.load(image + ray, mask=mask, other=0), mask=mask, other=0)
     pose = poses + camera * 12
-    x -= tl.load(pose + 3, mask=here, other=0.0)
-    y -= tl.load(pose + 7, mask=here, other=0.0)
-    z -= tl.load(pose + 11, mask=here, other=0.0)
-    right = local_axis(pose, x, y, z, here)
-    up = local_axis(pose + 1, x, y, z, here)
-    depth = -local_axis(pose + 2, x, y, z, here)
+    x -= tl.load(pose + 3, mask=mask, other=0.0)
+    y -= tl.load(pose + 7, mask=mask, other=0.0)
+    z -= tl.load(pose + 11, mask=mask, other=0.0)
+    right = local_axis(pose, x, y, z, mask)
+    up = local_axis(pose + 1, x, y, z, mask)
+    depth = -local_axis(pose + 2, x, y, z, mask)
     depth = tl.where(tl.abs(depth) < NEAREST, NEAREST, depth)
-    focal_x = tl.load(focal + camera * 2, mask=here, other=0.0)
-    focal_y = tl.load(focal + camera * 2 + 1, mask=here, other=0.0)
-    across = focal_x * right / depth + tl.load(center + camera * 2, mask=here, other=0.0)
-    down = -focal_y * up / depth + tl.load(center + camera * 2 + 1, mask=here, other=0.0)
-    across -= tl.load(pixel + ray * 2, mask=here, other=0.0)
-    across -= tl.load(vectors + ray * 2, mask=here, other=0.0)
-    down -= tl.load(pixel + ray * 2 + 1, mask=here, other=0.0)
-    down -= tl.load(vectors + ray * 2 + 1, mask=here, other=0.0)
+    focal_x = tl.load(focal + camera * 2, mask=mask, other=0.0)
+    focal_y = tl.load(focal + camera * 2 + 1, mask=mask, other=0.0)
+    across = focal_x * right / depth + tl.load(center + camera * 2, mask=mask, other=0.0)
+    down = -focal_y * up / depth + tl.load(center + camera * 2 + 1, mask=mask, other=0.0)
+    across -= tl.load(pixel + ray * 2, mask=mask, other=0.0)
+    across -= tl.load(vectors + ray * 2, mask=mask, other=0.0)
+    down -= tl.load(pixel + ray * 2 + 1, mask=mask, other=0.0)
+    down -= tl.load(vectors + ray * 2 + 1, mask=mask, other=0.0)
     return across, down, pose, right, up, depth, focal_x, focal_y
 
 
 @triton.jit
-def pulled(grid, axes, px, py, pz, gx, gy, gz, here):
+def pulled(grid, axes, px, py, pz, gx, gy, gz, mask):
     """Slopes, per unit of length, of the values of a grid (X, Y, Z, 3) times (gx, gy, gz)."""
     first, along_x, along_y, fx, fy, fz = cell(axes, px, py, pz)
     over_x = fx * 0.0
     over_y = fx * 0.0
     over_z = fx * 0.0
     for corner in tl.static_range(8):
-        dx, dy, dz = load_vectors(grid, corner_row(first, along_x, along_y, corner) * 3, here)
+        dx, dy, dz = load_vectors(grid, corner_row(first, along_x, along_y, corner) * 3, mask)
         agreed = dx * gx + dy * gy + dz * gz
         dx, dy, dz = corner_slopes(agreed, fx, fy, fz, corner)
         over_x += dx
@@ -193,27 +193,27 @@ def motion_kernel(
 ):
     """A block's sums of both terms, and of the samples that each is over."""
     place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    here = (place < count) & (tl.load(present + place, mask=place < count, other=0) != 0)
+    mask = (place < count) & (tl.load(present + place, mask=place < count, other=0) != 0)
     at = place.to(tl.int64) * 3
-    qx, qy, qz = load_vectors(canonical, at, here)
-    mx, my, mz = displaced(forward, forward, 0.0, axes, qx, qy, qz, here, SLICES=1)
-    px, py, pz = load_vectors(points, at, here)
+    qx, qy, qz = load_vectors(canonical, at, mask)
+    mx, my, mz = displaced(forward, forward, 0.0, axes, qx, qy, qz, mask, SLICES=1)
+    px, py, pz = load_vectors(points, at, mask)
     mx -= px
     my -= py
     mz -= pz
-    missed = tl.where(here, mx * mx + my * my + mz * mz, 0.0)
+    missed = tl.where(mask, mx * mx + my * my + mz * mz, 0.0)
     part = parts + tl.program_id(0) * 4
     tl.store(part, 0.5 * tl.sum(missed, 0))
-    tl.store(part + 1, tl.sum(here.to(tl.float32), 0))
+    tl.store(part + 1, tl.sum(mask.to(tl.float32), 0))
     error = 0.0 * qx
-    on = here
+    on = mask
     if FLOW:
-        own = tl.load(ray + place, mask=here, other=0)
-        on = here & (tl.load(valid + own, mask=here, other=0) != 0)
+        sample_ray = tl.load(ray + place, mask=mask, other=0)
+        on = mask & (tl.load(valid + sample_ray, mask=mask, other=0) != 0)
         mx, my, mz = displaced(before, before, 0.0, axes, qx, qy, qz, on, SLICES=1)
         mx, my, mz, _ = to_world(mx, my, mz, slope_x, slope_y, near, NDC)
         across, down, _, _, _, _, _, _ = missed_flow(
-            mx, my, mz, own, image, vectors, pixel, previous, poses, focal, center, on
+            mx, my, mz, sample_ray, image, vectors, pixel, previous, poses, focal, center, on
         )
         error = tl.load(weight + place, mask=on, other=0.0) * (tl.abs(across) + tl.abs(down))
     tl.store(part + 2, tl.sum(tl.where(on, error, 0.0), 0))
@@ -233,18 +233,18 @@ def finish_motion_kernel(
     start = 0
     while start < programs:
         part = parts + (start + lane) * 4
-        here = start + lane < programs
-        cycle += tl.load(part, mask=here, other=0.0)
-        samples += tl.load(part + 1, mask=here, other=0.0)
-        flow += tl.load(part + 2, mask=here, other=0.0)
-        counted += 2.0 * tl.load(part + 3, mask=here, other=0.0)
+        mask = start + lane < programs
+        cycle += tl.load(part, mask=mask, other=0.0)
+        samples += tl.load(part + 1, mask=mask, other=0.0)
+        flow += tl.load(part + 2, mask=mask, other=0.0)
+        counted += 2.0 * tl.load(part + 3, mask=mask, other=0.0)
         start += AT_ONCE
     if OVER_RAYS:
         counted = tl.zeros((AT_ONCE,), dtype=tl.float32)
         start = 0
         while start < rays:
-            there = tl.load(valid + start + lane, mask=start + lane < rays, other=0)
-            counted += (there != 0).to(tl.float32)
+            known = tl.load(valid + start + lane, mask=start + lane < rays, other=0)
+            counted += (known != 0).to(tl.float32)
             start += AT_ONCE
     by_cycle = 1.0 / tl.maximum(tl.sum(samples, 0), 1.0)
     by_flow = 1.0 / tl.maximum(tl.sum(counted, 0), 1.0)
@@ -293,29 +293,29 @@ def motion_backward_kernel(
     """Gradients of q and w, and of Δ_f, which are scattered to its grid."""
     place = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     listed = place < count
-    here = listed & (tl.load(present + place, mask=listed, other=0) != 0)
+    mask = listed & (tl.load(present + place, mask=listed, other=0) != 0)
     at = place.to(tl.int64) * 3
-    qx, qy, qz = load_vectors(canonical, at, here)
-    gx, gy, gz = displaced(forward, forward, 0.0, axes, qx, qy, qz, here, SLICES=1)
-    px, py, pz = load_vectors(points, at, here)
-    slope = tl.where(here, tl.load(upstream) * of_cycle * tl.load(sums + 3), 0.0)
+    qx, qy, qz = load_vectors(canonical, at, mask)
+    gx, gy, gz = displaced(forward, forward, 0.0, axes, qx, qy, qz, mask, SLICES=1)
+    px, py, pz = load_vectors(points, at, mask)
+    slope = tl.where(mask, tl.load(upstream) * of_cycle * tl.load(sums + 3), 0.0)
     gx = slope * (gx - px)
     gy = slope * (gy - py)
     gz = slope * (gz - pz)
     if NEEDS_FORWARD:
-        scatter_vectors(into_forward, 1.0, axes, qx, qy, qz, gx, gy, gz, here)
-    over_x, over_y, over_z = pulled(forward, axes, qx, qy, qz, gx, gy, gz, here)
+        scatter_vectors(into_forward, 1.0, axes, qx, qy, qz, gx, gy, gz, mask)
+    over_x, over_y, over_z = pulled(forward, axes, qx, qy, qz, gx, gy, gz, mask)
     gx += over_x
     gy += over_y
     gz += over_z
     change = 0.0 * qx
     if FLOW:
-        own = tl.load(ray + place, mask=here, other=0)
-        on = here & (tl.load(valid + own, mask=here, other=0) != 0)
+        sample_ray = tl.load(ray + place, mask=mask, other=0)
+        on = mask & (tl.load(valid + sample_ray, mask=mask, other=0) != 0)
         mx, my, mz = displaced(before, before, 0.0, axes, qx, qy, qz, on, SLICES=1)
         wx, wy, wz, gap = to_world(mx, my, mz, slope_x, slope_y, near, NDC)
         across, down, pose, right, up, depth, focal_x, focal_y = missed_flow(
-            wx, wy, wz, own, image, vectors, pixel, previous, poses, focal, center, on
+            wx, wy, wz, sample_ray, image, vectors, pixel, previous, poses, focal, center, on
         )
         slope = tl.where(on, tl.load(upstream) * of_flow * tl.load(sums + 4), 0.0)
         change = slope * (tl.abs(across) + tl.abs(down))

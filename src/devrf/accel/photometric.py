@@ -30,14 +30,14 @@ class Photometric(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, alpha: Tensor | None, weights: Sequence[float], *given: Tensor
+        ctx: Any, alpha: Tensor | None, weights: Sequence[float], *tensors: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """``given``: image, transmittance, weights and colours of samples, first, truth."""
-        given = tuple(tensor.contiguous() for tensor in given)
-        image, transmittance = given[:2]
+        """``tensors``: image, transmittance, weights and colours of samples, first, truth."""
+        tensors = tuple(tensor.contiguous() for tensor in tensors)
+        image, transmittance = tensors[:2]
         rays, parts = len(image), image.new_empty(len(image), 7)
         # The transmittance stands in for a missing alpha mask, which is not read.
-        known = *given, transmittance if alpha is None else alpha.contiguous()
+        known = *tensors, transmittance if alpha is None else alpha.contiguous()
         ctx.weights, ctx.has_alpha = weights, alpha is not None
         launch(
             photometric_kernel,
@@ -47,11 +47,11 @@ class Photometric(torch.autograd.Function):
             num_warps=1,
         )
         sums = parts.sum(dim=0)
-        total, terms, seen = sums[4], sums[:4], sums[5:]
+        total, terms, means = sums[4], sums[:4], sums[5:]
         ctx.save_for_backward(*known)
         ctx.set_materialize_grads(False)
-        ctx.mark_non_differentiable(terms, seen)
-        return total, terms, seen
+        ctx.mark_non_differentiable(terms, means)
+        return total, terms, means
 
     @staticmethod
     @once_differentiable
@@ -113,9 +113,9 @@ def photometric_kernel(
     missed = 0.0
     while start < stop:
         at = start + lane
-        here = at < stop
-        r, g, b = load_vectors(sample_color, at * 3, here)
-        weight = tl.load(sample_weight + at, mask=here, other=0.0)
+        mask = at < stop
+        r, g, b = load_vectors(sample_color, at * 3, mask)
+        weight = tl.load(sample_weight + at, mask=mask, other=0.0)
         r -= red
         g -= green
         b -= blue
@@ -186,13 +186,13 @@ def photometric_backward_kernel(
         lane = tl.arange(0, LANES)
         while start < stop:
             at = start + lane
-            here = at < stop
-            r, g, b = load_vectors(sample_color, at * 3, here)
-            steep = 2.0 * of_samples * share * tl.load(sample_weight + at, mask=here, other=0.0)
+            mask = at < stop
+            r, g, b = load_vectors(sample_color, at * 3, mask)
+            steep = 2.0 * of_samples * share * tl.load(sample_weight + at, mask=mask, other=0.0)
             r = steep * (r - red)
             g = steep * (g - green)
             b = steep * (b - blue)
-            store_vectors(into_color, at * 3, r, g, b, here)
+            store_vectors(into_color, at * 3, r, g, b, mask)
             start += LANES
     else:
         place, empty = padding_places(program - rays, tl.load(first + rays), places)

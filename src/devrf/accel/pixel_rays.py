@@ -32,24 +32,24 @@ def gather_pixels(
     alpha, time, pixel = poses.new_empty(rays), poses.new_empty(rays), poses.new_empty(rays, 2)
     frame = torch.empty_like(image)
     # Any pointers stand in for what is not there.
-    seen, valid, vectors, known = pixel, pixels, pixel, pixels
+    vector, valid, vectors, known = pixel, pixels, pixel, pixels
     if flow is not None:
         vectors, known = flow[0], flow[1].view(torch.uint8)
-        seen, valid = torch.empty_like(pixel), known.new_empty(rays)
+        vector, valid = torch.empty_like(pixel), known.new_empty(rays)
     launch(
         gather_kernel,
         blocks(rays),
         *(image.contiguous(), flat.contiguous(), pixels),
         *(poses.contiguous(), focal.contiguous(), center.contiguous(), background.contiguous()),
         *(times.contiguous(), frames.contiguous(), vectors, known),
-        *(origins, directions, color, alpha, time, frame, pixel, seen, valid),
+        *(origins, directions, color, alpha, time, frame, pixel, vector, valid),
         *(rays, width, height * width, 0 if background.dim() == 1 else 3),
         CHANNELS=channels,
         FLOW=flow is not None,
     )
     return (
         *(origins, directions, color, alpha if channels == 4 else None, time, frame, pixel),
-        *((None, None) if flow is None else (seen, valid.view(torch.bool))),
+        *((None, None) if flow is None else (vector, valid.view(torch.bool))),
     )
 
 
@@ -76,12 +76,12 @@ def on_background(rgb, behind, alpha):
 
 
 @triton.jit
-def turned(pose, u, v, here):
+def turned(pose, u, v, mask):
     """A row of a pose times (u, −v, −1), and its last entry."""
-    direction = tl.load(pose, mask=here, other=0.0) * u
-    direction -= tl.load(pose + 1, mask=here, other=0.0) * v
-    direction -= tl.load(pose + 2, mask=here, other=0.0)
-    return direction, tl.load(pose + 3, mask=here, other=0.0)
+    direction = tl.load(pose, mask=mask, other=0.0) * u
+    direction -= tl.load(pose + 1, mask=mask, other=0.0) * v
+    direction -= tl.load(pose + 2, mask=mask, other=0.0)
+    return direction, tl.load(pose + 3, mask=mask, other=0.0)
 
 
 @triton.jit(do_not_specialize=["count", "width", "area", "apart"])
@@ -104,7 +104,7 @@ def gather_kernel(
     time,
     frame,
     pixel,
-    seen,
+    vector,
     valid,
     count,
     width,
@@ -115,45 +115,45 @@ def gather_kernel(
 ):
     """Looks a pixel up; its ray. ``apart`` is 3 where each ray has a background, else 0."""
     ray = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    here = ray < count
-    shown = tl.load(image + ray, mask=here, other=0)
-    number = tl.load(flat + ray, mask=here, other=0)
+    mask = ray < count
+    shown = tl.load(image + ray, mask=mask, other=0)
+    number = tl.load(flat + ray, mask=mask, other=0)
     row = shown * area + number
     x = (number % width).to(tl.float32) + 0.5
     y = (number // width).to(tl.float32) + 0.5
-    tl.store(pixel + ray * 2, x, mask=here)
-    tl.store(pixel + ray * 2 + 1, y, mask=here)
-    tl.store(time + ray, tl.load(times + shown, mask=here, other=0.0), mask=here)
-    tl.store(frame + ray, tl.load(frames + shown, mask=here, other=0), mask=here)
-    red = tl.load(pixels + row * CHANNELS, mask=here, other=0).to(tl.float32) / 255.0
-    green = tl.load(pixels + row * CHANNELS + 1, mask=here, other=0).to(tl.float32) / 255.0
-    blue = tl.load(pixels + row * CHANNELS + 2, mask=here, other=0).to(tl.float32) / 255.0
+    tl.store(pixel + ray * 2, x, mask=mask)
+    tl.store(pixel + ray * 2 + 1, y, mask=mask)
+    tl.store(time + ray, tl.load(times + shown, mask=mask, other=0.0), mask=mask)
+    tl.store(frame + ray, tl.load(frames + shown, mask=mask, other=0), mask=mask)
+    red = tl.load(pixels + row * CHANNELS, mask=mask, other=0).to(tl.float32) / 255.0
+    green = tl.load(pixels + row * CHANNELS + 1, mask=mask, other=0).to(tl.float32) / 255.0
+    blue = tl.load(pixels + row * CHANNELS + 2, mask=mask, other=0).to(tl.float32) / 255.0
     if CHANNELS == 4:
-        alpha_mask = tl.load(pixels + row * CHANNELS + 3, mask=here, other=0).to(tl.float32) / 255.0
-        tl.store(alpha + ray, alpha_mask, mask=here)
-        behind_red, behind_green, behind_blue = load_vectors(background, ray * apart, here)
+        alpha_mask = tl.load(pixels + row * CHANNELS + 3, mask=mask, other=0).to(tl.float32) / 255.0
+        tl.store(alpha + ray, alpha_mask, mask=mask)
+        behind_red, behind_green, behind_blue = load_vectors(background, ray * apart, mask)
         red = on_background(red, behind_red, alpha_mask)
         green = on_background(green, behind_green, alpha_mask)
         blue = on_background(blue, behind_blue, alpha_mask)
-    store_vectors(color, ray * 3, red, green, blue, here)
-    middle_x = tl.load(center + shown * 2, mask=here, other=0.0)
-    middle_y = tl.load(center + shown * 2 + 1, mask=here, other=0.0)
-    u = (x - middle_x) / tl.load(focal + shown * 2, mask=here, other=1.0)
-    v = (y - middle_y) / tl.load(focal + shown * 2 + 1, mask=here, other=1.0)
-    dx, ox = turned(poses + shown * 12, u, v, here)
-    dy, oy = turned(poses + shown * 12 + 4, u, v, here)
-    dz, oz = turned(poses + shown * 12 + 8, u, v, here)
+    store_vectors(color, ray * 3, red, green, blue, mask)
+    middle_x = tl.load(center + shown * 2, mask=mask, other=0.0)
+    middle_y = tl.load(center + shown * 2 + 1, mask=mask, other=0.0)
+    u = (x - middle_x) / tl.load(focal + shown * 2, mask=mask, other=1.0)
+    v = (y - middle_y) / tl.load(focal + shown * 2 + 1, mask=mask, other=1.0)
+    dx, ox = turned(poses + shown * 12, u, v, mask)
+    dy, oy = turned(poses + shown * 12 + 4, u, v, mask)
+    dz, oz = turned(poses + shown * 12 + 8, u, v, mask)
     length = tl.maximum(tl.sqrt(dx * dx + dy * dy + dz * dz), 1e-12)
-    store_vectors(origins, ray * 3, ox, oy, oz, here)
-    store_vectors(directions, ray * 3, dx / length, dy / length, dz / length, here)
+    store_vectors(origins, ray * 3, ox, oy, oz, mask)
+    store_vectors(directions, ray * 3, dx / length, dy / length, dz / length, mask)
     if FLOW:
-        trusted = tl.load(known + row, mask=here, other=0)
-        tl.store(valid + ray, trusted, mask=here)
-        used = here & (trusted != 0)
+        trusted = tl.load(known + row, mask=mask, other=0)
+        tl.store(valid + ray, trusted, mask=mask)
+        used = mask & (trusted != 0)
         along = tl.load(vectors + row * 2, mask=used, other=0.0)
         down = tl.load(vectors + row * 2 + 1, mask=used, other=0.0)
-        tl.store(seen + ray * 2, along, mask=here)
-        tl.store(seen + ray * 2 + 1, down, mask=here)
+        tl.store(vector + ray * 2, along, mask=mask)
+        tl.store(vector + ray * 2 + 1, down, mask=mask)
 
 
 @triton.jit
@@ -184,14 +184,14 @@ def steps_kernel(
 ):
     """Where a ray enters the box, and how many steps it takes to its exit."""
     ray = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    here = ray < rays
-    ox, oy, oz = load_vectors(origins, ray * 3, here)
-    dx, dy, dz = load_vectors(directions, ray * 3, here)
+    mask = ray < rays
+    ox, oy, oz = load_vectors(origins, ray * 3, mask)
+    dx, dy, dz = load_vectors(directions, ray * 3, mask)
     from_x, to_x = slab(ox, dx, low_x, high_x)
     from_y, to_y = slab(oy, dy, low_y, high_y)
     from_z, to_z = slab(oz, dz, low_z, high_z)
     entry = tl.maximum(tl.maximum(tl.maximum(from_x, from_y), from_z), near)
     leave = tl.minimum(tl.minimum(tl.minimum(to_x, to_y), to_z), far)
     steps = tl.where(leave >= entry, tl.floor((leave - entry) / step + 1e-3) + 1.0, 0.0)
-    tl.store(entries + ray, entry, mask=here)
-    tl.store(counts + ray, steps.to(tl.int64), mask=here)
+    tl.store(entries + ray, entry, mask=mask)
+    tl.store(counts + ray, steps.to(tl.int64), mask=mask)

@@ -52,24 +52,24 @@ def find_samples(
     count, stride = len(origins), blocks(longest, LANES.value) * LANES.value
     marks = origins.new_empty(count, stride, dtype=torch.uint8)
     # As wide as their running sum: no cast before it.
-    kept = origins.new_empty(count, dtype=torch.int64)
+    visible = origins.new_empty(count, dtype=torch.int64)
     reached = origins.new_empty(count, dtype=torch.int32)
     launch(
         march_kernel,
         count,
         *(*along, mask.contiguous().view(torch.uint8), density, before, after, *axes),
-        *(marks, kept, reached, longest, stride, *numbers),
+        *(marks, visible, reached, longest, stride, *numbers),
         SLICES=len(slices),
         num_warps=1,
     )
-    ray, first, total = (kept.new_empty(shape) for shape in (capacity, count + 1, ()))
+    ray, first, total = (visible.new_empty(shape) for shape in (capacity, count + 1, ()))
     distance, points = origins.new_empty(capacity), origins.new_empty(capacity, 3)
     significant = marks.new_empty(capacity)
     launch(
         list_kernel,
         # One at least behind the rays, for the total.
         count + max(1, padding_programs(capacity)),
-        *(*along[:3], marks, reached, kept.cumsum(0), ray, distance, points, significant),
+        *(*along[:3], marks, reached, visible.cumsum(0), ray, distance, points, significant),
         *(first, total, count, stride, capacity, numbers[0]),
         num_warps=1,
     )
@@ -98,7 +98,7 @@ def nearest(coordinate, points):
 
 
 @triton.jit
-def occupied(mask, axes, px, py, pz, here):
+def occupied(mask, axes, px, py, pz, inside):
     """Is the grid point nearest to a position on the grid and True?"""
     x = tl.load(axes + 6).to(tl.int32)
     y = tl.load(axes + 7).to(tl.int32)
@@ -106,8 +106,8 @@ def occupied(mask, axes, px, py, pz, here):
     i = nearest(grid_coordinate(axes, 0, px), x)
     j = nearest(grid_coordinate(axes, 1, py), y)
     k = nearest(grid_coordinate(axes, 2, pz), z)
-    here = here & (i >= 0) & (i < x) & (j >= 0) & (j < y) & (k >= 0) & (k < z)
-    return tl.load(mask + (i * y + j) * z + k, mask=here, other=0) != 0
+    inside = inside & (i >= 0) & (i < x) & (j >= 0) & (j < y) & (k >= 0) & (k < z)
+    return tl.load(mask + (i * y + j) * z + k, mask=inside, other=0) != 0
 
 
 @triton.jit(do_not_specialize=["longest", "stride"])
@@ -124,7 +124,7 @@ def march_kernel(
     slice_axes,
     density_axes,
     marks,
-    kept,
+    number_visible,
     reached,
     longest,
     stride,
@@ -154,26 +154,28 @@ def march_kernel(
         px = ox + dx * at
         py = oy + dy * at
         pz = oz + dz * at
-        there = occupied(mask, mask_axes, px, py, pz, sample < samples)
+        candidate = occupied(mask, mask_axes, px, py, pz, sample < samples)
         mark = tl.zeros((LANES,), dtype=tl.uint8)
-        if tl.max(there.to(tl.int32), 0) > 0:
+        if tl.max(candidate.to(tl.int32), 0) > 0:
             if SLICES > 0:
-                px, py, pz = displaced(before, after, weight, slice_axes, px, py, pz, there, SLICES)
-            raw = scalar_at(density, density_axes, px, py, pz, there)
+                px, py, pz = displaced(
+                    before, after, weight, slice_axes, px, py, pz, candidate, SLICES
+                )
+            raw = scalar_at(density, density_axes, px, py, pz, candidate)
             tau = softplus(raw + shift) * delta
             alpha = opacity(tau)
-            opaque = there & (alpha >= alpha_threshold)
+            opaque = candidate & (alpha >= alpha_threshold)
             # Nothing is visible behind exp(−32); a larger sum would cost precision.
             tau = tl.where(opaque, tl.minimum(tau, 32.0), 0.0)
             left = tl.exp(-(depth + tl.cumsum(tau, 0) - tau))
-            seen = opaque & (left >= stop)
-            significant = seen & (left * alpha >= weight_threshold)
-            mark = (seen.to(tl.int32) + significant.to(tl.int32)).to(tl.uint8)
-            number += tl.sum(seen.to(tl.int32), 0)
+            visible = opaque & (left >= stop)
+            significant = visible & (left * alpha >= weight_threshold)
+            mark = (visible.to(tl.int32) + significant.to(tl.int32)).to(tl.uint8)
+            number += tl.sum(visible.to(tl.int32), 0)
             depth += tl.sum(tau, 0)
         tl.store(into + sample, mark)
         tested += LANES
-    tl.store(kept + ray, number)
+    tl.store(number_visible + ray, number)
     tl.store(reached + ray, tested)
 
 
@@ -214,15 +216,15 @@ def list_kernel(
         while (tested < end) & (free < capacity):
             sample = tested + lane
             mark = tl.load(from_ + sample).to(tl.int32)
-            kept = (mark > 0).to(tl.int32)
-            place = free + tl.cumsum(kept, 0) - kept
-            fits = (kept > 0) & (place < capacity)
+            listed = (mark > 0).to(tl.int32)
+            place = free + tl.cumsum(listed, 0) - listed
+            fits = (listed > 0) & (place < capacity)
             at = begin + step * sample.to(tl.float32)
             tl.store(rays + place, (lane * 0 + ray).to(tl.int64), mask=fits)
             tl.store(distances + place, at, mask=fits)
             store_vectors(points, place * 3, ox + dx * at, oy + dy * at, oz + dz * at, fits)
             tl.store(significant + place, (mark > 1).to(tl.uint8), mask=fits)
-            free += tl.sum(kept, 0)
+            free += tl.sum(listed, 0)
             tested += LANES
     else:
         used = tl.load(ends + count - 1, mask=count > 0, other=0)

@@ -48,17 +48,17 @@ class SelectListed(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
         flags, running = ctx.saved_tensors
-        given = [None if up is None else up.contiguous() for up in upstream[-2:]]
-        into = [None if up is None else up.new_empty(len(flags), *up.shape[1:]) for up in given]
+        gradients = [None if up is None else up.contiguous() for up in upstream[-2:]]
+        into = [None if up is None else up.new_empty(len(flags), *up.shape[1:]) for up in gradients]
         launch(
             select_backward_kernel,
             blocks(len(flags)),
             *(flags.view(torch.uint8), running),
             # Any pointer where there is no gradient.
-            *(running if tensor is None else tensor for tensor in (*given, *into)),
-            *(len(flags), max(0 if up is None else len(up) for up in given)),
-            HAS_CANONICAL=given[0] is not None,
-            HAS_WEIGHT=given[1] is not None,
+            *(running if tensor is None else tensor for tensor in (*gradients, *into)),
+            *(len(flags), max(0 if up is None else len(up) for up in gradients)),
+            HAS_CANONICAL=gradients[0] is not None,
+            HAS_WEIGHT=gradients[1] is not None,
         )
         return *into, None, None
 
@@ -93,22 +93,22 @@ def select_kernel(
     gradients to them do not collide. ``begin`` is where each of the ``count`` rays begins.
     """
     place = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = place < places
-    flag = tl.load(flags + place, mask=here, other=0) != 0
-    rank = tl.load(running + place, mask=here, other=0) - 1
-    kept = here & flag & (rank < capacity)
+    mask = place < places
+    flag = tl.load(flags + place, mask=mask, other=0) != 0
+    rank = tl.load(running + place, mask=mask, other=0) - 1
+    selected = mask & flag & (rank < capacity)
     empty = (place >= tl.load(running + places - 1)) & (place < capacity)
-    ray = tl.load(rays + place, mask=here, other=0)
-    distance = tl.load(distances + place, mask=here, other=0.0)
-    weight = tl.load(weights + place, mask=kept, other=0.0)
-    x, y, z = load_vectors(points, place * 3, here)
-    qx, qy, qz = load_vectors(canonical, place * 3, here)
-    tl.store(owner + rank, ray, mask=kept)
-    tl.store(reached + rank, distance, mask=kept)
-    store_vectors(where, rank * 3, x, y, z, kept)
-    store_vectors(into_canonical, rank * 3, qx, qy, qz, kept)
-    tl.store(into_weight + rank, weight, mask=kept)
-    tl.store(present + rank, (rank >= 0).to(tl.uint8), mask=kept)
+    ray = tl.load(rays + place, mask=mask, other=0)
+    distance = tl.load(distances + place, mask=mask, other=0.0)
+    weight = tl.load(weights + place, mask=selected, other=0.0)
+    x, y, z = load_vectors(points, place * 3, mask)
+    qx, qy, qz = load_vectors(canonical, place * 3, mask)
+    tl.store(owner + rank, ray, mask=selected)
+    tl.store(reached + rank, distance, mask=selected)
+    store_vectors(where, rank * 3, x, y, z, selected)
+    store_vectors(into_canonical, rank * 3, qx, qy, qz, selected)
+    tl.store(into_weight + rank, weight, mask=selected)
+    tl.store(present + rank, (rank >= 0).to(tl.uint8), mask=selected)
     tl.store(owner + place, place % count, mask=empty)
     tl.store(reached + place, distance, mask=empty)
     store_vectors(where, place * 3, x, y, z, empty)
@@ -136,13 +136,13 @@ def select_backward_kernel(
 ):
     """The gradient of each place of the first list: that of the place that took it, or none."""
     place = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = place < places
-    flag = tl.load(flags + place, mask=here, other=0) != 0
-    rank = tl.load(running + place, mask=here, other=0) - 1
-    kept = here & flag & (rank < capacity)
+    mask = place < places
+    flag = tl.load(flags + place, mask=mask, other=0) != 0
+    rank = tl.load(running + place, mask=mask, other=0) - 1
+    selected = mask & flag & (rank < capacity)
     if HAS_CANONICAL:
-        gx, gy, gz = load_vectors(to_canonical, rank * 3, kept)
-        store_vectors(into_canonical, place * 3, gx, gy, gz, here)
+        gx, gy, gz = load_vectors(to_canonical, rank * 3, selected)
+        store_vectors(into_canonical, place * 3, gx, gy, gz, mask)
     if HAS_WEIGHT:
-        change = tl.load(to_weight + rank, mask=kept, other=0.0)
-        tl.store(into_weight + place, change, mask=here)
+        change = tl.load(to_weight + rank, mask=selected, other=0.0)
+        tl.store(into_weight + place, change, mask=mask)

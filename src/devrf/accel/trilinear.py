@@ -36,11 +36,11 @@ class Interpolate(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, grid: Tensor, coords: Tensor, axes: Tensor, kept: Tensor | None
+        ctx: Any, grid: Tensor, coords: Tensor, axes: Tensor, accumulated: Tensor | None
     ) -> Tensor:
         grid, coords = grid.contiguous(), coords.contiguous()
         ctx.save_for_backward(grid, coords, axes)
-        ctx.kept = kept
+        ctx.accumulated = accumulated
         count, tile = len(coords), _tile(grid.shape[3])
         out = grid.new_empty(count, grid.shape[3])
         launch(
@@ -53,7 +53,7 @@ class Interpolate(torch.autograd.Function):
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
         grid, coords, axes = ctx.saved_tensors
         needs_grid, needs_coords, *_ = ctx.needs_input_grad
-        into, gradient, adds = gradient_target(grid, needs_grid, ctx.kept)
+        into, gradient, adds = gradient_target(grid, needs_grid, ctx.accumulated)
         moved = torch.empty_like(coords)
         count, tile = len(coords), _tile(grid.shape[3])
         launch(
@@ -79,12 +79,12 @@ def _tile(channels: int) -> dict[str, int]:
 
 @triton.jit
 def rows_between(
-    grid, axes, px, py, pz, here, CHANNELS: tl.constexpr, PADDED: tl.constexpr, BLOCK: tl.constexpr
+    grid, axes, px, py, pz, mask, CHANNELS: tl.constexpr, PADDED: tl.constexpr, BLOCK: tl.constexpr
 ):
     """Σ_corners weight · grid[corner], a tile (BLOCK, PADDED); 0 behind the channels."""
     first, along_x, along_y, fx, fy, fz = cell(axes, px, py, pz)
     channel = tl.arange(0, PADDED)
-    wanted = here[:, None] & (channel < CHANNELS)[None, :]
+    wanted = mask[:, None] & (channel < CHANNELS)[None, :]
     total = tl.zeros((BLOCK, PADDED), dtype=tl.float32)
     for corner in tl.static_range(8):
         row = corner_row(first, along_x, along_y, corner)
@@ -103,7 +103,7 @@ def spread_rows(
     px,
     py,
     pz,
-    here,
+    mask,
     NEEDS_GRID: tl.constexpr,
     NEEDS_POINTS: tl.constexpr,
     CHANNELS: tl.constexpr,
@@ -111,7 +111,7 @@ def spread_rows(
     """Scatter weight · change (BLOCK, PADDED) to the corners; the gradients of the positions."""
     first, along_x, along_y, fx, fy, fz = cell(axes, px, py, pz)
     channel = tl.arange(0, change.shape[1])
-    wanted = here[:, None] & (channel < CHANNELS)[None, :]
+    wanted = mask[:, None] & (channel < CHANNELS)[None, :]
     # Padding has no gradient; atomic additions of its zeros to one place would be serialised.
     changed = wanted & (tl.max(tl.abs(change), axis=1) > 0.0)[:, None]
     gx = fx * 0.0
@@ -146,11 +146,11 @@ def interpolate_kernel(
 ):
     """out[m] = Σ_corners weight · grid[corner]."""
     point = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    here = point < count
-    x, y, z = load_vectors(coords, point.to(tl.int64) * 3, here)
-    total = rows_between(grid, axes, x, y, z, here, CHANNELS, PADDED, BLOCK)
+    mask = point < count
+    x, y, z = load_vectors(coords, point.to(tl.int64) * 3, mask)
+    total = rows_between(grid, axes, x, y, z, mask, CHANNELS, PADDED, BLOCK)
     channel = tl.arange(0, PADDED)
-    wanted = here[:, None] & (channel < CHANNELS)[None, :]
+    wanted = mask[:, None] & (channel < CHANNELS)[None, :]
     into = point.to(tl.int64)[:, None] * CHANNELS + channel[None, :]
     tl.store(out + into, total, mask=wanted)
 
@@ -172,15 +172,15 @@ def interpolate_backward_kernel(
 ):
     """Scatter weight · upstream to the corners; slopes along the axes to the coordinates."""
     point = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    here = point < count
+    mask = point < count
     at = point.to(tl.int64) * 3
-    x, y, z = load_vectors(coords, at, here)
+    x, y, z = load_vectors(coords, at, mask)
     channel = tl.arange(0, PADDED)
-    wanted = here[:, None] & (channel < CHANNELS)[None, :]
+    wanted = mask[:, None] & (channel < CHANNELS)[None, :]
     from_ = point.to(tl.int64)[:, None] * CHANNELS + channel[None, :]
     change = tl.load(upstream + from_, mask=wanted, other=0.0)
     gx, gy, gz = spread_rows(
-        grid, axes, grid_gradient, change, x, y, z, here, NEEDS_GRID, NEEDS_COORDS, CHANNELS
+        grid, axes, grid_gradient, change, x, y, z, mask, NEEDS_GRID, NEEDS_COORDS, CHANNELS
     )
     if NEEDS_COORDS:
-        store_vectors(coords_gradient, at, gx, gy, gz, here)
+        store_vectors(coords_gradient, at, gx, gy, gz, mask)

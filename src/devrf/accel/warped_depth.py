@@ -41,14 +41,14 @@ class WarpedDepth(torch.autograd.Function):
         points: Tensor,
         axes: tuple[Tensor, Tensor],
         numbers: tuple[float, float, float],
-        kept: Sequence[Tensor | None],
+        accumulated: Sequence[Tensor | None],
         density: Tensor,
         *slices: Tensor,
     ) -> tuple[Tensor, Tensor]:
         """Canonical positions (M, 3) and optical depths (M,).
 
         ``axes``: of the slices and of the density. ``numbers``: weight of the second slice, shift,
-        delta. ``kept``: gradients that the density and each slice have already, or None.
+        delta. ``accumulated``: gradients of the density and each slice so far, or None.
         """
         points, grids = points.contiguous(), [grid.contiguous() for grid in (density, *slices)]
         # The kernel takes two slices; the density stands in for missing ones, which are not read.
@@ -62,7 +62,7 @@ class WarpedDepth(torch.autograd.Function):
             SLICES=len(slices),
         )
         ctx.save_for_backward(points, warped, *grids)
-        ctx.axes, ctx.numbers, ctx.kept = axes, numbers, kept
+        ctx.axes, ctx.numbers, ctx.accumulated = axes, numbers, accumulated
         ctx.set_materialize_grads(False)
         if not any(ctx.needs_input_grad[5:]):
             # Points get no gradient: without slices nothing that is looked up at q need find one.
@@ -74,8 +74,10 @@ class WarpedDepth(torch.autograd.Function):
     def backward(ctx: Any, to_warped: Tensor | None, to_tau: Tensor | None) -> tuple[Any, ...]:
         points, warped, *grids = ctx.saved_tensors
         targets = [
-            gradient_target(grid, need, kept)
-            for grid, need, kept in zip(grids, ctx.needs_input_grad[4:], ctx.kept, strict=True)
+            gradient_target(grid, need, accumulated)
+            for grid, need, accumulated in zip(
+                grids, ctx.needs_input_grad[4:], ctx.accumulated, strict=True
+            )
         ]
         into, gradients, adds = zip(*targets, *[(grids[0], None, False)] * 2, strict=False)
         if to_tau is None:
@@ -117,14 +119,14 @@ def warped_depth_kernel(
 ):
     """q = x + Δ(x), τ = softplus(v(q) + b)·δ."""
     point = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    here = point < count
+    mask = point < count
     at = point.to(tl.int64) * 3
-    x, y, z = load_vectors(points, at, here)
+    x, y, z = load_vectors(points, at, mask)
     if SLICES > 0:
-        x, y, z = displaced(before, after, weight, slice_axes, x, y, z, here, SLICES)
-    store_vectors(warped, at, x, y, z, here)
-    raw = scalar_at(density, density_axes, x, y, z, here)
-    tl.store(tau + point, softplus(raw + shift) * delta, mask=here)
+        x, y, z = displaced(before, after, weight, slice_axes, x, y, z, mask, SLICES)
+    store_vectors(warped, at, x, y, z, mask)
+    raw = scalar_at(density, density_axes, x, y, z, mask)
+    tl.store(tau + point, softplus(raw + shift) * delta, mask=mask)
 
 
 @triton.jit(do_not_specialize=["count"])
@@ -150,21 +152,21 @@ def warped_depth_backward_kernel(
 ):
     """Gradients of q and τ, scattered to the density grid and to the slices."""
     point = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    here = point < count
+    mask = point < count
     at = point.to(tl.int64) * 3
-    x, y, z = load_vectors(warped, at, here)
-    raw, over_x, over_y, over_z = scalar_and_slopes(density, density_axes, x, y, z, here)
-    change = tl.load(tau_gradient + point, mask=here, other=0.0) * sigmoid(raw + shift) * delta
+    x, y, z = load_vectors(warped, at, mask)
+    raw, over_x, over_y, over_z = scalar_and_slopes(density, density_axes, x, y, z, mask)
+    change = tl.load(tau_gradient + point, mask=mask, other=0.0) * sigmoid(raw + shift) * delta
     if NEEDS_DENSITY:
-        scatter_scalars(density_into, density_axes, x, y, z, change, here)
+        scatter_scalars(density_into, density_axes, x, y, z, change, mask)
     if NEEDS_BEFORE or NEEDS_AFTER:
-        gx, gy, gz = load_vectors(warped_gradient, at, here)
+        gx, gy, gz = load_vectors(warped_gradient, at, mask)
         gx += change * over_x
         gy += change * over_y
         gz += change * over_z
-        x, y, z = load_vectors(points, at, here)
+        x, y, z = load_vectors(points, at, mask)
         if NEEDS_BEFORE:
-            own = 1.0 - weight if TWO else 1.0
-            scatter_vectors(before_into, own, slice_axes, x, y, z, gx, gy, gz, here)
+            weight_before = 1.0 - weight if TWO else 1.0
+            scatter_vectors(before_into, weight_before, slice_axes, x, y, z, gx, gy, gz, mask)
         if NEEDS_AFTER:
-            scatter_vectors(after_into, weight, slice_axes, x, y, z, gx, gy, gz, here)
+            scatter_vectors(after_into, weight, slice_axes, x, y, z, gx, gy, gz, mask)
