@@ -165,11 +165,11 @@ def test_senseless_settings_are_refused() -> None:
 
 
 def test_emptied_and_filled_by_hand() -> None:
-    assert emptied(seen=0.001, most=0.2, expected=0.3)
+    assert emptied(opacity=0.001, highest=0.2, expected=0.3)
     assert not emptied(0.02, 0.2, 0.3)  # faint, but there
     assert not emptied(0.001, 0.02, 0.3)  # it has never been there
     assert not emptied(0.0, 0.2, 0.01)  # nothing should be there
-    assert filled(seen=0.7, least=0.2, expected=0.2)
+    assert filled(opacity=0.7, lowest=0.2, expected=0.2)
     assert not filled(0.5, 0.2, 0.2)  # three fifths of the light still pass
     assert not filled(0.7, 0.5, 0.2)  # it never passed: fog, at the beginning
     assert not filled(1.0, 0.1, 0.99)  # no light should pass

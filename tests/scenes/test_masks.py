@@ -128,6 +128,6 @@ def test_wrong_masks(root, spoil, said):
 
 
 def test_masks_that_cut_out_the_subject_are_told_from_others(root):
-    found = [a for a in advice_on(NerfstudioReader(root).read()) if "masks" in a.what]
+    found = [a for a in advice_on(NerfstudioReader(root).read()) if "masks" in a.problem]
     assert len(found) == 1 and "set data.masks=alpha" in found[0].remedy
     assert found[0].where.startswith("static training set, ")

@@ -91,9 +91,9 @@ def short_name(name: str) -> str:
     return name if len(name) <= LONGEST_NAME else f"…{name[1 - LONGEST_NAME :]}"
 
 
-def evenly(count: int, most: int) -> list[int]:
-    """At most ``most`` of the positions 0 … count − 1, evenly spread, both ends among them."""
-    return [round(k) for k in np.linspace(0, count - 1, min(count, most))]
+def evenly(count: int, max_count: int) -> list[int]:
+    """At most ``max_count`` of the positions 0 … count − 1, evenly spread, both ends among them."""
+    return [round(k) for k in np.linspace(0, count - 1, min(count, max_count))]
 
 
 def image_grid(

@@ -166,10 +166,10 @@ def _rigid(numbers: list[float]) -> list[float]:
 
 def _with_seconds(keyframes: Any) -> Any:
     """devrf's own keyframes; without seconds they are nerfstudio's, which are not used."""
-    own = isinstance(keyframes, list) and all(
+    has_seconds = isinstance(keyframes, list) and all(
         isinstance(keyframe, dict) and keyframe.get("seconds") is not None for keyframe in keyframes
     )
-    return keyframes if own else []
+    return keyframes if has_seconds else []
 
 
 Matrix = Annotated[list[Number], Field(min_length=16, max_length=16), AfterValidator(_rigid)]
@@ -251,8 +251,10 @@ def write_path(file: Path, path: CameraPath, height: int) -> None:
 def _path(content: _PathFile, where: object) -> CameraPath:
     cameras, last = content.camera_path, max(len(content.camera_path) - 1, 1)
     keyframes = [
-        Keyframe(_pose(own.matrix).float(), own.fov, own.render_time, own.seconds)
-        for own in content.keyframes
+        Keyframe(
+            _pose(keyframe.matrix).float(), keyframe.fov, keyframe.render_time, keyframe.seconds
+        )
+        for keyframe in content.keyframes
     ]
     for k, camera in enumerate(cameras if not keyframes else ()):
         time = k / last if camera.render_time is None else camera.render_time

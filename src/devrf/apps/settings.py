@@ -61,9 +61,9 @@ class CaptureSettings:
                 "capture.static: needs a video, or a folder of photographs, of the scene at rest; "
                 "give capture.static=PATH (a moving camera's video alone is capture.views=[PATH])"
             )
-        for key, least in (("frames", 3), ("max_timesteps", 2), ("size", 64), ("holdout", 2)):
+        for key, minimum in (("frames", 3), ("max_timesteps", 2), ("size", 64), ("holdout", 2)):
             value = getattr(self, key)
-            expect(value >= least, f"capture.{key}", f"at least {least}", value)
+            expect(value >= minimum, f"capture.{key}", f"at least {minimum}", value)
         views = len(self.views)
         if self.offsets is not None and len(self.offsets) != views:
             raise DevrfError(

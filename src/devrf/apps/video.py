@@ -42,11 +42,13 @@ class VideoSettings:
     time: float = 0.5
 
     def __post_init__(self) -> None:
-        height, most = self.height, self.max_seconds
+        height, max_seconds = self.height, self.max_seconds
         expect(0 <= self.time <= 1, "video.time", "0 to 1", self.time)
         high_enough = height is None or height >= MIN_HEIGHT
         expect(high_enough, "video.height", f"at least {MIN_HEIGHT}", height)
-        expect(most is None or most > 0, "video.max_seconds", "more than 0", most)
+        expect(
+            max_seconds is None or max_seconds > 0, "video.max_seconds", "more than 0", max_seconds
+        )
 
     def sized(self, cameras: Cameras) -> Cameras:
         """Captured cameras with images of the video's size."""
@@ -54,8 +56,8 @@ class VideoSettings:
 
     def within_limit(self, seconds: float) -> VideoSettings:
         """The settings for images that take ``seconds`` each: fewer frames if need be."""
-        most = self.frames if self.max_seconds is None else int(self.max_seconds / seconds)
-        frames = min(self.frames, max(most, MIN_FRAMES))
+        max_frames = self.frames if self.max_seconds is None else int(self.max_seconds / seconds)
+        frames = min(self.frames, max(max_frames, MIN_FRAMES))
         return replace(self, frames=frames, fps=self.fps * frames / self.frames)
 
 
@@ -163,13 +165,13 @@ def held_out_images(views: Views, frames: int) -> list[int]:
     another.
     """
     first = (views.view == views.view[0]).nonzero()[:, 0]
-    own = first if len(first) > 1 else torch.arange(len(views))
-    times = views.times[own]
+    images = first if len(first) > 1 else torch.arange(len(views))
+    times = views.times[images]
     if bool((times == times[0]).all()):
-        times = torch.linspace(0, 1, len(own))
+        times = torch.linspace(0, 1, len(images))
     wanted = torch.linspace(0, 1, frames)
     nearest = (times[None] - wanted[:, None]).abs().argmin(dim=1)
-    return [int(image) for image in own[nearest]]
+    return [int(image) for image in images[nearest]]
 
 
 def _ring(

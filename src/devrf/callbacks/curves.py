@@ -120,16 +120,16 @@ class Previews(Callback):
         started = time.perf_counter()
         if watching := trackers(trainer.loggers):
             views = pl_module.scene.capture(pl_module.scored_capture).test
-            seen = preview(
+            scored = preview(
                 pl_module.current_model(), views, len(views) // 2, pl_module.scene.background
             )
             done, capture = pl_module.iteration, pl_module.capture
-            self.psnr = [point for point in self.psnr if point[0] < done] + [(done, seen.psnr)]
+            self.psnr = [point for point in self.psnr if point[0] < done] + [(done, scored.psnr)]
             for tracker in watching:
-                for name, image in seen.images.items():
+                for name, image in scored.images.items():
                     tracker.show_image(f"{capture}/{name}", image, done)
             for logger in trainer.loggers:
-                logger.log_metrics({f"{capture}/held_out_psnr": seen.psnr}, done)
+                logger.log_metrics({f"{capture}/held_out_psnr": scored.psnr}, done)
         self.seconds += time.perf_counter() - started
 
     def _due(self, stage: ScheduledStage) -> int:

@@ -31,18 +31,18 @@ THERE, GONE = 0.1, 0.01
 CLEAR, BLOCKED = 0.8, 0.5
 
 
-def emptied(seen: float, most: float, expected: float) -> bool:
+def emptied(opacity: float, highest: float, expected: float) -> bool:
     """Whether what should be seen was there and is gone.
 
-    All are mean opacities of rays: ``seen`` now, the highest so far, and what it should be.
+    All are mean opacities of rays: ``opacity`` now, the highest so far, and what it should be.
     """
-    return expected > FAINT and most > THERE * expected and seen < GONE * expected
+    return expected > FAINT and highest > THERE * expected and opacity < GONE * expected
 
 
-def filled(seen: float, least: float, expected: float) -> bool:
-    """Whether light that should pass did so, and no longer does; ``least``: the lowest so far."""
+def filled(opacity: float, lowest: float, expected: float) -> bool:
+    """Whether light that should pass did so, and no longer does; ``lowest``: the lowest so far."""
     clear = 1 - expected
-    return clear > FAINT and 1 - least > CLEAR * clear and 1 - seen < BLOCKED * clear
+    return clear > FAINT and 1 - lowest > CLEAR * clear and 1 - opacity < BLOCKED * clear
 
 
 class Snapshot(NamedTuple):
@@ -154,20 +154,20 @@ class DivergenceGuard(Callback):
     ) -> str | None:
         """In words, that everything has become empty or opaque."""
         late = steps[len(steps) // 2 :]
-        seen = mean(means["opacity"] for means in late)
+        opacity = mean(means["opacity"] for means in late)
         # Only alpha masks say what should be seen.
         covered = mean(means["coverage"] for means in late) if "coverage" in late[0] else None
-        least, most = self._range
+        lowest, highest = self._range
         where = f"{stage.describe(stage.iteration)} ({BACKGROUND})"
         if since >= MIN_ITERATIONS:
-            self._range = [min(least, seen), max(most, seen)]
-            if covered is not None and filled(seen, least, covered):
+            self._range = [min(lowest, opacity), max(highest, opacity)]
+            if covered is not None and filled(opacity, lowest, covered):
                 return f"everything has become opaque by {where}"
             # Without alpha masks, what moves may have left the picture.
             judged = covered is not None or stage.name == "canonical"
-            if judged and emptied(seen, most, most if covered is None else covered):
+            if judged and emptied(opacity, highest, highest if covered is None else covered):
                 return f"everything has become empty by {where}"
-        if stage.iteration >= stage.total_iterations and seen < GONE * (covered or THERE):
+        if stage.iteration >= stage.total_iterations and opacity < GONE * (covered or THERE):
             log.warning("%s: nothing is to be seen at the end (%s)", stage.name, BACKGROUND)
         return None
 

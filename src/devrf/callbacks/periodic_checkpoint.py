@@ -87,9 +87,9 @@ class PeriodicCheckpoint(Callback):
     ) -> None:
         """Write a file if one is due, if this step is the last, or if the stage is to stop."""
         assert isinstance(pl_module, ScheduledStage)
-        asked, due = self._asked, time.monotonic() >= self._due
+        stopping, due = self._asked, time.monotonic() >= self._due
         if trainer.world_size > 1:  # what one process is asked, all must do
-            asked, due = self._agreed(trainer.is_global_zero, pl_module.device)
+            stopping, due = self._agreed(trainer.is_global_zero, pl_module.device)
         if pl_module.iteration >= pl_module.total_iterations:
             return  # the stage is done: its checkpoint is next
         # Lightning writes this step's row of the curves after this hook: a run that was killed in
@@ -97,14 +97,14 @@ class PeriodicCheckpoint(Callback):
         every: int = trainer.log_every_n_steps  # type: ignore[attr-defined]
         row_follows = every > 1 and (batch_idx + 1) % every == 0
         last = trainer.should_stop or 0 < trainer.max_steps <= trainer.global_step
-        if asked or last or due and not row_follows:
+        if stopping or last or due and not row_follows:
             callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
             for guard in callbacks:
                 if isinstance(guard, DivergenceGuard):
                     guard.check(pl_module)  # rolls back first: a diverged state is never written
             if trainer.is_global_zero:
                 self._write(trainer, pl_module)
-        if asked:
+        if stopping:
             self._asked, trainer.should_stop = False, True
 
     def _agreed(self, leads: bool, device: torch.device) -> tuple[bool, bool]:
@@ -115,8 +115,8 @@ class PeriodicCheckpoint(Callback):
         self._steps += 1
         if self._steps % AGREE_EVERY != 1:
             return False, False
-        asked, due = largest([self._asked, leads and time.monotonic() >= self._due], device)
-        return bool(asked), bool(due)
+        stopping, due = largest([self._asked, leads and time.monotonic() >= self._due], device)
+        return bool(stopping), bool(due)
 
     def _write(self, trainer: Trainer, stage: ScheduledStage) -> None:
         began, path = time.monotonic(), progress_file(self.folder, stage.name, stage.iteration)

@@ -43,12 +43,12 @@ def pack(grids: Tensor, keep: Tensor, *, smooth: bool) -> Packed:
     thin = _thinned(grids.shape[1:4])
     details, elsewhere = [], []
     for n, grid in enumerate(grids):
-        here = keep[min(n, len(keep) - 1)]
-        details.append(grid[here].half())
+        kept_voxels = keep[min(n, len(keep) - 1)]
+        details.append(grid[kept_voxels].half())
         if smooth:
             elsewhere.append(resample(grid, thin).half())
         else:
-            left_out = grid[~here]
+            left_out = grid[~kept_voxels]
             mean = left_out.mean(dim=0) if len(left_out) else grid.new_zeros(grid.shape[-1])
             elsewhere.append(mean.half())
     return {
@@ -106,8 +106,8 @@ class StoredShape(nn.Module):
         self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any
     ) -> None:
         for name in self.resizable:
-            stored, own = state_dict.get(prefix + name), getattr(self, name)
-            if stored is not None and stored.shape != own.shape:
-                empty = own.new_empty(stored.shape)
+            stored, current = state_dict.get(prefix + name), getattr(self, name)
+            if stored is not None and stored.shape != current.shape:
+                empty = current.new_empty(stored.shape)
                 setattr(self, name, nn.Parameter(empty) if name in self._parameters else empty)
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)

@@ -113,7 +113,7 @@ PROBLEMS = [
 @pytest.mark.parametrize(("spoil", "where", "what"), PROBLEMS)
 def test_a_problem(healthy, spoil, where, what):
     (advice,) = advice_on(spoil(healthy))
-    assert where in advice.where and what in advice.what
+    assert where in advice.where and what in advice.problem
 
 
 def test_held_out_views_that_are_learned_from(healthy):
@@ -121,7 +121,7 @@ def test_held_out_views_that_are_learned_from(healthy):
     spoil = changed("dynamic.test", lambda _: train[torch.tensor([0, 4])])
     (advice,) = advice_on(spoil(healthy))
     assert advice.where == "dynamic test set"
-    assert train.names[0] in advice.what and train.names[4] in advice.what
+    assert train.names[0] in advice.problem and train.names[4] in advice.what
     # The same camera at another time may be held out.
     test = replace(train[torch.tensor([0])], times=torch.tensor([0.25]))
     assert advice_on(changed("dynamic.test", lambda _: test)(healthy)) == []
@@ -145,4 +145,4 @@ def test_large_motion_without_flow_is_said(healthy, pixels, far):
     moving = replace(train, pixels=images, flow=None)
     scene = replace(healthy, dynamic=replace(healthy.dynamic, train=moving))
     said = [advice for advice in advice_on(scene) if advice.where == "optical flow"]
-    assert [f"{pixels} px" in advice.what for advice in said] == [True] * far
+    assert [f"{pixels} px" in advice.problem for advice in said] == [True] * far

@@ -118,7 +118,7 @@ def test_up_of_level_cameras():
     assert common_up(replace(cameras, camera_to_world=poses)) is None
 
 
-def test_an_endless_box_is_cut_off_at_twice_the_near_plane(tiny_scene):
+def test_an_unbounded_box_is_cut_off_at_twice_the_near_plane(tiny_scene):
     space = NormalizedDevice(24, 18, (12.0, 9.0), near=1.0)
     box = Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
     scene = replace(tiny_scene, kind="forward", space=space)

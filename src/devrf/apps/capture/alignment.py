@@ -98,7 +98,7 @@ def offsets_found(paths: Sequence[Path], surveys: Sequence[Survey]) -> list[floa
     for path, survey in zip(paths, surveys, strict=True):
         if max(survey.motion) == 0:
             raise DevrfError(f"{path}: nothing moves in it; {_BY_HAND}")
-    found = [0.0]
+    offsets = [0.0]
     for path, survey in zip(paths[1:], surveys[1:], strict=True):
         offset, correlation = offset_between(surveys[0], survey)
         log.info(
@@ -109,8 +109,8 @@ def offsets_found(paths: Sequence[Path], surveys: Sequence[Survey]) -> list[floa
                 f"{path}: what moves in it does not tell when it began (correlation with "
                 f"{paths[0]} {correlation:.2f}, expected {SURE} or more); {_BY_HAND}"
             )
-        found.append(offset)
-    return found
+        offsets.append(offset)
+    return offsets
 
 
 def offset_between(first: Survey, second: Survey) -> tuple[float, float]:
@@ -122,8 +122,8 @@ def offset_between(first: Survey, second: Survey) -> tuple[float, float]:
     """
     step = 1 / (STEPS_A_FRAME * max(first.rate, second.rate))
     (a, a_start), (b, b_start) = _sampled(first, step), _sampled(second, step)
-    least = max(2, int(LEAST_OVERLAP * min(len(a), len(b))))
-    lags = np.arange(least - len(b), len(a) - least + 1)
+    min_overlap = max(2, int(LEAST_OVERLAP * min(len(a), len(b))))
+    lags = np.arange(min_overlap - len(b), len(a) - min_overlap + 1)
     values = np.array([_correlation(a, b, int(lag)) for lag in lags])
     best = int(values.argmax())
     lag = float(lags[best])

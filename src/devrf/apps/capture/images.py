@@ -255,14 +255,14 @@ def box_of_motion(
     )
     # Coarsely where it is, then with a finer grid.
     coarse = motion_box(views, around)
-    found = None if coarse is None else motion_box(views, coarse)
-    if found is None:
+    box = None if coarse is None else motion_box(views, coarse)
+    if box is None:
         raise DevrfError(
             "capture.alpha_masks: subtract needs at least 2 fixed views that see something move at "
             "one time; leave capture.alpha_masks out"
         )
-    log.info("what moves is in %s", found)
-    return found
+    log.info("what moves is in %s", box)
+    return box
 
 
 def shrunk(image: npt.NDArray[Any], longer: int) -> npt.NDArray[Any]:

@@ -98,12 +98,12 @@ def reconstruct(
     library.match_image_pairs(base, matching, wanted, verification, **on_host)
     log.info("structure from motion: cameras and points")
     mapping = library.IncrementalPipelineOptions(random_seed=0, min_model_size=3)
-    found = library.incremental_mapping(base, images, models, mapping)
-    if not found:
+    reconstructions = library.incremental_mapping(base, images, models, mapping)
+    if not reconstructions:
         raise DevrfError(
             f"{moving.path}: too few matches between its frames to find any camera; {_FILM}"
         )
-    best = max(found, key=lambda number: found[number].num_reg_images())
+    best = max(reconstructions, key=lambda number: reconstructions[number].num_reg_images())
     return models / str(best)
 
 
@@ -145,11 +145,11 @@ def _check_turns(model: SparseModel, moving: Chosen, known: Sequence[str]) -> No
     trace = (turns[1:] * turns[:-1]).sum(dim=(1, 2))
     degrees = torch.rad2deg(((trace - 1) / 2).clamp(-1, 1).acos())
     worst = int(degrees.argmax())
-    most = float(degrees[worst])
-    if most > max(MOST_TURN, MOST_TURNS * float(degrees.median())):
+    turn = float(degrees[worst])
+    if turn > max(MOST_TURN, MOST_TURNS * float(degrees.median())):
         raise DevrfError(
             f"{moving.path}: between {Path(known[worst]).stem} and {Path(known[worst + 1]).stem}, "
-            f"frames that follow one another, its camera seems to turn by {most:.0f} degrees: "
+            f"frames that follow one another, its camera seems to turn by {turn:.0f} degrees: "
             "different places look alike; give more frames with capture.frames, or "
             "capture.matching=sequential, or film where there is more texture"
         )

@@ -96,11 +96,11 @@ def sharpness(grey: Grey) -> float:
     """
     shares = []
     for axis, kernel in ((0, (1, 9)), (1, (9, 1))):
-        there = np.abs(np.diff(grey, axis=axis))
+        sharp = np.abs(np.diff(grey, axis=axis))
         blurred = cv2.blur(grey, kernel)
-        left = np.abs(np.diff(blurred, axis=axis))
-        lost = np.maximum(there - left, 0).sum()
-        shares.append(float(lost / there.sum()) if there.sum() > 0 else 0.0)
+        soft = np.abs(np.diff(blurred, axis=axis))
+        lost = np.maximum(sharp - soft, 0).sum()
+        shares.append(float(lost / sharp.sum()) if sharp.sum() > 0 else 0.0)
     return min(shares)
 
 

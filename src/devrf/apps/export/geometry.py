@@ -170,8 +170,8 @@ def seen_points(
     filled = len(_seen(renderer, some.of_height(FIRST), time, background)[0])
     rows = FIRST * (SPARE * count / max(filled, 1)) ** 0.5
     points, colors = _seen(renderer, some.of_height(min(round(rows), LARGEST)), time, background)
-    kept = _evenly(len(points), count)
-    return points[kept], colors[kept]
+    chosen = _evenly(len(points), count)
+    return points[chosen], colors[chosen]
 
 
 def _seen(
@@ -189,6 +189,8 @@ def _seen(
     return torch.cat(points), torch.cat(colors)
 
 
-def _evenly(count: int, most: int) -> Tensor:
-    """Positions of at most ``most`` of ``count`` things, evenly spread."""
-    return torch.arange(count) if count <= most else torch.arange(most) * count // most
+def _evenly(count: int, max_count: int) -> Tensor:
+    """Positions of at most ``max_count`` of ``count`` things, evenly spread."""
+    return (
+        torch.arange(count) if count <= max_count else torch.arange(max_count) * count // max_count
+    )

@@ -47,9 +47,11 @@ def export_scene(model: Renderable, scene: Scene, settings: ExportSettings, fold
         )
     else:
         path = folder / "points"
-        most = _write_points(path, model, scene, settings, times)
-        log.info("%d coloured points at most at %d times written to %s", most, len(times), path)
-        if most == 0:
+        max_points = _write_points(path, model, scene, settings, times)
+        log.info(
+            "%d coloured points at most at %d times written to %s", max_points, len(times), path
+        )
+        if max_points == 0:
             log.warning("the files are empty: nothing that the cameras see hides what is behind it")
 
 
@@ -92,18 +94,18 @@ def _write_points(
 ) -> int:
     """Write what the static cameras see at each time; the points of the time with the most."""
     renderer, behind = Renderer(model, times=1), background_value(scene.background)
-    cameras, most = scene.static.train.cameras, 0
+    cameras, max_points = scene.static.train.cameras, 0
 
     def drawn() -> Iterator[Drawn]:
-        nonlocal most
+        nonlocal max_points
         for time in times:
             points, colors = seen_points(renderer, cameras, time, behind, settings.points)
-            most = max(most, len(points))
+            max_points = max(max_points, len(points))
             yield point_file(points, colors)
 
     clouds = followed(drawn(), len(times), "points")
     write_sequence(folder, "ply", times, clouds, "points", settings.seconds)
-    return most
+    return max_points
 
 
 def _named_cameras(scene: Scene) -> dict[str, Cameras]:

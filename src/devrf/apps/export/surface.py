@@ -63,10 +63,10 @@ def isosurface(model: Renderable, outside: Tensor, threshold: float, side: int |
     values = _logit(depth).numpy()
     empty = values < level
     if empty.all():
-        most = -math.expm1(-float(depth.max()))
+        max_opacity = -math.expm1(-float(depth.max()))
         raise DevrfError(
             f"export.threshold: the field is empty: no voxel has the opacity {threshold:g}, the "
-            f"most is {most:.2g}; give a lower threshold, or learn for longer"
+            f"most is {max_opacity:.2g}; give a lower threshold, or learn for longer"
         )
     if not empty.any():
         raise DevrfError(
@@ -84,13 +84,13 @@ def entries(model: Renderable, cameras: Cameras) -> Tensor:
     """Points (K, 3) in the fields' space at which rays of the cameras begin to be sampled."""
     space, box = model.space, _field(model).box
     cameras = cameras.resized(ENTRIES, ENTRIES)
-    found = []
+    points = []
     for camera in range(len(cameras)):
         rays = space.rays(cameras.image_rays(camera))
         entry, leave = box.crossing(rays, *model.depth_limits)
         met = (entry < leave).nonzero()[:, 0]
-        found.append(rays.at(met, entry[met]))
-    return torch.cat(found)
+        points.append(rays.at(met, entry[met]))
+    return torch.cat(points)
 
 
 def _field(model: Renderable) -> SurfaceField:
@@ -118,9 +118,9 @@ def _reached(empty: npt.NDArray[np.bool_], box: Box, outside: Tensor) -> npt.NDA
     cells = box.to_grid(outside, empty.shape).round().long()
     inside = ((cells >= 0) & (cells < shape)).all(dim=1)
     begun = np.unique(labels[tuple(cells[inside].t().numpy())])
-    found: npt.NDArray[np.bool_] = np.isin(labels, begun[begun > 0])
+    reached: npt.NDArray[np.bool_] = np.isin(labels, begun[begun > 0])
     # Where all cameras stand in fog there is nothing to go by.
-    return found if found.any() else empty
+    return reached if reached.any() else empty
 
 
 def canonical_surface(model: Renderable, cameras: Cameras, settings: ExportSettings) -> Surface:
@@ -150,10 +150,10 @@ def canonical_surface(model: Renderable, cameras: Cameras, settings: ExportSetti
         mesh = mesh.simplify_quadric_decimation(face_count=settings.faces)
     vertices = torch.from_numpy(np.array(mesh.vertices, np.float32))
     triangles = torch.from_numpy(np.array(mesh.faces, np.int64))
-    seen = triangles.flip(1) if _mirrors(space, _field(model).box) else triangles
-    normals = vertex_normals(space.to_world(vertices), seen)
+    outward = triangles.flip(1) if _mirrors(space, _field(model).box) else triangles
+    normals = vertex_normals(space.to_world(vertices), outward)
     colors = vertex_colors(model, vertices, triangles, normals, averaged=settings.colors == "mean")
-    return Surface(vertices, seen, colors)
+    return Surface(vertices, outward, colors)
 
 
 def _mirrors(space: Space, box: Box) -> bool:
@@ -178,9 +178,9 @@ def vertex_colors(
 ) -> Tensor:
     """RGB (V, 3) in [0, 1] of vertices (V, 3) in the fields' space, seen from outside.
 
-    A vertex lies where matter begins, and there the field's colours are not yet learned: its own
-    is that of a ray that goes straight in, Σ w_i c_i / Σ w_i (docs/method.md#compositing), along
-    its unit normal (V, 3) of the world, or ``averaged`` over directions up to 60 degrees off it.
+    A vertex lies where occupied space begins, and there the field's colours are not yet learned:
+    its own is that of a ray that goes straight in, Σ w_i c_i / Σ w_i (docs/method.md#compositing),
+    along its unit normal (V, 3) of the world, or ``averaged`` over directions up to 60 degrees off.
     Faces (F, 3) are counter-clockwise from outside in the fields' space.
     """
     field = _field(model)
@@ -204,13 +204,13 @@ def _seen(
     vertex, sample = (weight > SIGNIFICANT).nonzero(as_tuple=True)
     share, where = weight[vertex, sample, None], samples[vertex, sample]
     field, device, frames = _field(model), model.device, _frames(normals)
-    seen, total = torch.zeros_like(points), toward_eyes[:, 2].sum()
+    colors, total = torch.zeros_like(points), toward_eyes[:, 2].sum()
     for direction in toward_eyes:
         viewdirs = -(frames @ direction)
         color = field.color(where.to(device), viewdirs[vertex].to(device)).cpu()
-        seen.index_add_(0, vertex, share * color * (direction[2] / total))
-    kept = torch.zeros(len(points)).index_add_(0, vertex, share[:, 0])
-    return seen / kept.clamp(min=1e-9)[:, None]
+        colors.index_add_(0, vertex, share * color * (direction[2] / total))
+    weight_sum = torch.zeros(len(points)).index_add_(0, vertex, share[:, 0])
+    return colors / weight_sum.clamp(min=1e-9)[:, None]
 
 
 def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:

@@ -40,11 +40,11 @@ class Advice(NamedTuple):
     """A problem that lowers quality: a file, view or part of the scene, and what to do."""
 
     where: str
-    what: str
+    problem: str
     remedy: str
 
     def __str__(self) -> str:
-        return f"{self.where}: {self.what}; {self.remedy}"
+        return f"{self.where}: {self.problem}; {self.remedy}"
 
 
 def advice_on(scene: Scene) -> list[Advice]:
@@ -63,10 +63,10 @@ def image_sets(scene: Scene) -> dict[str, Views]:
     }
 
 
-def listed(names: Sequence[str], most: int = 3) -> str:
-    """The first ``most`` names, and how many more there are."""
-    more = len(names) - most
-    return ", ".join(names[:most]) + (f" and {more} more" if more > 0 else "")
+def listed(names: Sequence[str], max_names: int = 3) -> str:
+    """The first ``max_names`` names, and how many more there are."""
+    more = len(names) - max_names
+    return ", ".join(names[:max_names]) + (f" and {more} more" if more > 0 else "")
 
 
 def _held_out(scene: Scene) -> Iterator[Advice]:
@@ -144,11 +144,11 @@ def _images(scene: Scene) -> Iterator[Advice]:
     def beside(views: Views, k: int) -> bool:
         pixels, depth = views.cameras.project_into(k, points.reshape(-1, 3))
         size = pixels.new_tensor([views.width, views.height])
-        seen = (depth > 0) & ((pixels >= 0) & (pixels <= size)).all(dim=1)
-        return not away(views, k) and not bool(seen.any())
+        visible = (depth > 0) & ((pixels >= 0) & (pixels <= size)).all(dim=1)
+        return not away(views, k) and not bool(visible.any())
 
     pose = "check the pose (camera-to-world, x right, y up, looking along -z), or set data.box"
-    for test, what, remedy in (
+    for test, problem, remedy in (
         (away, "looks away from the middle of the box", pose),
         (beside, "does not have the box in the picture", pose),
         (_is_flat, "one colour all over", "look at the file, and leave it out if it is lost"),
@@ -168,7 +168,7 @@ def _images(scene: Scene) -> Iterator[Advice]:
         sets = image_sets(scene).values()
         names = [views.names[k] for views in sets for k in range(len(views)) if test(views, k)]
         if names:
-            yield Advice(listed(list(dict.fromkeys(names))), what, remedy)
+            yield Advice(listed(list(dict.fromkeys(names))), problem, remedy)
 
 
 def _valid_pixels(views: Views, k: int) -> Tensor:
@@ -283,8 +283,11 @@ def _flow(scene: Scene) -> Iterator[Advice]:
             "or set data.flow=dis or data.flow=none",
         )
     if broken:
-        what, remedy = "valid where it is not a number", "mask these pixels, or set data.flow=none"
-        yield Advice(f"flow of {listed(broken)}", what, remedy)
+        problem, remedy = (
+            "valid where it is not a number",
+            "mask these pixels, or set data.flow=none",
+        )
+        yield Advice(f"flow of {listed(broken)}", problem, remedy)
     share = sum(covered) / max(len(covered), 1)
     if covered and share < MIN_FLOW:
         where = "the alpha masks" if views.has_alpha else "the pixels"

@@ -12,7 +12,7 @@ from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
 from devrf.scenes.scene import Scene
 
-# NDC depth at which an endless frustum is cut off: twice the near plane's distance. More would
+# NDC depth at which an unbounded frustum is cut off: twice the near plane's distance. More would
 # dwarf the cameras.
 NDC_CUT = 0.0
 # Mean square sine of the angle between x axes under which cameras stand side by side.

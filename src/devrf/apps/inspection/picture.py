@@ -133,8 +133,8 @@ def sample_images(views: Views) -> list[list[int]]:
         return [some[k : k + COLUMNS] for k in range(0, len(some), COLUMNS)]
     rows = []
     for k in evenly(len(numbers), MOST_VIEWS):
-        own = [image for image in order if int(views.view[image]) == numbers[k]]
-        rows.append([own[j] for j in evenly(len(own), COLUMNS)])
+        of_view = [image for image in order if int(views.view[image]) == numbers[k]]
+        rows.append([of_view[j] for j in evenly(len(of_view), COLUMNS)])
     return rows
 
 
@@ -220,8 +220,10 @@ def compass(scene: Scene) -> Tensor:
 
 def scene_lines(scene: Scene) -> list[Lines]:
     """Boxes and cameras as lines; each fixed camera once, not once a frame."""
-    size, bounds, endless = _camera_size(scene), scene.bounds, scene.kind == "forward"
-    lines = [Lines("box" + endless * " (endless, cut off)", box_edges(scene, bounds.box), "0.2", 2)]
+    size, bounds, unbounded = _camera_size(scene), scene.bounds, scene.kind == "forward"
+    lines = [
+        Lines("box" + unbounded * " (unbounded, cut off)", box_edges(scene, bounds.box), "0.2", 2)
+    ]
     if bounds.motion is not None:
         lines.append(Lines("room for motion", box_edges(scene, bounds.motion), "#1f9e6b", 2))
     for label, views, color, width in (

@@ -33,8 +33,8 @@ def inspection_text(scene: Scene, requirements: Sequence[Sequence[str]]) -> Rend
         _titled_table("what a run will need, estimated", requirements),
         Text(verdict, style="bold yellow" if advice else "bold green"),
         *(
-            Text.assemble((f"  {where}", "yellow"), f": {what}; ", (remedy, "italic"))
-            for where, what, remedy in advice
+            Text.assemble((f"  {where}", "yellow"), f": {problem}; ", (remedy, "italic"))
+            for where, problem, remedy in advice
         ),
     )
 

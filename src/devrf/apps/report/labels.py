@@ -75,17 +75,17 @@ def labelled(runs: pd.DataFrame) -> pd.DataFrame:
     """
     traits = _distinguishing(runs["scene"], [_traits(run) for run in runs.to_dict("records")])
     views = runs.get("run.train_views", pd.Series(None, runs.index, dtype=object))
-    found = runs.assign(
-        label=[_label(own) for own in traits],
-        name=[_label(own, without="protocol") for own in traits],
-        line=[_label(own, without="views") for own in traits],
+    ordered = runs.assign(
+        label=[_label(trait) for trait in traits],
+        name=[_label(trait, without="protocol") for trait in traits],
+        line=[_label(trait, without="views") for trait in traits],
         views=views.map(number).astype(float),
         by_scene=pd.factorize(runs["scene"])[0],
         by_method=[_rank(method, METHODS) for method in runs["method"]],
-        by_name=[_rank(own["method"], ABLATIONS.values()) for own in traits],
+        by_name=[_rank(trait["method"], ABLATIONS.values()) for trait in traits],
     )
     order = ["by_scene", "by_method", "by_name", "views", "label"]
-    return found.sort_values(order, kind="stable").drop(columns=order[:3])
+    return ordered.sort_values(order, kind="stable").drop(columns=order[:3])
 
 
 def _rank(name: str, names: Iterable[str]) -> int:
@@ -101,34 +101,34 @@ def _traits(run: Mapping[str, Any]) -> dict[str, str]:
         if key.startswith(CHOICES)
     }
     ablation = options.get("ablation", "")
-    found = {"method": _method(run["method"], ablation), "protocol": run["protocol"]}
+    traits = {"method": _method(run["method"], ablation), "protocol": run["protocol"]}
     for trait, key, kind, words in RECORDED:
         value = run.get(f"run.{key}")
         if isinstance(value, kind):
-            found[trait] = words(value)
-    found |= _settings(run)
-    own = {key: text for key, text in found.items() if key != "method"}
-    found[IDENTITY] = json.dumps({**own, "method": run["method"]}, sort_keys=True)
+            traits[trait] = words(value)
+    traits |= _settings(run)
+    distinct = {key: text for key, text in traits.items() if key != "method"}
+    traits[IDENTITY] = json.dumps({**distinct, "method": run["method"]}, sort_keys=True)
     if run["method"] == DEFAULT_METHOD:
         options["experiment"] = options.get("experiment") or DEFAULT_EXPERIMENT
     for group, option in options.items():
         if option and group != "ablation" and option != run.get(group):
-            found[f"={group}" if group in found else group] = f"{group}={option}"
-    parts = {key: re.split("[./]", key.lstrip("="))[0] for key in found}
-    return {key: text for key, text in found.items() if parts[key] not in LOGGING}
+            traits[f"={group}" if group in traits else group] = f"{group}={option}"
+    parts = {key: re.split("[./]", key.lstrip("="))[0] for key in traits}
+    return {key: text for key, text in traits.items() if parts[key] not in LOGGING}
 
 
 def _settings(run: Mapping[str, Any]) -> dict[str, str]:
     """The settings that a run was learned with, by key."""
-    found = {}
+    settings = {}
     for column, value in run.items():
         key = column.removeprefix(SETTINGS)
         # Of a key that the run does not have the value is NaN; null is None.
         absent = isinstance(value, float) and math.isnan(value)
         if key != column and key not in (*IGNORED, "method") and not absent:
             text = value if isinstance(value, str) else json.dumps(value)
-            found[f"={key}"] = f"{key}={text}"
-    return found
+            settings[f"={key}"] = f"{key}={text}"
+    return settings
 
 
 def _method(method: str, ablation: str) -> str:

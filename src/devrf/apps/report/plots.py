@@ -75,14 +75,14 @@ class Plot(NamedTuple):
 
 def plots(table: Table) -> list[Plot]:
     """Every plot that has data."""
-    found = [
+    candidates = [
         ("psnr_against_seconds", "PSNR against training time", psnr_against_seconds(table)),
         ("metrics_against_views", "Metrics against dynamic training views", against_views(table)),
     ]
     for scene in table.runs["scene"].unique():
         name = file_name(f"psnr_over_time_{scene}")
-        found.append((name, f"{scene}: PSNR over time", psnr_over_time(table, scene)))
-    return [Plot(name, shows, figure) for name, shows, figure in found if figure is not None]
+        candidates.append((name, f"{scene}: PSNR over time", psnr_over_time(table, scene)))
+    return [Plot(name, shows, figure) for name, shows, figure in candidates if figure is not None]
 
 
 def file_name(text: str) -> str:

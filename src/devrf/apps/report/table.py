@@ -251,13 +251,13 @@ def _average(
 
 def _published(scenes: list[str], theirs: list[str], columns: Sequence[Column]) -> pd.DataFrame:
     """The paper's rows of a scene, or their means over several; none unless it has them all."""
-    asked = scenes if set(scenes) <= set(theirs) else []
-    values = _over_scenes(_of(published().values, asked), scenes).dropna()
+    published_scenes = scenes if set(scenes) <= set(theirs) else []
+    values = _over_scenes(_of(published().values, published_scenes), scenes).dropna()
     values = values.reindex(columns=[column.title for column in columns])
     rows = values.assign(name=values.index, protocol="", counts=[{1} for _ in values.index])
     cells = _cells(rows, values * math.nan, columns, devices=None)
     if len(scenes) == 1:
-        cells["text"] = _of(published().texts[TITLES], asked).reindex(
+        cells["text"] = _of(published().texts[TITLES], published_scenes).reindex(
             columns=values.columns, fill_value=UNKNOWN
         )
     return cells

@@ -41,7 +41,7 @@ def _rows(
     """A row for each label of any frame."""
     cells = [_marked(frame, style, table.columns) for frame in frames]
     titles = [style.escape(block.title) for block in blocks]
-    found = pd.concat(cells, axis=1, keys=titles, sort=False)
+    body = pd.concat(cells, axis=1, keys=titles, sort=False)
     heads = pd.concat([frame["head"] for frame in frames]).groupby(level=0)
     counts = heads["counts"].agg(lambda sets: set().union(*sets))
     # How many runs a row's values are means of, where it is more than one.
@@ -51,7 +51,7 @@ def _rows(
     lead = {("", heading): names.map(lambda name: style.escape(label.format(name)))}
     if table.rows["protocol"].nunique() > 1:
         lead["", "Protocol"] = heads["protocol"].first().map(style.escape)
-    return pd.concat([pd.DataFrame(lead).reindex(found.index), found], axis=1)
+    return pd.concat([pd.DataFrame(lead).reindex(body.index), body], axis=1)
 
 
 def _marked(frame: pd.DataFrame, style: Style, columns: Sequence[Column]) -> pd.DataFrame:
@@ -89,14 +89,14 @@ def credit() -> str:
 def reasons(collection: Collection) -> list[str]:
     """Which runs failed, and why, a line each; overrides that all runs share are left out."""
     overrides = pd.concat([collection.runs["run.overrides"], collection.failures["run.overrides"]])
-    typed = [set(own) for own in overrides]
+    typed = [set(texts) for texts in overrides]
     shared = set.intersection(*typed) if len(typed) > 1 else set()
     lines: list[str] = []
     for failure in collection.failures.to_dict("records"):
-        own = [text for text in failure["run.overrides"] if text not in shared]
-        what = " ".join([failure["scene"] or "unknown scene", *own])
+        further = [text for text in failure["run.overrides"] if text not in shared]
+        described = " ".join([failure["scene"] or "unknown scene", *further])
         bug = " (a fault of the program: see its run.log)" * (failure["mistake"] is False)
-        lines.append(f"{failure['folder']} ({what}): {failure['error']}{bug}")
+        lines.append(f"{failure['folder']} ({described}): {failure['error']}{bug}")
     return lines
 
 
