@@ -134,7 +134,8 @@ def quick_composition() -> Iterator[None]:
         return copy.deepcopy(known[place])
 
     def get_mode(self: Hydra, config_name: str | None, overrides: list[str]) -> Any:
-        words = {word for one in overrides for word in re.split(r"[=,+]", one)}
+        others = (one for one in overrides if one != "hydra.mode=RUN")  # that is the usual
+        words = {word for one in others for word in re.split(r"[=,+]", one)}
         if words & {"hydra.mode", "hydra", *files_of_sweeps}:
             return asked(self, config_name, overrides)
         return None

@@ -104,6 +104,8 @@ def _in_form(texts: list[str], before: Sequence[str]) -> list[str]:
     """
     both = parsed([*before, *texts])
     names = values(both, "experiment")
+    if not names:
+        return texts
     known = set(group_choices()["experiment"])
     if not any(other.startswith(f"{name}_") for name in names for other in known):
         return texts

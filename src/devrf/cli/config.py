@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +47,7 @@ def config_folder() -> Path:
     return installed if installed.is_dir() else Path(__file__).resolve().parents[3] / "conf"
 
 
+@cache
 def rows(group: str) -> DictConfig:
     """The choices of a group that are rows of one file, ``conf/rows/GROUP.yaml``, by name."""
     path = config_folder() / "rows" / f"{group}.yaml"
@@ -143,6 +145,7 @@ def _of_sweep(mode: Any) -> bool:
     return str(getattr(mode, "name", mode)) == "MULTIRUN"
 
 
+@cache  # for the whole process
 def register_config() -> None:
     """Make the resolvers ``${devrf.scene_name:…}`` … and the rows known to Hydra.
 
