@@ -67,7 +67,7 @@ def scores(folder: Path) -> list[dict[str, str]]:
 def test_masked_pixels_decide_nothing(devrf, short, recorded, tiny_scene, tmp_path):
     bounds = tiny_scene.bounds.box
     box = f"data.box={[list(bounds.low), list(bounds.high)]}".replace(" ", "")
-    more = (box, "data.masks=ignore", "video.frames=1", "video.height=40")
+    more = (box, "data.masks=ignore", "video.frames=1", "evaluation.metrics=[]")
     for name, grey in (("a", 0), ("b", 200)):
         root = f"data.root={recorded(name, grey)}"
         outcome = devrf(*short, *LAYOUT, root, *more, f"hydra.run.dir=run_{name}")

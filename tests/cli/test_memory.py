@@ -95,7 +95,7 @@ def test_networks_too_wide_to_build_are_one_line(devrf, tiny_data) -> None:
 
 # Half of the fields and a small part of a batch fit into the memory left to the program.
 LARGE = (
-    "schedule.canonical.rays=60000",
+    "schedule.canonical.rays=20000",
     "schedule.canonical.iterations=2",
     "schedule.canonical.upsample_at=[]",
     "stage=canonical",
@@ -105,7 +105,7 @@ LARGE = (
 
 @linux
 def test_a_stage_learns_in_parts_where_memory_is_short(warm, tiny, tmp_path) -> None:
-    outcome = warm(tmp_path, *tiny, *LARGE, most_memory=300 * 2**20)
+    outcome = warm(tmp_path, *tiny, *LARGE, most_memory=100 * 2**20)
     assert outcome.status == 0, outcome.out
     assert "out of memory (" in outcome.out
 
