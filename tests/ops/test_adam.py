@@ -127,11 +127,11 @@ def test_what_is_replaced_or_forgotten_starts_afresh() -> None:
     run(optimizer, old, [torch.ones(1, 1, 1, 1)] * 3)
     optimizer.replace(0, [new])
     assert old not in optimizer.state
-    optimizer.forget(0)
+    optimizer.forget()
     run(optimizer, new, [torch.full((1, 1, 1, 1), -5.0)])
     assert new.item() == pytest.approx(0.1) and old.item() == pytest.approx(-0.3)
     moments = optimizer.state[new]["mean"]
-    optimizer.forget(0)
+    optimizer.forget()
     run(optimizer, new, [torch.full((1, 1, 1, 1), 5.0)])
     assert optimizer.state[new]["mean"] is moments
     assert new.item() == pytest.approx(0.0, abs=1e-7)

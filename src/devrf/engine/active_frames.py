@@ -153,7 +153,6 @@ class ActiveFrames:
         fields: Mapping[str, FrameField],
     ) -> None:
         """Make memory for ``count`` frames, as :meth:`ActiveFrame.of` does."""
-        self._frames = []  # frees the memory of those before
         self._frames = [ActiveFrame.of(store, occupancy, fields) for _ in range(count)]
 
     def check_out(self, numbers: Sequence[int]) -> None:
@@ -171,6 +170,10 @@ class ActiveFrames:
     def close(self) -> None:
         """Write the frames back, and free their memory."""
         self.write_back()
+        self.free()
+
+    def free(self) -> None:
+        """Free the memory of the frames; what was not written back is lost."""
         self._frames = []
 
     def _check_out_again(self) -> None:

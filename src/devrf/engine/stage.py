@@ -134,8 +134,7 @@ class ScheduledStage(Learner):
         self.iteration = iteration
         self.num_rollbacks += 1
         self.lr_scale *= lr_scale
-        for group in range(len(self.optimizer.param_groups)):
-            self.optimizer.forget(group)
+        self.optimizer.forget()
         self._reseed()
         self.trainer.should_stop = False
 

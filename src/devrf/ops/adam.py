@@ -183,9 +183,9 @@ class GridAdam(torch.optim.Optimizer):
         if self.keeps_gradients:
             self.keep_gradients()
 
-    def forget(self, group: int) -> None:
-        """Zero a group's moments, step counts and gradients; its parameters stay."""
-        for parameter in self.param_groups[group]["params"]:
+    def forget(self) -> None:
+        """Zero all moments, step counts and gradients; the parameters stay."""
+        for parameter in (each for group in self.param_groups for each in group["params"]):
             for value in self.state.get(parameter, {}).values():
                 value.zero_()
             if parameter.grad is not None:

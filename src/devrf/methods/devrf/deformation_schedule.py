@@ -6,6 +6,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from itertools import accumulate, pairwise
 from typing import Any, Literal, get_args
 
@@ -206,6 +207,7 @@ class DeformationSchedule:
         )
 
 
+@cache
 def _visits(frames: int, stretch: int) -> list[range]:
     """The frames of each visit: of 6 in stretches of 3, frame 3, then 1 and 4, then 2 and 5."""
     # Visit 0 leaves out frame 0.

@@ -128,66 +128,66 @@ class DeformationStage(MotionStage):
         voxels, still_outside = levels[0].side ** 3, box != model.box
         model.deformation = DeformationField(box, clock, voxels=voxels, still_outside=still_outside)
         device, finest = self.trainer.strategy.root_device, box.grid_shape(levels[-1].side ** 3)
-        half, parallel = (
-            motion.stored_half(device),
-            self.schedule.max_parallel_frames(-1, len(clock)),
-        )
-        frames = model.deformation.frames
-        frames.keep(motion.store, device, finest, half=half, parallel=parallel)
+        half = motion.stored_half(device)
+        parallel = self.schedule.max_parallel_frames(-1, len(clock))
+        model.deformation.frames.keep(motion.store, device, finest, half=half, parallel=parallel)
 
     def enter(self, phase: DeformationPhase) -> None:
         """Go to the phase's frames: grow the grids if a level begins, fresh Adam if asked for."""
-        previous, self.phase, motion = self.phase, phase, self.motion
+        previous, self.phase = self.phase, phase
         self.active.write_back()
         if previous is not None and previous.level != phase.level:
-            self._allocate(0)
+            self._free()
             self.field.resize(phase.side**3)
+        self._initialise(phase)
+        self._activate(phase)
+        self._prefetch_after(phase)
+        self._update_occupancy()
+        occupied, joined = self.motion.pixels == "occupied", self.motion.views == "all"
+        for active in self.active:
+            shown = self.views, active.number, self.scene_model, active.occupancy
+            active.pools = frame_pools(*shown, occupied_only=occupied, join_views=joined)
+
+    def _free(self) -> None:
+        """Free the memory of the active frames, and that of all that refers to it."""
+        self.loop.release()
+        self.active.free()
+        for group in range(len(self.optimizer.param_groups)):
+            self.optimizer.replace(group, [])
+
+    def _initialise(self, phase: DeformationPhase) -> None:
+        """Give the phase's frames their first values, in the fields."""
         for frame in phase.frames:
             if phase.init_from_previous:
                 self.field.frames.copy_previous(frame)
             for extension in self.extensions:
                 extension.initialise(self, phase, frame)
-        carried = motion.adam_state == "carried" and phase.level > 0
-        if len(self.active) == len(phase.frames) and not carried:
-            for group in range(len(self.optimizer.param_groups)):
-                self.optimizer.forget(group)
-        self._activate(phase)
-        self._prefetch_after(phase)
-        self._update_occupancy()
-        occupied, joined = motion.pixels == "occupied", motion.views == "all"
-        for active in self.active:
-            shown = self.views, active.number, self.scene_model, active.occupancy
-            active.pools = frame_pools(*shown, occupied_only=occupied, join_views=joined)
 
     def _activate(self, phase: DeformationPhase) -> None:
-        """Check out the phase's frames, with memory for them."""
+        """Check out the phase's frames, into memory for as many."""
         if len(self.active) != len(phase.frames):
-            self._allocate(len(phase.frames))
+            self._allocate(phase)
+        elif self.motion.adam_state != "carried" or phase.level == 0:
+            self.optimizer.forget()
         self.active.check_out(phase.frames)
         self._convergence.reset()
         level = f"schedule.deformation.levels.{phase.level + 1}"
         together = (f"{level}.parallel_frames",) if len(phase.frames) > 1 else ()
         self.memory_keys = (f"{level}.side", "schedule.deformation.rays", *together)
 
-    def _allocate(self, count: int) -> None:
-        """Make memory for ``count`` active frames at the field's present resolution."""
-        assert self.phase is not None
-        level, memory = self.phase.level, (self.field.frames, self.scene_model.occupancy)
-        # The memory of the frames before is freed first.
-        self.loop.release()
-        self.active.allocate(0, *memory, {})
-        for group in range(len(self.optimizer.param_groups)):
-            self.optimizer.replace(group, [])
+    def _allocate(self, phase: DeformationPhase) -> None:
+        """Make memory for the phase's frames at the fields' resolutions, and let Adam learn it."""
+        self._free()
+        level, memory = phase.level, (self.field.frames, self.scene_model.occupancy)
         further = {k: v for e in self.extensions for k, v in e.frame_fields(self, level).items()}
-        self.active.allocate(count, *memory, further)
+        self.active.allocate(len(phase.frames), *memory, further)
         self.weights = self.motion_loss.weights_at(level)
         learned = [tensor for frame in self.active for tensor in frame.slices]
         smoothing = self.motion_loss.smoothing(level, self.field.shape)
         self.optimizer.replace(0, learned, smoothing=smoothing)
         for extension in self.extensions:
             extension.begin_level(self, level)
-        if count:
-            self.bind(self.schedule.rays, [frame.learned for frame in self.active])
+        self.bind(self.schedule.rays, [frame.learned for frame in self.active])
 
     def _prefetch_after(self, phase: DeformationPhase) -> None:
         """Begin to fetch the next phase's frames, unless they change before it begins."""
@@ -241,17 +241,19 @@ class DeformationStage(MotionStage):
         before = [frame.before] if capacity is not None or frame.number > 1 else []
         changes = (extension.color_change(frame) for extension in self.extensions)
         color_change = next((change for change in changes if change is not None), None)
-        warp = field.warp_by(frame.backward)
+        motion = field.warp_by(frame.backward), color_change
+        output, rays = self.render_pixels(views, pixels, frame.occupancy, capacity, *motion)
         prediction = MotionPrediction(
-            *self.render_pixels(views, pixels, frame.occupancy, capacity, warp, color_change),
-            field.warp_by(frame.forward),
-            field.warp_by(*before),
-            views.cameras,
-            self.previous_images,
-            frame.forward,
-            field.box,
-            self.scene_model.space,
-            self.flow_mean,
+            output,
+            rays,
+            unwarp=field.warp_by(frame.forward),
+            unwarp_previous=field.warp_by(*before),
+            cameras=views.cameras,
+            previous_image=self.previous_images,
+            forward_slice=frame.forward,
+            box=field.box,
+            space=self.scene_model.space,
+            flow_mean=self.flow_mean,
         )
         with span("losses"):
             return weighted_loss(prediction, self.motion_loss.terms, self.weights)

@@ -137,7 +137,7 @@ class MotionPrior(Extension):
 
     def begin_level(self, stage: MotionStage, level: int) -> None:
         """Find the cells of the level's grids that are occupied at rest."""
-        if self.name in stage.weights and len(stage.active):
+        if self.name in stage.weights:
             field, occupancy = stage.field, stage.scene_model.occupancy
             self._occupied = occupied_cells(occupancy, field.box, field.shape)
 
