@@ -213,8 +213,6 @@ def choices_of(hint: Any) -> tuple[object, ...]:
 def check_extras(config: DictConfig) -> None:
     """Check that what the config's settings need beyond devrf's own requirements is installed.
 
-    Launchers and searchers of sweeps are Hydra's plugins: Hydra itself misses them.
-
     Raises:
         DevrfError: naming the setting and the extra to install.
     """

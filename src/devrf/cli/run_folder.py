@@ -31,8 +31,8 @@ RANKS = ("RANK", "SLURM_PROCID")
 class RunFolderLock(Callback):
     """Hydra callback that locks the folder of a run or sweep before anything is written there.
 
-    Hydra writes before it calls the program, which then uses this lock.
-    Hydra ignores what a callback raises, except an exit: errors are reported here.
+    Hydra writes before it calls the program, which then uses this lock. Hydra ignores what a
+    callback raises, except an exit: errors are reported here.
     """
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
