@@ -134,7 +134,7 @@ def test_a_later_command_continues_the_run(watched):
     assert first.run.run_id == second.run.run_id
     found = json.loads((watched.folder / "metrics.json").read_text())
     for section in ("static", "dynamic", "deformation"):
-        assert second.summary[f"{section}/psnr"] == pytest.approx(found[section]["psnr"])
+        assert second.summary[f"test/{section}/psnr"] == pytest.approx(found[section]["psnr"])
     assert "static/loss" in first.history and "static/loss" not in second.history
 
 
@@ -164,8 +164,12 @@ def test_tensorboard_holds_both_stages_and_the_scores(devrf, tmp_path, tiny):
     assert [event.step for event in events.Images("static/view")][-1] == 6
     assert {"dynamic/depth", "held_out/static", "held_out/dynamic"} <= set(events.Tags()["images"])
     found = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    scored = events.Scalars("deformation/psnr")
-    assert [event.value for event in scored] == pytest.approx([found["deformation"]["psnr"]])
+    scored = events.Scalars("test/dynamic/psnr")
+    assert [event.value for event in scored] == pytest.approx([found["dynamic"]["psnr"]])
+    # The curves under the name of the score are whole.
+    assert [event.step for event in events.Scalars("dynamic/psnr")][-1] == 12
+    (config,) = events.Tensors("config/text_summary")
+    assert b'"seed"' in config.tensor_proto.string_val[0]
     # A run that begins anew in the folder has curves of its own.
     assert devrf(*common, "stage=canonical", "resume=false").status == 0
     events = read()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -54,6 +55,12 @@ class TensorBoardTracker(TensorBoardLogger):
     def __init__(self, save_dir: str | Path, name: str = "tensorboard") -> None:
         """Choose a folder in the run's; the first file is written when something is logged."""
         super().__init__(save_dir=save_dir, name=name, version="", default_hp_metric=False)
+
+    def log_hyperparams(self, params: dict[str, Any], *args: Any, **kwargs: Any) -> None:  # type: ignore[override]
+        """Log the config as text, too: TensorBoard's own table of settings needs metrics."""
+        super().log_hyperparams(params, *args, **kwargs)
+        if params:
+            self.experiment.add_text("config", f"```json\n{json.dumps(params, indent=2)}\n```")
 
     def show_image(self, name: str, image: Tensor, step: int | None = None) -> None:
         """Log an image (H, W, 3) in [0, 1]."""

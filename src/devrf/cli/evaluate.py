@@ -85,11 +85,13 @@ def _tell(
     dynamic = sections.get("dynamic", {})
     of_times = {name: dynamic[name] for name in OF_TIMES if name in dynamic}
     shown = {name: plain[name] for name in frames} | of_times
+    scores = {}  # training curves have their names without "test/"
+    for section, own in (plain | shown).items():
+        scores |= {f"test/{section}/{k}": v for k, v in own.items() if v is not None}
     for name, values in shown.items():
         log.info("%s: %s", name.replace("_", " "), in_words(values))
-    scores = {f"{s}/{name}": v for s, own in (plain | shown).items() for name, v in own.items()}
     for tracker in run.trackers:
-        tracker.conclude({name: score for name, score in scores.items() if score is not None})
+        tracker.conclude(scores)
         tracker.show_table("metrics", [{"section": name, **own} for name, own in shown.items()])
         tracker.show_table("frames", frame_rows(frames))
 
