@@ -79,13 +79,12 @@ def _tell(
 ) -> None:
     """Log the scores and give them to the trackers, those of some times as further sections."""
     plain = {
-        name: {key: value for key, value in one.items() if key not in OF_TIMES}
-        for name, one in sections.items()
+        name: {k: v for k, v in own.items() if k not in OF_TIMES} for name, own in sections.items()
     }
     dynamic = sections.get("dynamic", {})
     of_times = {name: dynamic[name] for name in OF_TIMES if name in dynamic}
     shown = {name: plain[name] for name in frames} | of_times
-    scores = {}  # training curves have their names without "test/"
+    scores: dict[str, Any] = {}  # training curves have their names without "test/"
     for section, own in (plain | shown).items():
         scores |= {f"test/{section}/{k}": v for k, v in own.items() if v is not None}
     for name, values in shown.items():
