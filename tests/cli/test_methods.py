@@ -26,7 +26,7 @@ SMALL = {
         f"{SETTINGS}.occupancy_side=8",
     ),
 }
-FILM = ("trainer=cpu", "video.frames=2", "video.height=20", "hydra.run.dir=run")
+FILM = ("trainer=cpu", "video.frames=1", "video.height=20", "hydra.run.dir=run")
 FILM += ("evaluation.metrics=[]", "~callbacks.training_curve")
 SHORT = ("ray_stage.schedule.iterations=4", "ray_stage.schedule.rays=64", *FILM)
 

