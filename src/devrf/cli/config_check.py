@@ -211,11 +211,7 @@ def choices_of(hint: Any) -> tuple[object, ...]:
 
 
 def check_extras(config: DictConfig) -> None:
-    """Check that what the config's settings need beyond devrf's own requirements is installed.
-
-    Raises:
-        DevrfError: naming the setting and the extra to install.
-    """
+    """Refuse by a DevrfError settings for which an extra of devrf is not installed."""
     needs = []  # packages, the setting, the extra, and what to set instead
     if "TensorBoard" in config.logger.get("_target_", ""):
         needs.append(("tensorboard", "logger=tensorboard", "tensorboard", "logger=csv"))
