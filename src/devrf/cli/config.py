@@ -155,7 +155,7 @@ def register_config() -> None:
         OmegaConf.register_new_resolver(f"devrf.{word.__name__}", word, replace=True)
     store = ConfigStore.instance()
     # Hydra copies its sources, the store among them, for each group that --help lists.
-    store.__deepcopy__ = _present_store  # type: ignore[attr-defined]
+    store.__deepcopy__ = lambda memo: ConfigStore.instance()  # type: ignore[attr-defined]
     folder = config_folder() / "rows"
     for path in sorted(folder.rglob("*.yaml")):
         group = path.relative_to(folder).with_suffix("").as_posix()
@@ -163,10 +163,6 @@ def register_config() -> None:
         for name, row in rows(group).items():
             package = "_global_" if at_root else None
             store.store(str(name), row, group, package, "devrf")
-
-
-def _present_store(memo: dict[int, Any]) -> ConfigStore:
-    return ConfigStore.instance()
 
 
 def choices() -> dict[str, str | None]:
