@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 import json
+import re
+from pathlib import Path
 
 import pytest
 
+import devrf as package
+import devrf.methods
+
+PAGE = Path(__file__).parents[2] / "docs" / "extending.md"
 SETTINGS = "ray_stage.model.settings"
 NARROW = (f"{SETTINGS}.width=8", f"{SETTINGS}.steps=16", f"{SETTINGS}.occupancy_side=8")
 SMALL = {
@@ -81,3 +87,24 @@ def test_what_cannot_be_is_said_in_one_line(devrf, tiny_data, method, asked, sai
     small = (f"method={method}", "experiment=peer_small", *SMALL[method], *SHORT)
     done = devrf(*small, *tiny_data, "protocol=joint", *asked)
     assert done.status == 2 and said in done.err and done.err.count("\n") == 1, done.err
+
+
+def test_the_method_of_the_documentation_is_learned_and_loaded(
+    devrf, tmp_path, tiny_data, monkeypatch
+):
+    section = PAGE.read_text().split("{ #protocol }")[0]
+    model, config = re.findall(r"```(?:python|yaml)\n(.*?)```", section, re.DOTALL)
+    for name, text in (("wobble/model.py", model), ("conf/method/wobble.yaml", config)):
+        (tmp_path / name).parent.mkdir(parents=True)
+        (tmp_path / name).write_text(text)
+    places = [*package.methods.__path__, str(tmp_path)]
+    monkeypatch.setattr(package.methods, "__path__", places)
+    asked = ("--config-dir", str(tmp_path / "conf"), "method=wobble", "protocol=two_stage", *SHORT)
+    done = devrf(*asked, *tiny_data, "ray_stage.model.width=8")
+    assert done.status == 0, done.err
+    learned = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    (tmp_path / "run" / "metrics.json").unlink()
+    done = devrf(*asked, *tiny_data, "ray_stage.model.width=8", "stage=evaluate")
+    assert done.status == 0, done.err
+    scored = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert scored["dynamic"]["psnr"] == learned["dynamic"]["psnr"] > 3
