@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-import devrf as package
-import devrf.methods
+from devrf import methods
 
 PAGE = Path(__file__).parents[2] / "docs" / "extending.md"
 SETTINGS = "ray_stage.model.settings"
@@ -97,8 +96,8 @@ def test_the_method_of_the_documentation_is_learned_and_loaded(
     for name, text in (("wobble/model.py", model), ("conf/method/wobble.yaml", config)):
         (tmp_path / name).parent.mkdir(parents=True)
         (tmp_path / name).write_text(text)
-    places = [*package.methods.__path__, str(tmp_path)]
-    monkeypatch.setattr(package.methods, "__path__", places)
+    places = [*methods.__path__, str(tmp_path)]
+    monkeypatch.setattr(methods, "__path__", places)
     asked = ("--config-dir", str(tmp_path / "conf"), "method=wobble", "protocol=two_stage", *SHORT)
     done = devrf(*asked, *tiny_data, "ray_stage.model.width=8")
     assert done.status == 0, done.err

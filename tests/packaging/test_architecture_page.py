@@ -10,11 +10,12 @@ from types import FrameType
 from typing import Any
 
 from lightning import Trainer
+from torch import Tensor
 
 import devrf
 from devrf.checkpoints.checkpoint import LoadedCheckpoint
 from devrf.data.datamodule import SceneDataModule
-from devrf.engine.loop import Loop
+from devrf.engine.stage import ScheduledStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule, Level
 from devrf.methods.devrf.deformation_stage import DeformationStage
 
@@ -22,35 +23,34 @@ SOURCE = Path(devrf.__file__).parent
 PAGE = Path(__file__).parents[2] / "docs" / "architecture.md"
 
 
-def test_an_iteration_enters_the_files_that_are_listed(
+def test_an_iteration_enters_the_files_that_are_listed_in_their_order(
     rest: LoadedCheckpoint,
     datamodule: SceneDataModule,
     trainer: Callable[..., Trainer],
     monkeypatch: Any,
 ) -> None:
-    entered: set[str] = set()
+    entered: dict[str, None] = {}  # in the order in which they are entered first
 
     def note(frame: FrameType, event: str, _: object) -> None:
         path = Path(frame.f_code.co_filename)
         if event == "call" and path.is_relative_to(SOURCE):
-            entered.add(str(path.relative_to(SOURCE)))
+            entered[str(path.relative_to(SOURCE))] = None
 
-    step = Loop.step
+    step = ScheduledStage.training_step
 
-    def noted(loop: Loop, stage: Any, *arguments: Any) -> None:
+    def noted(stage: ScheduledStage, *arguments: Any) -> dict[str, Tensor]:
         before = sys.getprofile()
         sys.setprofile(note if stage.iteration == 3 else before)
         try:
-            stage.prepare()
-            step(loop, stage, *arguments)
+            return step(stage, *arguments)
         finally:
             sys.setprofile(before)
 
-    monkeypatch.setattr(Loop, "step", noted)
-    stage = DeformationStage(rest, DeformationSchedule((Level(4, 4),), rays=64))
+    monkeypatch.setattr(ScheduledStage, "training_step", noted)
+    schedule = DeformationSchedule((Level(4, 4),), rays=64)
+    stage = DeformationStage(rest, schedule, iterations_per_step=1)
     trainer(max_steps=5).fit(stage, datamodule=datamodule)
     section = PAGE.read_text().split("{ #one-iteration }")[1]
-    listed = set(re.findall(r"`((?:engine|methods/devrf)/\w+\.py)`", section))
-    inner = {name for name in entered if name.startswith(("engine/", "methods/devrf/"))}
-    # Lightning's step is around the iteration.
-    assert inner | {"engine/stage.py"} == listed
+    listed = re.findall(r"`((?:engine|methods/devrf)/\w+\.py)`", section)
+    inner = [name for name in entered if name.startswith(("engine/", "methods/devrf/"))]
+    assert inner == listed

@@ -1,4 +1,4 @@
-"""The example of README and docs/python.md runs as it is printed, at a smaller size."""
+"""The examples of README and docs/python.md run as they are printed, at a smaller size."""
 
 from __future__ import annotations
 
@@ -14,25 +14,26 @@ SMALLER = {
     "side=56": "side=14",
     "upsample_at=[80, 160, 240]": "upsample_at=[2]",
     "rays=1024": "rays=64",
+    "of_height(400)": "of_height(20)",
+    "view(400,": "view(20,",
     "[Level(12, 36), Level(20, 18), Level(32, 18)]": "[Level(4, 2)]",
 }
 
 
-def example(page: str) -> str:
-    found = re.search(r"```python\n(.*?)```", (REPOSITORY / page).read_text(), re.DOTALL)
-    assert found
-    return found[1]
+def examples(page: str) -> list[str]:
+    return re.findall(r"```python\n(.*?)```", (REPOSITORY / page).read_text(), re.DOTALL)
 
 
 def test_both_pages_print_the_same():
-    assert example("README.md") == example("docs/python.md")
+    assert examples("README.md")[0] == examples("docs/python.md")[0]
 
 
-def test_it_runs(capsys):
-    code = example("README.md")
+def test_they_run(capsys):
+    code = "\n".join(examples("docs/python.md"))
     for printed, smaller in SMALLER.items():
         assert printed in code
         code = code.replace(printed, smaller)
     names: dict[str, object] = {"__name__": "__main__"}
-    exec(compile(code, "README.md", "exec"), names)
+    exec(compile(code, "docs/python.md", "exec"), names)
     assert "psnr" in capsys.readouterr().out.lower()
+    assert names["color"].shape == (20, 20, 3)
