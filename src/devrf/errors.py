@@ -38,5 +38,5 @@ def did_you_mean(word: object, known: Iterable[object], before: str = "") -> str
         known: what there is.
         before: what is written before the word: ``data=``.
     """
-    close = difflib.get_close_matches(str(word), [str(one) for one in known], n=1)
+    close = difflib.get_close_matches(str(word), [str(candidate) for candidate in known], n=1)
     return f"; did you mean {before}{close[0]}?" if close else ""

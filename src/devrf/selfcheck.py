@@ -200,10 +200,10 @@ def small_scene(device: torch.device, seed: int = 0) -> SmallScene:
     return SmallScene(device, *sizes, 96, 24, 9, seed)
 
 
-def require(condition: bool, said: str) -> None:
+def require(condition: bool, message: str) -> None:
     """Fail the check unless ``condition`` holds."""
     if not condition:
-        raise DevrfError(said)
+        raise DevrfError(message)
 
 
 def require_gpu(scene: SmallScene, reason: str) -> None:

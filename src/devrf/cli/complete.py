@@ -62,7 +62,7 @@ def completed(arguments: Sequence[str]) -> list[str]:
     before = of_named_run(typed, multirun)
     texts = _in_form(texts, before)
     both = parsed([*before, *texts])
-    if values(both, "data.root") and not any(one.key_or_group == "data" for one in both):
+    if values(both, "data.root") and not any(override.key_or_group == "data" for override in both):
         if not any(map(_reads_files, values(both, "experiment"))):
             before.append("data=auto")
     # Hydra takes all overrides from one place.
@@ -115,11 +115,11 @@ def _in_form(texts: list[str], before: Sequence[str]) -> list[str]:
 
         scenes = [recognise(root).choice for root in values(both, "data.root")]
     forms = [[_form(name, scene, known) for name in names] for scene in scenes or [None]]
-    if len(names) == 1 and len(scenes) > 1 and forms == [[f"{names[0]}_{one}"] for one in scenes]:
-        forms = [[form for own in forms for form in own]]
+    if len(names) == 1 and len(scenes) > 1 and forms == [[f"{names[0]}_{k}"] for k in scenes]:
+        forms = [[form for row in forms for form in row]]
         texts = [text for text in texts if not text.startswith("data=")]
     if any(form != forms[0] for form in forms):
-        needed = dict.fromkeys(form for own in forms for form in own)
+        needed = dict.fromkeys(form for row in forms for form in row)
         raise DevrfError(
             f"experiment={','.join(names)}: these scenes need different forms of it; sweep over "
             f"the scenes of each apart, with experiment={' and experiment='.join(needed)}"
@@ -177,20 +177,20 @@ def with_recognised_data(config: DictConfig) -> DictConfig:
     from devrf.scenes.formats import recognise
 
     layout = recognise(data.root)
-    own = OmegaConf.load(config_folder() / "data" / f"{layout.choice}.yaml")
-    assert isinstance(own, DictConfig)
+    chosen_data = OmegaConf.load(config_folder() / "data" / f"{layout.choice}.yaml")
+    assert isinstance(chosen_data, DictConfig)
     raw: Any = OmegaConf.to_container(data)
-    given = {k: v for k, v in raw.items() if v is not None and k not in NOT_PASSED}
+    user_options = {k: v for k, v in raw.items() if v is not None and k not in NOT_PASSED}
     # As a list: a DictConfig does not "contain" what is required and not given.
-    known = [str(name) for name in own if name not in NOT_PASSED]
-    for key in given:
+    known = [str(name) for name in chosen_data if name not in NOT_PASSED]
+    for key in user_options:
         if key not in known:
             raise DevrfError(
                 f"data.{key}: {data.root} is read by data={layout.choice}, which takes "
                 f"{', '.join(known)}"
             )
     with open_dict(config):
-        config.data = OmegaConf.merge(own, given, {"flow_cache": raw["flow_cache"]})
+        config.data = OmegaConf.merge(chosen_data, user_options, {"flow_cache": raw["flow_cache"]})
     if HydraConfig.initialized():
         chosen: Any = HydraConfig.get().runtime.choices
         with open_dict(chosen), read_write(chosen):

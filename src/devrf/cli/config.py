@@ -119,8 +119,8 @@ def run_folder(stage: str, report: Any, capture: Any, scene: str, name: str) -> 
         return f"outputs/{scene}/{name}"
     settings = ReportSettings(report.runs, report.into)
     # A misspelt folder is not created: the step reports that there is none.
-    there = Path(settings.runs).is_dir() or report.into is not None
-    return str(settings.folder) if there else "outputs/report"
+    has_folder = Path(settings.runs).is_dir() or report.into is not None
+    return str(settings.folder) if has_folder else "outputs/report"
 
 
 def config_record(stage: str) -> str | None:

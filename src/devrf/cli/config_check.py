@@ -118,15 +118,15 @@ def _check_part(raw: Node, resolved: Node, path: str, read: set[str]) -> None:
             settings = {**_settings(str(part["_target_"]), path), **settings}
             del settings["**"]
     for key in (key for key in raw if key not in RESERVED):
-        where, given, value = f"{path}{key}", raw[key], resolved[key]
+        where, raw_value, value = f"{path}{key}", raw[key], resolved[key]
         if key not in settings and "**" not in settings:
             raise unknown_key(where, settings)
-        if isinstance(given, Mapping) and "_target_" in given:
-            _check_part(given, value, f"{where}.", read)
+        if isinstance(raw_value, Mapping) and "_target_" in raw_value:
+            _check_part(raw_value, value, f"{where}.", read)
         elif not (isinstance(value, Mapping) and "_target_" in value):
             hint, default = settings.get(key, (Any, None))
             # The key to name is the one where the user sets the value.
-            reference = REFERENCE.fullmatch(given) if isinstance(given, str) else None
+            reference = REFERENCE.fullmatch(raw_value) if isinstance(raw_value, str) else None
             if value != default:
                 _check_value(reference.group(1) if reference else where, value, hint)
 
@@ -154,14 +154,14 @@ def _settings(target: str, path: str) -> dict[str, tuple[Any, Any]]:
 def _check_value(where: str, value: object, hint: Any) -> None:
     row = next((kind for kind in (hint, *get_args(hint)) if is_dataclass(kind)), None)
     if isinstance(value, Mapping) and get_origin(hint) in (dict, Mapping):
-        for key, one in value.items():
-            _check_value(f"{where}.{key}", one, get_args(hint)[1])
+        for key, entry in value.items():
+            _check_value(f"{where}.{key}", entry, get_args(hint)[1])
     elif isinstance(value, Mapping) and row is not None:
         hints = get_type_hints(row)
-        for key, one in value.items():
+        for key, entry in value.items():
             if key not in hints:
                 raise unknown_key(f"{where}.{key}", hints)
-            _check_value(f"{where}.{key}", one, hints[key])
+            _check_value(f"{where}.{key}", entry, hints[key])
     elif expected := unfit(value, hint):
         meant = did_you_mean(value, choices_of(hint), f"{where}=")
         raise DevrfError(f"{where}: expected {expected}, not {value!r}{meant}")
@@ -193,10 +193,10 @@ def unfit(value: object, hint: Any) -> str:
     except PydanticUserError:  # a hint that pydantic does not know
         return ""
     except ValidationError as error:
-        if any(one["type"] == "needs_python_object" for one in error.errors()):
+        if any(issue["type"] == "needs_python_object" for issue in error.errors()):
             return ""
-        said = (one["msg"].removeprefix("Input should be ") for one in error.errors())
-        return " or ".join(dict.fromkeys(said))
+        wanted = (issue["msg"].removeprefix("Input should be ") for issue in error.errors())
+        return " or ".join(dict.fromkeys(wanted))
     return ""
 
 
@@ -206,7 +206,7 @@ def choices_of(hint: Any) -> tuple[object, ...]:
     if get_origin(hint) is Literal:
         return inner
     if get_origin(hint) in (Union, types.UnionType):
-        return tuple(value for one in inner for value in choices_of(one))
+        return tuple(value for argument in inner for value in choices_of(argument))
     return ()
 
 

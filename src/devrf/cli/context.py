@@ -99,14 +99,14 @@ class RunContext:
         left = tuple(name for name in names if name in known)
         if left:
             return left
-        what = f"{self.scene.name} is at rest: all its images show one moment"
+        at_rest = f"{self.scene.name} is at rest: all its images show one moment"
         if known:
             raise DevrfError(
-                f"stage={names[0]}: learns motion, but {what}; use stage={known[0]} or "
+                f"stage={names[0]}: learns motion, but {at_rest}; use stage={known[0]} or "
                 "stage=pipeline"
             )
         raise DevrfError(
-            f"protocol={self.protocol.name}: learns from images in motion, but {what}; use "
+            f"protocol={self.protocol.name}: learns from images in motion, but {at_rest}; use "
             "protocol=two_stage"
         )
 
@@ -224,13 +224,13 @@ class RunContext:
                 raise DevrfError(f"{self.config.ckpt}: no such checkpoint; set ckpt to a file")
             return Path(self.config.ckpt)
         names = self.learning_stages[::-1] if name is None else (name,)
-        found = [path for path in map(self.own_checkpoint, names) if path.exists()]
-        if not found:
+        paths = [path for path in map(self.own_checkpoint, names) if path.exists()]
+        if not paths:
             raise DevrfError(
                 f"{self.own_checkpoint(names[-1])}: no such checkpoint; run stage={names[-1]} "
                 "first, or give ckpt=PATH"
             )
-        return found[0]
+        return paths[0]
 
     def load(self, name: str | None = None, *, unread: bool = False) -> LoadedCheckpoint:
         """Load :meth:`checkpoint`; one that builds on another than the run's is passed over.
@@ -242,8 +242,8 @@ class RunContext:
         if self.config.ckpt is None and loaded.metadata.stage in self.learning_stages:
             below = self.protocol[loaded.metadata.stage].builds_on
             rest = loaded.metadata.training_config.get(OWN_REST)
-            own = None if below is None else self.own_checkpoint(below)
-            if rest and own is not None and own.is_file() and digest_of(own) != rest:
+            base = None if below is None else self.own_checkpoint(below)
+            if rest and base is not None and base.is_file() and digest_of(base) != rest:
                 log.info("%s: left out, it belongs to another %s.ckpt than the run's", path, below)
-                return load_checkpoint(own, scene)
+                return load_checkpoint(base, scene)
         return loaded

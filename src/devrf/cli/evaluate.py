@@ -79,19 +79,19 @@ def _tell(
 ) -> None:
     """Log the scores and give them to the trackers, those of some times as further sections."""
     plain = {
-        name: {k: v for k, v in own.items() if k not in OF_TIMES} for name, own in sections.items()
+        name: {k: v for k, v in row.items() if k not in OF_TIMES} for name, row in sections.items()
     }
     dynamic = sections.get("dynamic", {})
     of_times = {name: dynamic[name] for name in OF_TIMES if name in dynamic}
     shown = {name: plain[name] for name in frames} | of_times
     scores: dict[str, Any] = {}  # training curves have their names without "test/"
-    for section, own in (plain | shown).items():
-        scores |= {f"test/{section}/{k}": v for k, v in own.items() if v is not None}
+    for section, row in (plain | shown).items():
+        scores |= {f"test/{section}/{k}": v for k, v in row.items() if v is not None}
     for name, values in shown.items():
         log.info("%s: %s", name.replace("_", " "), in_words(values))
     for tracker in run.trackers:
         tracker.conclude(scores)
-        tracker.show_table("metrics", [{"section": name, **own} for name, own in shown.items()])
+        tracker.show_table("metrics", [{"section": name, **row} for name, row in shown.items()])
         tracker.show_table("frames", frame_rows(frames))
 
 
@@ -105,9 +105,9 @@ def _origin(run: RunContext, described: CheckpointMetadata) -> dict[str, Any]:
     for of_stage in (*described.earlier_configs.values(), described.training_config):
         settings |= of_stage
     frames = scene.clock.frames_of(scene.dynamic.train.times)
-    own = {name: records.get(name, {}) for name in run.stages_with_images}
-    learned = {name: record.get("wall_seconds") for name, record in own.items()}
-    execution = {name: {key: record.get(key) for key in EXECUTION} for name, record in own.items()}
+    stages = {name: records.get(name, {}) for name in run.stages_with_images}
+    learned = {name: record.get("wall_seconds") for name, record in stages.items()}
+    execution = {n: {key: record.get(key) for key in EXECUTION} for n, record in stages.items()}
     return {
         "choices": choices(),
         "overrides": overrides(),

@@ -70,7 +70,7 @@ def entry() -> None:
                 name_failures(error)
                 raise
     except Interrupted as stop:
-        print(f"devrf: {stop.said}", file=sys.stderr)
+        print(f"devrf: {stop.message}", file=sys.stderr)
         raise
     except KeyboardInterrupt:  # raised by another library's handler of Ctrl-C
         print("devrf: interrupted", file=sys.stderr)
@@ -105,15 +105,15 @@ def _run(config: DictConfig, folder: Path, key: str) -> float | None:
 main = hydra.main(config_path=str(config_folder()), config_name="config", version_base="1.3")(run)
 
 
-def _complete_in_bash(asked: Sequence[str]) -> bool:
+def _complete_in_bash(words: Sequence[str]) -> bool:
     """Answer ``install=bash``, ``uninstall=bash`` or ``query=bash``; other shells are Hydra's."""
-    if "query=bash" in asked:
+    if "query=bash" in words:
         print("\n".join(candidates(os.environ.get("COMP_LINE", ""))))
-    elif "install=bash" in asked:
+    elif "install=bash" in words:
         print(INSTALL.format(python=sys.executable), end="")
-    elif "uninstall=bash" in asked:
+    elif "uninstall=bash" in words:
         print(UNINSTALL, end="")
-    return bool(asked) and asked[0].endswith("=bash")
+    return bool(words) and words[0].endswith("=bash")
 
 
 def candidates(line: str) -> list[str]:

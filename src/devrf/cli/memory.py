@@ -59,7 +59,7 @@ def check_memory(run: RunContext, names: Sequence[str]) -> str:
     on_gpu = run.device.type == "cuda"
     host = host_bytes(run.scene, stages, on_host=not on_gpu)
     host *= 1 if on_gpu else int(getattr(run.strategy, "num_processes", 1))
-    disk = FILES * max(one.learned for one in stages)
+    disk = FILES * max(stage_needs.learned for stage_needs in stages)
     room = free_disk(run.folder)
     if run.config.resume:  # what is there is replaced
         room += sum(file.stat().st_size for file in run.folder.glob("checkpoints/*.ckpt"))
@@ -69,19 +69,19 @@ def check_memory(run: RunContext, names: Sequence[str]) -> str:
         ("disk", disk, disk, room),
     ]
     if on_gpu:
-        least = stage.peak(MicroBatching.MOST)
-        compared.insert(0, ("GPU memory", stage.peak(), least, free_memory(run.device)))
-    said = ", ".join(f"{gib(n)} of {gib(there)} GiB of {what}" for what, n, _, there in compared)
-    for what, _, least, there in compared:
-        if least > there:
+        minimum = stage.peak(MicroBatching.MOST)
+        compared.insert(0, ("GPU memory", stage.peak(), minimum, free_memory(run.device)))
+    summary = ", ".join(f"{gib(n)} of {gib(free)} GiB of {name}" for name, n, _, free in compared)
+    for resource, _, minimum, free in compared:
+        if minimum > free:
             key, part = max(stage.parts.items(), key=lambda item: item[1])
-            share = 1 - (1 - there / least) * stage.peak() / part
+            share = 1 - (1 - free / minimum) * stage.peak() / part
             raise DevrfError(
-                f"{key}: the run needs about {said}; it would end for lack of {what}: give "
+                f"{key}: the run needs about {summary}; it would end for lack of {resource}: give "
                 f"{_smaller(run, key, share)}, or try all the same with memory_check=false"
             )
-    split = any(needed > there for _, needed, _, there in compared)
-    return f"needs about {said}{'; batches will be split, slower' if split else ''}"
+    split = any(needed > free for _, needed, _, free in compared)
+    return f"needs about {summary}{'; batches will be split, slower' if split else ''}"
 
 
 def _smaller(run: RunContext, key: str, share: float) -> str:

@@ -77,9 +77,9 @@ def _own_error(error: BaseException) -> DevrfError | None:
 
 def one_line(error: BaseException) -> str:
     """The error's message on one line that begins with the key or file at fault."""
-    own = _own_error(error)
-    if own is not None:
-        text = str(own)
+    known_error = _own_error(error)
+    if known_error is not None:
+        text = str(known_error)
     elif isinstance(error, MissingConfigException):
         text = _missing_option(error)
     elif isinstance(error, OverrideParseException):
@@ -132,11 +132,11 @@ def _of_hydra(error: BaseException) -> str:
         near = getattr(error.__cause__, "parent_node", None)
         return str(unknown_key(unknown.group(1), near or ()))
     if text.startswith("Error in call to target") and error.__cause__ is not None:
-        said = str(error.__cause__)
+        detail = str(error.__cause__)
     else:  # without the lines that OmegaConf adds on its types
-        said = re.sub(r"(?m)^\s*(full_key:|object_type=|reference_type=).*$", "", text)
+        detail = re.sub(r"(?m)^\s*(full_key:|object_type=|reference_type=).*$", "", text)
     key = re.search(r"^\s*full_key: (\S+)$", text, re.MULTILINE)
-    return f"{key.group(1)}: {said}" if key else said
+    return f"{key.group(1)}: {detail}" if key else detail
 
 
 def in_quotes(text: str) -> str:

@@ -116,9 +116,9 @@ def selfcheck(run: RunContext) -> None:
         raise DevrfError("trainer: stage=selfcheck checks one device; leave out trainer=ddp")
     results = []
     run_checks = instantiate(run.config.selfcheck, _convert_="all")
-    for name, verdict, said in run_checks(run.device, run.config.seed):
-        log.info("%s  %s: %s", verdict, name, said)
-        results.append({"name": name, "verdict": verdict, "said": said})
+    for name, verdict, detail in run_checks(run.device, run.config.seed):
+        log.info("%s  %s: %s", verdict, name, detail)
+        results.append({"name": name, "verdict": verdict, "said": detail})
         # After each, so that the file is there whatever ends the run.
         write_json(run.folder / "selfcheck.json", {"checks": results})
     failed = [result["name"] for result in results if result["verdict"] == "failed"]

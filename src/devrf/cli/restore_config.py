@@ -58,8 +58,8 @@ def values(overrides: Sequence[Override], key: str) -> list[str]:
 
 def value(overrides: Sequence[Override], key: str) -> str | None:
     """The last value of ``key``; None where there is none, or several."""
-    found = values(overrides, key)
-    return found[0] if len(found) == 1 else None
+    texts = values(overrides, key)
+    return texts[0] if len(texts) == 1 else None
 
 
 def recorded(overrides: Iterable[str]) -> list[str]:
@@ -70,7 +70,7 @@ def recorded(overrides: Iterable[str]) -> list[str]:
     Raises:
         HydraException: an override is not understood.
     """
-    kept = []
+    lasting = []
     for override in parsed(overrides):
         key, text = override.key_or_group, str(override.input_line)
         if _root(key) in OF_A_COMMAND or CODE in text:
@@ -78,8 +78,8 @@ def recorded(overrides: Iterable[str]) -> list[str]:
         path = None if override.is_delete() else override.value()
         if key in RELATIVE and isinstance(path, str) and "${" not in path:
             text = f"{key}={in_quotes(str(Path(path).expanduser().absolute()))}"
-        kept.append(text)
-    return kept
+        lasting.append(text)
+    return lasting
 
 
 def _root(key: str) -> str:

@@ -62,11 +62,11 @@ class ResumePoint:
 
 def deciding_settings(config: DictConfig, stage: str) -> dict[str, Any]:
     """The settings that decide what a stage learns, by the key at which the user sets them."""
-    own = (stage,) if stage in config else ("ray_stage", "protocol")
-    parts = {key: OmegaConf.to_container(config[key], resolve=False) for key in ("data", *own)}
-    found = dict(_values(config, parts, ""))
-    found.update(method=config.method, seed=config.seed)
-    return {key: found[key] for key in sorted(found)}
+    sections = (stage,) if stage in config else ("ray_stage", "protocol")
+    parts = {key: OmegaConf.to_container(config[key], resolve=False) for key in ("data", *sections)}
+    settings = dict(_values(config, parts, ""))
+    settings.update(method=config.method, seed=config.seed)
+    return {key: settings[key] for key in sorted(settings)}
 
 
 def _values(config: DictConfig, raw: Mapping[Any, Any], path: str) -> Iterator[tuple[str, Any]]:

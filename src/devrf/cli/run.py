@@ -123,10 +123,10 @@ def run_stage(config: DictConfig, folder: Path) -> float | None:
     return _ended(run, steps) if "evaluate" in steps and run.leads else None
 
 
-def _prepare_to_learn(run: RunContext, asked: Names, steps: Names) -> None:
+def _prepare_to_learn(run: RunContext, requested: Names, steps: Names) -> None:
     """Look at scene, memory and what earlier commands left, before anything is learned."""
-    learning = run.learnable(asked)
-    if learning != asked:
+    learning = run.learnable(requested)
+    if learning != requested:
         left = ", ".join(learning + steps)
         log.info("%s is at rest: %s; no motion is learned", run.scene.name, left)
     resume = run.config.resume

@@ -72,7 +72,7 @@ def forget_failure(folder: Path) -> None:
 def _record(error: Exception, config: DictConfig, folder: Path) -> None:
     """Report why a job failed: in its folder, and in one line on stderr."""
     user_error, where, scene = is_user_error(error), "", None
-    said = one_line(error) if user_error else f"{type(error).__name__}: {one_line(error)}"
+    message = one_line(error) if user_error else f"{type(error).__name__}: {one_line(error)}"
     with suppress(OmegaConfBaseException):
         scene = str(config.scene)
     failure = {
@@ -80,7 +80,7 @@ def _record(error: Exception, config: DictConfig, folder: Path) -> None:
         "choices": choices(),
         "overrides": overrides(),
         "seed": config.get("seed"),
-        "error": said,
+        "error": message,
         "mistake": user_error,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
     }
@@ -93,7 +93,7 @@ def _record(error: Exception, config: DictConfig, folder: Path) -> None:
             if isinstance(handler, logging.FileHandler):
                 handler.handle(record)
         where = f"; the traceback is in {folder / 'run.log'}"
-    print(f"devrf: job {folder.name}: {said}{where}", file=sys.stderr)
+    print(f"devrf: job {folder.name}: {message}{where}", file=sys.stderr)
 
 
 class SweepMonitor(Callback):

@@ -62,7 +62,7 @@ def _fit(run: RunContext, stage: ScheduledStage, begin: ResumePoint) -> None:
         _ = run.scene  # errors in it come before a logger writes files
     stage.training_config = begin.training_config
     callbacks = [*instantiate(run.config.callbacks).values(), TrainingRecord()]
-    saving = next((one for one in callbacks if isinstance(one, PeriodicCheckpoint)), None)
+    saving = next((hook for hook in callbacks if isinstance(hook, PeriodicCheckpoint)), None)
     if saving is None:  # no periodic files, but still one at a signal
         saving = PeriodicCheckpoint(run.folder / "checkpoints", every_seconds=math.inf)
         callbacks.append(saving)
@@ -83,11 +83,11 @@ def _fit(run: RunContext, stage: ScheduledStage, begin: ResumePoint) -> None:
         path = begin.progress and str(begin.progress)
         trainer.fit(stage, datamodule=run.datamodule, ckpt_path=path)
         strategy = trainer.strategy
-        asked = strategy.reduce_boolean_decision(stop.number is not None, all=False)
-        if run.leads and (not asked or stage.iteration >= stage.total_iterations):
+        stopping = strategy.reduce_boolean_decision(stop.number is not None, all=False)
+        if run.leads and (not stopping or stage.iteration >= stage.total_iterations):
             _keep(run, trainer, stage)
         strategy.barrier("the checkpoint is written")
-    if asked:
+    if stopping:
         raise Interrupted(stop.number or signal.SIGTERM, _where(stage, saving))
 
 
@@ -102,9 +102,9 @@ def _keep(run: RunContext, trainer: Trainer, stage: ScheduledStage) -> None:
             OmegaConf.save(run.config, partial, resolve=True)
     except OSError as error:
         left = progress_files(path.parent, stage.name)
-        kept = f"the last good progress file stays ({left[0].name}); " if left else ""
+        stays = f"the last good progress file stays ({left[0].name}); " if left else ""
         raise DevrfError(
-            f"{error.filename or path}: {error.strerror}; {kept}make it possible to write there, "
+            f"{error.filename or path}: {error.strerror}; {stays}make it possible to write there, "
             "and run the same command again"
         ) from error
     if stage.iteration >= stage.total_iterations:

@@ -109,9 +109,9 @@ class Pixels:
 
     def between(self, start: int, stop: int) -> Pixels:
         """The pixels from ``start`` up to ``stop``, sharing memory."""
-        kept = slice(start, stop)
-        behind = self.background if self.background.dim() == 1 else self.background[kept]
-        return Pixels(self.image[kept], self.flat[kept], behind)
+        part = slice(start, stop)
+        behind = self.background if self.background.dim() == 1 else self.background[part]
+        return Pixels(self.image[part], self.flat[part], behind)
 
     def clone(self) -> Pixels:
         """The same pixels in other memory; a plain background is shared."""
@@ -173,21 +173,21 @@ def concatenated(batches: Sequence[RayBatch]) -> RayBatch:
 
     Images that have no alpha mask count as opaque beside images that have one.
     """
-    alphas = [one.alpha for one in batches]
+    alphas = [batch.alpha for batch in batches]
     alpha = None
     if any(a is not None for a in alphas):
         alpha = torch.cat(
             [torch.ones_like(b.time) if b.alpha is None else b.alpha for b in batches]
         )
     return RayBatch(
-        rays=Rays.joined([one.rays for one in batches]),
-        color=torch.cat([one.color for one in batches]),
+        rays=Rays.joined([batch.rays for batch in batches]),
+        color=torch.cat([batch.color for batch in batches]),
         alpha=alpha,
-        background=torch.cat([one.background.expand(len(one.rays), 3) for one in batches]),
-        time=torch.cat([one.time for one in batches]),
-        frame=torch.cat([one.frame for one in batches]),
-        image=torch.cat([one.image for one in batches]),
-        pixel=torch.cat([one.pixel for one in batches]),
+        background=torch.cat([batch.background.expand(len(batch.rays), 3) for batch in batches]),
+        time=torch.cat([batch.time for batch in batches]),
+        frame=torch.cat([batch.frame for batch in batches]),
+        image=torch.cat([batch.image for batch in batches]),
+        pixel=torch.cat([batch.pixel for batch in batches]),
         flow=None,
         flow_valid=None,
     )

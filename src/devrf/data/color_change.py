@@ -86,19 +86,19 @@ def _change(views: Views, chain: list[int]) -> float | None:
     height, width = views.height, views.width
     x, y = torch.arange(width) + 0.5, torch.arange(height) + 0.5
     start = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
-    place, kept = start, _inside(views, chain[0])
+    place, usable = start, _inside(views, chain[0])
     for image, earlier in zip(chain, chain[1:], strict=False):
         valid = views.flow.valid[image]
         vectors = torch.where(valid[..., None], views.flow.vectors[image], 0.0)
-        kept = kept & (_look_up(valid[None].float(), place)[0] > 0.999)
+        usable = usable & (_look_up(valid[None].float(), place)[0] > 0.999)
         place = place + _look_up(vectors.permute(2, 0, 1), place).permute(1, 2, 0)
-        kept = kept & (_look_up(_inside(views, earlier)[None].float(), place)[0] > 0.999)
+        usable = usable & (_look_up(_inside(views, earlier)[None].float(), place)[0] > 0.999)
     if not views.has_alpha:
-        kept = kept & ((place - start).norm(dim=-1) > 0.5)
-    if int(kept.sum()) < MARGIN**2:
+        usable = usable & ((place - start).norm(dim=-1) > 0.5)
+    if int(usable.sum()) < MARGIN**2:
         return None
     now, before = _smooth(views, chain[0]), _smooth(views, chain[-1])
-    return float((_look_up(before, place) - now).abs()[:, kept].mean())
+    return float((_look_up(before, place) - now).abs()[:, usable].mean())
 
 
 def _inside(views: Views, image: int) -> Tensor:

@@ -83,8 +83,8 @@ class SceneDataModule(LightningDataModule, ABC):
         """The training views of ``capture`` on ``device``, moved there at the first call."""
         key = (capture, device)
         if key not in self._on_device:
-            kept = set(self._captures) if self.trainer is not None else {capture}
-            self._on_device = {k: v for k, v in self._on_device.items() if k[0] in kept}
+            needed = set(self._captures) if self.trainer is not None else {capture}
+            self._on_device = {k: v for k, v in self._on_device.items() if k[0] in needed}
             self._on_device[key] = self.scene.capture(capture).train.to(device)
         return self._on_device[key]
 

@@ -106,5 +106,5 @@ def recognised_datamodule(root: str | Path, **options: Any) -> RecordedDataModul
     Raises:
         DevrfError: the layout is unknown, or its reader has no such option.
     """
-    given = {name: value for name, value in options.items() if value is not None}
-    return RecordedDataModule(READERS[recognise(root).choice], root, **given)
+    reader_options = {name: value for name, value in options.items() if value is not None}
+    return RecordedDataModule(READERS[recognise(root).choice], root, **reader_options)

@@ -38,7 +38,7 @@ def gather_batch(
     """
     assert views.frames is not None, "views of a scene know their frames"
     cameras, flow = views.cameras, views.flow
-    found = gather_pixels(
+    gathered = gather_pixels(
         image,
         flat,
         views.pixels,
@@ -51,16 +51,16 @@ def gather_batch(
         None if flow is None else (flow.vectors, flow.valid),
     )
     return RayBatch(
-        rays=space.rays(Rays(found.origins, found.directions, found.directions)),
-        color=found.color,
-        alpha=found.alpha,
+        rays=space.rays(Rays(gathered.origins, gathered.directions, gathered.directions)),
+        color=gathered.color,
+        alpha=gathered.alpha,
         background=background,
-        time=found.time,
-        frame=found.frame,
+        time=gathered.time,
+        frame=gathered.frame,
         image=image,
-        pixel=found.pixel,
-        flow=found.flow,
-        flow_valid=found.flow_valid,
+        pixel=gathered.pixel,
+        flow=gathered.flow,
+        flow_valid=gathered.flow_valid,
     )
 
 
@@ -134,7 +134,7 @@ def rays_hit_occupied(
     """
     width, height = (-(-size // BLOCK) for size in (cameras.width, cameras.height))
     coarse = cameras.resized(width, height)
-    pixels, found = coarse.pixel_grid(), []
+    pixels, masks = coarse.pixel_grid(), []
     near, far = model.depth_limits
     together = ON_GPU if images.is_cuda else ON_CPU
     for start in range(0, len(images), together):
@@ -142,8 +142,8 @@ def rays_hit_occupied(
         rays = coarse.rays(some.repeat_interleave(len(pixels)), pixels.repeat(len(some), 1))
         hit = hits(model.space.rays(rays), model.box, occupancy, near=near, far=far)
         rows = hit.view(-1, height, width).repeat_interleave(BLOCK, dim=1)[:, : cameras.height]
-        found.append(rows.repeat_interleave(BLOCK, dim=2)[:, :, : cameras.width].flatten(1))
-    return torch.cat(found)
+        masks.append(rows.repeat_interleave(BLOCK, dim=2)[:, :, : cameras.width].flatten(1))
+    return torch.cat(masks)
 
 
 def static_pool(views: Views, model: Viewable, occupancy: Occupancy | None) -> PixelPool:

@@ -138,10 +138,10 @@ def _reached_points(gradients: Sequence[Tensor]) -> list[Tensor]:
     """For each (X, Y, Z, C) the points, counted along the grid, at which any process has values."""
     if not gradients:
         return []
-    own = [(gradient != 0).any(dim=-1).view(-1) for gradient in gradients]
-    anywhere = torch.cat(own).to(torch.uint8)
+    reached_here = [(gradient != 0).any(dim=-1).view(-1) for gradient in gradients]
+    anywhere = torch.cat(reached_here).to(torch.uint8)
     distributed.all_reduce(anywhere, distributed.ReduceOp.MAX)
-    parts = torch.split(anywhere, [len(reached) for reached in own])
+    parts = torch.split(anywhere, [len(reached) for reached in reached_here])
     return [part.nonzero()[:, 0] for part in parts]
 
 
@@ -149,9 +149,9 @@ def largest(values: Sequence[int], device: torch.device) -> list[int]:
     """For each value, as many in each process, the largest of all; waits for the others."""
     if world_size() == 1:
         return list(values)
-    most = torch.tensor(values, dtype=torch.int64, device=device)
-    distributed.all_reduce(most, distributed.ReduceOp.MAX)
-    return [int(value) for value in most.tolist()]
+    maxima = torch.tensor(values, dtype=torch.int64, device=device)
+    distributed.all_reduce(maxima, distributed.ReduceOp.MAX)
+    return [int(value) for value in maxima.tolist()]
 
 
 def average(values: Tensor) -> Tensor:
@@ -184,10 +184,10 @@ def assert_replicas_equal(tensors: Mapping[str, Tensor]) -> None:
     """
     if world_size() == 1:
         return
-    own = {name: _checksum(tensor) for name, tensor in tensors.items()}
+    sums = {name: _checksum(tensor) for name, tensor in tensors.items()}
     everyone: list[Any] = [None] * world_size()
-    distributed.all_gather_object(everyone, own)
-    differing = sorted({name for other in everyone for name, _ in other.items() ^ own.items()})
+    distributed.all_gather_object(everyone, sums)
+    differing = sorted({name for other in everyone for name, _ in other.items() ^ sums.items()})
     if differing:
         raise DevrfError(
             f"trainer: the processes have learned different fields ({', '.join(differing)}); give "

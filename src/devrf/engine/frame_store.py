@@ -212,10 +212,10 @@ class FrameStore(nn.Module):
 
     def reserve(self, shape: Shape) -> None:
         """Lock memory for :meth:`resize` to ``shape`` now: for gigabytes it takes seconds."""
-        kept = self.to_time
-        if self.on_host and torch.cuda.is_available() and kept.shape[1:4] != shape:
-            whole = (len(kept), *shape, 3)
-            self._reserved = [self._empty(whole, kept.dtype) for _ in NAMES]
+        frames = self.to_time
+        if self.on_host and torch.cuda.is_available() and frames.shape[1:4] != shape:
+            whole = (len(frames), *shape, 3)
+            self._reserved = [self._empty(whole, frames.dtype) for _ in NAMES]
 
     def _empty(self, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
         """An uninitialised tensor where displacements are kept."""
@@ -232,8 +232,8 @@ class FrameStore(nn.Module):
         return torch.empty(shape, dtype=dtype)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> FrameStore:
-        kept = NAMES if self.on_host else ()
-        frames = {name: self._buffers.pop(name) for name in kept}
+        names = NAMES if self.on_host else ()
+        frames = {name: self._buffers.pop(name) for name in names}
         super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
         self._buffers.update(frames)
         return self
@@ -257,5 +257,5 @@ def fits_on_device(free: int, frames: int, shape: Shape, *, half: bool, parallel
     """Whether T ``frames``, ``parallel`` of them active, fit into ``free`` bytes of a GPU."""
     x, y, z = shape
     grid = x * y * z * DISPLACEMENT
-    kept = 2 * frames * grid // (2 if half else 1)
-    return kept + parallel * ACTIVE_GRIDS * grid <= FRAMES_SHARE * free
+    stored = 2 * frames * grid // (2 if half else 1)
+    return stored + parallel * ACTIVE_GRIDS * grid <= FRAMES_SHARE * free

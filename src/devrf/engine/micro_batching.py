@@ -62,9 +62,9 @@ class MicroBatching:
                 capturing = device.type == "cuda" and torch.cuda.is_current_stream_capturing()
                 if capturing or not is_oom(error):
                     raise
-                said = str(error)
+                message = str(error)
             # Outside the handler, where the error's traceback no longer holds tensors.
-            self._divide(said, device, len(pixels))
+            self._divide(message, device, len(pixels))
             divided()
             free_cache(device)
 
@@ -83,18 +83,18 @@ class MicroBatching:
                 sums[name] = sums[name] + value if name in sums else value
         return sums.pop(""), sums
 
-    def _divide(self, said: str, device: torch.device, rays: int) -> None:
-        """Double ``count``, if there are enough rays; ``said`` is the allocator's message."""
+    def _divide(self, message: str, device: torch.device, rays: int) -> None:
+        """Double ``count``, if there are enough rays; ``message`` is the allocator's message."""
         if world_size() > 1:
             # The other processes already wait for this one's gradients.
             raise DevrfError(
                 f"schedule: one of {world_size()} processes is out of memory "
-                f"({numbers(said, device)}); fewer rays, smaller grids or more processes"
+                f"({numbers(message, device)}); fewer rays, smaller grids or more processes"
             )
         if self.count >= min(self.MOST, rays):
-            raise OutOfMemoryError(f"out of memory ({numbers(said, device)})")
+            raise OutOfMemoryError(f"out of memory ({numbers(message, device)})")
         self.count *= 2
         log.warning(
             "out of memory (%s): batches are split into %d micro-batches from now on",
-            *(numbers(said, device), self.count),
+            *(numbers(message, device), self.count),
         )

@@ -231,11 +231,11 @@ class ScheduledStage(Learner):
             self._log(means)
         return means
 
-    def _iterate(self, views: Any, most: int) -> None:
-        """Run a step's iterations, no more than ``most``; abort if memory runs out."""
+    def _iterate(self, views: Any, limit: int) -> None:
+        """Run a step's iterations, no more than ``limit``; abort if memory runs out."""
         optimizer = self.optimizers()
         assert isinstance(optimizer, LightningOptimizer)
-        count = min(self.iterations_per_step, most)
+        count = min(self.iterations_per_step, limit)
         if self.trainer.max_steps > 0:
             count = min(count, self.trainer.max_steps - self.trainer.global_step)
         for _ in range(count):

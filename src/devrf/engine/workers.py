@@ -168,8 +168,8 @@ def _failure(error: ProcessException) -> Exception:
             f"{error.signal_name or f'exit status {error.exit_code}'}; was memory short?"
         )
     last = error.msg.rstrip().rpartition("\n")[2]
-    _, own, line = last.partition(f"{DevrfError.__module__}.{DevrfError.__name__}: ")
-    return DevrfError(line) if own else RuntimeError(error.msg)
+    _, is_devrf_error, line = last.partition(f"{DevrfError.__module__}.{DevrfError.__name__}: ")
+    return DevrfError(line) if is_devrf_error else RuntimeError(error.msg)
 
 
 def _take_part(index: int, work: Work, arguments: Sequence[Any]) -> None:

@@ -44,8 +44,8 @@ class HeldOutView:
     @property
     def scores(self) -> dict[str, float | None]:
         """Every metric by name."""
-        own = {"psnr": self.psnr, "ssim": self.ssim, "rest_pose_psnr": self.rest_pose_psnr}
-        return {**own, **self.further}
+        metrics = {"psnr": self.psnr, "ssim": self.ssim, "rest_pose_psnr": self.rest_pose_psnr}
+        return {**metrics, **self.further}
 
 
 def score(
@@ -69,18 +69,18 @@ def score(
     time = own_time if time is None else time
     truth = truth_image(views, index, background)
     behind = background_value(background)
-    seen = renderer.view(views.cameras, index, time, behind)
-    prediction = _image(seen, views)
+    rendered = renderer.view(views.cameras, index, time, behind)
+    prediction = _image(rendered, views)
     rest = prediction
     if not renderer.at(time).at_rest:
         rest = _image(renderer.view(views.cameras, index, 0.0, behind), views)
     valid_mask = views.valid_mask_of(index)
     compared, rest = (compare(image, truth, valid_mask) for image in (prediction, rest))
     further: dict[str, float | None] = {}
-    opacity = seen.opacity.cpu().view(truth.shape[:2])
+    opacity = rendered.opacity.cpu().view(truth.shape[:2])
     if suite is not None and suite.metrics:
         rays = views.cameras.image_rays(index)
-        points = points_at_depth(renderer.model.space, rays, seen.depth.cpu())
+        points = points_at_depth(renderer.model.space, rays, rendered.depth.cpu())
         distance = (points - rays.origins).norm(dim=1).view(truth.shape[:2])
         further = suite.scores(
             MetricInput(renderer, views, index, compared, truth, distance, opacity, suite.lpips)
@@ -95,7 +95,7 @@ def score(
         rest_pose_psnr=_psnr(rest, truth, valid_mask),
         further=further,
         compared=compared,
-        depth=seen.depth.cpu().view(truth.shape[:2]),
+        depth=rendered.depth.cpu().view(truth.shape[:2]),
         opacity=opacity,
     )
 
@@ -138,5 +138,5 @@ def background_value(background: Background) -> float:
     return 0.0 if background == "black" else 1.0
 
 
-def _image(seen: RenderedImage, views: Views) -> Tensor:
-    return seen.color.view(views.height, views.width, 3).clamp(0, 1).cpu()
+def _image(image: RenderedImage, views: Views) -> Tensor:
+    return image.color.view(views.height, views.width, 3).clamp(0, 1).cpu()

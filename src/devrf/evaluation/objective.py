@@ -33,12 +33,12 @@ def check_objective(key: str, metrics: Sequence[str]) -> None:
         )
 
 
-def objective(key: str, found: Mapping[str, Any]) -> float | None:
+def objective(key: str, metrics: Mapping[str, Any]) -> float | None:
     """The number ``key`` of metrics.json; None where it could not be measured.
 
     The static section stands in for a missing dynamic one.
     """
     section, _, name = key.partition(".")
     section = "static" if section in STATIC else "dynamic"
-    value: float | None = found.get(section, found["static"]).get(name)
+    value: float | None = metrics.get(section, metrics["static"]).get(name)
     return value

@@ -187,7 +187,7 @@ class RayTrainable(Renderable):
 
         A method may add ``rate`` to a group: a factor of the configured learning rate.
         """
-        parts = {n: [p for p in own if p.requires_grad] for n, own in self.parts().items()}
+        parts = {n: [p for p in group if p.requires_grad] for n, group in self.parts().items()}
         return [{"name": name, "params": free} for name, free in parts.items() if free]
 
     def freeze(self, parts: Sequence[str]) -> None:
@@ -199,14 +199,14 @@ class RayTrainable(Renderable):
         Raises:
             DevrfError: the method has no such part.
         """
-        own, frozen = self.parts(), set[str]()
+        parts_by_name, frozen = self.parts(), set[str]()
         for name in parts:
-            matching = fnmatch.filter(own, name)
+            matching = fnmatch.filter(parts_by_name, name)
             if not matching:
-                known = ", ".join(own)
+                known = ", ".join(parts_by_name)
                 raise DevrfError(f"protocol: {self.name} has no part {name!r}; it has {known}")
             frozen.update(matching)
-        for name, parameters in own.items():
+        for name, parameters in parts_by_name.items():
             for parameter in parameters:
                 parameter.requires_grad_(name not in frozen)
 

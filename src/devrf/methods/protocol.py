@@ -65,8 +65,8 @@ class Protocol:
         expect(0 < share < 1, "protocol.static_share", "between 0 and 1", share)
         try:
             steps = tuple(
-                self._frozen_as_asked(ProtocolStage(name, **given))
-                for name, given in self.stages.items()
+                self._frozen_as_asked(ProtocolStage(name, **settings))
+                for name, settings in self.stages.items()
             )
         except TypeError as error:
             raise DevrfError(f"protocol.stages: {error}") from None

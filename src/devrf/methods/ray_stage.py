@@ -153,7 +153,7 @@ class RayStage(ScheduledStage):
         self.phase = phase
         static = [self.training_views("static")] if self.capture != "dynamic" else []
         views = static + ([self.training_views("dynamic")] if self.capture != "static" else [])
-        self.pools = [FramePool.of(one) for one in views]
+        self.pools = [FramePool.of(view_set) for view_set in views]
         self.scene_model.learn_from(views, self.weights)
         groups = self.optimizer.param_groups
         fewer = self.schedule.rays_without_hull
@@ -213,18 +213,18 @@ class RayStage(ScheduledStage):
     def _gather(self, views: Views | tuple[Views, ...], pixels: Pixels) -> RayBatch:
         """The batch of pixels, in the order of their images' captures."""
         space, parts, offset = self.scene_model.space, [], 0
-        for one in views if isinstance(views, tuple) else (views,):
-            own = (pixels.image >= offset) & (pixels.image < offset + len(one))
-            place, background = own.nonzero()[:, 0], pixels.background
+        for view_set in views if isinstance(views, tuple) else (views,):
+            in_capture = (pixels.image >= offset) & (pixels.image < offset + len(view_set))
+            place, background = in_capture.nonzero()[:, 0], pixels.background
             part = gather_batch(
-                one,
+                view_set,
                 pixels.image[place] - offset,
                 pixels.flat[place],
                 background if background.dim() == 1 else background[place],
                 space,
             )
             parts.append(replace(part, image=pixels.image[place]))
-            offset += len(one)
+            offset += len(view_set)
         return parts[0] if len(parts) == 1 else concatenated(parts)
 
     def restore(self, phase: Phase, state: dict[str, Any]) -> None:

@@ -192,8 +192,8 @@ def read_lpips(network: Network, path: Path) -> Lpips:
         DevrfError: it holds something else, or is not there.
     """
     shipped = files("torchmetrics.functional.image") / "lpips_models" / f"{network}.pth"
-    with as_file(shipped) as own:
-        linear = torch.load(own, map_location="cpu", weights_only=True)
+    with as_file(shipped) as weights_file:
+        linear = torch.load(weights_file, map_location="cpu", weights_only=True)
     heads = [linear[f"lin{number}.model.1.weight"] for number in range(5)]
     try:
         stored = torch.load(path, map_location="cpu", weights_only=True)

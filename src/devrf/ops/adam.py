@@ -113,14 +113,14 @@ class GridAdam(torch.optim.Optimizer):
 
     def _learned(self, group: dict[str, Any]) -> list[Tensor]:
         """The group's parameters that have a gradient, or get one from their total variation."""
-        found = []
+        learned = []
         for parameter in group["params"]:
             if parameter.grad is None:
                 if not group["smoothing"] or group["touched_only"]:
                     continue
                 parameter.grad = torch.zeros_like(parameter)
-            found.append(parameter)
-        return found
+            learned.append(parameter)
+        return learned
 
     def _tensors_of(self, parameter: Tensor) -> tuple[Tensor, ...]:
         """A parameter, its gradient, its two moments and its number of steps."""

@@ -44,9 +44,9 @@ class Draw:
 
     def gradients(self, results: Results, *leaves: Tensor) -> Results:
         """The results, and the gradients of the leaves where random gradients reach them."""
-        kept = [result for result in results if result.requires_grad]
-        upstream = [self(*result.shape) for result in kept]
-        return *results, *torch.autograd.grad(kept, leaves, upstream)
+        differentiable = [result for result in results if result.requires_grad]
+        upstream = [self(*result.shape) for result in differentiable]
+        return *results, *torch.autograd.grad(differentiable, leaves, upstream)
 
 
 class _Box(NamedTuple):
@@ -86,7 +86,7 @@ def compare(case: Case, device: torch.device) -> tuple[float, float]:
         with using(kind), torch.inference_mode(False), torch.enable_grad():
             results.append([result.detach().double() for result in case(Draw(device))])
     tolerance = 5e-4 if case is half_color_network else 1e-4
-    pairs = [(abs(found - true), true.abs()) for true, found in zip(*results, strict=True)]
+    pairs = [(abs(computed - true), true.abs()) for true, computed in zip(*results, strict=True)]
     largest = max(error.max().item() for error, _ in pairs)
     shares = [(error / (tolerance * (1 + true))).max().item() for error, true in pairs]
     # Not a number is too far off.
@@ -135,7 +135,7 @@ def visible_samples(draw: Draw) -> Results:
         directions = torch.nn.functional.normalize(draw(9, 3), dim=1)
         count = (20 * draw(9)).clamp(min=0).long() * 2
         along = 0.5 * draw(9, 3), directions, -1 + 0.1 * draw(9), count
-        found = find_samples(
+        samples = find_samples(
             *(*along, draw(5, 4, 6) > -0.3, 3 * draw(4, 3, 5, 1)),
             slices,
             0.3,
@@ -148,8 +148,8 @@ def visible_samples(draw: Draw) -> Results:
             delta=0.5,
             thresholds=Thresholds(alpha=0.05, stop=0.05, weight=0.1),
         )
-        listed = found.ray, found.distance, found.points, found.significant, found.first
-        results += *listed, found.total
+        listed = samples.ray, samples.distance, samples.points, samples.significant, samples.first
+        results += *listed, samples.total
     return results
 
 
@@ -158,9 +158,9 @@ def selection(draw: Draw) -> Results:
     first = torch.tensor([0, 0, 9, 9, 30]).to(draw.device)
     flags = (draw(40) > 0) & (torch.arange(40, device=draw.device) < 30)
     listed = (4 * draw(40).abs()).long(), draw(40), draw(40, 3), flags, first
-    found = PackedSamples(*listed, total=first[-1], steps=first.diff(), longest=40)
+    packed = PackedSamples(*listed, total=first[-1], steps=first.diff(), longest=40)
     canonical, weight = draw.leaf(40, 3), draw.leaf(40)
-    return draw.gradients(select_listed(found, canonical, weight, 30), canonical, weight)
+    return draw.gradients(select_listed(packed, canonical, weight, 30), canonical, weight)
 
 
 def segments(draw: Draw) -> Results:
@@ -234,11 +234,11 @@ def motion_terms(draw: Draw) -> Results:
         poses[:, 2, 3] += 4
         image = torch.tensor([0, 1, 1, 0, 1, 1]).to(draw.device)
         flow = 3 * draw(6, 2), draw(6) > -0.5, 8 + 8 * draw(6, 2), image, 1 - image[:2]
-        seen = SeenEarlier(*flow, poses, 20 + draw(2, 2), 8 + draw(2, 2))
+        earlier = SeenEarlier(*flow, poses, 20 + draw(2, 2), 8 + draw(2, 2))
         canonical, weight, forward = draw.leaf(90, 3), draw.leaf(90), draw.leaf(4, 3, 5, 3)
         ray, present = (2.99 + 2.99 * draw(90)).long(), torch.arange(90, device=draw.device) < 80
         samples = ListedSamples(draw(90, 3), canonical, weight, ray, present)
-        known = samples, forward, draw(4, 3, 5, 3), None if over_samples is None else seen
+        known = samples, forward, draw(4, 3, 5, 3), None if over_samples is None else earlier
         sums = motion_sum(*known, (10.0, 0.5), box=BOX, over_samples=bool(over_samples), ndc=ndc)
         leaves = (canonical, forward) if over_samples is None else (canonical, forward, weight)
         results += draw.gradients(sums, *leaves)

@@ -75,8 +75,8 @@ def listed_colors(
     suits = multiplied and len(network.hidden_bias) <= WIDEST.get(precision, 0)
     if suits and (kernels := accelerated("color_network", points, viewdirs, *learned)):
         known = points, grid, axes_of(box, grid), viewdirs, network.octaves, ray, first
-        kept = [kept_gradient(leaf) for leaf in learned]
-        colors: Tensor = kernels.listed_colors(*known, precision, kept, *network[:7])
+        accumulated = [kept_gradient(leaf) for leaf in learned]
+        colors: Tensor = kernels.listed_colors(*known, precision, accumulated, *network[:7])
         return colors
     coords = to_grid(points, box, shape_of(grid))
     features = interpolate(grid, coords, gradient=kept_gradient(grid))

@@ -106,11 +106,11 @@ def composite_colors(
             weights, colors, distance, first, transmittance, background
         )
         return image, depth
-    seen = sum_segments(weights, colors, first)
+    weighted_color = sum_segments(weights, colors, first)
     with torch.no_grad():
         along = torch.stack([distance, torch.ones_like(distance)], dim=1)
         reached, mass = sum_segments(weights, along, first).unbind(1)
-    return color_and_depth(seen, reached, mass, transmittance, background)
+    return color_and_depth(weighted_color, reached, mass, transmittance, background)
 
 
 def transmittances(depth: Tensor, ray: Tensor, rays: int) -> Tensor:
@@ -132,18 +132,18 @@ def sum_by_ray(values: Tensor, ray: Tensor, rays: int) -> Tensor:
 
 
 def color_and_depth(
-    seen: Tensor, reached: Tensor, mass: Tensor, transmittance: Tensor, background: Tensor
+    weighted_color: Tensor, reached: Tensor, mass: Tensor, transmittance: Tensor, background: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Colour Σ w_i c_i + T_end · background (R, 3) and depth Σ w_i z_i / Σ w_i (R,) of rays.
 
     Args:
-        seen: (R, 3) Σ w_i c_i.
+        weighted_color: (R, 3) Σ w_i c_i.
         reached: (R,) Σ w_i z_i.
         mass: (R,) Σ w_i; where it is 0, so is the depth.
         transmittance: (R,) T_end.
         background: (3,) or (R, 3) RGB.
     """
-    return seen + transmittance[:, None] * background, reached / mass.clamp(min=1e-6)
+    return weighted_color + transmittance[:, None] * background, reached / mass.clamp(min=1e-6)
 
 
 class _Composite(torch.autograd.Function):
@@ -164,8 +164,8 @@ class _Composite(torch.autograd.Function):
         depth, ray, first, last, transmittance, weights, end = ctx.saved_tensors
         shadowed = _running_sum(grad_weights * weights)
         behind = (shadowed[last][ray] - shadowed[1:]).to(depth.dtype)
-        own = grad_weights * transmittance * torch.exp(-depth)
-        return own - behind - (grad_end * end)[ray], None, None
+        transmitted = grad_weights * transmittance * torch.exp(-depth)
+        return transmitted - behind - (grad_end * end)[ray], None, None
 
 
 def _firsts(ray: Tensor, rays: int) -> Tensor:

@@ -95,7 +95,7 @@ def motion_sum(
     samples: ListedSamples,
     forward: Tensor,
     before: Tensor,
-    seen: SeenEarlier | None,
+    earlier: SeenEarlier | None,
     weights: Sequence[float],
     *,
     box: Corners,
@@ -113,19 +113,19 @@ def motion_sum(
         samples: K samples.
         forward: (X, Y, Z, 3) Δ_f of the frame, in the box's units.
         before: (X, Y, Z, 3) Δ_f of the frame before; it gets no gradient.
-        seen: the flow at the rays' pixels; None: there is none, and the term is 0.
+        earlier: the flow at the rays' pixels; None: there is none, and the term is 0.
         weights: of cycle and flow.
         box: the box of both grids.
         over_samples: whether flow is a mean over samples, else over rays.
         ndc: slopes 2f/W, 2f/H and near plane of the normalised device coordinates that points are
             in; None: they are in world units.
     """
-    floats = *samples[:3], forward, before, *(() if seen is None else (seen.vectors, seen.poses))
+    floats = *samples[:3], forward, before, *((earlier.vectors, earlier.poses) if earlier else ())
     if kernels := accelerated("motion", *floats):
         total, terms = kernels.motion_sum(
             *(samples.canonical, samples.weight, forward),
             (samples.points, samples.ray, samples.present, before, axes_of(box, forward)),
-            *(seen, weights, over_samples, ndc, kept_gradient(forward)),
+            *(earlier, weights, over_samples, ndc, kept_gradient(forward)),
         )
         return MotionSum(total, terms)
     points, q, weight, ray, present = samples
@@ -134,14 +134,14 @@ def motion_sum(
     missed = torch.where(present, cycle_error(points.detach(), returned), 0.0)
     cycle = missed.sum() / present.sum().clamp(min=1)
     flow = cycle.new_zeros(())
-    if seen is not None:
-        kept = present & seen.valid[ray]
-        q = torch.where(kept[:, None], q, 0.0)
+    if earlier is not None:
+        counts_flow = present & earlier.valid[ray]
+        q = torch.where(counts_flow[:, None], q, 0.0)
         moved = q + interpolate(before.detach(), to_grid(q, box, shape_of(before)))
-        found = _project(_to_world(moved, ndc), seen, seen.previous[seen.image[ray]])
-        count = 2 * kept.sum() if over_samples else seen.valid.sum()
-        induced, counted = found - seen.pixel[ray], torch.where(kept, weight, 0.0)
-        flow = flow_error(counted, induced, seen.vectors[ray], count)
+        projected = _project(_to_world(moved, ndc), earlier, earlier.previous[earlier.image[ray]])
+        count = 2 * counts_flow.sum() if over_samples else earlier.valid.sum()
+        induced, counted = projected - earlier.pixel[ray], torch.where(counts_flow, weight, 0.0)
+        flow = flow_error(counted, induced, earlier.vectors[ray], count)
     total = weights[0] * cycle + weights[1] * flow
     return MotionSum(total, torch.stack([cycle, flow]).detach())
 
@@ -156,11 +156,11 @@ def _to_world(points: Tensor, ndc: Triple | None) -> Tensor:
     return torch.stack([-x * depth / slope_x, -y * depth / slope_y, depth], dim=-1)
 
 
-def _project(points: Tensor, seen: SeenEarlier, camera: Tensor) -> Tensor:
+def _project(points: Tensor, earlier: SeenEarlier, camera: Tensor) -> Tensor:
     """Pixels (K, 2) of world points (K, 3) in the images ``camera`` (K,)."""
-    pose = seen.poses[camera]
+    pose = earlier.poses[camera]
     local = (pose[:, :, :3] * (points - pose[:, :, 3])[:, :, None]).sum(dim=-2)
     x, y, z = local.unbind(-1)
     depth = torch.where(z.abs() < NEAREST, NEAREST, -z)
-    pixel: Tensor = torch.stack([x / depth, -y / depth], dim=-1) * seen.focal[camera]
-    return pixel + seen.center[camera]
+    pixel: Tensor = torch.stack([x / depth, -y / depth], dim=-1) * earlier.focal[camera]
+    return pixel + earlier.center[camera]

@@ -90,8 +90,8 @@ def photometric_sum(
     """
     floats = image, transmittance, sample_weight, sample_color
     if kernels := accelerated("photometric", *floats, truth):
-        total, terms, seen = kernels.photometric_sum(alpha, weights, *floats, first, truth)
-        return PhotometricSum(total, terms, seen[0], None if alpha is None else seen[1])
+        total, terms, means = kernels.photometric_sum(alpha, weights, *floats, first, truth)
+        return PhotometricSum(total, terms, means[0], None if alpha is None else means[1])
     place = torch.arange(len(sample_weight), device=first.device)
     ray = torch.searchsorted(first[1:].contiguous(), place, right=True).clamp(max=len(image) - 1)
     present = torch.where(place < first[-1], sample_weight, 0.0)

@@ -90,13 +90,13 @@ def gather_pixels(
     pose = poses[image]
     directions = (pose[:, :, :3] * local[:, None, :]).sum(dim=-1)
     directions = torch.nn.functional.normalize(directions, dim=-1)
-    seen = valid = None
+    vectors = valid = None
     if flow is not None:
         valid = flow[1].reshape(-1)[row]
         # What was observed where it is not valid may be anything, NaN included.
-        seen = torch.where(valid[:, None], flow[0].reshape(-1, 2)[row], 0.0)
+        vectors = torch.where(valid[:, None], flow[0].reshape(-1, 2)[row], 0.0)
     return GatheredPixels(
-        pose[:, :, 3], directions, color, alpha, times[image], frames[image], pixel, seen, valid
+        pose[:, :, 3], directions, color, alpha, times[image], frames[image], pixel, vectors, valid
     )
 
 

@@ -161,24 +161,24 @@ def find_samples(
     number = torch.arange(len(ray), device=ray.device) - (samples.cumsum(0) - samples)[ray]
     distance = torch.add(entry[ray], number, alpha=step)
     points = torch.addcmul(origins[ray], directions[ray], distance[:, None])
-    kept = _occupied(mask, to_grid(points, mask_box, shape_of(mask))).nonzero()[:, 0]
-    ray, distance, points = ray[kept], distance[kept], points[kept]
+    index = _occupied(mask, to_grid(points, mask_box, shape_of(mask))).nonzero()[:, 0]
+    ray, distance, points = ray[index], distance[index], points[index]
     _, tau = warped_depth(points, density, slices, weight, box=box, shift=shift, delta=delta)
     alpha = -torch.expm1(-tau)
-    kept = (alpha >= thresholds.alpha).nonzero()[:, 0]
-    ray, distance, points = ray[kept], distance[kept], points[kept]
-    before = transmittances(tau[kept], ray, rays)
-    significant = before * alpha[kept] >= thresholds.weight
-    kept = (before >= thresholds.stop).nonzero()[:, 0]
-    first = torch.searchsorted(ray[kept], torch.arange(rays + 1, device=ray.device))
+    index = (alpha >= thresholds.alpha).nonzero()[:, 0]
+    ray, distance, points = ray[index], distance[index], points[index]
+    before = transmittances(tau[index], ray, rays)
+    significant = before * alpha[index] >= thresholds.weight
+    index = (before >= thresholds.stop).nonzero()[:, 0]
+    first = torch.searchsorted(ray[index], torch.arange(rays + 1, device=ray.device))
     total = first[-1]
-    kept = kept[:capacity]
-    room = capacity - len(kept)
+    index = index[:capacity]
+    room = capacity - len(index)
     return PackedSamples(
-        pad(ray[kept], (0, room), value=rays),
-        pad(distance[kept], (0, room)),
-        pad(points[kept], (0, 0, 0, room)),
-        pad(significant[kept], (0, room)),
+        pad(ray[index], (0, room), value=rays),
+        pad(distance[index], (0, room)),
+        pad(points[index], (0, 0, 0, room)),
+        pad(significant[index], (0, room)),
         first.clamp(max=capacity),
         total,
         count,
@@ -196,12 +196,12 @@ def _occupied(mask: Tensor, coords: Tensor) -> Tensor:
 
 
 def select_listed(
-    found: PackedSamples, canonical: Tensor, weight: Tensor, capacity: int
+    packed: PackedSamples, canonical: Tensor, weight: Tensor, capacity: int
 ) -> ListedSubset:
     """The significant samples of a list, without waiting for the device.
 
     Args:
-        found: C samples.
+        packed: C samples.
         canonical: (C, 3) their canonical positions.
         weight: (C,) their weights.
         capacity: K ≤ C, the length of the new list; samples that do not fit are dropped.
@@ -209,28 +209,28 @@ def select_listed(
     Returns:
         The new list, differentiable once in ``canonical`` and ``weight``.
     """
-    rays = len(found.first) - 1
-    floats = found.distance, found.points, canonical, weight
-    if capacity <= len(found.ray) and (kernels := accelerated("selection", *floats)):
-        listed = found.ray, found.distance, found.points, found.significant, found.first
+    rays = len(packed.first) - 1
+    floats = packed.distance, packed.points, canonical, weight
+    if capacity <= len(packed.ray) and (kernels := accelerated("selection", *floats)):
+        listed = packed.ray, packed.distance, packed.points, packed.significant, packed.first
         return ListedSubset(*kernels.select_listed(canonical, weight, listed, capacity))
-    if capacity > len(found.ray):
-        raise ValueError(f"{capacity} of {len(found.ray)} samples cannot be selected")
-    flags, running = found.significant, pad(found.significant.cumsum(0), (1, 0))
+    if capacity > len(packed.ray):
+        raise ValueError(f"{capacity} of {len(packed.ray)} samples cannot be selected")
+    flags, running = packed.significant, pad(packed.significant.cumsum(0), (1, 0))
     # One extra place receives everything that is not selected.
     target = torch.where(flags, running[:-1], capacity).clamp_(max=capacity)
     index = torch.arange(capacity + 1, device=flags.device)
     index.scatter_(0, target, torch.arange(len(flags), device=flags.device))
-    index, first = index[:capacity], running[found.first].clamp_(max=capacity)
+    index, first = index[:capacity], running[packed.first].clamp_(max=capacity)
     place = torch.arange(capacity, device=flags.device)
     present = place < first[-1]
     taken = canonical.index_select(0, index)
     return ListedSubset(
         first,
         running[-1],
-        torch.where(present, found.ray.index_select(0, index), place % max(rays, 1)),
-        found.distance.index_select(0, index),
-        found.points.index_select(0, index),
+        torch.where(present, packed.ray.index_select(0, index), place % max(rays, 1)),
+        packed.distance.index_select(0, index),
+        packed.points.index_select(0, index),
         present,
         torch.where(present[:, None], taken, taken.detach()),
         weight.index_select(0, index) * present,

@@ -58,8 +58,8 @@ def warped_depth(
     tau: Tensor
     if kernels := accelerated("warped_depth", points, density, *slices):
         axes = axes_of(box, slices[0] if slices else density), axes_of(box, density)
-        numbers, kept = (weight, shift, delta), (density_gradient, *into)
-        q, tau = kernels.warped_depth(points.detach(), axes, numbers, kept, density, *slices)
+        numbers, accumulated = (weight, shift, delta), (density_gradient, *into)
+        q, tau = kernels.warped_depth(points.detach(), axes, numbers, accumulated, density, *slices)
         return q, tau
     q = points = points.detach()
     if slices:

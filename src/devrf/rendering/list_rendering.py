@@ -95,10 +95,10 @@ def render_static(
     density = field.raw_density
     with span("sampling"):
         scene = rays, field, occupancy, settings, slices, slice_weight
-        found = search(*scene, capacity=capacity.visible, wait=False)
+        packed = search(*scene, capacity=capacity.visible, wait=False)
     with span("density"):
         canonical, tau = warped_depth(
-            found.points,
+            packed.points,
             density,
             slices,
             slice_weight,
@@ -109,10 +109,10 @@ def render_static(
             slice_gradients=[kept_gradient(frame) for frame in slices],
         )
     with span("compositing"):
-        weight, transmittance = composite_segments(tau, found.first)
+        weight, transmittance = composite_segments(tau, packed.first)
     with span("sampling"):
-        chosen = select_listed(found, canonical, weight, capacity.significant)
-        capacity.note(found.total, chosen.total)
+        chosen = select_listed(packed, canonical, weight, capacity.significant)
+        capacity.note(packed.total, chosen.total)
         samples = Samples(
             chosen.ray, chosen.distance, chosen.points, len(rays), present=chosen.present
         )
@@ -167,17 +167,17 @@ class ListRenderer:
         """
         field = self.field
         slices = () if displacement is None else (displacement,)
-        found = self._search(rays, occupancy, slices)
+        packed = self._search(rays, occupancy, slices)
         canonical, tau = warped_depth(
-            found.points,
+            packed.points,
             field.raw_density,
             slices,
             box=field.box,
             shift=field.shift,
             delta=field.step_in_base_voxels(self.settings.step),
         )
-        weight, left = composite_segments(tau, found.first)
-        chosen = select_listed(found, canonical, weight, len(found.ray))
+        weight, left = composite_segments(tau, packed.first)
+        chosen = select_listed(packed, canonical, weight, len(packed.ray))
         used = int(chosen.total)
         precision = torch.float16 if self.half and tau.is_cuda else torch.float32
         points, ray = chosen.canonical[:used], chosen.ray[:used]
@@ -191,10 +191,10 @@ class ListRenderer:
         """The samples that can be seen, in lists without padding."""
         scene = rays, self.field, occupancy, self.settings, slices
         while True:
-            found = search(*scene, capacity=self._capacity, wait=True)
-            total = int(found.total)
+            packed = search(*scene, capacity=self._capacity, wait=True)
+            total = int(packed.total)
             if total <= self._capacity:
-                return found.head(total)
+                return packed.head(total)
             self._capacity = int(SPARE * total)
 
 

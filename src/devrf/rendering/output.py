@@ -89,18 +89,18 @@ class VoxelOutput(RenderOutput):
 
     def count_on(self, chosen: Tensor) -> Tensor:
         """The number () of samples on the ``chosen`` (R,) rays, padding left out."""
-        kept, present = chosen[self.samples.ray], self.samples.present
-        return kept.sum() if present is None else (kept & present).sum()
+        counts, present = chosen[self.samples.ray], self.samples.present
+        return counts.sum() if present is None else (counts & present).sum()
 
     def on_rays(self, chosen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Ray (S,), canonical position (S, 3) and weight (S,) of the ``chosen`` (R,) rays' samples.
 
         A list of fixed length keeps its length: other samples get weight 0 and a harmless position.
         """
-        ray, kept = self.samples.ray, chosen[self.samples.ray]
+        ray, counts = self.samples.ray, chosen[self.samples.ray]
         if self.samples.present is None:
-            index = kept.nonzero()[:, 0]
+            index = counts.nonzero()[:, 0]
             return ray[index], self.canonical[index], self.weight[index]
-        kept = kept & self.samples.present
-        canonical = torch.where(kept[:, None], self.canonical, 0.0)
-        return ray, canonical, torch.where(kept, self.weight, 0.0)
+        counts = counts & self.samples.present
+        canonical = torch.where(counts[:, None], self.canonical, 0.0)
+        return ray, canonical, torch.where(counts, self.weight, 0.0)

@@ -63,9 +63,9 @@ class Renderer:
             background = torch.full((3,), background, device=self.device)
         rays, space = rays.to(self.device), self.model.space
         cropped = crop and CroppedRays.of(rays, crop, space, self.model.depth_limits[0])
-        own = cropped.rays if cropped else space.rays(rays)
+        field_rays = cropped.rays if cropped else space.rays(rays)
         image = RenderedImage.joined(
-            in_chunks(lambda part: view.render(part, background), own, view.chunk)
+            in_chunks(lambda part: view.render(part, background), field_rays, view.chunk)
         )
         return cropped.completed(image, background) if cropped else image
 
@@ -97,9 +97,9 @@ class Renderer:
 
         def flow(part: Rays) -> tuple[Tensor, Tensor]:
             nonlocal done
-            found = view.induced_flow(part, pixels[done : done + len(part)], camera, other)
+            mean_and_mass = view.induced_flow(part, pixels[done : done + len(part)], camera, other)
             done += len(part)
-            return found
+            return mean_and_mass
 
         parts = in_chunks(flow, self.model.space.rays(rays), view.chunk)
         return torch.cat([mean for mean, _ in parts]), torch.cat([mass for _, mass in parts])
@@ -119,8 +119,8 @@ class Renderer:
 
 def points_at_depth(space: Space, rays: Rays, depth: Tensor) -> Tensor:
     """World points (R, 3) at ``depth`` (R,), in the fields' space, along R world rays."""
-    own = space.rays(rays)
-    return space.to_world(own.at(torch.arange(len(own), device=depth.device), depth))
+    field_rays = space.rays(rays)
+    return space.to_world(field_rays.at(torch.arange(len(field_rays), device=depth.device), depth))
 
 
 def in_chunks(render: Callable[[Rays], Part], rays: Rays, chunk: int) -> list[Part]:
@@ -184,11 +184,11 @@ class CroppedRays:
     def completed(self, image: RenderedImage, background: Tensor) -> RenderedImage:
         """The image of all R rays from that of the K, with the background (3,) elsewhere."""
         inside = image.depth <= self.length
-        seen = self.hit.clone()
-        seen[self.hit] = inside
+        visible = self.hit.clone()
+        visible[self.hit] = inside
         color = background.expand(len(self.hit), 3).clone()
-        color[seen] = image.color[inside]
+        color[visible] = image.color[inside]
         depth, opacity = (torch.zeros_like(self.hit, dtype=color.dtype) for _ in range(2))
-        depth[seen] = (image.depth + self.skipped)[inside]
-        opacity[seen] = image.opacity[inside]
+        depth[visible] = (image.depth + self.skipped)[inside]
+        opacity[visible] = image.opacity[inside]
         return RenderedImage(color, depth, opacity)

@@ -79,8 +79,8 @@ def write_json(path: Path, values: dict[str, Any]) -> None:
 
 def free_disk(folder: Path) -> int:
     """Bytes that can be written to ``folder``, which need not exist yet."""
-    there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
-    return shutil.disk_usage(there).free
+    existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    return shutil.disk_usage(existing).free
 
 
 def holds_at_most(folder: Path, names: set[str]) -> bool:
@@ -101,11 +101,11 @@ def remove_if_only(folder: Path, names: set[str]) -> None:
             shutil.rmtree(path, ignore_errors=True)
         else:
             path.unlink(missing_ok=True)
-    here, folder = Path.cwd(), folder.resolve()
-    if here.is_relative_to(folder):
+    working_folder, folder = Path.cwd(), folder.resolve()
+    if working_folder.is_relative_to(folder):
         return
     with suppress(OSError):  # the first that is not empty
-        for path in [folder, *(path for path in folder.parents if here in path.parents)]:
+        for path in [folder, *(path for path in folder.parents if working_folder in path.parents)]:
             path.rmdir()
 
 

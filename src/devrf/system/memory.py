@@ -65,9 +65,9 @@ def _left_by_groups(root: Path) -> Iterator[int]:
     except OSError:
         return
     mount = root / "sys" / "fs" / "cgroup"
-    for own in (line.removeprefix("0::") for line in lines if line.startswith("0::")):
+    for group_path in (line.removeprefix("0::") for line in lines if line.startswith("0::")):
         # A group is held to the limits of its parents too; a container sees its own as "/".
-        folder = mount / own.strip("/")
+        folder = mount / group_path.strip("/")
         for group in (folder, *folder.parents):
             if group.is_relative_to(mount):
                 yield from _left_by_group(group)
@@ -76,12 +76,12 @@ def _left_by_groups(root: Path) -> Iterator[int]:
 def _left_by_group(folder: Path) -> Iterator[int]:
     """Bytes left of a group's limit, if it has one; cached files count as free."""
     try:
-        most, used = (int((folder / f"memory.{name}").read_text()) for name in ("max", "current"))
+        limit, used = (int((folder / f"memory.{name}").read_text()) for name in ("max", "current"))
         stat = (folder / "memory.stat").read_text().split()
     except (OSError, ValueError):  # "max": there is no limit
         return
     cached = int(stat[stat.index("inactive_file") + 1]) if "inactive_file" in stat else 0
-    yield max(most - used + cached, 0)
+    yield max(limit - used + cached, 0)
 
 
 def is_oom(error: BaseException) -> bool:
@@ -122,12 +122,12 @@ def shortage_in_words(stage: str, device: torch.device, rays: str | None) -> Ite
         ) from error
 
 
-def numbers(said: str, device: torch.device) -> str:
-    """In words, what was asked for, if the message ``said`` so, and what is free on ``device``."""
-    asked, free = ASKED.search(said), f"{gib(free_memory(device))} GiB free on {device}"
-    if not asked or asked.group(2).lower() not in UNITS:
+def numbers(message: str, device: torch.device) -> str:
+    """In words, what was asked for, if the ``message`` says so, and what is free on ``device``."""
+    match, free = ASKED.search(message), f"{gib(free_memory(device))} GiB free on {device}"
+    if not match or match.group(2).lower() not in UNITS:
         return free
-    return f"{gib(float(asked.group(1)) * UNITS[asked.group(2).lower()])} GiB more asked, {free}"
+    return f"{gib(float(match.group(1)) * UNITS[match.group(2).lower()])} GiB more asked, {free}"
 
 
 def gib(count: float) -> str:

@@ -73,14 +73,14 @@ class Interrupted(SystemExit):
     """A signal has ended the run; the exit status is 128 plus its number, as in a shell.
 
     Attributes:
-        said: the line for the user.
+        message: the line for the user.
     """
 
     def __init__(
-        self, number: int, said: str = "interrupted; run the same command again to go on"
+        self, number: int, message: str = "interrupted; run the same command again to go on"
     ) -> None:
         super().__init__(128 + number)
-        self.said = said
+        self.message = message
 
 
 def end_at_once(number: int) -> NoReturn:

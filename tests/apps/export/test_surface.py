@@ -73,7 +73,7 @@ def test_a_forward_facing_surface_is_in_the_world_and_faces_the_camera(of_distan
     assert mesh.area == pytest.approx(4.0 * 3.0, rel=0.01)
 
 
-def test_of_an_endless_scene_what_is_far_is_left_out(of_distance):
+def test_of_an_unbounded_scene_what_is_far_is_left_out(of_distance):
     space = ContractedSpace((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 
     def two_balls(points):

@@ -121,7 +121,7 @@ def test_held_out_views_that_are_learned_from(healthy):
     spoil = changed("dynamic.test", lambda _: train[torch.tensor([0, 4])])
     (advice,) = advice_on(spoil(healthy))
     assert advice.where == "dynamic test set"
-    assert train.names[0] in advice.problem and train.names[4] in advice.what
+    assert train.names[0] in advice.problem and train.names[4] in advice.problem
     # The same camera at another time may be held out.
     test = replace(train[torch.tensor([0])], times=torch.tensor([0.25]))
     assert advice_on(changed("dynamic.test", lambda _: test)(healthy)) == []

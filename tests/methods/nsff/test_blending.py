@@ -50,11 +50,11 @@ def test_opacities_are_scaled_by_their_shares() -> None:
     assert blend.dynamic.item() == pytest.approx((1 - 35 / 64) / 4)
 
 
-def test_an_endless_last_sample_leaves_nothing_to_see() -> None:
+def test_an_unbounded_last_sample_leaves_nothing_to_see() -> None:
     """On ray 0 of three; ray 1 has no sample, ray 2 an opaque one of which a quarter is dynamic."""
     ray, v = torch.tensor([0, 0, 2]), torch.tensor([0.5, 0.5, 0.25])
-    endless = torch.tensor([0.0, 1e10, 1e10])
-    blend = closed(blended(*shared(endless, endless, v), ray, 3), v, ray)
+    unbounded = torch.tensor([0.0, 1e10, 1e10])
+    blend = closed(blended(*shared(unbounded, unbounded, v), ray, 3), v, ray)
     torch.testing.assert_close(blend.transmittance, torch.tensor([0.0, 1.0, 0.0]))
     total = blend.dynamic + blend.static
     torch.testing.assert_close(total, torch.tensor([0.0, 1.0, 1.0]))
@@ -67,7 +67,7 @@ def test_added_densities_divide_what_they_absorb() -> None:
     assert blend.dynamic.item() == pytest.approx(3 / 8)
 
 
-def test_an_endless_sample_has_finite_gradients() -> None:
+def test_an_unbounded_sample_has_finite_gradients() -> None:
     dynamic = torch.tensor([1e10, 0.0], requires_grad=True)
     static = torch.tensor([0.0, 1e10], requires_grad=True)
     v = torch.tensor([1.0, 0.3], requires_grad=True)

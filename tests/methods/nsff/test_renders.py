@@ -56,7 +56,7 @@ def test_without_motion_and_time_another_frame_is_this_one(
     for warp in renders.warps:
         torch.testing.assert_close(warp.color, renders.alone[0])
         torch.testing.assert_close(warp.color, renders.output.color, atol=1e-5, rtol=1e-5)
-        assert warp.there.all()
+        assert warp.exists.all()
 
 
 def test_a_translation_is_chained(placed: NSFF, batch: RayBatch, compared: Compared) -> None:
@@ -65,7 +65,7 @@ def test_a_translation_is_chained(placed: NSFF, batch: RayBatch, compared: Compa
     first = replace(batch, frame=torch.zeros_like(batch.frame), time=torch.zeros_like(batch.time))
     renders = compared(placed, first)
     after, before = renders.warps
-    assert after.there.all() and not before.there.any() and len(before.kept) == 0
+    assert after.exists.all() and not before.exists.any() and len(before.sample) == 0
     assert (renders.trust(before) == 0).all() and (renders.trust(after) > 0).all()
     further = renders.chained()
     start = renders.output.points
@@ -73,9 +73,9 @@ def test_a_translation_is_chained(placed: NSFF, batch: RayBatch, compared: Compa
     torch.testing.assert_close(further.points, start + 2 * step, atol=1e-5, rtol=0)
     torch.testing.assert_close(after.points, start + step, atol=1e-5, rtol=0)
     # There and back again.
-    back = after.found.flow[:, BACKWARD]
+    back = after.dynamic.flow[:, BACKWARD]
     torch.testing.assert_close(after.moved + back, torch.zeros_like(back), atol=1e-5, rtol=0)
-    assert (further.frame == 2).all() and not replace(renders, step=1).chained().there.any()
+    assert (further.frame == 2).all() and not replace(renders, step=1).chained().exists.any()
 
 
 def test_one_neighbour_is_at_either_side_and_exists(
@@ -86,7 +86,7 @@ def test_one_neighbour_is_at_either_side_and_exists(
     sides = set()
     for _ in range(8):
         (warp,) = compared(placed, many, both=False).warps
-        assert warp.there.all()
+        assert warp.exists.all()
         assert (warp.side[frame == 0] == FORWARD).all()
         assert (warp.side[frame == 2] == BACKWARD).all()
         sides.update(warp.side[frame == 1].tolist())

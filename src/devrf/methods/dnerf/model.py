@@ -38,8 +38,8 @@ class TranslationField(nn.Module):
         moving = (time > 0).nonzero()[:, 0]
         place, when = points.index_select(0, moving), time.index_select(0, moving)
         encoded = torch.cat([self.encode_position(place), self.encode_time(when[:, None])], dim=-1)
-        found = self.output(self.trunk(encoded))
-        return torch.zeros_like(points).index_copy(0, moving, found.to(points.dtype))
+        displacement = self.output(self.trunk(encoded))
+        return torch.zeros_like(points).index_copy(0, moving, displacement.to(points.dtype))
 
 
 @dataclass(frozen=True)

@@ -65,12 +65,12 @@ class DeformableField(NeuralField):
 
     def radiance_parts(self) -> dict[str, Iterable[nn.Parameter]]:
         """The radiance fields as parts; what takes w is a part of its own."""
-        own: list[nn.Parameter] = []
+        base: list[nn.Parameter] = []
         beside: list[nn.Parameter] = []
         for field in (self.canonical, self.coarse):
             for name, parameter in field.named_parameters() if field is not None else ():
-                (beside if name.startswith("trunk.beside.") else own).append(parameter)
-        return {"canonical": own, "canonical_ambient": beside} if beside else {"canonical": own}
+                (beside if name.startswith("trunk.beside.") else base).append(parameter)
+        return {"canonical": base, "canonical_ambient": beside} if beside else {"canonical": base}
 
     def render_rays(
         self, rays: Rays, time: Tensor, background: Tensor, *, jitter: bool = False
@@ -101,7 +101,7 @@ class DeformableField(NeuralField):
     ) -> RenderOutput:
         """What samples of rays come to in a radiance field."""
         if not self.space.is_linear:
-            samples = samples.endless()
+            samples = samples.unbounded()
         points, when = self.placement.normalised(samples.points), time.index_select(0, samples.ray)
         canonical, ambient = self.deform(points, when)
         density, color = field(canonical, rays.viewdirs, samples.ray, ambient)

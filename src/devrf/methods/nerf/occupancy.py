@@ -84,8 +84,8 @@ class LearnedOccupancy(StoredShape):
         for cells in looks:
             for part in torch.split(cells, CHUNK):
                 points = self._points(part, box)
-                seen = opacity_at(points, torch.rand_like(points[:, 0]))
-                flat[part] = torch.maximum(DECAY * flat[part], seen)
+                opacity = opacity_at(points, torch.rand_like(points[:, 0]))
+                flat[part] = torch.maximum(DECAY * flat[part], opacity)
 
     def _points(self, cells: Tensor, box: Box) -> Tensor:
         """A random point (S, 3) nearest to each of the grid points of numbers (S,)."""
@@ -182,5 +182,5 @@ class OccupancyFrames(StoredShape):
         if occupied is not None:
             # The last sample of a ray stays: it may stand for all that is behind it.
             met &= occupied | (number == count[ray] - 1)
-        kept = met.nonzero()[:, 0]
-        return RaySamples.at(rays, ray[kept], distance[kept], step)
+        index = met.nonzero()[:, 0]
+        return RaySamples.at(rays, ray[index], distance[index], step)

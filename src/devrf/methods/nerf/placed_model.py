@@ -184,5 +184,5 @@ class RayView:
         """What R rays in the fields' space see."""
         time = torch.full_like(rays.origins[:, 0], self._time)
         with torch.autocast(time.device.type, torch.float16, enabled=self._half):
-            seen = self._render_rays(rays, time, background)
-        return RenderedImage(seen.color.float(), seen.depth.float(), 1 - seen.transmittance.float())
+            out = self._render_rays(rays, time, background)
+        return RenderedImage(out.color.float(), out.depth.float(), 1 - out.transmittance.float())

@@ -48,11 +48,11 @@ class Placement:
 
     def world(self, points: Tensor) -> Tensor:
         """World points (..., 3) of normalised ones; in NDC none behind :data:`FURTHEST`."""
-        own = self.fields(points)
+        field_points = self.fields(points)
         if isinstance(self.space, NormalizedDevice):
-            limit = own.new_tensor([float("inf"), float("inf"), FURTHEST])
-            own = own.minimum(limit)
-        return self.space.to_world(own)
+            limit = field_points.new_tensor([float("inf"), float("inf"), FURTHEST])
+            field_points = field_points.minimum(limit)
+        return self.space.to_world(field_points)
 
     def euclidean(self, points: Tensor) -> Tensor:
         """World points (..., 3) of normalised ones, in units of :attr:`unit`."""
@@ -63,7 +63,7 @@ class Placement:
 
         In NDC those of the nearest ``share`` of depths, elsewhere all that cameras look at.
         """
-        own = self.fields(points)
+        field_points = self.fields(points)
         if isinstance(self.space, NormalizedDevice):
-            return (own[..., 2] + 1) / 2 <= share
-        return self.space.inner(self.box).contains(own)
+            return (field_points[..., 2] + 1) / 2 <= share
+        return self.space.inner(self.box).contains(field_points)

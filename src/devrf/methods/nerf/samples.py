@@ -13,7 +13,7 @@ from devrf.ops.compositing import color_and_depth, composite, sum_by_ray
 from devrf.rendering.output import RenderOutput
 
 # Opaque at any density that a softplus gives.
-ENDLESS = 1e10
+UNBOUNDED = 1e10
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,9 @@ class RaySamples:
         """The same samples, their lengths in units of ``unit`` (of the fields' space)."""
         return replace(self, length=self.length / unit)
 
-    def endless(self) -> RaySamples:
+    def unbounded(self) -> RaySamples:
         """The same samples, the last of each ray standing for all that is behind it."""
-        return replace(self, length=torch.where(last_of_ray(self.ray), ENDLESS, self.length))
+        return replace(self, length=torch.where(last_of_ray(self.ray), UNBOUNDED, self.length))
 
 
 def last_of_ray(ray: Tensor) -> Tensor:
@@ -90,11 +90,11 @@ def accumulated(
         background: (3,) or (R, 3) RGB.
     """
     ray, rays = samples.ray, samples.rays
-    seen = sum_by_ray(color, ray, rays)
+    weighted_color = sum_by_ray(color, ray, rays)
     with torch.no_grad():
         mass = sum_by_ray(weight, ray, rays)
         reached = sum_by_ray(weight * samples.distance, ray, rays)
-    image, depth = color_and_depth(seen, reached, mass, transmittance, background)
+    image, depth = color_and_depth(weighted_color, reached, mass, transmittance, background)
     return RenderOutput(color=image, depth=depth, transmittance=transmittance)
 
 

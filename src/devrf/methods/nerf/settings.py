@@ -24,10 +24,10 @@ class CheckedSettings:
         """
         expect(holds, f"{self.key}.{name}", expected, getattr(self, name))
 
-    def check_least(self, least: int, *names: str) -> None:
+    def check_least(self, minimum: int, *names: str) -> None:
         """Refuse settings that are less; raises as :meth:`check`."""
         for name in names:
-            self.check(name, getattr(self, name) >= least, f"at least {least}")
+            self.check(name, getattr(self, name) >= minimum, f"at least {minimum}")
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,8 @@ def jacobians(warp: Callable[[Tensor], Tensor], points: Tensor) -> Tensor:
         return change
 
     columns = torch.eye(3, dtype=points.dtype, device=points.device)
-    found: Tensor = vmap(along, out_dims=-1)(columns)
-    return found
+    matrices: Tensor = vmap(along, out_dims=-1)(columns)
+    return matrices
 
 
 def strain(jacobian: Tensor) -> Tensor:

@@ -70,8 +70,8 @@ def encoder_images(scene: Scene, settings: NeuralVolumesSettings) -> Tensor:
                 color = nn.functional.interpolate(
                     color[None], (rows, columns), mode="bilinear", antialias=True
                 )[0]
-            own = images[int(views.frames[place]), k, :, top : top + rows, left : left + columns]
-            own.copy_((255 * color).round().clamp(0, 255))
+            target = images[int(views.frames[place]), k, :, top : top + rows, left : left + columns]
+            target.copy_((255 * color).round().clamp(0, 255))
     first = int(views.frames.min())
     images[:first] = images[first]
     return images

@@ -108,8 +108,8 @@ class NeuralVolumes(PlacedModel):
 
     def decoded(self, code: Tensor) -> Volumes:
         """The volumes of codes (M, code)."""
-        found = self.template(code)
-        color, opacity = found[:, :3].sigmoid(), nn.functional.softplus(found[:, 3:])
+        channels = self.template(code)
+        color, opacity = channels[:, :3].sigmoid(), nn.functional.softplus(channels[:, 3:])
         template = torch.cat([color, self.settings.density_scale * opacity], dim=1)
         return Volumes(template, self.warp(code))
 

@@ -99,8 +99,8 @@ class TimeEncoder(nn.Module):
             images: (M, K, 3, H, W) RGB in [0, 1].
         """
         standard = (images - MEAN) / DEVIATION
-        seen = [camera(standard[:, k]) for k, camera in enumerate(self.cameras)]
-        joined = self.joined(torch.cat(seen, dim=1))
+        features = [camera(standard[:, k]) for k, camera in enumerate(self.cameras)]
+        joined = self.joined(torch.cat(features, dim=1))
         return 0.1 * self.mean(joined), 0.01 * self.log_deviation(joined)
 
 
@@ -130,8 +130,8 @@ class ConvWarp(nn.Module):
 
     def forward(self, code: Tensor) -> Tensor:
         """Positions (M, 3, side, side, side) in the template, for codes (M, code)."""
-        found: Tensor = self.grid + self.scale * self.decoder(code)
-        return found
+        position: Tensor = self.grid + self.scale * self.decoder(code)
+        return position
 
 
 class AffineWarp(nn.Module):
@@ -163,9 +163,9 @@ class AffineWarp(nn.Module):
         moved = scale * (rotation @ (self.grid.flatten(1) - shift))  # (M, K, 3, side³)
         weight = self.weight(code).exp().view(count * self.maps, 1, side, side, side)
         place = moved.transpose(2, 3).reshape(count * self.maps, side, side, side, 3)
-        there = nn.functional.grid_sample(weight, place, align_corners=True)
-        there = there.view(count, self.maps, 1, -1)
-        mixed: Tensor = (there * moved).sum(dim=1) / there.sum(dim=1).clamp(min=1e-3)
+        mixing = nn.functional.grid_sample(weight, place, align_corners=True)
+        mixing = mixing.view(count, self.maps, 1, -1)
+        mixed: Tensor = (mixing * moved).sum(dim=1) / mixing.sum(dim=1).clamp(min=1e-3)
         return mixed.view(count, 3, side, side, side)
 
 

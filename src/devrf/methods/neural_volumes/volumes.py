@@ -34,19 +34,19 @@ class Volumes:
         order = moment.argsort(stable=True)
         counts = torch.bincount(moment, minlength=len(self.template)).tolist()
         parts = torch.split(points.index_select(0, order), counts)
-        found = [
+        sampled = [
             _sampled(self.template[k], _sampled(self.warp[k], part))
             for k, part in enumerate(parts)
             if len(part)
         ]
-        values = torch.cat(found) if found else points.new_zeros(0, 4)
+        values = torch.cat(sampled) if sampled else points.new_zeros(0, 4)
         return torch.zeros_like(values).index_copy(0, order, values)
 
 
 def _sampled(volume: Tensor, points: Tensor) -> Tensor:
     """Trilinear values (S, C) of a volume (C, Z, Y, X) at ``points`` (S, 3); 0 outside."""
-    found = grid_sample(volume[None], points[None, None, None], align_corners=True)
-    return found.view(len(volume), -1).t()
+    values = grid_sample(volume[None], points[None, None, None], align_corners=True)
+    return values.view(len(volume), -1).t()
 
 
 def added_opacity(amount: Tensor, ray: Tensor, rays: int) -> tuple[Tensor, Tensor]:

@@ -186,7 +186,7 @@ class TwoFields(nn.Module):
         return nn.functional.softplus(raw + noise) * self._scale * length
 
     def blended(
-        self, dynamic: Tensor, static: Tensor, v: Tensor, ray: Tensor, rays: int, *, endless: bool
+        self, dynamic: Tensor, static: Tensor, v: Tensor, ray: Tensor, rays: int, *, unbounded: bool
     ) -> Blend:
         """Weights of optical depths (S,) of both fields.
 
@@ -196,9 +196,9 @@ class TwoFields(nn.Module):
             v: (S,) the share of the dynamic part; does not count where densities add.
             ray: (S,) int64, ascending.
             rays: R.
-            endless: whether the last sample of each ray stands for all behind it.
+            unbounded: whether the last sample of each ray stands for all behind it.
         """
         if self.additive:
             return blended(dynamic, static, ray, rays)
         blend = blended(*shared(dynamic, static, v), ray, rays)
-        return closed(blend, v, ray) if endless else blend
+        return closed(blend, v, ray) if unbounded else blend

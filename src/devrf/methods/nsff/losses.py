@@ -44,15 +44,15 @@ def chained(r: Renders) -> Tensor:
     if not r.chains:
         return r.output.color.new_zeros(())
     warp = r.chained()
-    return photometric(warp.color, r.batch.color, warp.there * r.dynamic_share)
+    return photometric(warp.color, r.batch.color, warp.exists * r.dynamic_share)
 
 
 def cycle(r: Renders) -> Tensor:
     """‖f_{i→j}(x) + f_{j→i}(x + f_{i→j})‖₁, samples weighted by W = 1 − o_{i→j}."""
     terms = []
     for warp in r.warps:
-        sample = torch.arange(len(warp.kept), device=warp.kept.device)
-        back = warp.found.flow[sample, 1 - warp.side[warp.ray]]
+        sample = torch.arange(len(warp.sample), device=warp.sample.device)
+        back = warp.dynamic.flow[sample, 1 - warp.side[warp.ray]]
         trust = torch.ones_like(warp.occlusion) if r.fields.additive else 1 - warp.occlusion
         miss = (warp.moved + back).abs().mean(dim=1)
         terms.append((trust * miss).sum() / trust.sum().clamp(min=EPS))
@@ -81,10 +81,10 @@ def smooth_space(r: Renders) -> Tensor:
 
 def smooth_time(r: Renders) -> Tensor:
     """½‖X⁺ + X⁻ − 2X‖², twice for a ray's own points, once for those of the chained pair."""
-    found = 2 * _bending(r, r.output.points, r.output.dynamic.flow)
+    bending = 2 * _bending(r, r.output.points, r.output.dynamic.flow)
     if r.chains:
-        found = found + _bending(r, r.near.points, r.near.found.flow)
-    return found
+        bending = bending + _bending(r, r.near.points, r.near.dynamic.flow)
+    return bending
 
 
 def _bending(r: Renders, points: Tensor, flow: Tensor) -> Tensor:
@@ -109,8 +109,8 @@ def depth(r: Renders) -> Tensor:
         return r.output.color.new_zeros(())
     samples, weight = r.output.samples, r.seen[0]
     mass = sum_by_ray(weight, samples.ray, r.rays).clamp(min=1e-3)
-    found = sum_by_ray(weight * samples.distance, samples.ray, r.rays) / mass
-    difference = normalised(found[known]) - normalised(truth[known])
+    rendered = sum_by_ray(weight * samples.distance, samples.ray, r.rays) / mass
+    difference = normalised(rendered[known]) - normalised(truth[known])
     return r.prior_factor * difference.square().mean()
 
 
@@ -179,11 +179,11 @@ def missing_terms(priors: ImagePriors, terms: Collection[str], *, additive: bool
         terms: names of what counts.
         additive: whether densities add.
     """
-    found = {}
+    reasons = {}
     if not any(priors.has_flow):
-        found["flow"] = "no optical flow"
+        reasons["flow"] = "no optical flow"
     if not priors.has_depth:
-        found["depth"] = "no depth"
+        reasons["depth"] = "no depth"
     if additive:
-        found |= dict.fromkeys(OF_A_SHARE, "no blend v")
-    return {name: why for name, why in found.items() if name in terms}
+        reasons |= dict.fromkeys(OF_A_SHARE, "no blend v")
+    return {name: why for name, why in reasons.items() if name in terms}

@@ -106,8 +106,8 @@ class NSFF(NeuralField):
         if self.settings.hard_rays and self._images.moving is None:
             missing["hard_rays"] = "no motion masks"
         if missing:
-            said = ", ".join(f"{name} ({why})" for name, why in missing.items())
-            log.info("nsff: zero, for what this scene and blend do not have: %s", said)
+            listed = ", ".join(f"{name} ({why})" for name, why in missing.items())
+            log.info("nsff: zero, for what this scene and blend do not have: %s", listed)
 
     def further_pixels(self, generator: torch.Generator) -> tuple[Tensor, Tensor] | None:
         """In the first N₀ iterations, pixels that move."""
@@ -127,8 +127,8 @@ class NSFF(NeuralField):
             distance = stratified(near, far, self.settings.samples, jitter=jitter)
             samples = flattened(rays, distance, far)
         # Where masks cut the scene out it ends with its box; else the last sample is all behind it.
-        endless = not (self.cut_out and self.space.is_linear)
-        samples = samples.endless() if endless else samples
+        unbounded = not (self.cut_out and self.space.is_linear)
+        samples = samples.unbounded() if unbounded else samples
         samples = samples.scaled(self.placement.half_edge)
         ray, fields = samples.ray, self.fields
         points = self.placement.normalised(samples.points)
@@ -139,7 +139,7 @@ class NSFF(NeuralField):
             fields.optical_depth(dynamic.raw, samples.length, noise),
             fields.optical_depth(static.raw, samples.length, noise),
         )
-        blend = fields.blended(*depths, static.blend, ray, len(rays), endless=endless)
+        blend = fields.blended(*depths, static.blend, ray, len(rays), unbounded=unbounded)
         weight = blend.dynamic + blend.static
         color = blend.dynamic[:, None] * dynamic.color + blend.static[:, None] * static.color
         output = accumulated(samples, weight, color, blend.transmittance, background)

@@ -36,23 +36,23 @@ class ImagePriors:
             space: the fields' space.
         """
         self._views, self._space = tuple(views), space
-        every = [one.cameras for one in views]
+        all_cameras = [view_set.cameras for view_set in views]
         self.cameras = Cameras(
-            torch.cat([one.camera_to_world for one in every]),
-            torch.cat([one.focal for one in every]),
-            torch.cat([one.center for one in every]),
-            every[0].width,
-            every[0].height,
+            torch.cat([view_set.camera_to_world for view_set in all_cameras]),
+            torch.cat([view_set.focal for view_set in all_cameras]),
+            torch.cat([view_set.center for view_set in all_cameras]),
+            all_cameras[0].width,
+            all_cameras[0].height,
         )
         self.neighbour = torch.arange(len(self.cameras))[:, None].repeat(1, 2)
         # The number of each capture's first image.
         self._offsets = [sum(map(len, views[:k])) for k in range(len(views))]
         pools = []
-        for one, offset in zip(views, self._offsets, strict=True):
-            for image, earlier in frame_pairs(one):
+        for view_set, offset in zip(views, self._offsets, strict=True):
+            for image, earlier in frame_pairs(view_set):
                 self.neighbour[earlier + offset, 0] = image + offset
                 self.neighbour[image + offset, 1] = earlier + offset
-            if (pool := _moving(one)) is not None:
+            if (pool := _moving(view_set)) is not None:
                 pools.append(PixelPool(torch.stack([pool.image + offset, pool.flat])))
         self.neighbour = self.neighbour.to(views[0].times.device)
         self.moving = None
@@ -62,13 +62,13 @@ class ImagePriors:
     @property
     def has_flow(self) -> tuple[bool, bool]:
         """Whether some image has forward flow, and whether some has backward flow."""
-        there = [[_known(_flow(one, side)) for one in self._views] for side in (0, 1)]
-        return any(there[0]), any(there[1])
+        known = [[_known(_flow(view_set, side)) for view_set in self._views] for side in (0, 1)]
+        return any(known[0]), any(known[1])
 
     @property
     def has_depth(self) -> bool:
         """Whether some image has depth that rays of the fields' space can be compared with."""
-        return self._space.is_linear and any(one.depth is not None for one in self._views)
+        return self._space.is_linear and any(view_set.depth is not None for view_set in self._views)
 
     def flow(self, batch: RayBatch, side: int) -> tuple[Tensor, Tensor]:
         """Optical flow (R, 2) in pixels of a batch's rays, and (R,) bool where it is known.
@@ -80,33 +80,33 @@ class ImagePriors:
         vectors = torch.zeros_like(batch.pixel)
         valid = torch.zeros_like(batch.time, dtype=torch.bool)
 
-        for views, own, row in self._captures(batch):
+        for views, ray, row in self._captures(batch):
             if (flow := _flow(views, side)) is not None:
-                valid[own] = flow.valid.flatten()[row]
-                vectors[own] = flow.vectors.flatten(0, 2)[row]
+                valid[ray] = flow.valid.flatten()[row]
+                vectors[ray] = flow.vectors.flatten(0, 2)[row]
         # What was observed where it is not valid may be anything, NaN included.
         return torch.where(valid[:, None], vectors, 0.0), valid
 
     def distance(self, batch: RayBatch) -> Tensor:
         """How far along a batch's rays, in their own units, surfaces are (R,); inf: unknown."""
         depth = torch.full_like(batch.time, torch.inf)
-        for views, own, row in self._captures(batch):
+        for views, ray, row in self._captures(batch):
             if views.depth is not None:
-                depth[own] = views.depth.flatten()[row]
+                depth[ray] = views.depth.flatten()[row]
         known = depth.isfinite()
         world = self.cameras.rays(batch.image, batch.pixel)
         points = world.origins + world.directions * torch.where(known, depth, 1.0)[:, None]
         along = batch.rays.directions
         away = self._space.from_world(points) - batch.rays.origins
-        found = (away * along).sum(dim=1) / along.square().sum(dim=1)
-        return torch.where(known, found, torch.inf)
+        distance = (away * along).sum(dim=1) / along.square().sum(dim=1)
+        return torch.where(known, distance, torch.inf)
 
     def _captures(self, batch: RayBatch) -> Iterator[tuple[Views, Tensor, Tensor]]:
         """Each capture's views, the batch's rays in it, and their pixels' numbers among all."""
         column, line = batch.pixel.long().unbind(1)
         for views, offset in zip(self._views, self._offsets, strict=True):
-            own = (batch.image >= offset) & (batch.image < offset + len(views))
-            ray = own.nonzero()[:, 0]
+            in_capture = (batch.image >= offset) & (batch.image < offset + len(views))
+            ray = in_capture.nonzero()[:, 0]
             image = batch.image[ray] - offset
             yield views, ray, (image * views.height + line[ray]) * views.width + column[ray]
 

@@ -50,28 +50,28 @@ class Warp:
     """R rays of one frame rendered with the dynamic field of another: C_{j→i}.
 
     Attributes:
-        there: (R,) bool, whether that frame exists.
+        exists: (R,) bool, whether that frame exists.
         frame: (R,) int64, the other frame j.
         side: (R,) int64, whether it comes after (``FORWARD``) or before (``BACKWARD``).
-        kept: (K,) int64, the samples of the rays whose frame exists.
+        sample: (K,) int64, the samples of the rays whose frame exists.
         ray: (K,) int64, theirs.
         moved: (K, 3) f_{i→j}, by which they were displaced last.
         occlusion: (K,) o_{i→j}.
         points: (K, 3) where they are in frame j.
-        found: the dynamic field there.
+        dynamic: the dynamic field there.
         color: (R, 3) RGB.
         weight: (K,) of the dynamic field.
     """
 
-    there: Tensor
+    exists: Tensor
     frame: Tensor
     side: Tensor
-    kept: Tensor
+    sample: Tensor
     ray: Tensor
     moved: Tensor
     occlusion: Tensor
     points: Tensor
-    found: DynamicSamples
+    dynamic: DynamicSamples
     color: Tensor
     weight: Tensor
 
@@ -159,14 +159,16 @@ class Renders:
     def chained(self) -> Warp:
         """The rays rendered from two frames away, flows chained, beyond :attr:`near`."""
         near = self.near
-        return self._warp(near.side, near.frame, near.there, near.kept, near.points, near.found)
+        return self._warp(
+            near.side, near.frame, near.exists, near.sample, near.points, near.dynamic
+        )
 
     def _warp(
         self,
         side: Tensor,
         frame: Tensor,
-        there: Tensor,
-        kept: Tensor,
+        exists: Tensor,
+        sample: Tensor,
         points: Tensor,
         dynamic: DynamicSamples,
     ) -> Warp:
@@ -176,41 +178,43 @@ class Renders:
         """
         samples, count = self.output.samples, len(self.times)
         frame = frame + torch.where(side == FORWARD, 1, -1)
-        there = there & (frame >= 0) & (frame < count)
+        exists = exists & (frame >= 0) & (frame < count)
         frame = frame.clamp(0, count - 1)
-        going = there[samples.ray[kept]].nonzero()[:, 0]
-        kept = kept[going]
-        ray = samples.ray[kept]
+        going = exists[samples.ray[sample]].nonzero()[:, 0]
+        sample = sample[going]
+        ray = samples.ray[sample]
         toward = side[ray]
         moved, occlusion = dynamic.flow[going, toward], dynamic.occlusion[going, toward]
         points = points[going] + moved
-        found = self.fields.dynamic.at(
+        warped = self.fields.dynamic.at(
             points, self.times[frame[ray]], self.batch.rays.viewdirs, ray
         )
-        color, weight = self._composited(found, kept, ray)
-        return Warp(there, frame, side, kept, ray, moved, occlusion, points, found, color, weight)
+        color, weight = self._composited(warped, sample, ray)
+        return Warp(
+            exists, frame, side, sample, ray, moved, occlusion, points, warped, color, weight
+        )
 
     def _composited(
-        self, found: DynamicSamples, kept: Tensor, ray: Tensor
+        self, dynamic: DynamicSamples, sample: Tensor, ray: Tensor
     ) -> tuple[Tensor, Tensor]:
         """C (R, 3) of samples with another frame's dynamic field, and its weights (K,).
 
         The static part stays as it is where densities add; else it is left out.
         """
-        length = self.output.samples.length[kept]
-        depth = self.fields.optical_depth(found.raw, length, self.fields.noise(found.raw))
+        length = self.output.samples.length[sample]
+        depth = self.fields.optical_depth(dynamic.raw, length, self.fields.noise(dynamic.raw))
         if not self.fields.additive:
             weight, end = composite(depth, ray, self.rays)
-            return self._color(weight, found.color, ray, end), weight
-        static, v = self.output.depths[1][kept], self.output.static.blend[kept]
-        blend = self.fields.blended(depth, static, v, ray, self.rays, endless=False)
-        color = self._color(blend.dynamic, found.color, ray, blend.transmittance)
-        behind = blend.static[:, None] * self.output.static.color[kept]
+            return self._color(weight, dynamic.color, ray, end), weight
+        static, v = self.output.depths[1][sample], self.output.static.blend[sample]
+        blend = self.fields.blended(depth, static, v, ray, self.rays, unbounded=False)
+        color = self._color(blend.dynamic, dynamic.color, ray, blend.transmittance)
+        behind = blend.static[:, None] * self.output.static.color[sample]
         return color + sum_by_ray(behind, ray, self.rays), blend.dynamic
 
     def _color(self, weight: Tensor, color: Tensor, ray: Tensor, end: Tensor) -> Tensor:
-        seen = sum_by_ray(weight[:, None] * color, ray, self.rays)
-        return seen + end[:, None] * self.batch.background
+        total = sum_by_ray(weight[:, None] * color, ray, self.rays)
+        return total + end[:, None] * self.batch.background
 
     def trust(self, warp: Warp) -> Tensor:
         """Ŵ_{j→i} (R,): how far each ray's render from another frame can be compared.
@@ -220,8 +224,8 @@ class Renders:
         """
         weight = warp.weight.detach()
         if self.fields.additive:
-            own = self.output.blend.dynamic[warp.kept].detach()
-            found = 1 - sum_by_ray(weight - own, warp.ray, self.rays).abs()
+            own_weight = self.output.blend.dynamic[warp.sample].detach()
+            trust = 1 - sum_by_ray(weight - own_weight, warp.ray, self.rays).abs()
         else:
-            found = 1 - sum_by_ray(weight * warp.occlusion, warp.ray, self.rays)
-        return found.clamp(min=0) * warp.there
+            trust = 1 - sum_by_ray(weight * warp.occlusion, warp.ray, self.rays)
+        return trust.clamp(min=0) * warp.exists

@@ -30,8 +30,8 @@ class Warmup(CheckedSettings):
 
     def __post_init__(self) -> None:
         self.check_least(1, "steps_per_frame", "prior_decay")
-        most = self.max_frames
-        self.check("min_frames", 1 <= self.min_frames <= most, f"1 … max_frames ({most})")
+        limit = self.max_frames
+        self.check("min_frames", 1 <= self.min_frames <= limit, f"1 … max_frames ({limit})")
 
     def steps(self, frames: int) -> int:
         """N₀ of a scene of so many frames."""
