@@ -114,14 +114,14 @@ def catalogue(file: str | Path | None = None) -> list[PublishedScene]:
     path = OWN if file is None else Path(file).expanduser()
     try:
         listed = tomllib.loads(path.read_text())
-        collections = [Collection.model_validate(one) for one in listed.get("collection", [])]
+        collections = [Collection.model_validate(table) for table in listed.get("collection", [])]
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, ValidationError) as error:
         why = " ".join(str(error).split())
         raise DevrfError(f"fetch.catalogue: {path} cannot be read ({why[:200]})") from None
     return [
-        PublishedScene(name, about, one)
-        for one in collections
-        for name, about in one.scenes.items()
+        PublishedScene(name, about, collection)
+        for collection in collections
+        for name, about in collection.scenes.items()
     ]
 
 
@@ -266,14 +266,14 @@ def _unpacked(scene: PublishedScene, work: Path) -> Path:
         ) from None
     folder = scene.collection.folder and scene.collection.folder.format(scene=scene.name)
     marker = MARKERS[scene.collection.data]
-    found = [
+    folders = [
         path.parent
         for path in sorted(place.rglob(marker))
         if "__MACOSX" not in path.parts and folder in (None, path.parent.name)
     ]
-    if not found:
+    if not folders:
         raise DevrfError(
             f"{archive}: holds no {folder or 'folder'} with {marker}; what is "
             "published has changed: unpack it by hand"
         )
-    return min(found, key=lambda path: len(path.parts))
+    return min(folders, key=lambda path: len(path.parts))

@@ -132,11 +132,11 @@ class ViewerSettings:
             DevrfError: another program does, or the machine has no such address.
         """
         try:
-            found = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_STREAM)[0]
-            with closing(socket.socket(found[0], socket.SOCK_STREAM)) as probe:
+            address = socket.getaddrinfo(self.host, self.port, type=socket.SOCK_STREAM)[0]
+            with closing(socket.socket(address[0], socket.SOCK_STREAM)) as probe:
                 # As a server sets it: a port that was just given back is free.
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                probe.bind(found[4])
+                probe.bind(address[4])
         except OSError as error:
             key, remedy = "host", "an address of this machine, such as viewer.host=127.0.0.1"
             if error.errno == errno.EADDRINUSE:
