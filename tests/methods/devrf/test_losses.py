@@ -24,11 +24,11 @@ from devrf.methods.devrf.losses import (
     FlowMean,
     MotionPrediction,
     Prediction,
+    batch_loss,
     cycle,
     flow,
     induced_flow,
 )
-from devrf.methods.devrf.voxel_stage import weighted_loss
 from devrf.methods.weighted_loss import counted_weights
 from devrf.rendering.output import VoxelOutput
 from devrf.rendering.sampling import Samples
@@ -113,7 +113,7 @@ def test_alpha_mask_by_hand_and_without_one(prediction: Prediction) -> None:
 
 def test_the_loss_weighs_what_counts_and_reports_it_unweighted(prediction: Prediction) -> None:
     weights = counted_weights({"alpha_mask": 2.0, "color": 0.0}, PHOTOMETRIC_TERMS, "loss.fine")
-    total, values = weighted_loss(prediction, PHOTOMETRIC_TERMS, weights)
+    total, values = batch_loss(prediction, PHOTOMETRIC_TERMS, weights)
     assert (
         list(values) == ["alpha_mask", "opacity", "coverage"] and total == 2 * values["alpha_mask"]
     )
@@ -121,7 +121,7 @@ def test_the_loss_weighs_what_counts_and_reports_it_unweighted(prediction: Predi
     assert values["opacity"].item() == pytest.approx(1.55 / 3)
     assert values["coverage"].item() == pytest.approx(0.5)
     without = replace(prediction, batch=replace(prediction.batch, alpha=None))
-    assert weighted_loss(without, PHOTOMETRIC_TERMS, weights)[1].keys() == {"alpha_mask", "opacity"}
+    assert batch_loss(without, PHOTOMETRIC_TERMS, weights)[1].keys() == {"alpha_mask", "opacity"}
     with pytest.raises(DevrfError, match="loss.fine: unknown term 'colour'.*alpha_mask, color"):
         counted_weights({"colour": 1.0}, PHOTOMETRIC_TERMS, "loss.fine")
 

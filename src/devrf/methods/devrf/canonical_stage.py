@@ -22,11 +22,12 @@ from devrf.methods.devrf.free_space import possibly_occupied, view_count_weight
 from devrf.methods.devrf.losses import (
     PHOTOMETRIC_TERMS,
     Prediction,
+    batch_loss,
     total_variation_weight,
 )
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import FINE_LOSS, SEARCH_LOSS, CanonicalRates, Precision, Sampling
-from devrf.methods.devrf.voxel_stage import VoxelStage, field_optimizer, weighted_loss
+from devrf.methods.devrf.voxel_stage import VoxelStage, field_optimizer
 from devrf.methods.weighted_loss import counted_weights
 from devrf.rendering.occupancy import Occupancy, bounding_box, dilate
 from devrf.rendering.sampling import RenderSettings
@@ -282,7 +283,7 @@ class CanonicalStage(VoxelStage):
         occupancy = self.scene_model.occupancy
         prediction = Prediction(*self.render_pixels(views, pixels, occupancy, batch.capacity))
         with span("losses"):
-            return weighted_loss(prediction, PHOTOMETRIC_TERMS, self.weights[self.phase.kind])
+            return batch_loss(prediction, PHOTOMETRIC_TERMS, self.weights[self.phase.kind])
 
     @torch.no_grad()
     def on_train_end(self) -> None:

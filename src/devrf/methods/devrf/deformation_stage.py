@@ -19,10 +19,9 @@ from devrf.errors import DevrfError
 from devrf.methods.devrf.deformation_field import DeformationField, deformed_occupancy
 from devrf.methods.devrf.deformation_schedule import DeformationPhase, DeformationSchedule
 from devrf.methods.devrf.extension import Extension, MotionLoss, MotionStage
-from devrf.methods.devrf.losses import FlowMean, MotionPrediction
+from devrf.methods.devrf.losses import FlowMean, MotionPrediction, batch_loss
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import DEFORMATION_LOSS, MotionSettings, Precision
-from devrf.methods.devrf.voxel_stage import weighted_loss
 from devrf.ops.adam import GridAdam
 from devrf.scenes.scene import Views
 from devrf.system.graphs import Graphs
@@ -256,7 +255,7 @@ class DeformationStage(MotionStage):
             flow_mean=self.flow_mean,
         )
         with span("losses"):
-            return weighted_loss(prediction, self.motion_loss.terms, self.weights)
+            return batch_loss(prediction, self.motion_loss.terms, self.weights)
 
     def converged(self, losses: Tensor) -> bool:
         """Whether each active frame's loss has stopped falling, if the schedule asks for that."""

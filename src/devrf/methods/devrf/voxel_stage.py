@@ -1,10 +1,9 @@
-"""What the stages share: how a batch is drawn and rendered, and how its loss terms are weighed."""
+"""What the stages share: how a batch is drawn and rendered, and the rates of a field."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
-from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -12,20 +11,13 @@ from torch import Tensor
 from devrf.data.batch import PixelPool, Pixels, RayBatch
 from devrf.engine.batches import gather_batch
 from devrf.engine.stage import ScheduledStage
-from devrf.geometry.ndc import NormalizedDevice
-from devrf.geometry.space import WORLD
 from devrf.methods.devrf.canonical_field import CanonicalField
 from devrf.methods.devrf.deformation_field import DeformationField, GridWarp
-from devrf.methods.devrf.losses import MotionPrediction, Prediction
 from devrf.methods.devrf.model import DeVRFModel
 from devrf.methods.devrf.settings import CanonicalRates, Precision
 from devrf.methods.devrf.view import in_lists
 from devrf.methods.devrf.volume_rendering import render
-from devrf.methods.weighted_loss import visibility, weighted_sum
 from devrf.ops.adam import GridAdam
-from devrf.ops.dispatch import triton_runs
-from devrf.ops.motion import ListedSamples, SeenEarlier, motion_sum
-from devrf.ops.photometric import TERMS, photometric_sum
 from devrf.rendering.list_rendering import render_static
 from devrf.rendering.occupancy import Occupancy
 from devrf.rendering.output import ColorChange, VoxelOutput
@@ -34,10 +26,6 @@ from devrf.scenes.scene import Views
 from devrf.system.device import multiplies_bfloat16
 from devrf.system.graphs import Graphs
 from devrf.system.profiling import span
-
-Predicted = TypeVar("Predicted", bound=Prediction)
-# Σ weight · term (), and each term's value, by name.
-Weighted = tuple[Tensor, dict[str, Tensor]]
 
 
 class VoxelStage(ScheduledStage):
@@ -121,99 +109,3 @@ def field_optimizer(field: CanonicalField, rates: CanonicalRates) -> GridAdam:
         }
         for name, rate in asdict(rates).items()
     )
-
-
-def weighted_loss(
-    prediction: Predicted,
-    terms: Mapping[str, Callable[[Predicted], Tensor]],
-    weights: Mapping[str, float],
-) -> Weighted:
-    """Σ weight · term (); each term's value and how much rays hit, detached, by name.
-
-    Where Triton runs, kernels compute terms of :mod:`devrf.methods.devrf.losses` together.
-
-    Args:
-        prediction: what a batch's rays see, and the truth.
-        terms: what can be computed, by name.
-        weights: of the terms that count.
-    """
-    parts: list[Weighted] = []
-    output = prediction.output
-    if output.first is not None and triton_runs(output.color, output.sample_color):
-        parts.append(_photometric(prediction, output.first, weights))
-        if isinstance(prediction, MotionPrediction) and not {"cycle", "flow"}.isdisjoint(weights):
-            parts += _motion(prediction, weights)
-    known = {name for _, values in parts for name in values}
-    others = {name: terms[name](prediction) for name in weights if name not in known}
-    if others:
-        parts.append(weighted_sum(others, weights))
-    total, values = parts[0]
-    for part, further in parts[1:]:
-        total, values = total + part, values | further
-    if "opacity" not in values:
-        values |= visibility(output.transmittance, prediction.batch.alpha)
-    return total, values
-
-
-def _photometric(prediction: Prediction, first: Tensor, weights: Mapping[str, float]) -> Weighted:
-    """The photometric terms of lists in which ray r begins at ``first[r]``, in one kernel."""
-    output, batch = prediction.output, prediction.batch
-    # The colour's error through a warp is called render.
-    names = ["render" if term == "color" and "render" in weights else term for term in TERMS]
-    computed = photometric_sum(
-        output.color,
-        output.transmittance,
-        output.weight,
-        output.sample_color,
-        first,
-        batch.color,
-        batch.alpha,
-        [weights.get(name, 0.0) for name in names],
-    )
-    each = zip(names, computed.terms.unbind(), strict=True)
-    values = {name: value for name, value in each if name in weights}
-    values["opacity"] = computed.opacity
-    if computed.coverage is not None:
-        values["coverage"] = computed.coverage
-    return computed.total, values
-
-
-def _motion(prediction: MotionPrediction, weights: Mapping[str, float]) -> list[Weighted]:
-    """Cycle and flow in one kernel; none for warps or spaces that it does not know."""
-    output, batch, cameras = prediction.output, prediction.batch, prediction.cameras
-    samples, space = output.samples, prediction.space
-    unwarp, before = prediction.unwarp, prediction.unwarp_previous
-    if not (isinstance(unwarp, GridWarp) and isinstance(before, GridWarp)):
-        return []
-    ndc = (*space.slopes, space.near) if isinstance(space, NormalizedDevice) else None
-    grids = (*unwarp.slices, *before.slices)
-    straight = (ndc is not None or space == WORLD) and not unwarp.still_outside
-    if samples.present is None or not straight or len(grids) != 2:
-        return []
-    if not triton_runs(output.canonical, *grids):
-        return []
-    seen = None
-    if "flow" in weights and batch.flow is not None and batch.flow_valid is not None:
-        seen = SeenEarlier(
-            batch.flow,
-            batch.flow_valid,
-            batch.pixel,
-            batch.image,
-            prediction.previous_image,
-            cameras.camera_to_world,
-            cameras.focal,
-            cameras.center,
-        )
-    computed = motion_sum(
-        ListedSamples(
-            samples.points, output.canonical, output.weight, samples.ray, samples.present
-        ),
-        *grids,
-        seen,
-        (weights.get("cycle", 0.0), weights.get("flow", 0.0)),
-        box=unwarp.box,
-        over_samples=prediction.flow_mean == "samples",
-        ndc=ndc,
-    )
-    values = zip(("cycle", "flow"), computed.terms.unbind(), strict=True)
-    return [(computed.total, {name: value for name, value in values if name in weights})]

@@ -17,9 +17,9 @@ from devrf.data.batch import PixelPool, Pixels
 from devrf.engine.batches import frame_pools, static_pool
 from devrf.engine.learner import ParallelBatch, Phase
 from devrf.errors import expect
-from devrf.methods.devrf.losses import PHOTOMETRIC_TERMS, Prediction
+from devrf.methods.devrf.losses import PHOTOMETRIC_TERMS, Prediction, batch_loss
 from devrf.methods.devrf.settings import FINE_LOSS, CanonicalRates, Precision
-from devrf.methods.devrf.voxel_stage import VoxelStage, field_optimizer, weighted_loss
+from devrf.methods.devrf.voxel_stage import VoxelStage, field_optimizer
 from devrf.methods.weighted_loss import counted_weights
 from devrf.rendering.occupancy import Occupancy, dilate
 from devrf.scenes.scene import Views
@@ -192,7 +192,7 @@ class RefinementStage(VoxelStage):
                 occupancy = self._occupancies[frame - 1]
             seen = self.render_pixels(shown, part, occupancy, None, warp, color_change)
             with span("losses"):
-                loss, terms = weighted_loss(Prediction(*seen), PHOTOMETRIC_TERMS, self.weights)
+                loss, terms = batch_loss(Prediction(*seen), PHOTOMETRIC_TERMS, self.weights)
                 share = (stop - start) / len(pixels)
                 total = total + share * loss
                 for name, value in terms.items():
