@@ -112,7 +112,7 @@ class MotionLoss:
         extensions: Sequence[Extension],
         schedule: DeformationSchedule,
     ) -> None:
-        """Check the weights.
+        """Merge the weights, and check all names.
 
         Args:
             loss: weights by the terms' names; ``tv`` is the total variation of both fields.
@@ -124,23 +124,24 @@ class MotionLoss:
         """
         self.terms: dict[str, MotionTerm] = dict(MOTION_TERMS)
         weights = {name: weight for name, weight in loss.items() if name != "tv"}
-        scaled = [("schedule.extensions", extension.scaled_terms) for extension in extensions]
-        for number, level in enumerate(schedule.levels, 1):
-            key = f"schedule.deformation.levels.{number}.weight_factors"
-            scaled.append((key, level.weight_factors.keys() - {"tv"}))
         for extension in extensions:
             self.terms |= extension.terms
             weights |= extension.weights
-        for key, names in scaled:
-            for name in names:
-                if name not in self.terms:
-                    known = ", ".join(sorted(self.terms))
-                    raise DevrfError(
-                        f"{key}: {name} is no term of loss.deformation; the terms are {known}"
-                    )
-        self._whole = counted_weights(weights, self.terms, "loss.deformation")
         self._tv = loss.get("tv", 0.0)
         self._extensions, self._schedule = extensions, schedule
+        self._check_factors()
+        self._whole = counted_weights(weights, self.terms, "loss.deformation")
+
+    def _check_factors(self) -> None:
+        factors = [("schedule.extensions", each.scaled_terms) for each in self._extensions]
+        for number, level in enumerate(self._schedule.levels, 1):
+            key = f"schedule.deformation.levels.{number}.weight_factors"
+            factors.append((key, level.weight_factors.keys() - {"tv"}))
+        terms = ", ".join(sorted(self.terms))
+        for key, names in factors:
+            for name in sorted(set(names) - self.terms.keys()):
+                problem = f"{name} is no term of loss.deformation; the terms are {terms}"
+                raise DevrfError(f"{key}: {problem}")
 
     def leave_out(self, term: str) -> bool:
         """Let a term count no more; whether it did."""

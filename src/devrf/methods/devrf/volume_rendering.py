@@ -58,14 +58,12 @@ def render(
             near=settings.near,
             far=settings.far,
         )
-    # Most samples are empty or hidden. They are left out before the graph is built, so that
-    # gradients are computed for the others alone.
+    # Most samples are empty or hidden. A first pass without gradients leaves them out; a second
+    # warps the others again, since its results have a graph to the warp and the field.
     with torch.no_grad():
         samples, canonical, tau = _visible(samples, field, delta, settings.alpha_threshold, warp)
     if torch.is_grad_enabled():
-        canonical = _warped(samples, warp)
-        with span("density"):
-            tau = field.optical_depth(canonical, delta)
+        canonical, tau = _optical_depths(samples, field, delta, warp)
     with span("compositing"):
         weight, transmittance = composite(tau, samples.ray, len(rays))
     with span("sampling"):
@@ -101,9 +99,7 @@ def _visible(
     samples: Samples, field: CanonicalField, delta: float, threshold: float, warp: Warp | None
 ) -> tuple[Samples, Tensor, Tensor]:
     """The samples that are neither empty nor hidden, their canonical positions, and their τ."""
-    canonical = _warped(samples, warp)
-    with span("density"):
-        tau = field.optical_depth(canonical, delta)
+    canonical, tau = _optical_depths(samples, field, delta, warp)
     with span("sampling"):
         opaque = _at_least(-torch.expm1(-tau), threshold)
         ray, tau = samples.ray.index_select(0, opaque), tau.index_select(0, opaque)
@@ -115,11 +111,16 @@ def _visible(
         return samples[kept], canonical.index_select(0, kept), tau.index_select(0, reached)
 
 
-def _warped(samples: Samples, warp: Warp | None) -> Tensor:
-    if warp is None:
-        return samples.points
-    with span("warp"):
-        return warp(samples.points)
+def _optical_depths(
+    samples: Samples, field: CanonicalField, delta: float, warp: Warp | None
+) -> tuple[Tensor, Tensor]:
+    """Canonical positions of samples, and their τ."""
+    canonical = samples.points
+    if warp is not None:
+        with span("warp"):
+            canonical = warp(canonical)
+    with span("density"):
+        return canonical, field.optical_depth(canonical, delta)
 
 
 def _at_least(values: Tensor, threshold: float) -> Tensor:
