@@ -142,7 +142,8 @@ def load_checkpoint(path: Path, scene: Scene | None = None) -> LoadedCheckpoint:
     model_class = _model_class(path, metadata)
     try:
         state = {k.removeprefix(MODEL): v for k, v in data["state_dict"].items() if MODEL in k}
-        model = model_class.from_config(metadata.model)
+        own_config = {k: v for k, v in metadata.model.items() if k != "_target_"}
+        model = model_class.from_config(own_config)
         model.load_stored_state(state)
         viewpoints = None if "viewpoints" not in data else _viewpoints(**data["viewpoints"])
     except (RuntimeError, LookupError, ValueError, TypeError, AttributeError):
