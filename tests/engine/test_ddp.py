@@ -143,8 +143,8 @@ def test_each_process_and_step_draws_pixels_of_its_own(
     drawn = {}
     for number, iteration, seed in [(0, 0, 0), (1, 0, 0), (0, 10, 0), (0, 0, 1), (0, 0, 0)]:
         torch.manual_seed(seed)
-        monkeypatch.setattr("devrf.engine.stage.rank", lambda number=number: number)
         stage = canonical()
+        monkeypatch.setattr(CanonicalStage, "global_rank", number)
         stage.iteration = iteration
         stage.trainer = trainer()
         stage.trainer.datamodule = SimpleNamespace(scene=datamodule.scene)

@@ -49,14 +49,14 @@ class MetricAccumulator:
         else:
             torch._foreach_add_(self._values.view(-1).unbind(), values)
 
-    def take(self, iterations: int) -> tuple[dict[str, Tensor], Tensor]:
-        """The means over ``iterations`` and all processes; the sums are set to zero.
+    def take(self, iterations: int, processes: int) -> tuple[dict[str, Tensor], Tensor]:
+        """The means over ``iterations`` and all ``processes``; the sums are set to zero.
 
         Returns:
             For each name the mean over the batches, (); for each batch its ``loss``, (batches,).
         """
         assert self._values is not None
-        means = average(self._values) / iterations
+        means = (average(self._values) if processes > 1 else self._values) / iterations
         self._values.zero_()
         over_batches = dict(zip(self._names, means.mean(dim=0).unbind(), strict=True))
         return over_batches, means[:, self._names.index("loss")]
@@ -86,7 +86,7 @@ class Loop:
         self.micro_batching = MicroBatching()
         self.metrics = MetricAccumulator()
         self.num_captures = self.num_short_lists = 0
-        self.rays, self._processes = 0, 1
+        self.rays, self.processes = 0, 1
         self._device = torch.device("cpu")
         # What losses are scaled by in the backward pass, which would fill one each time.
         self._one = torch.ones(())
@@ -116,7 +116,7 @@ class Loop:
             static_shape: whether all shapes must be independent of data.
         """
         self.release()
-        self.rays, self._processes = rays_per_rank(rays), world_size()
+        self.rays, self.processes = rays_per_rank(rays), world_size()
         self._device = parameters[0][0].device
         self._one = self._one.to(self._device)
         self.batches = [ParallelBatch(k, learned) for k, learned in enumerate(parameters)]
@@ -174,7 +174,7 @@ class Loop:
         """Compute the gradients of all batches; add losses and terms to the metrics."""
         pieces = [partial(self._gradients, batch, stage, views) for batch in self.batches]
         terms = self._streams(pieces, self._device)
-        if self._processes > 1:
+        if self.processes > 1:
             groups = stage.optimizer.param_groups
             average_gradients(p for group in groups for p in group["params"])
         self.metrics.add(terms)
@@ -229,7 +229,7 @@ class Loop:
 
     def capturer(self) -> CudaGraphCapture | None:
         """Captures work in graphs; None unless shapes are static, in one process on a GPU."""
-        on_gpu = self._device.type == "cuda" and self._processes == 1
+        on_gpu = self._device.type == "cuda" and self.processes == 1
         if not (self.capacities and self.graphs == "auto" and on_gpu):
             return None
         if self._capture is None or self._capture.device != self._device:

@@ -25,7 +25,7 @@ from devrf.checkpoints.checkpoint import (
 )
 from devrf.checkpoints.progress import rng_state, set_rng_state
 from devrf.data.batch import background_color
-from devrf.engine.ddp import assert_replicas_equal, broadcast, check_strategy, rank
+from devrf.engine.ddp import assert_replicas_equal, broadcast, check_strategy
 from devrf.engine.learner import Learner
 from devrf.engine.loop import Loop
 from devrf.errors import DevrfError
@@ -219,7 +219,7 @@ class ScheduledStage(Learner):
         self.loop.poll()
         means: dict[str, Tensor] = {}
         if self.iteration > first:
-            means, losses = self.loop.metrics.take(self.iteration - first)
+            means, losses = self.loop.metrics.take(self.iteration - first, self.loop.processes)
             if self.iteration < stop and self.converged(losses):
                 self.skipped += stop - self.iteration
                 self.iteration = stop
@@ -266,12 +266,18 @@ class ScheduledStage(Learner):
 
     def _reseed(self) -> None:
         """Seed the generator for the next step, differently in each process."""
-        mixed = np.random.SeedSequence([self.seed, rank(), self.iteration, self.num_rollbacks])
+        mixed = np.random.SeedSequence(
+            [self.seed, self.global_rank, self.iteration, self.num_rollbacks]
+        )
         self.generator.manual_seed(int(mixed.generate_state(1, np.uint64)[0]))
 
     def on_train_end(self) -> None:
         """Pack what was learned while it is on its GPU: Lightning moves the stage to the host."""
-        if self.device.type == "cuda" and self.iteration >= self.total_iterations and rank() == 0:
+        if (
+            self.device.type == "cuda"
+            and self.iteration >= self.total_iterations
+            and self.global_rank == 0
+        ):
             self._finished = self.current_model().stored_state()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:

@@ -43,7 +43,8 @@ def _box(value: Any) -> Box | None:
 
 
 BoundScale = Annotated[float | str, PlainValidator(_bound_scale)]
-BoxOption = Annotated[Box | None, PlainValidator(_box)]
+# A config gives corners, of which the reader makes a Box.
+BoxOption = Annotated[Any, PlainValidator(_box)]
 
 
 @dataclass(frozen=True)
