@@ -78,11 +78,6 @@ def check_strategy(trainer: Trainer) -> None:
         )
 
 
-def rank() -> int:
-    """The index of this process, from 0."""
-    return distributed.get_rank() if _is_distributed() else 0
-
-
 def world_size() -> int:
     """The number of processes."""
     return distributed.get_world_size() if _is_distributed() else 1
