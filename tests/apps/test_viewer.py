@@ -193,6 +193,15 @@ def test_another_browsers_first_frame_comes_before_the_finer_of_one():
     assert {key for key, _, rows in screen.shown if rows == 100} == {"a", "b"}
 
 
+def test_browsers_are_served_in_turn_while_time_runs():
+    screen = Screen()
+    for _ in range(6):
+        for key in "abc":  # time runs for all
+            screen.scheduler.ask(key, FIRST)
+        assert screen.scheduler.render_next(0)
+    assert [key for key, _, _ in screen.shown] == [*"abcabc"]
+
+
 def test_nothing_is_shown_to_who_has_left_or_once_it_is_stopped():
     screen = Screen()
     screen.between = lambda rows: screen.scheduler.drop("a")

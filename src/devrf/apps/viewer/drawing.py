@@ -164,19 +164,18 @@ class Drawing:
 
 @dataclass
 class _Request:
-    """A browser's newest shot, its number among all, and the rows last shown of it, or 0."""
+    """A browser's newest shot, and the rows last shown of it, or 0."""
 
     shot: Shot
-    number: int
     rows: int = 0
 
 
 class RenderScheduler:
     """Renders the newest shot of each browser, coarse first; a finer frame ends when one moves.
 
-    Shots may be asked for from any thread; frames are rendered by the one that calls
-    :meth:`render_next`. A coarse frame is always finished: while a camera moves without pause it
-    would never be seen otherwise.
+    Browsers are served in turn. Shots may be asked for from any thread; frames are rendered by the
+    one that calls :meth:`render_next`. A coarse frame is always finished: while a camera moves
+    without pause it would never be seen otherwise.
     """
 
     def __init__(
@@ -194,15 +193,13 @@ class RenderScheduler:
         """
         self.drawing, self._stop, self._show = drawing, stop, show
         self._height, self._move_seconds = settings.height, settings.move_seconds
-        self._requests: dict[Hashable, _Request] = {}
-        self._number = 0
+        self._requests: dict[Hashable, _Request] = {}  # the one served last is at the end
         self._change = threading.Condition()
 
     def ask(self, key: Hashable, shot: Shot) -> None:
         """Render ``shot`` for the browser ``key``, instead of what it asked for before."""
         with self._change:
-            self._number += 1
-            self._requests[key] = _Request(shot, self._number)
+            self._requests[key] = _Request(shot)
             self._change.notify()
 
     def again(self) -> None:
@@ -235,7 +232,11 @@ class RenderScheduler:
         for frame in self.drawing.draw(request.shot, rows):
             if frame is not None:
                 request.rows = rows
-                if key in self._requests:
+                with self._change:
+                    watched = key in self._requests
+                    if watched:
+                        self._requests[key] = self._requests.pop(key)
+                if watched:
                     self._show(key, frame)
                     return True
             elif self._stop.is_set() or (not coarse and self._overtaken(key, request)):
@@ -243,9 +244,9 @@ class RenderScheduler:
         return False
 
     def _most_urgent(self) -> tuple[Hashable, _Request] | None:
-        """Whose frame is the coarsest; of several the one that has waited longest."""
+        """Whose frame is the coarsest; of several the one that was served longest ago."""
         waiting = [item for item in self._requests.items() if item[1].rows < self._height]
-        return min(waiting, key=lambda item: (item[1].rows, item[1].number), default=None)
+        return min(waiting, key=lambda item: item[1].rows, default=None)
 
     def _overtaken(self, key: Hashable, request: _Request) -> bool:
         """Whether the browser has moved on, or another waits for its first frame."""
