@@ -272,6 +272,49 @@ def test_keyframes_are_collected_saved_loaded_and_flown_through(moving, tiny_sce
         session.close()
 
 
+# Host and Origin of a request, and whether it may open the page's socket; % is the port.
+ASKED = [
+    ("127.0.0.1:%", None, True),  # no browser's
+    ("127.0.0.1:%", "http://127.0.0.1:%", True),
+    ("localhost:9000", "http://localhost:9000", True),  # through a tunnel
+    (socket.gethostname(), f"https://{socket.gethostname()}", True),
+    ("127.0.0.1:%", "http://elsewhere.org", False),
+    ("127.0.0.1:%", "http://127.0.0.1:3000", False),  # another program's page
+    ("127.0.0.1:%", "null", False),
+    ("rebound.org:%", "http://rebound.org:%", False),
+    ("rebound.org:%", None, False),
+]
+
+
+def test_other_pages_and_probes_of_the_port_get_nothing(caplog):
+    pytest.importorskip("viser", reason="the viewer's extra is not installed")
+    from devrf.apps.viewer.server import open_server, quiet
+
+    port = free_port()
+
+    def answer(request):
+        with socket.create_connection(("127.0.0.1", port), timeout=20) as probe:
+            probe.sendall(request.replace("%", str(port)).encode())
+            return probe.recv(12) if request.endswith("\r\n\r\n") else None
+
+    upgrade = (
+        "GET / HTTP/1.1\r\nHost: {}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n{}\r\n"
+    )
+    with quiet():
+        server = open_server(ViewerSettings(port=port))
+        for half in ("", "GET / HT", "\0\1"):
+            answer(half)
+        for host, origin, opens in ASKED:
+            named = "" if origin is None else f"Origin: {origin}\r\n"
+            status = b"HTTP/1.1 101" if opens else b"HTTP/1.1 403"
+            assert answer(upgrade.format(host, named)) == status, (host, origin)
+        assert answer("GET / HTTP/1.1\r\nHost: 127.0.0.1:%\r\n\r\n") == b"HTTP/1.1 200"
+        assert answer("POST / HTTP/1.1\r\nHost: 127.0.0.1:%\r\n\r\n") != b"HTTP/1.1 200"
+        server.stop()
+    assert not caplog.records
+
+
 @pytest.mark.parametrize(
     ("keys", "expected"), [({"port": 70000}, "viewer.port: "), ({"share": 2}, "viewer.share: ")]
 )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import logging
 import threading
 import time
@@ -19,6 +17,7 @@ from devrf.apps.viewer.cameras import FrustaLayer, in_browser
 from devrf.apps.viewer.controls import Controls
 from devrf.apps.viewer.drawing import Drawing, Frame, RenderScheduler
 from devrf.apps.viewer.paths import PathPanel, distance_ahead, known_paths
+from devrf.apps.viewer.server import open_server, quiet
 from devrf.checkpoints.checkpoint import Viewpoints
 from devrf.rendering.view import Viewable
 from devrf.scenes.scene import Scene
@@ -60,7 +59,7 @@ class Session:
         self._stop = threading.Event()
         self._flight: tuple[CameraPath, float] | None = None
         self._ticked = time.monotonic()
-        self.server = _open_server(settings)
+        self.server = open_server(settings)
         self.controls = Controls(self.server, self.refresh)
         self.paths = PathPanel(
             self.server,
@@ -110,7 +109,7 @@ class Session:
     def close(self) -> None:
         """Take the page from the network."""
         self.stop()
-        with _quiet():
+        with quiet():
             self.server.stop()
 
     def refresh(self) -> None:
@@ -188,20 +187,3 @@ class Session:
                 client.camera.fov = fov
             self._ask(client)
         self._show_cameras()
-
-
-def _open_server(settings: ViewerSettings) -> viser.ViserServer:
-    """A server at the address of the settings."""
-    settings.check_free()
-    logging.getLogger("websockets").setLevel(logging.WARNING)
-    with _quiet():
-        server = viser.ViserServer(settings.host, settings.port, label="devrf", verbose=False)
-    # Its share button would give the page to a server elsewhere.
-    server.gui.configure_theme(show_logo=False, show_share_button=False)
-    server.gui.main_panel.dock_right()  # beside the frame, not on it
-    return server
-
-
-def _quiet() -> contextlib.redirect_stdout[io.StringIO]:
-    """A block in which the server prints no banner."""
-    return contextlib.redirect_stdout(io.StringIO())

@@ -1,0 +1,79 @@
+"""The page's server: it answers the page that it gave out, and no other."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import socket
+from functools import partial
+from http import HTTPStatus
+from ipaddress import ip_address
+from typing import Any
+from urllib.parse import urlsplit
+
+import viser
+from websockets.asyncio import server as websockets_server
+from websockets.asyncio.server import ServerConnection
+from websockets.http11 import Request, Response
+
+from devrf.apps.settings import ViewerSettings
+
+
+def open_server(settings: ViewerSettings) -> viser.ViserServer:
+    """A server at the address of the settings, with an empty page.
+
+    Raises:
+        DevrfError: the address is in use, or not this machine's.
+    """
+    settings.check_free()
+    logging.getLogger("websockets").setLevel(logging.WARNING)
+    # A probe of the port asks for no page: its traceback would tell nothing.
+    logging.getLogger("websockets.server").addFilter(lambda r: r.msg != "opening handshake failed")
+    names = {"localhost", settings.host, socket.gethostname(), socket.getfqdn()}
+    serve = websockets_server.serve
+    # viser has no setting for a check of requests.
+    websockets_server.serve = partial(_guarded, serve, names)  # type: ignore[misc, assignment]
+    try:
+        with quiet():
+            server = viser.ViserServer(settings.host, settings.port, label="devrf", verbose=False)
+    finally:
+        websockets_server.serve = serve  # type: ignore[misc]
+    # Its share button would give the page to a server elsewhere.
+    server.gui.configure_theme(show_logo=False, show_share_button=False)
+    server.gui.main_panel.dock_right()  # beside the frame, not on it
+    return server
+
+
+def quiet() -> contextlib.redirect_stdout[io.StringIO]:
+    """A block in which the server prints no banner."""
+    return contextlib.redirect_stdout(io.StringIO())
+
+
+def _guarded(serve: Any, names: set[str], *where: Any, process_request: Any, **more: Any) -> Any:
+    """``serve``, which answers no page from elsewhere that the same browser shows.
+
+    Such a page gives its own address in ``Origin``. One whose name was made to lead to this machine
+    (DNS rebinding) gives that name in ``Host``: an IP address or one of the machine's own ``names``
+    cannot be made so.
+    """
+
+    def answer(connection: ServerConnection, request: Request) -> Response | None:
+        host = request.headers.get("Host", "").lower()
+        name = urlsplit(f"//{host}").hostname or ""
+        if name not in map(str.lower, names) and not _is_address(name):
+            why = f"this machine is not {name!r}; open the page by its IP address"
+        elif urlsplit(request.headers.get("Origin", f"//{host}")).netloc.lower() != host:
+            why = "another page's request"
+        else:
+            response: Response | None = process_request(connection, request)
+            return response
+        return connection.respond(HTTPStatus.FORBIDDEN, f"devrf: {why}\n")
+
+    return serve(*where, process_request=answer, **more)
+
+
+def _is_address(name: str) -> bool:
+    with contextlib.suppress(ValueError):
+        return bool(ip_address(name))
+    return False
