@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 
 import pytest
@@ -16,13 +17,14 @@ class Page:
     """Stands for a session: draws one small picture in each step."""
 
     def __init__(self, keyframe: Keyframe) -> None:
-        self.watched, self.keyframe, self.scheduler = True, keyframe, self
-        self.pictures = list[float]()
+        self.watched, self.keyframe, self.scheduler, self.controls = True, keyframe, self, self
+        self.pictures, self.told, self.followed = list[float](), list[str](), set[float | None]()
+        self.tell, self.follow = self.told.append, self.followed.add
 
     def present(self, drawing: Drawing) -> None:
         self.drawing = drawing
 
-    def again(self) -> None:
+    def refresh(self) -> None:
         pass
 
     def step(self, timeout: float) -> bool:
@@ -53,6 +55,10 @@ def test_the_scene_is_shown_as_it_is_learned(fitted):
     live, page, _ = fitted(share=1.0)
     assert len(page.pictures) > 3 and live.seconds > 0.02 * len(page.pictures)
     assert page.pictures[0] != page.pictures[-1]
+    assert page.told[0] == "**canonical** begins"
+    assert re.match(r"\*\*canonical\*\*: static \d+/20  \d+\.\d dB  .* left$", page.told[2])
+    assert "**canonical** has ended after 20 of 20 iterations." in page.told[-1]
+    assert page.followed == {None}
 
 
 def test_pictures_take_their_share_alone(fitted):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from typing import Any
 
@@ -10,11 +9,10 @@ from lightning import Callback, LightningModule, Trainer
 
 from devrf.apps.viewer.drawing import Drawing
 from devrf.apps.viewer.session import Session
+from devrf.callbacks.progress import in_one_line
 from devrf.engine.stage import ScheduledStage
 from devrf.evaluation.held_out import background_value
 from devrf.rendering.renderer import Renderer
-
-log = logging.getLogger(__name__)
 
 # Seconds between two pictures at least, however fast they are.
 PAUSE = 0.2
@@ -39,8 +37,10 @@ class LiveView(Callback):
         """Show this stage."""
         assert isinstance(pl_module, ScheduledStage)
         self.seconds, self._began = 0.0, time.perf_counter()
+        self._first = pl_module.iteration
         self._drawing = Drawing(_renderer(pl_module), background_value(pl_module.scene.background))
         self.session.present(self._drawing)
+        self.session.controls.tell(f"**{pl_module.name}** begins")
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -50,19 +50,29 @@ class LiveView(Callback):
         scheduler, now = self.session.scheduler, time.perf_counter()
         if scheduler is None or not scheduler.watched or now - self._last < PAUSE:
             return
+        self._last = now
+        speed = (pl_module.iteration - self._first) / (now - self._began)
+        line = in_one_line(pl_module.logged, pl_module, speed)
+        self.session.controls.tell(f"**{pl_module.name}**: {line}")
         if self.seconds > self.share * (now - self._began):
             return
         self._drawing.renderer = _renderer(pl_module)
-        scheduler.again()
+        frames = () if pl_module.phase is None else pl_module.phase.frames
+        clock = pl_module.scene.clock
+        self.session.controls.follow(clock.times[frames[-1]] if frames else None)
+        self.session.refresh()
         self.session.step(0.0)
         self._last = time.perf_counter()
         self.seconds += self._last - now
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Say what this stage's pictures have taken."""
-        if self.seconds:
-            passed = time.perf_counter() - self._began
-            log.info("viewer: pictures took %.1f of %.1f s", self.seconds, passed)
+        """Say that the stage has ended."""
+        assert isinstance(pl_module, ScheduledStage)
+        done, total = pl_module.iteration, pl_module.total_iterations
+        self.session.controls.tell(
+            f"**{pl_module.name}** has ended after {done} of {total} iterations. The picture stays "
+            "as it is until another stage begins or the run ends."
+        )
 
 
 def _renderer(stage: ScheduledStage) -> Renderer:

@@ -65,13 +65,12 @@ class Progress(Callback):
         since, done = now - self._shown[0], pl_module.iteration
         if since < (self.line_every_seconds if self._bar is None else BAR_EVERY_SECONDS):
             return
-        speed, total = (done - self._shown[1]) / since, pl_module.total_iterations
-        state = describe(outputs or {}, pl_module, speed)
+        speed = (done - self._shown[1]) / since
         self._shown = (now, done)
         if self._bar is None:
-            left = f"  {time_left((total - done) / speed)}" if 0 < speed and done < total else ""
-            log.info("%s %d/%d  %s%s", pl_module.capture, done, total, state, left)
+            log.info("%s", in_one_line(outputs or {}, pl_module, speed))
         else:
+            state = describe(outputs or {}, pl_module, speed)
             self._bar.update(self._bar.task_ids[0], completed=done, state=state)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -89,6 +88,13 @@ class Progress(Callback):
             self._bar.update(self._bar.task_ids[0], completed=self._shown[1])
             self._bar.stop()
             self._bar = None
+
+
+def in_one_line(means: Mapping[str, Tensor], stage: ScheduledStage, speed: float) -> str:
+    """Where a stage is, what :func:`describe` says, and the time left."""
+    done, total = stage.iteration, stage.total_iterations
+    left = f"  {time_left((total - done) / speed)}" if 0 < speed and done < total else ""
+    return f"{stage.capture} {done}/{total}  {describe(means, stage, speed)}{left}"
 
 
 def describe(means: Mapping[str, Tensor], stage: ScheduledStage, speed: float) -> str:

@@ -96,7 +96,7 @@ def view(run: RunContext) -> None:
     assert viewpoints is not None
     renderer = Renderer(stored.model.to_view(run.device), times=CACHED)
     with (
-        closing(Session(settings, viewpoints, scene, run.folder)) as session,
+        closing(Session(settings, viewpoints, scene, run.folder, run.config.ckpt)) as session,
         handle_signals(lambda _: session.stop()),
     ):
         session.present(Drawing(renderer, background_value(viewpoints.background)))

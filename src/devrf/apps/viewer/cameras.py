@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 FLIP = (1.0, -1.0, -1.0)
 # Rows of an image in a frustum, and the most frusta of a capture.
 ROWS, MAX_FRUSTA = 96, 60
-# A frustum's depth as a share of the cameras' extent.
-DEPTH = 0.04
-COLOR = (40, 110, 170)
+# A frustum is as deep as its neighbour is far, within these shares of the distance of the scene.
+MIN_DEPTH, MAX_DEPTH = 0.03, 0.12
+COLOR, THICKNESS = (40, 110, 170), 1.5
 
 
 def from_browser(camera: viser.CameraHandle, time: float, seconds: float = 0.0) -> Keyframe:
@@ -83,11 +83,14 @@ def _thumbnail(scene: Scene, views: Views, index: int) -> Tensor:
 class FrustaLayer:
     """The captured cameras in the page's scene."""
 
-    def __init__(self, server: viser.ViserServer, cameras: Cameras, scene: Scene | None) -> None:
-        """Show none yet; ``cameras`` saw the scene at rest, their images are the ``scene``'s."""
+    def __init__(
+        self, server: viser.ViserServer, cameras: Cameras, scene: Scene | None, distance: float
+    ) -> None:
+        """Show none yet; ``cameras`` saw the ``scene`` at rest, from about this ``distance``."""
         self._server, self._cameras, self._scene = server, cameras, scene
-        extent = float((cameras.positions.amax(dim=0) - cameras.positions.amin(dim=0)).norm())
-        self._depth = DEPTH * (extent or 1.0)
+        shown = cameras.positions[evenly(len(cameras), MAX_FRUSTA)]
+        apart = torch.cdist(shown, shown).fill_diagonal_(math.inf).amin(dim=1).median()
+        self._depth = float(apart.clamp(MIN_DEPTH * distance, MAX_DEPTH * distance))
         self._handles: dict[str, viser.CameraFrustumHandle] = {}
         self._shown: object = None
 
@@ -114,12 +117,15 @@ class FrustaLayer:
     def _added(self, frustum: Frustum) -> viser.CameraFrustumHandle:
         wxyz, position, fov = in_browser(keyframes_of(frustum.camera, [0.0], 0.0)[0])
         fx, fy = frustum.camera.focal[0].tolist()
+        aspect = (frustum.camera.width / fx) / (frustum.camera.height / fy)
+        volume = math.tan(fov / 2) ** 2 * aspect / 3  # the same for all frusta of one scale
         return self._server.scene.add_camera_frustum(
             f"/cameras/{frustum.name}",
             fov,
-            (frustum.camera.width / fx) / (frustum.camera.height / fy),
-            scale=self._depth,
-            thickness=0.02 * self._depth,
+            aspect,
+            scale=self._depth * volume ** (1 / 3),
+            thickness=THICKNESS,
+            thickness_units="screen",
             color=COLOR,
             image=None if frustum.image is None else frustum.image.numpy(),
             wxyz=wxyz,

@@ -64,12 +64,16 @@ class Controls:
         """Put them on the page; ``changed`` is called, from any thread, to render again."""
         self.playback, self._lock, self._changed = Playback(), threading.Lock(), changed
         gui = server.gui
-        with gui.add_folder("Time"):
+        self._told = gui.add_markdown("", visible=False)
+        self._timing = gui.add_folder("Time")
+        with self._timing:
             self._time = gui.add_slider("time", 0.0, 1.0, 0.001, 0.0, hint="0 is the rest state")
             self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY)
             self._loop = gui.add_checkbox("loop", True)
             hint = f"1: all of it in {DURATION:g} seconds"
             self._speed = gui.add_dropdown("speed", SPEEDS, initial_value="1", hint=hint)
+            hint = "show the frame that is being learned"
+            self._follow = gui.add_checkbox("follow", True, visible=False, hint=hint)
         with gui.add_folder("Picture"):
             self._channel: Any = gui.add_dropdown("show", ("color",))
             self._rest = gui.add_checkbox("rest beside", False, hint="the rest state on the left")
@@ -83,13 +87,21 @@ class Controls:
                 gui.add_multi_slider(axis, 0, 100, 1, (0, 100), min_range=1, hint="% of the box")
                 for axis in "xyz"
             ]
+            gui.add_button("Reset").on_click(lambda _: self._reset_crop())
+        self._cropped_by: int | None = None
         self._time.on_update(self._time_set)
         self._play.on_click(self._play_pressed)
         self._loop.on_update(self._pace_set)
         self._speed.on_update(self._pace_set)
-        boxes: list[Any] = [self._channel, self._rest, self.dynamic, self.static, self._crop]
-        for control in (*boxes, *self._sides):
+        # Frusta would not lie where two pictures show the scene.
+        scene, rest = server.scene, self._rest
+        rest.on_update(lambda _: scene.set_global_visibility(not rest.value))
+        boxes: list[Any] = [self._channel, rest, self.dynamic, self.static]
+        crop: list[Any] = [self._crop, *self._sides]
+        for control in (*boxes, *crop):
             control.on_update(lambda _: self._changed())
+        for control in crop:
+            control.on_update(self._crop_set)
 
     def offer(self, drawing: Drawing) -> None:
         """Offer what can be shown of a scene."""
@@ -97,8 +109,7 @@ class Controls:
         self._channel.options = drawing.channels
         set_value(self._channel, chosen if chosen in drawing.channels else "color")
         self._rest.visible = drawing.has_rest
-        for control in (self._time, self._play, self._loop, self._speed):
-            control.disabled = drawing.at_rest
+        self._timing.visible = not drawing.at_rest
 
     def advance(self, seconds: float) -> bool:
         """Let time run for ``seconds``; whether it has changed."""
@@ -134,8 +145,31 @@ class Controls:
 
     def show_status(self, text: str) -> None:
         """Show a line below the choice of channels."""
-        if self._status.content != text:
-            self._status.content = text
+        self._status.content = text
+
+    def tell(self, text: str) -> None:
+        """Say at the top of the page what the scene is going through."""
+        self._told.content, self._told.visible = text, True
+
+    def follow(self, time: float | None) -> None:
+        """Show the time that is being learned, if it is one, and none was chosen on the page."""
+        self._follow.visible = time is not None
+        if time is not None and self._follow.value and time != self.playback.time:
+            self.set_time(time)
+
+    def left(self, client: int) -> None:
+        """A page was closed: the crop that it set goes with it."""
+        if client == self._cropped_by:
+            self._reset_crop()
+
+    def _reset_crop(self) -> None:
+        set_value(self._crop, False)
+        for slider in self._sides:
+            set_value(slider, (0, 100))
+
+    def _crop_set(self, event: viser.GuiEvent[Any]) -> None:
+        if event.client_id is not None:
+            self._cropped_by = event.client_id
 
     def _change(self, change: Callable[[Playback], Playback]) -> None:
         """Change the playback, and the button that says what it does."""
@@ -149,10 +183,12 @@ class Controls:
     def _time_set(self, event: viser.GuiEvent[Any]) -> None:
         if event.client is None:  # set by this program
             return
+        set_value(self._follow, False)
         self._change(lambda now: replace(now, time=float(self._time.value)))
         self._changed()
 
     def _play_pressed(self, _: object) -> None:
+        set_value(self._follow, False)
         self._change(Playback.toggled)
         self._changed()
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Hashable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -39,7 +40,8 @@ class Shot:
         keyframe: the camera and the scene's time.
         aspect: width over height.
         channel: ``color``, ``depth``, ``opacity`` or ``motion``.
-        beside_rest: whether the rest state is shown beside, on the left.
+        beside_rest: whether the rest state is shown beside, on the left, from so much farther that
+            each half shows the whole width.
         crop: leave out what is outside this box (:class:`~devrf.rendering.renderer.CroppedRays`).
         with_depth: whether distances are asked for, to hide what is behind the scene.
     """
@@ -96,9 +98,11 @@ class Drawing:
         began = time.perf_counter()
         shown = shot.keyframe.time
         times = [0.0, shown] if shot.beside_rest and self.has_rest else [shown]
+        tangent = len(times) * math.tan(math.radians(shot.keyframe.fov) / 2)
+        keyframe = replace(shot.keyframe, fov=2 * math.degrees(math.atan(tangent)))
         parts, depth = [], None
         for moment in times:
-            camera = cameras_of([shot.keyframe], shot.aspect / len(times), height)
+            camera = cameras_of([keyframe], shot.aspect / len(times), height)
             camera = camera.to(self.renderer.device)
             started = time.perf_counter()
             with torch.no_grad():
@@ -202,12 +206,6 @@ class RenderScheduler:
             self._requests[key] = _Request(shot)
             self._change.notify()
 
-    def again(self) -> None:
-        """Render again what every browser asked for: the scene has changed."""
-        with self._change:
-            for request in self._requests.values():
-                request.rows = 0
-
     def drop(self, key: Hashable) -> None:
         """Forget a browser."""
         with self._change:
@@ -223,20 +221,17 @@ class RenderScheduler:
         with self._change:
             self._change.wait_for(self._most_urgent, timeout)
             urgent = self._most_urgent()
-        if urgent is None:
-            return False
-        key, request = urgent
+            if urgent is None:
+                return False
+            key, request = urgent
+            self._requests[key] = self._requests.pop(key)
         full, coarse, aspect = self._height, request.rows == 0, request.shot.aspect
         rows = FINER * request.rows or self.drawing.height_within(self._move_seconds, aspect, full)
         rows = full if rows > NEARLY * full else rows
         for frame in self.drawing.draw(request.shot, rows):
             if frame is not None:
                 request.rows = rows
-                with self._change:
-                    watched = key in self._requests
-                    if watched:
-                        self._requests[key] = self._requests.pop(key)
-                if watched:
+                if key in self._requests:
                     self._show(key, frame)
                     return True
             elif self._stop.is_set() or (not coarse and self._overtaken(key, request)):

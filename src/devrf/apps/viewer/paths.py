@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import shlex
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,8 @@ from devrf.scenes.bounds import nearest_point
 KEYFRAMES, SECONDS = 13, 8.0
 # Points of the line that shows a path.
 POINTS = 120
+# Known paths of scenes that move.
+IN_TIME = ("bullet time", "time freeze")
 # Keyframes from a time in [0, 1], at which the video is to stop.
 Preset = Callable[[float], tuple[Keyframe, ...]]
 Act = Callable[[viser.GuiEvent[Any]], None]
@@ -83,6 +86,7 @@ class PathPanel:
         self,
         server: viser.ViserServer,
         folder: Path,
+        run: Sequence[str],
         height: int,
         presets: Mapping[str, Preset],
         time: Callable[[], float],
@@ -91,12 +95,13 @@ class PathPanel:
     ) -> None:
         """Put the panel on the page.
 
-        ``folder`` is the run's; ``height`` the rows of frames, for files that say so; ``presets``
-        are keyframes from the current ``time`` in [0, 1]. ``fly`` shows a path from its beginning
-        to its end; ``changed`` is called when a path appears in the scene, or vanishes.
+        ``folder`` is the run's, and ``run`` the overrides that name it in a command; ``height`` the
+        rows of frames, for files that say so; ``presets`` are keyframes from the current ``time``
+        in [0, 1]. ``fly`` shows a path from its beginning to its end; ``changed`` is called when a
+        path appears in the scene, or vanishes.
         """
         self.keyframes: tuple[Keyframe, ...] = ()
-        self._server, self._folder, self._height = server, folder, height
+        self._server, self._folder, self._run, self._height = server, folder, run, height
         self._time, self._changed = time, changed
         self._line: viser.LineSegmentsHandle | None = None
         gui = server.gui
@@ -110,16 +115,22 @@ class PathPanel:
             self._aspect = gui.add_number(
                 "width/height", 1.5, min=0.1, max=10.0, step=0.01, hint="of the video"
             )
-            self._preset = gui.add_dropdown("path", tuple(presets), hint="a path that is known")
+            self._presets = tuple(presets)
+            self._preset: Any = gui.add_dropdown("path", self._presets, hint="a path that is known")
             self._button(
                 "Take this path", lambda _: self._take(presets[self._preset.value](time()))
             )
             self._button("Fly through", lambda _: fly(self.path()))
             self._name = gui.add_text("name", "path")
             self._button("Save", self._save)
+            self._command = gui.add_text("film it with", "", multiline=True, visible=False)
             self._upload = gui.add_upload_button("Load", mime_type="application/json")
             self._upload.on_upload(self._answer(self._load))
         self._draw()
+
+    def offer(self, at_rest: bool) -> None:
+        """Offer the known paths of a scene, with the time if it is not ``at_rest``."""
+        self._preset.options = [k for k in self._presets if not (at_rest and k in IN_TIME)]
 
     @property
     def drawn(self) -> bool:
@@ -146,7 +157,8 @@ class PathPanel:
             try:
                 act(event)
             except (DevrfError, OSError) as error:
-                _notify(event, "Not done", str(error))
+                if event.client is not None:
+                    event.client.add_notification("Not done", str(error), auto_close_seconds=20)
             before = self.drawn
             self._draw()
             if before != self.drawn:
@@ -168,11 +180,12 @@ class PathPanel:
         first = keyframes[0].seconds if keyframes else 0.0
         self.keyframes = tuple(replace(key, seconds=key.seconds - first) for key in keyframes)
 
-    def _save(self, event: viser.GuiEvent[Any]) -> None:
+    def _save(self, _: object) -> None:
         file = self._folder / "paths" / f"{check_name(self._name.value)}.json"
         write_path(file, self.path(), self._height)
-        command = f"`python -m devrf stage=render hydra.run.dir={self._folder} video.path={file}`"
-        _notify(event, f"Saved {file.name}", f"Film it with {command}")
+        words = ["python", "-m", "devrf", "stage=render", *self._run, f"video.path={file}"]
+        set_value(self._command, shlex.join(words))
+        self._command.visible = True
 
     def _load(self, _: object) -> None:
         upload = self._upload.value
@@ -199,8 +212,3 @@ class PathPanel:
             thickness=2.0,
             thickness_units="screen",
         )
-
-
-def _notify(event: viser.GuiEvent[Any], title: str, text: str) -> None:
-    if event.client is not None:
-        event.client.add_notification(title, text, auto_close_seconds=20)

@@ -8,8 +8,8 @@ import logging
 import socket
 from functools import partial
 from http import HTTPStatus
-from ipaddress import ip_address
 from typing import Any
+from unittest.mock import patch
 from urllib.parse import urlsplit
 
 import viser
@@ -31,14 +31,10 @@ def open_server(settings: ViewerSettings) -> viser.ViserServer:
     # A probe of the port asks for no page: its traceback would tell nothing.
     logging.getLogger("websockets.server").addFilter(lambda r: r.msg != "opening handshake failed")
     names = {"localhost", settings.host, socket.gethostname(), socket.getfqdn()}
-    serve = websockets_server.serve
+    serve = partial(_guarded, websockets_server.serve, {name.lower() for name in names})
     # viser has no setting for a check of requests.
-    websockets_server.serve = partial(_guarded, serve, names)  # type: ignore[misc, assignment]
-    try:
-        with quiet():
-            server = viser.ViserServer(settings.host, settings.port, label="devrf", verbose=False)
-    finally:
-        websockets_server.serve = serve  # type: ignore[misc]
+    with quiet(), patch.object(websockets_server, "serve", serve):
+        server = viser.ViserServer(settings.host, settings.port, label="devrf", verbose=False)
     # Its share button would give the page to a server elsewhere.
     server.gui.configure_theme(show_logo=False, show_share_button=False)
     server.gui.main_panel.dock_right()  # beside the frame, not on it
@@ -51,7 +47,7 @@ def quiet() -> contextlib.redirect_stdout[io.StringIO]:
 
 
 def _guarded(serve: Any, names: set[str], *where: Any, process_request: Any, **more: Any) -> Any:
-    """``serve``, which answers no page from elsewhere that the same browser shows.
+    """``serve``, which refuses pages from elsewhere that the same browser shows.
 
     Such a page gives its own address in ``Origin``. One whose name was made to lead to this machine
     (DNS rebinding) gives that name in ``Host``: an IP address or one of the machine's own ``names``
@@ -61,7 +57,8 @@ def _guarded(serve: Any, names: set[str], *where: Any, process_request: Any, **m
     def answer(connection: ServerConnection, request: Request) -> Response | None:
         host = request.headers.get("Host", "").lower()
         name = urlsplit(f"//{host}").hostname or ""
-        if name not in map(str.lower, names) and not _is_address(name):
+        is_address = ":" in name or name.replace(".", "").isdigit()
+        if name not in names and not is_address:
             why = f"this machine is not {name!r}; open the page by its IP address"
         elif urlsplit(request.headers.get("Origin", f"//{host}")).netloc.lower() != host:
             why = "another page's request"
@@ -71,9 +68,3 @@ def _guarded(serve: Any, names: set[str], *where: Any, process_request: Any, **m
         return connection.respond(HTTPStatus.FORBIDDEN, f"devrf: {why}\n")
 
     return serve(*where, process_request=answer, **more)
-
-
-def _is_address(name: str) -> bool:
-    with contextlib.suppress(ValueError):
-        return bool(ip_address(name))
-    return False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shlex
 import threading
 import time
 from collections.abc import Hashable
@@ -26,8 +27,8 @@ log = logging.getLogger(__name__)
 
 # Seconds between looks at the clock while nothing is to be rendered.
 TICK = 0.02
-# Of JPEG frames: those of a moving scene are small.
-COARSE_QUALITY, FULL_QUALITY = 70, 92
+# Of full frames, as JPEG. Coarse ones are enlarged, which would show JPEG's blocks and halos.
+QUALITY = 92
 
 
 class Session:
@@ -44,11 +45,12 @@ class Session:
         viewpoints: Viewpoints,
         scene: Scene | None,
         folder: Path,
+        ckpt: str | None = None,
     ) -> None:
         """Open the page; there is nothing on it before :meth:`present`.
 
         The cameras have pictures if there is a ``scene``. Saved paths go below the run's
-        ``folder``.
+        ``folder``. Commands that the page tells are for this run, or for ``ckpt`` if it is given.
 
         Raises:
             DevrfError: the address is in use, or not this machine's.
@@ -61,16 +63,20 @@ class Session:
         self._ticked = time.monotonic()
         self.server = open_server(settings)
         self.controls = Controls(self.server, self.refresh)
+        learned = [] if ckpt is None else [f"ckpt={Path(ckpt).resolve()}"]
+        self._run = [f"hydra.run.dir={folder}", *learned]
         self.paths = PathPanel(
             self.server,
             folder,
+            self._run,
             settings.height,
             known_paths(viewpoints.static, lambda: self._model),
             time=lambda: self.controls.playback.time,
             fly=self._fly,
             changed=self.refresh,
         )
-        self._frusta = FrustaLayer(self.server, viewpoints.static, scene)
+        away = distance_ahead(viewpoints.static)
+        self._frusta = FrustaLayer(self.server, viewpoints.static, scene, away)
         self.controls.dynamic.visible = scene is not None and scene.moves
         self._place_camera()
         self.server.on_client_connect(self._connected)
@@ -82,6 +88,7 @@ class Session:
             self.scheduler = RenderScheduler(drawing, self._show, self.settings, self._stop)
         self.scheduler.drawing = drawing
         self.controls.offer(drawing)
+        self.paths.offer(drawing.at_rest)
         self.refresh()
 
     def serve(self) -> None:
@@ -107,8 +114,12 @@ class Session:
         return self.scheduler.render_next(timeout)
 
     def close(self) -> None:
-        """Take the page from the network."""
+        """Take the page from the network, and say on it how to come back."""
         self.stop()
+        command = shlex.join(["python", "-m", "devrf", "stage=view", *self._run])
+        self.controls.tell(f"This page has ended; `{command}` opens another.")
+        self.server.flush()
+        time.sleep(0.1)  # it reaches those who have the page open
         with quiet():
             self.server.stop()
 
@@ -138,8 +149,8 @@ class Session:
         full = rows >= self.settings.height
         client.scene.set_background_image(
             frame.pixels.numpy(),
-            format="jpeg",
-            jpeg_quality=FULL_QUALITY if full else COARSE_QUALITY,
+            format="jpeg" if full else "png",
+            jpeg_quality=QUALITY,
             depth=None if frame.depth is None else frame.depth.numpy(),
         )
         self.frames += 1
@@ -153,6 +164,7 @@ class Session:
     def _disconnected(self, client: viser.ClientHandle) -> None:
         if self.scheduler is not None:
             self.scheduler.drop(client.client_id)
+        self.controls.left(client.client_id)
 
     def _show_cameras(self) -> None:
         controls = self.controls
