@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import csv
+import json
 import re
 import sys
 
 import pytest
 import torch
 
-from devrf.apps.needs import StageNeeds, tensor_bytes
-from devrf.cli import memory
+from devrf.apps import fitting
+from devrf.apps.needs import StageNeeds, smaller, tensor_bytes
+from devrf.scenes import image_folders
 from devrf.scenes.scene import Scene
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="memory as Linux limits and counts it")
@@ -27,6 +29,39 @@ def test_what_is_needed_by_hand(tiny_scene: Scene) -> None:
     assert tensor_bytes(moving.flow) == (2 * 4 + 1) * len(moving) * 24 * 18
 
 
+def test_the_least_change_by_hand(tiny_scene: Scene) -> None:
+    """100 bytes of images made smaller by 2, and a grid of side 4, 64 bytes."""
+
+    def change(free: float) -> tuple[str, int] | None:
+        def suffices(key: str, value: int) -> bool:
+            images, side = (value, 4) if key == fitting.SIZE else (2, value)
+            return 100 * (2 / images) ** 2 + side**3 <= free
+
+        parts = {"side": 64.0, fitting.SIZE: 100.0}
+        return fitting.least_change(parts, {"side": 4, fitting.SIZE: 2}, suffices)
+
+    # By 3 images take 44 bytes, by 16, the most, 1.6; a side of 3 takes 27.
+    assert change(125) == (fitting.SIZE, 3)
+    assert change(65) is None and change(66) == (fitting.SIZE, 15)
+    pixels = smaller(tiny_scene, 1.5).static.train.pixels
+    assert pixels.shape == (len(tiny_scene.static.train), 12, 16, 4)
+
+
+def test_the_size_that_was_chosen_stays(devrf, tiny_data, short, tmp_path, monkeypatch) -> None:
+    assert devrf(*tiny_data, "stage=prepare", "data.export=scene").status == 0
+    monkeypatch.setattr(image_folders, "LEAST_SIDE", 8)
+    monkeypatch.setitem(image_folders.LONGEST, "cpu", 12)
+    command = (*short, "data=inward", "data.root=scene", "data.downscale=auto")
+    outcome = devrf(*command, "stage=canonical", "hydra.run.dir=run")
+    assert outcome.status == 0 and "12x10 px, made smaller by 2 (chosen for a CPU" in outcome.out
+    # Moved to a machine that would take whole images.
+    monkeypatch.setitem(image_folders.LONGEST, "cpu", 1600)
+    assert "learned already" in devrf(*command, "stage=canonical", "hydra.run.dir=run").out
+    assert devrf("stage=evaluate", "hydra.run.dir=run").status == 0
+    settings = json.loads((tmp_path / "run" / "metrics.json").read_text())["run"]["settings"]
+    assert settings["data.downscale"] == 2
+
+
 def test_the_needs_are_told_first(trained) -> None:
     lines = trained[1].out.splitlines()
     said = [k for k, line in enumerate(lines) if NEEDS.search(line)]
@@ -37,11 +72,11 @@ def test_the_needs_are_told_first(trained) -> None:
 @pytest.mark.parametrize(
     ("argument", "key", "change"),
     [
-        ("schedule.canonical.side=9000", "schedule.canonical.side", r"side=\d{3,4},"),
+        ("schedule.canonical.side=9000", "schedule.canonical.side", r"side=\d{3,4}"),
         (
             "schedule.deformation.levels.2={side:9000,iterations:1}",
             "schedule.deformation.levels.2.side",
-            r"levels.2.side=\d{3,4},",
+            r"levels.2.side=\d{3,4}",
         ),
     ],
 )
@@ -51,12 +86,12 @@ def test_what_cannot_be_is_refused_with_a_change_that_fits(
     outcome = devrf(*tiny, argument, "hydra.run.dir=run")
     assert outcome.status == 2 and outcome.err.count("\n") == 1
     assert outcome.err.startswith(f"devrf: {key}: the run needs about ")
-    assert re.search(rf"lack of host memory: give \S*{change} or try all the same", outcome.err)
+    assert re.search(rf"lack of host memory; give \S*{change} \([\d.]+ of", outcome.err)
     assert not (tmp_path / "run").exists()
 
 
 def test_a_full_disk_is_noticed_before_it_begins(devrf, tiny, monkeypatch) -> None:
-    monkeypatch.setattr(memory, "free_disk", lambda folder: 1000)
+    monkeypatch.setattr(fitting, "free_disk", lambda folder: 1000)
     outcome = devrf(*tiny)
     assert outcome.status == 2
     assert " of 9.3e-07 GiB of disk; it would end for lack of disk" in outcome.err
@@ -66,7 +101,7 @@ def test_little_memory_refuses_what_is_not_finished_and_changes_nothing(
     devrf, tiny, monkeypatch, tmp_path
 ) -> None:
     command = (*tiny, "stage=canonical", "hydra.run.dir=run")
-    monkeypatch.setattr(memory, "free_host_memory", lambda: -(10**12))
+    monkeypatch.setattr(fitting, "free_host_memory", lambda: -(10**12))
     assert devrf(*command, "memory_check=false").status == 0
     # What is learned already needs nothing.
     assert devrf(*command).status == 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from functools import partial
 
 import pytest
 import torch
@@ -53,17 +54,24 @@ def test_in_a_file_that_lists_what_is_held_out(tmp_path, balls, caplog):
     assert len(warnings_in(caplog)) == 1
 
 
+def _photograph(height: int, factor: int) -> tuple[int, int]:
+    return height * 4 // (3 * factor), height // factor
+
+
 @pytest.mark.parametrize(
-    ("downscale", "side", "factor"),
+    ("downscale", "height", "factor"),
     [
         ("up_to_4", 800, 4),
         ("up_to_4", 255, 3),
         ("up_to_4", 24, 1),
         (4, 24, 4),
+        ("cpu", 3024, 8),  # a phone's photograph: 504 x 378
+        ("gpu", 3024, 4),  # 1008 x 756
+        ("cpu", 480, 1),
     ],
 )
-def test_the_factor(downscale: int | str, side: int, factor: int) -> None:
-    assert whole_factor(downscale, lambda by: side // by) == factor
+def test_the_factor(downscale: int | str, height: int, factor: int) -> None:
+    assert whole_factor(downscale, partial(_photograph, height)) == factor
 
 
 def test_the_folder_that_is_there_is_taken(llff_folder, caplog):
@@ -74,10 +82,7 @@ def test_the_folder_that_is_there_is_taken(llff_folder, caplog):
             llff_folder.root / folder / "images", 9 if folder == "static" else 3, times=4
         )
     with caplog.at_level(logging.INFO):
-        scene = LlffReader(llff_folder.root).read()
+        scene = LlffReader(llff_folder.root, downscale="up_to_4").read()
     # 96 x 64 pixels: made smaller at all they would have fewer than 64.
     assert (scene.static.train.width, scene.dynamic.train.width) == (96, 96)
-    assert (
-        "images keep their size, although data.downscale=up_to_4: their shorter side has 64"
-        in caplog.text
-    )
+    assert "images of 96x64 px, made smaller by 1 (data.downscale=up_to_4;" in caplog.text

@@ -8,14 +8,16 @@ small beside them; where memory runs out all the same, batches are split
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any
 
 from torch import Tensor, nn
 
+from devrf.geometry.ndc import NormalizedDevice
 from devrf.methods.devrf.architecture import fitted_to
 from devrf.methods.devrf.canonical_stage import CanonicalStage
 from devrf.methods.devrf.deformation_schedule import DeformationSchedule
-from devrf.scenes.scene import Scene
+from devrf.scenes.scene import Capture, Scene
 
 # Python and its libraries on the host; measured, as is what the C library keeps of freed memory.
 PROGRAM, FRAGMENTATION = 600_000_000, 1.3
@@ -43,6 +45,25 @@ class StageNeeds:
         """Bytes on the device, with each batch taken in ``pieces``."""
         batch = sum(size for key, size in self.parts.items() if key.endswith(".rays"))
         return sum(self.parts.values()) - batch * (1 - 1 / pieces)
+
+
+def smaller(scene: Scene, by: float) -> Scene:
+    """What a scene of images smaller by ``by`` needs: corners of the images stand for them."""
+
+    def corner(of_views: Any) -> Any:
+        if not isinstance(of_views, Tensor) or of_views.ndim < 3:
+            return of_views
+        return of_views[:, : int(of_views.shape[1] / by), : int(of_views.shape[2] / by)]
+
+    captures = [
+        Capture(capture.train.mapped(corner), capture.test.mapped(corner))
+        for capture in (scene.static, scene.dynamic)
+    ]
+    space = scene.space
+    if isinstance(space, NormalizedDevice):
+        size = {"width": round(space.width / by), "height": round(space.height / by)}
+        space = replace(space, **size, focal=(space.focal[0] / by, space.focal[1] / by))
+    return replace(scene, static=captures[0], dynamic=captures[1], space=space)
 
 
 def host_bytes(scene: Scene, stages: Iterable[StageNeeds], *, on_host: bool) -> float:
@@ -119,9 +140,11 @@ def needs_of_devrf(
     sample = 600 + 24 * sizes.width + 96 * sizes.channels
     along = 2 / 3 * schedule.side * OCCUPIED if sizes.planes is None else sizes.planes
     ray = along / canonical.sampling.step * sample / processes
+    by_pixels = schedule.voxels_per_pixel is not None and isinstance(scene.space, NormalizedDevice)
+    grid = f"schedule.canonical.{'voxels_per_pixel' if by_pixels else 'side'}"
     at_rest = {
         images: tensor_bytes(scene.static.train),
-        "schedule.canonical.side": LEARNED * values,
+        grid: LEARNED * values,
         "schedule.canonical.rays": schedule.rays * ray,
     }
     # Displacements of a frame: three numbers in both directions. Active frames are learned.
@@ -130,11 +153,11 @@ def needs_of_devrf(
     held = active if offloaded else frames
     in_motion = {
         images: tensor_bytes(scene.dynamic.train),
-        "schedule.canonical.side": values,
+        grid: values,
         f"schedule.deformation.levels.{last_level}.side": frame * (held + LEARNED * active),
         "schedule.deformation.rays": active * moving.rays * COLOURED * ray,
     }
-    refined = {**in_motion, "schedule.canonical.side": LEARNED * values}
+    refined = {**in_motion, grid: LEARNED * values}
     return {
         "canonical": StageNeeds(at_rest, values),
         "deformation": StageNeeds(in_motion, values + frames * frame),

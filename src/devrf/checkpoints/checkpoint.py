@@ -182,6 +182,12 @@ def latest_checkpoint(run: Path) -> Path | None:
     return max(latest)[2] if latest else None
 
 
+def learned_with(run: Path, chosen: str | Path | None = None) -> dict[str, Any]:
+    """The settings of the ``chosen`` checkpoint, else of a run's latest one; none without one."""
+    path = Path(chosen or latest_checkpoint(run) or "")
+    return metadata_of(path).training_config if path.is_file() else {}
+
+
 def metadata_in(path: Path, data: dict[str, Any]) -> CheckpointMetadata:
     """The metadata in the content of a checkpoint.
 

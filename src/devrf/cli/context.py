@@ -15,9 +15,11 @@ from lightning import Trainer
 from lightning.pytorch.strategies import Strategy
 from omegaconf import DictConfig, OmegaConf
 
+from devrf.apps.fitting import SIZE
 from devrf.apps.trackers import Tracker, trackers
-from devrf.checkpoints.checkpoint import LoadedCheckpoint, Viewpoints, load_checkpoint
+from devrf.checkpoints.checkpoint import LoadedCheckpoint, Viewpoints, learned_with, load_checkpoint
 from devrf.checkpoints.checkpoint_file import digest_of
+from devrf.cli.config import PIPELINE
 from devrf.data.datamodule import SceneDataModule
 from devrf.engine.ddp import ManualDDP
 from devrf.engine.stage import ScheduledStage
@@ -43,12 +45,14 @@ class RunContext:
         config: a composed config (``conf/config.yaml``).
         folder: gets ``checkpoints/<stage>.ckpt``, ``metrics.json``, ``frames.csv``, ``images/`` and
             ``videos/``, next to Hydra's config and log.
+        chooses_size: whether the images' size is left to this run.
     """
 
     def __init__(self, config: DictConfig, folder: Path) -> None:
         self.config = config
         self.folder = folder
         self.step_began = time.perf_counter()
+        self.chooses_size = False
 
     @property
     def step_seconds(self) -> float:
@@ -57,14 +61,23 @@ class RunContext:
 
     @cached_property
     def datamodule(self) -> SceneDataModule:
-        """Serves the scene to the stages."""
-        built: SceneDataModule = instantiate(self.config.data)
+        """Serves the scene to the stages, its images of the size that is learned already."""
+        data = self.config.data
+        if data.get("downscale") == "auto":
+            anew = self.config.stage == PIPELINE and not self.config.resume
+            known = {} if anew else learned_with(self.folder, self.config.ckpt)
+            data.downscale = known.get(SIZE, "gpu" if self.device.type == "cuda" else "cpu")
+            self.chooses_size = SIZE not in known
+        built: SceneDataModule = instantiate(data)
         return built
 
     @property
     def scene(self) -> Scene:
-        """The scene."""
-        return self.datamodule.scene
+        """The scene; the config then says in numbers by what its images were made smaller."""
+        scene = self.datamodule.scene
+        if self.chooses_size:
+            self.config.data.downscale = self.datamodule.downscale
+        return scene
 
     @cached_property
     def protocol(self) -> Protocol:

@@ -2,30 +2,36 @@
 
 from __future__ import annotations
 
-import math
+import logging
 from collections.abc import Sequence
 
 import torch
 from hydra.utils import instantiate
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
-from devrf.apps.needs import StageNeeds, host_bytes, needs_of_devrf, needs_of_networks
+from devrf.apps.fitting import (
+    SIZE,
+    Bytes,
+    free_bytes,
+    in_words,
+    lacking,
+    least_change,
+    needed_bytes,
+)
+from devrf.apps.inspection.advice import Advice
+from devrf.apps.needs import StageNeeds, needs_of_devrf, needs_of_networks, smaller
 from devrf.cli.context import RunContext
+from devrf.cli.messages import as_own_errors
 from devrf.engine.micro_batching import MicroBatching
-from devrf.errors import DevrfError
-from devrf.system.files import free_disk
-from devrf.system.memory import free_host_memory, free_memory, gib, own_memory
+from devrf.scenes.scene import Scene
 
-# A checkpoint, and three progress files at once, each with values and Adam's two means.
-FILES = 10
-# A part grows with this power of the value of its key, else in proportion.
-POWER = {"downscale": -2, "side": 3, "width": 2}
+log = logging.getLogger(__name__)
 
 
-def needs(run: RunContext) -> dict[str, StageNeeds]:
-    """What each stage of the configured run needs; several processes share a batch."""
-    scene, config, processes = run.scene, run.config, int(getattr(run.strategy, "world_size", 1))
-    images = "data.downscale" if "downscale" in config.data else "data.frames"
+def needs(run: RunContext, config: DictConfig, scene: Scene) -> dict[str, StageNeeds]:
+    """What each stage of a configured run needs; several processes share a batch."""
+    processes = int(getattr(run.strategy, "world_size", 1))
+    images = SIZE if "downscale" in config.data else "data.frames"
     if "canonical" in config:
         stages = needs_of_devrf(
             scene,
@@ -47,48 +53,43 @@ def needs(run: RunContext) -> dict[str, StageNeeds]:
     return {name: stages[name] for name in run.stages_with_images or run.learning_stages}
 
 
-def check_memory(run: RunContext, names: Sequence[str]) -> str:
-    """Compare what the stages ``names`` need with what there is; both, in one line.
+def compare(run: RunContext, names: Sequence[str]) -> tuple[str, Advice | None]:
+    """What the stages ``names`` need of what there is; where that lacks, the change that helps.
 
-    Raises:
-        DevrfError: memory or disk cannot suffice.
+    Where the images' size was left to the run, it is changed at once.
     """
-    every = needs(run)
-    stages = [every[name] for name in names]
-    stage = max(stages, key=StageNeeds.peak)
+    processes, by = int(getattr(run.strategy, "num_processes", 1)), run.datamodule.downscale
     on_gpu = run.device.type == "cuda"
-    host = host_bytes(run.scene, stages, on_host=not on_gpu)
-    host *= 1 if on_gpu else int(getattr(run.strategy, "num_processes", 1))
-    disk = FILES * max(stage_needs.learned for stage_needs in stages)
-    room = free_disk(run.folder)
-    if run.config.resume:  # what is there is replaced
-        room += sum(file.stat().st_size for file in run.folder.glob("checkpoints/*.ckpt"))
-    # What, needed, needed at least, there.
-    compared = [
-        ("host memory", host, host, free_host_memory() + own_memory()),
-        ("disk", disk, disk, room),
-    ]
-    if on_gpu:
-        minimum = stage.peak(MicroBatching.MOST)
-        compared.insert(0, ("GPU memory", stage.peak(), minimum, free_memory(run.device)))
-    summary = ", ".join(f"{gib(n)} of {gib(free)} GiB of {name}" for name, n, _, free in compared)
-    for resource, _, minimum, free in compared:
-        if minimum > free:
-            key, part = max(stage.parts.items(), key=lambda item: item[1])
-            share = 1 - (1 - free / minimum) * stage.peak() / part
-            raise DevrfError(
-                f"{key}: the run needs about {summary}; it would end for lack of {resource}: give "
-                f"{_smaller(run, key, share)}, or try all the same with memory_check=false"
-            )
-    split = any(needed > free for _, needed, _, free in compared)
-    return f"needs about {summary}{'; batches will be split, slower' if split else ''}"
+    free = free_bytes(run.device, run.folder, resume=run.config.resume)
 
+    def needed(key: str = "", value: int = 0, pieces: int = MicroBatching.MOST) -> Bytes:
+        config, scene = run.config.copy(), run.scene
+        if key:
+            OmegaConf.update(config, key, value)
+        if key == SIZE:
+            scene = smaller(scene, value / by)
+        with as_own_errors():
+            every = needs(run, config, scene)
+        stages = [every[name] for name in names]
+        return needed_bytes(scene, stages, processes, pieces, on_gpu=on_gpu)
 
-def _smaller(run: RunContext, key: str, share: float) -> str:
-    """``key=VALUE`` with which its part takes ``share`` as much; in words where that is unknown."""
-    value = OmegaConf.select(run.config, key)
-    if share <= 0 or not isinstance(value, int | float):
-        return f"another {key}"
-    power = POWER.get(key.rpartition(".")[2], 1)
-    scaled = value * share ** (1 / power)
-    return f"{key}={math.ceil(scaled) if power < 0 else max(math.floor(scaled), 1)}"
+    whole = needed(pieces=1)
+    line, lacks = f"needs about {in_words(whole, free)}", lacking(needed(), free)
+    if not lacks:
+        return line + "; batches will be split, slower" * bool(lacking(whole, free)), None
+    every = needs(run, run.config, run.scene)
+    parts = max((every[name] for name in names), key=StageNeeds.peak).parts
+    present = {key: OmegaConf.select(run.config, key) for key in parts} | {SIZE: by}
+    change = least_change(parts, present, lambda *one: not lacking(needed(*one), free))
+    problem = f"the run {line}; it would end for lack of {lacks[0]}"
+    if change is None:
+        remedy = "lower several keys, or free some of it"
+        return line, Advice(max(parts, key=parts.__getitem__), problem, remedy)
+    key, value = change
+    if key == SIZE and run.chooses_size:
+        log.info("%s=auto: %d, as %s", key, value, problem)
+        run.config.data.downscale = value
+        del run.datamodule  # the images are read again
+        return compare(run, names)
+    then = in_words(needed(key, value, 1), {lacks[0]: free[lacks[0]]})
+    return line, Advice(key, problem, f"give {key}={value} ({then})")

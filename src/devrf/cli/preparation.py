@@ -25,7 +25,7 @@ from devrf.apps.needs import needs_table
 from devrf.apps.settings import CaptureSettings
 from devrf.cli.config import config_folder
 from devrf.cli.context import RunContext
-from devrf.cli.memory import needs
+from devrf.cli.memory import compare, needs
 from devrf.engine.ddp import ManualDDP
 from devrf.errors import DevrfError
 from devrf.scenes.export import export
@@ -94,8 +94,10 @@ def inspect(run: RunContext) -> None:
     # Only this step draws with matplotlib.
     from devrf.apps.inspection.picture import write_inspection_picture
 
-    rows = [(name, decimal(round(size))) for name, size in needs_table(run.scene, needs(run))]
-    report = inspection_text(run.scene, rows)
+    _, shortage = compare(run, run.stages_with_images or run.learning_stages)
+    table = needs_table(run.scene, needs(run, run.config, run.scene))
+    rows = [(name, decimal(round(size))) for name, size in table]
+    report = inspection_text(run.scene, rows, shortage)
     console = Console()
     if console.is_terminal:
         console.print(report)

@@ -24,7 +24,7 @@ from devrf.apps.settings import ViewerSettings
 from devrf.cli.config import OF_A_CHECKPOINT, in_search, in_sweep, meant_stage
 from devrf.cli.context import RunContext
 from devrf.cli.evaluate import evaluate
-from devrf.cli.memory import check_memory
+from devrf.cli.memory import compare
 from devrf.cli.messages import as_own_errors
 from devrf.cli.preparation import capture, fetch, inspect, prepare, say_next, selfcheck
 from devrf.cli.render import export, picture, render, view
@@ -131,7 +131,9 @@ def _prepare_to_learn(run: RunContext, requested: Names, steps: Names) -> None:
         log.info("%s is at rest: %s; no motion is learned", run.scene.name, left)
     resume = run.config.resume
     names = [name for name in learning if not (resume and run.own_checkpoint(name).is_file())]
-    needed = check_memory(run, names) if names and run.config.memory_check else None
+    needed, shortage = compare(run, names) if names and run.config.memory_check else (None, None)
+    if shortage is not None:
+        raise DevrfError(f"{shortage}, or try all the same with memory_check=false")
     if not resume:
         below = run.protocol[learning[0]].builds_on
         archive_previous(run.folder, *([] if below is None else [run.own_checkpoint(below)]))

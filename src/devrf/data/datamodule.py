@@ -22,6 +22,9 @@ class SceneDataModule(LightningDataModule, ABC):
     host during training. A test batch is the position of one held-out image.
     """
 
+    # By what images that were read have been made smaller.
+    downscale = 1
+
     def __init__(self) -> None:
         super().__init__()
         self._scene: Scene | None = None

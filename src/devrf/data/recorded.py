@@ -51,6 +51,7 @@ class RecordedDataModule(SceneDataModule):
     def load(self) -> Scene:
         """Read the scene, and estimate its optical flow if that is asked for."""
         scene = self.reader.read()
+        self.downscale = self.reader.factor
         if scene.kind == "inward":
             bounds, kind = scene.bounds, "world" if scene.space.is_linear else "contracted"
             log.info(

@@ -5,11 +5,13 @@ from __future__ import annotations
 import logging
 import os
 import re
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
+import torch
 from pydantic import PlainValidator
 
 from devrf.errors import DevrfError
@@ -88,64 +90,69 @@ def _natural(name: str) -> list[object]:
     return [int(piece) if k % 2 else piece for k, piece in enumerate(pieces)]
 
 
-# ``up_to_<N>`` keeps so many pixels of the shorter side: of smaller images little can be learned.
+# Of images with a shorter side of fewer pixels little can be learned.
 LEAST_SIDE = 64
+# ``cpu`` and ``gpu`` leave at most so many pixels of the longer side: the grids that a CPU learns
+# show no more; a GPU gets about what scenes are published at.
+LONGEST = {"cpu": 640, "gpu": 1600}
 _UP_TO = re.compile(r"up_to_([1-9]\d{0,3})")
 
 
 def _downscale(value: object) -> object:
     whole = isinstance(value, int) and not isinstance(value, bool) and value >= 1
-    if not whole and not (isinstance(value, str) and _UP_TO.fullmatch(value)):
-        raise ValueError(f"expected a whole number of at least 1, or up_to_<number>, not {value!r}")
+    known = isinstance(value, str) and (value in ("auto", *LONGEST) or _UP_TO.fullmatch(value))
+    if not whole and not known:
+        raise ValueError(
+            f"expected auto, a whole number of at least 1, or up_to_<number>, not {value!r}"
+        )
     return value
 
 
-# A factor, or ``up_to_<factor>``.
+# A factor, what it is to be chosen for, or ``up_to_<factor>``.
 Downscale = Annotated[int | str, PlainValidator(_downscale)]
+SizeAt = Callable[[int], tuple[int, int] | None]
 
 
-def whole_factor(downscale: int | str, side_at: Callable[[int], int | None]) -> int:
+def whole_factor(downscale: int | str, size_at: SizeAt) -> int:
     """The factor by which images are made smaller.
 
-    A number is obeyed. ``up_to_<N>`` takes the largest factor up to N at which the shorter side
-    keeps 64 pixels, or else the one that leaves the most. ``side_at`` gives the shorter side in
-    pixels at a factor, None where it cannot be had.
+    A number is obeyed. ``cpu`` and ``gpu`` take the least power of two that leaves no more than
+    such a device has a use for, ``auto`` that of this machine, ``up_to_<N>`` the largest factor up
+    to N; all keep 64 pixels of the shorter side, or else what leaves the most. ``size_at`` gives
+    (width, height) at a factor, None where there are no such images.
     """
     if isinstance(downscale, int):
         return downscale
-    most = int(downscale.removeprefix("up_to_"))
-    sides = {factor: side_at(factor) for factor in range(most, 0, -1)}
-    known = {factor: side for factor, side in sides.items() if side is not None}
-    enough = [factor for factor, side in known.items() if side >= LEAST_SIDE]
-    if not known:
-        return most  # the reader of the files says what is missing
-    factor = enough[0] if enough else max(known, key=lambda one: (known[one], -one))
-    if factor < most:
-        log.info(
-            "images %s, although data.downscale=%s: their shorter side has %d px, and is not to "
-            "fall below %d (data.downscale=%d all the same)",
-            f"are made smaller by {factor}" if factor > 1 else "keep their size",
-            downscale,
-            known[factor],
-            LEAST_SIDE,
-            most,
-        )
+    device = "gpu" if downscale == "auto" and torch.cuda.is_available() else downscale
+    limit, factors = LONGEST.get(device, LONGEST["cpu"]), [1 << k for k in range(10)]
+    if match := _UP_TO.fullmatch(downscale):
+        limit, factors = sys.maxsize, list(range(int(match[1]), 0, -1))
+    sizes = {factor: size for factor in factors if (size := size_at(factor)) is not None}
+    if not sizes:
+        return factors[0]  # the reader of the files says what is missing
+    enough = [factor for factor, size in sizes.items() if min(size) >= LEAST_SIDE]
+    enough = enough or [max(sizes, key=lambda factor: (min(sizes[factor]), -factor))]
+    factor = next((factor for factor in enough if max(sizes[factor]) <= limit), enough[-1])
+    reason = f"data.downscale={downscale}" if match else f"chosen for a {device.upper()}"
+    log.info(
+        "images of %dx%d px, made smaller by %d (%s; data.downscale=NUMBER chooses otherwise)",
+        *(*sizes[factor], factor, reason),
+    )
     return factor
 
 
-def folder_factor(
-    parent: Path, downscale: int | str, *, full: str = "images", reduced: str = "images_{}"
-) -> int:
-    """:func:`whole_factor` for images in folders of several sizes; arguments as image_folder's."""
+def folder_size(parent: Path, **names: str) -> SizeAt:
+    """The size at a factor of images in folders of several sizes; ``names`` as of image_folder."""
 
-    def side_at(factor: int) -> int | None:
+    def size_at(factor: int) -> tuple[int, int] | None:
         try:
-            source = image_folder(parent, factor, full=full, reduced=reduced)
+            source = image_folder(parent, factor, **names)
         except DevrfError:
             return None
-        return min(image_size(listed_images(source.path)[0])) // source.downscale
+        width, height = image_size(listed_images(source.path)[0])
+        return width // source.downscale, height // source.downscale
 
-    return whole_factor(downscale, side_at)
+    return size_at
 
 
 Missing = Literal["error", "skip"]

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import torch
 
-from devrf.scenes.image_folders import whole_factor
 from devrf.scenes.images import image_size
 from devrf.scenes.masks import Masks
 from devrf.scenes.scene import Capture, Views
@@ -50,6 +48,12 @@ class Layout:
     def moves(self) -> bool:
         """Whether there are images of the scene in motion."""
         return self.dynamic_train is not self.static_train
+
+    def size_at(self, factor: int) -> tuple[int, int]:
+        """Width and height in pixels of the static images made smaller by ``factor``."""
+        transforms, first = self.static_train.transforms, int(self.static_train.index[0])
+        width, height = image_size(transforms.images[first], transforms.intrinsics[first].size)
+        return width // factor, height // factor
 
 
 def static_alone(train: Transforms, test: Transforms, why: str) -> Layout:
@@ -123,22 +127,21 @@ def fewer(layout: Layout, train_views: int | None, frames: int | None) -> tuple[
 def load_layout(
     layout: Layout,
     root: Path,
-    downscale: int | str,
+    downscale: int,
     masks: Masks = "none",
     dynamic_downscale: int | None = None,
 ) -> tuple[Capture, Capture]:
     """The static and the dynamic capture, images read from below the scene's folder ``root``.
 
-    ``downscale`` is as :class:`devrf.scenes.reader.SceneReader` has it, ``masks`` as for
-    :func:`devrf.scenes.splits.load_views`; ``dynamic_downscale`` is that of the dynamic images,
-    where they are not of the size of the static ones.
+    Images are made smaller by ``downscale``, the dynamic ones by ``dynamic_downscale`` where they
+    are not of the size of the static ones; ``masks`` is as for
+    :func:`devrf.scenes.splits.load_views`.
     """
-    factor = whole_factor(downscale, partial(_shorter_side, layout.static_train))
-    moving = factor if dynamic_downscale is None else dynamic_downscale
+    moving = downscale if dynamic_downscale is None else dynamic_downscale
     loaded: list[tuple[Split, Views]] = []
     for split, by in (
-        (layout.static_train, factor),
-        (layout.static_test, factor),
+        (layout.static_train, downscale),
+        (layout.static_test, downscale),
         (layout.dynamic_train, moving),
         (layout.dynamic_test, moving),
     ):
@@ -147,13 +150,6 @@ def load_layout(
         loaded.append((split, twin or load_views(split, root, by, masks)))
     a, b, c, d = (views for _, views in loaded)
     return Capture(a, b), Capture(c, d)
-
-
-def _shorter_side(split: Split, factor: int) -> int:
-    """The shorter side in pixels of a split's images made smaller by ``factor``."""
-    first = int(split.index[0])
-    size = image_size(split.transforms.images[first], split.transforms.intrinsics[first].size)
-    return min(size) // factor
 
 
 def _same_images(a: Split, b: Split) -> bool:

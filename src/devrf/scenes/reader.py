@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import KW_ONLY, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, PlainValidator
 from pydantic.dataclasses import dataclass
@@ -13,7 +13,7 @@ from pydantic.dataclasses import dataclass
 from devrf.geometry.box import Box
 from devrf.geometry.clock import FrameClock
 from devrf.scenes.files import Number
-from devrf.scenes.image_folders import Downscale, Missing
+from devrf.scenes.image_folders import Downscale, Missing, SizeAt, whole_factor
 from devrf.scenes.scene import Background, Capture, OpticalFlow, Scene, Views
 from devrf.scenes.space import SpaceChoice, centred, forward_facing_scene, inward_space
 from devrf.scenes.transforms import SceneBounds
@@ -54,8 +54,9 @@ class SceneReader(Options, ABC):
     Attributes:
         root: the scene's folder.
         name: short name; None takes the folder's.
-        downscale: integer factor ≥ 1 by which images and flow are made smaller; ``up_to_<factor>``:
-            no further than to 64 pixels of the shorter side.
+        downscale: integer factor ≥ 1 by which images and flow are made smaller; ``auto``, ``cpu``,
+            ``gpu``, ``up_to_<factor>``: see :func:`~devrf.scenes.image_folders.whole_factor`.
+        factor: by what images were made smaller; known once they have been read.
         background: what is behind the alpha masks of RGBA images; RGB images are used as they are.
         flow: ``auto`` reads the scene's backward flow where it has files of it, ``files`` insists
             on them, ``dis`` and ``raft`` estimate it, ``none`` does without.
@@ -74,6 +75,13 @@ class SceneReader(Options, ABC):
     flow: FlowSource = "auto"
     flow_cache: str | Path | None = None
     frames: SeveralFrames | None = None
+
+    factor: ClassVar[int] = 1
+
+    def choose_factor(self, size_at: SizeAt) -> int:
+        """By what images of such sizes are made smaller; :attr:`factor` from now on."""
+        self.__dict__["factor"] = factor = whole_factor(self.downscale, size_at)
+        return factor
 
     @abstractmethod
     def read(self) -> Scene:
@@ -115,7 +123,7 @@ class FixedViewsReader(SceneReader):
 
     _: KW_ONLY
     dynamic: str | None = None
-    downscale: Downscale = "up_to_4"
+    downscale: Downscale = "auto"
     test_view: Annotated[int, Field(strict=True)] = -1
     holdout: Holdout = 8
     train_views: Count | None = None

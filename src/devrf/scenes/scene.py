@@ -101,7 +101,7 @@ class Views:
     def __getitem__(self, index: Tensor) -> Views:
         """The views at positions ``index`` (K,) int64."""
         return replace(
-            self._mapped(lambda of_views: of_views[index]),
+            self.mapped(lambda of_views: of_views[index]),
             names=tuple(self.names[i] for i in index.tolist()),
         )
 
@@ -111,9 +111,9 @@ class Views:
 
     def to(self, device: torch.device | str) -> Views:
         """The same views on ``device``; images stay uint8."""
-        return self._mapped(lambda of_views: of_views.to(device))
+        return self.mapped(lambda of_views: of_views.to(device))
 
-    def _mapped(self, change: Callable[[Any], Any]) -> Views:
+    def mapped(self, change: Callable[[Any], Any]) -> Views:
         """The views with ``change`` made to all tensors and cameras."""
         changed: dict[str, Any] = {}
         for field in fields(self):

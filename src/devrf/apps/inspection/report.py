@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 from torch import Tensor
 
-from devrf.apps.inspection.advice import OPAQUE, advice_on, image_sets, mean_share
+from devrf.apps.inspection.advice import OPAQUE, Advice, advice_on, image_sets, mean_share
 from devrf.apps.inspection.layout import box_middle, widest_gap
 from devrf.data.color_change import CHANGING, color_change, color_drift
 from devrf.geometry.clock import FrameClock
@@ -23,9 +23,14 @@ HEADING = "set,images,views x times,size,alpha masks,masks,focal length,distance
 Row = tuple[str, ...]
 
 
-def inspection_text(scene: Scene, requirements: Sequence[Sequence[str]]) -> RenderableType:
-    """The report for a terminal; ``requirements`` of a run are rows of a name and an amount."""
-    advice = advice_on(scene)
+def inspection_text(
+    scene: Scene, requirements: Sequence[Sequence[str]], shortage: Advice | None = None
+) -> RenderableType:
+    """The report for a terminal; ``requirements`` of a run are rows of a name and an amount.
+
+    ``shortage`` says what this machine has too little of for the run.
+    """
+    advice = [*advice_on(scene), *([] if shortage is None else [shortage])]
     verdict = f"problems found: {len(advice)}" if advice else "no problems found"
     return Group(
         _titled_table("what was found", scene_facts(scene)),

@@ -48,7 +48,7 @@ class BlenderReader(InwardReader):
         """See :meth:`devrf.scenes.reader.SceneReader.read`."""
         folder = scene_folder(self.root)
         found = self._layout(folder)
-        static, dynamic = load_layout(found[0], folder, self.downscale)
+        static, dynamic = load_layout(found[0], folder, self.choose_factor(found[0].size_at))
         if found[0].moves and self.wants_flow_files:
             flow = self._flow(dynamic.train, *found, "bwd")
             dynamic = replace(dynamic, train=replace(dynamic.train, flow=flow))

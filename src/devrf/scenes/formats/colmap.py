@@ -15,7 +15,6 @@ from devrf.scenes.image_folders import (
     ImageFolder,
     image_folder,
     present_images,
-    whole_factor,
 )
 from devrf.scenes.images import image_at
 from devrf.scenes.layout import Layout, fewer, load_layout, static_alone
@@ -94,7 +93,7 @@ class ColmapReader(PosedReader, FixedViewsReader):
     """
 
     _: KW_ONLY
-    downscale: Downscale = "up_to_4"
+    downscale: Downscale = "auto"
     flow: EstimatedFlow = "auto"
 
     def read(self) -> Scene:
@@ -108,8 +107,8 @@ class ColmapReader(PosedReader, FixedViewsReader):
         model = read_model(place)
         world = normalised(model, _facing(self.space))
         camera = model.cameras[model.images[0].camera]
-        side = int(min(camera["w"], camera["h"]))
-        factor = whole_factor(self.downscale, lambda factor: side // factor)
+        width, height = int(camera["w"]), int(camera["h"])
+        factor = self.choose_factor(lambda factor: (width // factor, height // factor))
         source = images_of(model, folder, factor)
         layout, smaller = self._layout(folder, model, world.poses, source.path, factor)
         layout, _ = fewer(layout, self.train_views, self.frames)

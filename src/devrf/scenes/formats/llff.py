@@ -12,7 +12,7 @@ from pydantic.dataclasses import dataclass
 from devrf.scenes.files import Positive, existing_folder, scene_folder
 from devrf.scenes.flow_files import FlowDirection, stacked_flow
 from devrf.scenes.formats.llff_poses import POSES, read_dynamic_poses, read_static_poses
-from devrf.scenes.image_folders import folder_factor, image_folder, listed_images
+from devrf.scenes.image_folders import folder_size, image_folder, listed_images
 from devrf.scenes.images import image_size
 from devrf.scenes.layout import Layout, fewer, load_layout, static_alone, without_static_set
 from devrf.scenes.reader import FixedViewsReader, Time
@@ -94,7 +94,7 @@ class LlffReader(FixedViewsReader):
             raise scene_error(
                 "data.monocular", f"{folder} has fixed views, so it is no video; leave it null"
             )
-        factor = folder_factor(posed, self.downscale)
+        factor = self.choose_factor(folder_size(posed))
         source = image_folder(posed, factor)
         images = _posed_images(posed, source.path)
         video = self.monocular

@@ -29,7 +29,7 @@ from devrf.scenes.files import (
 from devrf.scenes.image_folders import (
     Downscale,
     ImageFolder,
-    folder_factor,
+    folder_size,
     image_folder,
     present_images,
 )
@@ -184,7 +184,7 @@ class ItemsReader(InwardReader):
             folder / "scene.json", World, "it says where the scene is; set data.root to its folder"
         )
         names = {"full": "1x", "reduced": "{}x"}
-        factor = folder_factor(folder / "rgb", self.downscale, **names)
+        factor = self.choose_factor(folder_size(folder / "rgb", **names))
         images = image_folder(folder / "rgb", factor, **names)
         files = [f"rgb/{images.path.name}/{item}" for item in items]
         present = present_images(files, listing, folder, self.missing)
@@ -244,7 +244,7 @@ class NerfiesReader(ItemsReader):
     listing: ClassVar[str] = "dataset.json"
 
     _: KW_ONLY
-    downscale: Downscale = "up_to_4"
+    downscale: Downscale = "auto"
 
     def listed(self, folder: Path) -> Listed:
         """The ids in ``dataset.json``."""

@@ -12,6 +12,7 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor
 
 from devrf.scenes.files import inside, scene_folder
+from devrf.scenes.image_folders import Downscale
 from devrf.scenes.images import image_at
 from devrf.scenes.layout import Layout, fewer, load_layout, one_capture, static_alone
 from devrf.scenes.masks import Masks
@@ -62,6 +63,7 @@ class NerfstudioReader(PosedReader):
     """
 
     _: KW_ONLY
+    downscale: Downscale = "auto"
     flow: EstimatedFlow = "auto"
     train_views: Count | None = None
     holdout: Holdout = 8
@@ -73,7 +75,8 @@ class NerfstudioReader(PosedReader):
         folder = scene_folder(self.root)
         layout = _layout(folder, self)
         layout, _ = fewer(layout, self.train_views, self.frames)
-        static, dynamic = load_layout(layout, folder, self.downscale, self.masks)
+        factor = self.choose_factor(layout.size_at)
+        static, dynamic = load_layout(layout, folder, factor, self.masks)
         bounds = layout.static_train.transforms.bounds
         return self.placed(folder, static, dynamic, bounds, f"scene_bounds in {FILE}")
 

@@ -21,7 +21,7 @@ from torch import Tensor
 from devrf.scenes.files import Positive, entries, scene_folder
 from devrf.scenes.footage import FilmHeader, Size, chosen, film_header
 from devrf.scenes.formats.llff_poses import PosedSet, read_static_poses
-from devrf.scenes.image_folders import Downscale, whole_factor
+from devrf.scenes.image_folders import Downscale
 from devrf.scenes.images import in_threads
 from devrf.scenes.reader import Count, EstimatedFlow, SceneReader, SeveralFrames
 from devrf.scenes.resampling import shrink_pixels
@@ -133,7 +133,7 @@ class Neural3DVideoReader(SceneReader):
     """
 
     _: KW_ONLY
-    downscale: Downscale = "up_to_4"
+    downscale: Downscale = "auto"
     flow: EstimatedFlow = "auto"
     test_view: Annotated[int, Field(strict=True, ge=0)] = 0
     near: Positive = 1.0
@@ -153,8 +153,8 @@ class Neural3DVideoReader(SceneReader):
         posed = posed.normalised()
         test, train = self._split(videos)
         frames, times = self._moments(videos)
-        side = min(videos.header.size)
-        factor = whole_factor(self.downscale, lambda factor: side // factor)
+        width, height = videos.header.size
+        factor = self.choose_factor(lambda factor: (width // factor, height // factor))
         moving = Capture(
             *(_views(videos, posed, chosen, frames, times, factor) for chosen in (train, [test]))
         )
