@@ -13,7 +13,13 @@ import torch
 import trimesh
 from pxr import Gf, Usd, UsdGeom
 
-from devrf.apps.export.geometry import ExportSettings, UpFrame, carried, seen_points
+from devrf.apps.export.geometry import (
+    ExportSettings,
+    MovingMesh,
+    UpFrame,
+    carried,
+    seen_points,
+)
 from devrf.apps.export.gltf import write_gltf
 from devrf.apps.export.sequence import mesh_files, write_sequence
 from devrf.apps.export.surface import canonical_surface
@@ -72,15 +78,15 @@ def glb(path):
     return whole, array
 
 
-def morphed(whole, array, seconds):
+def morphed(whole, array, seconds, attribute="POSITION"):
     """The mesh's vertices so many seconds into the animation, as the standard says."""
     primitive = whole["meshes"][0]["primitives"][0]
     sampler = whole["animations"][0]["samplers"][0]
     keys = array(sampler["input"])[:, 0]
     weights = array(sampler["output"]).reshape(len(keys), -1)
-    vertices = array(primitive["attributes"]["POSITION"]).astype(float)
+    vertices = array(primitive["attributes"][attribute]).astype(float)
     for target, of_target in zip(primitive["targets"], weights.T, strict=True):
-        vertices = vertices + np.interp(seconds, keys, of_target) * array(target["POSITION"])
+        vertices = vertices + np.interp(seconds, keys, of_target) * array(target[attribute])
     return vertices
 
 
@@ -101,6 +107,32 @@ def test_gltf_goes_where_the_forward_field_leads(tmp_path, moving_ball, mesh, fr
     for time in (*TIMES, 0.8):
         expected = frame.points(moving_ball.forward_map(time)(at_rest)).numpy()
         np.testing.assert_allclose(morphed(whole, array, SECONDS * time), expected, atol=1e-5)
+
+
+def test_normals_point_out_of_a_ball_that_is_pulled_long(tmp_path):
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    points = torch.tensor(ball.vertices, dtype=torch.float32)
+    pull = torch.tensor([[1.0, 1, 1], [3.0, 1, 1]])
+    faces = torch.tensor(ball.faces)
+    mesh = MovingMesh((0.0, 1.0), points * pull[:, None], faces, torch.zeros_like(points))
+    # Its frame turns x to y.
+    frame = UpFrame(torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), 1e-3, "x")
+    write_gltf(tmp_path / "ball.glb", mesh, {}, frame, SECONDS)
+    write_usd(tmp_path / "ball.usdc", mesh, {}, frame, SECONDS)
+    whole, array = glb(tmp_path / "ball.glb")
+    (read,) = trimesh.load_scene(tmp_path / "ball.glb", process=False).geometry.values()
+    stage = Usd.Stage.Open(str(tmp_path / "ball.usdc"))
+    shape = UsdGeom.Mesh(stage.GetPrimAtPath("/scene/mesh"))
+    for seconds, stretch in ((0.0, 1.0), (SECONDS, 3.0)):
+        # The gradient of (x / a)² + y² + z² at the surface's point (a x, y, z).
+        gradient = points / torch.tensor([stretch, 1.0, 1.0])
+        expected = frame.points(torch.nn.functional.normalize(gradient, dim=1)) * 1e3
+        found = morphed(whole, array, seconds, "NORMAL")
+        np.testing.assert_allclose((found * expected.numpy()).sum(axis=1), 1, atol=4e-3)
+        np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-5)
+        code = seconds * stage.GetTimeCodesPerSecond()
+        np.testing.assert_allclose(shape.GetNormalsAttr().Get(code), found, atol=1e-5)
+    np.testing.assert_allclose(read.vertex_normals, array(1), atol=1e-6)
 
 
 def test_gltf_cameras_see_the_ball_where_the_captures_do(tmp_path, mesh, frame, around):

@@ -150,6 +150,19 @@ def carried(surface: Surface, model: Renderable, times: Sequence[float]) -> Movi
     return MovingMesh(tuple(times), torch.stack(moved), surface.faces, surface.colors)
 
 
+def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
+    """Unit normals (V, 3) of vertices (V, 3): means over the faces (F, 3) around, by area.
+
+    They point to where faces are counter-clockwise from; along z where all faces around are empty.
+    """
+    a, b, c = vertices[faces].unbind(dim=1)
+    across, normals = torch.linalg.cross(b - a, c - a), torch.zeros_like(vertices)
+    for corner in range(3):
+        normals.index_add_(0, faces[:, corner], across)
+    lengths = normals.norm(dim=1, keepdim=True)
+    return torch.where(lengths > 0, normals / lengths, torch.eye(3)[2])
+
+
 # Cameras that look at the scene, at most.
 CAMERAS = 24
 # Rows of the images that tell how much of them is filled, and of the largest ones.

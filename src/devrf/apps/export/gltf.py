@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 import devrf
-from devrf.apps.export.geometry import MovingMesh, UpFrame
+from devrf.apps.export.geometry import MovingMesh, UpFrame, vertex_normals
 from devrf.geometry.cameras import Cameras
 from devrf.system.files import atomic_write
 
@@ -41,13 +41,15 @@ def write_gltf(
 
     The mesh is as it is at the first time; for each other time there is a morph target that leads
     there, and the animation goes from one to the next: linearly, as displacements are between
-    frames. Its colours are light that the cameras saw, so its material is unlit.
+    frames. Its colours are light that the cameras saw, so its material is unlit; normals are for
+    who gives it another.
 
     Mesh and ``cameras``, one each by name, are in the capture's world; principal points are taken
     to be the centres. Time 0 to 1 takes ``seconds``.
     """
     content = _Content()
     vertices = frame.points(mesh.vertices)
+    normals = torch.stack([vertex_normals(placed, mesh.faces) for placed in vertices])
     size = float((vertices.amax(dim=(0, 1)) - vertices.amin(dim=(0, 1))).norm())
     names = [f"t={time:.4g}" for time in mesh.times[1:]]
     # The standard's vertex colours are linear, with alpha, in 16 bits.
@@ -56,15 +58,20 @@ def write_gltf(
     primitive: dict[str, Any] = {
         "attributes": {
             "POSITION": content.array(vertices[0].numpy(), VERTICES, limits=True),
+            "NORMAL": content.array(normals[0].numpy(), VERTICES),
             "COLOR_0": content.array(rgba16, VERTICES, normalized=True),
         },
         "indices": content.array(mesh.faces.reshape(-1).numpy().astype("u4"), INDICES),
         "material": 0,
     }
     if names:
-        moves = (vertices[1:] - vertices[0]).numpy()
+        moves = (vertices[1:] - vertices[0]).numpy(), (normals[1:] - normals[0]).numpy()
         primitive["targets"] = [
-            {"POSITION": content.array(move, VERTICES, limits=True)} for move in moves
+            {
+                "POSITION": content.array(move, VERTICES, limits=True),
+                "NORMAL": content.array(turn, VERTICES),
+            }
+            for move, turn in zip(*moves, strict=True)
         ]
     shown: dict[str, Any] = {"name": "scene", "primitives": [primitive]}
     nodes: list[dict[str, Any]] = [{"name": "scene", "mesh": 0}]

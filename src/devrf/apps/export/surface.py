@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from devrf.apps.export.geometry import ExportSettings, Surface
+from devrf.apps.export.geometry import ExportSettings, Surface, vertex_normals
 from devrf.errors import DevrfError
 from devrf.geometry.box import Box
 from devrf.geometry.cameras import Cameras
@@ -211,15 +211,6 @@ def _seen(
         colors.index_add_(0, vertex, share * color * (direction[2] / total))
     weight_sum = torch.zeros(len(points)).index_add_(0, vertex, share[:, 0])
     return colors / weight_sum.clamp(min=1e-9)[:, None]
-
-
-def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
-    """Unit normals (V, 3): the means over the faces (F, 3) around, weighted by area."""
-    a, b, c = vertices[faces].unbind(dim=1)
-    across, normals = torch.linalg.cross(b - a, c - a), torch.zeros_like(vertices)
-    for corner in range(3):
-        normals.index_add_(0, faces[:, corner], across)
-    return normalize(normals, dim=1)
 
 
 def _cap(count: int, widest: float) -> Tensor:

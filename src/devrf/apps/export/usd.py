@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from devrf.apps.export.geometry import MovingMesh, UpFrame
+from devrf.apps.export.geometry import MovingMesh, UpFrame, vertex_normals
 from devrf.apps.export.gltf import linear
 from devrf.geometry.cameras import Cameras
 from devrf.system.files import atomic_write
@@ -42,9 +42,13 @@ def write_usd(
     colors = Vt.Vec3fArray.FromNumpy(linear(mesh.colors).numpy())
     shape.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex).Set(colors)
     points, extent = shape.CreatePointsAttr(), shape.CreateExtentAttr()
+    normals = shape.CreateNormalsAttr()
+    shape.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     for code, vertices in zip(codes, frame.points(mesh.vertices), strict=True):
         placed = Vt.Vec3fArray.FromNumpy(vertices.contiguous().numpy())
         points.Set(placed, code)
+        turned = vertex_normals(vertices, mesh.faces)
+        normals.Set(Vt.Vec3fArray.FromNumpy(turned.contiguous().numpy()), code)
         extent.Set(UsdGeom.PointBased.ComputeExtent(placed), code)
     for name, camera in cameras.items():
         lens = UsdGeom.Camera.Define(stage, Sdf.Path(f"/scene/cameras/{name}"))
