@@ -138,10 +138,3 @@ def test_a_missing_package_is_named_first(devrf, tmp_path, monkeypatch, argument
     said = f'{missing} is not installed; run pip install "devrf[{extra}]", or set {instead}'
     assert (outcome.status, outcome.err) == (2, f"devrf: {said}\n")
     assert not list(tmp_path.iterdir())
-
-
-def test_flow_that_was_estimated_before_needs_no_estimator(devrf, tmp_path, monkeypatch):
-    monkeypatch.setattr("devrf.cli.config_check.find_spec", lambda package: None)
-    (tmp_path / "flow.npz").touch()
-    cached = ("data=inward", "data.root=nowhere", "data.flow=raft", "data.flow_cache=flow.npz")
-    assert devrf(*cached).err.startswith("devrf: nowhere: no such folder")

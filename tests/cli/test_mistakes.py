@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
@@ -113,8 +114,10 @@ def test_results_of_an_earlier_run_survive_a_mistake(devrf, tmp_path, tiny, trai
 def test_help_names_stages_groups_and_examples(devrf):
     outcome = devrf("--help")
     assert outcome.status == 0
-    for words in ("stage=deformation", "data.root=PATH", "experiment: ", "ablation: "):
+    for words in ("data.root=PATH", "experiment: ", "ablation: "):
         assert words in outcome.out
+    named = "|".join(re.findall(r"^stage=(\S+)", outcome.out, re.MULTILINE))
+    assert set(named.split("|")) == set(known_stages())
 
 
 def test_as_a_process_of_its_own(python, tmp_path):
@@ -122,6 +125,18 @@ def test_as_a_process_of_its_own(python, tmp_path):
     expected = "devrf: data.widht: no such key; did you mean data.width?\n"
     assert (done.status, done.err) == (2, expected)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_torchvision_for_another_torch_is_one_line(python, tmp_path, monkeypatch):
+    (tmp_path / "torchvision").mkdir()
+    fault = 'raise RuntimeError("operator torchvision::nms does not exist")'
+    (tmp_path / "torchvision" / "__init__.py").write_text(fault)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    for typed in ("stage=inspect", "hydra.run.dir=run"):
+        done = python(tmp_path, "-m", "devrf", typed)
+        assert done.status == 2 and done.err.count("\n") == 1, done.err
+        assert done.err.startswith("devrf: torchvision: ")
+        assert "pip install --upgrade torch torchvision" in done.err
 
 
 def test_a_fault_of_the_program_keeps_its_traceback(devrf, monkeypatch):

@@ -117,10 +117,9 @@ def run_folder(stage: str, report: Any, capture: Any, scene: str, name: str) -> 
         return f"outputs/{scene_folder_name(Path(str(capture.into or 'scene')).name)}/capture"
     if stage != "report":
         return f"outputs/{scene}/{name}"
-    settings = ReportSettings(report.runs, report.into)
     # A misspelt folder is not created: the step reports that there is none.
-    has_folder = Path(settings.runs).is_dir() or report.into is not None
-    return str(settings.folder) if has_folder else "outputs/report"
+    runs = report.runs if Path(report.runs).is_dir() else "outputs"
+    return str(ReportSettings(runs, report.into).folder)
 
 
 def config_record(stage: str) -> str | None:
@@ -131,18 +130,14 @@ def config_record(stage: str) -> str | None:
     return None if stage in ("report", "fetch", "view") else ".hydra"
 
 
-def tracked_name(scene: str, mode: Any, folder: str, overrides: str) -> str:
+def tracked_name(scene: str, folder: str, overrides: str) -> str:
     """A tracker's name of a run: the scene; of a sweep's job, its folder and overrides."""
-    return f"{Path(folder).name} {overrides}" if _of_sweep(mode) else scene
+    return f"{Path(folder).name} {overrides}" if in_sweep() else scene
 
 
-def tracked_group(mode: Any, folder: str) -> str | None:
+def tracked_group(folder: str) -> str | None:
     """A tracker's group of a run: the name of the sweep's folder, None outside a sweep."""
-    return Path(folder).name if _of_sweep(mode) else None
-
-
-def _of_sweep(mode: Any) -> bool:
-    return str(getattr(mode, "name", mode)) == "MULTIRUN"
+    return Path(folder).name if in_sweep() else None
 
 
 @cache  # for the whole process

@@ -6,7 +6,7 @@ import inspect
 import json
 import re
 import types
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import is_dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -73,56 +73,33 @@ def check_config(config: DictConfig) -> None:
     Raises:
         DevrfError: naming the key at fault and what was expected.
     """
-    raw = OmegaConf.to_container(config)
-    assert isinstance(raw, dict)
-    for key, value in _leaves(raw):
-        if value == "???":
-            value = "PATH" if key.endswith("root") else "VALUE"
-            raise DevrfError(f"{key}: required; give {key}={value}")
-    resolved = OmegaConf.to_container(config, resolve=True)
-    assert isinstance(resolved, dict)
+    for key in sorted(OmegaConf.missing_keys(config)):
+        value = "PATH" if key.endswith("root") else "VALUE"
+        raise DevrfError(f"{key}: required; give {key}={value}")
+    raw: Any = OmegaConf.to_container(config)
+    resolved: Any = OmegaConf.to_container(config, resolve=True)
     for key, hint in ROOT.items():
         _check_value(key, resolved.get(key), hint)
     if not 0 <= resolved["seed"] < 2**32:
         raise DevrfError(f"seed: expected 0 to {2**32 - 1}, not {resolved['seed']}")
     # A value outside any part counts as read when some part refers to it: ${loss.search}.
-    read = {ref for _, v in _leaves(raw) if isinstance(v, str) for ref in REFERENCE.findall(v)}
-    _check_group(raw, resolved, "", {*ROOT, *read})
+    _check_node(raw, resolved, "", {*ROOT, *REFERENCE.findall(OmegaConf.to_yaml(config))})
 
 
-def _leaves(raw: Node, path: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in raw.items():
-        if isinstance(value, Mapping):
-            yield from _leaves(value, f"{path}{key}.")
-        else:
-            yield f"{path}{key}", value
-
-
-def _check_group(raw: Node, resolved: Node, path: str, read: set[str]) -> None:
-    """Check a node without ``_target_``: parts below it, and values that parts refer to."""
-    for key, value in raw.items():
-        where = f"{path}{key}"
-        if isinstance(value, Mapping):
-            check = _check_part if "_target_" in value else _check_group
-            check(value, resolved[key], f"{where}.", read)
-        elif value is not None and not any(f"{where}.".startswith(f"{ref}.") for ref in read):
-            known = {ref.removeprefix(path).split(".")[0] for ref in read if ref.startswith(path)}
-            raise unknown_key(where, {*map(str, raw), *known} - {str(key)})
-
-
-def _check_part(raw: Node, resolved: Node, path: str, read: set[str]) -> None:
-    settings = _settings(str(resolved["_target_"]), path)
-    for part in resolved.values():
-        if "**" in settings and isinstance(part, Mapping) and part.get("_partial_"):
-            # It is made later, of the keys beside it.
-            settings = {**_settings(str(part["_target_"]), path), **settings}
-            del settings["**"]
+def _check_node(raw: Node, resolved: Node, path: str, read: set[str]) -> None:
+    """Check a part by its signature; of another node the parts below, and that values are read."""
+    settings = _settings(resolved, path) if "_target_" in raw else None
     for key in (key for key in raw if key not in RESERVED):
         where, raw_value, value = f"{path}{key}", raw[key], resolved[key]
-        if key not in settings and "**" not in settings:
+        if settings is not None and key not in settings and "**" not in settings:
             raise unknown_key(where, settings)
-        if isinstance(raw_value, Mapping) and "_target_" in raw_value:
-            _check_part(raw_value, value, f"{where}.", read)
+        if isinstance(raw_value, Mapping) and (settings is None or "_target_" in raw_value):
+            _check_node(raw_value, value, f"{where}.", read)
+        elif settings is None:
+            if value is not None and not any(f"{where}.".startswith(f"{ref}.") for ref in read):
+                below = (ref.removeprefix(path) for ref in read if ref.startswith(path))
+                known = {*map(str, raw), *(name.split(".")[0] for name in below)}
+                raise unknown_key(where, known - {str(key)})
         elif not (isinstance(value, Mapping) and "_target_" in value):
             hint, default = settings.get(key, (Any, None))
             # The key to name is the one where the user sets the value.
@@ -131,14 +108,23 @@ def _check_part(raw: Node, resolved: Node, path: str, read: set[str]) -> None:
                 _check_value(reference.group(1) if reference else where, value, hint)
 
 
-def _settings(target: str, path: str) -> dict[str, tuple[Any, Any]]:
-    """Type and default of each parameter of a part, by name; ``**`` if it takes any name."""
+def _settings(part: Node, path: str) -> dict[str, tuple[Any, Any]]:
+    """Type and default of each key of a part, by name; ``**`` if it takes any name."""
+    settings = _parameters(str(part["_target_"]), path)
+    for below in part.values():
+        if "**" in settings and isinstance(below, Mapping) and below.get("_partial_"):
+            # It is made later, of the keys beside it.
+            settings = {**_parameters(str(below["_target_"]), path), **settings}
+            del settings["**"]
+    return settings
+
+
+def _parameters(target: str, path: str) -> dict[str, tuple[Any, Any]]:
     try:
         part = get_object(target)
         parameters = inspect.signature(part).parameters
     except Exception as error:
-        why = " ".join(str(error).split())
-        raise DevrfError(f"{path}_target_: cannot load {target!r} ({why})") from None
+        raise DevrfError(f"{path}_target_: cannot load {target!r} ({error})") from None
     try:
         # A dataclass may inherit fields whose types only its base's module knows.
         own_init = inspect.isclass(part) and not is_dataclass(part)
@@ -153,11 +139,9 @@ def _settings(target: str, path: str) -> dict[str, tuple[Any, Any]]:
 
 def _check_value(where: str, value: object, hint: Any) -> None:
     row = next((kind for kind in (hint, *get_args(hint)) if is_dataclass(kind)), None)
-    if isinstance(value, Mapping) and get_origin(hint) in (dict, Mapping):
-        for key, entry in value.items():
-            _check_value(f"{where}.{key}", entry, get_args(hint)[1])
-    elif isinstance(value, Mapping) and row is not None:
-        hints = get_type_hints(row)
+    by_name = get_origin(hint) in (dict, Mapping)
+    if isinstance(value, Mapping) and (by_name or row is not None):
+        hints = dict.fromkeys(value, get_args(hint)[1]) if by_name else get_type_hints(row)
         for key, entry in value.items():
             if key not in hints:
                 raise unknown_key(f"{where}.{key}", hints)
@@ -201,36 +185,41 @@ def unfit(value: object, hint: Any) -> str:
 
 
 def choices_of(hint: Any) -> tuple[object, ...]:
-    """The values that a hint enumerates; none where it does not."""
+    """The values that a hint enumerates, as they are typed; none where it does not."""
     inner = get_args(hint)
     if get_origin(hint) is Literal:
         return inner
+    if hint is bool:
+        return "true", "false"
     if get_origin(hint) in (Union, types.UnionType):
         return tuple(value for argument in inner for value in choices_of(argument))
     return ()
 
 
+def choices_at(config: DictConfig, key: str) -> tuple[object, ...]:
+    """The values that the part with ``key`` in a composed config enumerates for it."""
+    parent, _, name = key.rpartition(".")
+    part = OmegaConf.select(config, parent)
+    if not isinstance(part, DictConfig) or "_target_" not in part:
+        return ()
+    node: Any = OmegaConf.to_container(part)
+    return choices_of(_settings(node, f"{parent}.").get(name, (None,))[0])
+
+
 def check_extras(config: DictConfig) -> None:
     """Refuse by a DevrfError settings for which an extra of devrf is not installed."""
-    needs = []  # packages, the setting, the extra, and what to set instead
-    if "TensorBoard" in config.logger.get("_target_", ""):
-        needs.append(("tensorboard", "logger=tensorboard", "tensorboard", "logger=csv"))
-    if config.stage == "view":
-        needs.append(("viser", "stage=view", "viewer", "stage=render"))
-    if config.viewer.get("training") is True:
-        needs.append(("viser", "viewer=true", "viewer", "viewer=false"))
-    # Flow that was estimated before is read from its file.
-    cache = config.data.get("flow_cache")
-    if config.data.get("flow") == "raft" and not (cache and Path(cache).is_file()):
-        needs.append(("torchvision", "data.flow=raft", "raft", "data.flow=dis"))
-    if config.stage == "export":
-        packages = "skimage trimesh fast_simplification"
-        needs.append((packages, "stage=export", "export", "stage=render"))
-        if config.export.format == "usd":
-            needs.append(("pxr", "export.format=usd", "export", "export.format=gltf"))
-    for packages, setting, extra, instead in needs:
+    tensorboard = "TensorBoard" in config.logger.get("_target_", "")
+    exports, meshes = config.stage == "export", "skimage trimesh fast_simplification"
+    usd = exports and config.export.format == "usd"
+    for chosen, setting, packages, extra, instead in (
+        (tensorboard, "logger=tensorboard", "tensorboard", "tensorboard", "logger=csv"),
+        (config.stage == "view", "stage=view", "viser", "viewer", "stage=render"),
+        (config.viewer.get("training"), "viewer=true", "viser", "viewer", "viewer=false"),
+        (exports, "stage=export", meshes, "export", "stage=render"),
+        (usd, "export.format=usd", "pxr", "export", "export.format=gltf"),
+    ):
         for package in packages.split():
-            if find_spec(package) is None:
+            if chosen and find_spec(package) is None:
                 raise DevrfError(
                     f"{setting}: {package} is not installed; run pip install "
                     f'"devrf[{extra}]", or set {instead}'

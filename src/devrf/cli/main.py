@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import hydra
-from hydra import initialize_config_dir
+from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
 from hydra.plugins.completion_plugin import DefaultCompletionPlugin
 from omegaconf import DictConfig
 
@@ -18,11 +20,12 @@ import devrf
 from devrf.apps.fetch import catalogue
 from devrf.cli.complete import completed, with_recognised_data
 from devrf.cli.config import config_folder, in_sweep, known_stages, register_config
-from devrf.cli.config_check import ROOT, check_config, check_extras, choices_of
+from devrf.cli.config_check import ROOT, check_config, check_extras, choices_at, choices_of
 from devrf.cli.messages import report_user_errors
 from devrf.cli.restore_config import log_source
 from devrf.cli.run_folder import working_in
-from devrf.cli.sweep import forget_failure, name_failures, run_job
+from devrf.cli.sweep import forget_failure, name_failures, record_failure
+from devrf.errors import DevrfError
 from devrf.system.process import Interrupted, end_at_once, handle_signals, importing, tune_for_cpu
 
 # Without `=` among the shell's word breaks the whole of KEY=VALUE is one word. Other commands of
@@ -41,7 +44,6 @@ _devrf_complete() {{
 COMP_WORDBREAKS=${{COMP_WORDBREAKS//=}}
 complete -o nospace -o bashdefault -o default -F _devrf_complete devrf python python3
 """
-UNINSTALL = "complete -r devrf python python3; unset -f _devrf_complete\n"
 
 register_config()
 
@@ -55,10 +57,8 @@ def entry() -> None:
     """
     # Hydra would print a traceback of its own and exit with 1 if it were not told to raise.
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    if "--version" in sys.argv[1:]:  # else Hydra's own
-        print(f"devrf {devrf.__version__}")
-        return
-    if sys.argv[1:2] in (["-sc"], ["--shell-completion"]) and _complete_in_bash(sys.argv[2:]):
+    if (answer := _answer_at_once(sys.argv[1:])) is not None:
+        print(answer)
         return
     tune_for_cpu()
     try:
@@ -80,16 +80,9 @@ def entry() -> None:
 def run(config: DictConfig) -> float | None:
     """Run ``stage=…`` in Hydra's output folder; return the objective, if measured."""
     folder = Path(HydraConfig.get().runtime.output_dir)
-    if in_sweep():
-        return run_job(lambda: _run(config, folder, "hydra.sweep.dir"), config, folder)
-    with report_user_errors():
-        value = _run(config, folder, "hydra.run.dir")
-        forget_failure(folder)
-        return value
-
-
-def _run(config: DictConfig, folder: Path, key: str) -> float | None:
-    with working_in(folder, config, key):
+    key = "hydra.sweep.dir" if in_sweep() else "hydra.run.dir"
+    guard = record_failure(config, folder) if in_sweep() else report_user_errors()
+    with guard, working_in(folder, config, key):
         log_source()
         config = with_recognised_data(config)
         check_config(config)
@@ -98,37 +91,45 @@ def _run(config: DictConfig, folder: Path, key: str) -> float | None:
         with importing():
             from devrf.cli.run import run_stage
 
-        return run_stage(config, folder)
+        value = run_stage(config, folder)
+        forget_failure(folder)
+        return value
+    return None  # of a job that failed
 
 
 # A name of its own: other processes import `run` by its name.
 main = hydra.main(config_path=str(config_folder()), config_name="config", version_base="1.3")(run)
 
 
-def _complete_in_bash(words: Sequence[str]) -> bool:
-    """Answer ``install=bash``, ``uninstall=bash`` or ``query=bash``; other shells are Hydra's."""
-    if "query=bash" in words:
-        print("\n".join(candidates(os.environ.get("COMP_LINE", ""))))
-    elif "install=bash" in words:
-        print(INSTALL.format(python=sys.executable), end="")
-    elif "uninstall=bash" in words:
-        print(UNINSTALL, end="")
-    return bool(words) and words[0].endswith("=bash")
+def _answer_at_once(words: Sequence[str]) -> str | None:
+    """The answer to ``--version``, and to bash; what other shells ask is Hydra's to answer."""
+    match words:
+        case [*_, "--version"]:
+            return f"devrf {devrf.__version__}"
+        case ["-sc" | "--shell-completion", "install=bash"]:
+            return INSTALL.format(python=sys.executable)
+        case ["-sc" | "--shell-completion", "query=bash"]:
+            return "\n".join(candidates(os.environ.get("COMP_LINE", "")))
+    return None
 
 
 def candidates(line: str) -> list[str]:
     """What the last word of ``devrf ARGUMENT …`` may become.
 
-    Hydra knows keys, groups and their choices; here come the values of ``stage``, and of other keys
-    that have few.
+    Hydra knows keys, groups and their choices; the values of other keys are those that parts
+    declare. What only a scene from disk has is known before its folder is typed, too.
     """
-    _, _, typed = line.partition(" ")
-    key, is_set, _ = typed.split(" ")[-1].partition("=")
-    values = known_stages() if key == "stage" else [str(v) for v in choices_of(ROOT.get(key))]
-    if key == "scene" and "stage=fetch" in typed.split():
+    *before, word = line.split(" ")[1:]
+    key, is_set, _ = word.partition("=")
+    values: Sequence[object] = known_stages() if key == "stage" else choices_of(ROOT.get(key))
+    if key == "scene" and "stage=fetch" in before:
         values = [scene.name for scene in catalogue()]
-    if is_set and values:
-        return [f"{key}={value}" for value in values]
+    found: list[str] = []
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
         plugin = DefaultCompletionPlugin(GlobalHydra.instance().config_loader())
-        return plugin._query(config_name="config", line=typed)
+        for typed in (before, ["data=inward", *before]):
+            with suppress(HydraException, DevrfError):
+                values = values or (is_set and choices_at(compose("config", typed), key)) or ()
+            found = found or [f"{key}={value}" for value in values if is_set]
+            found = found or plugin._query("config", " ".join([*typed, word]))
+    return [candidate for candidate in found if "_target_" not in candidate]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import gc
 import logging
 import sys
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,29 +37,30 @@ OF_SWEEP = {"multirun.yaml", PLACE}
 
 def report(run: RunContext) -> None:
     """``stage=report``: tables and plots of the runs below ``report.runs``; needs no scene."""
-    # Slow to import: pandas and matplotlib.
+    _write_report(run.config.report, log.info)
+
+
+def _write_report(settings: DictConfig, say: Callable[[str], None], **other: Any) -> None:
+    # Hydra imports this module with every command; pandas and matplotlib are slow to import.
     from devrf.apps.report.write import write_report
 
-    written = write_report(instantiate(run.config.report))
-    log.info("%s", written.text)
-    log.info("report written to %s", written.path)
+    written = write_report(instantiate(settings, **other))
+    say(written.text)
+    say(f"report written to {written.path}")
 
 
-def run_job(run: Callable[[], float | None], config: DictConfig, folder: Path) -> float | None:
-    """Run one job of a sweep; if it fails, write ``failure.json``, so that the next jobs still run.
+@contextmanager
+def record_failure(config: DictConfig, folder: Path) -> Iterator[None]:
+    """If a sweep's job, the block, fails, write ``failure.json``, so that the next jobs still run.
 
-    Returns:
-        The objective; None for a failed job, which a search counts as failed. (A NaN would end the
-        search, an exception the basic sweeper.)
+    Its objective is then None: a search counts it as failed. (A NaN would end the search, an
+    exception the basic sweeper.)
     """
     forget_peak_memory()
     try:
-        value = run()
-        forget_failure(folder)
-        return value
+        yield
     except Exception as error:
         _record(error, config, folder)
-        return None
     finally:
         gc.collect()  # so that the next job does not start with the memory of this one
 
@@ -154,11 +155,6 @@ class SweepReport(Callback):
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Write the report into the sweep's folder and print it; nothing if no job was scored."""
-        # Hydra imports this module with every command; pandas and matplotlib are slow to import.
-        from devrf.apps.report.write import write_report
-
         with suppress(DevrfError):
-            written = write_report(instantiate(config.report, runs=config.hydra.sweep.dir))
             # Printed, because Hydra's last job has closed the log.
-            print(written.text)
-            print(f"report written to {written.path}")
+            _write_report(config.report, print, runs=config.hydra.sweep.dir)
