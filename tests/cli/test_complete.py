@@ -36,7 +36,7 @@ def test_text_in_quotes_is_read_as_that_text(text):
 @pytest.mark.parametrize("key", ["data.root", "+data.root", "report.runs"])
 @pytest.mark.parametrize("path", ["/my scenes/fox [1]", "München (2)", "a=b", 'a "b"', "2026"])
 def test_a_path_is_taken_as_it_is_typed(key, path):
-    argument = completed([f"{key}={path}"])[-1]
+    argument = completed(["data=inward", f"{key}={path}"])[-1]
     assert PARSER.parse_override(argument).value() == path
 
 
@@ -79,12 +79,24 @@ def test_the_keys_of_paths_exist(devrf):
 
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory) -> Path:
-    """``walker`` and ``wall``, an inward-facing and a forward-facing scene, in DeVRF's layout."""
+    """``walker`` and ``wall``, an inward-facing and a forward-facing scene, in DeVRF's layout.
+
+    ``phone`` is what ``stage=capture`` writes of photographs from one side, but for the images.
+    """
     folder = tmp_path_factory.mktemp("scenes")
     size = {"width": 32, "height": 24, "static_views": 5, "train_views": 2, "frames": 3}
     export(ProceduralScene(static_test_views=1, supersample=1, **size)(), folder / "walker")
     size["static_views"] = 7
     export(ProceduralForwardScene(supersample=1, **size)(), folder / "wall")
+    (folder / "phone").mkdir()
+    frame = {"file_path": "0.jpg", "transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}
+    content = {"frames": [frame], "scene_bounds": {"space": "ndc", "near": 1.0}}
+    (folder / "phone/transforms.json").write_text(json.dumps(content))
+    # As D-NeRF's: one camera, elsewhere in each image.
+    (folder / "hook").mkdir()
+    moved = [[1, 0, 0, 1], [0, 1, 0, 0], [0, 0, 1, 0]]
+    frames = [frame | {"time": 0}, frame | {"time": 1, "transform_matrix": moved}]
+    (folder / "hook/transforms_train.json").write_text(json.dumps({"frames": frames}))
     return folder
 
 
@@ -107,6 +119,15 @@ def scenes(tmp_path_factory) -> Path:
         ("experiment=best_small data.root=walker", "experiment=best_small data.root=walker"),
         ("experiment=best_small data.root=wall", "experiment=best_small_forward data.root=wall"),
         ("experiment=paper data.root=wall", "experiment=paper_forward data.root=wall"),
+        ("experiment=cpu_small data.root=walker", "experiment=cpu_small data.root=walker"),
+        ("experiment=cpu_small data.root=wall", "experiment=cpu_small_forward data.root=wall"),
+        ("experiment=cpu_small data=flower", "experiment=cpu_small_embedded data=flower"),
+        # What a folder's files say counts, not the reader alone.
+        ("experiment=best data.root=phone", "experiment=best_forward data.root=phone"),
+        ("data.root=phone seed=1", "data.root=phone seed=1 experiment=best_small_forward"),
+        ("data.root=hook method=dnerf", "data=auto data.root=hook method=dnerf protocol=dynamic"),
+        ("data.root=hook method=devrf", "data=auto data.root=hook method=devrf"),
+        ("data.root=wall method=dnerf", "data=auto data.root=wall method=dnerf"),
         ("experiment=best_small", "experiment=best_small"),
         ("experiment=paper", "experiment=paper_inward"),
         ("experiment=cpu_small,best_small", "experiment=cpu_small,best_small"),
@@ -114,10 +135,9 @@ def scenes(tmp_path_factory) -> Path:
         # The reader.
         ("data.root=walker", "data=auto data.root=walker"),
         ("+data.root=walker seed=1", "data=auto +data.root=walker seed=1"),
-        ("data.root=x experiment=cpu_small", "data.root=x experiment=cpu_small"),
         ("data.root=x experiment=peer_small", "data=auto data.root=x experiment=peer_small"),
         ("data.root=x experiment=nonsense", "data=auto data.root=x experiment=nonsense"),
-        ("data.root=x data=nerfstudio", "data.root=x data=nerfstudio"),
+        ("data.root=walker data=nerfstudio", "data.root=walker data=nerfstudio"),
     ],
 )
 def test_the_form_for_the_scene_and_its_reader(scenes, monkeypatch, typed, meant):

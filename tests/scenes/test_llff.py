@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -154,6 +155,38 @@ def test_space_and_box_by_hand(llff_folder):
     assert bounds.box.high == pytest.approx((6.0, 1.0, 1.0))
     assert (bounds.near, bounds.far, bounds.motion, bounds.scale) == (0.0, 1.0, None, 1.0)
     assert LlffReader(llff_folder.root, near=0.5).read().bounds.box.high[0] == pytest.approx(11.0)
+
+
+def test_a_stray_point_does_not_set_the_near_plane(llff_folder, caplog):
+    caplog.set_level("INFO")
+    expected = LlffReader(llff_folder.root).read().static.train.cameras.positions
+    rows = llff_folder.static_rows()
+    rows[[4, 7], 15] = 0.02, 2.9  # the others are 6 and 7: half of their median is 3.5
+    llff_folder.save(STATIC, rows)
+    cameras = LlffReader(llff_folder.root).read().static.train.cameras
+    torch.testing.assert_close(cameras.positions, expected)
+    assert "2 cameras see stray points before them: the nearest depth is 6, not 0.02" in caplog.text
+
+
+def test_the_cameras_that_nr_nerf_publishes(llff_folder):
+    """The same cameras as LLFF's, in axes right, up, back, without its file."""
+    root = llff_folder.static
+    expected = LlffReader(root, monocular=True).read().dynamic.train.cameras
+    rows = llff_folder.static_rows()
+    matrix = rows[:, :15].reshape(9, 3, 5)
+    down, right = matrix[:, :, 0].copy(), matrix[:, :, 1].copy()
+    matrix[:, :, 0], matrix[:, :, 1] = right, -down
+    content = {
+        "poses": matrix.tolist(),
+        "bds": rows[:, 15:].tolist(),
+        "render_poses": [],
+        "i_test": 3,
+    }
+    (root / "poses_bounds.npy").unlink()
+    (root / "precomputed.json").write_text(json.dumps(content))
+    cameras = LlffReader(root).read().dynamic.train.cameras
+    torch.testing.assert_close(cameras.camera_to_world, expected.camera_to_world)
+    assert torch.equal(cameras.focal, expected.focal)
 
 
 STATIC = "static/poses_bounds.npy"

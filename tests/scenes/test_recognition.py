@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 
+from devrf.data.recorded import InwardFacingDataModule
 from devrf.errors import DevrfError
 from devrf.scenes.formats import recognise
 
+PARTS = ("cameras", "images", "points3D")
+MODEL = [f"sparse/0/{part}.bin" for part in PARTS]
 LAYOUTS = {
     "DeVRF": ("inward", ["static/transforms_train.json", "dynamic_4views/transforms_train.json"]),
     "D-NeRF and NeRF-synthetic": ("inward", ["transforms_train.json", "transforms_test.json"]),
@@ -19,11 +23,13 @@ LAYOUTS = {
     "Nerfies": ("nerfies", ["dataset.json", "metadata.json", "scene.json"]),
     "DyCheck": ("dycheck", ["splits/train.json", "splits/val.json", "dataset.json", "scene.json"]),
     "Neural 3D Video": ("neural_3d_video", ["poses_bounds.npy", "cam00.mp4", "cam01.mp4"]),
-    "COLMAP": ("colmap", ["sparse/0/cameras.bin", "sparse/0/images.bin", "images/0.jpg"]),
-    "COLMAP, one folder less": ("colmap", ["sparse/cameras.txt", "sparse/images.txt"]),
+    "COLMAP": ("colmap", [*MODEL, "images/0.jpg"]),
+    "COLMAP, one folder less": ("colmap", [f"sparse/{part}.txt" for part in PARTS]),
+    "COLMAP, as nerfstudio leaves it": ("colmap", [f"colmap/{name}" for name in MODEL]),
     # mip-NeRF 360 has both; a video says its times, a model of COLMAP does not.
-    "COLMAP beside LLFF": ("colmap", ["poses_bounds.npy", "sparse/0/cameras.bin"]),
-    "NR-NeRF": ("forward", ["poses_bounds.npy", "precomputed.json", "sparse/0/cameras.bin"]),
+    "COLMAP beside LLFF": ("colmap", ["poses_bounds.npy", *MODEL]),
+    "NR-NeRF": ("forward", ["precomputed.json", "images/image000001.png"]),
+    "NR-NeRF, with COLMAP's files": ("forward", ["poses_bounds.npy", "precomputed.json", *MODEL]),
     # nerfstudio's converters leave COLMAP's other files beside their own.
     "nerfstudio beside LLFF": ("nerfstudio", ["transforms.json", "poses_bounds.npy"]),
 }
@@ -61,9 +67,34 @@ def test_what_each_layout_lacks_is_said_in_one_line(tmp_path: Path) -> None:
     assert "mp4" not in line  # what lacks more than another is left out
 
 
-def test_a_folder_of_scenes_is_told_from_a_scene(tmp_path: Path) -> None:
-    touch(tmp_path, ["lego/transforms_train.json", "notes/readme.txt"])
-    with pytest.raises(DevrfError, match="lego/ in it is a scene: give data.root that folder"):
-        recognise(tmp_path)
+def test_an_incomplete_model_is_left_alone_and_said(tmp_path: Path, caplog) -> None:
+    caplog.set_level("INFO")
+    assert recognise(touch(tmp_path, ["poses_bounds.npy", *MODEL[:2]])).choice == "forward"
+    assert "its sparse/ is incomplete, no sparse/**/points3D.*: left alone" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("files", "root", "typed"),
+    [
+        (["lego/transforms_train.json", "notes/readme.txt"], "", "data.root={}/lego"),
+        ([*MODEL, "images/0.jpg"], "images", "data.root={}"),
+        (["transforms.json"], "transforms.json", "data.root={}"),
+        (["cup/images/0.png"], "cup", "capture.static={}/cup/images capture.into=scenes/cup"),
+        (["a.mp4", "b.mov"], "", "a.mp4 'capture.views=[{}/b.mov]' capture.into=scenes/a"),
+        (["walk.MP4"], "walk.MP4", "capture.static={}/walk.MP4 capture.into=scenes/walk"),
+    ],
+)
+def test_the_line_says_what_to_type(tmp_path: Path, files, root, typed) -> None:
+    touch(tmp_path, files)
+    with pytest.raises(DevrfError, match=re.escape(typed.format(tmp_path))) as caught:
+        recognise(tmp_path / root)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_wrong_reader_is_answered_with_the_right_one(tmp_path: Path) -> None:
+    touch(tmp_path, MODEL)
+    with pytest.raises(DevrfError, match="the files of COLMAP, .*; write data=colmap, or leave"):
+        _ = InwardFacingDataModule(tmp_path).scene
+
     with pytest.raises(DevrfError, match="nowhere: no such folder"):
         recognise(tmp_path / "nowhere")

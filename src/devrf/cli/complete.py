@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Sequence
+from itertools import product
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
@@ -20,7 +21,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from devrf.cli.config import config_folder, group_choices, rows
 from devrf.cli.messages import in_quotes
-from devrf.cli.restore_config import of_named_run, parsed, values
+from devrf.cli.restore_config import of_named_run, parsed, value, values
 from devrf.errors import DevrfError
 
 # Keys whose values are files or folders.
@@ -34,9 +35,8 @@ PATHS = {
 SHORTHAND = {f"viewer={value}": f"viewer.training={value}" for value in ("true", "false")}
 KEY_VALUE = re.compile(r"(\+{0,2}([\w./@-]+)=)(.*)", re.DOTALL)
 
-# Readers whose scenes are forward-facing, and those of the embedded scenes.
-FORWARD = {"forward", "neural_3d_video", "procedural_forward"}
-EMBEDDED = {"procedural", "procedural_forward"}
+# Readers of the embedded scenes, and what an experiment's form for them is called after.
+EMBEDDED = {"procedural": ["embedded", "inward"], "procedural_forward": ["forward"]}
 # What conf/data/auto.yaml names, and keys that are not passed on with its options.
 AUTOMATIC = "devrf.data.recorded.recognised_datamodule"
 NOT_PASSED = ("_target_", "reader", "flow_cache")
@@ -97,25 +97,39 @@ def _in_form(texts: list[str], before: Sequence[str]) -> list[str]:
     Of ``paper`` with ``data=lego`` that is ``paper_lego``, else ``paper_inward``, else ``paper``;
     of ``best_small`` with an embedded scene ``best_small_embedded``. Of a sweep over scenes with
     settings of their own, ``experiment=paper data=lego,plant``, it is one over such experiments,
-    which name their data themselves.
+    which name their data themselves. Without an experiment a forward-facing scene from disk has
+    ``best_small_forward``; other methods learn D-NeRF's kind of scene by ``protocol=dynamic``.
 
     Raises:
         DevrfError: a sweep's scenes need different forms.
     """
     both = parsed([*before, *texts])
-    names = values(both, "experiment")
-    if not names:
+    names, known = values(both, "experiment"), set(group_choices()["experiment"])
+    roots, chosen = values(both, "data.root"), {override.key_or_group for override in both}
+    fresh = bool(roots) and not before
+    default = fresh and not names and not chosen & {"method", "comparison", "field", "schedule"}
+    peer = fresh and value(both, "method") not in (None, "devrf")
+    formed = any(other.startswith(f"{name}_") for name in names for other in known)
+    if not (default or peer or formed):
         return texts
-    known = set(group_choices()["experiment"])
-    if not any(other.startswith(f"{name}_") for name in names for other in known):
-        return texts
-    scenes: list[str | None] = [*values(both, "data")]
-    if not scenes or "auto" in scenes:
-        from devrf.scenes.formats import recognise  # loads numpy
+    from devrf.data.kind import ONE_CAMERA, kind_of  # loads torch
 
-        scenes = [recognise(root).choice for root in values(both, "data.root")]
-    forms = [[_form(name, scene, known) for name in names] for scene in scenes or [None]]
-    if len(names) == 1 and len(scenes) > 1 and forms == [[f"{names[0]}_{k}"] for k in scenes]:
+    options, space = values(both, "data") or ["auto"], value(both, "data.space")
+    scenes = [
+        [option, *(EMBEDDED.get(_reader(option)) or kind_of(_reader(option), root, space))]
+        for option, root in product(options, roots or ([] if "auto" in options else [""]))
+    ]
+    if peer and not chosen & {"protocol", "comparison"} and all(ONE_CAMERA in k for k in scenes):
+        texts = [*texts, "protocol=dynamic"]
+    if not names:
+        forward = default and all("forward" in kinds for kinds in scenes)
+        return [*texts, "experiment=best_small_forward"] if forward else texts
+    # The most specific form; the name itself where it has none.
+    forms = [
+        [next((f"{n}_{kind}" for kind in kinds if f"{n}_{kind}" in known), n) for n in names]
+        for kinds in scenes or [["inward"]]
+    ]
+    if len(scenes) > 1 and forms == [[f"{names[0]}_{kinds[0]}"] for kinds in scenes]:
         forms = [[form for row in forms for form in row]]
         texts = [text for text in texts if not text.startswith("data=")]
     if any(form != forms[0] for form in forms):
@@ -126,16 +140,6 @@ def _in_form(texts: list[str], before: Sequence[str]) -> list[str]:
         )
     form = f"experiment={','.join(forms[0])}"
     return [form if text.startswith("experiment=") else text for text in texts]
-
-
-def _form(name: str, scene: str | None, known: set[str]) -> str:
-    """The most specific form of an experiment for ``data=scene``; None where it is not said."""
-    if scene is None:
-        return name if name in known else f"{name}_inward"
-    reader = _reader(scene)
-    kinds = [scene, "embedded"] if reader == "procedural" else [scene]
-    kinds.append("forward" if reader in FORWARD else "inward")
-    return next((f"{name}_{kind}" for kind in kinds if f"{name}_{kind}" in known), name)
 
 
 def _defaults(group: str, option: str) -> list[Any]:
@@ -169,10 +173,9 @@ def with_recognised_data(config: DictConfig) -> DictConfig:
         DevrfError: the layout is unknown, or its reader has no such option.
     """
     data = config.data
-    if data.get("_target_") != AUTOMATIC or config.stage == "report":
+    unread = config.stage == "report" or OmegaConf.is_missing(data, "root")
+    if unread or data.get("_target_") != AUTOMATIC:
         return config
-    if OmegaConf.is_missing(data, "root"):
-        return config  # the check of the config says so
     # Imported here: --help and a misspelt key are answered before numpy and torch have loaded.
     from devrf.scenes.formats import recognise
 

@@ -68,11 +68,8 @@ def capture(run: RunContext) -> None:
     config.data = OmegaConf.load(config_folder() / "data" / "nerfstudio.yaml")
     config.data.root, config.data.name = str(folder), folder.resolve().name
     config.data.flow_cache = str(run.folder / "flow.npz")
-    captured = RunContext(config, run.folder)
-    inspect(captured)
-    # The default field is one for cameras around a scene; the layout does not tell which these are.
-    forward = ["experiment=best_small_forward", "data=auto"]
-    say_next([*(forward if captured.scene.kind == "forward" else []), f"data.root={folder}"])
+    inspect(RunContext(config, run.folder))
+    say_next([f"data.root={folder}"])
 
 
 def prepare(run: RunContext) -> None:

@@ -9,7 +9,8 @@ from typing import Any
 
 from devrf.data.datamodule import SceneDataModule
 from devrf.data.flow import with_flow, with_forward_flow
-from devrf.scenes.formats import recognise
+from devrf.errors import DevrfError
+from devrf.scenes.formats import check_choice, recognise
 from devrf.scenes.formats.blender import BlenderReader
 from devrf.scenes.formats.colmap import ColmapReader
 from devrf.scenes.formats.dycheck import DycheckReader
@@ -50,7 +51,13 @@ class RecordedDataModule(SceneDataModule):
 
     def load(self) -> Scene:
         """Read the scene, and estimate its optical flow if that is asked for."""
-        scene = self.reader.read()
+        try:
+            scene = self.reader.read()
+        except DevrfError:
+            for choice, reader in READERS.items():
+                if type(self.reader) is reader:
+                    check_choice(self.reader.root, choice)
+            raise
         self.downscale = self.reader.factor
         if scene.kind == "inward":
             bounds, kind = scene.bounds, "world" if scene.space.is_linear else "contracted"

@@ -160,12 +160,14 @@ def inward_bounds(
         source = "data.box (no alpha masks from two cameras at every time)"
     reach = box if motion is None else box.union(motion)
     ranges = [depth_range(views.cameras, reach) for views in everyone]
-    near = min(r[0] for r in ranges) if near is None else float(near)
-    far = max(r[1] for r in ranges) if far is None else float(far)
+    nearest, farthest = min(r[0] for r in ranges), max(r[1] for r in ranges)
+    near = nearest if near is None else float(near)
+    far = farthest if far is None else float(far)
     if not 0 <= near < far <= 4 * FARTHEST:
         raise scene_error(
             "data.near, data.far",
-            f"expected 0 <= near < far, not {near:g} and {far:g}; correct both",
+            f"expected 0 <= near < far, not {near:g} and {far:g}; the cameras say "
+            f"data.near={nearest:.3g} data.far={farthest:.3g}",
         )
     return Bounds(box, near, far, motion, scale, source, limited)
 

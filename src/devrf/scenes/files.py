@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import os
+import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -64,6 +65,9 @@ def scene_folder(root: str | Path) -> Path:
 
 def existing_folder(folder: Path) -> Path:
     """``folder`` itself, or DevrfError if there is no such folder."""
+    if os.path.isfile(folder):
+        parent = shlex.quote(f"data.root={folder.parent}")
+        raise scene_error(folder, f"is a file, expected the scene's folder; write {parent}")
     if not os.path.isdir(folder):  # unlike Path.is_dir it raises on nothing
         raise scene_error(folder, "no such folder; set data.root to the scene's folder")
     return folder

@@ -205,12 +205,14 @@ class PosedReader(InwardReader):
             box_source = source if found else scene.bounds.box_source
             bounds = replace(scene.bounds, reason=reason, box_source=box_source)
             return replace(scene, bounds=bounds)
+        name, captures = self.name_of(folder), centred(static, dynamic)
         if reader.near is None or reader.near <= 0:
+            apart = float(captures[0].train.cameras.positions.norm(dim=1).max())
             raise scene_error(
                 "data.near",
-                "data.space=ndc needs a near plane; give its distance in world units, above 0",
+                "data.space=ndc needs a near plane before all that is seen, in world units; try "
+                f"data.near={apart:.3g}, which is as far as cameras are from their middle",
             )
-        name, captures = self.name_of(folder), centred(static, dynamic)
         return forward_facing_scene(name, *captures, reader.near, self.background)
 
 

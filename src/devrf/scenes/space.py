@@ -116,13 +116,15 @@ def forward_facing_scene(
     bounds = forward_bounds(learned, space, SEEN if moves else STILL)
     # The held-out cameras need not see inside the box, but they have to look the same way.
     forward_bounds(held_out, space, "")
+    foremost = max(-float(v.cameras.positions[:, 2].min()) for v in learned + held_out)
     for views in learned + held_out:
         beyond = (views.cameras.positions[:, 2] <= -near).nonzero().flatten()
         if len(beyond):  # it would look through what is behind the near plane
             log.warning(
-                "%d cameras are beyond the near plane, %s the first of them; set data.near higher",
+                "%d cameras are beyond the near plane, %s the first of them; set data.near=%.3g",
                 len(beyond),
                 views.names[int(beyond[0])],
+                1.05 * foremost,
             )
     return Scene(name, "forward", static, dynamic, bounds, background, space)
 

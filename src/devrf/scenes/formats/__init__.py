@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import logging
 import os
-from dataclasses import dataclass
+import shlex
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from devrf.scenes.files import entries, scene_folder
+from devrf.scenes.images import SUFFIXES
 from devrf.scenes.validation import scene_error
 
 log = logging.getLogger(__name__)
@@ -32,6 +34,9 @@ class KnownLayout:
         return [name for name in self.files if not any(map(os.path.isfile, root.glob(name)))]
 
 
+COLMAP = KnownLayout(
+    "colmap", "COLMAP", ("sparse/**/cameras.*", "sparse/**/images.*", "sparse/**/points3D.*")
+)
 # Folders that hold files of several layouts have that of the first: of two captures before one,
 # of what says more about its images before what says less.
 LAYOUTS = (
@@ -43,35 +48,85 @@ LAYOUTS = (
     KnownLayout("inward", "D-NeRF, NeRF-synthetic", ("transforms_train.json",)),
     KnownLayout("nerfstudio", "nerfstudio, instant-ngp", ("transforms.json",)),
     KnownLayout("neural_3d_video", "Neural 3D Video", ("poses_bounds.npy", "cam*.mp4")),
-    KnownLayout("forward", "NR-NeRF", ("poses_bounds.npy", "precomputed.json")),
-    KnownLayout("colmap", "COLMAP", ("sparse/**/cameras.*",)),
+    KnownLayout("forward", "NR-NeRF", ("precomputed.json",)),
+    replace(COLMAP, files=tuple(f"colmap/{file}" for file in COLMAP.files)),
+    COLMAP,
     KnownLayout("forward", "LLFF", ("poses_bounds.npy",)),
 )
+# Of footage, which stage=capture makes scenes of.
+VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 
 
 def recognise(root: str | Path) -> KnownLayout:
-    """The layout of the scene in ``root``; if none fits, DevrfError says what each lacks."""
-    folder = scene_folder(root)
-    fitting = [layout for layout in LAYOUTS if not layout.missing(folder)]
-    if not fitting:
-        raise scene_error(folder, f"no known layout ({_lacks(folder)}); {_advice(folder)}")
+    """The layout of the scene in ``root``; if none fits, DevrfError says what to do about it."""
+    folder, fitting = _fitting(root)
     chosen = fitting[0]
     others = sorted({layout.choice for layout in fitting} - {chosen.choice})
     also = f"; it would fit data={' and data='.join(others)} too" if others else ""
+    if COLMAP not in fitting and os.path.isdir(folder / "sparse"):
+        also += f"; its sparse/ is incomplete, no {', '.join(COLMAP.missing(folder))}: left alone"
     log.info("%s: the layout of %s (data=%s)%s", folder, chosen.name, chosen.choice, also)
     return chosen
 
 
-def _lacks(folder: Path) -> str:
-    """What each layout lacks; of layouts that begin alike, the one that lacks the least."""
-    missing = {one.name: set(one.missing(folder)) for one in LAYOUTS}
-    least = [one for one in LAYOUTS if not any(m < missing[one.name] for m in missing.values())]
-    return "; ".join(f"{one.name}: no {', '.join(one.missing(folder))}" for one in least)
+def check_choice(root: str | Path, choice: str) -> None:
+    """DevrfError that names the right option, if ``data=choice`` does not read such a folder."""
+    folder, fitting = _fitting(root)
+    if all(layout.choice != choice for layout in fitting):
+        known = fitting[0]
+        raise scene_error(
+            folder,
+            f"has the files of {known.name}, which data={choice} does not read; write "
+            f"data={known.choice}, or leave data= out",
+        )
 
 
-def _advice(folder: Path) -> str:
-    """What to do about a folder of unknown layout: scenes may lie right below it."""
-    for path in entries(folder):
-        if os.path.isdir(path) and any(not layout.missing(path) for layout in LAYOUTS):
-            return f"{path.name}/ in it is a scene: give data.root that folder"
-    return "set data.root to the scene's folder"
+def _fitting(root: str | Path) -> tuple[Path, list[KnownLayout]]:
+    """The scene's folder, and the layouts that it has, at least one."""
+    file = Path(os.path.expanduser(root))
+    if file.suffix.lower() in VIDEOS and os.path.isfile(file):
+        raise scene_error(file, _footage(file))
+    folder = scene_folder(root)
+    fitting = _layouts(folder)
+    if not fitting:
+        raise scene_error(folder, _of_no_layout(folder))
+    return folder, fitting
+
+
+def _layouts(folder: Path) -> list[KnownLayout]:
+    """The layouts that a folder has, that of the first choice first."""
+    return [layout for layout in LAYOUTS if not layout.missing(folder)]
+
+
+def _of_no_layout(folder: Path) -> str:
+    """What to do about a folder of no known layout: scenes, images or videos may be around it."""
+    above, inside = folder.absolute().parent, entries(folder)
+    if _layouts(above):
+        return f"is a part of a scene; write {shlex.quote(f'data.root={above}')}"
+    for path in inside:
+        if os.path.isdir(path) and _layouts(path):
+            return f"{path.name}/ in it is a scene; write {shlex.quote(f'data.root={path}')}"
+    for place in (folder, folder / "images"):
+        if os.path.isdir(place) and any(p.suffix.lower() in SUFFIXES for p in entries(place)):
+            return _footage(place)
+    if videos := [path for path in inside if path.suffix.lower() in VIDEOS]:
+        return _footage(*videos)
+    # Of layouts that begin alike, the one that lacks the least.
+    missing = {layout.name: layout.missing(folder) for layout in LAYOUTS}
+    lacks = [
+        f"{name}: no {files[0]}"
+        for name, files in missing.items()
+        if not any({*fewer} < {*files} for fewer in missing.values())
+    ]
+    return f"no known layout ({'; '.join(lacks)}); set data.root to the scene's folder"
+
+
+def _footage(static: Path, *views: Path) -> str:
+    """What to type to make a scene of photographs or videos; of several the first is at rest."""
+    name = static.parent.name if static.name == "images" else static.stem
+    listed = [f"capture.views=[{','.join(map(str, views))}]"] if views else []
+    words = [f"capture.static={static}", *listed, f"capture.into=scenes/{name or 'mine'}"]
+    typed = " ".join(map(shlex.quote, words))
+    alone = ", or with capture.views=[…] in place of static if things move"
+    hint = alone if static.suffix.lower() in VIDEOS and not views else ""
+    return f"footage without camera poses; make a scene of it: stage=capture {typed}{hint}"

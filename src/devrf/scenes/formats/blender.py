@@ -18,7 +18,6 @@ from devrf.scenes.reader import Count, InwardReader, Time
 from devrf.scenes.scene import OpticalFlow, Scene, Views
 from devrf.scenes.splits import at_rest, in_motion
 from devrf.scenes.transforms import Transforms, read_transforms
-from devrf.scenes.validation import scene_error
 from devrf.scenes.view_folders import chosen_dynamic, dynamic_folders
 
 log = logging.getLogger(__name__)
@@ -63,10 +62,6 @@ class BlenderReader(InwardReader):
         """The splits, whether times were left out, and the folder where flow files would lie."""
         static, flow_folder = root / "static", root / "train_flow"
         if not os.path.isdir(static) and not dynamic_folders(root):
-            if not os.path.isfile(root / "transforms_train.json"):
-                raise scene_error(
-                    root, "no static/ or transforms_train.json; set data.root to the scene's folder"
-                )
             layout = one_capture(*_train_and_test(root, root, self.missing), self.static_until)
         elif self.dynamic is None and not dynamic_folders(root):
             rest = _train_and_test(static, root, self.missing)

@@ -11,7 +11,13 @@ from pydantic.dataclasses import dataclass
 
 from devrf.scenes.files import Positive, existing_folder, scene_folder
 from devrf.scenes.flow_files import FlowDirection, stacked_flow
-from devrf.scenes.formats.llff_poses import POSES, read_dynamic_poses, read_static_poses
+from devrf.scenes.formats.llff_poses import (
+    POSES,
+    PRECOMPUTED,
+    read_dynamic_poses,
+    read_precomputed_poses,
+    read_static_poses,
+)
 from devrf.scenes.image_folders import folder_size, image_folder, listed_images
 from devrf.scenes.images import image_size
 from devrf.scenes.layout import Layout, fewer, load_layout, static_alone, without_static_set
@@ -47,7 +53,7 @@ class LlffReader(FixedViewsReader):
 
     Three layouts: ``static/`` and ``dynamic_<V>views/``; LLFF's ``poses_bounds.npy`` and images in
     ``root`` itself, or in ``static/`` alone: a scene at rest; or the same as a video by one camera
-    (NR-NeRF), each image a time of its own, in the order of their names.
+    (NR-NeRF's, with ``precomputed.json``), each image a time of its own, in the order of names.
 
     The world's unit is 0.75 of the least depth of the static cameras, their average pose its origin
     and axes (x right, y up, −z forward). The scene's space is NDC of that camera.
@@ -99,7 +105,7 @@ class LlffReader(FixedViewsReader):
         images = _posed_images(posed, source.path)
         video = self.monocular
         if video is None:
-            video = not moving and os.path.isfile(posed / VIDEO)
+            video = not moving and os.path.isfile(posed / PRECOMPUTED)
         if video:
             return self._video(images), source.downscale, []
         train, test = (images[part] for part in every_nth(len(images.images), self.holdout, 0))
@@ -133,21 +139,19 @@ class LlffReader(FixedViewsReader):
         return without_static_set(train, test, self.static_until)
 
 
-# NR-NeRF's file of the cameras: where it lies, the images follow one another in time.
-VIDEO = "precomputed.json"
-
-
 def static_folder(root: Path) -> Path:
     """Where the static cameras and images are: ``static/`` or ``root`` itself; else DevrfError."""
-    static = root / "static"
-    if not os.path.isdir(static) and os.path.isfile(root / POSES) and not dynamic_folders(root):
+    static, here = root / "static", (root / POSES, root / PRECOMPUTED)
+    if not os.path.isdir(static) and any(map(os.path.isfile, here)) and not dynamic_folders(root):
         return root
     return existing_folder(static)
 
 
 def _posed_images(folder: Path, source: Path) -> Transforms:
-    """All images in ``source`` with the cameras of the folder's ``poses_bounds.npy``."""
-    posed, images = read_static_poses(folder).normalised(), listed_images(source)
+    """All images in ``source`` with the cameras of ``poses_bounds.npy``, or NR-NeRF's file."""
+    alone = os.path.isfile(folder / PRECOMPUTED) and not os.path.isfile(folder / POSES)
+    read = read_precomputed_poses if alone else read_static_poses
+    posed, images = read(folder).normalised(), listed_images(source)
     if len(images) != len(posed):
         raise scene_error(
             posed.file,

@@ -6,22 +6,30 @@ LLFF writes a camera's axes as columns [down, right, back]; the moving capture's
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
+from pydantic import BaseModel, Field
 from torch import Tensor
 
 from devrf.geometry.poses import average_pose, relative_to
-from devrf.scenes.files import Numbers, read_numbers
+from devrf.scenes.files import Number, Numbers, Vector2, read_json, read_numbers
 from devrf.scenes.lens import Intrinsics
 from devrf.scenes.validation import check_poses, in_reach, scene_error
 
-# The file of LLFF's cameras.
+log = logging.getLogger(__name__)
+
+# The file of LLFF's cameras, and that of NR-NeRF's, whose images follow one another in time.
 POSES = "poses_bounds.npy"
+PRECOMPUTED = "precomputed.json"
 # The nearest point of the scene comes to rest at 1/0.75 of the near plane, as the field does it.
 BOUND_FACTOR = 0.75
+# A camera's least depth below this share of their median is taken for that of a stray point.
+STRAY_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -46,9 +54,15 @@ class PosedSet:
     def normalised(self) -> PosedSet:
         """The set in units of 0.75 · its least depth, its average pose the identity.
 
-        DevrfError if the cameras look in too different directions, or are too far apart.
+        Least depths of stray points do not count. DevrfError if the cameras look in too different
+        directions, or are too far apart.
         """
-        scale = 1 / (BOUND_FACTOR * float(self.bounds[:, 0].min()))
+        least = self.bounds[:, 0]
+        agreed = least[least >= STRAY_SHARE * least.median()]
+        if stray := len(least) - len(agreed):
+            known = f"the nearest depth is {float(agreed.min()):.3g}, not {float(least.min()):.3g}"
+            log.info("%s: %d cameras see stray points before them: %s", self.file, stray, known)
+        scale = 1 / (BOUND_FACTOR * float(agreed.min()))
         middle = average_pose(self.poses)
         # NaN compares false.
         if (
@@ -93,6 +107,28 @@ def read_static_poses(folder: Path) -> PosedSet:
     return _posed_set(file, poses, intrinsics, file, rows[:, -2:])
 
 
+Row = tuple[Number, Number, Number, Number, Number]
+
+
+class _Precomputed(BaseModel):
+    """``precomputed.json``, as NR-NeRF publishes it.
+
+    Attributes:
+        poses: N matrices 3×5: axes [right, up, back], position, [H, W, focal].
+        bds: N times least and largest depth.
+    """
+
+    poses: Annotated[list[tuple[Row, Row, Row]], Field(fail_fast=True, min_length=1)]
+    bds: Annotated[list[Vector2], Field(fail_fast=True, min_length=1)]
+
+
+def read_precomputed_poses(folder: Path) -> PosedSet:
+    """The cameras of NR-NeRF's ``precomputed.json``; DevrfError if it holds something else."""
+    file = folder / PRECOMPUTED
+    content = read_json(file, _Precomputed, "expected the cameras of a video")
+    return _of_matrices(file, np.array(content.poses), file, np.array(content.bds))
+
+
 def read_dynamic_poses(folder: Path) -> PosedSet:
     """The cameras of ``poses.npy`` (N, 3, 5) and ``bds.npy`` (N, 2).
 
@@ -104,9 +140,14 @@ def read_dynamic_poses(folder: Path) -> PosedSet:
     if matrix.ndim != 3 or matrix.shape[1:] != (3, 5) or len(matrix) == 0:
         raise scene_error(file, f"has shape {matrix.shape}, expected (N, 3, 5); write it again")
     bounds = read_numbers(depths, "least and largest depths, (N, 2)")
+    return _of_matrices(file, matrix, depths, bounds)
+
+
+def _of_matrices(file: Path, matrix: Numbers, depths: Path, bounds: Numbers) -> PosedSet:
+    """The set of matrices (N, 3, 5), axes [right, up, back], and the bounds in ``depths``."""
     if bounds.shape != (len(matrix), 2):
         raise scene_error(
-            depths, f"has shape {bounds.shape}, expected ({len(matrix)}, 2); write it again"
+            depths, f"has depths {bounds.shape}, expected ({len(matrix)}, 2); write it again"
         )
     intrinsics = _of_columns(file, matrix[:, :, 4])
     return _posed_set(file, matrix[:, :, :4], intrinsics, depths, bounds)

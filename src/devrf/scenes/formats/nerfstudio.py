@@ -86,10 +86,6 @@ def _layout(root: Path, options: NerfstudioReader) -> Layout:
         train, test = _train_and_test(root / FILE, root, options)
         return _one_file(train, test, options.static_until)
     still, moving = root / "static" / FILE, root / "dynamic" / FILE
-    if not os.path.isfile(still) and not os.path.isfile(moving):
-        raise scene_error(
-            root, f"no {FILE}, nor static/{FILE}; set data.root to the scene's folder"
-        )
     rest = _train_and_test(still, root, options)
     if not os.path.isfile(moving):
         return static_alone(*rest, f"there is no dynamic/{FILE}")
